@@ -13,8 +13,8 @@
 #   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
 #   make release-build    build sdist and wheel twice, compare, try the wheel with every Python here (some minutes each)
 #   make release-check    the same, and fail for kernels that are out of date
-#   make kernels  compile everything anew into unifg/machine/kernels.zip, which spares a first use most of it (minutes)
-#   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/driving/drive_past.py')
+#   make kernels  compile everything anew into unifg/codegen/kernels.zip, which spares a first use most of it (minutes)
+#   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/ground/drive_past.py')
 #   make examples run all scripts of examples/ and draw the pictures of docs/examples.md again
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make docs     build the site with the reference of all public names into out/site, every link checked

@@ -14,12 +14,12 @@ from benchmarks.report import listing, words
 from benchmarks.section import Result, goal
 from benchmarks.timing import Split, interleave, milliseconds, number, shown, timed
 from problems.control import Unicycle
-from unifg.answers import solver
+from unifg.codegen.jit import compiled
 from unifg.elimination import fronts, substitution
-from unifg.machine.jit import compiled
 from unifg.models import unicycle
-from unifg.program import passes
-from unifg.program.program import Program
+from unifg.problem import evaluation
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.solution import solver
 from unifg.solvers import AugmentedLagrangian, GaussNewton, augmented_step, augmented_usual
 from unifg.typing import Array
 
@@ -28,14 +28,14 @@ SOFT = 0.01  # sigma of soft dynamics [m, m, rad]
 TARGET = 0.15  # [ms] per iteration
 REPEATS = 20  # of a compiled pass inside one timed call
 WATCHED: dict[str, tuple[Any, str]] = {
-    "linearise": (passes, "linearize"),
-    "evaluate": (passes, "evaluate"),
+    "linearise": (evaluation, "linearize"),
+    "evaluate": (evaluation, "evaluate"),
     "usual iteration": (augmented_usual, "usual_iteration"),
     "primal step": (augmented_step, "minimize"),
     "eliminate": (fronts, "factor"),
     "substitute": (substitution, "solve"),
     "KKT test": (solver, "optimality"),
-    "retract": (Program, "retract"),
+    "retract": (CompiledProblem, "retract"),
 }
 
 
@@ -140,10 +140,10 @@ def _factor_often(plan: Any, data: Array, added: Array, count: int) -> None:
 @compiled
 def _assemble_often(terms: Any, jacobian: Array, weights: Array, hessian: Array, count: int) -> None:
     for _ in range(count):
-        passes.add_constraints(terms, jacobian, weights, hessian)
+        evaluation.add_constraints(terms, jacobian, weights, hessian)
 
 
-def _compiled_parts(program: Program, guess: fg.Guess, repeats: int, rounds: int) -> Result:
+def _compiled_parts(program: CompiledProblem, guess: fg.Guess, repeats: int, rounds: int) -> Result:
     """One elimination and one assembly of the constraints' normal equations, without Python around them."""
     lin = program.linearize(program.values_from(guess.values))
     factorization = program.systems.normal()

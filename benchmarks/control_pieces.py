@@ -10,12 +10,12 @@ import numpy as np
 
 from benchmarks.report import table
 from problems.control import Problem, Quadrotor, Unicycle
+from unifg.codegen.function_pointers import run
+from unifg.codegen.jit import compiled
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
-from unifg.machine.jit import compiled
-from unifg.machine.links import run
-from unifg.program import passes
-from unifg.program.curvature import add_curvature
+from unifg.problem import evaluation
+from unifg.problem.hessian import add_curvature
 from unifg.solvers import InteriorPoint
 
 REPEATS, ROUNDS = 500, 7
@@ -44,7 +44,7 @@ def measure(problem: Problem) -> dict[str, float]:
     entries, norms = lin.hessian.copy(), np.empty(len(program.arrays.fields))
     squares, weights, gradient = lin.squares.copy(), lin.weights.copy(), lin.gradient.copy()
     calls: dict[str, Callable[[], object]] = {
-        "linearise *": lambda: passes.linearize(
+        "linearise *": lambda: evaluation.linearize(
             program.arrays, lin.values.flat, False, lin.residual, lin.jacobian, lin.constraints,
             lin.constraint_jacobian, squares, weights, norms, gradient, entries, program.scratch,
         ),

@@ -21,7 +21,7 @@ from benchmarks.comparison import interval as bootstrap
 from benchmarks.comparison import share as rate
 from benchmarks.report import command, listing, machine, publish
 from benchmarks.routes import drawn
-from unifg.scenarios.driving.drive_settings import AVOIDANCES, ControllerSettings
+from unifg.scenarios.ground.drive_settings import AVOIDANCES, ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 

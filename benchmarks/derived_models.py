@@ -20,8 +20,8 @@ import numpy as np
 from benchmarks import hand_written
 from benchmarks.report import table
 from benchmarks.timing import interleave
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.kernel import Argument, Kernel, evaluate_rows, side_by_side
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.kernel import Argument, Kernel, evaluate_rows, side_by_side
 from unifg.lie import SE2, SO3, Rn
 from unifg.models import avoidance, landmarks, obstacles, quadrotor, unicycle, vehicle
 from unifg.models.quadrotor import STATE

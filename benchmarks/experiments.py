@@ -29,7 +29,7 @@ from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, repla
 from unifg.scenarios.campaigns.performed import OK
 from unifg.scenarios.campaigns.sheet import Combination, Sheet, load
 from unifg.scenarios.campaigns.statement import Statement, read
-from unifg.scenarios.driving.drive_pilot import COUPLINGS
+from unifg.scenarios.ground.drive_pilot import COUPLINGS
 from unifg.typing import Array
 
 RUNS = 30

@@ -22,15 +22,15 @@ from benchmarks import runs
 from benchmarks.comparison import Row
 from benchmarks.report import command, machine, publish, table
 from unifg.scenarios.flight import FlightSettings, run_flight
-from unifg.scenarios.flying.braking import braking_control
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
-from unifg.scenarios.worlds.air import QuadrotorWorld
-from unifg.scenarios.worlds.conditions import draw_conditions
-from unifg.scenarios.worlds.disturbance import DisturbanceModel
-from unifg.scenarios.worlds.faults import DRIVE_FAULTS, FLIGHT_FAULTS, GUST, Fault
+from unifg.scenarios.quadrotor.braking import braking_control
+from unifg.scenarios.simulation.air import QuadrotorWorld
+from unifg.scenarios.simulation.conditions import draw_conditions
+from unifg.scenarios.simulation.disturbance import DisturbanceModel
+from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, GUST, Fault
 
 SEEDS = range(5)
 ROBOTS = {"drive": DRIVE_FAULTS, "flight": FLIGHT_FAULTS}

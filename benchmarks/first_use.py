@@ -28,10 +28,10 @@ BACKENDS = {
 CHILD = """
 import json, sys, time
 from pathlib import Path
-from unifg.machine import shipped
-from unifg.machine.tally import tally
+from unifg.codegen import precompiled
+from unifg.codegen.compile_counter import tally
 if sys.argv[2] == "sources":
-    shipped.ARCHIVE = Path("none")
+    precompiled.ARCHIVE = Path("none")
 from unifg.solvers import InteriorPoint
 text = Path("README.md").read_text(encoding="utf-8").split("```python")[2].split("for solver in")[0]
 exec(text)

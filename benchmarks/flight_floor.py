@@ -27,9 +27,9 @@ from scipy.optimize import minimize
 from benchmarks.report import command, table
 from unifg.models.quadrotor import GRAVITY
 from unifg.scenarios.safe_flight import SafeSettings
+from unifg.scenarios.safety.cbf_mpc import TRACKING
 from unifg.scenarios.safety.flatness import TUNED
-from unifg.scenarios.safety.keeper import TRACKING
-from unifg.scenarios.worlds.body_rate import Loops
+from unifg.scenarios.simulation.body_rate import Loops
 from unifg.typing import Array
 
 Axis: TypeAlias = Literal["level", "up"]

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
-from unifg.kernels.kernel import Kernel
+from unifg.codegen.calls import local_matrix, vector
+from unifg.codegen.jit import compiled
+from unifg.factors.kernel import Kernel
 from unifg.lie import SE2, Rn, so3
 from unifg.lie.rn import minus
 from unifg.lie.so2 import wrap
-from unifg.machine.calls import local_matrix, vector
-from unifg.machine.jit import compiled
 from unifg.models.quadrotor import STATE
 from unifg.models.vehicle import Vehicle
 from unifg.typing import Array

@@ -23,7 +23,7 @@ from benchmarks.comparison import digits, interval
 from benchmarks.report import command, machine, publish, table
 from unifg.scenarios.safe_flight import SafeSettings, flights
 from unifg.scenarios.safety.cascade import CascadeSettings
-from unifg.scenarios.safety.keeper import KeeperSettings
+from unifg.scenarios.safety.cbf_mpc import KeeperSettings
 from unifg.scenarios.safety.situations import Kind, Situation, situation
 
 GAMMAS = (0.0, 0.1, 0.3, 1.0, 1.3)

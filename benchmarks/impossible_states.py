@@ -10,8 +10,8 @@ from collections.abc import Callable
 import numpy as np
 
 import unifg as fg
-from unifg.language.variables import Data
 from unifg.lie import SE2
+from unifg.modeling.variables import Data
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array
 

@@ -29,9 +29,9 @@ from unifg.files.ros_map import OccupancyMap, save_map
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
-from unifg.scenarios.ways.grid import plan
-from unifg.scenarios.ways.polyline import path_length
-from unifg.scenarios.worlds.rectangles import wall_rectangles
+from unifg.scenarios.planning.grid import plan
+from unifg.scenarios.planning.polyline import path_length
+from unifg.scenarios.simulation.rectangles import wall_rectangles
 from unifg.typing import BoolArray
 
 CAMPAIGNS = Path(__file__).resolve().parent / "campaigns"

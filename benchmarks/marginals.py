@@ -18,8 +18,8 @@ from benchmarks.gtsam_peer import ANCHOR, Peer, available, joint
 from benchmarks.report import listing
 from benchmarks.section import Result, goal
 from benchmarks.timing import interleave, milliseconds, shown, spread
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, IntArray
 
@@ -138,7 +138,7 @@ class Tree:
         factorization: what entries of the inverse are read from.
     """
 
-    def __init__(self, program: Program, solution: fg.Solution) -> None:
+    def __init__(self, program: CompiledProblem, solution: fg.Solution) -> None:
         """Linearise, order, factorise."""
         self.lin = program.linearize(solution.values)
         self.factorization = program.systems.normal()

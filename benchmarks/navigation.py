@@ -22,8 +22,8 @@ import numpy as np
 from benchmarks import runs
 from benchmarks.comparison import Row, where
 from benchmarks.report import command, machine, publish, shared, table
-from unifg.scenarios.driving.drive_pilot import COUPLINGS
-from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.ground.drive_pilot import COUPLINGS
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.typing import Array

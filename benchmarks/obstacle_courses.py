@@ -37,8 +37,8 @@ from unifg.scenarios.course import (
     course_guess,
     state_problem,
 )
-from unifg.scenarios.worlds.air import VEHICLE_RADIUS
-from unifg.scenarios.worlds.layouts import COURSE_SEEDS, TUNING_SEEDS, Layout, obstacle_course
+from unifg.scenarios.simulation.air import VEHICLE_RADIUS
+from unifg.scenarios.simulation.layouts import COURSE_SEEDS, TUNING_SEEDS, Layout, obstacle_course
 
 SAME = 1e-3  # relative difference of cost below which two minima are one
 BACKENDS = tuple(product(("sqp", "ipm", "alm"), HESSIANS))

@@ -17,25 +17,25 @@ from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import listing, shared, words
 from benchmarks.section import Result, goal
 from benchmarks.timing import Split, interleave, milliseconds, number, shown, spread, timed
-from unifg.answers import solver
 from unifg.elimination import factorization, fronts, substitution
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.lie import SE3
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
-from unifg.program import passes
-from unifg.program.program import Program
+from unifg.problem import evaluation
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.solution import solver
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
 SAME = 1e-6  # relative difference of chi2
 # What the compiled passes and Python around them do in a solve; linearising adds up the normal equations too.
 WATCHED: dict[str, tuple[Any, str]] = {
-    "linearise": (passes, "linearize"),
+    "linearise": (evaluation, "linearize"),
     "eliminate": (fronts, "factor"),
     "substitute": (substitution, "solve"),
-    "retract": (Program, "retract"),
+    "retract": (CompiledProblem, "retract"),
     "KKT test": (solver, "optimality"),
-    "bind data": (Program, "bind"),
+    "bind data": (CompiledProblem, "bind"),
 }
 FROM_FILE: dict[str, tuple[Any, str]] = {
     "read": (sys.modules[__name__], "read_g2o"),

@@ -21,11 +21,11 @@ from benchmarks.comparison import Row
 from benchmarks.quadrotor_tables import HEADLINE, render
 from benchmarks.report import command, machine, publish
 from unifg.scenarios.flight import FlightSettings, run_flight
-from unifg.scenarios.flying.flight_pilot import COUPLINGS
-from unifg.scenarios.flying.flight_settings import Avoidance
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics
-from unifg.scenarios.worlds.layouts import CORRIDOR_SEEDS
+from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS
+from unifg.scenarios.quadrotor.flight_settings import Avoidance
+from unifg.scenarios.simulation.layouts import CORRIDOR_SEEDS
 
 STUDIES = ("flights", "potential", "association", "movers", "weights", "timing")
 SOLVERS = ("ipm", "sqp", "alm")

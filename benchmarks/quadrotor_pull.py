@@ -23,11 +23,11 @@ from benchmarks.quadrotor_flights import SOLVERS
 from benchmarks.report import command, listing, machine, publish
 from unifg.models import quadrotor
 from unifg.scenarios.flight import Flight, FlightSettings
-from unifg.scenarios.flying.flight_joint import JointSettings
-from unifg.scenarios.flying.flight_pilot import make_pilot
-from unifg.scenarios.flying.flight_settings import Avoidance
-from unifg.scenarios.seeing.belief import Belief, Landmarks
-from unifg.scenarios.worlds.layouts import TUNING_SEEDS
+from unifg.scenarios.perception.belief import Belief, Landmarks
+from unifg.scenarios.quadrotor.flight_joint import JointSettings
+from unifg.scenarios.quadrotor.flight_pilot import make_pilot
+from unifg.scenarios.quadrotor.flight_settings import Avoidance
+from unifg.scenarios.simulation.layouts import TUNING_SEEDS
 from unifg.typing import Array
 
 WEIGHTS = (0.01, 0.1, 1.0, 10.0)

@@ -72,7 +72,7 @@ def render(results: Results, loops: str, rounds: int) -> str:
     notes = (
         f"Median processor time of {rounds} interleaved cold solves (one where it took more than "
         f"{RULES.slow / 1e3:.0f} s), tolerance {RULES.tolerance:.0e} each. KKT: largest number of our own test, scaled "
-        f"as in unifg.answers.optimality. Solved: KKT below {RULES.good:.0e} (peers: converged), and a cost within "
+        f"as in unifg.solution.optimality. Solved: KKT below {RULES.good:.0e} (peers: converged), and a cost within "
         f"{KNOWN:.0e} of a known optimum or one at which IPOPT stays, to {STAYS:.0e}, when it is started there at "
         f"tolerance 1e-9; IPOPT is asked wherever the cost is not a known one to {RULES.same:.0e}. Staying shows a KKT "
         "point, not that it is a minimum. QPs: accepted iterations by the route that solved their subproblem. Times: "

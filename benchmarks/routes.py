@@ -8,9 +8,9 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.ways.grid import plan
-from unifg.scenarios.ways.polyline import path_length
-from unifg.scenarios.worlds.building import building_map
+from unifg.scenarios.planning.grid import plan
+from unifg.scenarios.planning.polyline import path_length
+from unifg.scenarios.simulation.building import building_map
 from unifg.typing import Array
 
 ROOM = 0.45  # [m] between a start or goal and the walls

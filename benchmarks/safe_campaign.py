@@ -30,7 +30,7 @@ from unifg.scenarios.safe_flight import Controller, Knowledge, SafeFlight, SafeS
 from unifg.scenarios.safety.oracle import Answer, Authority, Threat, exists_among
 from unifg.scenarios.safety.situations import Kind
 from unifg.scenarios.show.safe_plot import picture
-from unifg.scenarios.worlds.bodies import Ellipse, Thrown
+from unifg.scenarios.simulation.bodies import Ellipse, Thrown
 from unifg.style.figures import write_figure
 
 VEHICLE = 5.0  # horizontal acceleration at a tilt of 27 degrees [m/s^2]

@@ -25,14 +25,14 @@ from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.episode import silent
 from unifg.scenarios.flight import Flight, FlightSettings
-from unifg.scenarios.flying.estimator import STILL, DeadReckoning, Dynamics, Estimator, EstimatorSettings
-from unifg.scenarios.flying.flight_control import Controller
-from unifg.scenarios.flying.flight_past import WindowSettings
-from unifg.scenarios.flying.flight_pilot import Pilot
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics
-from unifg.scenarios.seeing.readings import Reading
-from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.quadrotor.estimator import STILL, DeadReckoning, Dynamics, Estimator, EstimatorSettings
+from unifg.scenarios.quadrotor.flight_control import Controller
+from unifg.scenarios.quadrotor.flight_past import WindowSettings
+from unifg.scenarios.quadrotor.flight_pilot import Pilot
 from unifg.typing import Array
 
 FORCE_SIGMA = 0.15  # [m/s^2] of an accelerometer with noise of 0.1 and an unknown bias of 0.05

@@ -26,8 +26,8 @@ from benchmarks.gtsam_peer import Peer, as_array, available
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.report import OUT, command, listing, machine, publish, shared
 from problems.closures import Claim, with_wrong_closures
+from unifg.factors.robust import Loss
 from unifg.files.g2o import read_g2o
-from unifg.kernels.robust import Loss
 from unifg.lie import SE2
 from unifg.pose_graphs import PoseGraph, manhattan, pairwise_consistent, sphere
 from unifg.solvers import GaussNewton, GraduatedNonConvexity

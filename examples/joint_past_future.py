@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import COUPLINGS, ControlCost, Dynamics, Loop, Measurement, Now, Robot, Window
+from unifg.horizon import COUPLINGS, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
 from unifg.models import bicycle, rkmk
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
@@ -29,7 +29,7 @@ class Parking:  # what the future is to be, besides the dynamics
         graph.bound(u, lower=[-1.0, -0.5], upper=[1.0, 0.5], name="limits")
         graph.bound(x.speed[1:], lower=-1.5, upper=1.5, name="speed")
 
-    def data(self, now: Now[None]) -> dict[str, Array]:
+    def data(self, now: Context[None]) -> dict[str, Array]:
         return {}
 
 
@@ -40,7 +40,7 @@ for coupling, ax in zip(COUPLINGS[1:], axes, strict=True):
     past = Dynamics(motion, h, sigma=noise), Measurement("gps", lambda x, z: x[:, :2] - z, (2,), gps)
     window = Window(robot, 10, past, start=np.zeros(4), sigma=[0.3, 0.3, 0.1, 0.1])
     future = Dynamics(motion, h), Parking(), ControlCost(sigma=[1.0, 0.5], change=[0.5, 0.2])
-    loop = Loop(robot, 25, future, solver=InteriorPoint(), window=window, coupling=coupling)
+    loop = RecedingHorizon(robot, 25, future, solver=InteriorPoint(), window=window, coupling=coupling)
     truth, believed = np.array([[0.2, -0.2, 0.05, 0.0]]), np.zeros((0, 4))
     for tick in range(60):
         plan = loop.tick(measured={"gps": truth[-1, :2] + gps * rng.normal(size=2)} if tick % 4 else {})

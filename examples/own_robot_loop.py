@@ -13,7 +13,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import COUPLINGS, ControlCost, Dynamics, Loop, Measurement, Now, Robot, Static, Window
+from unifg.horizon import (
+    COUPLINGS,
+    Constant,
+    Context,
+    ControlCost,
+    Dynamics,
+    Measurement,
+    RecedingHorizon,
+    Robot,
+    Window,
+)
 from unifg.models import manipulator, rkmk
 from unifg.solvers import SQP
 from unifg.typing import Array
@@ -31,25 +41,27 @@ class Reach:  # what the future is to be, besides the dynamics
         graph.minimize(fg.prior, x[1:], goal, sigma=[1.0, 1.0, 3.0, 3.0], name="reach")
         graph.bound(u, lower=-most, upper=most, name="limits")
 
-    def data(self, now: Now[None]) -> dict[str, Array]:
+    def data(self, now: Context[None]) -> dict[str, Array]:
         return {}
 
 
 motion, rho, results = rkmk.integrator(STATE, arm, "rk4"), ("friction",), {}
 figure, axes = plt.subplots(1, 2, figsize=(8.0, 2.6), sharey=True, layout="constrained")
 for coupling, ax in zip(COUPLINGS[1:], axes, strict=True):
-    rng, robot = np.random.default_rng(1), Robot(STATE, fg.Rn(2), (Static("friction", fg.Rn(2), [0.0, 0.0], 1.0),))
+    rng, robot = np.random.default_rng(1), Robot(STATE, fg.Rn(2), (Constant("friction", fg.Rn(2), [0.0, 0.0], 1.0),))
     angles = (Measurement(name, fg.prior, (1,), 0.01, component=name) for name in ("shoulder", "elbow"))
-    window = Window(robot, 12, [*angles, Dynamics(motion, h, sigma=noise, statics=rho)], start=-goal, sigma=0.1)
-    future = Dynamics(motion, h, statics=rho), Reach(), ControlCost(sigma=[20.0, 10.0], change=[10.0, 5.0])
-    loop = Loop(robot, 20, future, solver=SQP(tolerance=1e-4), window=window, coupling=coupling, limits=(-most, most))
+    window = Window(robot, 12, [*angles, Dynamics(motion, h, sigma=noise, constants=rho)], start=-goal, sigma=0.1)
+    future = Dynamics(motion, h, constants=rho), Reach(), ControlCost(sigma=[20.0, 10.0], change=[10.0, 5.0])
+    loop = RecedingHorizon(
+        robot, 20, future, solver=SQP(tolerance=1e-4), window=window, coupling=coupling, limits=(-most, most)
+    )
     truth = -goal[None] + [0.05, -0.05, 0.0, 0.0]
     for _ in range(60):
         q, fails = truth[-1, :2, None] + 0.01 * rng.normal(size=(2, 1)), rng.random() < 0.2
         plan = loop.tick(measured={"shoulder": q[0], "elbow": None if fails else q[1]})
         x = rkmk.rollout(STATE, arm, truth[-1], plan.control[None], friction[None], h=h)[-1]
         truth = np.vstack([truth, STATE.retract(x, rng.normal(scale=noise))])
-    away, learnt = np.abs(STATE.local(goal, truth[-1])[:2]).max(), loop.statics["friction"][0]
+    away, learnt = np.abs(STATE.local(goal, truth[-1])[:2]).max(), loop.constants["friction"][0]
     results[coupling] = away, learnt, loop.statuses[fg.Status.CONVERGED]
     print(f"{coupling:10} {away:.3f} rad from upright, friction {learnt.round(2)} of {friction}")
     ax.plot(h * np.arange(61), truth[:, :2])

@@ -20,11 +20,11 @@ from typing import TypeAlias
 
 import numpy as np
 
+from unifg.codegen.jit import compiled, inlined
 from unifg.errors import GraphError, ModelError
-from unifg.kernels.kernel import Kernel
-from unifg.kernels.residuals import Residual, residual
+from unifg.factors.kernel import Kernel
+from unifg.factors.residuals import Residual, residual
 from unifg.lie import Rn
-from unifg.machine.jit import compiled, inlined
 from unifg.models.profile import of_distance
 from unifg.typing import Array
 

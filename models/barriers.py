@@ -26,8 +26,8 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.derive.rates import rate
-from unifg.kernels.residuals import Residual
+from unifg.factors.autodiff.rates import rate
+from unifg.factors.residuals import Residual
 from unifg.lie import Manifold
 from unifg.models import quadrotor
 from unifg.typing import Array

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.kernels.residuals import Residual
+from unifg.factors.residuals import Residual
 from unifg.lie import SE2, Product, Rn
 from unifg.models import rkmk
 from unifg.models.rkmk import Field

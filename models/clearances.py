@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.residuals import Residual
+from unifg.factors.residuals import Residual
 from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.typing import Array, ArrayLike

@@ -18,8 +18,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
+from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
 HEADER = 8  # numbers in front of the cells of a table

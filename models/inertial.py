@@ -23,16 +23,16 @@ from typing import Any, cast
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.residuals import Residual, residual
-from unifg.language.factors import difference
-from unifg.language.statement import Statement
-from unifg.language.variables import Data, Selection, Variable, as_selection
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.residuals import Residual, residual
 from unifg.lie import SE23, SO3, Manifold, Product
+from unifg.locks import ReentrantLock
+from unifg.modeling.factors import difference
+from unifg.modeling.model import Model
+from unifg.modeling.variables import Data, Selection, Variable, as_selection
 from unifg.models.preintegration import BIAS, CLOSE, GRAVITY, ImuNoise, Preintegrated, preintegrate
 from unifg.models.rigid import motion_parts
 from unifg.models.stamped import Present, by_handle, state_whole
-from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike
 
 STILL = 1e-6  # standard deviation of each row, and of biases, over a step of no duration
@@ -175,17 +175,17 @@ class InertialMeasurements:
         self._body, self._bias, self._gravity = body, bias, gravity
         self._walk = f"{name}: walk"
         self._place: slice | None = None  # of biases in states
-        self._turn = Turn()
+        self._lock = ReentrantLock()
         self.reset()
 
     def reset(self) -> None:
         """Forget all samples, and what has become of them."""
-        with self._turn:
+        with self._lock:
             self._samples: Array = np.empty((0, 7))  # stamp, rates, forces
             self._left = -np.inf  # the last stamp that has left
             self.counts = SampleCounts()
 
-    def state(self, graph: Statement, x: Variable, u: Any = None) -> None:
+    def state(self, graph: Model, x: Variable, u: Any = None) -> None:
         """Add factors between all neighbours of x, and of the biases where there is one for each node.
 
         Raises:
@@ -211,7 +211,7 @@ class InertialMeasurements:
             )
         moved = motion(body.manifold, self._gravity)
 
-        def stated(graph: Statement) -> None:
+        def stated(graph: Model) -> None:
             data = {
                 name: graph.data(name, value, each=True)
                 for name, value in self._named(nothing).items()
@@ -231,7 +231,7 @@ class InertialMeasurements:
         state_whole(graph, stated)
         self._place = biases.storage if biases.family is nodes.family else None
 
-    def _biases(self, graph: Statement, nodes: Selection) -> Variable:
+    def _biases(self, graph: Model, nodes: Selection) -> Variable:
         if isinstance(nodes.manifold, Product) and self._bias in nodes.manifold.components:
             found: Selection = getattr(nodes, self._bias)
             return found
@@ -265,7 +265,7 @@ class InertialMeasurements:
             )
         rows = np.concatenate([t.reshape(-1, 1), w.reshape(-1, 3), a.reshape(-1, 3)], axis=1)
         good = np.isfinite(rows).all(axis=1)
-        with self._turn:
+        with self._lock:
             rows = np.concatenate([self._samples, rows[good]])
             rows = rows[np.argsort(rows[:, 0], kind="stable")]
             first = np.diff(rows[:, 0], prepend=-np.inf) > 0.0
@@ -286,11 +286,11 @@ class InertialMeasurements:
         times, first = np.array(history.times), int(history.empty)
         if self._place is not None:
             return self._given(times, first, history.states[:-1, self._place])
-        found = self._given(times, first, now.statics[self._bias][0])
+        found = self._given(times, first, now.constants[self._bias][0])
         del found[self._walk]  # there is one bias, which stays
         return found
 
-    def at(self, graph: Statement, times: ArrayLike, bias: ArrayLike) -> dict[Data, Array]:
+    def at(self, graph: Model, times: ArrayLike, bias: ArrayLike) -> dict[Data, Array]:
         """Data of a graph for one solve, with nodes at these times; older samples are dropped.
 
         Args:
@@ -314,7 +314,7 @@ class InertialMeasurements:
         empty, first = first, int(np.searchsorted(times, times[first], side="right")) - 1
         times = np.concatenate([times[first] - np.arange(first, 0, -1.0), times[first:]])
         since = float(times[first])
-        with self._turn:
+        with self._lock:
             begin = float(self._samples[0, 0]) if len(self._samples) else np.inf
             if since < begin - CLOSE and self._left >= since - self.gap:
                 raise ModelError(
@@ -329,7 +329,7 @@ class InertialMeasurements:
         found = self._integrated(samples, times, bias)
         found.held[:first] = np.inf
         unknown = int((found.held[first:] > self.gap).sum())
-        with self._turn:
+        with self._lock:
             self.counts = replace(self.counts, kept=len(samples), unknown=unknown)
         still = slice(empty, first)  # steps of no duration, in which nothing moves
         found.increment[still], found.by_bias[still], found.duration[still] = SE23.identity(), 0.0, 0.0

@@ -15,13 +15,13 @@ from typing import Any, Literal, Protocol, TypeAlias
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.residuals import Residual
-from unifg.language.factors import prior
-from unifg.language.statement import Statement, complete
-from unifg.language.terms import prepare_arguments
-from unifg.language.trial import rows_of
-from unifg.language.variables import Family
+from unifg.factors.residuals import Residual
 from unifg.lie import Rn
+from unifg.modeling.factors import prior
+from unifg.modeling.model import Model, complete
+from unifg.modeling.probing import rows_of
+from unifg.modeling.terms import prepare_arguments
+from unifg.modeling.variables import Family
 from unifg.typing import Array
 
 __all__ = ["Form", "Kept", "Use", "aligned", "grid", "hinge", "keep"]
@@ -88,7 +88,7 @@ class Kept:
 
 
 def keep(
-    graph: Statement,
+    graph: Model,
     barrier: Callable[..., Array] | Residual,
     *arguments: Any,
     obstacles: int | Sequence[str],
@@ -115,7 +115,7 @@ def keep(
             or a weight that is not positive.
         GraphError: as the statements of the graph raise it; the graph is as it was.
     """
-    if not isinstance(graph, Statement):
+    if not isinstance(graph, Model):
         raise ModelError(
             f"'{name}': {type(graph).__name__} is no graph; a smoother takes the hinge, as a residual: "
             "minimize(keeping.hinge(barrier), ..., sigma=weight**-0.5)"
@@ -138,7 +138,7 @@ def keep(
 
 
 def _hold(
-    graph: Statement, barrier: Callable[..., Array] | Residual, arguments: tuple[Any, ...], count: int,
+    graph: Model, barrier: Callable[..., Array] | Residual, arguments: tuple[Any, ...], count: int,
     names: tuple[str, ...], form: Form, price: float, active: Any, name: str,
 ) -> Kept:  # fmt: skip
     if form == "hinge":

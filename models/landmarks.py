@@ -11,12 +11,12 @@ import math
 
 import numpy as np
 
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.kernel import Kernel
-from unifg.kernels.residuals import residual
+from unifg.codegen.calls import local_matrix
+from unifg.codegen.jit import compiled
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.kernel import Kernel
+from unifg.factors.residuals import residual
 from unifg.lie import SO3, Rn, so3, wrap_angle
-from unifg.machine.calls import local_matrix
-from unifg.machine.jit import compiled
 from unifg.models.quadrotor import STATE
 from unifg.typing import Array, ArrayLike
 

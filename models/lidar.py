@@ -12,11 +12,11 @@ import math
 
 import numpy as np
 
-from unifg.kernels.kernel import Kernel
-from unifg.kernels.residuals import Residual, residual
-from unifg.kernels.robust import Reweighted
+from unifg.codegen.jit import compiled
+from unifg.factors.kernel import Kernel
+from unifg.factors.residuals import Residual, residual
+from unifg.factors.robust import Reweighted
 from unifg.lie import SE2
-from unifg.machine.jit import compiled
 from unifg.models.distance_map import DistanceMap, bilinear
 from unifg.typing import Array, BoolArray
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
+from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
-from unifg.kernels.kernel import Kernel
-from unifg.kernels.residuals import Residual, residual
+from unifg.factors.kernel import Kernel
+from unifg.factors.residuals import Residual, residual
 from unifg.lie import SE2
-from unifg.machine.jit import compiled
 from unifg.models.distance_map import SmoothField, smooth
 from unifg.models.profile import of_distance
 from unifg.typing import Array

@@ -27,9 +27,9 @@ from dataclasses import replace
 from functools import cache
 from typing import Literal, TypeAlias
 
+from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
-from unifg.kernels.residuals import Residual, residual
-from unifg.machine.jit import compiled
+from unifg.factors.residuals import Residual, residual
 from unifg.models.profile import first_order, of_distance
 from unifg.typing import Array
 

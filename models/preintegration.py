@@ -26,10 +26,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
 from unifg.lie import SE23, SO3, Product, Rn, se3, se23, so3
 from unifg.lie.series import c_slope, c_value
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 BIAS = Product(gyro=Rn(3), accelerometer=Rn(3))

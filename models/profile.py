@@ -13,9 +13,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unifg.kernels.residuals import Residual, residual
-from unifg.machine.calls import vector
-from unifg.machine.jit import compiled
+from unifg.codegen.calls import vector
+from unifg.codegen.jit import compiled
+from unifg.factors.residuals import Residual, residual
 from unifg.typing import Array
 
 Profile: TypeAlias = Callable[[float, Array], tuple[float, float, float]]

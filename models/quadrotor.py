@@ -23,8 +23,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.kernel import Kernel
-from unifg.kernels.residuals import residual
+from unifg.factors.kernel import Kernel
+from unifg.factors.residuals import residual
 from unifg.lie import SO3, Product, Rn
 from unifg.models import quadrotor_dynamics, quadrotor_second
 from unifg.models.quadrotor_dynamics import GRAVITY

@@ -13,11 +13,11 @@ Every entry that can differ from zero is written by name: a step touches 90 of t
 
 from __future__ import annotations
 
+from unifg.codegen.calls import local_matrix, local_vector
+from unifg.codegen.jit import compiled
 from unifg.lie import so3
 from unifg.lie.rn import minus
 from unifg.lie.series import k_value
-from unifg.machine.calls import local_matrix, local_vector
-from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 GRAVITY = 9.81  # [m/s^2]

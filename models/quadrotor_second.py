@@ -9,10 +9,10 @@ A turn R Exp(t) makes of q: q - t x q + t x (t x q) / 2, and of s the same. All 
 
 from __future__ import annotations
 
+from unifg.codegen.calls import local_matrix
+from unifg.codegen.jit import compiled
 from unifg.lie import so3
 from unifg.lie.series import k_slope, k_value
-from unifg.machine.calls import local_matrix
-from unifg.machine.jit import compiled
 from unifg.models.quadrotor_dynamics import AFTER, AFTER_COLUMN, DISTURBED_AFTER, DISTURBED_COLUMN
 from unifg.typing import Array
 

@@ -33,17 +33,17 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
+from unifg.codegen.calls import RETRACTION, address, call_residual, call_retraction, vector
+from unifg.codegen.jit import compiled
 from unifg.errors import ModelError, UnifgError
-from unifg.kernels.derive.derived import DerivedKernel, derived
-from unifg.kernels.derive.reach import reach_of
-from unifg.kernels.derive.rows import Each
-from unifg.kernels.derive.symbols import TraceError
-from unifg.kernels.differences import jacobian
-from unifg.kernels.residuals import Residual, residual
+from unifg.factors.autodiff.captured import captured_by
+from unifg.factors.autodiff.derived import DerivedKernel, derived
+from unifg.factors.autodiff.rows import Each
+from unifg.factors.autodiff.symbols import TraceError
+from unifg.factors.differences import jacobian
+from unifg.factors.residuals import Residual, residual
 from unifg.lie import LieGroup
 from unifg.lie.functions import functions_of
-from unifg.machine.calls import RETRACTION, address, call_residual, call_retraction, vector
-from unifg.machine.jit import compiled
 from unifg.models.tableau import METHODS, Tableau
 from unifg.typing import Array, ArrayLike
 
@@ -259,7 +259,7 @@ def _stepping(
     """An explicit step as a kernel; None where its field cannot be traced."""
     step = partial(travel, group, field, tableau.numbers)
     first = [start[None], *(part[:1] for part in inputs), np.array([h])]
-    reach = reach_of(step)
+    reach = captured_by(step)
     if reach.refusal:
         return None
     try:

@@ -21,8 +21,8 @@ from typing import Any, cast
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.residuals import Residual, residual
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.residuals import Residual, residual
 from unifg.lie import SE3, SO3, Manifold, Rn
 from unifg.models.rigid import pose_parts
 from unifg.typing import Array, ArrayLike

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import solve_banded
 
 from unifg.errors import ModelError
-from unifg.kernels.derive.lookup import Lookup
+from unifg.factors.autodiff.lookup import Lookup
 from unifg.models.distance_map import DistanceMap
 from unifg.typing import Array, ArrayLike
 

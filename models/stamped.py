@@ -14,13 +14,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.residuals import Function, Residual
-from unifg.kernels.robust import Loss
-from unifg.language.statement import Statement
-from unifg.language.variables import Data, Family, Variable, as_selection
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.residuals import Function, Residual
+from unifg.factors.robust import Loss
+from unifg.locks import ReentrantLock
+from unifg.modeling.model import Model
+from unifg.modeling.variables import Data, Family, Variable, as_selection
 from unifg.models.interpolation import Interpolation, geodesic
-from unifg.turns import Turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 CLOSE = 1e-6  # of a step: how far from a node a stamp still falls on it
@@ -41,8 +41,8 @@ class Present(Protocol):
     """Context of a term in a window, as in :class:`unifg.horizon.Now`."""
 
     @property
-    def statics(self) -> Mapping[str, Array]:
-        """(count, storage) believed statics, by name."""
+    def constants(self) -> Mapping[str, Array]:
+        """(count, storage) believed constants, by name."""
         ...
 
     @property
@@ -96,7 +96,7 @@ class StampedMeasurements:
         capacity: int,
         sigma: ArrayLike,
         between: Interpolation | None = None,
-        statics: Sequence[str] = (),
+        constants: Sequence[str] = (),
         offset: str | None = None,
         component: str | None = None,
         robust: Loss | None = None,
@@ -105,14 +105,14 @@ class StampedMeasurements:
         """Describe the sensor.
 
         Args:
-            error: ``error(x, z)`` or, with statics, ``error(x, s_1, ..., z)``, (n, m): what measurements z (n, size)
+            error: ``error(x, z)`` or, with constants, ``error(x, s_1, ..., z)``, (n, m): what measurements z (n, size)
                 differ by from what they should be at states x (n, storage). A batched function, or a residual made of
                 one.
             size: how many numbers a measurement has.
             capacity: slots of an interval between two nodes.
             sigma: standard deviations, one or (m,).
             between: how states x are interpolated; the geodesic of their manifold by default.
-            statics: names of families of one member that ``error`` takes, too: a landmark, a lever arm.
+            constants: names of families of one member that ``error`` takes, too: a landmark, a lever arm.
             offset: name of a family of one member on Rn(1): by how much the sensor's clock is behind [s], so that a
                 measurement was taken at its stamp plus this. None: not at all.
             component: of the nodes, which takes the place of x; None for all of them.
@@ -125,21 +125,21 @@ class StampedMeasurements:
         if size < 1 or capacity < 1:
             raise ModelError(f"'{name}': size {size} and capacity {capacity} must be at least 1")
         self.name, self.size, self.capacity = name, size, capacity
-        self.statics, self.offset, self.component = tuple(statics), offset, component
+        self.constants, self.offset, self.component = tuple(constants), offset, component
         self._error, self._sigma, self._between, self._robust = _batched(error, name), sigma, between, robust
-        self._turn = Turn()
+        self._lock = ReentrantLock()
         self.reset()
 
     def reset(self) -> None:
         """Forget all measurements, and what has become of them."""
-        with self._turn:
+        with self._lock:
             self._stamps: Array = np.empty(0)
             self._values: Array = np.empty((0, self.size))
             self._known: BoolArray = np.empty(0, dtype=bool)  # whether they have been placed before
             self._left = self._since = -np.inf  # the last stamp that has left, and the oldest node at that time
             self.counts = Counts()
 
-    def state(self, graph: Statement, x: Variable, u: Any = None) -> None:
+    def state(self, graph: Model, x: Variable, u: Any = None) -> None:
         """Add the factors, all inactive, between the nodes x, two or more in the order of time.
 
         Raises:
@@ -150,7 +150,7 @@ class StampedMeasurements:
         nodes = as_selection(x) if self.component is None else getattr(as_selection(x), self.component)
         if len(nodes) < 2:
             raise ModelError(f"'{self.name}' needs two nodes or more to stand between, found {len(nodes)}")
-        shared = [self._family(graph, "statics", name) for name in self.statics]
+        shared = [self._family(graph, "constants", name) for name in self.constants]
         clock = [] if self.offset is None else [self._family(graph, "offset", self.offset)]
         if any((len(family), family.manifold.dim) != (1, 1) for family in clock):
             raise ModelError(f"'{self.name}': the offset of a clock is one variable on Rn(1)")
@@ -158,7 +158,7 @@ class StampedMeasurements:
         before = np.repeat(np.arange(len(nodes) - 1), self.capacity)
         error = _at_stamp(self._error, self._between or geodesic(nodes.manifold), bool(clock))
 
-        def stated(graph: Statement) -> None:
+        def stated(graph: Model) -> None:
             into, step, values, measured = (graph.data(name, value, each=True) for name, value in empty.items())
             graph.minimize(
                 error,
@@ -171,7 +171,7 @@ class StampedMeasurements:
 
         state_whole(graph, stated)
 
-    def _family(self, graph: Statement, role: str, name: str) -> Family:
+    def _family(self, graph: Model, role: str, name: str) -> Family:
         if name not in graph.families:
             there = ", ".join(f"'{other}'" for other in graph.families)
             raise ModelError(
@@ -193,7 +193,7 @@ class StampedMeasurements:
             raise ModelError(f"'{self.name}': stamps {stamps.shape} need values {wanted}, found {values.shape}")
         stamps, values = np.atleast_1d(stamps), values.reshape(-1, self.size)
         good = np.isfinite(stamps) & np.isfinite(values).all(axis=1)
-        with self._turn:
+        with self._lock:
             self._count(invalid=int((~good).sum()))
             self._stamps = np.concatenate([self._stamps, stamps[good]])
             self._values = np.concatenate([self._values, values[good]])
@@ -206,10 +206,10 @@ class StampedMeasurements:
             ModelError: when measurements of theirs have left with the nodes of another window.
         """
         history: Nodes = now.past
-        offset = 0.0 if self.offset is None else float(np.ravel(now.statics[self.offset])[0])
+        offset = 0.0 if self.offset is None else float(np.ravel(now.constants[self.offset])[0])
         return self._given(np.array(history.times), history.empty, offset)
 
-    def at(self, graph: Statement, times: ArrayLike, offset: float = 0.0) -> dict[Data, Array]:
+    def at(self, graph: Model, times: ArrayLike, offset: float = 0.0) -> dict[Data, Array]:
         """Data of a graph for one solve, with nodes at these times.
 
         Args:
@@ -233,7 +233,7 @@ class StampedMeasurements:
     def _given(self, times: Array, first: int, offset: float) -> dict[str, Array]:
         """Values of the data, by name, for nodes of which those before the first are not there yet."""
         oldest = int(np.searchsorted(times, times[first], side="right")) - 1  # steps before it have no duration
-        with self._turn:
+        with self._lock:
             if oldest < len(times) - 1:
                 interval, place = self._place(times[oldest:], offset)
                 slot = (interval + oldest) * self.capacity + place
@@ -290,7 +290,7 @@ class StampedMeasurements:
         self.counts = replace(self.counts, **{name: getattr(self.counts, name) + n for name, n in more.items()})
 
 
-def state_whole(graph: Statement, stated: Callable[[Statement], None]) -> None:
+def state_whole(graph: Model, stated: Callable[[Model], None]) -> None:
     """State several things that belong together, or nothing: what is refused is refused on a snapshot first."""
     stated(graph.snapshot())
     stated(graph)
@@ -328,7 +328,7 @@ def _at_stamp(error: Function, between: Interpolation, clocked: bool) -> Functio
     return clocked_stamped if clocked else stamped
 
 
-def by_handle(graph: Statement, terms: Sequence[str], values: Mapping[str, Array]) -> dict[Data, Array]:
+def by_handle(graph: Model, terms: Sequence[str], values: Mapping[str, Array]) -> dict[Data, Array]:
     """Values of data by the handles that terms of a graph read."""
     found: dict[Data, Array] = {}
     for name in terms:

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.residuals import residual
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.residuals import residual
 from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.models.barriers import Barrier, P, V

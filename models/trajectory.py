@@ -32,8 +32,8 @@ from typing import Any, NamedTuple, TypeAlias, cast
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.language.variables import Family
 from unifg.lie import LieGroup
+from unifg.modeling.variables import Family
 from unifg.typing import Array, ArrayLike, IntArray
 
 Function: TypeAlias = Callable[[Array, Array, Array, Array, Array], Array]

@@ -10,13 +10,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.residuals import residual
-from unifg.language.factors import difference
+from unifg.codegen.calls import call_residual, vector
+from unifg.codegen.jit import compiled
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.residuals import residual
 from unifg.lie import SE2, Rn, wrap_angle
 from unifg.lie.so2 import wrap
-from unifg.machine.calls import call_residual, vector
-from unifg.machine.jit import compiled
+from unifg.modeling.factors import difference
 from unifg.typing import Array, ArrayLike
 
 state = SE2

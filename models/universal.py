@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.residuals import residual
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.residuals import residual
 from unifg.lie import SO3, Rn
 from unifg.models import quadrotor
 from unifg.typing import Array, ArrayLike

@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.residuals import Residual, residual
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.residuals import Residual, residual
 from unifg.lie import Rn
 from unifg.typing import Array, ArrayLike
 

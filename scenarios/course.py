@@ -13,13 +13,13 @@ from typing import Literal, get_args
 import numpy as np
 
 import unifg as fg
-from unifg.answers.solver import Callback
 from unifg.models import avoidance, landmarks, quadrotor
 from unifg.scenarios.options import option
-from unifg.scenarios.ways.polyline import arc_lengths, at_stations
-from unifg.scenarios.ways.visibility import Ways
-from unifg.scenarios.worlds.air import VEHICLE_RADIUS
-from unifg.scenarios.worlds.layouts import Layout, obstacle_course
+from unifg.scenarios.planning.polyline import arc_lengths, at_stations
+from unifg.scenarios.planning.visibility import Ways
+from unifg.scenarios.simulation.air import VEHICLE_RADIUS
+from unifg.scenarios.simulation.layouts import Layout, obstacle_course
+from unifg.solution.solver import Callback
 from unifg.solvers import names
 from unifg.typing import Array
 

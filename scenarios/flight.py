@@ -15,23 +15,23 @@ from typing import Any
 
 import numpy as np
 
+from unifg.codegen.compile_counter import counting
 from unifg.errors import ScenarioError, UnifgError
 from unifg.horizon import Plan
-from unifg.machine.tally import counting
 from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
-from unifg.scenarios.flying.estimator import EstimatorSettings
-from unifg.scenarios.flying.flight_pilot import COUPLINGS, make_pilot
-from unifg.scenarios.flying.flight_settings import ControllerSettings
-from unifg.scenarios.flying.flight_watch import FlightWatch
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.options import count, not_negative, option, positive, share
-from unifg.scenarios.seeing.readings import Reading
-from unifg.scenarios.worlds.air import QuadrotorWorld
-from unifg.scenarios.worlds.conditions import draw_conditions
-from unifg.scenarios.worlds.disturbance import DisturbanceModel
-from unifg.scenarios.worlds.faults import FLIGHT_FAULTS, Fault, FlightFaults, one_of
+from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.quadrotor.estimator import EstimatorSettings
+from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS, make_pilot
+from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
+from unifg.scenarios.quadrotor.flight_watch import FlightWatch
+from unifg.scenarios.simulation.air import QuadrotorWorld
+from unifg.scenarios.simulation.conditions import draw_conditions
+from unifg.scenarios.simulation.disturbance import DisturbanceModel
+from unifg.scenarios.simulation.faults import FLIGHT_FAULTS, Fault, FlightFaults, one_of
 from unifg.typing import Array
 
 __all__ = ["Flight", "FlightSettings", "run_flight"]

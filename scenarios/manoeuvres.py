@@ -15,9 +15,9 @@ from typing import Any, TypedDict
 import numpy as np
 
 import unifg as fg
-from unifg.answers.solver import Callback
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.log import metrics
+from unifg.solution.solver import Callback
 from unifg.solvers import names
 from unifg.typing import Array
 

@@ -15,21 +15,23 @@ from typing import Any
 
 import numpy as np
 
+from unifg.codegen.compile_counter import counting
 from unifg.errors import ScenarioError
 from unifg.files.contents import Limits
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.horizon import Plan
 from unifg.lie import wrap_angle
-from unifg.machine.tally import counting
 from unifg.models.distance_map import DistanceMap
 from unifg.models.unicycle import step
-from unifg.scenarios.driving.drive_pilot import STOPPED, Pilot, make_pilot
-from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.route import Blocked, Route
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
+from unifg.scenarios.ground.drive_pilot import STOPPED, Pilot, make_pilot
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.options import count, existing, option, pair, pose, positive
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.planning.polyline import path_length
 from unifg.scenarios.rivals.choices import (
     LOCALISERS,
     OWN_LOCALISER,
@@ -38,15 +40,13 @@ from unifg.scenarios.rivals.choices import (
     make_localiser,
     make_planner,
 )
-from unifg.scenarios.seeing.readings import Scan
-from unifg.scenarios.ways.polyline import path_length
-from unifg.scenarios.worlds.building import DEMO_GOALS, DEMO_START, building_map
-from unifg.scenarios.worlds.drivetrain import Drivetrain
-from unifg.scenarios.worlds.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
-from unifg.scenarios.worlds.imperfection import Imperfection, imperfect
-from unifg.scenarios.worlds.placement import PlacementRules, place_obstacles
-from unifg.scenarios.worlds.plane import LidarModel, OdometryModel, World
-from unifg.scenarios.worlds.traffic import Traffic, draw_traffic
+from unifg.scenarios.simulation.building import DEMO_GOALS, DEMO_START, building_map
+from unifg.scenarios.simulation.drivetrain import Drivetrain
+from unifg.scenarios.simulation.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
+from unifg.scenarios.simulation.imperfection import Imperfection, imperfect
+from unifg.scenarios.simulation.placement import PlacementRules, place_obstacles
+from unifg.scenarios.simulation.plane import LidarModel, OdometryModel, World
+from unifg.scenarios.simulation.traffic import Traffic, draw_traffic
 from unifg.typing import Array
 
 INITIAL_SIGMA = (0.1, 0.1, 0.05)  # [m, m, rad]
@@ -391,7 +391,7 @@ class Episode:
             cause=verdict.cause,
             allowed=verdict.share,
             explained=pilot.share,
-            last_stop=pilot.slowed,
+            emergency_stop=pilot.slowed,
             fault=self.faults.names(world.time),
         )
 

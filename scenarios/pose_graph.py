@@ -13,14 +13,11 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.answers.history import Iteration
-from unifg.answers.solution import Solution
-from unifg.answers.status import Status
+from unifg.codegen.threads import threads, use_threads
 from unifg.errors import ScenarioError
+from unifg.factors.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
 from unifg.files.contents import legible
 from unifg.files.pose_graph import read_pose_graph
-from unifg.kernels.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
-from unifg.machine.threads import threads, use_threads
 from unifg.pose_graphs.certificate import Certificate, certify
 from unifg.pose_graphs.information import REPAIRS, Repair, indefinite
 from unifg.pose_graphs.initialise import chordal, lago, odometric, starts
@@ -30,6 +27,9 @@ from unifg.pose_graphs.relaxation import admit
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import existing, option
 from unifg.scenarios.stopwatch import Stopwatch
+from unifg.solution.history import Iteration
+from unifg.solution.solution import Solution
+from unifg.solution.status import Status
 from unifg.solvers import GraduatedNonConvexity, names
 from unifg.solvers.least_squares import MAP
 from unifg.typing import Array, BoolArray

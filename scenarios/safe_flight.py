@@ -22,9 +22,10 @@ from unifg.scenarios.episode import Progress, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.safe_log import SafeLog
 from unifg.scenarios.options import count, not_negative, option, positive
+from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.safety.cascade import CascadeSettings, Track
+from unifg.scenarios.safety.cbf_mpc import TRACKING, CbfMpc, Decision, KeeperSettings, Obstacles, Reading, Terminal
 from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.keeper import TRACKING, Decision, Keeper, KeeperSettings, Obstacles, Reading, Terminal
 from unifg.scenarios.safety.one_step import FilterSettings, filtered
 from unifg.scenarios.safety.pace import Pace
 from unifg.scenarios.safety.sightings import Sightings, SightingSettings
@@ -32,9 +33,8 @@ from unifg.scenarios.safety.situations import Kind, Situation, situation
 from unifg.scenarios.safety.spline_planner import SplinePath, SplineSettings, around
 from unifg.scenarios.safety.state_filter import FilterStatistics, StateFilter
 from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
-from unifg.scenarios.ways.flat_path import Line
-from unifg.scenarios.worlds.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
-from unifg.scenarios.worlds.disturbance import DisturbanceModel, Disturbances
+from unifg.scenarios.simulation.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
+from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.typing import Array
 
 __all__ = ["CONTROLLERS", "Controller", "Knowledge", "SafeFlight", "SafeSettings", "flights", "run_safe_flights"]
@@ -202,7 +202,7 @@ class SafeFlight:
                 weights, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots, terminal=s.terminal
             )
             frame = s.books if estimating else replace(s.books, loops=replace(s.books.loops, gain=np.inf))
-            keeper, lead = Keeper(numbers, frame, s.dt, self.weighing, s.solver), link + s.dt if estimating else 0.0
+            keeper, lead = CbfMpc(numbers, frame, s.dt, self.weighing, s.solver), link + s.dt if estimating else 0.0
 
             def plan(state: Array, seen: Obstacles) -> Decision:
                 start = np.concatenate(self.model.ahead(state, lead, self._air))

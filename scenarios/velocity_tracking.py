@@ -18,12 +18,12 @@ from typing import TypedDict
 import numpy as np
 
 import unifg as fg
-from unifg.answers.solver import Callback
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios.log import metrics as numbers
 from unifg.scenarios.options import count, existing, option, pair, positive
-from unifg.scenarios.ways.speed_profile import Profile, drive_cycle, read_profile
+from unifg.scenarios.planning.speed_profile import Profile, drive_cycle, read_profile
+from unifg.solution.solver import Callback
 from unifg.solvers import names
 from unifg.typing import Array
 

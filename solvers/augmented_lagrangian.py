@@ -22,18 +22,18 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.answers.solver import Solver, SolveState
-from unifg.answers.status import Status
+from unifg.codegen.jit import compiled
 from unifg.errors import BackendError
-from unifg.machine.jit import compiled
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.solution.solver import Solver, SolveState
+from unifg.solution.status import Status
 from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import STRAIGHT, damped_step, model_step
 from unifg.solvers.augmented_usual import UsualPrimal
 from unifg.solvers.globalize.damping import Damping
-from unifg.solvers.globalize.least_violation import leave, resume, settle
-from unifg.solvers.globalize.sizes import largest, norm
+from unifg.solvers.globalize.feasibility_restoration import leave, resume, settle
+from unifg.solvers.globalize.norms import largest, norm
 from unifg.typing import Array, IntArray
 
 LARGEST_PENALTY = 1e10
@@ -95,7 +95,7 @@ class AugmentedLagrangian(Solver):
         if self.penalty is not None and not self.penalty > 0.0:
             raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
 
-    def workspace(self, program: Program) -> UsualPrimal:
+    def workspace(self, program: CompiledProblem) -> UsualPrimal:
         """The factorisation of the primal step."""
         return UsualPrimal(program)
 

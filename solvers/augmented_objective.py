@@ -12,14 +12,14 @@ from functools import cached_property
 
 import numpy as np
 
-from unifg.machine.inner import inner
-from unifg.machine.jit import compiled
-from unifg.program.columns import Values
-from unifg.program.curvature import lagrangian_hessian
-from unifg.program.linearization import Evaluation, Linearization
-from unifg.program.passes import transposed_times
-from unifg.program.program import Program
-from unifg.program.table import TermArrays
+from unifg.codegen.inner import inner
+from unifg.codegen.jit import compiled
+from unifg.problem.columns import Values
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.evaluation import transposed_times
+from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.linearization import Evaluation, Linearization
+from unifg.problem.table import TermArrays
 from unifg.typing import Array, IntArray
 
 DIAGONAL_FLOOR = 1e-9  # of the largest diagonal entry: damping must act on unknowns with little curvature too
@@ -36,7 +36,7 @@ class Primal:
         reached: what came of that.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Analyse the structure of the normal equations."""
         self.program = program
         self.solver = program.systems.normal()

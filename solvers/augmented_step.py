@@ -13,15 +13,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import NEGATIVE, Plan
 from unifg.elimination.substitution import solve
 from unifg.elimination.symmetric import add_times
-from unifg.machine.jit import compiled
-from unifg.program.columns import Values
-from unifg.program.linearization import Linearization
-from unifg.program.passes import add_constraints, times, transposed_times
-from unifg.program.table import TermArrays
+from unifg.problem.columns import Values
+from unifg.problem.evaluation import add_constraints, times, transposed_times
+from unifg.problem.linearization import Linearization
+from unifg.problem.table import TermArrays
 from unifg.solvers.augmented_objective import DIAGONAL_FLOOR, Primal, barrier, update
 from unifg.solvers.globalize.damping import LARGEST, SUFFICIENT, Damping, gain
 from unifg.typing import Array, BoolArray, IntArray
@@ -124,7 +124,7 @@ def model_step(
         multipliers: (M,) of the augmented objective.
         penalty: (M,) rho of every row.
         damping: relative to the diagonal of the Hessian at ``lin``.
-        bend: (nnz,) what Gauss-Newton's Hessian leaves out, in the order of ``Program.normal``; empty for nothing.
+        bend: (nnz,) second-order terms, in the order of ``CompiledProblem.normal``; empty for none.
         constraints: (M,) their values in the model where the step is zero; None takes those at ``lin``.
 
     Returns:

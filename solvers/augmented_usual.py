@@ -13,16 +13,16 @@ from typing import NamedTuple
 
 import numpy as np
 
+from unifg.codegen.function_pointers import NOTHING, NUMBER, link_like, number, run
+from unifg.codegen.jit import compiled
 from unifg.elimination.plan import Plan
-from unifg.machine.jit import compiled
-from unifg.machine.links import NOTHING, NUMBER, link_like, number, run
-from unifg.program.columns import Values
-from unifg.program.curvature import add_curvature, add_losses
-from unifg.program.linearization import Linearization, all_finite
-from unifg.program.passes import linearize, times
-from unifg.program.program import Program
-from unifg.program.retraction import retract_parts
-from unifg.program.table import TermArrays
+from unifg.problem.columns import Values
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.evaluation import linearize, times
+from unifg.problem.hessian import add_curvature, add_losses
+from unifg.problem.linearization import Linearization, all_finite
+from unifg.problem.retraction import retract_parts
+from unifg.problem.table import TermArrays
 from unifg.solvers.augmented_objective import Primal, barrier, slope_of, update
 from unifg.solvers.augmented_step import ROUNDING, WELL, minimize
 from unifg.solvers.globalize.damping import SUFFICIENT, Damping, gain
@@ -129,7 +129,7 @@ class UsualPrimal(Primal):
         fast: whether compiled code can do without Python.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Make room."""
         super().__init__(program)
         self._bend = np.empty(program.normal.nnz)

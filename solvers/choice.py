@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from unifg.answers.solution import AnyGuess, NotConverged, Solution
-from unifg.answers.solver import Callback, Solver
-from unifg.answers.status import Status
-from unifg.language.statement import Statement
-from unifg.language.variables import Data
-from unifg.program.program import Program, idle_program
+from unifg.modeling.model import Model
+from unifg.modeling.variables import Data
+from unifg.problem.compiled_problem import CompiledProblem, idle_problem
+from unifg.solution.solution import AnyGuess, NotConverged, Solution
+from unifg.solution.solver import Callback, Solver
+from unifg.solution.status import Status
 from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
 from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.least_squares import LevenbergMarquardt
@@ -54,7 +54,7 @@ class Choice:
 
 
 def choose(
-    graph: Statement,
+    graph: Model,
     data: Mapping[Data, Numbers] | None = None,
     *,
     tolerance: float = 1e-6,
@@ -66,8 +66,8 @@ def choose(
     Raises:
         GraphError: when the graph or data is malformed.
     """
-    program = idle_program(graph)
-    with program.turn:
+    program = idle_problem(graph)
+    with program.lock:
         program.bind(data or {})
         reason, squares = _kind(program)
     options = {"tolerance": tolerance, "time_limit": time_limit, "verbose": verbose}
@@ -78,7 +78,7 @@ def choose(
     return Choice(point, other(**options), reason)  # type: ignore[arg-type]
 
 
-def _kind(program: Program) -> tuple[str, bool]:
+def _kind(program: CompiledProblem) -> tuple[str, bool]:
     """Deciding property in words, and true if all costs are squares."""
     if program.scalar_terms:
         return f"the scalar cost '{program.scalar_terms[0].name}'", False
@@ -95,7 +95,7 @@ def _kind(program: Program) -> tuple[str, bool]:
 
 
 def solve(
-    graph: Statement,
+    graph: Model,
     guess: AnyGuess,
     *,
     data: Mapping[Data, Numbers] | None = None,

@@ -21,10 +21,10 @@ import numpy as np
 
 from unifg.elimination.components import components
 from unifg.elimination.factorization import Factorization
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
-from unifg.program.table import ENTRY, ROW, WIDTH
-from unifg.program.term import CompiledTerm
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.problem.table import ENTRY, ROW, WIDTH
+from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, BoolArray, IntArray
 
 NEAR = 10  # members of a family between two measurements of one group, at most
@@ -36,7 +36,7 @@ UNCHECKED = 1e-9  # share of a residual that the others can see: below, it is ro
 
 
 @dataclass(frozen=True)
-class Scatter:
+class VarianceFactor:
     """Variance factor of the measurements in use.
 
     Attributes:
@@ -59,7 +59,7 @@ class Scatter:
 
         return min(1.0, self.squared / float(chdtri(self.freedom, 1.0 - CHANCE)))
 
-    def contradicts(self, innovation: Array, size: int, count: int) -> BoolArray:
+    def rejects(self, innovation: Array, size: int, count: int) -> BoolArray:
         """Test whether measurements scatter more than the others, at a false-alarm rate of ``CHANCE`` in ``count``.
 
         Args:
@@ -97,7 +97,7 @@ class Innovations:
         determined: whether they determine every unknown.
     """
 
-    def __init__(self, program: Program, solver: Factorization, information: Array) -> None:
+    def __init__(self, program: CompiledProblem, solver: Factorization, information: Array) -> None:
         """Factorise.
 
         Args:

@@ -42,20 +42,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unifg.answers.history import Iteration
-from unifg.answers.solution import AnyGuess, NotConverged, Solution, values_of
-from unifg.answers.solver import Backend, Callback, Prepared, Solver
-from unifg.answers.status import Status
-from unifg.answers.verdict import Group, Verdict
+from unifg.codegen.inner import inner
 from unifg.errors import BackendError, GraphError
-from unifg.kernels.robust import DCS, Graduated, Huber, Loss
-from unifg.language.statement import Statement
-from unifg.language.terms import Cost
-from unifg.language.variables import Data
-from unifg.machine.inner import inner
-from unifg.program.linearization import Linearization
-from unifg.program.term import CompiledTerm
-from unifg.solvers.gating import CHANCE, Innovations, Scatter, groups_of
+from unifg.factors.robust import DCS, Graduated, Huber, Loss
+from unifg.modeling.model import Model
+from unifg.modeling.terms import Cost
+from unifg.modeling.variables import Data
+from unifg.problem.linearization import Linearization
+from unifg.problem.term import CompiledTerm
+from unifg.solution.history import Iteration
+from unifg.solution.outlier_report import Group, OutlierReport
+from unifg.solution.solution import AnyGuess, NotConverged, Solution, values_of
+from unifg.solution.solver import Backend, Callback, Prepared, Solver
+from unifg.solution.status import Status
+from unifg.solvers.gating import CHANCE, Innovations, VarianceFactor, groups_of
 from unifg.solvers.least_squares import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
@@ -76,7 +76,7 @@ ROUNDS = 20  # of taking back or out
 DECIDED = 1e-3  # a truncated loss is done when every weight is this close to zero or one
 
 
-STATED = Scatter(0.0, np.inf)  # noise as large as stated
+STATED = VarianceFactor(0.0, np.inf)  # noise as large as stated
 
 
 class _Held:
@@ -126,7 +126,7 @@ class _Stage:
         return self.now.weight(squared)
 
     @property
-    def heard(self) -> bool:
+    def influential(self) -> bool:
         """True if no factor pulls much less for being farther off than another one."""
         if not len(self.squared):
             return True
@@ -148,7 +148,7 @@ class GraduatedNonConvexity(Backend):
 
     The answer is the best found, not the best there is: no local method knows that. CONVERGED says that it is
     stationary. ``solution.verdict`` says which measurements it believes and which other answers were found that cost
-    less, or as much (:class:`unifg.Verdict`).
+    less, or as much (:class:`unifg.OutlierReport`).
 
     It is called like a backend. Terms with other losses, or none, take part as they are: measurements that can be
     trusted, such as odometry, are stated without a loss.
@@ -177,7 +177,7 @@ class GraduatedNonConvexity(Backend):
 
     def solve(
         self,
-        graph: Statement,
+        graph: Model,
         guess: AnyGuess,
         *,
         data: Mapping[Data, Numbers] | None = None,
@@ -186,7 +186,7 @@ class GraduatedNonConvexity(Backend):
     ) -> Solution:
         """Solve without the losses, through their surrogates, and with the losses themselves.
 
-        Arguments as for :class:`unifg.answers.solver.Backend`; every surrogate starts at the guess.
+        Arguments as for :class:`unifg.solution.solver.Backend`; every surrogate starts at the guess.
 
         Returns:
             The solution of the graph as stated, judged with its own losses. The history holds all stages, numbered
@@ -218,8 +218,8 @@ class _Search:
     def __init__(
         self,
         options: GraduatedNonConvexity,
-        graph: Statement,
-        staged: Statement,
+        graph: Model,
+        staged: Model,
         stages: list[_Stage],
         data: Mapping[Data, Numbers] | None,
         callback: Callback | None,
@@ -245,24 +245,24 @@ class _Search:
         """The best answer found, judged with the losses themselves."""
         told: list[str] = []
 
-        def heard(origin: str, solution: Solution) -> None:
+        def influential(origin: str, solution: Solution) -> None:
             told.append(f"{origin} {self._answer(solution).solution.cost:.6g}")
 
         for start in self._starts(guess):
             graduated = self._graduated(start)
             if graduated.status is Status.INTERRUPTED:
                 break
-            heard("surrogates", self._stated(graduated))
+            influential("surrogates", self._stated(graduated))
             # The optimum without losses believes everything: on a clean graph it is the answer.
-            heard("squares", self.history.add(self._last, self._plain.values, self._data, restart=True))
+            influential("squares", self.history.add(self._last, self._plain.values, self._data, restart=True))
             if self._plain_terms and self._calm is None and self._within(self._plain) and self.found[-1].consistent:
                 self._calm = self.found[-1]
             for make in (_rival,) if self._plain_terms else (_rival, _huber):
                 for stage in self._stages:
                     stage.now = make(stage.goal)
-                heard(str(self._stages[0].now), self._stated(self._from(start)))
+                influential(str(self._stages[0].now), self._stated(self._from(start)))
             if not self._plain_terms:
-                heard("guess", self.history.add(self._last, start, self._data, restart=True))
+                influential("guess", self.history.add(self._last, start, self._data, restart=True))
         if not self.found:
             return self._interrupted(graduated)
         # Nothing contradicts what was stated: a right measurement is not given up because that is cheaper.
@@ -306,7 +306,7 @@ class _Search:
                 break
             solution = self._from(solution.values)
             stride = STRIDE
-            if not all(stage.heard for stage in stages):
+            if not all(stage.influential for stage in stages):
                 solution, stride = self._or_from(guess, solution), 1
             if all(stage.decided for stage in stages):
                 break
@@ -368,10 +368,10 @@ class _Search:
                 score[score > min(bound, answer.scatter.limit(term.size, everything))] = np.inf
                 back.append(score / bound)
                 fall, far = innovations.without(term, plain, kept, stage.goal.weight(squared)[kept])
-                wrong = answer.scatter.contradicts(fall, term.size, everything)
-                answer.doubted[term.name] = np.flatnonzero(kept)[wrong]
+                wrong = answer.scatter.rejects(fall, term.size, everything)
+                answer.flagged[term.name] = np.flatnonzero(kept)[wrong]
                 if self._calm is not None:
-                    wrong = STATED.contradicts(fall, term.size, everything)
+                    wrong = STATED.rejects(fall, term.size, everything)
                 # What would stay within its threshold counts, by the loss as stated, however the others scatter.
                 score = np.full(len(kept), np.inf)
                 score[kept] = np.where(wrong & (far > bound), -fall, np.inf)
@@ -404,18 +404,18 @@ class _Search:
     def _by_groups(self, answer: _Answer, plain: Linearization, innovations: Innovations) -> _Answer | None:
         """A better answer without a group of measurements that counts, or with one that was left out, or None."""
         self._groups = []
-        doubted: list[tuple[float, int, IntArray]] = []
+        flagged: list[tuple[float, int, IntArray]] = []
         left: list[tuple[int, IntArray]] = []
         for k, (term, kept, weight) in enumerate(zip(self._terms, answer.kept, answer.weights, strict=True)):
             groups = groups_of(term, kept)
             for group in groups:
                 fall = innovations.joint(term, plain, group, weight[group])
-                if answer.scatter.contradicts(np.array([fall]), term.size, len(groups))[0]:
-                    doubted.append((fall / len(group), k, group))
+                if answer.scatter.rejects(np.array([fall]), term.size, len(groups))[0]:
+                    flagged.append((fall / len(group), k, group))
             left += [(k, group) for group in groups_of(term, ~kept & (_active(term) > 0.0))]
-        doubted.sort(key=lambda one: -one[0])
+        flagged.sort(key=lambda one: -one[0])
         left.sort(key=lambda one: -len(one[1]))
-        tried = [(k, group, 0.0) for _, k, group in doubted[:GROUPS]] + [(k, group, 1.0) for k, group in left[:GROUPS]]
+        tried = [(k, group, 0.0) for _, k, group in flagged[:GROUPS]] + [(k, group, 1.0) for k, group in left[:GROUPS]]
         for k, group, share in tried:
             for j, (stage, squared) in enumerate(zip(self._stages, answer.squared, strict=True)):
                 held = stage.goal.weight(squared)
@@ -492,7 +492,7 @@ class _Search:
     def _concluded(self, answer: _Answer) -> Solution:
         """Solve once more, and say what was found besides."""
         final = self._answer(self._stated(answer.solution))
-        doubted = answer.doubted if final.believes_as(answer) else {}
+        flagged = answer.flagged if final.believes_as(answer) else {}
         rivals: list[_Answer] = []
         for other in sorted(self.found, key=lambda a: a.solution.cost):
             known = any(other.believes_as(one) for one in [final, *rivals])
@@ -502,12 +502,12 @@ class _Search:
         others = tuple(other.solution for other in rivals[:RIVALS])
         for other in rivals[:RIVALS]:
             theirs = {term.name: kept for term, kept in zip(self._terms, other.kept, strict=True)}
-            other.solution.verdict = Verdict(theirs, other.doubted, other.scatter.unit)
+            other.solution.verdict = OutlierReport(theirs, other.flagged, other.scatter.unit)
         groups = [
             Group(name, factors, held, other, self._moved(final.solution, other))
             for name, factors, held, other in self._groups
         ]
-        final.solution.verdict = Verdict(kept, doubted, final.scatter.unit, others, tuple(groups))
+        final.solution.verdict = OutlierReport(kept, flagged, final.scatter.unit, others, tuple(groups))
         return final.solution
 
     def _moved(self, one: Solution, other: Solution) -> tuple[str, int, float]:
@@ -555,11 +555,11 @@ class _Answer:
         self.weights = [goal.weight(s) * a for goal, s, a in zip(self._goals, squared, self._active, strict=True)]
         self.kept: list[BoolArray] = [weight >= HALF for weight in self.weights]
         self.count = sum(int(kept.sum()) for kept in self.kept)
-        self.doubted: dict[str, IntArray] = {}
+        self.flagged: dict[str, IntArray] = {}
         sums = [*plain.values()]
         for term, weight, own in zip(terms, self.weights, squared, strict=True):
             sums.append(_Sum(inner(weight, own), term.size * float(weight.sum())))
-        self.scatter = Scatter(sum(one.total for one in sums), sum(one.rows for one in sums) - unknowns)
+        self.scatter = VarianceFactor(sum(one.total for one in sums), sum(one.rows for one in sums) - unknowns)
 
     @property
     def consistent(self) -> bool:
@@ -580,12 +580,12 @@ class _Answer:
         """
         found = {}
         for name, one in self._plain.items():
-            found[name] = Scatter(max(one.total, other._plain[name].total), shares[name].total).unit
+            found[name] = VarianceFactor(max(one.total, other._plain[name].total), shares[name].total).unit
         for k, term in enumerate(self._terms):
             ours, theirs = self.weights[k] * self.squared[k], other.weights[k] * other.squared[k]
             rows = term.size * float(np.maximum(self.weights[k], other.weights[k]).sum())
             freedom = shares[term.name].total + rows - shares[term.name].rows
-            found[term.name] = Scatter(float(np.maximum(ours, theirs).sum()), freedom).unit
+            found[term.name] = VarianceFactor(float(np.maximum(ours, theirs).sum()), freedom).unit
         return found
 
     def judged(self, units: Mapping[str, float]) -> float:
@@ -653,7 +653,7 @@ def _huber(loss: Loss) -> Loss:
     return Huber(HUBER)
 
 
-def _staged(graph: Statement) -> tuple[Statement, list[_Stage]]:
+def _staged(graph: Model) -> tuple[Model, list[_Stage]]:
     """The same graph with a `_Stage` in place of every loss that has surrogates."""
     staged, stages = graph.snapshot(), []
     for k, term in enumerate(staged.terms):

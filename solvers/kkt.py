@@ -9,8 +9,8 @@ its contribution to the linear system is the block A and nothing else:
 The weight is indefinite, so the system is assembled as blocks, never through a square root. It is factorised with
 a shift of every row in its own units, so that no order of elimination meets a vanishing pivot, and refined until the
 shift is gone (:mod:`unifg.elimination.saddle`). H is that of Gauss-Newton, or of the Lagrangian where steps with the
-first converge slowly (:mod:`unifg.solvers.globalize.pace`): what residuals and constraints bend may be as much as H. A
-step of the second that does not lower the merit is left for one of the first.
+first converge slowly (:mod:`unifg.solvers.globalize.slow_convergence`): second-order terms may be as large as H. A step
+of the second that does not lower the merit is left for one of the first.
 
 The paper takes every step in full. By default a step has to lower the l1 merit f + price |h| (Nocedal and Wright,
 chapter 18): the cost alone would reject steps that restore feasibility. A full step that is rejected is corrected once
@@ -28,21 +28,21 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.answers.requirements import require
-from unifg.answers.solver import Solver, SolveState
-from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.program.curvature import lagrangian_hessian
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
-from unifg.program.systems import aim, fill
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.linearization import Linearization
+from unifg.problem.systems import aim, fill
+from unifg.solution.capabilities import require
+from unifg.solution.solver import Solver, SolveState
+from unifg.solution.status import Status
 from unifg.solvers.augmented_objective import DIAGONAL_FLOOR
 from unifg.solvers.globalize.damping import LARGEST, Damping, gain
-from unifg.solvers.globalize.least_violation import leave, settle
+from unifg.solvers.globalize.feasibility_restoration import leave, settle
 from unifg.solvers.globalize.line_search import search
 from unifg.solvers.globalize.merit import OnePrice
-from unifg.solvers.globalize.pace import creeps
-from unifg.solvers.globalize.sizes import largest, norm
+from unifg.solvers.globalize.norms import largest, norm
+from unifg.solvers.globalize.slow_convergence import converges_slowly
 from unifg.typing import Array
 
 RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved
@@ -85,7 +85,7 @@ class KKT(Solver):
         if self.full_steps and self.globalization == "levenberg-marquardt":
             raise BackendError(f"{self.name}: full_steps=True leaves nothing to Levenberg-Marquardt: choose one")
 
-    def workspace(self, program: Program) -> Newton:
+    def workspace(self, program: CompiledProblem) -> Newton:
         """Structure of the KKT matrix."""
         return Newton(program)
 
@@ -104,7 +104,7 @@ class KKT(Solver):
         damping = slackness = 0.0
         failures, slow = 0, False
         while run.status is None:
-            taken, slow = None, slow or (creeps(run.history) and not self.full_steps)
+            taken, slow = None, slow or (converges_slowly(run.history) and not self.full_steps)
             if slow and (found := workspace.step(run.lin, run.multipliers, 0.0, slackness, curved=True)) is not None:
                 taken = self._search(run, workspace, merit, *found, hopeful=True)
             if taken is None:
@@ -150,7 +150,7 @@ class KKT(Solver):
         merit, damping = OnePrice(run.program), Damping(FIRST_LEVENBERG)
         rejected, slackness, slow = 0, 0.0, False
         while run.status is None:
-            lin, slow = run.lin, slow or creeps(run.history)
+            lin, slow = run.lin, slow or converges_slowly(run.history)
             less = damping.value / (1.0 + damping.value)
             curved = slow and rejected == 0
             found = workspace.step(lin, run.multipliers, damping.value, slackness, less, curved)
@@ -217,7 +217,7 @@ class KKT(Solver):
 class Newton:
     """The KKT system of one prepared graph."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Analyse the KKT matrix."""
         self.program = program
         self._structure(program)
@@ -298,7 +298,7 @@ class Newton:
         change[rows] = found[n:]
         return found[:n], change
 
-    def _structure(self, program: Program) -> None:
+    def _structure(self, program: CompiledProblem) -> None:
         self.system = program.systems.kkt(program.equality)
         self._data, self._begun = np.zeros(self.system.pattern.nnz), False
 

@@ -12,18 +12,18 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.answers.solver import Solver, SolveState
-from unifg.answers.status import Status
+from unifg.codegen.inner import inner
 from unifg.errors import BackendError
-from unifg.machine.inner import inner
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.solution.solver import Solver, SolveState
+from unifg.solution.status import Status
 from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import damped_step, model_step
 from unifg.solvers.globalize.damping import Damping, gain
 from unifg.solvers.globalize.line_search import search
 from unifg.solvers.globalize.merit import Merit
-from unifg.solvers.globalize.sizes import norm
+from unifg.solvers.globalize.norms import norm
 from unifg.typing import Array
 
 MAP = 1e-5**0.5  # the relative offset is the root of the share of the cost that a step promises to remove
@@ -37,7 +37,7 @@ class LeastSquares(Solver):
     """Unconstrained sums of squares with robust losses.
 
     Attributes:
-        tolerance: for the KKT test, the relative offset of the residuals (:mod:`unifg.answers.relative_offset`). "map"
+        tolerance: for the KKT test, the relative offset of the residuals (:mod:`unifg.solution.relative_offset`). "map"
             stands for `MAP`, where another step would lower the cost by less than 1e-5 of it: what GTSAM stops at, and
             enough for a map; the default goes on until the optimum is reached to all digits that matter to anybody.
         step_tolerance: optional stop rule on the norm of the step; it does not grant CONVERGED.
@@ -62,7 +62,7 @@ class LeastSquares(Solver):
             self.tolerance = MAP
         super().__post_init__()
 
-    def workspace(self, program: Program) -> Primal:
+    def workspace(self, program: CompiledProblem) -> Primal:
         """The factorisation of the normal equations."""
         return Primal(program)
 
@@ -116,7 +116,7 @@ class LevenbergMarquardt(LeastSquares):
 
     damping: float = 1e-8
 
-    def workspace(self, program: Program) -> Primal:
+    def workspace(self, program: CompiledProblem) -> Primal:
         """As of all; steps that rounding swallows, of which the first may be one in a loop, ask for multipliers."""
         primal, none = super().workspace(program), np.zeros(0)
         primal.next_multipliers(none, none, none)
@@ -208,7 +208,7 @@ class Path:
         cauchy: (n,) minimiser of the model along the negative gradient.
     """
 
-    program: Program
+    program: CompiledProblem
     hessian: Array
     gradient: Array
     newton: Array

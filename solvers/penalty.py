@@ -12,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.answers.solver import Solver, SolveState
-from unifg.answers.status import Status
 from unifg.errors import BackendError
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.solution.solver import Solver, SolveState
+from unifg.solution.status import Status
 from unifg.solvers.augmented_objective import Primal, update
 from unifg.solvers.augmented_step import damped_step, model_step
 from unifg.solvers.globalize.damping import Damping
-from unifg.solvers.globalize.least_violation import settle
-from unifg.solvers.globalize.sizes import norm
+from unifg.solvers.globalize.feasibility_restoration import settle
+from unifg.solvers.globalize.norms import norm
 from unifg.typing import Array
 
 ROUNDING = 1e-15  # relative decrease of the objective that is noise
@@ -62,7 +62,7 @@ class Penalty(Solver):
         if not self.penalty_growth > 1.0:
             raise BackendError(f"{self.name}: penalty_growth must be above 1, found {self.penalty_growth}")
 
-    def workspace(self, program: Program) -> Primal:
+    def workspace(self, program: CompiledProblem) -> Primal:
         """The factorisation of the normal equations."""
         return Primal(program)
 
@@ -118,7 +118,7 @@ class Penalty(Solver):
         return max(run.optimality.violation, run.optimality.complementarity) > self.tolerance
 
 
-def _estimate(program: Program, lin: Linearization, step: Array, penalty: Array) -> Array:
+def _estimate(program: CompiledProblem, lin: Linearization, step: Array, penalty: Array) -> Array:
     """(M,) multipliers from the linear model of a step: the penalties times the violations after it.
 
     rho times the violation of the new iterate would be mostly rounding errors once rho is large; these balance the

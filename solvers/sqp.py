@@ -16,18 +16,18 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.answers.requirements import require
-from unifg.answers.solver import Solver, SolveState
-from unifg.answers.status import Status
+from unifg.codegen.inner import inner
 from unifg.errors import BackendError
-from unifg.machine.inner import inner
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
-from unifg.solvers.globalize.least_violation import Watch, leave, resume, settle
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.solution.capabilities import require
+from unifg.solution.solver import Solver, SolveState
+from unifg.solution.status import Status
+from unifg.solvers.globalize.feasibility_restoration import RestorationTrigger, leave, resume, settle
 from unifg.solvers.globalize.line_search import Taken, search
 from unifg.solvers.globalize.merit import RowPrices
-from unifg.solvers.globalize.pace import creeps
-from unifg.solvers.globalize.sizes import largest, norm
+from unifg.solvers.globalize.norms import largest, norm
+from unifg.solvers.globalize.slow_convergence import converges_slowly
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
 from unifg.solvers.sqp_usual import NOISE, ROUNDING, UsualSubproblems
@@ -53,7 +53,7 @@ class SQP(Solver):
         hessian: "gauss-newton", or "exact": of the Lagrangian with the present multipliers, second derivatives of
             residuals and constraints included, which converges quadratically where Gauss-Newton is linear. A step for
             which it has the wrong inertia, or along which the merit does not fall, takes Gauss-Newton's. "auto" begins
-            with the first and goes on with the second once it creeps (:mod:`unifg.solvers.globalize.pace`); under a
+            with the first and goes on with the second on slow convergence; under a
             ``time_limit`` it stays with the first, for the second has to be compiled.
         qp: "osqp" (called directly, warm-started), "graph" (an interior point whose systems are eliminated on the
             graph), "elimination" (Ta's primal and dual linear graphs, for equalities only; a reference, written to be
@@ -93,12 +93,12 @@ class SQP(Solver):
                 f"{self.name}: hessian must be 'auto', 'exact' or 'gauss-newton', found '{self.hessian}'"
             )
 
-    def require(self, program: Program) -> None:
+    def require(self, program: CompiledProblem) -> None:
         """Refuse inequalities where the linear algebra knows equalities only."""
         if self.qp == "elimination":
             require(program, f"{self.name}(qp='elimination')", "equalities")
 
-    def workspace(self, program: Program) -> UsualSubproblems:
+    def workspace(self, program: CompiledProblem) -> UsualSubproblems:
         """QP workspaces."""
         return UsualSubproblems(
             program,
@@ -127,10 +127,10 @@ class SQP(Solver):
         merit = RowPrices(run.program, workspace.scaling.rows, run.multipliers, run.lin)
         damping, missing = SMALLEST_DAMPING, 0.0
         failures = 0
-        watch = Watch()
+        watch = RestorationTrigger()
         turning = self.hessian == "auto" and self.time_limit == np.inf and self.qp != "elimination"
         while run.status is None:
-            if turning and creeps(run.history):
+            if turning and converges_slowly(run.history):
                 turning, workspace = False, workspace.curved()
                 workspace.start(run.lin)
                 merit = RowPrices(run.program, workspace.scaling.rows, run.multipliers, run.lin)
@@ -225,7 +225,7 @@ class SQP(Solver):
         here, linear = merit.value(lin), qp.linear(answer.step)
         slope = merit.slope(inner(qp.gradient, answer.step), lin, linear)
         # The QP meets its conditions to its own accuracy only; what that costs in merit is noise.
-        slack = ROUNDING * max(1.0, abs(here)) + max(NOISE * merit.price, min(answer.error, accuracy))
+        slack = ROUNDING * max(1.0, abs(here)) + max(NOISE * merit.penalty, min(answer.error, accuracy))
         if program.least_squares:  # what is rounding depends on the cost alone, whose unit is free
             slack = ROUNDING * abs(here)
         if slope > slack:

@@ -14,21 +14,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unifg.answers.solver import SolveState
+from unifg.codegen.function_pointers import NOTHING, NUMBER, link_like, number, run
+from unifg.codegen.jit import compiled, in_order
 from unifg.elimination.symmetric import add_times
-from unifg.machine.jit import compiled, in_order
-from unifg.machine.links import NOTHING, NUMBER, link_like, number, run
-from unifg.program.columns import Values
-from unifg.program.linearization import Linearization, all_finite
-from unifg.program.passes import evaluate, linearize, times, transposed_times
-from unifg.program.program import Program
-from unifg.program.retraction import retract_parts
-from unifg.program.systems import KktArrays
-from unifg.program.table import TermArrays
+from unifg.problem.columns import Values
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.evaluation import evaluate, linearize, times, transposed_times
+from unifg.problem.linearization import Linearization, all_finite
+from unifg.problem.retraction import retract_parts
+from unifg.problem.systems import KktArrays
+from unifg.problem.table import TermArrays
+from unifg.solution.solver import SolveState
 from unifg.solvers.augmented_usual import Point, point_at
 from unifg.solvers.globalize.line_search import SHORTEST, Taken
 from unifg.solvers.globalize.merit import ARMIJO, RowPrices
-from unifg.solvers.globalize.sizes import largest
+from unifg.solvers.globalize.norms import largest
 from unifg.solvers.quadratic_programs.graph_route import HOPELESS, TIGHTEST, GraphRoute, minimize_quadratic
 from unifg.solvers.quadratic_programs.routes import LEFT, USABLE, Subproblems
 from unifg.solvers.quadratic_programs.subproblem import FINER, QP, QPAnswer, largest_residual
@@ -99,7 +99,7 @@ class Work(NamedTuple):
     lower: Array
     upper: Array
     multipliers: Array
-    prices: Array
+    penalties: Array
     columns: Array
     full: Array
     rows: Array
@@ -124,7 +124,7 @@ class UsualSubproblems(Subproblems):
         known: whether terms and route are such that compiled code can do without Python.
     """
 
-    def __init__(self, program: Program, **options: Any) -> None:
+    def __init__(self, program: CompiledProblem, **options: Any) -> None:
         """Make room; options as for :class:`Subproblems`."""
         super().__init__(program, **options)
         self._options = options
@@ -175,7 +175,7 @@ class UsualSubproblems(Subproblems):
         numbers[:ERROR] = lin.cost, accuracy, enough, 0.1 * self.tolerance, merit.farthest, correcting
         own: list[Array] = [np.empty(size) for size in (n,) * 3 + (count,) * 7]
         work = Work(
-            numbers, qp.hessian, qp.gradient, qp.lower, qp.upper, start.multipliers, merit.prices, scaling.columns,
+            numbers, qp.hessian, qp.gradient, qp.lower, qp.upper, start.multipliers, merit.penalties, scaling.columns,
             scaling.full, scaling.rows, self._spread, self._norms, *own,
         )  # fmt: skip
         problem = self._problem
@@ -198,7 +198,7 @@ class UsualSubproblems(Subproblems):
             self._answered = answer
             return None
         answer.step, answer.multipliers = scaling.columns * work.answer, work.after
-        merit.prices = work.raised
+        merit.penalties = work.raised
         self._misses, self.elastic_asked, self._first_answered = 0, False, True
         reached = Linearization(
             values, float(numbers[COST]), *there[1:7], program.norms(self._norms), there.weights, squares=there.squares
@@ -334,7 +334,7 @@ def usual_iteration(links: IntArray, problem: Problem, here: Point, there: Point
                 descent += work.gradient[k] * step[k]
             for row in range(len(dual)):
                 size = abs(after[row])
-                raised = work.raised[row] = max(1.1 * size, 0.5 * (work.prices[row] + size))
+                raised = work.raised[row] = max(1.1 * size, 0.5 * (work.penalties[row] + size))
                 price = max(price, raised / rows[row])
                 linear[row] /= rows[row]
                 value, low, high = here.constraints[row], terms.lower[row], terms.upper[row]

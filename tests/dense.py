@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from unifg.language.statement import complete
+from unifg.modeling.model import complete
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph
 from unifg.typing import Array
 
-Statement = tuple[Any, Sequence[int], Sequence[Any], Any]
+Model = tuple[Any, Sequence[int], Sequence[Any], Any]
 """Residual, numbers of its variables, parameters, standard deviations."""
 
 
@@ -22,7 +22,7 @@ class Batch:
     def __init__(self, manifolds: Sequence[Any]) -> None:
         self.manifolds = list(manifolds)
         self.values: list[Array] = []
-        self.statements: list[Statement] = []
+        self.statements: list[Model] = []
 
     def manifold(self, i: int) -> Any:
         return self.manifolds[min(i, len(self.manifolds) - 1)]
@@ -77,13 +77,13 @@ class Batch:
         return self._complete(function, variables)(*arguments)
 
 
-def drive(group: Any, rng: np.random.Generator, count: int) -> Iterator[list[Statement]]:
+def drive(group: Any, rng: np.random.Generator, count: int) -> Iterator[list[Model]]:
     """Statements that arrive with each pose of a noisy drive with loop closures and a few priors."""
     truth = [group.identity()]
     for k in range(count):
         if k:
             truth.append(group.compose(truth[-1], group.exp(0.3 * rng.standard_normal(group.dim))))
-        statements: list[Statement] = []
+        statements: list[Model] = []
         if k == 0:
             statements.append((fg.prior, [0], [truth[0]], 0.01 + np.zeros(group.dim)))
         others = [k - 1] if k else []

@@ -96,7 +96,7 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         cause=[""] * (ticks - 1) + ["no plan"],
         allowed=np.where(emergency, 0.5, 1.0),
         explained=np.full(ticks, 0.9),
-        last_stop=np.zeros(ticks, dtype=bool),
+        emergency_stop=np.zeros(ticks, dtype=bool),
         fault=[""] * ticks,
     )
 

@@ -1,6 +1,6 @@
 """Claims judged by casadi's exact derivatives of a problem's second statement.
 
-The KKT numbers are those of :mod:`unifg.answers.optimality`, whose docstring defines them; nothing of its code is used.
+The KKT numbers are those of :mod:`unifg.solution.optimality`, whose docstring defines them; its code is not used.
 A claim of local infeasibility is tested by looking for a feasible point: IPOPT minimises the sum of all violations from
 the point where the claim was made.
 """
@@ -31,7 +31,7 @@ STATIONARY = 1e-4
 
 @dataclass(frozen=True)
 class Numbers:
-    """Exact KKT numbers, scaled as in :mod:`unifg.answers.optimality`."""
+    """Exact KKT numbers, scaled as in :mod:`unifg.solution.optimality`."""
 
     cost: float
     stationarity: float

@@ -31,7 +31,7 @@ from unifg.files.pose_graph import read_pose_graph
 from unifg.files.ros_map import load_map
 from unifg.files.toro import read_toro
 from unifg.files.tum import read_tum
-from unifg.scenarios.ways.speed_profile import read_profile
+from unifg.scenarios.planning.speed_profile import read_profile
 
 SECONDS = 5  # a small file that takes longer is one too many
 SMALL = Limits(unpacked=2**22, pixels=10**6)

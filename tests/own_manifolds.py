@@ -8,9 +8,9 @@ import numpy as np
 from numpy.random import Generator
 
 import unifg as fg
+from unifg.codegen.jit import compiled
 from unifg.lie import se3, so3
 from unifg.lie.se2 import SE2Group
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
 Batch = tuple[int, ...]

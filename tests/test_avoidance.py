@@ -9,7 +9,7 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
-from unifg.kernels.residuals import Residual, residual
+from unifg.factors.residuals import Residual, residual
 from unifg.models import avoidance, obstacles
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array

@@ -10,10 +10,10 @@ import pytest
 from episodes import room
 from unifg.errors import ScenarioError
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.driving.drive_control import Controller
-from unifg.scenarios.driving.drive_parts import disc_limits, predicted, wall_limits
-from unifg.scenarios.driving.drive_settings import AVOIDANCES, ControllerSettings, backend
-from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.ground.drive_control import Controller
+from unifg.scenarios.ground.drive_parts import disc_limits, predicted, wall_limits
+from unifg.scenarios.ground.drive_settings import AVOIDANCES, ControllerSettings, backend
+from unifg.scenarios.perception.tracks import Tracks
 from unifg.typing import Array
 
 PLAIN = ControllerSettings()

@@ -13,10 +13,10 @@ import unifg as fg
 from judge import judge
 from problems.guarded_flight import NAMES, SPHERES, START, GuardedFlight
 from unifg.errors import GraphError, ModelError
-from unifg.kernels.derive.expression import traced
-from unifg.kernels.derive.operations import Op
-from unifg.kernels.derive.rates import rate
-from unifg.kernels.derive.stated import StatedKernel
+from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.operations import Op
+from unifg.factors.autodiff.rates import rate
+from unifg.factors.autodiff.stated import StatedKernel
 from unifg.models import (
     avoidance,
     barriers,

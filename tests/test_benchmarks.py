@@ -14,7 +14,7 @@ from benchmarks.section import Result, goal, met
 from benchmarks.timing import Split, interleave, number, shown, spread
 from problems.collection import BACKENDS, CASES, attempt
 from unifg.pose_graphs import manhattan
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import GaussNewton, InteriorPoint
 
 
@@ -75,10 +75,10 @@ def test_spreads_and_digits() -> None:
 
 def test_a_split_counts_adds_up_and_puts_back() -> None:
     graph, _, guess = manhattan(20).pose_graph.graph()
-    run, original = GaussNewton().prepare(graph), Program.linearize
-    split = Split({"linearise": (Program, "linearize")}, run.solve, per=2.0, setup=lambda: (guess,))
+    run, original = GaussNewton().prepare(graph), CompiledProblem.linearize
+    split = Split({"linearise": (CompiledProblem, "linearize")}, run.solve, per=2.0, setup=lambda: (guess,))
     elapsed = [split(), split()]
-    assert Program.linearize is original
+    assert CompiledProblem.linearize is original
     assert split.calls["linearise"] == run.solve(guess).iterations + 1
     np.testing.assert_allclose(np.sum(list(split.parts.values()), axis=0), elapsed, rtol=1e-9)
     assert split.milliseconds(1)["linearise"][0] == pytest.approx(1e3 * split.parts["linearise"][1])

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.program.binding import Binding
-from unifg.program.by_term import ByTerm
-from unifg.program.columns import Values
-from unifg.program.program import compile_graph
-from unifg.program.term import Bound, CompiledTerm
+from unifg.problem.binding import Binding
+from unifg.problem.by_term import ByTerm
+from unifg.problem.columns import Values
+from unifg.problem.compiled_problem import compile_graph
+from unifg.problem.term import Bound, CompiledTerm
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 

@@ -16,12 +16,12 @@ from unifg.scenarios import navigation
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
-from unifg.scenarios.seeing.explaining import PointWatch, explained, thinned
-from unifg.scenarios.seeing.readings import Scan
-from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.ways.grid import smoothed
-from unifg.scenarios.worlds.plane import World
-from unifg.scenarios.worlds.space import Obstacle
+from unifg.scenarios.perception.explaining import PointWatch, explained, thinned
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.grid import smoothed
+from unifg.scenarios.simulation.plane import World
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
 CELL = 0.05

@@ -15,7 +15,7 @@ from problems.collection import BACKENDS, CASES, GROUPS, OPTIMUM, RIGHT, ipopt, 
 from problems.hock_schittkowski import Case
 from problems.known import short_drive
 from problems.lie import LieCase
-from unifg.language.terms import Constraint
+from unifg.modeling.terms import Constraint
 from unifg.typing import Array
 
 # Equalities, inequalities, costs that are no squares.

@@ -17,9 +17,9 @@ import numba
 import numpy as np
 import pytest
 
-from unifg.machine import jit
-from unifg.machine.jit import compiled
-from unifg.machine.objects import read_sealed, write_sealed
+from unifg.codegen import jit
+from unifg.codegen.jit import compiled
+from unifg.codegen.objects import read_sealed, write_sealed
 
 SOURCE = "def twice(x):\n    return 2.0 * x\n"
 
@@ -176,7 +176,7 @@ from pathlib import Path
 spec = importlib.util.spec_from_file_location("doubling", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(module)
-from unifg.machine.jit import compiled
+from unifg.codegen.jit import compiled
 for k in range(4):
     function = compiled(module.twice)
     kinds = (3.0, 3, True) if k % 2 else (True, 3, 3.0)
@@ -204,7 +204,7 @@ def test_what_is_read_needs_no_compiler_until_a_function_of_ones_own_does() -> N
     script = (
         "import sys\n"
         "import numba, numpy as np\n"
-        "from unifg.machine.tally import tally\n"
+        "from unifg.codegen.compile_counter import tally\n"
         "from unifg.pose_graphs import manhattan\n"
         "from unifg.solvers import GaussNewton\n"
         "def solve():\n"

@@ -11,17 +11,17 @@ import pytest
 import unifg as fg
 from episodes import room
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.driving import drive_control
-from unifg.scenarios.driving.drive_control import LEFT_BEHIND, OFF_WALLS, PATIENCE, Controller, is_behind
-from unifg.scenarios.driving.drive_parts import along, disc_limits, in_world, predicted, wall_limits
-from unifg.scenarios.driving.drive_past import Smoother
-from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.stopping import evasions, followed, stopped
-from unifg.scenarios.seeing.readings import Scan
-from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.ways.follow import PathFollower
-from unifg.scenarios.ways.polyline import polyline_distance
-from unifg.scenarios.worlds.plane import World
+from unifg.scenarios.ground import drive_control
+from unifg.scenarios.ground.drive_control import LEFT_BEHIND, OFF_WALLS, PATIENCE, Controller, is_behind
+from unifg.scenarios.ground.drive_parts import along, disc_limits, in_world, predicted, wall_limits
+from unifg.scenarios.ground.drive_past import Smoother
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.stopping import evasions, followed, stopped
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.follow import PathFollower
+from unifg.scenarios.planning.polyline import polyline_distance
+from unifg.scenarios.simulation.plane import World
 from unifg.solvers import SQP
 from unifg.typing import Array
 
@@ -304,8 +304,8 @@ def test_only_a_solve_that_ended_moves_the_pose(field: DistanceMap, claims: dict
     """A solve that fell short says nothing about where the robot is; what is marginalised is the past alone, always."""
     controller, smoother = believing(field)
     window, registered = smoother.window, smoother.pose
-    states, departure = window.history.states.copy(), window.left.departure
-    assert window.history.full and departure is not None
+    states, pending_prior = window.history.states.copy(), window.left.pending_prior
+    assert window.history.full and pending_prior is not None
     for name in ("warm", "cold", "second"):
         setattr(controller.loop, name, Bent(getattr(controller.loop, name), **claims))
     plan = controller.plan(registered, ahead(OPEN), tracks())
@@ -316,7 +316,7 @@ def test_only_a_solve_that_ended_moves_the_pose(field: DistanceMap, claims: dict
     else:
         assert not moved.any()
     assert np.array_equal(window.history.states, states)
-    assert window.left.departure is departure
+    assert window.left.pending_prior is pending_prior
 
 
 @pytest.mark.parametrize("off", [(0.35, -0.3, 0.1), (0.0, 0.45, 0.0)], ids=str)
@@ -530,7 +530,7 @@ def test_a_scan_without_returns_changes_nothing(field: DistanceMap) -> None:
 
 
 def test_backends_take_the_settings_tolerances() -> None:
-    from unifg.scenarios.driving.drive_settings import backend
+    from unifg.scenarios.ground.drive_settings import backend
 
     for name in ("sqp", "alm"):
         warm, cold = (backend(name, SETTINGS, patience) for patience in (1, 3))

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.kernels.derive.expression import traced
-from unifg.kernels.derive.reach import reach_of
-from unifg.kernels.derive.symbols import TraceError
+from unifg.factors.autodiff.captured import captured_by
+from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.symbols import TraceError
 from unifg.lie import Rn
 from unifg.typing import Array
 
@@ -251,4 +251,4 @@ def test_clocks_and_random_numbers_are_refused_by_name(function: Function, why: 
 
 
 def test_functions_of_itertools_and_functools_are_no_foreign_ones() -> None:
-    assert not reach_of(lambda x: sum(itertools.accumulate([1.0, 2.0])) * x).refusal
+    assert not captured_by(lambda x: sum(itertools.accumulate([1.0, 2.0])) * x).refusal

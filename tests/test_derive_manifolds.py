@@ -10,11 +10,11 @@ import pytest
 import unifg as fg
 from own_manifolds import OWN
 from test_derive import compared, curved, evaluated, packed, points
-from unifg.kernels.derive.expression import traced
-from unifg.kernels.derive.symbols import TraceError
-from unifg.kernels.kernel import Argument, evaluate_rows
+from unifg.codegen.native import Native
+from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.symbols import TraceError
+from unifg.factors.kernel import Argument, evaluate_rows
 from unifg.lie import SE2, SE3, SO2, SO3, Rn
-from unifg.machine.native import Native
 from unifg.typing import Array, ArrayLike
 
 # ---------------------------------------------------------------- groups of one's own

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import unifg as fg
 from test_derive import curved, evaluated
-from unifg.kernels.derive.expression import traced
-from unifg.kernels.derive.symbols import TraceError
-from unifg.kernels.kernel import evaluate_rows
+from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.symbols import TraceError
+from unifg.factors.kernel import evaluate_rows
 from unifg.lie import Rn
 from unifg.typing import Array
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.codegen.objects import write_sealed
 from unifg.errors import ScenarioError
-from unifg.machine.objects import write_sealed
 from unifg.scenarios import command
 from unifg.scenarios.commands import doctor, performance
 from unifg.scenarios.commands.doctor import Finding

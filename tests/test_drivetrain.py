@@ -11,8 +11,8 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
-from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels
-from unifg.scenarios.worlds.plane import LidarModel, OdometryModel, World
+from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
+from unifg.scenarios.simulation.plane import LidarModel, OdometryModel, World
 
 QUIET, EXACT = LidarModel(sigma=0.0, dropout=0.0), OdometryModel(scale_sigma=0.0, noise_sigma=0.0)
 SUBSTEP = 0.005

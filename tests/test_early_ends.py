@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers.solver import SolveState
 from unifg.models import obstacles, unicycle
-from unifg.program.linearization import Linearization
+from unifg.problem.linearization import Linearization
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
+from unifg.solution.solver import SolveState
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 from unifg.typing import Array
 
@@ -28,7 +28,7 @@ def missing(pose: Array, goal: Array) -> Array:
     return goal - pose[:, :2]
 
 
-class Loop:
+class RecedingHorizon:
     """A unicycle sent to one goal, and at tick 3 to another; plain MPC, nothing but graph, guess and solve."""
 
     def __init__(self, limits: bool = True, disc: bool = False, soft: bool = False) -> None:
@@ -104,7 +104,7 @@ def test_little_time_follows_a_moved_goal(name: str, feasible: bool, monkeypatch
     # An iteration takes a second.
     monkeypatch.setattr(SolveState, "seconds", property(lambda run: run.iterations + 1.0))
 
-    def drive(loop: Loop) -> Array:
+    def drive(loop: RecedingHorizon) -> Array:
         solver = BACKENDS[name](200)
         solver.time_limit = 2.5
         return loop.drive(solver, feasible)
@@ -112,22 +112,22 @@ def test_little_time_follows_a_moved_goal(name: str, feasible: bool, monkeypatch
     arrives_as_converged(name, drive, feasible)
 
 
-def arrives_as_converged(name: str, drive: Callable[[Loop], Array], feasible: bool) -> None:
+def arrives_as_converged(name: str, drive: Callable[[RecedingHorizon], Array], feasible: bool) -> None:
     ends = converged_end(name, feasible)
     assert np.linalg.norm(ends - FAR) < 0.02  # the loop is one that arrives
-    assert drive(Loop(limits="kkt" not in name))[-1, :2] == pytest.approx(ends, abs=REACHED)
+    assert drive(RecedingHorizon(limits="kkt" not in name))[-1, :2] == pytest.approx(ends, abs=REACHED)
 
 
 @cache
 def converged_end(name: str, feasible: bool) -> Array:
     """End of the loop that solves every tick."""
-    return Loop(limits="kkt" not in name).drive(BACKENDS[name](200), feasible)[-1, :2]
+    return RecedingHorizon(limits="kkt" not in name).drive(BACKENDS[name](200), feasible)[-1, :2]
 
 
 @pytest.mark.parametrize("name", [name for name in BACKENDS if "kkt" not in name])
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_few_iterations_pass_a_disc(name: str, iterations: int) -> None:
-    loop = Loop(disc=True)
+    loop = RecedingHorizon(disc=True)
     poses = loop.drive(BACKENDS[name](iterations), feasible=True)
     assert np.linalg.norm(poses[-1, :2] - FAR) < 0.05
     gaps = np.linalg.norm(poses[:, :2] - CENTRE, axis=1) - RADIUS
@@ -137,7 +137,7 @@ def test_few_iterations_pass_a_disc(name: str, iterations: int) -> None:
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("iterations", [1, 2, 3])
 def test_the_last_iterate_is_returned(name: str, iterations: int) -> None:
-    loop = Loop(limits="kkt" not in name)
+    loop = RecedingHorizon(limits="kkt" not in name)
     ahead = np.tile([0.2, 0.1], (N, 1))
     guess = {loop.x: unicycle.rollout(np.zeros(3), ahead, DT), loop.u: ahead}  # keeps every constraint
     solution = BACKENDS[name](iterations).solve(loop.graph, guess, data={loop.goal: FAR})
@@ -149,7 +149,7 @@ def test_the_last_iterate_is_returned(name: str, iterations: int) -> None:
 
 def test_a_stop_rule_returns_the_iterate_at_which_it_fired() -> None:
     """Bazzana's loop on soft dynamics, from a guess that keeps every constraint and costs ten times as much."""
-    loop = Loop(soft=True)
+    loop = RecedingHorizon(soft=True)
     rest = {loop.x: np.zeros((N + 1, 3)), loop.u: np.zeros((N, 2))}
     for short in (1e-2, 1e-3):
         solver = AugmentedLagrangian(
@@ -225,7 +225,7 @@ def test_a_limit_returns_the_iterate_of_least_merit(
     name: str, iterations: int, feasible: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cost plus the largest multiplier so far times the sum of violations, of the guess and all iterates."""
-    loop = Loop(limits="kkt" not in name, disc="kkt" not in name)
+    loop = RecedingHorizon(limits="kkt" not in name, disc="kkt" not in name)
     ahead = np.tile([0.2, 0.1], (N, 1))
     poses = unicycle.rollout(np.zeros(3), ahead, DT)
     guess = {
@@ -353,7 +353,7 @@ def test_single_steps_are_returned_whatever_they_cost() -> None:
 
 def test_a_schedule_that_diverges_returns_the_guess() -> None:
     """A constant penalty far too light, from a guess that is nearly right."""
-    loop = Loop(limits=False)
+    loop = RecedingHorizon(limits=False)
     near = InteriorPoint().solve(loop.graph, loop.first(), data={loop.goal: FAR}).values
     near[loop.u] = near[loop.u] + 1e-3
     heavy = AugmentedLagrangian(schedule="bazzana-damped", penalty=1e-3, max_iterations=40)

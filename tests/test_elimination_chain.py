@@ -9,13 +9,13 @@ import pytest
 import scipy.sparse as sp
 
 from test_elimination import System, backward_error, full, system
+from unifg.codegen.jit import compiled
 from unifg.elimination import fronts, substitution
 from unifg.elimination.chain import stages
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.ordering import block_graph
 from unifg.elimination.plan import ADJACENT, DIRECT, Plan
 from unifg.elimination.symmetric import Symmetric
-from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 

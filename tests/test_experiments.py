@@ -22,7 +22,7 @@ from unifg.scenarios.campaigns.performed import FAILED, OK
 from unifg.scenarios.campaigns.sheet import Combination, Sheet, sheet_of
 from unifg.scenarios.campaigns.statement import read
 from unifg.scenarios.navigation import INITIAL_SIGMA
-from unifg.scenarios.ways.polyline import path_length
+from unifg.scenarios.planning.polyline import path_length
 
 Row: TypeAlias = dict[str, Any]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from dense import Batch, Statement, drive, one_by_one
+from dense import Batch, Model, drive, one_by_one
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.smoothing import FixedLag, Incremental
@@ -19,7 +19,7 @@ from unifg.typing import Array, IntArray
 ENDS = ("variable_end", "factor_end", "clique_end", "lists_end", "numbers_end")  # of tables and arenas
 
 
-def within(statement: Statement, k: int, lag: int) -> bool:
+def within(statement: Model, k: int, lag: int) -> bool:
     return min(statement[1]) > k - lag
 
 

@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.codegen.compile_counter import counting
 from unifg.horizon import (
     COUPLINGS,
-    Choice,
+    Constant,
+    Context,
     ControlCost,
+    Decision,
     Dynamics,
-    KeepThenBrake,
-    Loop,
+    InitialGuesses,
+    LastPlanThenBrake,
     Measurement,
-    Now,
     Plan,
+    RecedingHorizon,
     Robot,
-    Starts,
-    Static,
     Term,
     Window,
 )
-from unifg.machine.tally import counting
 from unifg.models import unicycle
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.solvers.names import backends
@@ -52,7 +52,7 @@ def position(x: Array, z: Array) -> Array:
 
 
 LINE = Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: T @ x + B @ u)
-BIASED = replace(LINE, statics=(Static("bias", fg.Rn(1), [0.0], 0.5),))
+BIASED = replace(LINE, constants=(Constant("bias", fg.Rn(1), [0.0], 0.5),))
 
 
 class Drive:
@@ -90,8 +90,8 @@ class Drive:
 
 
 def line_window(length: int, robot: Robot = LINE, **options: Any) -> Window:
-    names = tuple(static.name for static in robot.statics)
-    motion = Dynamics(biased if names else step, 0.1, sigma=NOISE, statics=names)
+    names = tuple(static.name for static in robot.constants)
+    motion = Dynamics(biased if names else step, 0.1, sigma=NOISE, constants=names)
     terms: list[Term] = [motion, Measurement("gps", position, (1,), GPS)]
     usual: dict[str, Any] = {"solver": GaussNewton(tolerance=1e-12)}
     return Window(robot, length, terms, start=START, sigma=0.8, **usual | options)
@@ -111,7 +111,7 @@ def test_a_window_says_what_the_whole_history_says(length: int, static: bool) ->
         np.testing.assert_allclose(window.present, state, atol=1e-9)
         np.testing.assert_allclose(window.covariance, covariance, atol=1e-9)
         if static:
-            np.testing.assert_allclose(window.history.statics["bias"][0], bias, atol=1e-9)
+            np.testing.assert_allclose(window.history.constants["bias"][0], bias, atol=1e-9)
     assert window.history.full and window.left.arrival is not None
 
 
@@ -143,7 +143,7 @@ class Pushed:
         )
         graph.constrain(lambda w: w, noise, lower=-50.0, upper=50.0, name="weak")  # an inequality that never holds
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {}
 
 
@@ -183,12 +183,12 @@ class Smooth:
         mark = graph.families["mark"]
         graph.minimize(lambda x, m: m - x[:, :1], x, mark[0], sigma=0.2, active=seen, name="mark")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {"marked": np.round(now.past.times) % 3 == 0}
 
 
 def test_factors_over_several_nodes_leave_whole() -> None:
-    robot = replace(LINE, statics=(Static("mark", fg.Rn(1), [[0.0], [7.0]], [[2.0], [0.1]]),))
+    robot = replace(LINE, constants=(Constant("mark", fg.Rn(1), [[0.0], [7.0]], [[2.0], [0.1]]),))
     terms: list[Term] = [
         Smooth(),
         Measurement("gps", position, (1,), GPS),
@@ -214,7 +214,7 @@ def test_factors_over_several_nodes_leave_whole() -> None:
         window.record("speed", [0.3])
         window.estimate(None)
     np.testing.assert_allclose(window.history.states, whole[x][-4:], atol=1e-9)
-    np.testing.assert_allclose(window.history.statics["mark"], whole[m], atol=1e-9)
+    np.testing.assert_allclose(window.history.constants["mark"], whole[m], atol=1e-9)
 
 
 def test_a_late_measurement_counts_as_one_in_time() -> None:
@@ -251,12 +251,12 @@ def test_what_cannot_be_recorded_is_refused() -> None:
     with pytest.raises(fg.GraphError, match="not a point"):
         Window(LINE, 3, [], start=[0.0], sigma=1.0)
     with pytest.raises(fg.GraphError, match="positive"):
-        line_window(3, replace(LINE, statics=(Static("bias", fg.Rn(1), [0.0], -1.0),)))
+        line_window(3, replace(LINE, constants=(Constant("bias", fg.Rn(1), [0.0], -1.0),)))
 
 
 def test_an_estimate_that_is_none_leaves_the_prediction() -> None:
     """A mark of which nothing is known and nothing is seen: the states are estimated, and leave, all the same."""
-    robot = replace(LINE, statics=(Static("mark", fg.Rn(1), [3.0], np.inf),))
+    robot = replace(LINE, constants=(Constant("mark", fg.Rn(1), [3.0], np.inf),))
     terms: list[Term] = [
         Dynamics(step, 0.1, sigma=NOISE),
         Measurement("gap", lambda x, m, z: m - x[:, :1] - z, (1,), 0.1, ("mark",)),
@@ -268,8 +268,8 @@ def test_an_estimate_that_is_none_leaves_the_prediction() -> None:
         window.record("gap", [1.0] if k == 6 else None)
         window.estimate(None)
         assert np.isfinite(window.present).all()
-        assert (window.history.statics["mark"][0, 0] == 3.0) == (k < 6)
-    assert window.history.statics["mark"][0, 0] == pytest.approx(0.5 + 0.6 + 1.0, abs=0.2)
+        assert (window.history.constants["mark"][0, 0] == 3.0) == (k < 6)
+    assert window.history.constants["mark"][0, 0] == pytest.approx(0.5 + 0.6 + 1.0, abs=0.2)
 
 
 class Marks:
@@ -286,14 +286,14 @@ class Marks:
             name="gaps",
         )  # fmt: skip
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         rows = now.past.recorded("gaps")[0].reshape(-1, 2)
         return {"gaps": rows[:, :1], "seen": rows[:, 1] > 0.0}
 
 
 def test_a_slot_that_gets_another_landmark_forgets_the_first() -> None:
     """Mark 0 is seen until it has left the window, then its slot holds another one: the batch has three marks."""
-    robot = replace(LINE, statics=(Static("mark", fg.Rn(1), [[0.0], [0.0]], 1e3),))
+    robot = replace(LINE, constants=(Constant("mark", fg.Rn(1), [[0.0], [0.0]], 1e3),))
     terms: list[Term] = [Dynamics(step, 0.1, sigma=NOISE), Marks()]
     exact = GaussNewton(tolerance=1e-12)
     window = Window(robot, 2, terms, start=START, sigma=0.8, solver=exact)
@@ -306,7 +306,7 @@ def test_a_slot_that_gets_another_landmark_forgets_the_first() -> None:
         if k == change:
             window.forget("mark", 0)
             window.admit("mark", 0, [1.0], 1e3)
-            assert window.history.statics["mark"][0, 0] == 1.0
+            assert window.history.constants["mark"][0, 0] == 1.0
         window.record("gaps", np.column_stack([gaps[k], seen[k]]))
         window.estimate(None)
     graph = fg.Graph()
@@ -322,7 +322,7 @@ def test_a_slot_that_gets_another_landmark_forgets_the_first() -> None:
     whole = exact.solve(graph, {x: np.zeros((ticks + 1, 2)), m: np.zeros((3, 1))})
     # What was believed of the first mark before it was seen, to a kilometre, goes with it.
     np.testing.assert_allclose(window.present, whole[x][-1], atol=1e-6)
-    np.testing.assert_allclose(window.history.statics["mark"], whole[m][[2, 1]], atol=1e-6)
+    np.testing.assert_allclose(window.history.constants["mark"], whole[m][[2, 1]], atol=1e-6)
     scale = np.sqrt(np.outer(*[np.diag(window.covariance)] * 2))
     expected = whole.covariance(x[-1], m[2], m[1])
     np.testing.assert_allclose(window.covariance / scale, expected / scale, atol=1e-6)
@@ -337,11 +337,11 @@ def test_a_slot_that_gets_another_landmark_forgets_the_first() -> None:
 
 def test_what_is_known_is_no_unknown() -> None:
     """A bias that is known is the same in every graph, and no measurement or wish moves it."""
-    known = replace(LINE, statics=(Static("bias", fg.Rn(1), [BIAS], 0.0),))
+    known = replace(LINE, constants=(Constant("bias", fg.Rn(1), [BIAS], 0.0),))
     for coupling in COUPLINGS:
         loop = line_loop(known, coupling=coupling)
         plans, _ = drive(loop, 12)
-        assert loop.statics["bias"][0, 0] == BIAS
+        assert loop.constants["bias"][0, 0] == BIAS
         before, after = plans[-1].states[:2]
         np.testing.assert_allclose(after, T @ before + B @ (plans[-1].control + BIAS), atol=1e-6)
         assert loop.window is not None
@@ -363,7 +363,7 @@ class Timed:
 
         graph.constrain(moved, x[:-1], u, noise, x[1:], times, lower=0, upper=0, name="moved")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {"durations": np.diff(now.past.times)}
 
 
@@ -392,7 +392,7 @@ class Floor:
         line = graph.data("line", np.zeros(1))
         graph.minimize(lambda x, z: x[:, :1] - z, x[-1], line, sigma=0.01, name="line")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {"line": [1.0 if now.present[0] < 0.95 else 2.0]}
 
 
@@ -433,25 +433,25 @@ class Goal:
         graph.minimize(fg.prior, x[1:], goal, sigma=[0.2, 0.5], name="goal")
         graph.bound(u, lower=-1.0, upper=1.0, name="limits")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {"goal": now.given}
 
 
 TARGET = np.array([1.5, 0.0])
 
 
-def line_loop(robot: Robot = LINE, steps: int = 20, solver: fg.Solver | None = None, **options: Any) -> Loop:
-    names = tuple(static.name for static in robot.statics)
-    motion = Dynamics(biased if names else step, 0.1, statics=names)
+def line_loop(robot: Robot = LINE, steps: int = 20, solver: fg.Solver | None = None, **options: Any) -> RecedingHorizon:
+    names = tuple(static.name for static in robot.constants)
+    motion = Dynamics(biased if names else step, 0.1, constants=names)
     terms: list[Term] = [motion, Goal(), ControlCost(sigma=[1.0], change=[2.0])]
     usual: dict[str, Any] = {"window": line_window(5, robot), "limits": (-np.ones(1), np.ones(1))}
-    return Loop(robot, steps, terms, solver=solver or InteriorPoint(), **usual | options)
+    return RecedingHorizon(robot, steps, terms, solver=solver or InteriorPoint(), **usual | options)
 
 
-def drive(loop: Loop, ticks: int, seed: int = 0) -> tuple[list[Plan], Array]:
+def drive(loop: RecedingHorizon, ticks: int, seed: int = 0) -> tuple[list[Plan], Array]:
     """Plans, and the true states before them, of a robot whose controls have a bias if it has one."""
     rng, truth, plans, states = np.random.default_rng(seed), START.copy(), [], []
-    bias = BIAS if loop.robot.statics else 0.0
+    bias = BIAS if loop.robot.constants else 0.0
     for k in range(ticks):
         states.append(truth)
         plans.append(loop.tick(TARGET, {"gps": truth[:1] + GPS * rng.normal(size=1)} if k % 3 else None))
@@ -471,7 +471,7 @@ def test_backends_and_couplings_find_the_same_way() -> None:
             assert loop.sources == {"solved": 60} and sum(loop.statuses.values()) == 60
             assert len(loop.milliseconds) == 60 and all(plan.milliseconds > 0.0 for plan in plans)
             assert states[-1] == pytest.approx(TARGET, abs=0.3)
-            assert loop.statics["bias"][0, 0] == pytest.approx(BIAS, abs=0.3)
+            assert loop.constants["bias"][0, 0] == pytest.approx(BIAS, abs=0.3)
             assert np.array_equal(plans[-1].states[0], loop.estimate)
             ends[coupling, name] = states[-1]
     for coupling in ("sequential", "joint"):
@@ -488,8 +488,8 @@ def test_what_the_couplings_hand_on() -> None:
         before, after = plans[-1].states[:2]
         found[coupling] = ((after - T @ before - B @ plans[-1].control) / B[:, 0]).mean()
         assert loop.window is not None
-        alone = loop.window.history.statics["bias"][0, 0]
-        assert loop.statics["bias"][0, 0] == pytest.approx(found["joint"] if coupling == "joint" else alone, abs=1e-5)
+        alone = loop.window.history.constants["bias"][0, 0]
+        assert loop.constants["bias"][0, 0] == pytest.approx(found["joint"] if coupling == "joint" else alone, abs=1e-5)
         if coupling == "sequential":
             assert found["sequential"] == pytest.approx(alone, abs=1e-6)
     assert found["separate"] == pytest.approx(0.0, abs=1e-6)
@@ -506,7 +506,7 @@ def test_how_far_the_future_pulls(weight: float, pull: Any, least: float, most: 
     drive(loop, 12)
     window = loop.window
     assert window is not None
-    pulled = np.append(loop.estimate - window.present, loop.statics["bias"][0] - window.history.statics["bias"][0])
+    pulled = np.append(loop.estimate - window.present, loop.constants["bias"][0] - window.history.constants["bias"][0])
     in_sigmas = np.abs(pulled) / np.sqrt(np.diag(window.covariance))
     if np.ndim(pull):
         assert np.abs(pulled[:2]) == pytest.approx(pull, abs=1e-4)
@@ -539,7 +539,7 @@ def test_a_pull_moves_by_the_covariance_times_the_gradient_of_the_plan() -> None
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
 def test_nothing_is_compiled_after_a_loop_is_made(coupling: Any) -> None:
     for solver in BACKENDS.values():
-        loop = line_loop(BIASED, solver=solver, coupling=coupling, judge=Sometimes(KeepThenBrake(BIASED, keep=2)))
+        loop = line_loop(BIASED, solver=solver, coupling=coupling, judge=Sometimes(LastPlanThenBrake(BIASED, keep=2)))
         with counting() as new:
             drive(loop, 16)
             loop.reset()
@@ -552,10 +552,10 @@ def test_nothing_is_compiled_after_a_loop_is_made(coupling: Any) -> None:
 class Sometimes:
     """A judge that refuses every plan of ticks 5 to 9."""
 
-    inner: KeepThenBrake
+    inner: LastPlanThenBrake
     ticks: int = 0
 
-    def __call__(self, solution: Any, states: Array, controls: Array, now: Now[Any], kept: Any) -> Choice:
+    def __call__(self, solution: Any, states: Array, controls: Array, now: Context[Any], kept: Any) -> Decision:
         self.ticks += 1
         if 5 <= self.ticks <= 9:
             return self.inner.instead(now, kept)
@@ -563,7 +563,7 @@ class Sometimes:
 
 
 def test_a_plan_is_kept_shifted_and_then_braked() -> None:
-    brake = KeepThenBrake(LINE, keep=2, brake=lambda now: np.clip(-now.present[1:] / 0.1, -1.0, 1.0))
+    brake = LastPlanThenBrake(LINE, keep=2, brake=lambda now: np.clip(-now.present[1:] / 0.1, -1.0, 1.0))
     loop = line_loop(judge=Sometimes(brake), solver=InteriorPoint())
     plans, _ = drive(loop, 12)
     assert [plan.source for plan in plans] == ["solved"] * 4 + ["kept"] * 2 + ["braking"] * 3 + ["solved"] * 3
@@ -588,7 +588,7 @@ def test_a_solve_that_fails_is_neither_applied_nor_believed() -> None:
     graph_least = 50.0
     motion = Dynamics(step, 0.1)
     for coupling in ("sequential", "joint"):
-        loop: Loop = Loop(
+        loop: RecedingHorizon = RecedingHorizon(
             LINE, 8, [motion, Wall()], solver=InteriorPoint(max_iterations=30), window=line_window(3), coupling=coupling
         )
         plans, _ = drive(loop, 4)
@@ -718,17 +718,17 @@ def test_a_loop_that_ended_early_begins_anew() -> None:
 
 def test_plans_that_end_behind_begin_anew() -> None:
     @dataclass(frozen=True)
-    class Behind(KeepThenBrake):
-        def __call__(self, *arguments: Any) -> Choice:
+    class Behind(LastPlanThenBrake):
+        def __call__(self, *arguments: Any) -> Decision:
             return replace(super().__call__(*arguments), behind=True)
 
     begun: list[float] = []
 
-    def cold(now: Now[Any]) -> tuple[Array, Array]:
+    def cold(now: Context[Any]) -> tuple[Array, Array]:
         begun.append(now.past.times[-1])
         return np.tile(now.present, (21, 1)), np.zeros((20, 1))
 
-    loop = line_loop(judge=Behind(LINE), patience=3, starts=Starts(cold=cold))
+    loop = line_loop(judge=Behind(LINE), patience=3, starts=InitialGuesses(cold=cold))
     drive(loop, 8)
     assert begun == [0.0, 3.0, 6.0]
 
@@ -751,7 +751,7 @@ class Scalar:
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize_scalar(lambda x: x[:, 0] ** 2, x, name="seen")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {}
 
 
@@ -775,20 +775,22 @@ def test_what_a_loop_refuses() -> None:
     with pytest.raises(fg.GraphError, match="control_weight"):
         line_loop(control_weight=0.0)
     with pytest.raises(fg.GraphError, match="'seen' cannot be weighed"):
-        Loop(LINE, 5, [Dynamics(step, 0.1), Scalar()], solver=SQP(), control_weight=2.0)
+        RecedingHorizon(LINE, 5, [Dynamics(step, 0.1), Scalar()], solver=SQP(), control_weight=2.0)
     with pytest.raises(fg.GraphError, match=r"'seen'.*cannot be marginalised"):
         Window(LINE, 5, [Scalar()], start=START, sigma=1.0)
     window: Window = Window(LINE, 5, [Dynamics(step, 0.1, sigma=NOISE), Ahead()], start=START, sigma=1.0)
     with pytest.raises(fg.GraphError, match="'latest' of the past reaches into the future"):
-        Loop(LINE, 5, [Dynamics(step, 0.1), Goal()], solver=SQP(), window=window, coupling="joint")
+        RecedingHorizon(LINE, 5, [Dynamics(step, 0.1), Goal()], solver=SQP(), window=window, coupling="joint")
     with pytest.raises(fg.GraphError, match="another robot"):
         line_loop(window=line_window(3, replace(LINE, predict=None)), coupling="joint")
 
     class Wrong(Goal):
-        def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+        def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
             return {"gaol": now.given}
 
-    loop: Loop = Loop(LINE, 5, [Dynamics(step, 0.1), Wrong()], solver=SQP(), window=line_window(3))
+    loop: RecedingHorizon = RecedingHorizon(
+        LINE, 5, [Dynamics(step, 0.1), Wrong()], solver=SQP(), window=line_window(3)
+    )
     with pytest.raises(fg.GraphError, match=r"Wrong gives data 'gaol'.*goal"):
         loop.tick(TARGET)
     with pytest.raises(fg.GraphError, match=r"data 'goal' has shape \(3,\)"):
@@ -817,7 +819,7 @@ class Lamp:
 
         graph.minimize(distance, x, graph.families["lamp"], ranges, sigma=0.05, active=seen, name="ranges")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         ranges, seen = now.past.recorded("range")
         return {"ranges": ranges, "in sight": seen}
 
@@ -833,7 +835,7 @@ class Towards:
         )
         graph.bound(u, lower=[0.0, -1.0], upper=[1.0, 1.0], name="limits")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {}
 
 
@@ -842,14 +844,16 @@ def test_a_robot_on_se2_finds_a_lamp_while_it_drives(coupling: Any) -> None:
     h, lamp = 0.2, np.array([2.0, -0.8])
     noise = np.array([0.01, 0.005, 0.01])
     robot = Robot(
-        fg.SE2, fg.Rn(2), (Static("lamp", fg.Rn(2), [1.5, -1.2], 0.5),),
+        fg.SE2, fg.Rn(2), (Constant("lamp", fg.Rn(2), [1.5, -1.2], 0.5),),
         predict=lambda x, u: unicycle.step(x[None], u[None], h)[0],
     )  # fmt: skip
     past: list[Term] = [Dynamics(unicycle.dynamics, h, sigma=noise), Lamp()]
     window: Window = Window(robot, 8, past, start=np.zeros(3), sigma=[0.02, 0.02, 0.02])
     effort = ControlCost([1.0, 1.0], [1.0, 1.0], wanted=[0.6, 0.0])
     ahead: list[Term] = [Dynamics(unicycle.dynamics, h), Towards(), effort]
-    loop: Loop = Loop(robot, 12, ahead, solver=InteriorPoint(hessian="gauss-newton"), window=window, coupling=coupling)
+    loop: RecedingHorizon = RecedingHorizon(
+        robot, 12, ahead, solver=InteriorPoint(hessian="gauss-newton"), window=window, coupling=coupling
+    )
     rng, truth = np.random.default_rng(5), np.zeros(3)
     compiled = 0
     for _ in range(30):
@@ -858,7 +862,7 @@ def test_a_robot_on_se2_finds_a_lamp_while_it_drives(coupling: Any) -> None:
             plan = loop.tick(measured={"range": [np.hypot(*(truth[:2] - lamp)) + 0.05 * rng.normal()]})
         compiled += new.everything
         truth = fg.SE2.retract(unicycle.step(truth[None], plan.control[None], h)[0], noise * rng.normal(size=3))
-    assert loop.statics["lamp"][0] == pytest.approx(lamp, abs=0.15)
+    assert loop.constants["lamp"][0] == pytest.approx(lamp, abs=0.15)
     assert np.hypot(*(truth[:2] - [4.0, 1.0])) < 0.4
     error = fg.SE2.local(window.present, before)
     assert error @ np.linalg.solve(window.state_covariance, error) < 16.3  # as large as its covariance says

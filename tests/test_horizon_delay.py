@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.horizon import ControlCost, Dynamics, Loop, Measurement, Now, Robot, Term, Window
+from unifg.horizon import Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.models import obstacles, unicycle
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
@@ -33,16 +33,16 @@ class Course:
         graph.constrain(obstacles.disc_clearance, x[1:], [DISC], [0.4], lower=0.0, name="disc")
         graph.bound(u, lower=LIMITS[0], upper=LIMITS[1], name="limits")
 
-    def data(self, now: Now[Any]) -> dict[str, Array]:
+    def data(self, now: Context[Any]) -> dict[str, Array]:
         return {}
 
 
-def loop_of(**options: Any) -> Loop:
+def loop_of(**options: Any) -> RecedingHorizon:
     terms: list[Term] = [Dynamics(unicycle.dynamics, H), Course(), ControlCost(sigma=[2.0, 2.0], change=[0.5, 0.5])]
-    return Loop(CAR, STEPS, terms, solver=InteriorPoint(tolerance=1e-9), limits=LIMITS, **options)
+    return RecedingHorizon(CAR, STEPS, terms, solver=InteriorPoint(tolerance=1e-9), limits=LIMITS, **options)
 
 
-def driven(loop: Loop, ticks: int, late: int) -> Array:
+def driven(loop: RecedingHorizon, ticks: int, late: int) -> Array:
     """True states of a plant without noise on which controls act ``late`` ticks after the loop has said them."""
     truth, states, waiting = START, [START], [np.zeros(2)] * late
     for _ in range(ticks):
@@ -104,4 +104,4 @@ def test_what_cannot_be_predicted_is_refused() -> None:
         with pytest.raises(fg.GraphError, match="a plan acts now or later"):
             loop_of(**options)
     with pytest.raises(fg.GraphError, match="takes a robot that predicts"):
-        Loop(Robot(fg.SE2, fg.Rn(2)), 5, [Dynamics(unicycle.dynamics, H)], solver=InteriorPoint(), delay=1)
+        RecedingHorizon(Robot(fg.SE2, fg.Rn(2)), 5, [Dynamics(unicycle.dynamics, H)], solver=InteriorPoint(), delay=1)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.horizon import ControlCost, Dynamics, Loop, Measurement, Now, Robot, Term, Window
+from unifg.horizon import Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array, ArrayLike
 
@@ -43,14 +43,14 @@ class Wish:
         graph.minimize(fg.prior, x[1:], goal, sigma=1.0, name="goal")
         graph.minimize(fg.prior, u, [5.0], sigma=1.0, robust=self.loss, name="wish")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {} if now.given is None else {"goal": now.given}
 
 
-def loop_of(*terms: Term, solver: fg.Solver | None = None, **options: Any) -> Loop:
+def loop_of(*terms: Term, solver: fg.Solver | None = None, **options: Any) -> RecedingHorizon:
     usual: dict[str, Any] = {"window": window_of()}
     ahead: list[Term] = [Dynamics(moved, H), *(terms or (Wish(), ControlCost([1.0])))]
-    return Loop(POINT, 4, ahead, solver=solver or InteriorPoint(tolerance=1e-9), **usual | options)
+    return RecedingHorizon(POINT, 4, ahead, solver=solver or InteriorPoint(tolerance=1e-9), **usual | options)
 
 
 # ---------------------------------------------------------------- one episode after another
@@ -67,7 +67,7 @@ class Buffer:
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize(position, x[-1], graph.data(self.name, np.zeros(1)), sigma=0.3, name=f"{self.name} here")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {self.name: [np.mean(self.waiting or [0.0])]}
 
     def reset(self) -> None:
@@ -194,19 +194,19 @@ def test_limits_of_one_number_hold_for_all(limits: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("statics", "message"),
+    ("constants", "message"),
     [
         ({"gian": [[0.1]]}, r"no static 'gian' \(there are: gain\)"),
         ({"gain": [[0.1], [0.2]]}, r"'gain' must be \(1, 1\)"),
         ({"gain": [[np.nan]]}, r"'gain' must be \(1, 1\)"),
     ],
 )
-def test_a_plan_is_given_statics_that_there_are(statics: Any, message: str) -> None:
-    robot = Robot(fg.Rn(2), fg.Rn(1), (fg.horizon.Static("gain", fg.Rn(1), [0.0], 1.0),), predict=POINT.predict)
-    loop: Loop = Loop(robot, 3, [Dynamics(moved, H), Wish()], solver=SQP())
-    loop.plan([0.0, 0.0], statics={"gain": np.array([[0.1]])})
+def test_a_plan_is_given_statics_that_there_are(constants: Any, message: str) -> None:
+    robot = Robot(fg.Rn(2), fg.Rn(1), (fg.horizon.Constant("gain", fg.Rn(1), [0.0], 1.0),), predict=POINT.predict)
+    loop: RecedingHorizon = RecedingHorizon(robot, 3, [Dynamics(moved, H), Wish()], solver=SQP())
+    loop.plan([0.0, 0.0], constants={"gain": np.array([[0.1]])})
     with pytest.raises(fg.GraphError, match=message):
-        loop.plan([0.0, 0.0], statics=statics)
+        loop.plan([0.0, 0.0], constants=constants)
 
 
 BAD_SIGMAS: list[Any] = [-1.0, [1.0, -1.0], 0.0, np.nan, np.inf, [1.0, 1.0, 1.0], [[1.0, 0.5], [0.0, 1.0]], np.eye(3)]
@@ -313,8 +313,8 @@ class Mute:
 
 def test_terms_are_looked_at_before_they_are_stated() -> None:
     for term in (
-        Dynamics(moved, H, sigma=1.0, statics=("b",)),
-        Measurement("p", position, (1,), 0.3, statics=("b",)),
+        Dynamics(moved, H, sigma=1.0, constants=("b",)),
+        Measurement("p", position, (1,), 0.3, constants=("b",)),
     ):
         with pytest.raises(fg.GraphError, match=rf"'{term.name}'.*'b'"):
             window_of(term)
@@ -334,7 +334,7 @@ class Speed:
         duration = graph.data("duration", np.ones(1), each=True)
         graph.minimize(lambda x, y, h: (y[:, :1] - x[:, :1]) / h[:, None], x[-3], x[-2], duration, name="speed")
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {"duration": np.diff(now.past.times)[-2:-1]}
 
 
@@ -354,5 +354,5 @@ def test_a_term_that_divides_by_durations_is_told_of_those_that_are_none() -> No
 class Wrong(Speed):
     """The same, with data that nobody reads."""
 
-    def data(self, now: Now[Any]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {"durations": [1.0]}

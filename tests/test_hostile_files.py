@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from hostile import CARMEN, PGM, PLANAR, PROFILE, READERS, SPATIAL, TUM, YAML, Reader, at_most, bomb, trouble
+from unifg.atomic_write import replacing, write_atomically
 from unifg.errors import FileFormatError
 from unifg.files.carmen import read_carmen
 from unifg.files.contents import Limits, legible, read_bytes, read_text
@@ -23,8 +24,7 @@ from unifg.files.ros_map import load_map
 from unifg.files.tum import read_tum
 from unifg.scenarios import pose_graph
 from unifg.scenarios.command import main
-from unifg.scenarios.ways.speed_profile import read_profile
-from unifg.whole import beside, write_whole
+from unifg.scenarios.planning.speed_profile import read_profile
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 NUMBERS = range(40)
@@ -174,16 +174,16 @@ def test_names_that_are_no_text_are_spelled(tmp_path: Path, capsys: pytest.Captu
 def test_a_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
     path = put(tmp_path, "numbers.json", b"old")
     path.chmod(0o640)
-    with pytest.raises(OSError, match="full"), beside(path) as own:
+    with pytest.raises(OSError, match="full"), replacing(path) as own:
         own.write_bytes(b"half")
         raise OSError("full")
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
-    write_whole(path, "new")
+    write_atomically(path, "new")
     assert path.read_bytes() == b"new" and path.stat().st_mode & 0o777 == 0o640
     (link := tmp_path / "link").symlink_to(path)
-    write_whole(link, "newer")
+    write_atomically(link, "newer")
     assert link.is_symlink() and path.read_bytes() == b"newer"
-    write_whole("/dev/null", "anything")
+    write_atomically("/dev/null", "anything")
     assert not Path("/dev/null").is_file()
 
 
@@ -191,8 +191,8 @@ WRITING = """
 import sys, time, types
 library = sys.modules["unifg"] = types.ModuleType("unifg")  # without all that it imports
 library.__path__ = [sys.argv[2]]
-from unifg.whole import beside
-with beside(sys.argv[1]) as own:
+from unifg.atomic_write import replacing
+with replacing(sys.argv[1]) as own:
     with open(own, "wb") as file:
         file.write(b"half")
         file.flush()

@@ -21,18 +21,18 @@ FOLDERS = {
 SIDES = ("solvers", "models", "scenarios")
 # From the ground up. A room knows the floors below it; rooms of one floor do not know each other.
 FLOORS: tuple[tuple[str, ...], ...] = (
-    ("errors", "typing", "turns", "whole"),
-    ("machine", "style"),
+    ("errors", "typing", "locks", "atomic_write"),
+    ("codegen", "style"),
     ("lie", "elimination"),
-    ("kernels",),
-    ("language",),
-    ("program", "plots"),
-    ("answers",),
+    ("factors",),
+    ("modeling",),
+    ("problem", "plots"),
+    ("solution",),
     ("solvers", "smoothing", "models"),
     ("horizon", "pose_graphs"),
     ("files",),
     ("view",),
-    ("warming",),
+    ("precompile",),
     ("unifg",),  # the names of the user's script, gathered
     ("scenarios",),
     ("benchmarks",),
@@ -41,10 +41,10 @@ FLOORS: tuple[tuple[str, ...], ...] = (
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 # Inside scenarios/, where "" are the files that lie in no room: one per scenario.
 STOREYS: tuple[tuple[str, ...], ...] = (
-    ("options", "stopwatch", "ways", "workers"),
-    ("seeing",),
-    ("supervision", "worlds"),
-    ("driving", "flying", "safety"),
+    ("options", "stopwatch", "planning", "workers"),
+    ("perception",),
+    ("monitoring", "simulation"),
+    ("ground", "quadrotor", "safety"),
     ("rivals",),
     ("log",),
     ("",),
@@ -244,17 +244,17 @@ def test_side_folders_use_absolute_imports() -> None:
 @pytest.mark.parametrize(
     ("source", "module", "wrong"),
     [
-        ("import unifg.solvers", "unifg.answers.check", True),
+        ("import unifg.solvers", "unifg.solution.check", True),
         ("from unifg import models, errors", "unifg.solvers.sqp", True),
-        ("def f():\n    from unifg.scenarios.worlds.plane import World", "unifg.models.lidar", True),
-        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from unifg.answers.solution import Solution",
-         "unifg.program.table", True),
+        ("def f():\n    from unifg.scenarios.simulation.plane import World", "unifg.models.lidar", True),
+        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from unifg.solution.solution import Solution",
+         "unifg.problem.table", True),
         ("from .. import solvers", "unifg.lie.so2", True),
         ("import importlib\nimportlib.import_module('unifg.solvers.sqp')", "unifg.models.lidar", True),
         ("import unifg as fg", "unifg.models.lidar", True),
-        ("import unifg as fg", "unifg.scenarios.driving.drive_past", False),
-        ("from unifg.models import unicycle\nfrom unifg.solvers import SQP", "unifg.scenarios.driving.route", False),
-        ("from unifg.answers.solver import Solver\nimport unifg.modelset", "unifg.models.lidar", False),
+        ("import unifg as fg", "unifg.scenarios.ground.drive_past", False),
+        ("from unifg.models import unicycle\nfrom unifg.solvers import SQP", "unifg.scenarios.ground.route", False),
+        ("from unifg.solution.solver import Solver\nimport unifg.modelset", "unifg.models.lidar", False),
     ],
 )  # fmt: skip
 def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
@@ -265,11 +265,11 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
     "unifg solvers models": 27_850, "scenarios": 12_300, "benchmarks": 6_424, "tests": 32_150, "docs examples": 1_650,
-    "unifg/kernels": 3_512, "unifg/program": 2_580, "models": 2_467, "unifg/elimination": 2_404, "solvers": 4_351,
-    "unifg/answers": 1_770, "unifg/smoothing": 1_748, "unifg/lie": 1_691, "unifg/view": 1_411, "unifg/files": 1_204,
-    "unifg/pose_graphs": 1_152, "unifg/horizon": 1_040, "unifg/language": 981, "unifg/machine": 846,
-    "unifg/plots": 424, "scenarios/show": 1_573, "scenarios/worlds": 1_510, "scenarios/campaigns": 1_231,
-    "scenarios/flying": 1_108, "scenarios/driving": 1_089, "scenarios/safety": 772, "scenarios/commands": 688,
+    "unifg/factors": 3_512, "unifg/problem": 2_580, "models": 2_467, "unifg/elimination": 2_404, "solvers": 4_351,
+    "unifg/solution": 1_770, "unifg/smoothing": 1_748, "unifg/lie": 1_691, "unifg/view": 1_411, "unifg/files": 1_204,
+    "unifg/pose_graphs": 1_152, "unifg/horizon": 1_040, "unifg/modeling": 981, "unifg/codegen": 846,
+    "unifg/plots": 424, "scenarios/show": 1_573, "scenarios/simulation": 1_510, "scenarios/campaigns": 1_231,
+    "scenarios/quadrotor": 1_108, "scenarios/ground": 1_089, "scenarios/safety": 772, "scenarios/commands": 688,
 }  # fmt: skip
 DENSITY = {"unifg solvers models": 10.0, "scenarios": 10.6, "benchmarks": 11.9, "tests": 12.3}  # nodes a statement
 LOST_WORDS = 498  # docstrings that begin with a question word; goes down to none
@@ -325,11 +325,11 @@ TEXT = {".py", ".md", ".toml", ".cff", ".yaml", ".yml", ".in", ".cfg", ".sh", ".
 
 
 def test_products_of_long_vectors_wake_no_threads() -> None:
-    """Solvers multiply vectors as long as the problem by `unifg.machine.inner`, not by a BLAS that shares them out."""
+    """Solvers multiply vectors as long as the problem by `unifg.codegen.inner`, not by a BLAS that shares them out."""
     woken = re.compile(r"float\((?:[^()]|\([^()]*\))* @ |np\.linalg\.norm\((?![^\n]*axis)|np\.vdot\(")
     assert woken.search("slope = float(gradient @ step)") and woken.search("size = float(np.linalg.norm(residual))")
     assert woken.search("float(step @ curved(step))") and not woken.search("np.linalg.norm(rows, axis=1)")
-    folders = ("solvers", "unifg/answers")
+    folders = ("solvers", "unifg/solution")
     found = [
         f"{path.relative_to(CHECKOUT)}:{number}: {line.strip()}"
         for folder in folders
@@ -380,10 +380,10 @@ def test_only_the_machine_knows_the_inside_of_numba() -> None:
     wrong = {
         name_of(path): found
         for package, path in HOUSE
-        if room_of(module_of(package, path)) != "machine" and (found := private_sides(path.read_text(encoding="utf-8")))
+        if room_of(module_of(package, path)) != "codegen" and (found := private_sides(path.read_text(encoding="utf-8")))
     }
     assert wrong == {}
-    inside = [path for package, path in LIBRARY if room_of(module_of(package, path)) == "machine"]
+    inside = [path for package, path in LIBRARY if room_of(module_of(package, path)) == "codegen"]
     assert any(private_sides(path.read_text(encoding="utf-8")) for path in inside)  # the witness sees what there is
 
 

@@ -12,11 +12,11 @@ from episodes import room
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.ways.grid import path_exists
-from unifg.scenarios.worlds.building import building_map
-from unifg.scenarios.worlds.imperfection import MOVED, Imperfection, imperfect
-from unifg.scenarios.worlds.plane import EDGE, LidarModel, OdometryModel, World
-from unifg.scenarios.worlds.space import Obstacle
+from unifg.scenarios.planning.grid import path_exists
+from unifg.scenarios.simulation.building import building_map
+from unifg.scenarios.simulation.imperfection import MOVED, Imperfection, imperfect
+from unifg.scenarios.simulation.plane import EDGE, LidarModel, OdometryModel, World
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
 QUIET, EXACT = LidarModel(sigma=0.0, dropout=0.0), OdometryModel(scale_sigma=0.0, noise_sigma=0.0)

@@ -12,10 +12,10 @@ from scipy.optimize import least_squares
 
 import unifg as fg
 from dense import Batch, drive, one_by_one
+from unifg.codegen.views import described
 from unifg.elimination.elements import arrange
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
-from unifg.machine.borrow import described
 from unifg.smoothing import Incremental
 from unifg.smoothing.memory import give_list, give_numbers, take_list, take_numbers
 from unifg.smoothing.state import empty_state

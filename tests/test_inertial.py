@@ -11,9 +11,9 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import unifg as fg
+from unifg.codegen.compile_counter import counting
 from unifg.errors import ModelError
 from unifg.lie import SE23, SO3
-from unifg.machine.tally import counting
 from unifg.models import inertial, preintegration
 from unifg.models.inertial import InertialMeasurements, SampleCounts
 from unifg.models.preintegration import BIAS, GRAVITY, ImuNoise, Preintegrated, at_rest, predict, preintegrate

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers.optimality import infeasible_stationary
 from unifg.models import obstacles, unicycle
+from unifg.solution.optimality import infeasible_stationary
 from unifg.solvers import SQP, AugmentedLagrangian
-from unifg.solvers.globalize.least_violation import least_violation
+from unifg.solvers.globalize.feasibility_restoration import least_violation
 from unifg.typing import Array
 from units import drive
 from variants import CONSTRAINED, EQUALITIES_ONLY

@@ -10,7 +10,7 @@ import pytest
 
 import unifg as fg
 from moving import FLYER, Carried, drag_and_thrust, with_held_rate
-from unifg.kernels.differences import jacobian
+from unifg.factors.differences import jacobian
 from unifg.lie import so3
 from unifg.lie.functions import functions_of
 from unifg.models import rkmk

@@ -13,10 +13,10 @@ import unifg as fg
 from own_manifolds import S2, SphereManifold
 from problems.control import Quadrotor, Unicycle
 from problems.known import short_drive
-from unifg.answers.solver import SolveState
-from unifg.kernels.robust import Loss
+from unifg.factors.robust import Loss
 from unifg.models import avoidance
-from unifg.program.columns import Values
+from unifg.problem.columns import Values
+from unifg.solution.solver import SolveState
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point.method import Workspace
 from unifg.typing import Array, ArrayLike

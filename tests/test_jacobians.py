@@ -12,9 +12,9 @@ import pytest
 
 import unifg as fg
 import unifg.models
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.differences import jacobian
-from unifg.kernels.residuals import Residual
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.differences import jacobian
+from unifg.factors.residuals import Residual
 from unifg.models import (
     avoidance,
     barriers,

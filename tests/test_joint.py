@@ -10,11 +10,11 @@ import pytest
 import unifg as fg
 from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_past import WINDOW, Registration, Smoother
-from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.ground.drive_past import WINDOW, Registration, Smoother
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
-from unifg.scenarios.worlds.building import building_map
+from unifg.scenarios.simulation.building import building_map
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
@@ -144,8 +144,8 @@ def test_window_keeps_its_length_and_its_prior_is_of_the_past_alone(field: Dista
     _, smoother = settled(field, 1.0)
     window = smoother.window
     assert window.history.full and window.history.entered == window.length == WINDOW
-    assert window.left.departure is not None
-    reference, information = window.left.departure
+    assert window.left.pending_prior is not None
+    reference, information = window.left.pending_prior
     assert np.linalg.eigvalsh(information).min() > 0.0
     oldest = window.history.states[1]  # the prior is about the pose that is oldest after the next move
     lowest = fg.SE2.retract(reference[:3], reference[3:])

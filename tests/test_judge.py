@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers.multipliers import Slopes, estimated
-from unifg.answers.solver import Solver, SolveState
+from unifg.solution.multipliers import Slopes, estimated
+from unifg.solution.solver import Solver, SolveState
 from unifg.solvers import (
     KKT,
     SQP,

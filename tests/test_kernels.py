@@ -15,10 +15,10 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.kernel import Kernel
-from unifg.kernels.residuals import Residual
-from unifg.kernels.robust import Huber
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.kernel import Kernel
+from unifg.factors.residuals import Residual
+from unifg.factors.robust import Huber
 from unifg.models import landmarks, lidar, unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.obstacles import disc_clearance, shortfall, wall_distance

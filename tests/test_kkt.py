@@ -13,7 +13,7 @@ from judge import judge
 from problems.control import Unicycle
 from problems.known import STARTS, ecg2o, pose_chain, short_drive, three_variable_qp
 from unifg.models import unicycle
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.typing import Array
 
@@ -357,7 +357,7 @@ def test_a_full_step_that_will_probably_be_taken_is_linearised_at_once(monkeypat
     graph.minimize(unicycle.tracking, x, reference, sigma=1.0)
     graph.minimize(fg.prior, u, cruise, sigma=1.0)
     graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.1, lower=0.0, upper=0.0)
-    monkeypatch.setattr(Program, "evaluate", None)
+    monkeypatch.setattr(CompiledProblem, "evaluate", None)
     solution = KKT().solve(graph, {x: reference, u: cruise}, check=True)
     assert all(row.step_length == 1.0 for row in solution.history[1:]) and solution.iterations > 2
 

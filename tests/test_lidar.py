@@ -12,23 +12,23 @@ import pytest
 from unifg.errors import ScenarioError
 from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.last_stop import LastStop, agreed
-from unifg.scenarios.driving.localiser import Localiser, least, scan_covariance
+from unifg.scenarios.ground.emergency_stop import EmergencyStop, agreed
+from unifg.scenarios.ground.localiser import Localiser, least, scan_covariance
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import consistency, episode_metrics, nees
+from unifg.scenarios.monitoring.validation import Door
 from unifg.scenarios.navigation import Episode, NavigationSettings
-from unifg.scenarios.seeing.disc_tracker import DiscTracker
-from unifg.scenarios.seeing.discs import DiscFinder, Discs
-from unifg.scenarios.seeing.readings import Scan
-from unifg.scenarios.supervision.door import Door
-from unifg.scenarios.worlds.building import building_map
-from unifg.scenarios.worlds.faults import DRIVE_FAULTS, one_of
-from unifg.scenarios.worlds.imperfection import Imperfection, imperfect
-from unifg.scenarios.worlds.plane import LidarModel, World
-from unifg.scenarios.worlds.space import Obstacle
+from unifg.scenarios.perception.disc_tracker import DiscTracker
+from unifg.scenarios.perception.discs import DiscFinder, Discs
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.simulation.building import building_map
+from unifg.scenarios.simulation.faults import DRIVE_FAULTS, one_of
+from unifg.scenarios.simulation.imperfection import Imperfection, imperfect
+from unifg.scenarios.simulation.plane import LidarModel, World
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
-STOP = LastStop(0.17, 2.5, 0.1)
+STOP = EmergencyStop(0.17, 2.5, 0.1)
 FAST = np.array([1.0, 0.0])
 SHORT = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),), obstacles=1)
 HALF = LidarModel(beams=181, field=math.pi)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.program.limits import outside
+from unifg.problem.limits import outside
 
 
 def test_distances_outside_limits_are_those_of_numpy() -> None:

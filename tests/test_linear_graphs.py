@@ -11,7 +11,7 @@ import unifg as fg
 from problems.known import PROBLEMS, Guess, ecg2o, ecg2o_inequality, short_drive, three_variable_qp
 from test_sqp_exact import two_rotations
 from unifg.models import unicycle
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.exact_hessian import ExactHessian
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
@@ -69,7 +69,7 @@ def test_there_are_problems_enough() -> None:
     assert len(BUILD) >= 13
 
 
-def prepared(name: str) -> tuple[Program, Guess]:
+def prepared(name: str) -> tuple[CompiledProblem, Guess]:
     graph, guess = BUILD[name]()
     program = graph.compile()
     program.bind({})

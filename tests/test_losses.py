@@ -12,10 +12,10 @@ from scipy.optimize import minimize
 
 import unifg as fg
 from problems.control import Unicycle
-from unifg.kernels.robust import Formula, Loss, bend_of, form_of
-from unifg.language.terms import Cost
-from unifg.program.curvature import lagrangian_hessian
-from unifg.program.program import Program
+from unifg.factors.robust import Formula, Loss, bend_of, form_of
+from unifg.modeling.terms import Cost
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.hessian import lagrangian_hessian
 from unifg.solvers import InteriorPoint
 from unifg.solvers.augmented_usual import UsualPrimal
 from unifg.solvers.names import CONSTRAINED, EQUALITIES, LEAST_SQUARES, backend
@@ -58,7 +58,7 @@ def slope(rho: Callable[[complex], complex], s: float) -> float:
     return rho(complex(s, 1e-30)).imag / 1e-30
 
 
-def objective(program: Program, values: dict[fg.Family, Array], loss: Loss, active: Array) -> float:
+def objective(program: CompiledProblem, values: dict[fg.Family, Array], loss: Loss, active: Array) -> float:
     """Cost of the terms called "robust" by the published loss, of all others by squares, from the functions alone."""
     total, rho = 0.0, PUBLISHED.get(loss)
     for term in program.cost_terms:

@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from unifg.machine.calls import RETRACTION, address, call_retraction, local_matrix, local_vector, matrix, vector
-from unifg.machine.fingerprint import fingerprint, is_compiled
-from unifg.machine.jit import compiled, in_order
-from unifg.machine.links import LAYOUT
-from unifg.machine.vectors import load, splat, store, total
+from unifg.codegen.calls import RETRACTION, address, call_retraction, local_matrix, local_vector, matrix, vector
+from unifg.codegen.fingerprint import fingerprint, is_compiled
+from unifg.codegen.function_pointers import LAYOUT
+from unifg.codegen.jit import compiled, in_order
+from unifg.codegen.vectors import load, splat, store, total
 from unifg.typing import Array
 
 
@@ -118,4 +118,4 @@ def test_private_sides_of_numba(side: str) -> None:
     try:
         SIDES[side]()
     except Exception as error:
-        pytest.fail(f"Numba {version('numba')} broke {side}, on which unifg.machine stands: {error!r}")
+        pytest.fail(f"Numba {version('numba')} broke {side}, on which unifg.codegen stands: {error!r}")

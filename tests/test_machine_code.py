@@ -19,15 +19,15 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.codegen import objects
+from unifg.codegen.native import Native
+from unifg.codegen.objects import SWITCH, Objects
 from unifg.errors import GraphError
-from unifg.kernels.derive import derived as derived_room
-from unifg.kernels.derive import expression as expression_room
-from unifg.kernels.derive.expression import Expression, traced
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.kernel import evaluate_rows
-from unifg.machine import objects
-from unifg.machine.native import Native
-from unifg.machine.objects import SWITCH, Objects
+from unifg.factors.autodiff import derived as derived_room
+from unifg.factors.autodiff import expression as expression_room
+from unifg.factors.autodiff.expression import Expression, traced
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.kernel import evaluate_rows
 from unifg.models.spline import SplineCurve
 from unifg.smoothing import Incremental
 from unifg.solvers import GaussNewton, InteriorPoint

@@ -14,17 +14,17 @@ import unifg as fg
 from unifg.errors import BackendError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.localiser import Localiser
-from unifg.scenarios.driving.route import Route
+from unifg.scenarios.ground.localiser import Localiser
+from unifg.scenarios.ground.route import Route
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
-from unifg.scenarios.seeing.readings import Scan
-from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.ways.polyline import path_length, polyline_distance
-from unifg.scenarios.worlds.building import building_map
-from unifg.scenarios.worlds.plane import World
-from unifg.scenarios.worlds.space import Obstacle
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.polyline import path_length, polyline_distance
+from unifg.scenarios.simulation.building import building_map
+from unifg.scenarios.simulation.plane import World
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
 RADIUS = 0.17

@@ -11,11 +11,11 @@ import pytest
 
 import unifg as fg
 from problems import offsets
-from unifg.kernels.differences import gradient_and_hessian, jacobian
+from unifg.codegen.jit import compiled
+from unifg.factors.differences import gradient_and_hessian, jacobian
 from unifg.lie.rn import minus
-from unifg.machine.jit import compiled
 from unifg.models import quadrotor, unicycle
-from unifg.program.curvature import lagrangian_hessian
+from unifg.problem.hessian import lagrangian_hessian
 from unifg.typing import Array
 
 FAR = (1e3, 1e5, 5e6)  # [m]; the last is a northing in UTM

@@ -11,7 +11,7 @@ import unifg as fg
 from counts import Count, counting
 from problems.control import problems
 from problems.known import active_bounds, short_drive
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
 from unifg.solvers.quadratic_programs.osqp_route import OsqpRoute, counted_iterations
@@ -45,7 +45,7 @@ def test_counts_are_kept_apart() -> None:
     assert Count().share == 0.0
 
 
-def at(name: str = "short drive") -> tuple[Program, QP]:
+def at(name: str = "short drive") -> tuple[CompiledProblem, QP]:
     """A subproblem near the answer."""
     graph, guess = short_drive() if name == "short drive" else active_bounds()
     program = graph.compile()

@@ -15,10 +15,10 @@ from scipy.optimize import least_squares
 import own_manifolds as own
 import unifg as fg
 from own_manifolds import GROUPS, OWN, S2, SE23, SIM3, STRAIGHT, XYZW
+from unifg.codegen.jit import compiled
 from unifg.lie import se2
 from unifg.lie.functions import functions_of
-from unifg.machine.jit import compiled
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import (
     KKT,
     SQP,
@@ -271,7 +271,7 @@ class Chain:
 def test_all_backends_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
     chain = Chain(manifold)
     answer = chain.answer()
-    program = Program(chain.graph)
+    program = CompiledProblem(chain.graph)
     assert program.fully_compiled and program.retraction.compiled  # nothing is left to Python
     for solver in (
         GaussNewton(),

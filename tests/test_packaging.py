@@ -143,7 +143,7 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     expected = {f"{name}/{path.name}" for name, folder in folders.items() for path in folder.glob("*.py")}
     maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios" / "worlds").glob(kind)]
     assert {path.suffix for path in maps} == {".pgm", ".yaml"}, "no map is shipped"
-    expected |= {f"unifg/scenarios/worlds/{path.name}" for path in maps}
+    expected |= {f"unifg/scenarios/simulation/{path.name}" for path in maps}
     expected |= {
         "unifg/py.typed",
         "unifg/view/live.js",
@@ -151,7 +151,7 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
         "unifg/scenarios/commands/performance.jsonl",
     }
     if (source / "unifg" / "machine" / "kernels.zip").exists():  # what may be missing is compiled on the first use
-        expected.add("unifg/machine/kernels.zip")
+        expected.add("unifg/codegen/kernels.zip")
     assert {name for name in names if ".dist-info/" not in name} == expected
 
 
@@ -206,7 +206,7 @@ def test_the_shipped_map_can_be_loaded(clean: Path) -> None:
         clean / "python", "-I", "-c",
         "from importlib.resources import as_file, files\n"
         "from unifg.files.ros_map import load_map\n"
-        "for entry in files('unifg.scenarios.worlds').iterdir():\n"
+        "for entry in files('unifg.scenarios.simulation').iterdir():\n"
         "    if entry.name.endswith('.yaml'):\n"
         "        with as_file(entry) as path: print(load_map(path).shape)\n",
         cwd=clean,

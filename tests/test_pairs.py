@@ -11,8 +11,8 @@ import pytest
 import unifg as fg
 from unifg.files.g2o import read_g2o
 from unifg.lie import LieGroup
-from unifg.program.program import Program
-from unifg.program.table import PAIRED
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.table import PAIRED
 from unifg.typing import Array
 
 GROUPS = (fg.SE2, fg.SE3, fg.Rn(3), fg.Rn(6), fg.SO3)
@@ -51,7 +51,7 @@ def web(group: LieGroup, seed: int, **options: Any) -> tuple[fg.Graph, dict[fg.F
     return graph, guess
 
 
-def both(program: Program, guess: dict[fg.Family, Array]) -> tuple[list[Array], list[Array]]:
+def both(program: CompiledProblem, guess: dict[fg.Family, Array]) -> tuple[list[Array], list[Array]]:
     """Linearizations of a program with and without loops of fixed size."""
     fields = program.arrays.fields
     kept = fields[:, PAIRED].copy()

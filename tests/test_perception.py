@@ -11,13 +11,13 @@ import pytest
 
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.seeing.disc_tracker import DiscTracker
-from unifg.scenarios.seeing.discs import DiscFinder
-from unifg.scenarios.seeing.readings import Scan
-from unifg.scenarios.seeing.tracks import Tracks, nearest
-from unifg.scenarios.ways.grid import plan
-from unifg.scenarios.worlds.plane import LidarModel, World
-from unifg.scenarios.worlds.space import Obstacle
+from unifg.scenarios.perception.disc_tracker import DiscTracker
+from unifg.scenarios.perception.discs import DiscFinder
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.perception.tracks import Tracks, nearest
+from unifg.scenarios.planning.grid import plan
+from unifg.scenarios.simulation.plane import LidarModel, World
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array, ArrayLike
 
 DT = 0.1

@@ -17,9 +17,9 @@ from matplotlib.quiver import Quiver
 import unifg as fg
 from own_manifolds import S2
 from problems.known import line, short_drive
-from unifg.answers.history import History
 from unifg.plots import factor_graph, shown
 from unifg.plots.factor_graph import _apart
+from unifg.solution.history import History
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array
 

@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 import unifg as fg
 from unifg.models import obstacles, unicycle
-from unifg.machine.tally import counting
+from unifg.codegen.compile_counter import counting
 from unifg.solvers.names import CONSTRAINED, backend
 
 def problem(gap):
@@ -55,9 +55,9 @@ print(json.dumps(found))
 EPISODE = """
 import json, sys
 from dataclasses import replace
-from unifg.machine.tally import counting
+from unifg.codegen.compile_counter import counting
 from unifg.scenarios import flight, navigation
-from unifg.scenarios.worlds.faults import Fault
+from unifg.scenarios.simulation.faults import Fault
 
 ticks = 0
 def progress(done, text):
@@ -89,10 +89,10 @@ TURNS = """
 import json
 from dataclasses import replace
 import numpy as np
-from unifg.machine.tally import counting
+from unifg.codegen.compile_counter import counting
 from unifg.scenarios import navigation
-from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.worlds.faults import Fault
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.simulation.faults import Fault
 
 def discs(place, velocity, mover):
     found = Tracks.of_movers(place[None, :2], np.array([velocity]), np.array([0.2]))
@@ -114,7 +114,7 @@ def progress(done, text):
         turns.append(pilot.controller._way_out(pilot.pose, discs(near, tuple(-0.6 * heading), True)).evades)
     if ticks == 7:  # something is right before the hull
         near = replace(run.world.scan(), ranges=np.full(len(run.world.scan().ranges), 0.2))
-        turns.append(bool(pilot.last_stop.control(pilot.driven, pilot.driven, near)[0] < pilot.driven[0]))
+        turns.append(bool(pilot.emergency_stop.control(pilot.driven, pilot.driven, near)[0] < pilot.driven[0]))
     if ticks == 9:  # the way it came, to let a mover pass
         route._retreat(pilot.pose)
     if pilot.relocated:

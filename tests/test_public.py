@@ -28,11 +28,11 @@ OPEN = (
 )
 OPEN_MODULES = {
     "unifg",
-    "unifg.machine.tally",
+    "unifg.codegen.compile_counter",
     "unifg.errors",
-    "unifg.answers.solver",
-    "unifg.answers.status",
-    "unifg.program.curvature",
+    "unifg.solution.solver",
+    "unifg.solution.status",
+    "unifg.problem.hessian",
 }
 
 

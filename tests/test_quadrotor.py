@@ -11,7 +11,7 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
-from unifg.kernels.derive.stated import StatedKernel
+from unifg.factors.autodiff.stated import StatedKernel
 from unifg.models import quadrotor, rkmk
 from unifg.models.quadrotor import CONTROL, DRAG, GRAVITY, MASS, STATE, UPDRAFT, WIND, Parameters
 from unifg.models.rkmk import Method, step_defect

@@ -10,19 +10,19 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.horizon import Static, Term
+from unifg.horizon import Constant, Term
 from unifg.lie import SO3
 from unifg.models import avoidance, quadrotor
-from unifg.scenarios.flying.braking import brake, stopping_path
-from unifg.scenarios.flying.flight_control import Controller
-from unifg.scenarios.flying.flight_joint import SharedMotion
-from unifg.scenarios.flying.flight_parts import GivenFlight
-from unifg.scenarios.flying.flight_past import MANIFOLDS
-from unifg.scenarios.flying.flight_settings import ControllerSettings
-from unifg.scenarios.flying.guide import Guide, GuideSettings
-from unifg.scenarios.flying.slots import FAR_AWAY, Obstacles, Slots
-from unifg.scenarios.seeing.belief import Belief, Landmarks
-from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.perception.belief import Belief, Landmarks
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.quadrotor.braking import brake, stopping_path
+from unifg.scenarios.quadrotor.flight_control import Controller
+from unifg.scenarios.quadrotor.flight_joint import SharedMotion
+from unifg.scenarios.quadrotor.flight_parts import GivenFlight
+from unifg.scenarios.quadrotor.flight_past import MANIFOLDS
+from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
+from unifg.scenarios.quadrotor.guide import Guide, GuideSettings
+from unifg.scenarios.quadrotor.slots import FAR_AWAY, Obstacles, Slots
 from unifg.solvers.names import CONSTRAINED
 from unifg.typing import Array
 
@@ -180,7 +180,9 @@ def test_terms_of_the_estimate_can_be_replaced() -> None:
     """Parameters and landmarks as variables, as in a joint graph: fixed where they were given, they change nothing."""
 
     values = np.split(HEAVY.packed, [1, 4, 6])
-    statics = [Static(name, kind, value, 0.0) for (name, kind), value in zip(MANIFOLDS.items(), values, strict=True)]
+    constants = [
+        Constant(name, kind, value, 0.0) for (name, kind), value in zip(MANIFOLDS.items(), values, strict=True)
+    ]
 
     class Places:
         def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
@@ -196,8 +198,8 @@ def test_terms_of_the_estimate_can_be_replaced() -> None:
     class Shared(GivenFlight):
         def __init__(self, settings: ControllerSettings) -> None:
             super().__init__(settings)
-            places = Static("places", fg.Rn(2), AHEAD.positions, 0.0)
-            self.robot = replace(self.robot, statics=(*statics, places))
+            places = Constant("places", fg.Rn(2), AHEAD.positions, 0.0)
+            self.robot = replace(self.robot, constants=(*constants, places))
 
         def motion(self) -> list[Term]:
             return [SharedMotion(self.settings, drag=False)]

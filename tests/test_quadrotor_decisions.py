@@ -10,15 +10,15 @@ import pytest
 
 import unifg as fg
 from test_quadrotor_controller import BOUNDS, TARGET, WALLS, belief, landmarks, state
-from unifg.horizon import Now
+from unifg.horizon import Context
 from unifg.models import quadrotor
-from unifg.scenarios.flying.flight_control import KEPT, LEFT_BEHIND, PATIENCE, Controller, is_behind
-from unifg.scenarios.flying.flight_parts import Flown
-from unifg.scenarios.flying.flight_settings import ControllerSettings
-from unifg.scenarios.flying.guide import Reference
-from unifg.scenarios.flying.slots import Slots
-from unifg.scenarios.seeing.belief import Landmarks
-from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.perception.belief import Landmarks
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.quadrotor.flight_control import KEPT, LEFT_BEHIND, PATIENCE, Controller, is_behind
+from unifg.scenarios.quadrotor.flight_parts import Flown
+from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
+from unifg.scenarios.quadrotor.guide import Reference
+from unifg.scenarios.quadrotor.slots import Slots
 from unifg.typing import Array
 
 SETTINGS = ControllerSettings()
@@ -139,7 +139,7 @@ def test_the_control_that_is_flown_is_what_the_next_one_changes_from() -> None:
     hover = quadrotor.hover(here.parameters)
     lasts, inner = [], controller.loop.data
 
-    def data(now: Now[Flown]) -> Any:
+    def data(now: Context[Flown]) -> Any:
         lasts.append(now.last)
         return inner(now)
 

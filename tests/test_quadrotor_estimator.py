@@ -10,18 +10,18 @@ import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
-from unifg.answers.solver import Prepared
 from unifg.horizon.past import without
 from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.models.matching import DOUBTFUL, NEW, Gates, nearest
-from unifg.scenarios.flying.arrival import arrival, seen_from_the_vehicle
-from unifg.scenarios.flying.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
-from unifg.scenarios.flying.flight_past import WindowSettings
-from unifg.scenarios.seeing.belief import Belief, Landmarks
-from unifg.scenarios.seeing.readings import Reading
-from unifg.scenarios.worlds.air import QuadrotorWorld
-from unifg.scenarios.worlds.layouts import Layout
+from unifg.scenarios.perception.belief import Belief, Landmarks
+from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.quadrotor.arrival import arrival, seen_from_the_vehicle
+from unifg.scenarios.quadrotor.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
+from unifg.scenarios.quadrotor.flight_past import WindowSettings
+from unifg.scenarios.simulation.air import QuadrotorWorld
+from unifg.scenarios.simulation.layouts import Layout
+from unifg.solution.solver import Prepared
 from unifg.solvers import KKT
 from unifg.typing import Array
 

@@ -16,18 +16,18 @@ from benchmarks import quadrotor_pull
 from unifg.horizon import Plan
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.scenarios.flight import Flight, FlightSettings
-from unifg.scenarios.flying.estimator import Estimator
-from unifg.scenarios.flying.flight_control import Controller
-from unifg.scenarios.flying.flight_joint import JointSettings, SharedFlight
-from unifg.scenarios.flying.flight_past import packed
-from unifg.scenarios.flying.flight_pilot import joint_controller, make_pilot
-from unifg.scenarios.flying.flight_settings import ControllerSettings
-from unifg.scenarios.flying.slots import FAR_AWAY
-from unifg.scenarios.seeing.belief import Belief
-from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.worlds.layouts import Layout
+from unifg.scenarios.perception.belief import Belief
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.quadrotor.estimator import Estimator
+from unifg.scenarios.quadrotor.flight_control import Controller
+from unifg.scenarios.quadrotor.flight_joint import JointSettings, SharedFlight
+from unifg.scenarios.quadrotor.flight_past import packed
+from unifg.scenarios.quadrotor.flight_pilot import joint_controller, make_pilot
+from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
+from unifg.scenarios.quadrotor.slots import FAR_AWAY
+from unifg.scenarios.simulation.layouts import Layout
 from unifg.solvers import InteriorPoint
 from unifg.solvers.names import CONSTRAINED
 from unifg.typing import Array
@@ -75,13 +75,13 @@ def past() -> Past:
 def compilations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     """Grows by one with every graph that is compiled."""
     made: list[int] = []
-    build = Program.__init__
+    build = CompiledProblem.__init__
 
-    def counted(self: Program, *arguments: object, **options: object) -> None:
+    def counted(self: CompiledProblem, *arguments: object, **options: object) -> None:
         made.append(len(made))
         build(self, *arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Program, "__init__", counted)
+    monkeypatch.setattr(CompiledProblem, "__init__", counted)
     yield made
 
 
@@ -92,7 +92,7 @@ def latest(controller: Controller) -> Belief:
 
 
 def alone(past: Past) -> tuple[Array, dict[str, Array]]:
-    """Present state and statics by the past's terms in a graph of their own, solved to the end."""
+    """Present state and constants by the past's terms in a graph of their own, solved to the end."""
     window = past.estimator.window
     solver = InteriorPoint(tolerance=1e-9)
     solution = solver.solve(window.run.program.graph, window.guess(), data=window.data())
@@ -127,12 +127,12 @@ def test_without_wishes_the_past_decides(past: Past) -> None:
     # With weights of 1e-9 rounding keeps one solve in forty above 1e-7.
     controller = past.controller(FREE, control_weight=1e-9, tolerance=1e-6)
     assert controller.plan(past.belief).status is fg.Status.CONVERGED
-    present, statics = alone(past)
+    present, constants = alone(past)
     marks = [past.estimator.atlas.slot_of(name) for name in past.belief.landmarks.ids.tolist()]
     believed = latest(controller)
     assert np.abs(quadrotor.STATE.local(present, believed.state)).max() < 1e-6
-    assert np.abs(believed.landmarks.positions - statics["landmarks"][marks]).max() < 1e-6
-    assert np.abs(believed.parameters.packed - packed(statics)).max() < 1e-6
+    assert np.abs(believed.landmarks.positions - constants["landmarks"][marks]).max() < 1e-6
+    assert np.abs(believed.parameters.packed - packed(constants)).max() < 1e-6
 
 
 def test_wishes_pull_on_what_is_shared(past: Past) -> None:

@@ -10,9 +10,9 @@ import pytest
 from scipy.ndimage import label
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.ways.passage import widest_way
-from unifg.scenarios.worlds import layouts
-from unifg.scenarios.worlds.layouts import (
+from unifg.scenarios.planning.passage import widest_way
+from unifg.scenarios.simulation import layouts
+from unifg.scenarios.simulation.layouts import (
     CORRIDOR_SEEDS,
     COURSE_SEEDS,
     TUNING_SEEDS,

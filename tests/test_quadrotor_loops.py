@@ -7,7 +7,7 @@ import pytest
 
 from unifg.errors import ModelError
 from unifg.models import quadrotor, quadrotor_loops
-from unifg.scenarios.worlds.body_rate import Airframe, BodyRatePlant, Loops
+from unifg.scenarios.simulation.body_rate import Airframe, BodyRatePlant, Loops
 from unifg.typing import Array
 
 HEAVY = quadrotor.Parameters(1.1, (0.3, 0.3, 0.15))

@@ -21,16 +21,16 @@ from unifg.scenarios.commands import flights as results
 from unifg.scenarios.commands.catalogue import SCENARIOS
 from unifg.scenarios.episode import Progress
 from unifg.scenarios.flight import Flight, FlightSettings, run_flight
-from unifg.scenarios.flying import flight_watch
-from unifg.scenarios.flying.estimator import EstimatorSettings
-from unifg.scenarios.flying.flight_pilot import COUPLINGS
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, state_errors
 from unifg.scenarios.options import add_options, settings_of
-from unifg.scenarios.seeing.line_tracker import LineTracker
-from unifg.scenarios.seeing.readings import Reading
-from unifg.scenarios.worlds.conditions import DRAG, MASS, WIND, draw_conditions
-from unifg.scenarios.worlds.faults import Fault
+from unifg.scenarios.perception.line_tracker import LineTracker
+from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.quadrotor import flight_watch
+from unifg.scenarios.quadrotor.estimator import EstimatorSettings
+from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS
+from unifg.scenarios.simulation.conditions import DRAG, MASS, WIND, draw_conditions
+from unifg.scenarios.simulation.faults import Fault
 from unifg.typing import Array
 
 SEED = 1006  # of those open to tuning

@@ -29,8 +29,8 @@ from unifg.scenarios.course import (
 )
 from unifg.scenarios.show.course_log import course_log
 from unifg.scenarios.show.course_plot import chosen_iterates, picture, plot_above
-from unifg.scenarios.worlds.air import VEHICLE_RADIUS
-from unifg.scenarios.worlds.layouts import Layout, obstacle_course
+from unifg.scenarios.simulation.air import VEHICLE_RADIUS
+from unifg.scenarios.simulation.layouts import Layout, obstacle_course
 
 BACKENDS = (("sqp", "exact"), ("sqp", "gauss-newton"), ("ipm", "exact"), ("ipm", "gauss-newton"), ("alm", "exact"),
             ("alm", "gauss-newton"))  # fmt: skip

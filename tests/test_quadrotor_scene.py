@@ -20,7 +20,7 @@ from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, landmark_errors
 from unifg.scenarios.show.flight_plot import control, estimates, moments, overview, plot_moment
 from unifg.scenarios.show.flight_scene import first_sights, flight_scene
-from unifg.scenarios.worlds.layouts import Layout
+from unifg.scenarios.simulation.layouts import Layout
 from unifg.style.colours import css
 from unifg.style.figures import write_figure
 from unifg.view import drone, shapes

@@ -14,12 +14,12 @@ from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.seeing.belief import Landmarks
-from unifg.scenarios.worlds.air import VEHICLE_RADIUS, QuadrotorWorld
-from unifg.scenarios.worlds.bearing_range import SensorModel
-from unifg.scenarios.worlds.disturbance import DisturbanceModel, Disturbances
-from unifg.scenarios.worlds.layouts import Layout, corridor
-from unifg.scenarios.worlds.space import Obstacle
+from unifg.scenarios.perception.belief import Landmarks
+from unifg.scenarios.simulation.air import VEHICLE_RADIUS, QuadrotorWorld
+from unifg.scenarios.simulation.bearing_range import SensorModel
+from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
+from unifg.scenarios.simulation.layouts import Layout, corridor
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
 CALM = DisturbanceModel.calm()

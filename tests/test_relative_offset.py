@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers.relative_offset import relative_offset
 from unifg.elimination.factorization import Factorization
 from unifg.files.g2o import read_g2o
 from unifg.lie import LieGroup
 from unifg.pose_graphs import manhattan, sphere
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.solution.relative_offset import relative_offset
 from unifg.solvers import (
     KKT,
     SQP,
@@ -113,7 +113,7 @@ def test_the_answer_is_within_the_tolerance_of_the_best_cost(solver: fg.Solver) 
         assert solution.cost <= best * (1.0 + 2.0 * tolerance**2 + 1e-14)
 
 
-def dense_offset(program: Program, lin: Linearization) -> float:
+def dense_offset(program: CompiledProblem, lin: Linearization) -> float:
     """|P r| / |r| by dense QR."""
     jacobian = program.costs.matrix(lin.jacobian).toarray()
     q, _ = np.linalg.qr(jacobian)
@@ -362,7 +362,7 @@ def test_gross_errors_hide_no_variable(solver: fg.Solver, linked: bool) -> None:
         assert solution.iterations <= 30
 
 
-def local_offset(program: Program, lin: Linearization) -> float:
+def local_offset(program: CompiledProblem, lin: Linearization) -> float:
     """Largest sqrt(sum |J_f d|^2 / sum |r_f|^2) over the variables, by dense algebra."""
     jacobian = program.costs.matrix(lin.jacobian).toarray()
     moved = jacobian @ np.linalg.lstsq(jacobian, lin.residual, rcond=None)[0]

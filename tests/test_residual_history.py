@@ -12,8 +12,8 @@ import pytest
 
 import unifg as fg
 from problems.known import short_drive
-from unifg.answers.history import factor_norms
 from unifg.scenarios.show.residual_plot import ResidualMonitor, residual_picture
+from unifg.solution.history import factor_norms
 from unifg.solvers import (
     KKT,
     SQP,
@@ -145,7 +145,7 @@ def test_nothing_is_worked_out_unless_asked(monkeypatch: pytest.MonkeyPatch) -> 
         made.append(1)
         return factor_norms(*given)
 
-    monkeypatch.setattr("unifg.answers.solver.factor_norms", counted)
+    monkeypatch.setattr("unifg.solution.solver.factor_norms", counted)
     graph, guess = short_drive()
     SQP(verbose=False).solve(graph, guess, callback=lambda row: None)
     assert not made

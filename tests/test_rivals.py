@@ -16,8 +16,9 @@ from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.navigation import Episode, NavigationSettings
+from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.rivals.choices import PLANNERS, make_planner
 from unifg.scenarios.rivals.dynamic_window import DynamicWindow, WindowSettings
 from unifg.scenarios.rivals.elastic_band import BandSettings, ElasticBand
@@ -26,8 +27,7 @@ from unifg.scenarios.rivals.monte_carlo import MonteCarlo
 from unifg.scenarios.rivals.path_integral import PathIntegral, PathIntegralSettings
 from unifg.scenarios.rivals.pure_pursuit import PurePursuit
 from unifg.scenarios.rivals.sampled_drives import driven, nearest_on
-from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.worlds.drivetrain import Drivetrain
+from unifg.scenarios.simulation.drivetrain import Drivetrain
 from unifg.typing import Array
 
 SLOW = (1.0, 2.1)  # [m/s^2, rad/s^2]

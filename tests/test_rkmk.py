@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.kernels.differences import jacobian
+from unifg.factors.differences import jacobian
 from unifg.models import rkmk, unicycle
 from unifg.models.rkmk import Form
 from unifg.solvers import SQP, LevenbergMarquardt

@@ -15,14 +15,14 @@ import unifg as fg
 from benchmarks import gtsam_peer
 from benchmarks.wrong_closures import COLUMNS, METHODS, Job, aligned_error, attempt
 from problems.closures import Claim, with_wrong_closures
-from unifg.answers.history import Iteration
-from unifg.answers.solution import AnyGuess, NotConverged, Solution
 from unifg.errors import BackendError, GraphError
+from unifg.factors.robust import Graduated, Loss
 from unifg.files.g2o import read_g2o
-from unifg.kernels.robust import Graduated, Loss
 from unifg.pose_graphs import Edges, PoseGraph, manhattan, sphere
+from unifg.solution.history import Iteration
+from unifg.solution.solution import AnyGuess, NotConverged, Solution
 from unifg.solvers import GaussNewton, GraduatedNonConvexity, LevenbergMarquardt, graduated_non_convexity
-from unifg.solvers.gating import Innovations, Scatter
+from unifg.solvers.gating import Innovations, VarianceFactor
 from unifg.typing import Array, BoolArray
 
 LOSSES: list[Loss] = [
@@ -136,7 +136,7 @@ def test_surrogates_begin_at_the_guess_once_a_measurement_is_not_heard(monkeypat
 
     def watched(self: graduated_non_convexity._Search, start: AnyGuess) -> Solution:
         found, stage = plain(self, start), self._stages[0]
-        solves.append((start is guess, getattr(stage.now, "mu", 0.0), stage.heard))
+        solves.append((start is guess, getattr(stage.now, "mu", 0.0), stage.influential))
         return found
 
     monkeypatch.setattr(graduated_non_convexity._Search, "_from", watched)
@@ -156,11 +156,11 @@ def test_surrogates_begin_at_the_guess_once_a_measurement_is_not_heard(monkeypat
 def test_a_measurement_is_heard_while_it_pulls() -> None:
     stage = graduated_non_convexity._Stage(fg.GemanMcClure(1.0))
     stage.now = fg.GemanMcClure(1.0, mu=4.0)
-    for distance, heard in ((2.0, True), (8.0, True), (20.0, False)):
+    for distance, influential in ((2.0, True), (8.0, True), (20.0, False)):
         stage.weight(np.array([0.0, 1e-9, 1.0, distance**2]))  # what is believed pulls little, and is not meant
-        assert stage.heard == heard
+        assert stage.influential == influential
     stage.weight(np.zeros(0))
-    assert stage.heard
+    assert stage.influential
 
 
 def test_data_and_interruptions_reach_the_stages() -> None:
@@ -315,21 +315,21 @@ def test_right_measurements_are_seldom_contradicted() -> None:
     for noise in (0.01, 1.0, 30.0):
         residual = noise * rng.standard_normal((trials, n)) @ (np.eye(n) - hat)
         for r in residual:
-            scatter = Scatter(float(r @ r), n - unknowns)
-            called += bool(scatter.contradicts(r**2 / (1.0 - np.diag(hat)), 1, n).any())
+            scatter = VarianceFactor(float(r @ r), n - unknowns)
+            called += bool(scatter.rejects(r**2 / (1.0 - np.diag(hat)), 1, n).any())
         gross = residual[0] + 12.0 * noise * (np.eye(n) - hat)[7]
-        scatter = Scatter(float(gross @ gross), n - unknowns)
-        assert scatter.contradicts(gross**2 / (1.0 - np.diag(hat)), 1, n)[7]
+        scatter = VarianceFactor(float(gross @ gross), n - unknowns)
+        assert scatter.rejects(gross**2 / (1.0 - np.diag(hat)), 1, n)[7]
     assert 0.005 * 3 * trials < called <= 0.014 * 3 * trials
 
 
 def test_how_much_measurements_scatter_is_not_guessed_from_few() -> None:
-    assert Scatter(1e-8, 0.0).unit == 1.0
-    assert Scatter(3e-2, 3.0).unit > 0.2  # three numbers may be small by chance
-    assert Scatter(100.0, 10000.0).unit == pytest.approx(0.01, rel=0.05)
-    assert Scatter(5e4, 1e4).unit == 1.0  # larger noise than stated does not move the threshold
-    assert not Scatter(1.0, 2.0).contradicts(np.array([0.99]), 3, 1).any()
-    assert Scatter(0.0, 0.0).limit(3, 10) == np.inf
+    assert VarianceFactor(1e-8, 0.0).unit == 1.0
+    assert VarianceFactor(3e-2, 3.0).unit > 0.2  # three numbers may be small by chance
+    assert VarianceFactor(100.0, 10000.0).unit == pytest.approx(0.01, rel=0.05)
+    assert VarianceFactor(5e4, 1e4).unit == 1.0  # larger noise than stated does not move the threshold
+    assert not VarianceFactor(1.0, 2.0).rejects(np.array([0.99]), 3, 1).any()
+    assert VarianceFactor(0.0, 0.0).limit(3, 10) == np.inf
 
 
 def cautious(seed: int) -> tuple[PoseGraph, BoolArray, Array]:
@@ -412,7 +412,7 @@ def test_a_verdict_names_what_is_doubted_and_what_is_inactive() -> None:
     verdict = solution.verdict
     assert verdict is not None and not verdict.rivals
     assert verdict.left_out["seen"].tolist() == [41, 42]
-    assert verdict.doubted["seen"].tolist() == [40]
+    assert verdict.flagged["seen"].tolist() == [40]
     assert "Within their threshold, but further off than the others allow: 1 in 'seen' (40)." in solution.report()
     assert GaussNewton().solve(graph, {point: [[0.0]]}).verdict is None
 

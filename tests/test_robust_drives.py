@@ -12,12 +12,12 @@ import pytest
 import unifg as fg
 from problems.closures import with_wrong_closures
 from problems.drives import Kind, aliased, drive, slipped
-from unifg.answers.verdict import Group
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.pose_graphs import Edges, PoseGraph, chordal, lago, manhattan, odometric, pairwise_consistent
 from unifg.scenarios import command
+from unifg.solution.outlier_report import Group
 from unifg.solvers import GaussNewton, GraduatedNonConvexity, graduated_non_convexity
-from unifg.solvers.gating import CHANCE, Innovations, Scatter, groups_of
+from unifg.solvers.gating import CHANCE, Innovations, VarianceFactor, groups_of
 from unifg.typing import Array, BoolArray
 
 THRESHOLD = 3.37
@@ -248,11 +248,11 @@ def test_the_size_of_noise_is_that_of_each_term_over_what_either_keeps() -> None
     assert units == dense.units_with(sparse, search._shares) and units.keys() == {"odometry", "closures"}
     shares = search._shares
     plain = max(one._plain["odometry"].total for one in (sparse, dense))
-    assert units["odometry"] == Scatter(plain, shares["odometry"].total).unit
+    assert units["odometry"] == VarianceFactor(plain, shares["odometry"].total).unit
     both = np.maximum(*(one.weights[0] * one.squared[0] for one in (sparse, dense)))
     rows = 3.0 * float(np.maximum(sparse.weights[0], dense.weights[0]).sum())
     freedom = shares["closures"].total + rows - shares["closures"].rows
-    assert units["closures"] == Scatter(float(both.sum()), freedom).unit
+    assert units["closures"] == VarianceFactor(float(both.sum()), freedom).unit
     # As stated, every closure left out counts its c^2, and nothing is scaled.
     left = sum(int((~kept).sum()) for kept in sparse.kept)
     inside = float(sparse.squared[0][sparse.kept[0]].sum())
@@ -261,11 +261,11 @@ def test_the_size_of_noise_is_that_of_each_term_over_what_either_keeps() -> None
 
 
 def test_noise_that_is_known_needs_no_scatter() -> None:
-    known = Scatter(0.0, np.inf)
+    known = VarianceFactor(0.0, np.inf)
     from scipy.special import chdtri
 
     limit = float(chdtri(3, CHANCE / 50))
-    assert known.contradicts(np.array([0.999, 1.001]) * limit, 3, 50).tolist() == [False, True]
+    assert known.rejects(np.array([0.999, 1.001]) * limit, 3, 50).tolist() == [False, True]
 
 
 def test_a_group_says_what_depends_on_it() -> None:

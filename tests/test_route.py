@@ -10,9 +10,9 @@ import pytest
 
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_control import Controller
-from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.driving.route import (
+from unifg.scenarios.ground.drive_control import Controller
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.route import (
     ALLOWANCE,
     CLOSED,
     GAP,
@@ -24,9 +24,9 @@ from unifg.scenarios.driving.route import (
     WALL_GAP,
     Route,
 )
-from unifg.scenarios.driving.stopping import followed
-from unifg.scenarios.seeing.tracks import Tracks
-from unifg.scenarios.ways.grid import SPACING
+from unifg.scenarios.ground.stopping import followed
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.grid import SPACING
 from unifg.typing import Array
 
 RADIUS = 0.17

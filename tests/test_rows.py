@@ -9,10 +9,10 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
-from unifg.kernels.derive.reach import reach_of
-from unifg.kernels.derive.rows import Common, Each, RowsError, Shared, lengths_for, traced_rows
-from unifg.kernels.derive.symbols import Length, symbols
-from unifg.program import traced
+from unifg.factors.autodiff.captured import captured_by
+from unifg.factors.autodiff.rows import Common, Each, RowsError, Shared, lengths_for, traced_rows
+from unifg.factors.autodiff.symbols import Length, symbols
+from unifg.problem import traced
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint
 from unifg.typing import Array
 
@@ -243,4 +243,4 @@ def test_mixed_inputs_are_named() -> None:
     with pytest.raises(RowsError) as raised:
         traced_rows(function, [fg.Rn(2), Each((2,))], [], (3, 4))
     assert raised.value.mixed == {1} and raised.value.row == 1
-    assert reach_of(function).key is not None
+    assert captured_by(function).key is not None

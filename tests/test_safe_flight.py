@@ -15,26 +15,26 @@ from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.scenarios import command
 from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
+from unifg.scenarios.planning.flat_path import FigureEight, Hover, Line
 from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
-from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.keeper import (
+from unifg.scenarios.safety.cbf_mpc import (
     ON,
     PULL,
     SLOWING,
     TRACKING,
+    CbfMpc,
     Decision,
-    Keeper,
     KeeperSettings,
     Obstacles,
     Reading,
 )
+from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
 from unifg.scenarios.safety.pace import Pace
 from unifg.scenarios.safety.situations import SITUATIONS, situation
 from unifg.scenarios.safety.state_filter import FilterStatistics, StateFilter
 from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
-from unifg.scenarios.ways.flat_path import FigureEight, Hover, Line
-from unifg.scenarios.worlds.body_rate import Airframe, BodyRatePlant
-from unifg.scenarios.worlds.disturbance import DisturbanceModel, Disturbances
+from unifg.scenarios.simulation.body_rate import Airframe, BodyRatePlant
+from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.typing import Array
 
 HEAVY = quadrotor.Parameters(1.1, (0.3, 0.3, 0.15))
@@ -150,11 +150,11 @@ def pillar(x: float, y: float, velocity: tuple[float, float, float] = (0.0, 0.0,
 LINE = Line((-4.0, 0.0, 1.5), (4.0, 0.0, 1.5), 2.0, 1.5)
 
 
-def keeper(**numbers: Any) -> Keeper:
-    return Keeper(KeeperSettings(**{"slots": 1, **numbers}), Airframe(), 0.01)
+def keeper(**numbers: Any) -> CbfMpc:
+    return CbfMpc(KeeperSettings(**{"slots": 1, **numbers}), Airframe(), 0.01)
 
 
-def decide(plans: Keeper, start: Array, now: float, obstacles: Obstacles, later: float = 0.0) -> Decision:
+def decide(plans: CbfMpc, start: Array, now: float, obstacles: Obstacles, later: float = 0.0) -> Decision:
     """Along the line in still air, the vehicle's loops hovering."""
     steady = np.concatenate([start, np.zeros(6), [quadrotor.GRAVITY]])
     return plans.decide(steady, LINE.at(now + plans.nodes), obstacles, later, np.zeros((plans.settings.horizon, 3)))
@@ -235,7 +235,7 @@ def test_without_a_plan_the_last_is_flown_on_and_then_the_vehicle_brakes() -> No
 def test_a_plan_does_not_wish_for_another_vehicle() -> None:
     """In one graph with the past a plan that is short of force would rather be light."""
     weighing = Weighing(WeighingSettings(mass_sigma=10.0, drag_sigma=10.0), quadrotor.Parameters(), 0.01)
-    plans = Keeper(KeeperSettings(slots=1, alpha=1.0, speed=6.0), Airframe(), 0.01, weighing)
+    plans = CbfMpc(KeeperSettings(slots=1, alpha=1.0, speed=6.0), Airframe(), 0.01, weighing)
     start = np.array([-0.85, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0])
     decision = decide(plans, start, 2.0, pillar(0.0, 0.02))
     assert abs(decision.mass - 1.0) < PULL[0] + 1e-3 and np.abs(decision.drag).max() < PULL[1] + 1e-3
@@ -247,7 +247,7 @@ def test_plans_of_millimetres_are_solved_to_the_end() -> None:
     numbers = {"solved": replace(TRACKING, slots=0), "stopped": replace(exact, settled=False), "exact": exact}
     start, told = np.array([-4.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), {}
     for name, settings in numbers.items():
-        plans = Keeper(settings, Airframe(), 0.01)
+        plans = CbfMpc(settings, Airframe(), 0.01)
         decide(plans, start, 0.0, NOTHING)
         told[name] = decide(plans, start + np.eye(10)[1] * 2e-3, 0.01, NOTHING)
     apart = {name: float(np.abs(told[name].control - told["exact"].control).max()) for name in told}

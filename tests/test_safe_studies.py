@@ -11,7 +11,7 @@ from benchmarks import flight_floor, horizon_and_velocity
 from benchmarks.flight_floor import Axis, chain, cheapest, left, plan, regulator
 from benchmarks.horizon_and_velocity import Flown
 from unifg.scenarios.safe_flight import SafeSettings
-from unifg.scenarios.safety.keeper import TRACKING
+from unifg.scenarios.safety.cbf_mpc import TRACKING
 
 BOOKS = SafeSettings().books.loops
 

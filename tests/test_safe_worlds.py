@@ -12,9 +12,9 @@ from scipy.linalg import expm
 
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor
-from unifg.scenarios.ways.flat_path import FigureEight, FlatPath, Hover, Line
-from unifg.scenarios.worlds.bodies import Bodies, Body, Ellipse, Motion, Shuttle, Still, Thrown
-from unifg.scenarios.worlds.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
+from unifg.scenarios.planning.flat_path import FigureEight, FlatPath, Hover, Line
+from unifg.scenarios.simulation.bodies import Bodies, Body, Ellipse, Motion, Shuttle, Still, Thrown
+from unifg.scenarios.simulation.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
 
 START = np.array([1.0, -2.0, 1.5, 1.0, 0.0, 0.0, 0.0, 0.3, 0.0, -0.1])
 HEAVY = Airframe(quadrotor.Parameters(1.1, (0.3, 0.3, 0.15)))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.kernels.differences import convexified
-from unifg.program.curvature import lagrangian_hessian
-from unifg.program.scalars import positive_part
+from unifg.factors.differences import convexified
+from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.scalars import positive_part
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point.method import Workspace
 from unifg.typing import Array
@@ -91,10 +91,10 @@ def test_compiled_passes_are_those_of_numpy() -> None:
         lin = program.linearize(values)
         assert program.evaluate(values).cost == pytest.approx(lin.cost, rel=1e-13)
         found.append((lin, lagrangian_hessian(program, lin, np.zeros(program.constraints.count)), program))
-    (lin, bent, program), (other, doubted, _) = found
+    (lin, bent, program), (other, flagged, _) = found
     assert lin.cost == pytest.approx(other.cost, rel=1e-12)
     np.testing.assert_allclose(lin.gradient, other.gradient, atol=1e-7)
-    np.testing.assert_allclose(bent, doubted, atol=1e-4)
+    np.testing.assert_allclose(bent, flagged, atol=1e-4)
     assert np.abs(lin.concavity).max() > 0.05
     np.testing.assert_allclose(lin.hessian, other.hessian, atol=1e-4)
     np.testing.assert_allclose(lin.concavity, other.concavity, atol=1e-4)

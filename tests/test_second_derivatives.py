@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.kernels.residuals import Residual, residual
+from unifg.factors.residuals import Residual, residual
 from unifg.lie import Manifold
 from unifg.models import avoidance, landmarks, obstacles, quadrotor, unicycle, vehicle
-from unifg.program.curvature import lagrangian_hessian
+from unifg.problem.hessian import lagrangian_hessian
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.random import Generator
 
 import unifg as fg
-from unifg.horizon import ControlCost, Dynamics, Loop, Measurement, Now, Robot, Static, Window
+from unifg.horizon import Constant, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
 from unifg.lie import SE23, SO3
 from unifg.models.inertial import InertialMeasurements
 from unifg.models.interpolation import cubic
@@ -96,8 +96,8 @@ def test_the_present_alone_keeps_what_comes() -> None:
 def test_one_sensor_stands_in_both_graphs_of_a_joint_loop(rng: Generator) -> None:
     """In the window alone and in past and future: the same fixes, counted once; with the clock's offset unknown."""
     count, offset = 25, 0.04
-    late = Static("clock", fg.Rn(1), [0.0], 0.1)
-    robot = Robot(fg.Rn(2), fg.Rn(2), statics=(late,), predict=step)
+    late = Constant("clock", fg.Rn(1), [0.0], 0.1)
+    robot = Robot(fg.Rn(2), fg.Rn(2), constants=(late,), predict=step)
     found = {}
     for coupling in ("sequential", "joint"):
         draw = np.random.default_rng(3)
@@ -110,11 +110,11 @@ def test_one_sensor_stands_in_both_graphs_of_a_joint_loop(rng: Generator) -> Non
                 graph.minimize(fg.prior, x[1:], [5.0, 3.0], sigma=1.0, name="goal")
                 graph.bound(u, lower=-1.0, upper=1.0)
 
-            def data(self, now: Now[None]) -> dict[str, Array]:
+            def data(self, now: Context[None]) -> dict[str, Array]:
                 return {}
 
         terms = [Dynamics(drift, H), Goal(), ControlCost(sigma=[3.0, 3.0])]
-        loop = Loop(robot, 6, terms, solver=SQP(), window=window, coupling=coupling)  # type: ignore[arg-type]
+        loop = RecedingHorizon(robot, 6, terms, solver=SQP(), window=window, coupling=coupling)  # type: ignore[arg-type]
         truth, before = np.zeros(2), np.zeros(2)
         for tick in range(count):
             for s in (0.5, 0.9) if tick else ():  # stamps of a clock that is behind
@@ -124,7 +124,7 @@ def test_one_sensor_stands_in_both_graphs_of_a_joint_loop(rng: Generator) -> Non
             assert plan.source == "solved"
             before, truth = truth, step(truth, plan.control)
         assert loop.statuses[fg.Status.CONVERGED] == count
-        found[coupling] = loop.statics["clock"][0, 0]
+        found[coupling] = loop.constants["clock"][0, 0]
         assert abs(found[coupling] - offset) < 0.02
         assert sensor.counts.late == sensor.counts.full == sensor.counts.invalid == 0
     assert found["joint"] != found["sequential"]
@@ -136,8 +136,8 @@ def test_inertial_navigation_in_a_window(static: bool, rng: Generator) -> None:
     noise, rate = ImuNoise(1e-3, 1e-2, 1e-4, 1e-3), 100.0
     state = SE23 if static else fg.Product(body=SE23, bias=BIAS)
     bias = np.array([0.01, -0.02, 0.01, 0.1, 0.05, -0.1])
-    statics = (Static("bias", BIAS, np.zeros(6), [0.05] * 3 + [0.3] * 3),) if static else ()
-    robot = Robot(state, fg.Rn(1), statics=statics)
+    constants = (Constant("bias", BIAS, np.zeros(6), [0.05] * 3 + [0.3] * 3),) if static else ()
+    robot = Robot(state, fg.Rn(1), constants=constants)
     body = None if static else "body"
     imu = InertialMeasurements(noise, body=body)
     fixes = StampedMeasurements(
@@ -165,13 +165,13 @@ def test_inertial_navigation_in_a_window(static: bool, rng: Generator) -> None:
             k = int(stamp * rate)
             fixes.add(stamp, truth[k, :3] + (stamp * rate - k) * (truth[k + 1, :3] - truth[k, :3]))
         history = window.history  # a first guess of the new node: the last one, moved
-        believed = history.statics["bias"][0] if static else history.states[-2, 10:]
+        believed = history.constants["bias"][0] if static else history.states[-2, 10:]
         moved = predict(history.states[-2, :10], imu.integrated(history.times[-2:], believed))[1]
         history.states[-1] = moved if static else np.concatenate([moved, believed])
         solution = window.estimate()
         assert solution.converged
         errors.append(SE23.local(window.present[:10], truth[round(now * rate)]))
-    final = history.statics["bias"][0] if static else window.present[10:]
+    final = history.constants["bias"][0] if static else window.present[10:]
     assert np.abs(final[:3] - bias[:3]).max() < 0.01 and np.abs(final[3:] - bias[3:]).max() < 0.1
     assert np.abs(np.array(errors[10:])[:, :3]).max() < 0.1
     assert imu.counts.unknown == 0 and fixes.counts.late == 0

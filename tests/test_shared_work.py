@@ -15,6 +15,12 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.codegen import threads as crews
+from unifg.codegen.jit import compiled
+from unifg.codegen.threads import cores, share, threads
+from unifg.codegen.vectors import Address, address, advance, present
+from unifg.codegen.waiting import first_chunk, next_chunk, wait_for
+from unifg.codegen.work_queue import ENTERED, LEFT, POSTED, arguments_at, arrays, empty_mailbox, entrance, lead, serve
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.fronts import WIDE
 from unifg.elimination.plan import PIVOTS, ROWS
@@ -22,16 +28,10 @@ from unifg.elimination.sharing import PLAN, row_of
 from unifg.elimination.subtrees import PARTS
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import UnifgError
-from unifg.machine import threads as crews
-from unifg.machine.jit import compiled
-from unifg.machine.mailbox import ENTERED, LEFT, POSTED, arguments_at, arrays, empty_mailbox, entrance, lead, serve
-from unifg.machine.threads import cores, share, threads
-from unifg.machine.vectors import Address, address, advance, present
-from unifg.machine.waiting import first_chunk, next_chunk, wait_for
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
-from unifg.program.passes import TERM_ARRAYS
-from unifg.program.shares import Shares
-from unifg.program.table import COUNT, PAIRED, POSITION, WIDTH
+from unifg.problem.evaluation import TERM_ARRAYS
+from unifg.problem.table import COUNT, PAIRED, POSITION, WIDTH
+from unifg.problem.thread_partition import Shares
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, IntArray
 

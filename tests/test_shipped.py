@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 
-from unifg.machine import shipped, tally
-from unifg.machine.jit import compiled, in_order
-from unifg.machine.tally import Tally, counting
+from unifg.codegen import compile_counter, precompiled
+from unifg.codegen.compile_counter import Tally, counting
+from unifg.codegen.jit import compiled, in_order
 
-SOURCE = """from unifg.machine.jit import compiled
+SOURCE = """from unifg.codegen.jit import compiled
 FACTOR = 2.0
 @compiled
 def inner(x):
@@ -51,13 +51,13 @@ def archive(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Of the function ``twice``, made in another folder, in the place of the library's own."""
     path = tmp_path / "kernels.zip"
     there = module(tmp_path / "there" / "doubling.py", SOURCE)
-    with shipped.recording() as recorder:
+    with precompiled.recording() as recorder:
         assert compiled(there.twice)(3.0) == 6.0
     recorder.write(path)
-    monkeypatch.setattr(shipped, "ARCHIVE", path)
-    shipped.archive.cache_clear()
+    monkeypatch.setattr(precompiled, "ARCHIVE", path)
+    precompiled.archive.cache_clear()
     yield path
-    shipped.archive.cache_clear()
+    precompiled.archive.cache_clear()
 
 
 def first_use(tmp_path: Path, source: str = SOURCE, how: Callable[..., Any] = compiled) -> Tally:
@@ -96,10 +96,10 @@ def test_what_has_changed_is_compiled(archive: Path, tmp_path: Path, source: str
 def test_an_archive_for_others_is_left_alone(
     archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    other = {**shipped.versions(), name: "of another kind"}
-    monkeypatch.setattr(shipped, "versions", lambda: other)
+    other = {**precompiled.versions(), name: "of another kind"}
+    monkeypatch.setattr(precompiled, "versions", lambda: other)
     assert first_use(tmp_path).generated == []
-    assert shipped.outdated(archive) == ["archive"]
+    assert precompiled.outdated(archive) == ["archive"]
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK nothing of the kind"], ids=["none", "empty", "no archive"])
@@ -116,7 +116,7 @@ def test_an_archive_that_cannot_be_read_is_none(
 def test_members_that_are_damaged_are_none(archive: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     whole = archive.read_bytes()
     with zipfile.ZipFile(archive) as file:
-        members = [info for info in file.infolist() if info.filename != shipped.ABOUT]
+        members = [info for info in file.infolist() if info.filename != precompiled.ABOUT]
     damaged = bytearray(whole)
     for info in members:
         first = info.header_offset + 30 + len(info.filename)
@@ -144,27 +144,27 @@ def test_what_computes_the_same_is_found(archive: Path, tmp_path: Path, source: 
 
 def test_an_archive_names_the_functions_that_have_changed_since(archive: Path, tmp_path: Path) -> None:
     module(tmp_path / "here" / "doubling.py", "\n" + SOURCE)
-    assert shipped.outdated(archive) == []
+    assert precompiled.outdated(archive) == []
     module(tmp_path / "here" / "doubling.py", SOURCE.replace("+ 0.0", "+ 1.0"))
-    assert shipped.outdated(archive) == ["doubling:twice"]
+    assert precompiled.outdated(archive) == ["doubling:twice"]
     module(tmp_path / "here" / "doubling.py", SOURCE.replace("FACTOR * x", "x"))
-    assert shipped.outdated(archive) == ["doubling:inner", "doubling:twice"]
+    assert precompiled.outdated(archive) == ["doubling:inner", "doubling:twice"]
     sys.modules["doubling"] = type(sys)("doubling")
-    assert shipped.outdated(archive) == ["doubling:inner", "doubling:twice"]
+    assert precompiled.outdated(archive) == ["doubling:inner", "doubling:twice"]
 
 
 def test_members_are_numbered_beyond_those_of_a_process(archive: Path) -> None:
     """Two functions of one name and of the same types would otherwise be one to the linker."""
     with zipfile.ZipFile(archive) as file:
-        members = [name for name in file.namelist() if name != shipped.ABOUT]
+        members = [name for name in file.namelist() if name != precompiled.ABOUT]
         assert len(members) == 2
-        assert all(f"v{shipped.FIRST_NUMBER}"[:4].encode() in file.read(name) for name in members)
+        assert all(f"v{precompiled.FIRST_NUMBER}"[:4].encode() in file.read(name) for name in members)
 
 
 def test_a_compilation_is_announced_once_and_disturbs_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(tally.listener, "announced", False)
+    monkeypatch.setattr(compile_counter.listener, "announced", False)
     before = gc.get_threshold()
     with caplog.at_level(logging.INFO, "unifg"):
         first_use(tmp_path)
@@ -187,7 +187,7 @@ def test_reading_is_no_compilation(
 ) -> None:
     function = module(tmp_path / "here" / "doubling.py", SOURCE).twice
     assert compiled(function)(3.0) == 6.0
-    monkeypatch.setattr(tally.listener, "announced", False)
+    monkeypatch.setattr(compile_counter.listener, "announced", False)
     with counting() as counted:
         assert compiled(function)(3.0) == 6.0
     assert (counted.compiled, counted.generated, counted.read) == ([], [], ["doubling.twice"])

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from unifg.models import barriers, quadrotor
+from unifg.scenarios.planning.flat_path import Flown, Line
 from unifg.scenarios.safe_flight import SafeSettings, flights
 from unifg.scenarios.safety.cascade import CascadeSettings, Track
-from unifg.scenarios.safety.keeper import Keeper, KeeperSettings, Obstacles, apart
+from unifg.scenarios.safety.cbf_mpc import CbfMpc, KeeperSettings, Obstacles, apart
 from unifg.scenarios.safety.sightings import Sightings, SightingSettings
-from unifg.scenarios.ways.flat_path import Flown, Line
-from unifg.scenarios.worlds.body_rate import Airframe
+from unifg.scenarios.simulation.body_rate import Airframe
 from unifg.typing import Array
 
 LINE = Line((-4.0, 0.0, 1.5), (4.0, 0.0, 1.5), 2.0, 1.5)
@@ -101,9 +101,9 @@ def test_what_is_seen_from_the_vehicle_goes_where_it_is_believed_to_be(knowledge
 # ---------------------------------------------------------------- plans
 
 
-def decided(doubt: float, **numbers: Any) -> tuple[Keeper, Array]:
+def decided(doubt: float, **numbers: Any) -> tuple[CbfMpc, Array]:
     """A plan past a pillar that is seen as well as ``doubt`` says, k sigma [m] and per second; its places."""
-    plans = Keeper(KeeperSettings(slots=1, alpha=3.0, **numbers), Airframe(), 0.01)
+    plans = CbfMpc(KeeperSettings(slots=1, alpha=3.0, **numbers), Airframe(), 0.01)
     start = np.array([-1.9, 0.05, 1.5, 1.0, 0.0, 0.0, 0.0, 1.5, 0.0, 0.0])
     steady = np.concatenate([start, np.zeros(6), [quadrotor.GRAVITY]])
     spread = np.array([[doubt**2, 0.0, doubt**2]])

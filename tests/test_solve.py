@@ -13,11 +13,11 @@ import pytest
 
 import unifg as fg
 from scenes import commands_of, data_of
+from unifg.codegen.threads import threads
 from unifg.errors import GraphError, ScenarioError, UnifgError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.toro import write_toro
 from unifg.files.tum import read_tum
-from unifg.machine.threads import threads
 from unifg.pose_graphs import Edges, PoseGraph, Sightings, manhattan, sphere
 from unifg.scenarios import command
 from unifg.scenarios.pose_graph import SolveSettings, robust_loss, solve_file

@@ -163,7 +163,7 @@ def test_landmarks_are_seen_between_nodes(rng: Generator) -> None:
     twist = np.array([1.0, 0.2, 0.0, 0.3, 0.0, 1.0])
     truth = SE3.exp(times[:, None] * twist)
     seen = StampedMeasurements(
-        bearing_range_3d(SE3, MOUNT), 4, capacity=3, sigma=[0.01, 0.01, 0.02], statics=("mark",), name="seen"
+        bearing_range_3d(SE3, MOUNT), 4, capacity=3, sigma=[0.01, 0.01, 0.02], constants=("mark",), name="seen"
     )
     seen.state(graph, x)
     graph.minimize(fg.prior, x, truth, sigma=0.001)

@@ -11,9 +11,9 @@ import pytest
 import unifg as fg
 from problems.known import short_drive
 from unifg.solvers import SQP
-from unifg.solvers.globalize.least_violation import FALLING, PATIENCE, Watch
+from unifg.solvers.globalize.feasibility_restoration import FALLING, PATIENCE, RestorationTrigger
 from unifg.solvers.globalize.merit import RowPrices
-from unifg.solvers.globalize.pace import creeps
+from unifg.solvers.globalize.slow_convergence import converges_slowly
 from unifg.solvers.quadratic_programs.routes import LEFT, RESTING
 from unifg.solvers.quadratic_programs.subproblem import QPAnswer, subproblem
 from unifg.solvers.sqp import _next_damping
@@ -26,7 +26,7 @@ def seen(violation: float) -> Any:
 
 
 def test_a_violation_that_does_not_fall_is_looked_at_ever_more_seldom() -> None:
-    watch = Watch()
+    watch = RestorationTrigger()
     assert not watch.calls(seen(1.0))
     calls = [watch.calls(seen(1.0)) for _ in range(7 * PATIENCE)]
     assert [k + 1 for k, called in enumerate(calls) if called] == [PATIENCE, 3 * PATIENCE, 7 * PATIENCE]
@@ -34,7 +34,7 @@ def test_a_violation_that_does_not_fall_is_looked_at_ever_more_seldom() -> None:
 
 @pytest.mark.parametrize("violation", [0.9 * FALLING, 1e-7])
 def test_a_violation_that_falls_or_is_none_begins_the_wait_anew(violation: float) -> None:
-    watch = Watch()
+    watch = RestorationTrigger()
     watch.calls(seen(1.0))
     assert not any(watch.calls(seen(1.0)) for _ in range(PATIENCE - 1))
     assert not watch.calls(seen(violation))
@@ -43,7 +43,7 @@ def test_a_violation_that_falls_or_is_none_begins_the_wait_anew(violation: float
 
 
 def test_falling_by_little_at_a_time_is_not_falling() -> None:
-    watch, violation = Watch(), 1.0
+    watch, violation = RestorationTrigger(), 1.0
     watch.calls(seen(violation))
     shrinking = violation * 0.999 ** np.arange(PATIENCE)
     assert [watch.calls(seen(float(value))) for value in shrinking][-1]
@@ -63,7 +63,7 @@ def test_the_highest_price_is_that_of_scaled_rows_and_at_least_one() -> None:
     program = graph.compile()
     lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
     for multiplier, row, price in ((6.0, 2.0, 3.0), (6.0, 0.5, 12.0), (0.1, 1.0, 1.0)):
-        assert RowPrices(program, np.array([row]), np.array([-multiplier]), lin).price == pytest.approx(price)
+        assert RowPrices(program, np.array([row]), np.array([-multiplier]), lin).penalty == pytest.approx(price)
 
 
 def test_prices_stay_above_their_multipliers_and_come_down_slowly() -> None:
@@ -72,9 +72,9 @@ def test_prices_stay_above_their_multipliers_and_come_down_slowly() -> None:
     lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
     merit = RowPrices(program, np.ones(1), np.array([2.0]), lin)
     merit.raise_above(np.array([-4.0]))
-    np.testing.assert_allclose(merit.prices, [4.4])
+    np.testing.assert_allclose(merit.penalties, [4.4])
     merit.raise_above(np.array([1.0]))
-    np.testing.assert_allclose(merit.prices, [2.7])
+    np.testing.assert_allclose(merit.penalties, [2.7])
 
 
 @pytest.mark.parametrize(
@@ -115,13 +115,13 @@ def row(missing: float) -> Any:
 @pytest.mark.parametrize(("pace", "slow"), [(0.75, False), (0.9, True), (1.1, True)])
 def test_a_solve_creeps_where_ten_iterations_leave_a_tenth_after_twenty(pace: float, slow: bool) -> None:
     history = [row(pace**k) for k in range(40)]
-    assert not any(creeps(history[:k]) for k in range(21))
-    assert [creeps(history[:k]) for k in range(21, 40)] == [slow] * 19
+    assert not any(converges_slowly(history[:k]) for k in range(21))
+    assert [converges_slowly(history[:k]) for k in range(21, 40)] == [slow] * 19
     for part in ("stationarity", "violation", "complementarity"):  # each of them keeps a solve from its end
         held = [row(0.5**k) for k in range(30)]
         for made in held:
             setattr(made, part, 1.0)
-        assert creeps(held)
+        assert converges_slowly(held)
 
 
 def test_damping_grows_with_shortened_steps_and_fades_with_full_ones() -> None:

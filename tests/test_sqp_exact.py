@@ -13,7 +13,7 @@ import unifg as fg
 from judge import judge
 from problems.hock_schittkowski import SMALL
 from problems.known import PROBLEMS, Guess, Problem, ecg2o, ecg2o_inequality, hs6, pose_beside_disc, short_drive
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.exact_hessian import ExactHessian, holds
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
@@ -130,7 +130,7 @@ def test_rim_of_the_disc_takes_a_tenth_of_the_iterations() -> None:
 # ---------------------------------------------------------------- convex for those who need it
 
 
-def saddle_qp(equality: bool, multiplier: float, level: float = 0.3) -> tuple[Program, QP]:
+def saddle_qp(equality: bool, multiplier: float, level: float = 0.3) -> tuple[CompiledProblem, QP]:
     """The exact subproblem of the saddle."""
     graph, guess = saddle(equality, level)
     program = graph.compile()
@@ -175,7 +175,7 @@ def test_without_its_linear_part_a_square_would_shift_the_multipliers() -> None:
     assert qp_error(bare, step, np.array([0.15 - float(qp.weights[0]) * b])) < 1e-6
 
 
-ROUTES: dict[str, Callable[[Program], Route]] = {
+ROUTES: dict[str, Callable[[CompiledProblem], Route]] = {
     "osqp": lambda program: OsqpRoute(program, 4000),
     "piqp": PiqpRoute,
     "graph": GraphRoute,

@@ -14,7 +14,7 @@ import unifg as fg
 from problems.control import Quadrotor, Unicycle
 from problems.known import short_drive
 from test_losses import LOSSES, poses
-from unifg.answers.solver import Prepared
+from unifg.solution.solver import Prepared
 from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.solvers.augmented_usual import UsualPrimal
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.program.curvature import lagrangian_hessian
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.linearization import Linearization
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 
@@ -56,7 +56,7 @@ class Counted:
         return self.function(*arguments)
 
 
-def chain(function: Callable[..., Array], *more: Any) -> tuple[Program, Linearization]:
+def chain(function: Callable[..., Array], *more: Any) -> tuple[CompiledProblem, Linearization]:
     """A graph of one dynamics term evaluated by NumPy, at the points above."""
     graph = fg.Graph()
     function = fg.residual(function, derivatives="differences")
@@ -67,7 +67,7 @@ def chain(function: Callable[..., Array], *more: Any) -> tuple[Program, Lineariz
     return program, program.linearize(program.values_from({x: X, u: U}))
 
 
-def second(program: Program, lin: Linearization, pull: Array = PULL) -> Array:
+def second(program: CompiledProblem, lin: Linearization, pull: Array = PULL) -> Array:
     """(N, 27, 27) second derivatives of the one term."""
     return program.terms[0].second_derivatives(lin.values, pull)
 

@@ -17,11 +17,11 @@ from numpy.random import Generator
 from scipy.io import loadmat
 
 import unifg as fg
+from unifg.codegen.compile_counter import counting
+from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
-from unifg.kernels.differences import jacobian
+from unifg.factors.differences import jacobian
 from unifg.lie import SE23
-from unifg.machine.jit import compiled
-from unifg.machine.tally import counting
 from unifg.models import landmarks
 from unifg.models.inertial import InertialMeasurements
 from unifg.models.interpolation import Interpolation, cubic, geodesic
@@ -429,7 +429,13 @@ def test_errors_may_be_shipped_residuals_with_landmarks(rng: Generator) -> None:
     graph = fg.Graph()
     x, mark = graph.variables("x", STATE, 4), graph.variables("mark", fg.Rn(2), 1)
     seen = StampedMeasurements(
-        landmarks.bearing_range, 2, capacity=2, sigma=[0.01, 0.02], between=cubic(STATE), statics=("mark",), name="seen"
+        landmarks.bearing_range,
+        2,
+        capacity=2,
+        sigma=[0.01, 0.02],
+        between=cubic(STATE),
+        constants=("mark",),
+        name="seen",
     )
     seen.state(graph, x)
     truth = np.tile(STATE.identity(), (4, 1))
@@ -495,7 +501,7 @@ def test_a_refused_sensor_leaves_the_graph_as_it_was() -> None:
     before = str(graph)
     with pytest.raises(fg.GraphError, match="sigma"):
         StampedMeasurements(lambda x, z: x[:, :2] - z, 2, capacity=1, sigma=-1.0, name="fixes").state(graph, x)
-    for wrong in ({"offset": "clock"}, {"statics": ("x", "mark")}):
+    for wrong in ({"offset": "clock"}, {"constants": ("x", "mark")}):
         role, name = next((key, value if isinstance(value, str) else value[1]) for key, value in wrong.items())
         fixes = StampedMeasurements(place, 2, capacity=1, sigma=1.0, name="fixes", **wrong)
         with pytest.raises(ModelError, match=f"'fixes': {role}= names '{name}', .*there are: 'x', 'bias'"):
@@ -575,7 +581,7 @@ def test_ranges_of_a_lawn_mower_between_sparse_nodes(shared_data: Path) -> None:
     off = {}
     for name, stamps in (("interpolated", ranges[:, 0]), ("nearest", nearest)):
         sensor = StampedMeasurements(
-            error, 3, capacity=20, sigma=0.7, statics=("long",), robust=fg.Huber(1.345), name=name
+            error, 3, capacity=20, sigma=0.7, constants=("long",), robust=fg.Huber(1.345), name=name
         )
         sensor.state(graph, x)
         sensor.add(stamps, values)

@@ -15,31 +15,31 @@ import pytest
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_signals import RAMPS, DriveSignals
-from unifg.scenarios.driving.last_stop import LastStop
-from unifg.scenarios.driving.motor_lag import MotorLag
-from unifg.scenarios.driving.relocalise import PORTION, Found, Relocaliser
 from unifg.scenarios.flight import Flight, FlightSettings
-from unifg.scenarios.flying.flight_watch import FlightWatch
-from unifg.scenarios.flying.unmodelled import Unmodelled
+from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
+from unifg.scenarios.ground.emergency_stop import EmergencyStop
+from unifg.scenarios.ground.motor_lag import MotorLag
+from unifg.scenarios.ground.relocalise import PORTION, Found, Relocaliser
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics
+from unifg.scenarios.monitoring.supervisor import RISE, STEADY, Health, Ramp, Supervisor
+from unifg.scenarios.monitoring.validation import Door
 from unifg.scenarios.navigation import Episode, NavigationSettings, askew
-from unifg.scenarios.seeing.belief import Belief, Landmarks
-from unifg.scenarios.seeing.line_tracker import LineTracker
-from unifg.scenarios.seeing.readings import Reading, Scan
+from unifg.scenarios.perception.belief import Belief, Landmarks
+from unifg.scenarios.perception.line_tracker import LineTracker
+from unifg.scenarios.perception.readings import Reading, Scan
+from unifg.scenarios.quadrotor.flight_watch import FlightWatch
+from unifg.scenarios.quadrotor.unmodelled import Unmodelled
 from unifg.scenarios.show.flight_plot import control
 from unifg.scenarios.show.flight_scene import flight_scene
-from unifg.scenarios.supervision.door import Door
-from unifg.scenarios.supervision.supervisor import RISE, STEADY, Health, Ramp, Supervisor
-from unifg.scenarios.worlds.air import QuadrotorWorld
-from unifg.scenarios.worlds.building import building_map
-from unifg.scenarios.worlds.drivetrain import Drivetrain, Wheels
-from unifg.scenarios.worlds.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault, one_of
-from unifg.scenarios.worlds.layouts import corridor
-from unifg.scenarios.worlds.plane import World
+from unifg.scenarios.simulation.air import QuadrotorWorld
+from unifg.scenarios.simulation.building import building_map
+from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
+from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault, one_of
+from unifg.scenarios.simulation.layouts import corridor
+from unifg.scenarios.simulation.plane import World
 from unifg.typing import Array
 
 BEAMS = 360
@@ -276,7 +276,7 @@ def test_numbers_that_no_motor_has_are_refused_and_ticks_without_any_say_nothing
 
 # ----------------------------------------------------------------- the last stop
 
-STOP = LastStop(0.17, 2.5, DT)
+STOP = EmergencyStop(0.17, 2.5, DT)
 
 
 def ahead(distance: float, half: float = 0.15, base: float = 5.0) -> Scan:

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers.rehearsal import rehearse
 from unifg.elimination import analysis, factorization
-from unifg.program.systems import KEPT
+from unifg.problem.systems import KEPT
+from unifg.solution.warmup_run import rehearse
 from unifg.solvers import (
     KKT,
     SQP,

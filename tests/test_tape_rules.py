@@ -9,10 +9,10 @@ import pytest
 import scipy.special
 
 from test_derive import curved, evaluated
-from unifg.kernels.derive import symbols
-from unifg.kernels.derive.expression import Expression, traced
-from unifg.kernels.derive.operations import GROUPED, STEADY, UNARY, Op
-from unifg.kernels.derive.tape import Tape
+from unifg.factors.autodiff import symbols
+from unifg.factors.autodiff.expression import Expression, traced
+from unifg.factors.autodiff.operations import GROUPED, STEADY, UNARY, Op
+from unifg.factors.autodiff.tape import Tape
 from unifg.lie import Rn
 
 mp = pytest.importorskip("mpmath")

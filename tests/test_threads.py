@@ -14,8 +14,8 @@ import pytest
 import unifg as fg
 from backends import BACKENDS, LENGTH, Walk, goal_of
 from test_horizon_hostile import loop_of, window_of
+from unifg.codegen.jit import compiled
 from unifg.errors import BackendError
-from unifg.machine.jit import compiled
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array
 

@@ -17,13 +17,13 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
-from unifg.kernels.derive.derived import derived
-from unifg.kernels.derive.reach import reach_of
-from unifg.kernels.derive.rows import Each, Shared
-from unifg.kernels.derive.symbols import TraceError
-from unifg.program import term
-from unifg.program.curvature import lagrangian_hessian
-from unifg.program.term import CHANGES
+from unifg.factors.autodiff.captured import captured_by
+from unifg.factors.autodiff.derived import derived
+from unifg.factors.autodiff.rows import Each, Shared
+from unifg.factors.autodiff.symbols import TraceError
+from unifg.problem import term
+from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.term import CHANGES
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint
 from unifg.typing import Array
 
@@ -556,7 +556,7 @@ def test_functions_that_compute_the_same_share_a_kernel() -> None:
         return lambda x: x - by
 
     def kernel(function: Function) -> Any:
-        return derived(function, (fg.Rn(2),), reach_of(function))
+        return derived(function, (fg.Rn(2),), captured_by(function))
 
     one, same, other = kernel(offset(1.0)), kernel(offset(1.0)), kernel(offset(2.0))
     assert one is same and one is not other
@@ -565,7 +565,9 @@ def test_functions_that_compute_the_same_share_a_kernel() -> None:
 
 def test_what_cannot_be_told_apart_is_not_shared() -> None:
     function = lambda x: x * (0.0 if DRAW is None else 2.0)  # noqa: E731
-    assert derived(function, (fg.Rn(2),), reach_of(function)) is not derived(function, (fg.Rn(2),), reach_of(function))
+    assert derived(function, (fg.Rn(2),), captured_by(function)) is not derived(
+        function, (fg.Rn(2),), captured_by(function)
+    )
 
 
 DRAW = np.random.default_rng(1)
@@ -573,7 +575,7 @@ DRAW = np.random.default_rng(1)
 
 def test_a_kernel_is_pickled_with_its_tape() -> None:
     function = lambda x, t: np.sin(x) * t  # noqa: E731
-    kernel = derived(function, (fg.Rn(2), Each((2,))), reach_of(function))
+    kernel = derived(function, (fg.Rn(2), Each((2,))), captured_by(function))
     before = kernel.address
     copy = pickle.loads(pickle.dumps(kernel))
     assert "address" not in copy.__dict__
@@ -617,8 +619,8 @@ def test_second_derivatives_wait_until_somebody_asks() -> None:
 
 def test_straight_rows_have_no_second_derivatives() -> None:
     function = lambda x, t: 3.0 * x - x[:, ::-1] * t  # noqa: E731
-    assert derived(function, (fg.Rn(2), Shared(())), reach_of(function)).linear
-    assert not derived(lambda x: x**2, (fg.Rn(2),), reach_of(lambda x: x**2)).linear
+    assert derived(function, (fg.Rn(2), Shared(())), captured_by(function)).linear
+    assert not derived(lambda x: x**2, (fg.Rn(2),), captured_by(lambda x: x**2)).linear
 
 
 def test_threads_trace_at_once() -> None:
@@ -643,7 +645,7 @@ def test_a_function_that_would_take_seconds_to_compile_is_left_alone() -> None:
         return x
 
     with pytest.raises(TraceError, match="numbers for one factor"):
-        derived(long, (fg.Rn(1),), reach_of(long))
+        derived(long, (fg.Rn(1),), captured_by(long))
 
 
 # ---------------------------------------------------------------- the same answers as by differences

@@ -16,8 +16,8 @@ from unifg.models.distance_map import DistanceMap
 from unifg.scenarios import navigation
 from unifg.scenarios.episode import run_ticks, silent
 from unifg.scenarios.navigation import Episode, NavigationSettings
-from unifg.scenarios.worlds.plane import LidarModel, World
-from unifg.scenarios.worlds.traffic import Person, Traffic, draw_traffic
+from unifg.scenarios.simulation.plane import LidarModel, World
+from unifg.scenarios.simulation.traffic import Person, Traffic, draw_traffic
 from unifg.typing import Array
 
 PAUSE = 0.005

@@ -13,11 +13,11 @@ from scipy import ndimage
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.ways.grid import plan
-from unifg.scenarios.ways.polyline import polyline_distance
-from unifg.scenarios.worlds.placement import PlacementRules, place_obstacles
-from unifg.scenarios.worlds.plane import World
-from unifg.scenarios.worlds.space import Obstacle
+from unifg.scenarios.planning.grid import plan
+from unifg.scenarios.planning.polyline import polyline_distance
+from unifg.scenarios.simulation.placement import PlacementRules, place_obstacles
+from unifg.scenarios.simulation.plane import World
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
 START = np.array([1.0, 1.5, 0.0])

@@ -17,6 +17,7 @@ from scenes import check_offline, commands_of, data_of, tracks_of
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios import command, velocity_tracking
+from unifg.scenarios.planning.speed_profile import drive_cycle, read_profile
 from unifg.scenarios.show import velocity_plot as velocity_tracking_plots
 from unifg.scenarios.show.velocity_scene import velocity_scene
 from unifg.scenarios.velocity_tracking import (
@@ -27,7 +28,6 @@ from unifg.scenarios.velocity_tracking import (
     state_problem,
     table,
 )
-from unifg.scenarios.ways.speed_profile import drive_cycle, read_profile
 from unifg.solvers import KKT, AugmentedLagrangian, GaussNewton, names
 from unifg.typing import Array
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.answers import solver as frame
-from unifg.kernels.derive import symbols
-from unifg.kernels.derive.calculus import jacobian
-from unifg.kernels.derive.operations import Op
-from unifg.program import term
+from unifg.factors.autodiff import symbols
+from unifg.factors.autodiff.calculus import jacobian
+from unifg.factors.autodiff.operations import Op
+from unifg.problem import term
+from unifg.solution import solver as frame
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt
 from unifg.typing import Array
 
@@ -92,8 +92,8 @@ def test_a_wrong_derivative_at_the_answer_is_found(solver: fg.Solver, monkeypatc
         own = any(tape.op[i] == Op.TANH for i in tape.live(rows))
         return {place: tape.apply(Op.ADD, node, node) if own else node for place, node in slopes.items()}
 
-    monkeypatch.setattr("unifg.kernels.derive.expression.jacobian", doubled)
-    monkeypatch.setattr("unifg.kernels.derive.expression._WRITERS", "")
+    monkeypatch.setattr("unifg.factors.autodiff.expression.jacobian", doubled)
+    monkeypatch.setattr("unifg.factors.autodiff.expression._WRITERS", "")
     graph, x, target = stated(lambda x: np.tanh(x), constrained=False)
     solution = solver.solve(graph, {x: np.full((N, 1), 0.1)}, data={target: np.full((N, 1), 2.5)})
     assert "derivatives differ" in solution.mistraced["own"] and solution.converged
@@ -122,8 +122,8 @@ def test_derivatives_are_compared_when_asked_and_along_another_direction_each_ti
     def doubled(tape: Any, rows: Any, width: int) -> Any:
         return {place: tape.apply(Op.ADD, node, node) for place, node in jacobian(tape, rows, width).items()}
 
-    monkeypatch.setattr("unifg.kernels.derive.expression.jacobian", doubled)
-    monkeypatch.setattr("unifg.kernels.derive.expression._WRITERS", "")
+    monkeypatch.setattr("unifg.factors.autodiff.expression.jacobian", doubled)
+    monkeypatch.setattr("unifg.factors.autodiff.expression._WRITERS", "")
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(1), N)
     graph.minimize(lambda x: np.sinh(x) * 0.5, x, name="own")

@@ -15,7 +15,7 @@ def test_a_lambda_reaches_a_front_in_few_hand_overs() -> None:
     assert len(walk.files) <= FILES, sorted(walk.files)
     assert walk.hand_overs <= HAND_OVERS, spelled(walk)
     calls = set(walk.calls)
-    assert ("unifg/language/statement.py", "complete", "unifg/kernels/residuals.py", "as_residual") in calls
+    assert ("unifg/modeling/model.py", "complete", "unifg/factors/residuals.py", "as_residual") in calls
     assert any(callee == "unifg/elimination/analysis.py" and what == "analyse" for _, _, callee, what in calls)
 
 

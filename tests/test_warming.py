@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from unifg import warming
-from unifg.machine.tally import tally
+from unifg import precompile
+from unifg.codegen.compile_counter import tally
 from unifg.scenarios import command
 from unifg.scenarios.commands import warm
 
@@ -17,7 +17,7 @@ from unifg.scenarios.commands import warm
 @pytest.fixture
 def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List of the jobs done, each of which leaves one file in a cache of its own."""
-    monkeypatch.setattr(warming, "folder_of", lambda function: tmp_path / "cache")
+    monkeypatch.setattr(precompile, "folder_of", lambda function: tmp_path / "cache")
     return []
 
 
@@ -30,8 +30,8 @@ def warmed(done: list[str], kept: Path) -> list[float]:
         done.append("keep")
 
     told: list[float] = []
-    works: list[warming.Job] = [("keep", keep), ("more", lambda: done.append("more"))]
-    warming.perform("some", lambda: works, lambda share, title: told.append(share))
+    works: list[precompile.Job] = [("keep", keep), ("more", lambda: done.append("more"))]
+    precompile.perform("some", lambda: works, lambda share, title: told.append(share))
     return told
 
 
@@ -41,7 +41,7 @@ def test_what_is_there_is_left_alone(done: list[str], tmp_path: Path, monkeypatc
     assert warmed(done, kept) == [] and len(done) == 2
     kept.unlink()  # somebody has emptied the cache
     assert warmed(done, kept) and len(done) == 4
-    monkeypatch.setattr(warming, "processor", lambda: "of another machine")
+    monkeypatch.setattr(precompile, "processor", lambda: "of another machine")
     assert warmed(done, kept) and len(done) == 6
     (mark,) = (tmp_path / "cache").iterdir()
     mark.write_text("cut o", encoding="utf-8")
@@ -54,12 +54,12 @@ def test_a_cache_that_cannot_be_written_is_no_error(done: list[str], tmp_path: P
 
 
 def test_every_job_has_a_title_and_every_mode_is_rehearsed() -> None:
-    titles = [title for title, _ in warming.jobs()]
+    titles = [title for title, _ in precompile.jobs()]
     assert len(titles) == len(set(titles)) and all(titles)
     assert {"InteriorPoint", "SQP graph", "SQP exact", "AugmentedLagrangian", "group SE3", "models"} <= set(titles)
 
 
-@pytest.mark.parametrize("changed", [[], ["unifg/program/passes.py"]])
+@pytest.mark.parametrize("changed", [[], ["unifg/problem/evaluation.py"]])
 def test_the_command_says_what_the_archive_is_behind(
     changed: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -78,7 +78,7 @@ class Missing(MetaPathFinder):
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 sys.meta_path.insert(0, Missing())
-from unifg.machine.tally import Tally
+from unifg.codegen.compile_counter import Tally
 from unifg.scenarios import command
 from unifg.scenarios.commands import warm
 

@@ -11,10 +11,10 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
-from unifg.scenarios.ways.polyline import polyline_distance
-from unifg.scenarios.worlds.plane import LidarModel, OdometryModel, World
-from unifg.scenarios.worlds.rectangles import surface_cells, wall_rectangles
-from unifg.scenarios.worlds.space import Obstacle
+from unifg.scenarios.planning.polyline import polyline_distance
+from unifg.scenarios.simulation.plane import LidarModel, OdometryModel, World
+from unifg.scenarios.simulation.rectangles import surface_cells, wall_rectangles
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array, BoolArray
 
 QUIET = LidarModel(sigma=0.0, dropout=0.0)

@@ -1,7 +1,7 @@
 """Do the tests notice when a decision is changed? Mutants of the decisions' files, each run against its tests.
 
     python -m tools.mutants                            every file of TARGETS (hours)
-    python -m tools.mutants scenarios/driving/drive_past.py   one file
+    python -m tools.mutants scenarios/ground/drive_past.py   one file
     python -m tools.mutants --share 0.3 --seed 1 ...   a drawn share of the mutants of each file
 
 Everything happens in a scratch copy of the checkout. The tests of a file run once with every line they touch recorded;
@@ -41,12 +41,12 @@ EARLY = 60.0  # [s]
 
 # Decisions, and the tests that are to notice when they change.
 TARGETS: dict[str, tuple[str, ...]] = {
-    "unifg/answers/check.py": ("answers", "refusals", "graph"),
-    "unifg/answers/covariance.py": ("answers", "covariance", "graph"),
-    "unifg/answers/optimality.py": ("kkt", "infeasible", "solvers", "refusals"),
-    "unifg/answers/marginal.py": ("answers", "marginal_prior"),
-    "unifg/answers/shift.py": ("answers", "binding", "graph"),
-    "unifg/answers/solution.py": (
+    "unifg/solution/check.py": ("answers", "refusals", "graph"),
+    "unifg/solution/covariance.py": ("answers", "covariance", "graph"),
+    "unifg/solution/optimality.py": ("kkt", "infeasible", "solvers", "refusals"),
+    "unifg/solution/marginal.py": ("answers", "marginal_prior"),
+    "unifg/solution/warm_start.py": ("answers", "binding", "graph"),
+    "unifg/solution/solution.py": (
         "answers",
         "residual_history",
         "covariance",
@@ -56,7 +56,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "binding",
         "plots",
     ),
-    "unifg/answers/solver.py": (
+    "unifg/solution/solver.py": (
         "answers",
         "early_ends",
         "interior_point",
@@ -65,15 +65,15 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "infeasible",
         "own_backend",
     ),
-    "unifg/kernels/derive/array_functions.py": ("derive_kinds", "derive_numpy", "tape_rules"),
-    "unifg/kernels/derive/calculus.py": ("tape_rules", "derive"),
-    "unifg/kernels/derive/reach.py": ("traced_terms", "derive_kinds"),
-    "unifg/kernels/derive/rows.py": ("rows", "traced_terms"),
-    "unifg/kernels/derive/symbols.py": ("derive_kinds", "derive_numpy", "rows"),
-    "unifg/kernels/derive/tape.py": ("tape_rules", "derive", "derive_kinds"),
-    "unifg/kernels/derive/trace.py": ("traced_terms", "derive_kinds", "rows"),
-    "unifg/program/traced.py": ("rows", "traced_terms"),
-    "unifg/program/verification.py": ("verification",),
+    "unifg/factors/autodiff/array_functions.py": ("derive_kinds", "derive_numpy", "tape_rules"),
+    "unifg/factors/autodiff/calculus.py": ("tape_rules", "derive"),
+    "unifg/factors/autodiff/captured.py": ("traced_terms", "derive_kinds"),
+    "unifg/factors/autodiff/rows.py": ("rows", "traced_terms"),
+    "unifg/factors/autodiff/symbols.py": ("derive_kinds", "derive_numpy", "rows"),
+    "unifg/factors/autodiff/tape.py": ("tape_rules", "derive", "derive_kinds"),
+    "unifg/factors/autodiff/trace.py": ("traced_terms", "derive_kinds", "rows"),
+    "unifg/problem/traced.py": ("rows", "traced_terms"),
+    "unifg/problem/verification.py": ("verification",),
     "unifg/pose_graphs/certificate.py": ("certificate",),
     "unifg/pose_graphs/consistency.py": ("consistency",),
     "unifg/pose_graphs/initialise.py": ("pose_graphs", "spanning"),
@@ -93,15 +93,15 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "unifg/smoothing/marginalize.py": ("fixed_lag", "smoothing_factors"),
     "unifg/smoothing/smoother.py": ("incremental", "smoothing_factors"),
     "unifg/smoothing/update.py": ("incremental",),
-    "unifg/language/inventory.py": ("statements",),
-    "unifg/language/statement.py": ("statements", "refusals", "graph", "errors"),
-    "unifg/language/trial.py": ("statements", "refusals", "kernels"),
-    "unifg/language/variables.py": ("statements", "refusals", "graph"),
-    "unifg/language/weights.py": ("statements", "refusals"),
+    "unifg/modeling/summary.py": ("statements",),
+    "unifg/modeling/model.py": ("statements", "refusals", "graph", "errors"),
+    "unifg/modeling/probing.py": ("statements", "refusals", "kernels"),
+    "unifg/modeling/variables.py": ("statements", "refusals", "graph"),
+    "unifg/modeling/weights.py": ("statements", "refusals"),
     "unifg/plots/descent.py": ("plots",),
     "unifg/plots/factor_graph.py": ("plots",),
     "unifg/plots/shown.py": ("plots",),
-    "unifg/program/binding.py": ("binding", "graph", "refusals"),
+    "unifg/problem/binding.py": ("binding", "graph", "refusals"),
     "solvers/augmented_lagrangian.py": ("augmented_lagrangian", "answers", "solvers", "infeasible", "least_violation"),
     "solvers/interior_point/barrier.py": ("interior_point", "solvers", "infeasible"),
     "solvers/interior_point/direction.py": ("interior_point", "solvers"),
@@ -112,7 +112,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "solvers/graduated_non_convexity.py": ("robust",),
     "solvers/interior_point/method.py": ("interior_point", "elastic", "early_ends", "solvers", "infeasible"),
     "solvers/kkt.py": ("kkt", "answers", "solvers", "infeasible"),
-    "solvers/globalize/least_violation.py": ("infeasible", "solvers"),
+    "solvers/globalize/feasibility_restoration.py": ("infeasible", "solvers"),
     "solvers/penalty.py": ("penalty", "solvers"),
     "solvers/augmented_objective.py": ("augmented_lagrangian", "solvers"),
     "solvers/augmented_usual.py": ("augmented_lagrangian", "solvers"),
@@ -130,23 +130,23 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "solvers",
         "infeasible",
     ),
-    "scenarios/driving/drive_control.py": ("control_decisions", "navigation", "joint"),
-    "scenarios/driving/drive_parts.py": ("control_decisions", "navigation", "joint"),
-    "scenarios/driving/drive_settings.py": ("control_decisions", "navigation", "joint"),
-    "scenarios/driving/drive_past.py": ("control_decisions", "joint"),
-    "scenarios/driving/localiser.py": ("navigation",),
+    "scenarios/ground/drive_control.py": ("control_decisions", "navigation", "joint"),
+    "scenarios/ground/drive_parts.py": ("control_decisions", "navigation", "joint"),
+    "scenarios/ground/drive_settings.py": ("control_decisions", "navigation", "joint"),
+    "scenarios/ground/drive_past.py": ("control_decisions", "joint"),
+    "scenarios/ground/localiser.py": ("navigation",),
     "scenarios/navigation.py": ("navigation",),
-    "scenarios/seeing/disc_tracker.py": ("perception", "control_decisions"),
-    "scenarios/driving/drive_pilot.py": ("navigation", "joint"),
-    "scenarios/ways/grid.py": ("planner", "route"),
-    "scenarios/driving/route.py": ("route", "navigation"),
-    "unifg/horizon/control_loop.py": ("horizon", "examples", "control_decisions", "quadrotor_decisions"),
-    "unifg/horizon/coupled.py": ("horizon", "joint"),
+    "scenarios/perception/disc_tracker.py": ("perception", "control_decisions"),
+    "scenarios/ground/drive_pilot.py": ("navigation", "joint"),
+    "scenarios/planning/grid.py": ("planner", "route"),
+    "scenarios/ground/route.py": ("route", "navigation"),
+    "unifg/horizon/receding_horizon.py": ("horizon", "examples", "control_decisions", "quadrotor_decisions"),
+    "unifg/horizon/coupling.py": ("horizon", "joint"),
     "unifg/horizon/decision.py": ("horizon", "control_decisions"),
     "unifg/horizon/past.py": ("horizon", "joint", "quadrotor_estimator"),
-    "unifg/horizon/recorded.py": ("horizon",),
+    "unifg/horizon/history.py": ("horizon",),
     "unifg/horizon/robot.py": ("horizon",),
-    "unifg/horizon/statements.py": ("horizon", "examples"),
+    "unifg/horizon/terms.py": ("horizon", "examples"),
     "unifg/horizon/window.py": ("horizon", "joint", "quadrotor_estimator"),
     "scenarios/log/columns.py": ("metrics",),
     "scenarios/options.py": ("cli",),
@@ -155,26 +155,26 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "unifg/view/recording.py": ("view", "scene", "quadrotor_scene"),
     "unifg/view/stage.py": ("scene", "quadrotor_scene"),
     "unifg/view/things.py": ("view",),
-    "scenarios/worlds/placement.py": ("unforeseen",),
-    "scenarios/flying/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),
-    "scenarios/seeing/association.py": ("quadrotor_estimator", "quadrotor_world"),
-    "scenarios/flying/braking.py": ("quadrotor_controller",),
-    "scenarios/flying/flight_control.py": ("quadrotor_decisions", "quadrotor_controller"),
-    "scenarios/flying/flight_parts.py": ("quadrotor_decisions", "quadrotor_controller"),
-    "scenarios/flying/estimator.py": ("quadrotor_estimator", "quadrotor_joint"),
-    "scenarios/flying/guide.py": ("quadrotor_controller", "quadrotor_layouts"),
-    "scenarios/flying/flight_joint.py": ("quadrotor_decisions", "quadrotor_joint"),
+    "scenarios/simulation/placement.py": ("unforeseen",),
+    "scenarios/quadrotor/arrival.py": ("quadrotor_mpc", "quadrotor_flights"),
+    "scenarios/perception/association.py": ("quadrotor_estimator", "quadrotor_world"),
+    "scenarios/quadrotor/braking.py": ("quadrotor_controller",),
+    "scenarios/quadrotor/flight_control.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/quadrotor/flight_parts.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/quadrotor/estimator.py": ("quadrotor_estimator", "quadrotor_joint"),
+    "scenarios/quadrotor/guide.py": ("quadrotor_controller", "quadrotor_layouts"),
+    "scenarios/quadrotor/flight_joint.py": ("quadrotor_decisions", "quadrotor_joint"),
     "scenarios/course.py": ("quadrotor_obstacles",),
-    "scenarios/flying/flight_settings.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/quadrotor/flight_settings.py": ("quadrotor_decisions", "quadrotor_controller"),
     "scenarios/show/flight_scene.py": ("quadrotor_scene",),
-    "scenarios/flying/slots.py": ("quadrotor_decisions", "quadrotor_controller"),
-    "scenarios/seeing/line_tracker.py": ("quadrotor_estimator", "quadrotor_world"),
-    "scenarios/flying/flight_past.py": ("quadrotor_estimator", "quadrotor_joint"),
+    "scenarios/quadrotor/slots.py": ("quadrotor_decisions", "quadrotor_controller"),
+    "scenarios/perception/line_tracker.py": ("quadrotor_estimator", "quadrotor_world"),
+    "scenarios/quadrotor/flight_past.py": ("quadrotor_estimator", "quadrotor_joint"),
 }
 
 
 @dataclass(frozen=True)
-class Verdict:
+class OutlierReport:
     """What became of a mutant: "killed", "survived", or "unseen" when no test touches its line."""
 
     mutation: Mutation
@@ -248,13 +248,13 @@ class Hunt:
         self.source = self.file.read_text(encoding="utf-8")
         self.times = self.file.stat()
 
-    def judge(self, mutation: Mutation) -> Verdict:
+    def judge(self, mutation: Mutation) -> OutlierReport:
         """Run the tests that touch a mutant's line, then, if they pass, all others."""
         begin = time.monotonic()
         first = self.seen.tests(None if mutation.compiled else self._lines(mutation))
         others = [test for test in self.seen.tests(None) if test not in set(first)]
         if not first:
-            return Verdict(mutation, "unseen", 0.0)
+            return OutlierReport(mutation, "unseen", 0.0)
         self.file.write_text(mutation.applied(self.source), encoding="utf-8")
         try:
             passed = all(
@@ -265,7 +265,7 @@ class Hunt:
         finally:
             self.file.write_text(self.source, encoding="utf-8")
             os.utime(self.file, ns=(self.times.st_atime_ns, self.times.st_mtime_ns))
-        return Verdict(mutation, "survived" if passed else "killed", time.monotonic() - begin)
+        return OutlierReport(mutation, "survived" if passed else "killed", time.monotonic() - begin)
 
     def _lines(self, mutation: Mutation) -> range:
         """A statement over several lines is recorded at some of them."""
@@ -273,7 +273,7 @@ class Hunt:
         return range(mutation.line, last + 1)
 
 
-def hunt(scratch: Path, path: str, share: float, seed: int, skip_compiled: bool, only: str) -> list[Verdict]:
+def hunt(scratch: Path, path: str, share: float, seed: int, skip_compiled: bool, only: str) -> list[OutlierReport]:
     """Judge the mutants of one file, and say what becomes of them."""
     tests = [f"tests/test_{name}.py" for name in TARGETS[path]]
     tests = [test for test in tests if (scratch / test).exists()]

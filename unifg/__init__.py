@@ -15,16 +15,8 @@ from collections.abc import Mapping as _Mapping
 from importlib import metadata as _metadata
 from pathlib import Path as _Path
 
-from unifg.answers.check import Finding, Report
-from unifg.answers.graph import Graph
-from unifg.answers.history import Iteration
-from unifg.answers.optimality import Optimality, optimality
-from unifg.answers.solution import AnyGuess as _AnyGuess
-from unifg.answers.solution import Guess, NotConverged, Solution
-from unifg.answers.solver import Callback as _Callback
-from unifg.answers.solver import Prepared, Solver
-from unifg.answers.status import Status
-from unifg.answers.verdict import Verdict
+from unifg.codegen.jit import compiled
+from unifg.codegen.threads import use_threads
 from unifg.errors import (
     BackendError,
     FileFormatError,
@@ -34,13 +26,10 @@ from unifg.errors import (
     UnifgError,
     ViewError,
 )
-from unifg.kernels.derive.casadi_function import from_casadi
-from unifg.kernels.kernel import Kernel
-from unifg.kernels.residuals import Residual, residual
-from unifg.kernels.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
-from unifg.language.factors import ManifoldResidual, between, difference, prior
-from unifg.language.joint_prior import joint_prior
-from unifg.language.variables import Data, Family, Selection, each, shared
+from unifg.factors.autodiff.casadi_function import from_casadi
+from unifg.factors.kernel import Kernel
+from unifg.factors.residuals import Residual, residual
+from unifg.factors.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
 from unifg.lie import (
     SE2,
     SE3,
@@ -57,9 +46,20 @@ from unifg.lie import (
     elementwise,
     wrap_angle,
 )
-from unifg.machine.jit import compiled
-from unifg.machine.threads import use_threads
+from unifg.modeling.factors import ManifoldResidual, between, difference, prior
+from unifg.modeling.joint_prior import joint_prior
+from unifg.modeling.variables import Data, Family, Selection, each, shared
 from unifg.smoothing import FixedLag, Incremental
+from unifg.solution.check import Finding, Report
+from unifg.solution.graph import Graph
+from unifg.solution.history import Iteration
+from unifg.solution.optimality import Optimality, optimality
+from unifg.solution.outlier_report import OutlierReport
+from unifg.solution.solution import AnyGuess as _AnyGuess
+from unifg.solution.solution import Guess, NotConverged, Solution
+from unifg.solution.solver import Callback as _Callback
+from unifg.solution.solver import Prepared, Solver
+from unifg.solution.status import Status
 from unifg.typing import Numbers as _Numbers
 
 _HERE = _Path(__file__).resolve().parent
@@ -103,6 +103,7 @@ __all__ = [
     "ModelError",
     "NotConverged",
     "Optimality",
+    "OutlierReport",
     "Prepared",
     "Product",
     "Report",
@@ -117,7 +118,6 @@ __all__ = [
     "TruncatedLeastSquares",
     "Tukey",
     "UnifgError",
-    "Verdict",
     "ViewError",
     "between",
     "check_manifold",
@@ -187,7 +187,7 @@ def warmup(progress: _Callable[[float, str], object] | None = None) -> None:
     Args:
         progress: called with the share that is done, and what comes next.
     """
-    from unifg.warming import jobs, perform
+    from unifg.precompile import jobs, perform
 
     perform("library", lambda: list(jobs()), progress)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy.special import gammaincinv
 
+from unifg.atomic_write import write_atomically
 from unifg.scenarios.campaigns.campaign import replay_command
 from unifg.scenarios.campaigns.campaign_plot import outcomes_picture, values_picture
 from unifg.scenarios.campaigns.comparison import by_chance, digits, interval, share
@@ -18,7 +19,6 @@ from unifg.scenarios.campaigns.performed import OK
 from unifg.scenarios.campaigns.sheet import OUTCOMES, Sheet, load
 from unifg.style.figures import write_figure
 from unifg.typing import Array
-from unifg.whole import write_whole
 
 __all__ = ["PAIRED", "Table", "consistency", "differences", "outcome_table", "value_table", "write_report"]
 
@@ -91,8 +91,8 @@ def write_report(folder: Path, against: Path | None = None, any_code: bool = Fal
         _beside(document, sheet, load(against, any_code), shown)
     _failures(document, sheet)
     files = folder / "report.html", folder / "report.md"
-    write_whole(files[0], document.html())
-    write_whole(files[1], document.markdown)
+    write_atomically(files[0], document.html())
+    write_atomically(files[1], document.markdown)
     return list(files)
 
 

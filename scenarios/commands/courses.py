@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from unifg.answers.status import Status
 from unifg.scenarios import course as courses
-from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, in_turn
+from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.course import Course
 from unifg.scenarios.log.metrics import table, write_metrics
@@ -17,6 +16,7 @@ from unifg.scenarios.show.course_log import course_log
 from unifg.scenarios.show.course_plot import picture
 from unifg.scenarios.show.course_scene import course_iterate, course_stage
 from unifg.scenarios.show.flight_scene import flight_scene
+from unifg.solution.status import Status
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "course_metrics", "run", "summary", "write_results"]
@@ -30,7 +30,7 @@ def run(settings: courses.CourseSettings, progress: Progress, announce: Announce
         progress, 0.95, lambda row: f"iteration {row.number}, cost {row.cost:.5g}, violation {row.violation:.1e}"
     )
     with watching_iterates(announce, course_stage(settings), course_iterate) as watch:
-        course = courses.run_course(settings, progress=in_turn(tell, watch))
+        course = courses.run_course(settings, progress=synchronized(tell, watch))
     progress(1.0, "solved")
     interrupted = course.solution.status is Status.INTERRUPTED
     numbers = course_metrics(course)

@@ -20,12 +20,12 @@ import numpy as np
 
 import unifg as fg
 from unifg import models, scenarios, solvers
+from unifg.codegen import precompiled
+from unifg.codegen.jit import folder_of
+from unifg.codegen.objects import read_sealed
+from unifg.codegen.threads import cores
 from unifg.elimination import fronts
 from unifg.errors import UnifgError
-from unifg.machine import shipped
-from unifg.machine.jit import folder_of
-from unifg.machine.objects import read_sealed
-from unifg.machine.threads import cores
 from unifg.scenarios.commands import performance
 from unifg.scenarios.commands.outcome import Progress
 
@@ -110,8 +110,8 @@ def _caches() -> Iterator[Finding]:
         )
     else:
         yield from _cache(_roots(folder))
-    if shipped.archive().usable:
-        changed = shipped.outdated()
+    if precompiled.archive().usable:
+        changed = precompiled.outdated()
         behind = f"; {len(changed)} functions have changed since and are compiled instead" if changed else ""
         yield Finding(
             "caches", f"kernels that come half compiled fit this Python and Numba{behind}", not changed or None

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from unifg.answers.fit import FAR
 from unifg.files.contents import legible
 from unifg.files.g2o import write_g2o
 from unifg.files.tum import write_tum
@@ -18,6 +17,7 @@ from unifg.scenarios import pose_graph
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.log.metrics import table, write_metrics
 from unifg.scenarios.pose_graph import SolvedGraph
+from unifg.solution.fit import FAR
 
 __all__ = ["SETTINGS", "metrics", "run", "summary", "write_results"]
 
@@ -123,7 +123,7 @@ def summary(solved: SolvedGraph) -> str:
     """The outcome as a table of two columns."""
     numbers, verdict, graph = metrics(solved), solved.solution.verdict, solved.after
     more = f", {numbers['landmarks']} landmarks" if numbers["landmarks"] else ""
-    doubted = "loop closures" if solved.settings.robust_on == "closures" else "measurements"
+    flagged = "loop closures" if solved.settings.robust_on == "closures" else "measurements"
     skipped = ", ".join(f"{tag} ({count})" for tag, count in numbers["skipped_lines"].items())
     milliseconds = {name: 1e3 * value for name, value in solved.seconds.items()}
     rows = [
@@ -135,12 +135,12 @@ def summary(solved: SolvedGraph) -> str:
         ),
         ("skipped lines", skipped),
         ("solver, residual", f"{numbers['solver']}, {numbers['residual']}"),
-        ("robust loss", "" if solved.loss is None else f"{solved.loss}, on {doubted}"),
+        ("robust loss", "" if solved.loss is None else f"{solved.loss}, on {flagged}"),
         ("chi2 in the file", f"{numbers['chi2_file']:.9g}" if graph.placed else "it has no poses"),
         ("chi2 at the start", f"{numbers['chi2_start']:.9g} ({numbers['init']})"),
         ("chi2 at the end", f"{numbers['chi2']:.9g}, {numbers['degrees_of_freedom']} degrees of freedom"),
         ("without outliers", f"{numbers['chi2_inliers']:.9g}" if numbers["outliers"] else ""),
-        ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the {doubted}"),
+        ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the {flagged}"),
         ("worst edges", _worst(solved)),
         *(("remark", sentence) for sentence in numbers["remarks"]),
         ("held where it was", ", ".join(f"pose {name}" for name in numbers["anchors_added"][:5])),

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from unifg.answers.status import Status
 from unifg.scenarios import manoeuvres
-from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, in_turn
+from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.options import option
 from unifg.scenarios.show.manoeuvre_plot import picture
 from unifg.scenarios.show.manoeuvre_scene import manoeuvre_iterate, manoeuvre_scene, manoeuvre_stage
+from unifg.solution.status import Status
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run"]
@@ -46,7 +46,7 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
         tell = by_iterations(part, 0.9, lambda row: f"iteration {row.number}, cost {row.cost:.5g}")
         case = manoeuvres.CASES[name]
         with watching_iterates(announce, manoeuvre_stage(case), manoeuvre_iterate) as watch:
-            solved.append(manoeuvres.run_manoeuvre(case, settings.solver, progress=in_turn(tell, watch)))
+            solved.append(manoeuvres.run_manoeuvre(case, settings.solver, progress=synchronized(tell, watch)))
         interrupted = solved[-1].solution.status is Status.INTERRUPTED
         if interrupted:
             break

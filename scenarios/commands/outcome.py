@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from unifg.answers.history import Iteration
+from unifg.solution.history import Iteration
 
-__all__ = ["Outcome", "Progress", "by_iterations", "in_turn"]
+__all__ = ["Outcome", "Progress", "by_iterations", "synchronized"]
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Takes the share that is done, and a word about it; raises KeyboardInterrupt when the user wants to stop."""
@@ -49,7 +49,7 @@ def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], st
     return tell
 
 
-def in_turn(*callbacks: Callable[[Iteration], None]) -> Callable[[Iteration], None]:
+def synchronized(*callbacks: Callable[[Iteration], None]) -> Callable[[Iteration], None]:
     """A callback of a solver that calls others, one after the other."""
 
     def each(row: Iteration) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from unifg.answers.status import Status
 from unifg.scenarios import velocity_tracking
-from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, in_turn
+from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.show.velocity_plot import picture
 from unifg.scenarios.show.velocity_scene import velocity_scene, velocity_stage
+from unifg.solution.status import Status
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run"]
@@ -21,7 +21,7 @@ def run(settings: velocity_tracking.TrackingSettings, progress: Progress, announ
     """Solve the whole drive."""
     tell = by_iterations(progress, 0.7, lambda row: f"iteration {row.number}, cost {2.0 * row.cost:.8g}")
     with watching_iterates(announce, velocity_stage(settings), lambda frame, row: None) as watch:
-        drive = velocity_tracking.run_tracking(settings, progress=in_turn(tell, watch))
+        drive = velocity_tracking.run_tracking(settings, progress=synchronized(tell, watch))
     progress(1.0, "solved")
 
     def write(folder: Path) -> list[Path]:

@@ -7,9 +7,9 @@ from functools import partial
 from pathlib import Path
 
 import unifg as fg
-from unifg.machine import shipped
-from unifg.machine.tally import Tally
-from unifg.warming import Job, Progress, jobs, perform
+from unifg.codegen import precompiled
+from unifg.codegen.compile_counter import Tally
+from unifg.precompile import Job, Progress, jobs, perform
 
 __all__ = ["missing", "outdated", "run", "ship"]
 
@@ -35,21 +35,21 @@ def run(progress: Progress, anew: bool = False) -> Tally:
 def ship(progress: Progress) -> Path:
     """Compile everything anew and write the archive of half compiled kernels that comes with the library."""
     list(_scenarios())  # raises without the extras that they need
-    with shipped.recording() as recorder:
+    with precompiled.recording() as recorder:
         run(progress, anew=True)
-    recorder.write(shipped.ARCHIVE)
-    return shipped.ARCHIVE
+    recorder.write(precompiled.ARCHIVE)
+    return precompiled.ARCHIVE
 
 
 def outdated() -> list[str]:
     """Functions that have changed since the archive was written."""
-    return shipped.outdated()
+    return precompiled.outdated()
 
 
 def _scenarios() -> Iterator[Job]:
     """Jobs of the scenarios, which need extras."""
     from unifg.scenarios import course, flight, manoeuvres, navigation, safe_flight, velocity_tracking
-    from unifg.scenarios.flying.flight_pilot import COUPLINGS
+    from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS
 
     for coupling in ("sequential", "joint"):
         drive = navigation.NavigationSettings(coupling=coupling)

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeAlias
 
-from unifg.answers.history import Iteration
 from unifg.scenarios.log.columns import SoFar, watched
+from unifg.solution.history import Iteration
 from unifg.view import Frame, Live, Scene
 
 __all__ = ["Announce", "watching_iterates", "watching_ticks"]

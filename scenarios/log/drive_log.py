@@ -119,7 +119,7 @@ class EpisodeLog:
     """Of its speed that the robot may use."""
     explained: Array = column("share")
     """Of the beams of the last scan that ended near something on the map."""
-    last_stop: BoolArray = column(dtype=np.bool_)
+    emergency_stop: BoolArray = column(dtype=np.bool_)
     """True where beams alone have slowed the robot below what was planned."""
     fault: list[str] = words()
     """What was made to go wrong just then."""

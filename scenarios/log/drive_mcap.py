@@ -17,12 +17,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from unifg.atomic_write import replacing
 from unifg.files.ros_map import OccupancyMap
 from unifg.scenarios.log.columns import columns
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.metrics import strict
 from unifg.typing import Array
-from unifg.whole import beside
 
 __all__ = ["write_mcap"]
 
@@ -65,7 +65,7 @@ def write_mcap(path: str | os.PathLike[str], log: EpisodeLog) -> None:
         from mcap.writer import Writer
     except ImportError as error:
         raise ImportError("writing MCAP needs the package mcap: pip install 'unifg[mcap]'") from error
-    with beside(path) as own, open(own, "wb") as file:
+    with replacing(path) as own, open(own, "wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="unifg")
         schemas = {name: _schema(name, log) for name in dict.fromkeys(_TOPICS.values())}

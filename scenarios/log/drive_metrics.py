@@ -11,7 +11,7 @@ from unifg.errors import ScenarioError
 from unifg.lie import SE2, wrap_angle
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.metrics import spread, statistics, timing
-from unifg.scenarios.ways.polyline import path_length
+from unifg.scenarios.planning.polyline import path_length
 from unifg.typing import Array
 
 __all__ = ["consistency", "episode_metrics", "nees", "pose_errors"]
@@ -77,7 +77,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "health": {state: log.health.count(state) for state in ("ok", "degraded", "lost")},
         "causes": dict(sorted(Counter(cause for cause in log.cause if cause).items())),
         "dropped_samples": dict(sorted(log.dropped.items())),
-        "last_stops": int(np.count_nonzero(log.last_stop)),
+        "last_stops": int(np.count_nonzero(log.emergency_stop)),
         "explained_share": {"mean": float(np.mean(log.explained)), "min": float(np.min(log.explained))},
         "tick_ms": timing(log.tick_ms),
         **statistics(log),

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unifg.atomic_write import replacing
 from unifg.errors import FileFormatError
 from unifg.scenarios.log.columns import column, ragged, words
-from unifg.scenarios.worlds.layouts import Layout
+from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
-from unifg.whole import beside
 
 __all__ = ["FlightLog", "LandmarkRow"]
 
@@ -144,7 +144,7 @@ class FlightLog:
             arrays[f"{name}_lengths"] = np.array([len(part) for part in parts], dtype=np.int64)
         rest = {name: getattr(self, name) for name in _WORDS}
         rest |= {"version": _VERSION, "layout_name": self.layout.name}
-        with beside(path) as own, open(own, "wb") as file:  # numpy adds a suffix to a name, not to a file
+        with replacing(path) as own, open(own, "wb") as file:  # numpy adds a suffix to a name, not to a file
             np.savez_compressed(file, words=np.array(json.dumps(rest)), **arrays)
 
     @staticmethod

@@ -12,7 +12,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.metrics import errors as norms
 from unifg.scenarios.log.metrics import statistics, timing
-from unifg.scenarios.worlds.layouts import Layout
+from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array, BoolArray
 
 __all__ = [

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from unifg.atomic_write import write_atomically
 from unifg.scenarios.log.columns import columns
 from unifg.typing import Array, IntArray
-from unifg.whole import write_whole
 
 __all__ = [
     "collision_words",
@@ -84,7 +84,7 @@ def write_metrics(path: str | Path, metrics: Mapping[str, object], *, sort_keys:
     """
     path = Path(path)
     text = json.dumps(strict(metrics), indent=2, sort_keys=sort_keys, allow_nan=False)
-    write_whole(path, text + "\n")
+    write_atomically(path, text + "\n")
     return path
 
 

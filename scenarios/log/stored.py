@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from unifg.atomic_write import replacing
 from unifg.errors import FileFormatError
 from unifg.scenarios.log.columns import columns
-from unifg.whole import beside
 
 __all__ = ["load_columns", "save_columns"]
 
@@ -43,7 +43,7 @@ def save_columns(path: str | os.PathLike[str], log: Any, kind: str, known: dict[
     arrays |= {name: value for name, value in known.items() if isinstance(value, np.ndarray)}
     rest = {name: value for name, value in known.items() if not isinstance(value, np.ndarray)}
     about = {"kind": kind, "units": {name: column.unit for name, column in columns(log).items()}, **rest}
-    with beside(path) as own, open(own, "wb") as file:  # numpy adds a suffix to a name, not to a file
+    with replacing(path) as own, open(own, "wb") as file:  # numpy adds a suffix to a name, not to a file
         np.savez_compressed(file, about=np.array(json.dumps(about)), **arrays)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.rivals.dynamic_window import DynamicWindow
 from unifg.scenarios.rivals.elastic_band import ElasticBand
 from unifg.scenarios.rivals.local_planner import LocalPlanner

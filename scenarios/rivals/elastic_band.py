@@ -21,9 +21,9 @@ import unifg as fg
 from unifg.lie import wrap_angle
 from unifg.models import obstacles
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.perception.tracks import nearest
 from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
-from unifg.scenarios.seeing.tracks import nearest
 from unifg.solvers import LevenbergMarquardt
 from unifg.typing import Array
 

@@ -20,8 +20,8 @@ from unifg.horizon import Plan
 from unifg.lie import wrap_angle
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_settings import ControllerSettings
-from unifg.scenarios.seeing.tracks import Tracks
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.perception.tracks import Tracks
 from unifg.typing import Array, BoolArray
 
 __all__ = ["LocalPlanner", "Situation", "Wish"]

@@ -26,7 +26,7 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2, wrap_angle
 from unifg.models import lidar, unicycle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.seeing.readings import Scan
+from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["MonteCarlo", "MonteCarloSettings", "needed"]

@@ -15,7 +15,7 @@ import numpy as np
 
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.driving.drive_settings import ControllerSettings
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
 from unifg.scenarios.rivals.sampled_drives import driven, nearest_on
 from unifg.typing import Array

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.scenarios.ways.flat_path import Flown
+from unifg.scenarios.planning.flat_path import Flown
 from unifg.typing import Array
 
 __all__ = ["CascadeSettings", "Track"]

@@ -19,7 +19,7 @@ import numpy as np
 
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.scenarios.ways.flat_path import Flown
+from unifg.scenarios.planning.flat_path import Flown
 from unifg.typing import Array
 
 __all__ = ["TUNED", "FlatnessController", "Gains", "flat_flight"]

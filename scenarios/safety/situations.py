@@ -11,8 +11,8 @@ from typing import Literal, TypeAlias, get_args
 import numpy as np
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.ways.flat_path import FigureEight, FlatPath, Hover, Line
-from unifg.scenarios.worlds.bodies import Bodies, Body, Ellipse, Shuttle, Still, Thrown
+from unifg.scenarios.planning.flat_path import FigureEight, FlatPath, Hover, Line
+from unifg.scenarios.simulation.bodies import Bodies, Body, Ellipse, Shuttle, Still, Thrown
 
 __all__ = ["SITUATIONS", "Kind", "Situation", "situation"]
 

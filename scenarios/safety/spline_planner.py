@@ -19,8 +19,8 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
-from unifg.scenarios.safety.keeper import Obstacles
-from unifg.scenarios.ways.flat_path import Flown, Line
+from unifg.scenarios.planning.flat_path import Flown, Line
+from unifg.scenarios.safety.cbf_mpc import Obstacles
 from unifg.typing import Array
 
 __all__ = ["SplinePath", "SplineSettings", "around"]

@@ -18,8 +18,8 @@ import numpy as np
 
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.scenarios.worlds.body_rate import BodyRatePlant
-from unifg.scenarios.worlds.disturbance import DisturbanceModel
+from unifg.scenarios.simulation.body_rate import BodyRatePlant
+from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.typing import Array
 
 __all__ = ["FilterStatistics", "StateFilter"]

@@ -6,7 +6,7 @@ import numpy as np
 
 from unifg.scenarios.course import Course
 from unifg.scenarios.log.flight_log import FlightLog, LandmarkRow
-from unifg.scenarios.worlds.air import VEHICLE_RADIUS
+from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 
 __all__ = ["course_log"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.answers.history import Iteration
 from unifg.scenarios.course import CourseSettings
+from unifg.solution.history import Iteration
 from unifg.view import Frame, Scene
 
 __all__ = ["course_iterate", "course_stage"]

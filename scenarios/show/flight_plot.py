@@ -19,7 +19,7 @@ from unifg.scenarios.log.flight_metrics import PARAMETERS, estimated_parameters,
 from unifg.scenarios.log.metrics import collision_words
 from unifg.scenarios.show.flight_scene import SIGMAS, first_sights, sensor_reach
 from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times, shade_trouble
-from unifg.scenarios.worlds.air import VEHICLE_RADIUS
+from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import dashes, discs, ground, headline, key_of, new_axes, new_figure
 from unifg.typing import Array, IntArray

@@ -16,8 +16,8 @@ from unifg.errors import ViewError
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.log.metrics import collision_words, health
-from unifg.scenarios.worlds.air import VEHICLE_RADIUS
-from unifg.scenarios.worlds.bearing_range import SensorModel
+from unifg.scenarios.simulation.air import VEHICLE_RADIUS
+from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from unifg.answers.history import Iteration
+from unifg.solution.history import Iteration
 from unifg.style.colours import GREY, css
 from unifg.style.figures import dashes, face, new_axes
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray

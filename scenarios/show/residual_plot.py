@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.answers.history import Iteration
 from unifg.errors import UnifgError
+from unifg.solution.history import Iteration
 from unifg.style.figures import new_figure, write_figure
 from unifg.typing import Array
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from unifg.program.linearization import Linearization
+from unifg.problem.linearization import Linearization
 from unifg.solvers.globalize.merit import Merit, Point
 from unifg.typing import Array
 

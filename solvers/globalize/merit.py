@@ -1,4 +1,4 @@
-"""Merit functions: what a step has to lower, and how the price of violation is set."""
+"""Merit functions: what a step has to lower, and how the penalty of violation is set."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unifg.machine.inner import inner
-from unifg.program.linearization import Evaluation, Linearization
-from unifg.program.program import Program
+from unifg.codegen.inner import inner
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Evaluation, Linearization
 from unifg.typing import Array
 
 Point: TypeAlias = Linearization | Evaluation
 
 ARMIJO = 1e-4
 FARTHEST = 1e4  # violation that a step may lead to, relative to the start's (Waechter and Biegler 2006, eq. 21)
-MARGIN = 0.3  # share of the violation's price that every step must earn (Nocedal and Wright, eq. 18.36)
+MARGIN = 0.3  # share of the violation's penalty that every step must earn (Nocedal and Wright, eq. 18.36)
 
 
 class Merit:
@@ -25,7 +25,7 @@ class Merit:
         program: the compiled graph.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Remember the program."""
         self.program = program
 
@@ -43,15 +43,15 @@ class Merit:
 
 
 class RowPrices(Merit):
-    """l1 merit: the cost plus a price per unit of violation for every row (Powell 1978).
+    """l1 merit: the cost plus a penalty per unit of violation for every row (Powell 1978).
 
     Attributes:
-        prices: (M,).
+        penalties: (M,).
         farthest: scaled violation that no step may exceed.
     """
 
-    def __init__(self, program: Program, units: Array, multipliers: Array, start: Linearization) -> None:
-        """Start with the prices the multipliers suggest.
+    def __init__(self, program: CompiledProblem, units: Array, multipliers: Array, start: Linearization) -> None:
+        """Start with the penalties the multipliers suggest.
 
         Args:
             program: the compiled graph.
@@ -61,22 +61,22 @@ class RowPrices(Merit):
         """
         super().__init__(program)
         self._units = units
-        self.prices = np.abs(multipliers)
+        self.penalties = np.abs(multipliers)
         self.farthest = FARTHEST * max(1.0, self._size(start.constraints))
 
     @property
-    def price(self) -> float:
-        """The highest price in scaled units, at least one."""
-        return float((self.prices / self._units).max(initial=1.0))
+    def penalty(self) -> float:
+        """The highest penalty in scaled units, at least one."""
+        return float((self.penalties / self._units).max(initial=1.0))
 
     def raise_above(self, multipliers: Array) -> None:
-        """Keep every price above its multiplier."""
+        """Keep every penalty above its multiplier."""
         size = np.abs(multipliers)
-        self.prices = np.maximum(1.1 * size, 0.5 * (self.prices + size))
+        self.penalties = np.maximum(1.1 * size, 0.5 * (self.penalties + size))
 
     def value(self, point: Point) -> float:
         """Merit at a point."""
-        return point.cost + inner(self.prices, self.outside(point.constraints))
+        return point.cost + inner(self.penalties, self.outside(point.constraints))
 
     def slope(self, descent: float, lin: Linearization, linear: Array) -> float:
         """Upper bound of the merit's derivative along a step.
@@ -87,7 +87,7 @@ class RowPrices(Merit):
             linear: (M,) A times the step.
         """
         change = self.outside(lin.constraints + linear) - self.outside(lin.constraints)
-        return descent + inner(self.prices, change)
+        return descent + inner(self.penalties, change)
 
     def accepts(self, trial: Point, here: float, slope: float, length: float, slack: float) -> bool:
         """Armijo's condition, not too far from the constraints: the merit may be unbounded out there."""
@@ -100,25 +100,25 @@ class RowPrices(Merit):
 
 
 class OnePrice(Merit):
-    """l1 merit with one price, which rises until every step is one of descent (Nocedal and Wright, chapter 18).
+    """l1 merit with one penalty, which rises until every step is one of descent (Nocedal and Wright, chapter 18).
 
     Attributes:
-        price: per unit of violation of any row; the first step that needs one raises it.
+        penalty: per unit of violation of any row; the first step that needs one raises it.
     """
 
-    price = 0.0
+    penalty = 0.0
 
     def value(self, point: Point) -> float:
         """Merit at a point."""
-        return point.cost + self.price * float(self.outside(point.constraints).sum())
+        return point.cost + self.penalty * float(self.outside(point.constraints).sum())
 
     def rounding(self, lin: Linearization) -> float:
         """Rounding of the merit: coordinates off by half a spacing in every row."""
         largest = float(np.abs(self.program.columns.values(lin.values).flat).max(initial=0.0))
-        return self.price * 0.5 * float(np.spacing(largest)) * len(lin.constraints)
+        return self.penalty * 0.5 * float(np.spacing(largest)) * len(lin.constraints)
 
     def slope(self, lin: Linearization, step: Array, linear: Array) -> float:
-        """Bound of the merit's derivative along a step, after the price was raised to make it one of descent.
+        """Bound of the merit's derivative along a step, after the penalty was raised to make it one of descent.
 
         Args:
             lin: where.
@@ -130,9 +130,9 @@ class OnePrice(Merit):
         if gain > 0.0:
             curved = self._curved(lin, step)
             needed = (descent + 0.5 * curved) / ((1.0 - MARGIN) * gain)
-            if needed > self.price:
-                self.price = 1.5 * needed
-        return descent - self.price * gain
+            if needed > self.penalty:
+                self.penalty = 1.5 * needed
+        return descent - self.penalty * gain
 
     def predicted(self, lin: Linearization, step: Array, linear: Array) -> float:
         """Decrease by the model, quadratic in the cost and linear in the constraints; arguments as for `slope`."""

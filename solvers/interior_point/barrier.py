@@ -1,7 +1,7 @@
 """Newton steps of a primal-dual interior point with elastic constraints, as compiled functions.
 
 Every finite limit of an inequality row is a *side* c(x) >= 0, with c = g - lower or upper - g. It has a slack s and an
-elastic variable e with price rho, and both carry a logarithmic barrier:
+elastic variable e with penalty rho, and both carry a logarithmic barrier:
 
     min  f(x) + sum rho e - mu log s - mu log e     s.t.  c(x) + e - s = 0,   h(x) = 0
 
@@ -16,19 +16,19 @@ correction and the correction of the inertia follow Waechter and Biegler, Math. 
 A row that cannot be satisfied has y = rho and e > 0.
 
 Equalities hold as they stand, h(x) = 0, until steps become short or fail. From then on they are elastic too, h = p - n
-with p, n > 0 at the price rho: p (rho - lambda) = mu, n (rho + lambda) = mu, and
+with p, n > 0 at the penalty rho: p (rho - lambda) = mu, n (rho + lambda) = mu, and
 
     A dx - (p / (rho - lambda) + n / (rho + lambda)) dlambda = -h + mu / (rho - lambda) - mu / (rho + lambda).
 
-The phase begins where all of its constraints hold (`_split`), at a mu in proportion to price and violation: an l1
+The phase begins where all of its constraints hold (`_split`), at a mu in proportion to penalty and violation: an l1
 penalty with a smooth edge, which needs no restoration. Its answers are those of the problem as long as no multiplier
-is at its price; where one is, the price is raised, until the pull of the objective is small beside the forces that the
+is at its penalty; where one is, the penalty is raised, until the pull of the objective is small beside the forces that the
 constraints exert on each other. Then violation is what is left to minimise, and whoever runs the loop has to find out
 whether less of it is to be had (`VIOLATED`); compare Curtis, Schenk and Waechter, SIAM J. Optim. 20 (2010), and Thierry
 and Biegler, Optim. Methods Softw. 35 (2020).
 
 s y and e z are the same in any unit of a row. Units (`_find_units`) therefore enter only where numbers of different
-rows or unknowns meet: prices, first slacks, sums of violations, shifts of the diagonals, and the error of a barrier
+rows or unknowns meet: penalties, first slacks, sums of violations, shifts of the diagonals, and the error of a barrier
 problem.
 """
 
@@ -39,10 +39,10 @@ from typing import Any
 
 import numpy as np
 
-from unifg.machine.jit import compiled
-from unifg.machine.links import linked, parts, run
-from unifg.program.passes import transposed_times
-from unifg.program.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.codegen.function_pointers import linked, parts, run
+from unifg.codegen.jit import compiled
+from unifg.problem.evaluation import transposed_times
+from unifg.problem.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
 from unifg.solvers.interior_point.state import (
     CONVERGED,
     LIMIT_REACHED,
@@ -57,14 +57,14 @@ from unifg.typing import Array, IntArray
 
 OBJECTIVE = 0  # table.COST
 KAPPA = 50.0  # mu is lowered when the error of the barrier problem is below KAPPA mu
-SOLVED = 50.0  # prices are looked at when it is below SOLVED mu
+SOLVED = 50.0  # penalties are looked at when it is below SOLVED mu
 MOST_SHORT_STEPS = 5  # in a row, before equalities become elastic
-RELAXED_MU = 1e-2  # of price times violation: first mu with elastic equalities
+RELAXED_MU = 1e-2  # of penalty times violation: first mu with elastic equalities
 LATE_MU = 1e-3  # the same: largest mu at which a violation is taken seriously
-AT_PRICE = 0.9  # share of the price from which on a multiplier is at it
+AT_PENALTY = 0.9  # share of the penalty from which on a multiplier is at it
 SMALL_PULL = 1e-2  # share of the constraints' forces below which the objective's force counts for nothing
-MOST_RAISES = 6  # of prices, tenfold each
-LARGE_PULL = 1e3  # force of the objective from which on mu and prices are in proportion to it
+MOST_RAISES = 6  # of penalties, tenfold each
+LARGE_PULL = 1e3  # force of the objective from which on mu and penalties are in proportion to it
 FAR = 100.0  # from one: largest entry of a row that calls for other units
 SWEEPS = 8
 BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
@@ -77,7 +77,7 @@ def merit(
     now: Any,
     sides: Records,
     pairs: Records,
-    prices: Array,
+    penalties: Array,
     row_units: Array,
     rows: IntArray,
     lower: Array,
@@ -92,7 +92,7 @@ def merit(
         row = sides[k].row
         c = sides[k].sign * (constraints[row] - sides[k].border)
         theta += abs(c + e - s) / row_units[row]
-        elastic += prices[row] * e
+        elastic += penalties[row] * e
         product *= s * e
         if k & 3 == 3:  # one logarithm for eight factors, each of moderate size
             logarithms += math.log(product)
@@ -106,7 +106,7 @@ def merit(
         for k in range(len(rows)):
             row, p, n = rows[k], pairs[k].p + alpha * pairs[k].dp, pairs[k].n + alpha * pairs[k].dn
             theta += abs(constraints[row] - lower[row] - p + n) / row_units[row]
-            elastic += prices[row] * (p + n)
+            elastic += penalties[row] * (p + n)
             product *= p * n
             if k & 3 == 3:
                 logarithms += math.log(product)
@@ -130,7 +130,7 @@ def _split(c: float, rho: float, mu: float) -> tuple[float, float]:
 def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
-    full, gradient, multipliers, pairs, prices = parts(address, "full gradient multipliers pairs prices")
+    full, gradient, multipliers, pairs, penalties = parts(address, "full gradient multipliers pairs penalties")
     row_units, rows, scalars, sides, terms = parts(address, "row_units rows scalars sides terms")
     (units,) = parts(address, "units")
     now = scalars[0]
@@ -141,7 +141,7 @@ def measure(address: int) -> None:
     for k in range(now.sides):
         row, y = sides[k].row, sides[k].y
         multipliers[row] -= sides[k].sign * y
-        sy, ez = sides[k].s * y, sides[k].e * (prices[row] - y)
+        sy, ez = sides[k].s * y, sides[k].e * (penalties[row] - y)
         least, most = min(least, min(sy, ez)), max(most, max(sy, ez))
         c = sides[k].sign * (constraints[row] - sides[k].border)
         gap = max(gap, abs(c + sides[k].e - sides[k].s) / row_units[row])
@@ -159,7 +159,7 @@ def measure(address: int) -> None:
         outside = max(value - upper[row], lower[row] - value)
         if not outside <= violation:
             violation = outside
-        paid = max(paid, outside * prices[row])
+        paid = max(paid, outside * penalties[row])
         if lower[row] != upper[row]:
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
@@ -170,7 +170,7 @@ def measure(address: int) -> None:
     else:
         for k in range(len(rows)):
             row, p, n = rows[k], pairs[k].p, pairs[k].n
-            pz, nz = p * (prices[row] - multipliers[row]), n * (prices[row] + multipliers[row])
+            pz, nz = p * (penalties[row] - multipliers[row]), n * (penalties[row] + multipliers[row])
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
     scale = max(1.0, size / max(1, len(constraints)) / 100.0)
@@ -270,7 +270,7 @@ def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
     full, gradient, links, multipliers, pairs = parts(address, "full gradient links multipliers pairs")
-    prices, row_units, rows, scalars, sides = parts(address, "prices row_units rows scalars sides")
+    penalties, row_units, rows, scalars, sides = parts(address, "penalties row_units rows scalars sides")
     terms, units = parts(address, "terms units")
     now = scalars[0]
     lower, upper = terms.lower, terms.upper
@@ -286,7 +286,7 @@ def begin(address: int) -> None:
     now.sides, now.elastic = count, 0 if len(rows) else 1
     now.cost_unit = 1.0
     if now.scaling == 1:
-        _find_units(terms, constraint_jacobian, row_units, units, prices, full)
+        _find_units(terms, constraint_jacobian, row_units, units, penalties, full)
         pull = 0.0
         for column in free:
             pull = max(pull, abs(gradient[column]) * units[column])
@@ -302,11 +302,11 @@ def begin(address: int) -> None:
     if largest > 0.5 * now.rho:
         now.rho = 10.0 * largest
     for row in range(len(lower)):
-        prices[row] = now.rho / row_units[row]
+        penalties[row] = now.rho / row_units[row]
     if warm:
         for k in range(count):
             c = sides[k].sign * (constraints[sides[k].row] - sides[k].border)
-            y = min(max(-sides[k].sign * multipliers[sides[k].row], 0.0), 0.9 * prices[sides[k].row])
+            y = min(max(-sides[k].sign * multipliers[sides[k].row], 0.0), 0.9 * penalties[sides[k].row])
             sides[k].y, sides[k].s, sides[k].e = y, c, 0.0
         run(links[0].measure, (address,))
         error = max(max(now.stationarity, now.violation), now.complementarity)
@@ -314,7 +314,7 @@ def begin(address: int) -> None:
     mu = now.mu
     for k in range(count):
         row = sides[k].row
-        unit, price = row_units[row], prices[row]
+        unit, penalty = row_units[row], penalties[row]
         c = sides[k].sign * (constraints[row] - sides[k].border)
         if warm:
             s = max(c, min(mu / max(sides[k].y, 1e-3 * mu / unit), FIRST_SLACK * unit))
@@ -322,10 +322,10 @@ def begin(address: int) -> None:
         else:
             s = max(c, FIRST_SLACK * unit)
             y = mu / s
-        y = min(y, 0.9 * price)
-        sides[k].y, sides[k].s, sides[k].e = y, s, mu / (price - y)
+        y = min(y, 0.9 * penalty)
+        sides[k].y, sides[k].s, sides[k].e = y, s, mu / (penalty - y)
         sides[k].ds = sides[k].de = sides[k].dy = 0.0
-    theta = merit(now, sides, pairs, prices, row_units, rows, lower, 0.0, constraints, 0.0)[1]
+    theta = merit(now, sides, pairs, penalties, row_units, rows, lower, 0.0, constraints, 0.0)[1]
     now.theta_small, now.theta_large = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
     now.filtered = now.failures = now.short_steps = 0
     now.delta = now.last_delta = now.step = now.taken = 0.0
@@ -337,7 +337,7 @@ def test(address: int) -> None:
     """Test the iterate; if there is to be a step, lower mu and measure what the line search compares with."""
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
     full, gradient, kept, links, log = parts(address, "full gradient kept links log")
-    multipliers, pairs, prices, row_units = parts(address, "multipliers pairs prices row_units")
+    multipliers, pairs, penalties, row_units = parts(address, "multipliers pairs penalties row_units")
     rows, scalars, sides, terms, values = parts(address, "rows scalars sides terms values")
     now = scalars[0]
     if now.failures == 0:
@@ -367,22 +367,22 @@ def test(address: int) -> None:
         now.answer = LIMIT_REACHED
         return
     if now.cost < BOTTOMLESS * now.cost_unit and now.violation > tolerance:
-        now.answer = STALLED  # no price holds back an objective that falls faster than violation grows
+        now.answer = STALLED  # no penalty holds back an objective that falls faster than violation grows
         return
     if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violation > tolerance:
         run(links[0].relax, (address,))
     smallest = 0.1 * tolerance
     bound = False
     if _error(now) <= SOLVED * now.mu and now.violation > tolerance:
-        # Whether something is violated because its price is too low, or because it has to be. With the least mu that
-        # is told by a solved problem: a step before, equalities without a price may still be on their way.
+        # Whether something is violated because its penalty is too low, or because it has to be. With the least mu that
+        # is told by a solved problem: a step before, equalities without a penalty may still be on their way.
         bound = now.mu <= smallest and _error(now) <= tolerance
         if now.mu <= LATE_MU * min(now.paid, now.rho):
             for k in range(now.sides):
-                bound = bound or (sides[k].y > AT_PRICE * prices[sides[k].row] and sides[k].e > tolerance)
+                bound = bound or (sides[k].y > AT_PENALTY * penalties[sides[k].row] and sides[k].e > tolerance)
             for k in range(len(rows) if now.elastic == 1 else 0):
                 row, away = rows[k], max(pairs[k].p, pairs[k].n)
-                bound = bound or (abs(multipliers[row]) > AT_PRICE * prices[row] and away > tolerance)
+                bound = bound or (abs(multipliers[row]) > AT_PENALTY * penalties[row] and away > tolerance)
         if bound:
             pull, push = _forces(terms, free, gradient, multipliers, constraint_jacobian, full)
             run(links[0].measure, (address,))  # it was written over
@@ -395,12 +395,12 @@ def test(address: int) -> None:
                 return
             now.raises += 1
             now.rho *= 10.0
-            for row in range(len(prices)):
-                prices[row] *= 10.0
+            for row in range(len(penalties)):
+                penalties[row] *= 10.0
             now.paid *= 10.0
             run(links[0].relax, (address,))
     if now.violation <= tolerance and now.mu <= smallest and _error(now) <= now.mu:
-        # All is done that can be done at these prices. A multiplier near its own lets a row give way by mu / (price -
+        # All is done that can be done at these penalties. A multiplier near its own lets a row give way by mu / (penalty -
         # multiplier): no violation that counts, but times the multiplier more than complementarity may be.
         near = False
         for k in range(now.sides):
@@ -409,36 +409,36 @@ def test(address: int) -> None:
             if now.raises >= MOST_RAISES:
                 now.answer = STALLED
                 return
-            run(links[0].dearer, (address,))
+            run(links[0].increase_penalty, (address,))
     while not bound and _error(now) <= KAPPA * now.mu and now.mu > smallest:
         less = min(0.2 * now.mu, now.mu**1.5)
         now.mu = less if less > tolerance else smallest
         now.filtered = 0
     cost, lower = now.cost, terms.lower
-    phi, theta = merit(now, sides, pairs, prices, row_units, rows, lower, cost, constraints, 0.0)
+    phi, theta = merit(now, sides, pairs, penalties, row_units, rows, lower, cost, constraints, 0.0)
     now.phi, now.theta = phi, theta
     now.trials, now.corrected, now.answer = 0, 0, TRY
 
 
 @linked
-def dearer(address: int) -> None:
-    """Raise all prices where the iterate stands, with what is elastic on its central path."""
-    multipliers, pairs, prices, links = parts(address, "multipliers pairs prices links")
+def increase_penalty(address: int) -> None:
+    """Raise all penalties where the iterate stands, with what is elastic on its central path."""
+    multipliers, pairs, penalties, links = parts(address, "multipliers pairs penalties links")
     rows, scalars, sides = parts(address, "rows scalars sides")
     now = scalars[0]
     now.raises += 1
     now.rho *= 10.0
     now.filtered = now.failures = 0
-    for row in range(len(prices)):
-        prices[row] *= 10.0
+    for row in range(len(penalties)):
+        penalties[row] *= 10.0
     for k in range(now.sides):
-        sides[k].e = now.mu / (prices[sides[k].row] - sides[k].y)
+        sides[k].e = now.mu / (penalties[sides[k].row] - sides[k].y)
     if now.elastic == 1:
         for k in range(len(rows)):
             row = rows[k]
             pairs[k].p, pairs[k].n = (
-                now.mu / (prices[row] - multipliers[row]),
-                now.mu / (prices[row] + multipliers[row]),
+                now.mu / (penalties[row] - multipliers[row]),
+                now.mu / (penalties[row] + multipliers[row]),
             )
     run(links[0].measure, (address,))
 
@@ -447,7 +447,7 @@ def dearer(address: int) -> None:
 def relax(address: int) -> None:
     """Make the equalities elastic: what the iterate violates is paid for, and the path to the answer begins anew."""
     constraints, links, multipliers, pairs = parts(address, "constraints links multipliers pairs")
-    prices, row_units, rows, scalars, sides = parts(address, "prices row_units rows scalars sides")
+    penalties, row_units, rows, scalars, sides = parts(address, "penalties row_units rows scalars sides")
     (terms,) = parts(address, "terms")
     now = scalars[0]
     now.elastic, now.filtered, now.failures, now.short_steps = 1, 0, 0, 0
@@ -456,15 +456,15 @@ def relax(address: int) -> None:
     for k in range(now.sides):
         row = sides[k].row
         c = sides[k].sign * (constraints[row] - sides[k].border)
-        s, e = _split(c, prices[row], mu)
+        s, e = _split(c, penalties[row], mu)
         sides[k].s, sides[k].e, sides[k].y = s, e, mu / s
         sides[k].ds = sides[k].de = sides[k].dy = 0.0
     for k in range(len(rows)):
         row = rows[k]
-        p, n = _split(constraints[row] - terms.lower[row], 2.0 * prices[row], mu)
-        # p (price - multiplier) = mu and n (price + multiplier) = mu
-        multipliers[row] = prices[row] - mu / p if p > n else mu / n - prices[row]
+        p, n = _split(constraints[row] - terms.lower[row], 2.0 * penalties[row], mu)
+        # p (penalty - multiplier) = mu and n (penalty + multiplier) = mu
+        multipliers[row] = penalties[row] - mu / p if p > n else mu / n - penalties[row]
         pairs[k].p, pairs[k].n, pairs[k].dp, pairs[k].dn = p, n, 0.0, 0.0
     run(links[0].measure, (address,))
-    theta = merit(now, sides, pairs, prices, row_units, rows, terms.lower, 0.0, constraints, 0.0)[1]
+    theta = merit(now, sides, pairs, penalties, row_units, rows, terms.lower, 0.0, constraints, 0.0)[1]
     now.theta_large = max(now.theta_large, 1e4 * max(1.0, theta))

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 
+from unifg.codegen.function_pointers import holds, linked, parts, run
 from unifg.elimination.plan import NEGATIVE
-from unifg.machine.links import holds, linked, parts, run
-from unifg.program.passes import add_constraints, times, transposed_times
+from unifg.problem.evaluation import add_constraints, times, transposed_times
 from unifg.solvers.interior_point.state import AGAIN, SINGULAR, TRY
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
@@ -24,7 +24,7 @@ def direct(address: int) -> None:
     constraint_jacobian, constraints = parts(address, "constraint_jacobian constraints")
     curvature, data, doubles, entries, free = parts(address, "curvature data doubles entries free")
     hessian, links, multipliers, pairs, plan = parts(address, "hessian links multipliers pairs plan")
-    prices, rests, row_units, row_weights = parts(address, "prices rests row_units row_weights")
+    penalties, rests, row_units, row_weights = parts(address, "penalties rests row_units row_weights")
     rows, scalars, shift, sides, step, terms = parts(address, "rows scalars shift sides step terms")
     (units,) = parts(address, "units")
     now = scalars[0]
@@ -33,7 +33,7 @@ def direct(address: int) -> None:
         row_weights[row] = 0.0
     for k in range(now.sides):
         row, y = sides[k].row, sides[k].y
-        weight = 1.0 / (sides[k].s / y + sides[k].e / (prices[row] - y))
+        weight = 1.0 / (sides[k].s / y + sides[k].e / (penalties[row] - y))
         sides[k].weight = weight
         row_weights[row] += weight
         sides[k].rest = sides[k].sign * (constraints[row] - sides[k].border) + sides[k].e - sides[k].s
@@ -44,7 +44,7 @@ def direct(address: int) -> None:
         if now.elastic == 1:
             p, q, multiplier = pairs[k].p, pairs[k].n, multipliers[row]
             rests[row] += q - p
-            shift[n + k] -= p / (prices[row] - multiplier) + q / (prices[row] + multiplier)
+            shift[n + k] -= p / (penalties[row] - multiplier) + q / (penalties[row] + multiplier)
     # Second derivatives need multipliers, and those of a cold start mean little.
     exact = now.exact == 1 and now.failures < 2 and (now.iteration > 0 or now.cold == 0)
     share = 1.0 if exact else 0.0  # of the second derivatives
@@ -97,7 +97,7 @@ def direct(address: int) -> None:
 def steer(address: int) -> None:
     """Solve for the residuals in ``rests`` and REST: the step, those of the sides, the slope, and both lengths."""
     constraint_jacobian, free, full, gradient = parts(address, "constraint_jacobian free full gradient")
-    links, multipliers, pairs, plan, prices = parts(address, "links multipliers pairs plan prices")
+    links, multipliers, pairs, plan, penalties = parts(address, "links multipliers pairs plan penalties")
     rests, right, row_terms, rows, scalars, unequal = parts(address, "rests right row_terms rows scalars unequal")
     sides, spread, step, terms = parts(address, "sides spread step terms")
     now = scalars[0]
@@ -107,7 +107,7 @@ def steer(address: int) -> None:
         row_terms[row] = 0.0
     for k in range(now.sides):
         row, y = sides[k].row, sides[k].y
-        r = sides[k].rest + sides[k].s - sides[k].e + mu / (prices[row] - y) - mu / y
+        r = sides[k].rest + sides[k].s - sides[k].e + mu / (penalties[row] - y) - mu / y
         row_terms[row] += sides[k].sign * sides[k].weight * r
     for k in range(len(full)):
         spread[k] = full[k]
@@ -118,7 +118,7 @@ def steer(address: int) -> None:
         row = rows[k]
         right[n + k] = -rests[row]
         if elastic:
-            over, under = prices[row] - multipliers[row], prices[row] + multipliers[row]
+            over, under = penalties[row] - multipliers[row], penalties[row] + multipliers[row]
             right[n + k] += pairs[k].n - pairs[k].p + mu / over - mu / under
     run(links[0].solve, (plan, right, step))
     times(terms, False, constraint_jacobian, step, row_terms, unequal)
@@ -130,23 +130,23 @@ def steer(address: int) -> None:
     for k in range(now.sides):
         s, e, y = sides[k].s, sides[k].e, sides[k].y
         row = sides[k].row
-        z = prices[row] - y
+        z = penalties[row] - y
         move = sides[k].sign * row_terms[row]
         r = sides[k].rest + s - e + mu / z - mu / y
         dy = -(move + r) * sides[k].weight
         ds = mu / y - s - s / y * dy
         de = mu / z - e + e / z * dy
         sides[k].dy, sides[k].ds, sides[k].de = dy, ds, de
-        slope += prices[row] * de - mu * (ds / s + de / e)
+        slope += penalties[row] * de - mu * (ds / s + de / e)
         primal = max(primal, max(-ds / s, -de / e))
         dual = max(dual, max(-dy / y, dy / z))
     if elastic:
         for k in range(len(rows)):
             row, p, q, move = rows[k], pairs[k].p, pairs[k].n, step[n + k]
-            over, under = prices[row] - multipliers[row], prices[row] + multipliers[row]
+            over, under = penalties[row] - multipliers[row], penalties[row] + multipliers[row]
             dp, dn = mu / over - p + p / over * move, mu / under - q - q / under * move
             pairs[k].dp, pairs[k].dn = dp, dn
-            slope += prices[row] * (dp + dn) - mu * (dp / p + dn / q)
+            slope += penalties[row] * (dp + dn) - mu * (dp / p + dn / q)
             primal = max(primal, max(-dp / p, -dn / q))
             dual = max(dual, max(move / over, -move / under))
     now.slope = slope

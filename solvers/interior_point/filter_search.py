@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from unifg.machine.links import linked, parts, run
+from unifg.codegen.function_pointers import linked, parts, run
 from unifg.solvers.interior_point.barrier import merit
 from unifg.solvers.interior_point.state import ACCEPTED, AGAIN, FILTER, STALLED, TRY
 
@@ -21,13 +21,13 @@ SHORT_STEP = 0.05  # length of one
 @linked
 def judge(address: int) -> None:
     """Filter test of a trial point: accept it, shorten the step, correct it, or ask for another direction."""
-    filter, links, pairs, prices, row_units = parts(address, "filter links pairs prices row_units")
+    filter, links, pairs, penalties, row_units = parts(address, "filter links pairs penalties row_units")
     rows, scalars, sides, terms = parts(address, "rows scalars sides terms")
     now = scalars[0]
     (constraints,) = parts(address, "trial_constraints")
     alpha, theta, phi, slope = now.alpha, now.theta, now.phi, now.slope
     cost, lower = now.trial_cost, terms.lower
-    phi_trial, theta_trial = merit(now, sides, pairs, prices, row_units, rows, lower, cost, constraints, alpha)
+    phi_trial, theta_trial = merit(now, sides, pairs, penalties, row_units, rows, lower, cost, constraints, alpha)
     finite = math.isfinite(phi_trial) and math.isfinite(theta_trial)
     slack = 1e-13 * max(1.0, abs(phi))
     switch = slope < 0.0 and alpha * (-slope / now.cost_unit) ** 2.3 > theta**1.1 and theta <= now.theta_small
@@ -113,7 +113,7 @@ def restore(address: int) -> None:
 @linked
 def accept(address: int) -> None:
     """Move multipliers and slacks and, unless the step was one of descent, remember where it came from."""
-    filter, free, multipliers, pairs, prices = parts(address, "filter free multipliers pairs prices")
+    filter, free, multipliers, pairs, penalties = parts(address, "filter free multipliers pairs penalties")
     rows, scalars, sides, step = parts(address, "rows scalars sides step")
     (trial_constraints,) = parts(address, "trial_constraints")
     now = scalars[0]
@@ -130,7 +130,7 @@ def accept(address: int) -> None:
             pairs[k].p += alpha * pairs[k].dp
             pairs[k].n += alpha * pairs[k].dn
             over, under = 1e-10 * mu / pairs[k].p, 1e-10 * mu / pairs[k].n
-            multipliers[row] = min(max(multipliers[row], under - prices[row]), prices[row] - over)
+            multipliers[row] = min(max(multipliers[row], under - penalties[row]), penalties[row] - over)
             pairs[k].dp = pairs[k].dn = 0.0
     for k in range(now.sides):
         s, e = sides[k].s + alpha * sides[k].ds, sides[k].e + alpha * sides[k].de
@@ -138,7 +138,7 @@ def accept(address: int) -> None:
         s = max(s, c + e)  # a longer slack costs nothing
         y = sides[k].y + dual * sides[k].dy
         y = min(max(y, 1e-10 * mu / s), 1e10 * mu / s)  # eq. 16
-        sides[k].y, sides[k].s, sides[k].e = min(y, prices[sides[k].row] - 1e-10 * mu / e), s, e
+        sides[k].y, sides[k].s, sides[k].e = min(y, penalties[sides[k].row] - 1e-10 * mu / e), s, e
         sides[k].ds = sides[k].de = 0.0
     if now.descent == 0 and now.filtered < FILTER:
         filter[now.filtered, 0] = (1.0 - GAMMA_THETA) * now.theta

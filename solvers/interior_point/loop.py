@@ -9,14 +9,14 @@ from functools import cache
 
 import numpy as np
 
+from unifg.codegen.function_pointers import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
+from unifg.codegen.jit import compiled
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
-from unifg.machine.jit import compiled
-from unifg.machine.links import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
-from unifg.program import passes
-from unifg.program.curvature import add_curvature, add_losses
-from unifg.program.retraction import retract_parts
-from unifg.program.scalars import add_scalars, evaluate_scalars
+from unifg.problem import evaluation
+from unifg.problem.hessian import add_curvature, add_losses
+from unifg.problem.retraction import retract_parts
+from unifg.problem.scalars import add_scalars, evaluate_scalars
 from unifg.solvers.interior_point import barrier, direction, filter_search
 from unifg.solvers.interior_point.state import (
     ACCEPTED,
@@ -202,9 +202,9 @@ def addresses() -> Records:
     links = np.zeros(1, LINKS)
     links[0]["factor"] = link(factor, TRUTH, kinds["plan"], kinds["data"], vector)
     links[0]["solve"] = link(solve, NOTHING, kinds["plan"], vector, vector)
-    links[0]["linearize"] = link(passes.linearize, NUMBER, terms, values, TRUTH, *linearized)
+    links[0]["linearize"] = link(evaluation.linearize, NUMBER, terms, values, TRUTH, *linearized)
     links[0]["evaluate"] = link(
-        passes.evaluate,
+        evaluation.evaluate,
         NUMBER,
         terms,
         values,
@@ -233,7 +233,7 @@ def addresses() -> Records:
         "judge": filter_search.judge,
         "correct": filter_search.correct,
         "relax": barrier.relax,
-        "dearer": barrier.dearer,
+        "increase_penalty": barrier.increase_penalty,
         "restore": filter_search.restore,
         "accept": filter_search.accept,
         "direct": direction.direct,

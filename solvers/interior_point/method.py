@@ -12,19 +12,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from unifg.answers.history import Iteration
-from unifg.answers.solver import Solver, SolveState
-from unifg.answers.status import Status
+from unifg.codegen.buffers import Block
+from unifg.codegen.function_pointers import memory
 from unifg.errors import BackendError
-from unifg.machine.buffers import Block
-from unifg.machine.links import memory
-from unifg.program.columns import Values
-from unifg.program.curvature import lagrangian_hessian
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
-from unifg.program.systems import stacked
-from unifg.program.table import COST, COUNT, KIND, ROW, ROWS
-from unifg.solvers.globalize.least_violation import nearest
+from unifg.problem.columns import Values
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.linearization import Linearization
+from unifg.problem.systems import stacked
+from unifg.problem.table import COST, COUNT, KIND, ROW, ROWS
+from unifg.solution.history import Iteration
+from unifg.solution.solver import Solver, SolveState
+from unifg.solution.status import Status
+from unifg.solvers.globalize.feasibility_restoration import nearest
 from unifg.solvers.interior_point import state
 from unifg.solvers.interior_point.loop import addresses, call
 from unifg.solvers.interior_point.state import Fields, Problem, empty_work
@@ -54,9 +54,9 @@ class InteriorPoint(Solver):
         max_iterations: Newton steps before giving up.
         hessian: "exact" (of the Lagrangian; Gauss-Newton where its inertia is wrong) or "gauss-newton".
         barrier: first mu of a cold start; a start with multipliers finds its own.
-        price: first rho of the elastic variables; raised when constraints stay violated.
+        penalty: first rho of the elastic variables; raised when constraints stay violated.
         scaling: measure rows and unknowns in units that make the largest entries of the constraint Jacobian near one,
-            where they are far from it, and prices and mu in proportion to a large gradient. Inside only: tolerances and
+            where they are far from it, and penalties and mu in proportion to a large gradient. Inside only: tolerances and
             multipliers are those of the problem as stated.
         step_tolerance, violation_tolerance: stop rule on the norm of the full step and the largest violation, for
             control loops. A positive step_tolerance switches it on; it does not grant CONVERGED. An infinite one asks
@@ -72,7 +72,7 @@ class InteriorPoint(Solver):
     max_iterations: int = 300
     hessian: Literal["exact", "gauss-newton"] = "exact"
     barrier: float = 0.3
-    price: float = 1e3
+    penalty: float = 1e3
     scaling: bool = True
     step_tolerance: float = 0.0
     violation_tolerance: float = 1e-4
@@ -83,15 +83,15 @@ class InteriorPoint(Solver):
         super().__post_init__()
         if self.hessian not in ("exact", "gauss-newton"):
             raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
-        for name, value in (("barrier", self.barrier), ("price", self.price)):
+        for name, value in (("barrier", self.barrier), ("penalty", self.penalty)):
             if not value > 0.0:
                 raise BackendError(f"{self.name}: {name} must be positive, found {value}")
 
-    def runs_alone(self, program: Program) -> bool:
+    def runs_alone(self, program: CompiledProblem) -> bool:
         """Test whether the loop may make the whole solve; that of least squares is tested outside, at every step."""
         return not program.least_squares
 
-    def workspace(self, program: Program) -> Workspace:
+    def workspace(self, program: CompiledProblem) -> Workspace:
         """Structure of the KKT matrix."""
         return Workspace(program)
 
@@ -154,7 +154,7 @@ class InteriorPoint(Solver):
                     return run.status
             if restarts == RESTARTS or now["iteration"] >= self.max_iterations or run.out_of_time:
                 return reason
-            if now["answer"] == state.VIOLATED:  # the price was too low
+            if now["answer"] == state.VIOLATED:  # the penalty was too low
                 now["going_on"] = 1
             elif run.has_been_feasible or _largest(run.program.violation(found.constraints)) <= run.tolerance:
                 workspace.begin_at(run.least_violated.flat if run.has_been_feasible else found.values.flat, self)
@@ -214,7 +214,7 @@ class InteriorPoint(Solver):
 class Workspace:
     """Memory kept between solves of one structure."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Analyse the KKT matrix and compile."""
         self.program = program
         self._taken: Linearization | None = None
@@ -328,7 +328,7 @@ class Workspace:
         work, now = self.work, self.now
         work.values[:], work.multipliers[:] = values, 0.0
         now["mu"], now["going_on"] = options.barrier, 0
-        now["rho"] = options.price * 10.0 ** now["raises"]
+        now["rho"] = options.penalty * 10.0 ** now["raises"]
 
     def found(self) -> Linearization:
         """The linearisation at the present iterate."""

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unifg.elimination.plan import Plan
-from unifg.program.table import TermArrays
+from unifg.problem.table import TermArrays
 from unifg.typing import Array, IntArray
 
 Records: TypeAlias = NDArray[np.void]
@@ -42,8 +42,8 @@ NOW = np.dtype(
         ("saved_slope", np.float64),  # of the step that a correction replaces
         ("saved_alpha", np.float64),
         ("saved_dual", np.float64),
-        ("asked", np.float64),  # price at which it was asked whether the violation is the least
-        ("paid", np.float64),  # largest violation of a row times its price
+        ("asked", np.float64),  # penalty at which it was asked whether the violation is the least
+        ("paid", np.float64),  # largest violation of a row times its penalty
         ("force", np.float64),  # stationarity in the units of the unknowns
         ("cost_unit", np.float64),  # what the objective is measured in
         ("step_tolerance", np.float64),  # norm of a full step below which to stop, once the violation is small enough
@@ -67,7 +67,7 @@ NOW = np.dtype(
         ("kept", np.int64),  # whether an iterate kept all constraints
         ("short_steps", np.int64),  # in a row
         ("scaling", np.int64),  # whether units are to be found
-        ("raises", np.int64),  # of the prices
+        ("raises", np.int64),  # of the penalties
         ("assisted", np.int64),  # whether Python evaluates, linearises and bends
         ("watched", np.int64),  # whether somebody looks at every iterate
         ("stage", np.int64),  # where the loop goes on
@@ -105,7 +105,9 @@ PAIR = np.dtype(
 )
 # Addresses of compiled functions.
 FUNCTIONS = "factor solve linearize evaluate curve weigh add_scalars evaluate_scalars retract"
-FUNCTIONS += " begin measure test bend direct steer advance judge correct restore accept relax dearer renew loop"
+FUNCTIONS += (
+    " begin measure test bend direct steer advance judge correct restore accept relax increase_penalty renew loop"
+)
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
 # What a call answers.
@@ -154,7 +156,7 @@ class Work(NamedTuple):
         scalars: (1,) of `NOW`.
         sides: (2 M,) one for each finite limit of an inequality row.
         pairs: (E,) one for each equality row.
-        prices: (M,) of the elastic variables of a row.
+        penalties: (M,) of the elastic variables of a row.
         row_units, units: (M,) what a row, and (width,) what an unknown, is measured in.
         kept: stored values of the last iterate that kept all constraints.
         values, trial: stored values of the present iterate and of a trial.
@@ -183,7 +185,7 @@ class Work(NamedTuple):
     scalars: Annotated[Records, NOW, 1]
     sides: Annotated[Records, SIDE, "sides"]
     pairs: Annotated[Records, PAIR, "equalities"]
-    prices: Annotated[Array, "rows"]
+    penalties: Annotated[Array, "rows"]
     row_units: Annotated[Array, "rows"]
     units: Annotated[Array, "width"]
     kept: Annotated[Array, "stored"]

@@ -14,10 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from unifg.program.linearization import Linearization
-from unifg.program.passes import add_constraints
-from unifg.program.program import Program
-from unifg.program.systems import KktSystem, fill
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.evaluation import add_constraints
+from unifg.problem.linearization import Linearization
+from unifg.problem.systems import KktSystem, fill
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
 from unifg.typing import Array, BoolArray
@@ -29,14 +29,14 @@ WEIGHTS = (1.0, 10.0, 1e2, 1e3, 1e4, 1e6)  # tried in turn, relative to curvatur
 class ExactHessian:
     """Makes subproblems with the Hessian of the Lagrangian for one prepared graph."""
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Remember the program; structures are analysed when first needed."""
         self.program = program
         self._definite = program.systems.normal()
         self._system: KktSystem | None = None
 
     def subproblem(self, lin: Linearization, multipliers: Array, damping: float | Array, scaling: Scaling) -> QP:
-        """The quadratic model at ``lin``, in the pattern ``Program.normal``.
+        """The quadratic model at ``lin``, in the pattern ``CompiledProblem.normal``.
 
         Args:
             lin: where.
@@ -101,7 +101,7 @@ class ExactHessian:
         return np.divide(size, squares, out=np.zeros(constraints.count), where=squares > 0.0)
 
 
-def active_inequalities(program: Program, lin: Linearization, multipliers: Array) -> BoolArray:
+def active_inequalities(program: CompiledProblem, lin: Linearization, multipliers: Array) -> BoolArray:
     """(M,) inequalities whose multiplier outweighs the distance to the limit it points at."""
     limit = np.where(multipliers > 0.0, program.upper, program.lower)
     distance = np.where(np.isfinite(limit), np.abs(lin.constraints - limit), np.inf)

@@ -12,13 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
-from unifg.machine.jit import compiled
-from unifg.program.passes import add_constraints, times, transposed_times
-from unifg.program.program import Program
-from unifg.program.systems import KktArrays, fill
-from unifg.program.table import TermArrays
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.evaluation import add_constraints, times, transposed_times
+from unifg.problem.systems import KktArrays, fill
+from unifg.problem.table import TermArrays
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -40,7 +40,7 @@ class GraphRoute:
 
     name = "graph"
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Analyse the KKT matrix."""
         self.program = program
         self.system = program.systems.kkt(program.equality)
@@ -108,7 +108,7 @@ class Polish:
     double precision holds.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Remember the program; systems are analysed when first needed."""
         self._program = program
         self._route: GraphRoute | None = None

@@ -22,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 import osqp
 
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import FINER, QP, QPAnswer, qp_error
 from unifg.typing import Array
@@ -49,7 +49,7 @@ class OsqpRoute:
 
     name = "osqp"
 
-    def __init__(self, program: Program, max_iterations: int | None) -> None:
+    def __init__(self, program: CompiledProblem, max_iterations: int | None) -> None:
         """Remember the pattern; OSQP is set up with the first numbers.
 
         Args:
@@ -140,7 +140,7 @@ class OsqpRoute:
         return replace(best, iterations=spent)
 
 
-def counted_iterations(program: Program) -> int:
+def counted_iterations(program: CompiledProblem) -> int:
     """Iterations of OSQP that cost as many operations as :data:`WORTH` of an interior point.
 
     One of OSQP solves with the factor of the KKT matrix and passes over the vectors; one of an interior point

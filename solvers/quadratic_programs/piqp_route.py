@@ -12,7 +12,7 @@ import piqp
 import scipy.sparse as sp
 
 from unifg.elimination.symmetric import Symmetric
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -53,7 +53,7 @@ class PiqpRoute:
 
     name = "piqp"
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Remember the pattern; PIQP is set up with the first numbers."""
         self.program = program
         self._solver: piqp.SparseSolver | None = None
@@ -129,7 +129,7 @@ class ElasticRoute:
     elsewhere it violates the linearised rows least.
     """
 
-    def __init__(self, program: Program, hessian: Symmetric) -> None:
+    def __init__(self, program: CompiledProblem, hessian: Symmetric) -> None:
         """Lay out d, and two slacks for every row that may be violated.
 
         Args:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from unifg.errors import BackendError
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error
 from unifg.typing import Array
 
@@ -28,7 +28,7 @@ class QpsolversRoute:
         name: the solver's name.
     """
 
-    def __init__(self, program: Program, name: str) -> None:
+    def __init__(self, program: CompiledProblem, name: str) -> None:
         """Check that the solver is installed.
 
         Raises:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.answers.requirements import require
 from unifg.elimination.symmetric import Symmetric
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
-from unifg.solvers.globalize.sizes import largest
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.solution.capabilities import require
+from unifg.solvers.globalize.norms import largest
 from unifg.solvers.quadratic_programs.exact_hessian import ExactHessian, holds
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute, Polish
 from unifg.solvers.quadratic_programs.scaling import Scaling
@@ -44,7 +44,7 @@ class Subproblems:
 
     def __init__(
         self,
-        program: Program,
+        program: CompiledProblem,
         *,
         hessian: str,
         qp: str,
@@ -166,7 +166,7 @@ class Subproblems:
         return None
 
 
-def _route(program: Program, name: str, osqp_iterations: int | None) -> Route:
+def _route(program: CompiledProblem, name: str, osqp_iterations: int | None) -> Route:
     """The engine, OSQP and PIQP are called directly, everything else through qpsolvers.
 
     What stands outside, and SciPy's matrices with it, is loaded when it is asked for.
@@ -188,7 +188,7 @@ def _route(program: Program, name: str, osqp_iterations: int | None) -> Route:
     return QpsolversRoute(program, name)
 
 
-def _elastic(program: Program, pattern: Symmetric) -> ElasticRoute:
+def _elastic(program: CompiledProblem, pattern: Symmetric) -> ElasticRoute:
     """The last resort, by PIQP."""
     from unifg.solvers.quadratic_programs.piqp_route import ElasticRoute
 

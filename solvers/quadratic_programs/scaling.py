@@ -14,10 +14,10 @@ from functools import cached_property
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.symmetric import Symmetric
-from unifg.machine.jit import compiled
-from unifg.program.linearization import Linearization
-from unifg.program.program import Program
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -36,17 +36,17 @@ class Scaling:
         rows: (M,) per constraint row.
     """
 
-    program: Program
+    program: CompiledProblem
     columns: Array
     rows: Array
 
     @classmethod
-    def none(cls, program: Program) -> Scaling:
+    def none(cls, program: CompiledProblem) -> Scaling:
         """The units of the graph."""
         return cls(program, np.ones(program.size), np.ones(program.constraints.count))
 
     @classmethod
-    def of(cls, program: Program, lin: Linearization, neutral: Scaling | None = None) -> Scaling:
+    def of(cls, program: CompiledProblem, lin: Linearization, neutral: Scaling | None = None) -> Scaling:
         """For the problem as it is at ``lin``; factors of one where the units of the graph are good enough.
 
         Args:
@@ -121,7 +121,7 @@ class Scaling:
         return full
 
 
-def equilibrate(program: Program, pattern: Symmetric, hessian: Array, jacobian: Array) -> tuple[Array, Array]:
+def equilibrate(program: CompiledProblem, pattern: Symmetric, hessian: Array, jacobian: Array) -> tuple[Array, Array]:
     """Factors of the unknowns (n,) and of the constraint rows (M,), powers of two; one where all entries vanish.
 
     Args:

@@ -13,13 +13,13 @@ from typing import Protocol
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.symmetric import Symmetric
-from unifg.machine.jit import compiled
-from unifg.program.curvature import lagrangian_hessian
-from unifg.program.linearization import Linearization, all_finite
-from unifg.program.passes import add_constraints
-from unifg.program.program import Program
-from unifg.solvers.globalize.sizes import largest
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.evaluation import add_constraints
+from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.linearization import Linearization, all_finite
+from unifg.solvers.globalize.norms import largest
 from unifg.typing import Array, BoolArray
 
 FINER = 0.01  # than the accuracy asked for: what interior points reach, and OSQP with a polish or not at all
@@ -36,7 +36,7 @@ class QP:
     Attributes:
         program: gives the pattern ``constraints`` (A).
         lin: where the problem was linearised.
-        pattern: of H: ``Program.hessian``, or ``Program.normal`` when H may hold the curvature of constraints.
+        pattern: of H: ``CompiledProblem.hessian``, or ``CompiledProblem.normal`` when H may hold second-order terms.
         hessian: entries of H, upper triangle.
         gradient: (n,) g.
         jacobian: entries of A in evaluation order.
@@ -46,7 +46,7 @@ class QP:
         weights: (M,) w, zero for rows without a square; None when H needs none.
     """
 
-    program: Program
+    program: CompiledProblem
     lin: Linearization
     pattern: Symmetric
     hessian: Array
@@ -71,7 +71,7 @@ class QP:
         return replace(self, lower=self.lower + offset, upper=self.upper + offset)
 
     def with_curvature(self, multipliers: Array) -> QP:
-        """The same problem, in the pattern ``Program.normal``, with the Hessian of the Lagrangian (Ta eq. 18).
+        """The same problem, in the pattern ``CompiledProblem.normal``, with the Hessian of the Lagrangian (Ta eq. 18).
 
         Args:
             multipliers: (M,).
@@ -145,7 +145,7 @@ class Route(Protocol):
 
 
 def qp_error(qp: QP, step: Array, multipliers: Array) -> float:
-    """Largest of stationarity, infeasibility and complementarity, scaled as in :mod:`unifg.answers.optimality`."""
+    """Largest of stationarity, infeasibility and complementarity, scaled as in :mod:`unifg.solution.optimality`."""
     if not (all_finite(step) and all_finite(multipliers)):
         return np.inf
     program = qp.program
@@ -195,7 +195,9 @@ def solve_convex(route: Route, qp: QP, multipliers: Array, accuracy: float) -> Q
     return replace(answer, multipliers=dual, error=qp_error(qp, answer.step, dual))
 
 
-def subproblem(program: Program, lin: Linearization, damping: float | Array, pattern: Symmetric | None = None) -> QP:
+def subproblem(
+    program: CompiledProblem, lin: Linearization, damping: float | Array, pattern: Symmetric | None = None
+) -> QP:
     """The quadratic model at ``lin``, with Gauss-Newton's Hessian and ``damping`` on its diagonal.
 
     Args:
@@ -218,7 +220,7 @@ def subproblem(program: Program, lin: Linearization, damping: float | Array, pat
     )
 
 
-def _gauss_newton(program: Program, lin: Linearization, pattern: Symmetric, damping: float | Array) -> Array:
+def _gauss_newton(program: CompiledProblem, lin: Linearization, pattern: Symmetric, damping: float | Array) -> Array:
     entries = lin.hessian.copy() if pattern is program.normal else program.hessian_entries(lin)
     entries[pattern.diagonal] += damping
     return entries

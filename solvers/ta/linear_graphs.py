@@ -21,19 +21,19 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from unifg.answers.graph import Graph
-from unifg.answers.requirements import require
-from unifg.answers.solution import Guess, Solution
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import BackendError, GraphError
-from unifg.kernels.differences import convexified
-from unifg.language.terms import Cost
-from unifg.language.variables import Data, Family
-from unifg.program.curvature import loss_curvature, row_weights
-from unifg.program.linearization import Rows
-from unifg.program.program import Program
-from unifg.program.term import CompiledTerm
+from unifg.factors.differences import convexified
+from unifg.modeling.terms import Cost
+from unifg.modeling.variables import Data, Family
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.hessian import loss_curvature, row_weights
+from unifg.problem.linearization import Rows
+from unifg.problem.term import CompiledTerm
+from unifg.solution.capabilities import require
+from unifg.solution.graph import Graph
+from unifg.solution.solution import Guess, Solution
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error, subproblem
 from unifg.solvers.ta.elimination import (
     Contradiction,
@@ -256,13 +256,13 @@ def primal_graph(qp: QP) -> LinearGraph:
     return LinearGraph("primal linear graph", sizes, tuple(factors))
 
 
-def variable_names(program: Program) -> tuple[str, ...]:
+def variable_names(program: CompiledProblem) -> tuple[str, ...]:
     """family[member] for each variable with an unknown, in the order of the unknowns."""
     columns = program.columns
     return tuple("{}[{}]".format(*columns.name(int(columns.free[k]))) for k in _first(program))
 
 
-def stacked_step(program: Program, step: Mapping[str, Array]) -> Array:
+def stacked_step(program: CompiledProblem, step: Mapping[str, Array]) -> Array:
     """(n,) tangent step of the program from the values of a primal graph."""
     return np.concatenate([np.zeros(0), *(step[name] for name in variable_names(program))])
 
@@ -274,7 +274,7 @@ def equality_rows(qp: QP) -> dict[str, IntArray]:
 
 
 def _blocks(
-    program: Program, pattern: Rows, terms: list[CompiledTerm], entries: Array, chosen: BoolArray
+    program: CompiledProblem, pattern: Rows, terms: list[CompiledTerm], entries: Array, chosen: BoolArray
 ) -> Iterator[tuple[CompiledTerm, str, IntArray, dict[str, Array]]]:
     """Term, name, chosen rows and blocks per variable of each factor that has chosen rows."""
     names, first = variable_names(program), _first(program)
@@ -326,7 +326,7 @@ def _curvature(qp: QP, names: tuple[str, ...], first: IntArray) -> list[Factor]:
 
 
 def _quadratic(
-    program: Program,
+    program: CompiledProblem,
     term: CompiledTerm,
     kind: Literal["cost", "curvature"],
     hessian: Array,
@@ -355,7 +355,7 @@ def _quadratic(
     return factors
 
 
-def _first(program: Program) -> IntArray:
+def _first(program: CompiledProblem) -> IntArray:
     """First unknown of each variable that has unknowns."""
     return np.unique(program.blocks, return_index=True)[1]
 
@@ -369,7 +369,7 @@ def _index(name: str) -> int:
     return int(name[name.rindex("[") + 1 : -1])
 
 
-def _stacked(program: Program, known: Mapping[str, Array]) -> Array:
+def _stacked(program: CompiledProblem, known: Mapping[str, Array]) -> Array:
     """(M,) multipliers by term name, zero where not given."""
     multipliers = np.zeros(program.constraints.count)
     for term, rows in zip(program.constraint_terms, program.slices, strict=True):
@@ -396,7 +396,7 @@ class EliminationRoute:
 
     name = "elimination"
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: CompiledProblem) -> None:
         """Remember the program."""
         self.program = program
 

@@ -18,8 +18,8 @@ import numba
 import numpy as np
 
 import unifg as fg
-from unifg.answers.solver import Solver
 from unifg.models import avoidance, obstacles, quadrotor, unicycle
+from unifg.solution.solver import Solver
 from unifg.solvers import (
     KKT,
     SQP,

@@ -114,7 +114,7 @@ class Parking:
         self._run = solver.prepare(graph)
 
     def solve(self, drawn: Layout, kind: Guess, **options: Any) -> fg.Solution:
-        """Solve one parking from a guess, with options of :meth:`unifg.answers.solver.Prepared.solve`."""
+        """Solve one parking from a guess, with options of :meth:`unifg.solution.solver.Prepared.solve`."""
         states, controls = guess(drawn, kind)
         data: dict[fg.Data, Array] = {self._start: drawn.start, self._goal: drawn.goal}
         if self._cars is not None:

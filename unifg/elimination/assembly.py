@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from unifg.machine.jit import compiled, inlined
-from unifg.machine.vectors import Address, blend, get, load, plus, put, splat, store
+from unifg.codegen.jit import compiled, inlined
+from unifg.codegen.vectors import Address, blend, get, load, plus, put, splat, store
 from unifg.typing import IntArray
 
 

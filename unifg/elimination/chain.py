@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.ordering import filled
-from unifg.machine.jit import compiled
 from unifg.typing import Array, IntArray
 
 FRONTIER = 24  # nodes

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.machine.jit import compiled, inlined
-from unifg.machine.vectors import (
+from unifg.codegen.jit import compiled, inlined
+from unifg.codegen.vectors import (
     Address,
     address,
     blend,

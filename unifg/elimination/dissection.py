@@ -8,8 +8,8 @@ of the Dulmage-Mendelsohn decomposition and network flow to graph bisection impr
 
 from __future__ import annotations
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.ordering import filled
-from unifg.machine.jit import compiled
 from unifg.typing import IntArray
 
 LEAF = 120  # nodes that are not split any further

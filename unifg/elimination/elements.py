@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.ordering import filled
-from unifg.machine.jit import compiled
 from unifg.typing import IntArray
 
 ZEROS, PART = 36, 0.12  # a clique joins its parent when the zeros this stores are fewer, or a smaller part of both

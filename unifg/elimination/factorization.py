@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from unifg.codegen.threads import threads
 from unifg.elimination import fronts, sharing, substitution
 from unifg.elimination.analysis import SLACK, Ordering, Structure, analyse
-from unifg.elimination.far import block_of, blocks_of_pairs, heights
 from unifg.elimination.inverse import invert, locate
+from unifg.elimination.off_diagonal_inverse import block_of, blocks_of_pairs, heights
 from unifg.elimination.plan import (
     FAILED,
     INDEX,
@@ -27,7 +28,6 @@ from unifg.elimination.plan import (
 from unifg.elimination.symmetric import Symmetric
 from unifg.elimination.tree import EliminationTree
 from unifg.errors import UnifgError
-from unifg.machine.threads import threads
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["Factorization", "Ordering"]

@@ -8,6 +8,8 @@ method is then the block tridiagonal recursion, without an index.
 
 from __future__ import annotations
 
+from unifg.codegen.jit import compiled, inlined
+from unifg.codegen.vectors import Address, address, get, put, splat, store
 from unifg.elimination.assembly import add_row
 from unifg.elimination.dense import complete, eliminate, subtract_signed
 from unifg.elimination.plan import (
@@ -32,8 +34,6 @@ from unifg.elimination.plan import (
     ZERO,
     Plan,
 )
-from unifg.machine.jit import compiled, inlined
-from unifg.machine.vectors import Address, address, get, put, splat, store
 from unifg.typing import Array, IntArray
 
 ALL = -1  # in the place of a part

@@ -8,11 +8,11 @@ T. Davis, "Computing the sparse inverse subset: an inverse multifrontal approach
 
 from __future__ import annotations
 
+from unifg.codegen.bisect import first_not_below
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import address, get, load, minus, put, splat, store, times
 from unifg.elimination.dense import subtract_products, subtract_signed
 from unifg.elimination.plan import FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, STRIDE, Plan
-from unifg.machine.bisect import first_not_below
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import address, get, load, minus, put, splat, store, times
 from unifg.typing import Array, BoolArray, IntArray
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.ordering import filled
 from unifg.elimination.plan import (
     ADJACENT,
@@ -22,7 +23,6 @@ from unifg.elimination.plan import (
     UPDATE_STRIDE,
 )
 from unifg.elimination.subtrees import PARTS, share_out
-from unifg.machine.jit import compiled
 from unifg.typing import IntArray
 
 Narrow = NDArray[np.int32]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.machine.jit import compiled
+from unifg.codegen.jit import compiled
 from unifg.typing import IntArray
 
 

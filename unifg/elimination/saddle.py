@@ -18,12 +18,12 @@ import math
 
 import numpy as np
 
+from unifg.codegen.jit import compiled, in_order
 from unifg.elimination import substitution
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import Plan
 from unifg.errors import UnifgError
-from unifg.machine.jit import compiled, in_order
 from unifg.typing import Array, IntArray
 
 SHIFT = 1e-12  # on the diagonal of the equilibrated matrix

@@ -16,6 +16,11 @@ from math import sqrt
 import numpy as np
 from numba import float64, int8, int32, int64
 
+from unifg.codegen.jit import compiled
+from unifg.codegen.threads import share
+from unifg.codegen.vectors import Address, address, get, put
+from unifg.codegen.waiting import first_chunk, next_chunk, wait_for
+from unifg.codegen.work_queue import arguments_at, arrays, bundle, entrance
 from unifg.elimination.dense import complete, eliminate, subtract_signed
 from unifg.elimination.fronts import (
     BLOCK,
@@ -51,11 +56,6 @@ from unifg.elimination.plan import (
 )
 from unifg.elimination.substitution import backward, forward
 from unifg.elimination.subtrees import PARTS
-from unifg.machine.jit import compiled
-from unifg.machine.mailbox import arguments_at, arrays, bundle, entrance
-from unifg.machine.threads import share
-from unifg.machine.vectors import Address, address, get, put
-from unifg.machine.waiting import first_chunk, next_chunk, wait_for
 from unifg.typing import Array, IntArray
 
 PLAN = bundle(

@@ -6,10 +6,10 @@ import math
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address, address, blend, get, load, minus, plus_products, put, splat, store, total
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import ADJACENT, FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, SCALARS, STRIDE, Plan
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address, address, blend, get, load, minus, plus_products, put, splat, store, total
 from unifg.typing import Array, IntArray
 
 MEMORY = 4  # corrections that are combined

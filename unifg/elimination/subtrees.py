@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.elimination.ordering import filled
 from unifg.elimination.plan import CHILD, PIVOTS, ROWS, SIBLING
-from unifg.machine.jit import compiled
 from unifg.typing import IntArray
 
 PARTS = 8

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.machine.jit import compiled
+from unifg.codegen.jit import compiled
 from unifg.typing import Array, IntArray
 
 if TYPE_CHECKING:

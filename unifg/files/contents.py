@@ -14,8 +14,8 @@ import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from unifg.atomic_write import write_atomically
 from unifg.errors import FileFormatError
-from unifg.whole import write_whole
 
 __all__ = ["LIMITS", "Limits", "checked_text", "legible", "read_bytes", "read_text", "write_text"]
 
@@ -126,5 +126,5 @@ def checked_text(path: str | os.PathLike[str], content: bytes, limits: Limits = 
 def write_text(path: Path, text: str) -> Path:
     """Write text, gzipped when the name ends in ``.gz``; the same text gives the same bytes."""
     data = text.encode("ascii")
-    write_whole(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
+    write_atomically(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
     return path

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from unifg.machine.jit import compiled, in_order
+from unifg.codegen.jit import compiled, in_order
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["BLANKS", "parse_fields"]

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from unifg.codegen.jit import compiled
 from unifg.files.contents import LIMITS, Limits, checked_text, read_bytes
 from unifg.files.decimals import is_blank
-from unifg.machine.jit import compiled
 from unifg.typing import IntArray
 
 __all__ = ["Lines", "read_lines"]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from unifg.errors import FileFormatError, GraphError
 from unifg.files.tagged import TaggedFile
-from unifg.language.inventory import counted
+from unifg.modeling.summary import counted
 from unifg.pose_graphs.information import Repair, indefinite, repaired, require_repair
 from unifg.pose_graphs.initialise import odometric
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Sightings

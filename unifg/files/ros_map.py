@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from unifg.atomic_write import write_atomically
 from unifg.errors import FileFormatError, ModelError
 from unifg.files.contents import LIMITS, Limits, legible, read_text
 from unifg.typing import Array, BoolArray
-from unifg.whole import write_whole
 
 _DEFAULT_OCCUPIED, _DEFAULT_FREE = 0.65, 0.196
 # Values of ROS's own map_saver; 205 lies between the default thresholds.
@@ -183,9 +183,9 @@ def save_map(path: str | Path, occupancy: OccupancyMap) -> None:
     pixels[occupancy.occupied] = _PIXEL_OCCUPIED
     height, width = occupancy.shape
     image = path.with_suffix(".pgm")
-    write_whole(image, f"P5\n{width} {height}\n255\n".encode("ascii") + pixels[::-1].tobytes())
+    write_atomically(image, f"P5\n{width} {height}\n255\n".encode("ascii") + pixels[::-1].tobytes())
     x, y, yaw = (float(value) for value in occupancy.origin)
-    write_whole(
+    write_atomically(
         path,
         f'image: "{image.name}"\nmode: trinary\nresolution: {_yaml_float(occupancy.resolution)}\n'
         f"origin: [{_yaml_float(x)}, {_yaml_float(y)}, {_yaml_float(yaw)}]\nnegate: 0\n"

@@ -9,34 +9,34 @@ loop = Loop(robot, 25, [Dynamics(motion, h), Parking()], solver=InteriorPoint(),
 plan = loop.tick(measured={"position": z})
 """
 
-from unifg.horizon.control_loop import Loop, Starts
-from unifg.horizon.coupled import COUPLINGS, Coupling
-from unifg.horizon.decision import Choice, Judge, KeepThenBrake, Kept, Plan
+from unifg.horizon.coupling import COUPLINGS, Coupling
+from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
+from unifg.horizon.history import History
 from unifg.horizon.past import Arrival
-from unifg.horizon.recorded import History
-from unifg.horizon.robot import Robot, Static
-from unifg.horizon.statements import ControlCost, Dynamics, Measurement, Now, Resetting, Term
+from unifg.horizon.receding_horizon import InitialGuesses, RecedingHorizon
+from unifg.horizon.robot import Constant, Robot
+from unifg.horizon.terms import Context, ControlCost, Dynamics, Measurement, Resetting, Term
 from unifg.horizon.window import Window
 
 __all__ = [
     "COUPLINGS",
+    "AcceptancePolicy",
     "Arrival",
-    "Choice",
+    "Constant",
+    "Context",
     "ControlCost",
     "Coupling",
+    "Decision",
     "Dynamics",
     "History",
-    "Judge",
-    "KeepThenBrake",
-    "Kept",
-    "Loop",
+    "InitialGuesses",
+    "LastPlan",
+    "LastPlanThenBrake",
     "Measurement",
-    "Now",
     "Plan",
+    "RecedingHorizon",
     "Resetting",
     "Robot",
-    "Starts",
-    "Static",
     "Term",
     "Window",
 ]

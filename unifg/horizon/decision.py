@@ -8,10 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from unifg.answers.solution import Solution
-from unifg.answers.status import Status
 from unifg.horizon.robot import Robot
-from unifg.horizon.statements import Now
+from unifg.horizon.terms import Context
+from unifg.solution.solution import Solution
+from unifg.solution.status import Status
 from unifg.typing import Array
 
 
@@ -51,7 +51,7 @@ class Plan:
         return self.source != "solved"
 
 
-class Kept:
+class LastPlan:
     """The last plan that was accepted, which ages while later solves fail.
 
     Attributes:
@@ -91,7 +91,7 @@ class Kept:
 
 
 @dataclass(frozen=True)
-class Choice:
+class Decision:
     """Controls applied at a tick.
 
     Attributes:
@@ -110,10 +110,12 @@ class Choice:
     behind: bool = False
 
 
-class Judge(Protocol):
+class AcceptancePolicy(Protocol):
     """Decides what is applied."""
 
-    def __call__(self, solution: Solution, states: Array, controls: Array, now: Now[Any], kept: Kept) -> Choice:
+    def __call__(
+        self, solution: Solution, states: Array, controls: Array, now: Context[Any], kept: LastPlan
+    ) -> Decision:
         """Judge a solve.
 
         Args:
@@ -127,7 +129,7 @@ class Judge(Protocol):
 
 
 @dataclass(frozen=True)
-class KeepThenBrake:
+class LastPlanThenBrake:
     """Apply a plan that keeps its constraints; else what is left of the last one, for a while; else brake.
 
     Attributes:
@@ -140,15 +142,17 @@ class KeepThenBrake:
     robot: Robot
     feasible: float = 1e-3
     keep: int = 8
-    brake: Callable[[Now[Any]], Array] | None = None
+    brake: Callable[[Context[Any]], Array] | None = None
 
-    def __call__(self, solution: Solution, states: Array, controls: Array, now: Now[Any], kept: Kept) -> Choice:
+    def __call__(
+        self, solution: Solution, states: Array, controls: Array, now: Context[Any], kept: LastPlan
+    ) -> Decision:
         """Judge a solve."""
         if solution.violation <= self.feasible and np.isfinite(states).all() and np.isfinite(controls).all():
-            return Choice(kept.within(controls), states, "solved")
+            return Decision(kept.within(controls), states, "solved")
         return self.instead(now, kept)
 
-    def instead(self, now: Now[Any], kept: Kept) -> Choice:
+    def instead(self, now: Context[Any], kept: LastPlan) -> Decision:
         """Fallback without a plan of this tick."""
         count = len(kept.controls)
         braking = kept.within(np.tile(np.zeros(kept.controls.shape[1]), (count, 1)))
@@ -159,4 +163,4 @@ class KeepThenBrake:
             controls, source = np.concatenate([left, braking[: count - len(left)]]), "kept"
         else:
             controls, source = braking, "braking"
-        return Choice(controls, self.robot.rollout(now.present, controls), source)
+        return Decision(controls, self.robot.rollout(now.present, controls), source)

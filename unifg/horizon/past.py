@@ -1,7 +1,7 @@
 """The past in a graph: what the terms of a window say, and the prior that stands for all that has left it.
 
-What leaves takes its costs and equalities along: they are marginalised into a prior on the nodes and statics they
-reach, at the point where they were last linearised (:mod:`unifg.answers.marginal`); inequalities are dropped. While
+What leaves takes its costs and equalities along: they are marginalised into a prior on the nodes and constants they
+reach, at the point where they were last linearised (:mod:`unifg.solution.marginal`); inequalities are dropped. While
 the window is not full, factors that touch an empty place do not count, and the empty places are held by a weak prior.
 """
 
@@ -12,19 +12,19 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 
-from unifg.answers.graph import Graph
-from unifg.answers.solution import Solution
 from unifg.errors import GraphError
-from unifg.horizon.recorded import History
+from unifg.factors.residuals import Residual
+from unifg.horizon.history import History
 from unifg.horizon.robot import Robot
-from unifg.horizon.statements import Now, Term, handles_of, values_of
-from unifg.kernels.residuals import Residual
-from unifg.language.factors import prior
-from unifg.language.joint_prior import joint_prior
-from unifg.language.terms import Constraint, ScalarCost
-from unifg.language.terms import Term as Stated
-from unifg.language.variables import Data, Family, Selection
+from unifg.horizon.terms import Context, Term, handles_of, values_of
 from unifg.lie import Manifold
+from unifg.modeling.factors import prior
+from unifg.modeling.joint_prior import joint_prior
+from unifg.modeling.terms import Constraint, ScalarCost
+from unifg.modeling.terms import Term as Stated
+from unifg.modeling.variables import Data, Family, Selection
+from unifg.solution.graph import Graph
+from unifg.solution.solution import Solution
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 Place: TypeAlias = tuple[slice, slice, slice]
@@ -79,15 +79,15 @@ class Tangent:
         return np.concatenate([here, step]), information
 
 
-class Left:
+class MarginalPrior:
     """Marginal prior of the nodes that left the window.
 
     Attributes:
         initial: reference (storage,) and information (d, d) about the node everything began at.
-        statics: reference (count, storage) and information (count, d, d) about unknown statics at the start, by name.
-        arrival: reference (S + more,) and information (D, D) about the oldest nodes and the statics, as
+        constants: reference (count, storage) and information (count, d, d) of unknown constants at the start, by name.
+        arrival: reference (S + more,) and information (D, D) about the oldest nodes and the constants, as
             :class:`Arrival` has them; None before any has left.
-        departure: what ``arrival`` becomes with the next node that leaves.
+        pending_prior: what ``arrival`` becomes with the next node that leaves.
     """
 
     def __init__(self, robot: Robot, start: Array, covariance: Array) -> None:
@@ -99,10 +99,10 @@ class Left:
         """Forget what has left; a state (storage,) is believed with a covariance (d, d)."""
         robot = self._robot
         self.initial = start.copy(), np.linalg.inv(covariance)
-        unknown = [static for static in robot.statics if not static.known]
-        self.statics = {static.name: (static.values, static.information) for static in unknown}
+        unknown = [static for static in robot.constants if not static.known]
+        self.constants = {static.name: (static.values, static.information) for static in unknown}
         self.arrival: tuple[Array, Array] | None = None
-        self.departure: tuple[Array, Array] | None = None
+        self.pending_prior: tuple[Array, Array] | None = None
 
     def admit(
         self, name: str, member: int, value: Array, information: Array, place: tuple[slice, slice, slice]
@@ -117,9 +117,9 @@ class Left:
             place: of the member in the arrival.
         """
         self.forget(place[1])
-        values, weights = (array.copy() for array in self.statics[name])
+        values, weights = (array.copy() for array in self.constants[name])
         values[member], weights[member] = value, information
-        self.statics[name] = values, weights
+        self.constants[name] = values, weights
         if self.arrival is not None:
             reference, information = self.arrival[0].copy(), self.arrival[1]
             reference[place[0]] = value
@@ -128,7 +128,7 @@ class Left:
 
     def forget(self, columns: slice) -> None:
         """Marginalise some columns out of the arrival."""
-        self.departure = None
+        self.pending_prior = None
         if self.arrival is not None:
             reference, information = self.arrival
             own = np.arange(columns.start, columns.stop)
@@ -152,11 +152,11 @@ class Past:
         x: Selection,
         robot: Robot,
         history: History,
-        left: Left,
+        left: MarginalPrior,
         terms: Sequence[Term],
         arrival: Arrival,
     ) -> None:
-        """Add everything the past says to a graph that holds the robot's statics.
+        """Add everything the past says to a graph that holds the robot's constants.
 
         Raises:
             GraphError: for a scalar cost, which cannot be marginalised, and a factor that reaches into the future.
@@ -165,8 +165,8 @@ class Past:
         self._arrival = arrival
         length = history.length
         self._steps = {name: graph.variables(name, kind, length) for name, kind in robot.steps.items()}
-        self._statics = {static.name: graph.families[static.name] for static in robot.statics}
-        self._known = {static.name for static in robot.statics if static.known}
+        self._statics = {static.name: graph.families[static.name] for static in robot.constants}
+        self._known = {static.name for static in robot.constants if static.known}
         self._applied = graph.data("applied controls", np.zeros((length, robot.control.storage)), each=True)
         before = len(graph.terms)
         for term in terms:
@@ -225,7 +225,7 @@ class Past:
         for name, family in self._statics.items():
             if name in self._known:
                 continue
-            values, weights = left.statics[name]
+            values, weights = left.constants[name]
             reference = graph.data(f"{name} at the start", values, each=True)
             weight = graph.data(f"information about {name} at the start", weights, each=True)
             graph.minimize(prior, family, reference, information=weight, name=f"prior of {name}")
@@ -248,11 +248,11 @@ class Past:
         return tuple(self._steps.values())
 
     @property
-    def statics(self) -> tuple[Family, ...]:
-        """Families of the statics."""
+    def constants(self) -> tuple[Family, ...]:
+        """Families of the constants."""
         return tuple(self._statics.values())
 
-    def data(self, now: Now[Any]) -> dict[Data, ArrayLike]:
+    def data(self, now: Context[Any]) -> dict[Data, ArrayLike]:
         """Data of the window."""
         history, left = self._history, self._left
         found = values_of(self._terms, now, self._handles)
@@ -272,7 +272,7 @@ class Past:
         if not history.filled:
             found |= {self._resting: history.present, self._empty: np.arange(history.length) < history.empty}
         for name, (reference, weight) in self._believed.items():
-            found[reference], found[weight] = left.statics[name]
+            found[reference], found[weight] = left.constants[name]
         if left.arrival is not None:
             found[self._reference], found[self._information] = left.arrival
         return found
@@ -281,7 +281,7 @@ class Past:
         """Beliefs about everything but the nodes."""
         history = self._history
         steps = {family: history.steps[name] for name, family in self._steps.items()}
-        return steps | {family: history.statics[name] for name, family in self._statics.items()}
+        return steps | {family: history.constants[name] for name, family in self._statics.items()}
 
     def nodes(self) -> Array:
         """(L + 1, storage) what is believed about the nodes; empty places are guessed at the present."""
@@ -296,21 +296,21 @@ class Past:
         for name, family in self._steps.items():
             history.steps[name][:] = solution[family]
         for name, family in self._statics.items():
-            history.statics[name][:] = solution[family]
+            history.constants[name][:] = solution[family]
 
     def depart(self, solution: Solution) -> None:
         """Marginalise the oldest node, if the next step drops it, where a solution was linearised."""
         if not self._history.full:
             return
         x, reach = self.x, self.reach
-        kept: list[Family | Selection] = [x[1 : reach + 1], *self.statics]
+        kept: list[Family | Selection] = [x[1 : reach + 1], *self.constants]
         leaving = [x[0], *(f[0] for f in self.families)]
         found, information = solution.marginal_prior(self.names, leaving, kept, offset=True)
         here, step = np.split(found[0], [len(found[0]) - len(information)])
         lowest = np.concatenate(list(_moved(kept, here, step)))
         nothing = np.flatnonzero(np.diag(information) == 0.0)
         information[nothing, nothing] = NOTHING
-        self._left.departure = self._arrival.express(here, step, lowest, information)
+        self._left.pending_prior = self._arrival.express(here, step, lowest, information)
 
 
 def _moved(variables: Sequence[Family | Selection], here: Array, step: Array) -> Iterator[Array]:

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.language.statement import Statement
-from unifg.language.variables import Family
 from unifg.lie import Manifold
+from unifg.modeling.model import Model
+from unifg.modeling.variables import Family
 from unifg.typing import Array, ArrayLike
 
 
 @dataclass(frozen=True)
-class Static:
+class Constant:
     """Unknowns that do not change with time: parameters, landmarks, biases. One family in every graph of the robot.
 
     Attributes:
@@ -69,7 +69,7 @@ class Static:
         """True if it is no unknown at all."""
         return not np.any(self.sigma)
 
-    def family(self, graph: Statement) -> Family:
+    def family(self, graph: Model) -> Family:
         """Add the family to a graph; what is known is fixed."""
         family = graph.variables(self.name, self.manifold, len(self.values))
         if self.known:
@@ -84,7 +84,7 @@ class Robot:
     Attributes:
         state: manifold of every node of the trajectory.
         control: manifold R^m of the controls.
-        statics: unknowns that past and future share.
+        constants: unknowns that past and future share.
         steps: manifolds by name of unknowns that belong to each step of the past, as process noise; terms of the past
             find the families, one member per step, as ``graph.families[name]``.
         predict: ``predict(x, u)`` where a state (storage,) is after one step with a control (m,); a first guess of the
@@ -93,7 +93,7 @@ class Robot:
 
     state: Manifold
     control: Manifold
-    statics: tuple[Static, ...] = ()
+    constants: tuple[Constant, ...] = ()
     steps: Mapping[str, Manifold] = field(default_factory=dict)
     predict: Callable[[Array, Array], Array] | None = None
 

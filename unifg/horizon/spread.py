@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from unifg.language.variables import Family, Variable, as_selection
-from unifg.program.program import Program
-from unifg.program.systems import fill
+from unifg.modeling.variables import Family, Variable, as_selection
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.systems import fill
 from unifg.typing import Array
 
 SHIFT = 1e-10  # constraints are softened by a standard deviation of 1e-5, in their own units
@@ -17,7 +17,7 @@ SHIFT = 1e-10  # constraints are softened by a standard deviation of 1e-5, in th
 class JointCovariance:
     """A block of the inverse KKT matrix of a graph whose constraints are equalities: structure once."""
 
-    def __init__(self, program: Program, *variables: Variable) -> None:
+    def __init__(self, program: CompiledProblem, *variables: Variable) -> None:
         """Choose the variables, in the order of the rows and columns; fixed ones have no variance."""
         columns = np.concatenate([program.columns.of(as_selection(variable)).ravel() for variable in variables])
         unknown = program.columns.unknown[columns]
@@ -37,7 +37,7 @@ class JointCovariance:
 
     def __call__(self, values: Mapping[Family, Array]) -> Array | None:
         """(D, D) covariance at ``values``, with the data of the last solve; None when it does not exist."""
-        with self._program.turn:
+        with self._program.lock:
             return self._found(values)
 
     def _found(self, values: Mapping[Family, Array]) -> Array | None:

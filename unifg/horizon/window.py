@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from unifg.answers.graph import Graph
-from unifg.answers.solution import Solution
-from unifg.answers.solver import Solver
-from unifg.answers.status import Status
 from unifg.errors import GraphError, UnifgError
-from unifg.horizon.past import Arrival, Left, Past, Place, Tangent
-from unifg.horizon.recorded import History
+from unifg.horizon.history import History
+from unifg.horizon.past import Arrival, MarginalPrior, Past, Place, Tangent
 from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
-from unifg.horizon.statements import Now, Recording, Term, looked_at, reset_all
-from unifg.language.terms import Constraint
-from unifg.language.variables import Data, Family, Selection
+from unifg.horizon.terms import Context, Recording, Term, looked_at, reset_all
+from unifg.locks import ReentrantLock, synchronized
+from unifg.modeling.terms import Constraint
+from unifg.modeling.variables import Data, Family, Selection
+from unifg.solution.graph import Graph
+from unifg.solution.solution import Solution
+from unifg.solution.solver import Solver
+from unifg.solution.status import Status
 from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.least_squares import LevenbergMarquardt
-from unifg.turns import Turn, in_turn
 from unifg.typing import Array, ArrayLike
 
 logger = logging.getLogger("unifg")
@@ -36,7 +36,7 @@ class Window:
     """The last L steps of a robot, and a solver for what they say by themselves.
 
     At a tick: :meth:`move` lets the next node enter, :meth:`record` attaches what was measured, :meth:`estimate`
-    solves. :class:`unifg.horizon.Loop` does all three.
+    solves. :class:`unifg.horizon.RecedingHorizon` does all three.
 
     Attributes:
         robot: who moves.
@@ -86,7 +86,7 @@ class Window:
         Raises:
             GraphError: when sizes do not fit, or a term cannot stand in a window.
         """
-        self._turn = Turn()
+        self._lock = ReentrantLock()
         self.robot, self.terms, self.length = robot, looked_at(terms), length
         self._arrival = arrival or Tangent()
         self._records: dict[str, tuple[int, ...]] = {}
@@ -96,10 +96,10 @@ class Window:
         self._start = robot.point(start, "the start")
         self._sigma = _covariance(sigma, robot.state.dim)
         self.history = History(robot, length, self._start, self._records, filled)
-        self.left = Left(robot, self._start, self._sigma)
+        self.left = MarginalPrior(robot, self._start, self._sigma)
         graph = Graph()
         x = graph.variables("x", robot.state, length + 1)
-        for static in robot.statics:
+        for static in robot.constants:
             static.family(graph)
         self._past = self.past_in(graph, x[:])
         if solver is None:
@@ -107,7 +107,7 @@ class Window:
             solver = InteriorPoint() if constrained else LevenbergMarquardt()
         self.run = solver.prepare(graph)
         self._look = replace(solver, max_iterations=0).prepare(graph)
-        self.spread = JointCovariance(self.run.program, x[-1], *self._past.statics)
+        self.spread = JointCovariance(self.run.program, x[-1], *self._past.constants)
         self.solution: Solution | None = None
         self._rehearse()
         self.statuses: Counter[Status] = Counter()
@@ -117,14 +117,14 @@ class Window:
 
     def _rehearse(self) -> None:
         """Call once what ticks call besides the solver: functions of manifolds are compiled when they are needed."""
-        kinds = [self.robot.state, *self.robot.steps.values(), *(static.manifold for static in self.robot.statics)]
+        kinds = [self.robot.state, *self.robot.steps.values(), *(static.manifold for static in self.robot.constants)]
         for kind in kinds:
             here = kind.identity()
             kind.retract(here, kind.local(here, here))
             kind.retract(here[None], kind.local(here[None], here[None]))
 
     def past_in(self, graph: Graph, x: Selection) -> Past:
-        """State the past on the nodes x (L + 1) of a graph that holds the robot's statics."""
+        """State the past on the nodes x (L + 1) of a graph that holds the robot's constants."""
         return Past(graph, x, self.robot, self.history, self.left, self.terms, self._arrival)
 
     @property
@@ -133,11 +133,11 @@ class Window:
         return self.history.present.copy()
 
     @property
-    @in_turn
+    @synchronized
     def covariance(self) -> Array:
-        """(D, D) of the present state and the statics side by side, from the past's terms alone.
+        """(D, D) of the present state and the constants side by side, from the past's terms alone.
 
-        That of the last estimate for which there is one: statics that nothing has been measured of have none.
+        That of the last estimate for which there is one: constants that nothing has been measured of have none.
         """
         if self._due and self.solution is not None:
             self._due = False
@@ -157,7 +157,7 @@ class Window:
         return self._member(name, member, self.robot.state.dim, "dim")
 
     def _member(self, name: str, member: int, at: int, size: str) -> slice:
-        for static in self.robot.statics:
+        for static in self.robot.constants:
             own = getattr(static.manifold, size)
             if static.name == name and 0 <= member < len(static.values):
                 return slice(at + member * own, at + (member + 1) * own)
@@ -169,11 +169,11 @@ class Window:
         state, reach = self.robot.state, self._past.reach
         sizes = (reach * state.storage, "storage"), (reach * state.dim, "dim")
         reference, information = (self._member(name, member, at, size) for at, size in sizes)
-        statics = sum(len(static.values) * static.manifold.storage for static in self.robot.statics)
-        behind = reach * state.storage + statics
+        constants = sum(len(static.values) * static.manifold.storage for static in self.robot.constants)
+        behind = reach * state.storage + constants
         return reference, information, slice(behind + information.start, behind + information.stop)
 
-    @in_turn
+    @synchronized
     def admit(self, name: str, member: int, value: ArrayLike, sigma: ArrayLike) -> None:
         """Let a member of a static stand for something new, of which nothing was known.
 
@@ -186,7 +186,7 @@ class Window:
         Raises:
             GraphError: when the robot has no such static, or it is known.
         """
-        manifold = {static.name: static for static in self.robot.statics if not static.known}
+        manifold = {static.name: static for static in self.robot.constants if not static.known}
         place = self._arriving(name, member)
         if name not in manifold:
             raise GraphError(f"static '{name}' is known: nothing new can take its place", family=name)
@@ -195,9 +195,9 @@ class Window:
             raise GraphError(f"static '{name}': {array} is not on {kind.name}", family=name)
         weight = information_of(np.broadcast_to(np.asarray(sigma, dtype=np.float64), (kind.dim,)))
         self.left.admit(name, member, array, weight, place)
-        self.history.statics[name][member] = array
+        self.history.constants[name][member] = array
 
-    @in_turn
+    @synchronized
     def forget(self, name: str, member: int) -> None:
         """Marginalise a member of a static out of what has left.
 
@@ -215,7 +215,7 @@ class Window:
         dim = self.robot.state.dim
         return self.covariance[:dim, :dim].copy()
 
-    @in_turn
+    @synchronized
     def move(
         self,
         control: ArrayLike,
@@ -243,9 +243,9 @@ class Window:
                 known = ", ".join(f"{name} ({kind.storage},)" for name, kind in robot.steps.items()) or "none"
                 raise GraphError(f"the guess of '{name}' is none of the robot's steps: {known}", family=name)
         if history.full:
-            if self.left.departure is None:
+            if self.left.pending_prior is None:
                 self._look_again()
-            self.left.arrival, self.left.departure = self.left.departure, None
+            self.left.arrival, self.left.pending_prior = self.left.pending_prior, None
         history.move(applied, expected, entering, steps or {})
 
     def _expected(self, applied: Array) -> Array:
@@ -254,23 +254,23 @@ class Window:
             raise GraphError(f"predict must give a finite state {found.shape}, found {found} at {self.history.present}")
         return found
 
-    @in_turn
+    @synchronized
     def record(self, name: str, value: ArrayLike | None, node: int = -1) -> None:
         """Attach what was measured to a node, by default the present one; None where nothing was.
 
         Raises:
-            GraphError: see :meth:`unifg.horizon.recorded.History.record`.
+            GraphError: see :meth:`unifg.horizon.history.History.record`.
         """
         if value is not None:
             self.history.record(name, value, node)
-            self.left.departure = None  # it was found without this measurement
+            self.left.pending_prior = None  # it was found without this measurement
 
-    def now(self, given: Any, last: Array | None = None) -> Now[Any]:
+    def now(self, given: Any, last: Array | None = None) -> Context[Any]:
         """Context of terms; ``last`` (m,) is the control applied last."""
         history = self.history
         applied = history.controls[-1] if last is None else last
-        statics = {name: values.copy() for name, values in history.statics.items()}
-        return Now(given, self.present, applied.copy(), statics, history)
+        constants = {name: values.copy() for name, values in history.constants.items()}
+        return Context(given, self.present, applied.copy(), constants, history)
 
     def data(self, given: Any = None) -> dict[Data, ArrayLike]:
         """Data of the window's own graph."""
@@ -280,7 +280,7 @@ class Window:
         """Beliefs by the families of the window's own graph."""
         return {self._past.x.family: self._past.nodes(), **self._past.guess()}
 
-    @in_turn
+    @synchronized
     def estimate(self, given: Any = None) -> Solution:
         """Solve the window and believe it, unless the answer is none; then the prediction is kept.
 
@@ -323,7 +323,7 @@ class Window:
         self.solution, self._due = solution, True
         self._past.depart(solution)
 
-    @in_turn
+    @synchronized
     def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
         """Forget everything, and begin anew; terms that keep something forget it, too.
 
@@ -343,7 +343,7 @@ class Window:
 
     def _prior_covariance(self) -> Array:
         blocks = [np.linalg.inv(self.left.initial[1])]
-        for static in self.robot.statics:
+        for static in self.robot.constants:
             sigma = np.broadcast_to(
                 np.asarray(static.sigma, dtype=np.float64), (len(static.values), static.manifold.dim)
             )

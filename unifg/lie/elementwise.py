@@ -16,10 +16,10 @@ from typing import Any, TypeAlias, cast, overload
 
 import numpy as np
 
+from unifg.codegen.calls import matrix, vector
+from unifg.codegen.fingerprint import is_compiled
+from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
-from unifg.machine.calls import matrix, vector
-from unifg.machine.fingerprint import is_compiled
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 Scalar: TypeAlias = Callable[..., None]

@@ -14,12 +14,12 @@ from collections.abc import Callable, Hashable
 from functools import cache
 from typing import Any, cast
 
-from unifg.lie.consequences import RULES
+from unifg.codegen.calls import local_matrix, vector
+from unifg.codegen.jit import compiled
+from unifg.lie.defaults import RULES
 from unifg.lie.elementwise import DIM, LAYOUTS, MATRIX, POINT, STORAGE, Scalar, stated, stated_in
 from unifg.lie.manifold import Manifold
 from unifg.lie.product import leaves
-from unifg.machine.calls import local_matrix, vector
-from unifg.machine.jit import compiled
 from unifg.typing import Array
 
 LOG_BETWEEN = "log_between"

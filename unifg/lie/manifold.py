@@ -13,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from unifg.errors import UnifgError
-from unifg.lie.consequences import RULES, STEP
+from unifg.lie.defaults import RULES, STEP
 from unifg.lie.elementwise import method, stated
 from unifg.typing import Array, ArrayLike, BoolArray
 

@@ -7,11 +7,11 @@ from typing import Any, SupportsIndex
 
 import numpy as np
 
+from unifg.codegen.jit import compiled, in_order
 from unifg.errors import UnifgError
 from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup, identities
 from unifg.lie.so2 import straight
-from unifg.machine.jit import compiled, in_order
 from unifg.typing import Array, ArrayLike
 
 

@@ -11,11 +11,11 @@ import math
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup
 from unifg.lie.series import c_value, k_slope, k_value, sinc, sinc_and_cos, x_cot_x
 from unifg.lie.so2 import PI, wrap
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 

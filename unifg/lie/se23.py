@@ -17,13 +17,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.calls import local_matrix, local_vector
+from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
 from unifg.lie import se3
 from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup
 from unifg.lie.so3 import SO3, write_matrix
-from unifg.machine.calls import local_matrix, local_vector
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
 

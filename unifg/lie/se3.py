@@ -19,6 +19,8 @@ import math
 
 import numpy as np
 
+from unifg.codegen.calls import vector
+from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
 from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup
@@ -36,8 +38,6 @@ from unifg.lie.so3 import (
     write_product,
     write_turn,
 )
-from unifg.machine.calls import vector
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
 

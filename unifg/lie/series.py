@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import math
 
-from unifg.machine.jit import compiled
+from unifg.codegen.jit import compiled
 
 TINY = 1e-300  # below every angle that matters: sin(TINY) / TINY is 1
 SERIES_BELOW = 0.25  # of theta^2 [rad^2]

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.lie.elementwise import elementwise, over_one
 from unifg.lie.manifold import LieGroup
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike
 
 PI = math.pi

@@ -18,12 +18,12 @@ from typing import Literal, TypeAlias
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
 from unifg.lie.elementwise import elementwise, over_one
 from unifg.lie.manifold import LieGroup
 from unifg.lie.series import TINY, c_value, k_slope, k_value, x_cot_x
 from unifg.lie.so2 import wrap
-from unifg.machine.jit import compiled
 from unifg.typing import Array, ArrayLike, BoolArray
 
 Order: TypeAlias = Literal["wxyz", "xyzw"]

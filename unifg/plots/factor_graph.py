@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.language.inventory import Group, alike, counted, weight
-from unifg.language.terms import Cost, Fix, Term
-from unifg.language.variables import Data, Family
 from unifg.lie import Manifold, Product
+from unifg.modeling.summary import Group, alike, counted, weight
+from unifg.modeling.terms import Cost, Fix, Term
+from unifg.modeling.variables import Data, Family
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import headline, new_figure
 from unifg.typing import Array, BoolArray

@@ -15,9 +15,9 @@ import math
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
-from unifg.kernels.whitening import quick_roots
-from unifg.machine.jit import compiled
+from unifg.factors.whitening import quick_roots
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
 

@@ -7,7 +7,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.kernels.whitening import quick_roots
+from unifg.factors.whitening import quick_roots
 from unifg.typing import Array, BoolArray
 
 __all__ = ["REPAIRS", "Repair", "bounded_below", "indefinite", "repaired", "require_repair"]

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.kernels.robust import Loss
+from unifg.factors.robust import Loss
 from unifg.lie import SE2, SE3, SO3, LieGroup
 from unifg.pose_graphs.linear import block_least_squares
 from unifg.pose_graphs.pose_graph import GUESSES, PoseGraph, ResidualName

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.answers.fit import is_far, ratio_sentence
-from unifg.language.inventory import counted
+from unifg.modeling.summary import counted
 from unifg.pose_graphs.information import indefinite
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.solution.fit import is_far, ratio_sentence
 from unifg.typing import Array, IntArray
 
 __all__ = ["Judgement", "judge"]

@@ -10,15 +10,15 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from unifg.answers.graph import Graph
 from unifg.elimination.components import components
 from unifg.errors import GraphError
-from unifg.kernels.residuals import Residual
-from unifg.kernels.robust import Loss
-from unifg.language.factors import ManifoldResidual, between
-from unifg.language.variables import Family
+from unifg.factors.residuals import Residual
+from unifg.factors.robust import Loss
 from unifg.lie import SE2, SE3, LieGroup, Rn
+from unifg.modeling.factors import ManifoldResidual, between
+from unifg.modeling.variables import Family
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, position, sighting
+from unifg.solution.graph import Graph
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["Edges", "Ids", "PoseGraph", "Priors", "ResidualName", "RobustOn", "Sightings"]

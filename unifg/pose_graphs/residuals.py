@@ -11,15 +11,15 @@ from functools import cache
 
 import numpy as np
 
+from unifg.codegen.calls import local_matrix, local_vector, vector
+from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
-from unifg.kernels.derive.stated import StatedKernel
-from unifg.kernels.kernel import Kernel
-from unifg.kernels.residuals import Residual, residual
-from unifg.language.factors import ManifoldResidual
+from unifg.factors.autodiff.stated import StatedKernel
+from unifg.factors.kernel import Kernel
+from unifg.factors.residuals import Residual, residual
 from unifg.lie import SE2, SE3, Manifold, Rn, wrap_angle
 from unifg.lie.functions import Functions, functions_of
-from unifg.machine.calls import local_matrix, local_vector, vector
-from unifg.machine.jit import compiled
+from unifg.modeling.factors import ManifoldResidual
 from unifg.typing import Array
 
 __all__ = ["bearing", "bearing_range", "chart_between", "distance", "sighting"]

@@ -11,13 +11,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from unifg.kernels.differences import jacobian
-from unifg.kernels.whitening import whiten_rows
-from unifg.language.factors import prior
-from unifg.language.terms import Cost
-from unifg.machine.vectors import Address
-from unifg.program.columns import Columns, Values
-from unifg.program.term import CompiledTerm
+from unifg.codegen.vectors import Address
+from unifg.factors.differences import jacobian
+from unifg.factors.whitening import whiten_rows
+from unifg.modeling.factors import prior
+from unifg.modeling.terms import Cost
+from unifg.problem.columns import Columns, Values
+from unifg.problem.term import CompiledTerm
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.linear import take_in, waiting
 from unifg.smoothing.queries import estimates

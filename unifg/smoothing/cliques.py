@@ -7,11 +7,11 @@ that the parent adds to its own front (J. Liu, "The multifrontal method", SIAM R
 
 from __future__ import annotations
 
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address, address, get, splat, store
 from unifg.elimination.assembly import add_products, add_update
 from unifg.elimination.fronts import eliminate_front
 from unifg.elimination.substitution import backward
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address, address, get, splat, store
 from unifg.smoothing.memory import length_of_front, take_list, take_numbers
 from unifg.smoothing.state import Record, opened
 from unifg.typing import Array, IntArray

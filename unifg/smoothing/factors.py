@@ -1,7 +1,7 @@
 """From what a user states to the numbers compiled code reads: types of factors, and the parts of manifolds.
 
 A statement is a cost like those of a graph, and the first of its kind is compiled as a graph compiles it
-(:class:`unifg.program.term.CompiledTerm`), with the same demands and messages. After that the kernel is known, and the
+(:class:`unifg.problem.term.CompiledTerm`), with the same demands and messages. After that the kernel is known, and the
 next statement only lays out its numbers. What a traced function reaches counts as it is when the factor is stated.
 """
 
@@ -14,23 +14,23 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.kernels.kernel import Kernel, side_by_side
-from unifg.kernels.residuals import Residual
-from unifg.kernels.robust import QUADRATIC, Form, Loss, form_of
-from unifg.kernels.whitening import DIAGONAL, FULL, quick_roots, reciprocals, square_roots
-from unifg.language.doubles import doubles
-from unifg.language.elements import elements_of, nearest, on_manifolds, quaternions_of
-from unifg.language.factors import prior
-from unifg.language.statement import AnyResidual, complete
-from unifg.language.terms import Cost, Parameter, prepare_arguments
-from unifg.language.trial import rows_of
-from unifg.language.variables import Data, Family, Selection
+from unifg.factors.kernel import Kernel, side_by_side
+from unifg.factors.residuals import Residual
+from unifg.factors.robust import QUADRATIC, Form, Loss, form_of
+from unifg.factors.whitening import DIAGONAL, FULL, quick_roots, reciprocals, square_roots
 from unifg.lie import Manifold
-from unifg.lie.moving import ADDITION, move_of
 from unifg.lie.product import leaves
-from unifg.program.columns import Columns
-from unifg.program.term import CompiledTerm
-from unifg.program.traced import Trace, reach_of_value
+from unifg.lie.retraction import ADDITION, move_of
+from unifg.modeling.duplicates import doubles
+from unifg.modeling.elements import elements_of, nearest, on_manifolds, quaternions_of
+from unifg.modeling.factors import prior
+from unifg.modeling.model import AnyResidual, complete
+from unifg.modeling.probing import rows_of
+from unifg.modeling.terms import Cost, Parameter, prepare_arguments
+from unifg.modeling.variables import Data, Family, Selection
+from unifg.problem.columns import Columns
+from unifg.problem.term import CompiledTerm
+from unifg.problem.traced import Trace, reach_of_value
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.repeated import Key, Kind, key_of, numbers_of
 from unifg.smoothing.state import BY_PYTHON, TYPE

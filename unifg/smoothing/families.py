@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.language.variables import Family, Index, Selection
 from unifg.lie import Manifold, Rn
+from unifg.modeling.variables import Family, Index, Selection
 from unifg.typing import IntArray
 
 

@@ -8,12 +8,12 @@ from typing import Literal
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.language.variables import Selection, Variable, as_selection
+from unifg.locks import synchronized
+from unifg.modeling.variables import Selection, Variable, as_selection
 from unifg.smoothing.factors import Staged
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.marginalize import marginalize
 from unifg.smoothing.smoother import Effort, Smoother
-from unifg.turns import in_turn
 from unifg.typing import Array, BoolArray, Numbers
 
 
@@ -80,7 +80,7 @@ class FixedLag(Smoother):
         self._drop = late == "drop"
         self._newest = -np.inf
 
-    @in_turn
+    @synchronized
     def update(
         self,
         values: Mapping[GrowingFamily, Numbers] | None = None,
@@ -118,7 +118,7 @@ class FixedLag(Smoother):
         self._batches.forget(self._state)
         return self._effort()
 
-    @in_turn
+    @synchronized
     def window(self, variable: Variable) -> Selection:
         """Those of the selected members that are still there."""
         selection = as_selection(variable)

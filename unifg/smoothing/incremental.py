@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from unifg.locks import synchronized
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.smoother import Effort, Smoother
-from unifg.turns import in_turn
 from unifg.typing import Numbers
 
 
@@ -35,7 +35,7 @@ class Incremental(Smoother):
         """
         super().__init__(relinearize, every, wildfire)
 
-    @in_turn
+    @synchronized
     def update(self, values: Mapping[GrowingFamily, Numbers] | None = None, *, iterations: int = 1) -> Effort:
         """Take in what was stated since the last update and improve all estimates.
 

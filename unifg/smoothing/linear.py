@@ -6,12 +6,12 @@ from math import sqrt
 
 import numpy as np
 
-from unifg.kernels.robust import QUADRATIC, value_of, weight_of
-from unifg.kernels.whitening import whiten
-from unifg.lie.moving import move_point
-from unifg.machine.calls import call_residual, matrix, vector, vector_at
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address, get, load, plus, put, splat, store
+from unifg.codegen.calls import call_residual, matrix, vector, vector_at
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address, get, load, plus, put, splat, store
+from unifg.factors.robust import QUADRATIC, value_of, weight_of
+from unifg.factors.whitening import whiten
+from unifg.lie.retraction import move_point
 from unifg.smoothing.state import BY_PYTHON, FRESH, LINEAR, Record, opened
 from unifg.typing import Array, IntArray
 

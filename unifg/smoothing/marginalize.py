@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address
 from unifg.elimination.ordering import filled
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address
 from unifg.smoothing.cliques import add_child
 from unifg.smoothing.linear import length_of
 from unifg.smoothing.memory import give_list, give_numbers

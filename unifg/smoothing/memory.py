@@ -9,9 +9,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from unifg.machine.borrow import redescribe
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address
+from unifg.codegen.views import redescribe
 from unifg.smoothing.state import CLASSES, State, opened
 from unifg.typing import Array, IntArray
 

@@ -7,9 +7,9 @@ micro Lie theory", eq. 69), and the quadratic is written anew in d'.
 
 from __future__ import annotations
 
-from unifg.machine.calls import call_residual, matrix, vector
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address
+from unifg.codegen.calls import call_residual, matrix, vector
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address
 from unifg.smoothing.linear import retract
 from unifg.smoothing.state import BY_PYTHON, opened
 from unifg.typing import Array

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address
 from unifg.elimination.ordering import filled
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address
 from unifg.smoothing.linear import cost_of, length_of, retract
 from unifg.smoothing.memory import found, grown, more, take_list, take_numbers
 from unifg.smoothing.state import BY_PYTHON, FRESH, SLOTS_MAX, opened

@@ -12,10 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unifg.kernels.robust import Loss, form_of
-from unifg.kernels.whitening import DIAGONAL, FULL, quick_roots
-from unifg.language.variables import Selection
-from unifg.program.traced import Trace
+from unifg.factors.robust import Loss, form_of
+from unifg.factors.whitening import DIAGONAL, FULL, quick_roots
+from unifg.modeling.variables import Selection
+from unifg.problem.traced import Trace
 from unifg.smoothing.families import GrowingFamily
 from unifg.typing import Array
 

@@ -8,14 +8,15 @@ from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
+from unifg.codegen.views import described
 from unifg.errors import GraphError
-from unifg.kernels.robust import Loss
-from unifg.language.doubles import doubles
-from unifg.language.statement import AnyResidual
-from unifg.language.terms import Parameter
-from unifg.language.variables import Data, Selection, Variable, as_selection
+from unifg.factors.robust import Loss
 from unifg.lie import Manifold
-from unifg.machine.borrow import described
+from unifg.locks import ReentrantLock, synchronized
+from unifg.modeling.duplicates import doubles
+from unifg.modeling.model import AnyResidual
+from unifg.modeling.terms import Parameter
+from unifg.modeling.variables import Data, Selection, Variable, as_selection
 from unifg.smoothing.batched import Batch, Batches, move_by_python
 from unifg.smoothing.factors import Parts, Staged, Types
 from unifg.smoothing.families import GrowingFamily
@@ -31,7 +32,6 @@ from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, Records, State,
 from unifg.smoothing.tree import give_up
 from unifg.smoothing.undetermined import enough
 from unifg.smoothing.update import begin, renew, update_tree
-from unifg.turns import Turn, in_turn
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers
 
 FIRST_MADE = PLACE[MADE[0]]
@@ -80,7 +80,7 @@ class Smoother:
                 raise GraphError(f"{type(self).__name__}: {name} must not be negative, found {value}")
         if every < 1:
             raise GraphError(f"{type(self).__name__}: every must be at least 1, found {every}")
-        self._turn = Turn()
+        self._lock = ReentrantLock()
         self.families: dict[str, GrowingFamily] = {}
         self.relinearize = relinearize
         self.every = every
@@ -105,7 +105,7 @@ class Smoother:
         parts = np.array(self._parts.fields, dtype=PART) if self._parts.fields else self._state.parts
         self._hold(self._state._replace(parts=parts))
 
-    @in_turn
+    @synchronized
     def variables(self, name: str, manifold: Manifold, *, keep: bool = False) -> GrowingFamily:
         """Add a family of unknowns, empty at first.
 
@@ -129,7 +129,7 @@ class Smoother:
         self._order.append(family)
         return family
 
-    @in_turn
+    @synchronized
     def data(self, name: str, value: ArrayLike, *, each: bool | None = None) -> Data:
         """Declare an array for the factors stated with it, which take the value it has then.
 
@@ -146,7 +146,7 @@ class Smoother:
         self._data[name] = Data(name, value, each)
         return self._data[name]
 
-    @in_turn
+    @synchronized
     def minimize(
         self,
         function: AnyResidual,
@@ -205,7 +205,7 @@ class Smoother:
             f"squares: {instead}, or solve the whole as a fg.Graph"
         )
 
-    @in_turn
+    @synchronized
     def estimate(self, variable: Variable, *, best: bool = False) -> Array:
         """(n, storage) estimates of a family or selection.
 
@@ -232,7 +232,7 @@ class Smoother:
         """(n, storage) points at which the factors of a family or selection are linear now."""
         return self._values(variable, True)
 
-    @in_turn
+    @synchronized
     def _values(self, variable: Variable, points: bool) -> Array:
         selection = as_selection(variable)
         rows = self._rows(selection)
@@ -242,7 +242,7 @@ class Smoother:
         out = flat.reshape(len(rows), storage)
         return out if selection.component is None else out[:, selection.storage]
 
-    @in_turn
+    @synchronized
     def covariance(self, *variables: Variable) -> Array:
         """Joint covariance (D, D) of all selected members, in their tangent spaces and the order given.
 
@@ -267,17 +267,17 @@ class Smoother:
         return result[np.ix_(columns, columns)]
 
     @property
-    @in_turn
+    @synchronized
     def cost(self) -> float:
         """Sum of 1/2 rho(|W r|^2) over all factors at the estimates; half of what is often called chi2."""
         return float(total_cost(self._memory)) + self._batches.cost(self._state, self._memory)
 
-    @in_turn
+    @synchronized
     def __len__(self) -> int:
         """Number of factors that count."""
         return int(self._state.factors["used"][: self._state.counters["factor_end"][0]].sum())
 
-    @in_turn
+    @synchronized
     def _update(self, values: Mapping[GrowingFamily, Numbers] | None, time: float | None, iterations: int) -> None:
         """Take in new members and staged factors, then bring everything up to date."""
         new = [self._checked(family, value) for family, value in values.items()] if values else []

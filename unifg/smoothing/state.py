@@ -13,9 +13,9 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from unifg.machine.borrow import opener
-from unifg.machine.jit import inlined
-from unifg.machine.vectors import Address
+from unifg.codegen.jit import inlined
+from unifg.codegen.vectors import Address
+from unifg.codegen.views import opener
 from unifg.typing import Array, IntArray
 
 Records: TypeAlias = NDArray[np.void]
@@ -170,7 +170,7 @@ _open = opener(State, (VARIABLE, FACTOR, TYPE, SLOT, PART, CLIQUE, COUNTERS, _IN
 
 @inlined
 def opened(memory: Address) -> State:
-    """The arrays whose description stands at an address, see :func:`unifg.machine.borrow.described`."""
+    """The arrays whose description stands at an address, see :func:`unifg.codegen.views.described`."""
     return _open(memory)
 
 

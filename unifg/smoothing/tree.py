@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address
 from unifg.elimination.ordering import filled
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address
 from unifg.smoothing.memory import give_list, give_numbers, length_of_front
 from unifg.smoothing.priors import relinearize
 from unifg.smoothing.state import LINEAR, SLOTS_MAX, STALE, opened

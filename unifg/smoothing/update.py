@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
+from unifg.codegen.vectors import Address
 from unifg.elimination.elements import arrange
 from unifg.elimination.ordering import filled
-from unifg.machine.jit import compiled
-from unifg.machine.vectors import Address
 from unifg.smoothing.cliques import add_child, add_factor, begin_clique, eliminate_clique, substitute
 from unifg.smoothing.linear import linearize
 from unifg.smoothing.memory import found, grown, length_of_front, more

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from unifg.atomic_write import replacing
 from unifg.errors import ViewError
 from unifg.style.colours import GREY, INK
 from unifg.typing import Array, ArrayLike
-from unifg.whole import beside
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -151,6 +151,6 @@ def word(ax: Axes, at: Array, text: str, offset: tuple[int, int], **style: Any) 
 def write_figure(path: str | Path, figure: Figure, dpi: int) -> Path:
     """Write a figure as a PNG and return its path; the same log gives the same bytes."""
     path = Path(path)
-    with beside(path) as own:
+    with replacing(path) as own:
         figure.savefig(own, dpi=dpi, format="png", metadata={"Software": None})  # no version, no date
     return path

@@ -9,8 +9,8 @@ from typing import TypeAlias
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.language.variables import Selection
 from unifg.lie import SE2, SE3, Manifold, Product, Rn
+from unifg.modeling.variables import Selection
 from unifg.typing import Array
 
 __all__ = ["Position", "Reading", "finite", "reading_of"]

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from unifg.answers.solution import Solution
+from unifg.atomic_write import write_atomically
 from unifg.errors import ViewError
-from unifg.language.variables import Family, Variable
+from unifg.modeling.variables import Family, Variable
+from unifg.solution.solution import Solution
 from unifg.style.colours import rgb
 from unifg.typing import Array, ArrayLike
 from unifg.view.bodies import Part, body_of
@@ -27,7 +28,6 @@ from unifg.view.members import Position
 from unifg.view.page import Label, Plot, View
 from unifg.view.recording import recorded
 from unifg.view.solutions import Recipe, recipe_of
-from unifg.whole import write_whole
 
 __all__ = ["Scene"]
 
@@ -262,7 +262,7 @@ class Scene(Content, Canvas):
             ViewError: nothing is drawn, or meshcat is not installed.
         """
         path = Path(path)
-        write_whole(path, self.html())
+        write_atomically(path, self.html())
         return path
 
     def live(self, port: int = 7000) -> Live:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.answers.solution import Solution
 from unifg.errors import GraphError, ViewError
-from unifg.language.variables import Family, Selection, Variable, as_selection
+from unifg.modeling.variables import Family, Selection, Variable, as_selection
+from unifg.solution.solution import Solution
 from unifg.typing import Array, IntArray
 from unifg.view.canvas import Canvas, Frame
 from unifg.view.members import Position, Reading, reading_of

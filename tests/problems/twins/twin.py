@@ -18,8 +18,8 @@ import casadi as ca
 import numpy as np
 
 import unifg as fg
-from unifg.language.statement import AnyResidual
-from unifg.language.variables import Variable, as_selection, is_variable
+from unifg.modeling.model import AnyResidual
+from unifg.modeling.variables import Variable, as_selection, is_variable
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 Exact = Callable[..., Any]

@@ -1,0 +1,219 @@
+"""Where to go? A model-predictive controller as a factor graph (Bazzana et al. 2022, section V).
+
+Costs: distance to reference poses along the path (eq. 8), control effort, control rate, soft margins to walls and
+discs. Constraints: unicycle dynamics, limits of velocities and of accelerations, rest at the end, hard clearance from
+walls and from tracked discs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+import unifg as fg
+from unifg.horizon import Context, ControlCost, Decision, InitialGuesses, LastPlan, Plan, RecedingHorizon, Term, Window
+from unifg.lie import wrap_angle
+from unifg.models import unicycle
+from unifg.models.distance_map import DistanceMap, SmoothField
+from unifg.scenarios.ground.drive_parts import Clearance, Drive, EvasiveTrajectory, Following, Limits, Motion, predicted
+from unifg.scenarios.ground.drive_past import robot
+from unifg.scenarios.ground.drive_settings import SECOND, ControllerSettings, backend
+from unifg.scenarios.ground.repulsion import Repulsion
+from unifg.scenarios.ground.stopping import evasions, followed, stopped
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.typing import Array
+
+COLD_PATIENCE = 3  # a tick without a warm start may iterate longer
+LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
+PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
+PURSUIT_TIME = 0.2  # [s] in which it would turn there
+ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
+SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
+COMMITTED = 0.1  # [m] more room than the evasion of the last tick has another one to have
+OFF_WALLS = 0.015  # [m] from the hull to walls: less is touching, as far as maps and estimates can tell
+PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
+
+
+class Controller:
+    """Decides the next control from a pose, a reference and tracks.
+
+    Attributes:
+        settings: weights and limits.
+        loop: the prepared graph.
+    """
+
+    def __init__(
+        self, distance_map: DistanceMap, solver: str, settings: ControllerSettings, window: Window | None = None
+    ) -> None:
+        """State the graph and prepare the backend; with a window, past and future are one graph."""
+        self.settings = s = settings
+        self.field = SmoothField(distance_map)
+        self._coming = np.zeros((0, 2))  # what would be driven next if nothing were decided any more
+        self._evasion: int | None = None  # number of the evasion that was the last tick's way out
+        terms: list[Term] = [
+            Following(s),
+            ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.wanted),
+            Motion(s),
+            Limits(s),
+            Repulsion(s, self.field) if s.avoidance in ("potential", "vortex") else Clearance(s, self.field),
+        ]
+        self.loop = RecedingHorizon(
+            robot(s.dt) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
+            cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND, s, COLD_PATIENCE), window=window,
+            coupling="sequential" if window is None else "joint", pull=s.pull, limits=s.box, judge=self.judge,
+            starts=InitialGuesses(self.along, self.leaving), believable=settled, patience=PATIENCE,
+        )  # fmt: skip
+
+    def stations(self) -> Array:
+        """(N + 1,) how far ahead along the path the reference is [m]."""
+        return self.settings.stations
+
+    def plan(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Plan:
+        """Decide the next control.
+
+        Args:
+            pose: (3,) estimate by the past alone [m, m, rad].
+            reference: (N + 1, 3) poses along the path, the first beside the robot.
+            tracks: discs the robot has seen.
+            covariance: (3, 3) of the estimate, in its tangent space; None for an estimate without error.
+        """
+        plan = self.loop.plan(pose, self.given(pose, reference, tracks, covariance))
+        self._coming = plan.controls[1:]
+        return plan
+
+    @property
+    def estimate(self) -> Array:
+        """(3,) present pose as it is believed after the last plan [m, m, rad]."""
+        return self.loop.estimate
+
+    def given(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Drive:
+        """What the terms are given; arguments as of :meth:`plan`."""
+        cruise = np.zeros((self.settings.horizon, 2))
+        cruise[:, 0] = np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
+        spread = np.zeros((3, 3)) if covariance is None else covariance
+        return Drive(cruise, reference, tracks, spread, self._way_out(pose, tracks))
+
+    def _way_out(self, pose: Array, tracks: Tracks) -> EvasiveTrajectory:
+        """Rest along the path of the last plan; if a mover would come too near there, the best simple way of evading.
+
+        Which is the best is judged by the least distance on the way, of discs and of walls alike, beyond what is to be
+        kept from them. One that leads into a wall is taken only where each does: walls do not step aside, and what the
+        way out comes near to the plan may come near to as well. The one of the last tick is kept while no other is much
+        better: who turns back and forth between two ways out takes neither.
+        """
+        s, last = self.settings, self.loop.applied
+        controls = stopped(last, self._coming, s.most, s.horizon)
+        rest = EvasiveTrajectory(followed(pose, last, controls, s.dt), controls)
+        movers = tracks.at(tracks.mover)
+        if not len(movers) or self._room(rest.states, predicted(s, pose, movers), movers.radius) >= 0.0:
+            self._evasion = None
+            return rest
+        centres, best, before, self._evasion = predicted(s, pose, tracks), rest, self._evasion, None
+        most = self._worth(rest.states, centres, tracks.radius)
+        for number, way in enumerate(evasions(last, s.most, s.box[1], s.horizon, s.dt)):
+            states = followed(pose, last, way, s.dt)
+            off_walls, clear, room = self._worth(states, centres, tracks.radius)
+            worth = off_walls, clear, room + (COMMITTED if number == before else 0.0)
+            if worth > most:
+                most, best, self._evasion = worth, EvasiveTrajectory(states, way, evades=True), number
+        return best
+
+    def _worth(self, states: Array, centres: Array, radii: Array) -> tuple[bool, bool, float]:
+        """How good a way out is, the greater the better: whether it touches no wall, nobody, and its least distance."""
+        walls, room = self._off_walls(states), self._room(states, centres, radii)
+        clear = room + self.settings.disc_clearance >= 0.0
+        return walls + self.settings.wall_clearance >= OFF_WALLS, clear, min(room, walls)
+
+    def _room(self, states: Array, centres: Array, radii: Array) -> float:
+        """Least gap between the hull at states (N + 1, 3) and discs at centres (N, k, 2), beyond what is to be kept."""
+        apart = np.hypot(*np.moveaxis(states[1:, None, :2] - centres, 2, 0)) - radii
+        return float(apart.min(initial=np.inf)) - self.settings.robot_radius - self.settings.disc_clearance
+
+    def _off_walls(self, states: Array) -> float:
+        """The same of walls."""
+        return (
+            float(self.field.distance(states[1:, :2]).min()) - self.settings.robot_radius - self.settings.wall_clearance
+        )
+
+    def rest(self, pose: Array) -> tuple[Array, Array]:
+        """Come to rest along the path of the last plan, without asking a solver.
+
+        Args:
+            pose: (3,) present [m, m, rad].
+
+        Returns:
+            Controls (N, 2) and states (N + 1, 3), the first of which is taken as applied.
+        """
+        s, last = self.settings, self.loop.applied
+        controls = stopped(last, self._coming, s.most, s.horizon)
+        self.loop.abandon()
+        self.loop.applied, self._coming = controls[0].copy(), controls[1:]
+        return controls, followed(pose, last, controls, s.dt)
+
+    def driven(self, control: Array) -> None:
+        """Be told that another control (2,) than the first of the plan is applied."""
+        self.loop.applied = control.copy()
+
+    def forget(self) -> None:
+        """Drop the warm start, as when a new route makes it misleading."""
+        self._evasion = None
+        self.loop.forget()
+
+    def judge(
+        self, solution: fg.Solution, states: Array, controls: Array, now: Context[Drive], kept: LastPlan
+    ) -> Decision:
+        """Drive a plan that keeps the constraints; leave by the way out otherwise.
+
+        Of a solve that ended early this is where it stopped. The cheapest iterate it has passed that keeps the
+        constraints was tried: such plans brush past obstacles and creep up to those that stand in the way.
+        """
+        if solution.violation <= self.settings.feasible:
+            driven = self._within_reach(kept.within(controls), now.last)
+            return Decision(driven, states, "solved", behind=is_behind(states, now.given.reference))
+        way = now.given.way_out
+        return Decision(way.controls, way.states, "evading" if way.evades else "braking")
+
+    def _within_reach(self, controls: Array, last: Array) -> Array:
+        """Controls (N, 2) of which the first is no farther from the last than the base can follow."""
+        most = self.settings.most
+        controls[0] = np.clip(controls[0], last - most, last + most)
+        return controls
+
+    def leaving(self, now: Context[Drive]) -> tuple[Array, Array]:
+        """Guess the way out, which is feasible: a solver that failed finds the near side of what stopped it."""
+        return now.given.way_out.states, now.given.way_out.controls
+
+    def along(self, now: Context[Drive]) -> tuple[Array, Array]:
+        """Guess how a simple pursuit would follow the reference, which leads around whatever the route leads around.
+
+        It keeps limits, accelerations and dynamics, and ends at rest: it turns first where the reference begins behind
+        the robot's back.
+        """
+        s, reference = self.settings, now.given.reference
+        speeds, controls = now.given.wanted[:, 0], np.zeros((s.horizon, 2))
+        states, last = np.tile(now.present, (s.horizon + 1, 1)), now.last
+        aim = 0
+        for k in range(s.horizon):
+            here = states[k]
+            while aim < s.horizon and np.hypot(*(reference[aim] - here)[:2]) < PURSUIT:
+                aim += 1
+            ahead = reference[aim] - here
+            distance = float(np.hypot(*ahead[:2]))
+            bearing = np.arctan2(ahead[1], ahead[0]) if distance > ARRIVED else reference[aim, 2]
+            turn = float(wrap_angle(bearing - here[2]))
+            speed = min(speeds[k], distance / s.dt) * max(np.cos(turn), 0.0) ** 2 if distance > ARRIVED else 0.0
+            fastest = np.minimum(s.box[1], s.most * (s.horizon - k))
+            wanted = np.clip([speed, turn / PURSUIT_TIME], -fastest, fastest)
+            controls[k] = np.clip(wanted, last - s.most, last + s.most)
+            states[k + 1] = unicycle.step(here[None], 0.5 * (last + controls[k])[None], s.dt)[0]
+            last = controls[k]
+        return states, controls
+
+
+def is_behind(states: Array, reference: Array) -> bool:
+    """Whether a plan (N + 1, 3) ends far from its reference: it may be caught in a dead end."""
+    return bool(np.hypot(*(states[-1] - reference[-1])[:2]) > LEFT_BEHIND)
+
+
+def settled(solution: fg.Solution, choice: Decision) -> bool:
+    """Whether a joint solve says where the robot is: it ended, and its plan is driven."""
+    return choice.source == "solved" and solution.status in SETTLED

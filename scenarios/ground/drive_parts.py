@@ -1,0 +1,224 @@
+"""What the driving robot's horizon says, term by term (Bazzana et al. 2022, section V)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import unifg as fg
+from unifg.horizon import Context
+from unifg.models import obstacles, unicycle
+from unifg.models.barriers import share
+from unifg.models.distance_map import SmoothField
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.perception.tracks import Tracks, nearest
+from unifg.typing import Array, ArrayLike
+
+FAR_AWAY = 1e3  # [m]; where an unused disc waits
+ENDS = "least controls", "greatest controls"
+
+
+@dataclass(frozen=True)
+class EvasiveTrajectory:
+    """What is driven when no plan is found.
+
+    It keeps limits and accelerations, ends at rest, and keeps clear as far as anything simple does.
+
+    Attributes:
+        states: (N + 1, 3) poses from the present on [m, m, rad].
+        controls: (N, 2) [m/s, rad/s].
+        evades: whether it is not to come to rest at once, but to get out of somebody's way.
+    """
+
+    states: Array
+    controls: Array
+    evades: bool = False
+
+
+@dataclass(frozen=True)
+class Drive:
+    """What the terms are given at a tick.
+
+    Attributes:
+        wanted: (N, 2) controls that would follow the reference [m/s, rad/s].
+        reference: (N + 1, 3) poses along the path, the first beside the robot.
+        tracks: discs the robot has seen.
+        covariance: (3, 3) of the present pose by the past alone, in its tangent space.
+        way_out: what is driven when no plan is found.
+    """
+
+    wanted: Array
+    reference: Array
+    tracks: Tracks
+    covariance: Array
+    way_out: EvasiveTrajectory
+
+
+@dataclass(frozen=True)
+class Following:
+    """Costs of leaving the reference (eq. 8), the one at its end apart."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the costs."""
+        s = self.settings
+        path = graph.data("reference", np.zeros((s.horizon - 1, 3)), each=True)
+        end = graph.data("end of reference", np.zeros(3))
+        graph.minimize(unicycle.tracking, x[1:-1], path, sigma=s.weighted(s.pose_sigma), name="path")
+        graph.minimize(unicycle.tracking, x[-1], end, sigma=s.weighted(s.terminal_sigma), name="end of path")
+
+    def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
+        """The reference."""
+        return {"reference": now.given.reference[1:-1], "end of reference": now.given.reference[-1]}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The unicycle with velocities that change steadily within a step, from those of now on."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the dynamics."""
+        now, dt = graph.data("velocities now", np.zeros(2)), self.settings.dt
+        graph.constrain(unicycle.ramped, x[0], now, u[0], x[1], dt, lower=0.0, upper=0.0, name="first step")
+        motion = x[1:-1], u[:-1], u[1:], x[2:], dt
+        graph.constrain(unicycle.ramped, *motion, lower=0.0, upper=0.0, name="dynamics")
+
+    def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
+        """The control applied last, which has been reached."""
+        return {"velocities now": now.last}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Of the unicycle's velocities and of their changes, from those of now to rest after the last step."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Bound the controls, and how they change."""
+        s = self.settings
+        low, high = (
+            graph.data(name, np.tile(side, (s.horizon, 1)), each=True) for name, side in zip(ENDS, s.box, strict=True)
+        )
+        graph.bound(u, lower=low, upper=high, name="limits")
+        graph.constrain(unicycle.rate, u[:-1], u[1:], lower=-s.most, upper=s.most, name="accelerations")
+
+    def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
+        """What can be reached in the first step, and left in one more after the last."""
+        s = self.settings
+        least, most = s.box
+        low, high = np.tile(least, (s.horizon, 1)), np.tile(most, (s.horizon, 1))
+        low[-1], high[-1] = np.maximum(least, -s.most), np.minimum(most, s.most)
+        low[0], high[0] = np.maximum(low[0], now.last - s.most), np.minimum(high[0], now.last + s.most)
+        return dict(zip(ENDS, (low, high), strict=True))
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Clearance from walls and tracked discs: soft margins, and hard limits as far as a robot at rest keeps them."""
+
+    settings: ControllerSettings
+    field: SmoothField
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add margins and limits."""
+        s, n, m = self.settings, self.settings.horizon, self.settings.discs
+        wall_limit = graph.data("wall clearance", np.zeros((n, 1)), each=True)
+        disc_limit = graph.data("disc clearance", np.zeros((n, m)), each=True)
+        centre = graph.data("disc centres", np.full((n, m, 2), FAR_AWAY), each=True)
+        radius, shy_radius = graph.data("disc radii", np.zeros(m)), graph.data("disc radii for the margin", np.zeros(m))
+        walls, discs = obstacles.wall_distance(self.field), obstacles.disc_clearance
+        margin, sigma = s.robot_radius + s.margin, s.weighted((s.margin_sigma,))[0]
+        graph.minimize(obstacles.shortfall(walls, margin), x[1:], sigma=sigma, name="wall margin")
+        shy = obstacles.shortfall(discs, margin)
+        graph.minimize(shy, x[1:], centre, shy_radius, sigma=sigma, name="disc margin")
+        graph.constrain(walls, x[1:], lower=wall_limit, name="walls")
+        graph.constrain(discs, x[1:], centre, radius, lower=disc_limit, name="discs")
+
+    def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
+        """Where the discs will be, and what the way out keeps."""
+        s, n, m = self.settings, self.settings.horizon, self.settings.discs
+        pose, given, chosen = now.present, now.given, nearest(now.given.tracks, now.present, m)
+        k, spread = len(chosen), in_world(pose, given.covariance)
+        centres, radii, shy = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m)
+        limits = np.zeros((n, m))
+        centres[:, :k], radii[:k], shy[:k] = predicted(s, pose, chosen), chosen.radius, chosen.mover * s.mover_margin
+        limits[:, :k] = disc_limits(s, pose, centres[:, :k], chosen, given.way_out.states, spread)
+        return {
+            "wall clearance": wall_limits(s, self.field, given.way_out.states, given.reference, spread),
+            "disc clearance": limits,
+            "disc centres": centres,
+            "disc radii": radii,
+            "disc radii for the margin": radii + shy,
+        }
+
+
+def in_world(pose: Array, covariance: Array) -> Array:
+    """(2, 2) covariance of a position [m^2], from that of a pose (3, 3) in its tangent space."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    turn = np.array([[cosine, -sine], [sine, cosine]])
+    spread: Array = turn @ covariance[:2, :2] @ turn.T
+    return spread
+
+
+def along(spread: Array, directions: Array) -> Array:
+    """(...) standard deviations [m] of a position along directions (..., 2)."""
+    length = np.maximum(np.hypot(directions[..., 0], directions[..., 1]), 1e-9)
+    variance = np.einsum("...i,ij,...j->...", directions, spread, directions)
+    sigma: Array = np.sqrt(np.maximum(variance, 0.0)) / length
+    return sigma
+
+
+def wall_limits(s: ControllerSettings, field: SmoothField, way_out: Array, reference: Array, spread: Array) -> Array:
+    """(N, 1) least distances to walls, as far as the way out keeps them.
+
+    They are wider by what the estimate (2, 2) may be off towards the wall that is nearest along the reference. With
+    ``avoidance="barrier"`` what is left of the distance may shrink at the rate ``approach``, too.
+    """
+    _, slopes = field.distance_and_gradient(reference[1:, :2])
+    least = s.robot_radius + s.wall_clearance + s.sigmas * along(spread, slopes)
+    if s.avoidance == "barrier":
+        spare = np.maximum(float(field.distance(way_out[:1, :2])[0]) - least, 0.0)
+        least = least + spare * share(s.approach, s.dt * np.arange(1, s.horizon + 1))
+    limits: Array = np.minimum(least, field.distance(way_out[1:, :2]))[:, None]
+    return limits
+
+
+def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
+    """(N, k, 2) centres along the horizon.
+
+    A mover goes straight on, whoever stands there; it is not trusted to go away, for it may turn round.
+    """
+    stages = s.dt * np.arange(1, s.horizon + 1)
+    centres: Array = tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
+    return centres
+
+
+def disc_limits(
+    s: ControllerSettings, pose: Array, centres: Array, tracks: Tracks, way_out: Array, spread: Array
+) -> Array:
+    """(N, M) least distances to the centres (N, M, 2) of discs less their radii, as far as the way out keeps them.
+
+    They are wider by what the estimate (2, 2) may be off towards a disc. A disc that has ever moved is kept off by what
+    it can travel in the meantime, or before it is noticed that it goes elsewhere, and what is left of the gap is a
+    barrier that may shrink at the rate ``approach`` from now on; with ``avoidance="barrier"`` that holds for each.
+    """
+    stages = s.dt * np.arange(1, s.horizon + 1)[:, None]
+    kept = np.hypot(*np.moveaxis(way_out[1:, None, :2] - centres, 2, 0)) - tracks.radius
+    movers, now = tracks.mover, pose[:2] - tracks.centre
+    walk = np.maximum(np.hypot(*tracks.velocity.T), s.mover_speed)
+    allowance = np.where(movers, walk * np.minimum(stages, s.mover_surprise), 0.0)
+    least = s.robot_radius + s.disc_clearance + s.sigmas * along(spread, now) + allowance
+    guarded = movers | (s.avoidance == "barrier")
+    spare = np.where(guarded, np.maximum(np.hypot(*now.T) - tracks.radius - least, 0.0), 0.0)
+    # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it; not so to a disc
+    # that moves.
+    squeezed = np.minimum(kept, np.maximum(kept - s.squeeze, s.robot_radius + s.squeeze))
+    limits: Array = np.minimum(least + spare * share(s.approach, stages), np.where(movers, kept, squeezed))
+    return limits

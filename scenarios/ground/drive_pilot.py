@@ -1,0 +1,342 @@
+"""How estimation and control are coupled: two graphs one after the other, or one graph for both."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+
+import unifg as fg
+from unifg.errors import ScenarioError, UnifgError
+from unifg.files.ros_map import OccupancyMap
+from unifg.horizon import Plan
+from unifg.models import unicycle
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.ground.drive_control import Controller
+from unifg.scenarios.ground.drive_past import Smoother
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
+from unifg.scenarios.ground.emergency_stop import EmergencyStop
+from unifg.scenarios.ground.localiser import Localiser
+from unifg.scenarios.ground.relocalise import Relocaliser
+from unifg.scenarios.ground.route import Route
+from unifg.scenarios.monitoring.supervisor import Health, OutlierReport, Supervisor
+from unifg.scenarios.monitoring.validation import Door
+from unifg.scenarios.perception.disc_tracker import DiscTracker
+from unifg.scenarios.perception.explaining import PointWatch, explained
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.stopwatch import Stopwatch
+from unifg.typing import Array
+
+COUPLINGS = ("sequential", "joint")
+AT_REST = 0.02  # [m/s]; slower is rest
+SEARCH_AGAIN = 20  # ticks after a search that found nothing
+FOUND_SIGMA = np.array([0.05, 0.05, 0.02])  # of a pose that a search has found [m, m, rad]
+STOPPED = "stopped"
+"""Source of a plan that the supervisor has made: come to rest."""
+
+
+logger = logging.getLogger("unifg")
+
+
+class Estimator(Protocol):
+    """What says where the robot is."""
+
+    @property
+    def iterations(self) -> int:
+        """Of the last update."""
+        ...
+
+    @property
+    def pose(self) -> Array:
+        """(3,) present estimate [m, m, rad]."""
+        ...
+
+    @property
+    def covariance(self) -> Array:
+        """(3, 3) of it, in the tangent space."""
+        ...
+
+    @property
+    def refused(self) -> str:
+        """Why the last scan has not corrected the estimate, "" where it has."""
+        ...
+
+    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        """Take in a scan, None for none, and the odometry (2,) since the last one, None on the first."""
+        ...
+
+    def reset(self, pose: Array, sigma: Array) -> None:
+        """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
+        ...
+
+
+class Planner(Protocol):
+    """What says where to go."""
+
+    settings: ControllerSettings
+
+    @property
+    def estimate(self) -> Array:
+        """(3,) present pose as it is believed after the last plan [m, m, rad]."""
+        ...
+
+    def stations(self) -> Array:
+        """(N + 1,) how far ahead along the path the reference is [m]."""
+        ...
+
+    def plan(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Plan:
+        """Decide the next control from a pose (3,), poses (N + 1, 3) along the route, discs, and the pose's (3, 3)."""
+        ...
+
+    def rest(self, pose: Array) -> tuple[Array, Array]:
+        """Controls (N, 2) and states (N + 1, 3) of coming to rest, the first of which is taken as applied."""
+        ...
+
+    def driven(self, control: Array) -> None:
+        """Be told that another control (2,) than the first of the plan is applied."""
+        ...
+
+    def forget(self) -> None:
+        """Drop the warm start, as when a new route makes it misleading."""
+        ...
+
+
+PlannerT = TypeVar("PlannerT", bound=Planner)
+
+
+class Pilot(Generic[PlannerT]):
+    """Estimates, looks for things that no map shows, repairs the route, plans along it, and stops when it has to.
+
+    Attributes:
+        estimator: of the pose, by the past alone.
+        controller: of the drive.
+        tracker: of discs.
+        points: what is neither on the map nor a disc.
+        tracks: after the last tick: discs and points.
+        pose: (3,) present estimate [m, m, rad]; that of the joint solve, if there is one.
+        iterations: of the estimator at the last tick.
+        clock: how long the stages of the last tick took: localise, perceive, route, plan.
+        door: what samples have to pass.
+        supervisor: how fast the robot may go.
+        share: of the beams of the last scan that the map explains.
+        relocated: whether the last tick has found the robot at another place.
+        slowed: whether the last stop has changed the control of the last tick.
+        driven: (2,) control of the last tick [m/s, rad/s].
+        search_said: why the last search has not found the robot, "" where it has.
+        planless: whether no solve is to give a plan: a planner that is out of time.
+    """
+
+    def __init__(
+        self,
+        estimator: Estimator,
+        controller: PlannerT,
+        tracker: DiscTracker,
+        occupancy: OccupancyMap,
+        distance_map: DistanceMap,
+        beams: int,
+    ) -> None:
+        """Join what stands for itself."""
+        s = controller.settings
+        self.estimator, self.controller, self.tracker = estimator, controller, tracker
+        self.points = PointWatch()
+        self.tracks = Tracks.none()
+        self.clock = Stopwatch()
+        self.pose = estimator.pose
+        self.door, self.supervisor = Door(beams), Supervisor(RAMPS)
+        self.emergency_stop = EmergencyStop(s.robot_radius, float(s.most[0]) / s.dt, s.dt)
+        self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
+        self.driven = np.zeros(2)
+        self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
+        self._signals = DriveSignals(s.dt, s.most)
+        self._pause, self.search_said = 0, ""
+        self._awake = False
+        self._first: Scan | None = None
+
+    @property
+    def iterations(self) -> int:
+        """Iterations of the last estimate."""
+        return self.estimator.iterations
+
+    @property
+    def verdict(self) -> OutlierReport:
+        """What the supervisor said at the last tick."""
+        return self.supervisor.verdict
+
+    @property
+    def planless_for(self) -> float:
+        """Time since the last tick with a plan of its own [s]."""
+        return self._signals.values()["plan"]
+
+    def wake(self, scan: Scan | None, now: float) -> None:
+        """Look where the robot stands before anything is decided, as where to go from there; the first tick goes on."""
+        try:
+            self._first = self.door.scan(scan, now)
+            self.estimator.update(self._first, None, self.controller.settings.dt)
+        except (UnifgError, ArithmeticError, ValueError):
+            return  # the first tick tries again, and says what is wrong
+        self.pose, self._awake = self.estimator.pose, True
+
+    def tick(self, scan: Scan | None, odometry: Array | None, route: Route, now: float, first: bool = False) -> Plan:
+        """Decide; the estimate is that of the plan afterwards. Samples may be anything.
+
+        Args:
+            scan: of now; None where none came.
+            odometry: (2,) since the last scan; None where none came.
+            route: to follow.
+            now: [s].
+            first: whether nothing has been driven yet, so that there is no odometry.
+        """
+        self.clock.start()
+        self.relocated = False
+        try:
+            plan = self._decide(scan, odometry, route, now, first)
+        except (UnifgError, ArithmeticError, ValueError) as error:  # a robot that drives has to come to rest
+            logger.warning("the tick at %.2f s failed, the robot brakes: %s", now, error)
+            self.supervisor.fail(str(error))
+            plan = self._rest(self.pose)
+            for stage in ("localise", "perceive", "route", "plan"):
+                self.clock.seconds.setdefault(stage, 0.0)
+        self._signals.planned(self.verdict.rests or not plan.emergency)
+        self.driven = plan.control.copy()
+        return plan
+
+    def _decide(self, scan: Scan | None, odometry: Array | None, route: Route, now: float, first: bool) -> Plan:
+        s = self.controller.settings
+        looked = first and self._awake
+        seen = self._first if looked else self.door.scan(scan, now)
+        wheels = None if first else self.door.odometry(odometry, self.driven, s.dt)
+        predicted = (
+            self.estimator.pose if wheels is None else unicycle.step(self.estimator.pose[None], wheels[None], s.dt)[0]
+        )
+        if not looked:
+            self.estimator.update(seen, wheels, s.dt)
+        if seen is not None and wheels is not None:
+            seen = seen.deskewed(wheels)
+        pose = self.pose = self.estimator.pose
+        self.clock.split("localise")
+        found = None if seen is None else explained(self._map, seen, pose)
+        if found is not None and seen is not None:
+            self.share = found.share
+            discs = self.tracker.update(seen, pose, s.dt)
+            self.points.update(found, discs, len(seen.ranges))
+            self.tracks = discs.followed_by(self.points.tracks())
+        self.clock.split("perceive")
+        signals = self._signals
+        signals.note(
+            corrected=found is not None and not self.estimator.refused, share=self.share, predicted=predicted,
+            pose=pose, covariance=self.estimator.covariance, wheels=wheels,
+            trusted="wheels" not in self.door.refused, asked=self.driven,
+            blind=0.0 if seen is None else seen.blind,
+        )  # fmt: skip
+        why = self.door.refused.get("lidar", "") or self.estimator.refused
+        verdict = self.supervisor.judge(signals.values(), {"fix": why, "odometry": self.door.refused.get("wheels", "")})
+        self._find_again(seen)
+        if verdict.rests:
+            plan = self._rest(pose)
+            self.clock.split("route")
+        else:
+            if route.repair(pose, self.tracks):
+                self.controller.forget()
+            self.clock.split("route")
+            plan = self._plan(pose, route, verdict.share)
+            if seen is not None:
+                plan = self._stop(plan, seen)
+        self.clock.split("plan")
+        return plan
+
+    def _plan(self, pose: Array, route: Route, share: float) -> Plan:
+        """Along the route, at a share of the speed."""
+        s = self.controller.settings
+        if self.planless or share < 1.0:
+            self.controller.settings = replace(s, speed=share * s.speed, feasible=-1.0 if self.planless else s.feasible)
+        reference = route.reference(pose, self.controller.stations())
+        plan = self.controller.plan(pose, reference, self.tracks, self.estimator.covariance)
+        self.controller.settings = s
+        self.pose = self.controller.estimate
+        return plan
+
+    def _stop(self, plan: Plan, scan: Scan) -> Plan:
+        """The plan, its first control slowed where beams say that its braking way is not free."""
+        control = self.emergency_stop.control(plan.control, self.driven, scan)
+        self.slowed = control is not plan.control and not np.array_equal(control, plan.control)
+        if not self.slowed:
+            return plan
+        self.controller.driven(control)
+        return replace(plan, controls=np.concatenate([control[None], plan.controls[1:]]))
+
+    def _rest(self, pose: Array) -> Plan:
+        """Brake along the path of the last plan; nothing is solved."""
+        self.slowed = False
+        controls, states = self.controller.rest(pose)
+        return Plan(controls, states, fg.Status.INTERRUPTED, 0, STOPPED, 0.0, 0.0)
+
+    def _find_again(self, scan: Scan | None) -> None:
+        """Search the map while the robot is lost, sees and rests."""
+        search, at_rest = self._search, not (np.abs(self.driven) > AT_REST).any()
+        if self.verdict.health is not Health.LOST or scan is None or not at_rest:
+            search.begin(None)
+            return
+        self._pause = max(0, self._pause - 1)
+        if not search.searching and not self._pause:
+            search.begin(scan)
+        found = search.search()
+        if found is None:
+            return
+        self._pause = SEARCH_AGAIN
+        self.search_said = found.cause
+        if found.pose is None:
+            return
+        self.estimator.reset(found.pose, FOUND_SIGMA)
+        self.pose, self.relocated = self.estimator.pose, True
+        self.tracker, self.points = DiscTracker(self._map), PointWatch()
+        self.tracks = Tracks.none()
+
+    def forget(self) -> None:
+        """Drop the warm start of the horizon."""
+        self.controller.forget()
+
+    def take_over(self, other: Pilot[PlannerT]) -> None:
+        """Go on where another pilot, with another map, was."""
+        self.door, self.supervisor, self._signals = other.door, other.supervisor, other._signals
+        self.driven, self.share = other.driven, other.share
+
+
+def make_pilot(
+    coupling: str,
+    occupancy: OccupancyMap,
+    distance_map: DistanceMap,
+    solver: str,
+    settings: ControllerSettings,
+    pose: Array,
+    sigma: Array,
+    beams: int,
+) -> Pilot[Controller]:
+    """The pilot for a coupling.
+
+    Args:
+        coupling: "sequential", estimation first, then control given the estimate; "joint", one graph for both.
+        occupancy: the map that the robot was given.
+        distance_map: of it.
+        solver: of the controller.
+        settings: weights and limits.
+        pose: (3,) believed at the start [m, m, rad].
+        sigma: (3,) its standard deviations [m, m, rad].
+        beams: number of beams in a scan.
+
+    Raises:
+        ScenarioError: for an unknown coupling.
+    """
+    estimator: Estimator
+    if coupling == "sequential":
+        estimator = Localiser(distance_map, pose, sigma, beams)
+        controller = Controller(distance_map, solver, settings)
+    elif coupling == "joint":
+        estimator = smoother = Smoother(distance_map, pose, sigma, beams, settings.dt)
+        controller = Controller(distance_map, solver, settings, smoother.window)
+    else:
+        raise ScenarioError(f"unknown coupling '{coupling}': choose {' or '.join(COUPLINGS)}")
+    return Pilot(estimator, controller, DiscTracker(distance_map), occupancy, distance_map, beams)

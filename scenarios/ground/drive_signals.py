@@ -1,0 +1,150 @@
+"""What tells the driving robot's supervisor that something is the matter."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+
+from unifg.lie import wrap_angle
+from unifg.scenarios.ground.motor_lag import MotorLag
+from unifg.scenarios.monitoring.supervisor import Ramp
+from unifg.typing import Array
+
+__all__ = ["RAMPS", "DriveSignals"]
+
+RAMPS: Mapping[str, Ramp] = {
+    "fix": Ramp("no scan says where it is", 0.15, 0.2, lost=1.0),  # [s] since the last that did
+    "unexplained": Ramp("the scan does not fit the map", 0.45, 0.6, lost=0.6),  # share of beams
+    "blind": Ramp("the lidar sees nothing in a sector", 0.15, 1.0, least=0.3),  # [rad]
+    "spread": Ramp("where it is, is known to decimetres only", 0.12, 0.35, lost=0.5),  # [m]
+    "plan": Ramp("no plan", 0.45, 1.0, least=0.3),  # [s] since the last; at rest there is nothing to plan from
+    "tick": Ramp("ticks take longer than they last", 1.0, 3.0, least=0.3),  # durations of a tick
+    "wheels": Ramp("the robot does not do what it is told", 0.3, 0.5),  # share
+    "lag": Ramp("the motors follow late", 0.05, 0.3, least=0.5),  # [s]; half as fast, braking is as short as without
+    "slip": Ramp("the wheels slip", 0.25, 0.6, least=0.4),  # share of the way
+    "odometry": Ramp("no odometry", 0.15, 1.0, least=0.3),  # [s]
+}
+"""By signal."""
+
+ARM = 0.15  # [m] from the middle to a wheel
+CRAWL = 0.2  # [m/s]; slower wheels are held against this
+AGREE = 3  # ticks in a row that count
+LATELY = 4  # ticks whose commands may still be on their way to the wheels
+WAY = 8  # ticks over which slip is summed up
+TRAVELLED = 0.2  # [m] in that time, below which nothing is said
+HELD = 1e6  # what a wheel that is not trusted misses
+HOLD = 2.0  # [s] for which wheels are not trusted again, twice as long every time
+
+
+class DriveSignals:
+    """The signals of one drive, tick by tick.
+
+    Attributes:
+        motors: how late they follow.
+    """
+
+    def __init__(self, dt: float, most: Array) -> None:
+        """Begin with nothing the matter, in a base whose velocities change by at most (2,) in a tick."""
+        self._dt = dt
+        self.motors = MotorLag(dt, most)
+        self._fix = self._plan = self._odometry = self._took = 0.0
+        self._share, self._spread, self._blind = 1.0, 0.0, 0.0
+        self._asked: deque[Array] = deque([np.zeros(2)], maxlen=LATELY)
+        self._missed: deque[float] = deque(maxlen=AGREE)
+        self._shifts: deque[tuple[float, float]] = deque(maxlen=WAY)
+        self._fixed: Array | None = None
+        self._held, self._hold = 0.0, HOLD
+
+    def note(
+        self,
+        *,
+        corrected: bool,
+        share: float,
+        predicted: Array,
+        pose: Array,
+        covariance: Array,
+        wheels: Array | None,
+        trusted: bool,
+        asked: Array,
+        blind: float = 0.0,
+    ) -> None:
+        """Take in what a tick has estimated.
+
+        Args:
+            corrected: whether a scan has.
+            share: of its beams that the map explains.
+            predicted: (3,) pose by the wheels [m, m, rad].
+            pose: (3,) pose after the scan.
+            covariance: (3, 3) of it.
+            wheels: (2,) velocities they have made [m/s, rad/s]; None at the first tick.
+            trusted: whether they measured these.
+            asked: (2,) velocities asked for.
+            blind: width of the widest sector of the scan whose beams are all lost [rad].
+        """
+        self._blind = blind
+        self._fix = 0.0 if corrected else self._fix + self._dt
+        self._share = share if corrected else self._share
+        spread = covariance[:2, :2]
+        finite = bool(np.isfinite(covariance).all() and np.isfinite(pose).all())
+        self._spread = math.sqrt(max(float(np.linalg.eigvalsh(spread)[-1]), 0.0)) if finite else math.inf
+        if wheels is None:
+            return
+        self._odometry = 0.0 if trusted else self._odometry + self._dt
+        self._asked.append(asked)
+        self.motors.note(asked, wheels if trusted else None)
+        done = [wheels if trusted else asked]
+        if corrected and self._fixed is not None:  # what it has done, whatever the wheels say
+            turned = wrap_angle(pose[2] - self._fixed[2])
+            done.append(np.array([forward(self._fixed, pose), turned]) / self._dt)
+        self._fixed = pose.copy() if corrected else None
+        self._missed.append(min(self._misses(did) for did in done))
+        self._held = max(0.0, self._held - self._dt)
+        if self._distrust() >= RAMPS["wheels"].ends and not self._held:
+            self._held, self._hold = self._hold, 2.0 * self._hold
+        shift = forward(predicted, pose) if corrected and trusted else 0.0
+        self._shifts.append((shift, float(wheels[0]) * self._dt))
+
+    def planned(self, sound: bool) -> None:
+        """Whether the tick has a plan of its own."""
+        self._plan = 0.0 if sound else self._plan + self._dt
+
+    def took(self, seconds: float) -> None:
+        """How long the last tick has taken [s], where that is to count."""
+        self._took = seconds
+
+    def _misses(self, did: Array) -> float:
+        """By which share velocities (2,) leave out what a wheel was asked for lately."""
+        sides = np.array([[1.0, 1.0], [-ARM, ARM]])  # speeds of the left and of the right wheel
+        told, made = np.array(self._asked) @ sides, did @ sides
+        missed = np.maximum(told.min(axis=0) - made, made - told.max(axis=0))
+        return float(missed.max(initial=0.0) / max(np.abs(told).max(), CRAWL))
+
+    def _distrust(self) -> float:
+        """By which share of it one wheel has missed what it was asked for in each of the last ticks."""
+        return min(self._missed) if len(self._missed) == AGREE else 0.0
+
+    def values(self) -> dict[str, float]:
+        """By signal."""
+        shifts = np.array(self._shifts).reshape(-1, 2)
+        travelled = float(np.abs(shifts[:, 1]).sum())
+        slip = abs(float(shifts[:, 0].sum())) / travelled if travelled > TRAVELLED else 0.0
+        return {
+            "fix": self._fix,
+            "unexplained": 1.0 - self._share,
+            "blind": self._blind,
+            "spread": self._spread,
+            "plan": self._plan,
+            "tick": self._took / self._dt,
+            "wheels": HELD if self._held else self._distrust(),
+            "lag": self.motors.seconds,
+            "slip": slip,
+            "odometry": self._odometry,
+        }
+
+
+def forward(one: Array, other: Array) -> float:
+    """How far one pose (3,) has to go ahead, along its heading, to be beside another [m]."""
+    return float((other - one)[:2] @ [math.cos(one[2]), math.sin(one[2])])

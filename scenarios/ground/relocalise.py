@@ -1,0 +1,176 @@
+"""Where on the whole map may the robot be? A scan against the distance field from many poses.
+
+Every free place of a coarse grid is tried with every heading of a fan; those whose beams end nearest to surfaces are
+refined by matching on the beams that count, and the best of them is believed if most of its beams end at surfaces and
+pass none, and no other place fits nearly as well. The search is done in portions of a fixed size, so that no tick takes
+long, while the robot rests.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.codegen.jit import compiled
+from unifg.files.ros_map import OccupancyMap
+from unifg.lie import wrap_angle
+from unifg.models.distance_map import DistanceMap, bilinear
+from unifg.scenarios.perception.readings import Scan
+from unifg.typing import Array
+
+__all__ = ["Found", "Relocaliser"]
+
+SPACING = 0.2  # [m] between places
+FAN = 2.0 * np.pi * np.arange(48) / 48  # headings [rad]
+BEAMS = 45  # of the scan that are held against the map
+CUT = 0.5  # [m]; a beam farther from everything costs no more
+PORTION = 1500  # places of one tick
+CANDIDATES = 24  # poses that are refined
+SEPARATE = 0.5  # [m] or [rad], apart from which two candidates are two places
+STEPS = 12  # of the refinement
+END = 0.08  # [m] from a surface, within which a beam ends as it should
+PIERCED = 0.03  # [m] that a beam may be inside of a wall before its end
+ALONG = np.linspace(0.1, 0.95, 18)  # shares of a beam at which it is looked at
+BELIEVED = 0.82  # share of the beams that have to end and to pass as they should
+CLEARLY = 0.1  # by which the next best place has to fit worse
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search has found.
+
+    Attributes:
+        pose: (3,) [m, m, rad]; None where it is not known.
+        share: of the beams that fit there.
+        cause: why it is not known.
+    """
+
+    pose: Array | None
+    share: float
+    cause: str
+
+
+class Relocaliser:
+    """Searches one map, portion by portion."""
+
+    def __init__(self, occupancy: OccupancyMap, distance_map: DistanceMap, robot_radius: float) -> None:
+        """List the places where a robot can stand."""
+        self._map = distance_map
+        stride = max(1, round(SPACING / occupancy.resolution))
+        cells = np.argwhere(occupancy.free[::stride, ::stride])[:, ::-1].astype(np.float64) * stride
+        places = occupancy.grid_to_world(cells + 0.5)
+        self.places: Array = places[distance_map.distance(places) > robot_radius]
+        _try_all(distance_map.table, np.zeros((0, 2)), np.zeros((1, 1, 2)), np.zeros((0, 2)))  # compiled before need
+        self.begin(None)
+
+    def begin(self, scan: Scan | None) -> None:
+        """Search anew, with a scan; None for not at all."""
+        self._scan, self._at = scan, 0
+        self._cost, self._heading = np.full(len(self.places), np.inf), np.zeros(len(self.places))
+
+    @property
+    def searching(self) -> bool:
+        """Whether a search has begun and not ended."""
+        return self._scan is not None
+
+    def search(self) -> Found | None:
+        """Go on with the search; what it has found, once it is at its end."""
+        if self._scan is None:
+            return None
+        chosen = slice(self._at, self._at + PORTION)
+        tips = _tips(self._scan)
+        best = np.empty((len(self.places[chosen]), 2))
+        _try_all(self._map.table, self.places[chosen], tips, best)
+        self._cost[chosen], self._heading[chosen] = best[:, 0], FAN[best[:, 1].astype(np.intp)]
+        self._at += PORTION
+        if self._at < len(self.places):
+            return None
+        scan, self._scan = self._scan, None
+        return self._decide(scan)
+
+    def _decide(self, scan: Scan) -> Found:
+        order = np.argsort(self._cost, kind="stable")[: 20 * CANDIDATES]
+        order = order[np.isfinite(self._cost[order])]
+        kept: list[tuple[float, Array]] = []
+        tried: list[Array] = []
+        for index in order.tolist():
+            pose = np.array([*self.places[index], self._heading[index]])
+            if len(tried) >= CANDIDATES:
+                break
+            if any(_same(pose, other) for other in tried):
+                continue
+            tried.append(pose)
+            refined = refine(self._map, scan, pose)
+            if not any(_same(refined, other) for _, other in kept):
+                kept.append((fit(self._map, scan, refined), refined))
+        if not kept:
+            return Found(None, 0.0, "no place on the map")
+        kept.sort(key=lambda row: -row[0])
+        share, best = kept[0]
+        if share < BELIEVED:
+            return Found(None, share, "no place on the map fits the scan")
+        if len(kept) > 1 and kept[1][0] > share - CLEARLY:
+            return Found(None, share, "several places on the map look alike")
+        return Found(best, share, "")
+
+
+def fit(distance_map: DistanceMap, scan: Scan, pose: Array) -> float:
+    """Share of the beams that end at a surface and have passed none, seen from a pose (3,)."""
+    with np.errstate(invalid="ignore"):
+        beams = scan.ranges <= 10.0
+    ranges, bearing = scan.ranges[beams], scan.angles[beams] + pose[2]
+    ray = ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+    ends = np.abs(distance_map.distance(pose[:2] + ray)) <= END
+    passes = distance_map.distance(pose[:2] + ALONG[:, None, None] * ray).min(axis=0) >= -PIERCED
+    return float((ends & passes).mean())
+
+
+def refine(distance_map: DistanceMap, scan: Scan, pose: Array) -> Array:
+    """Gauss-Newton on the beams that end near a surface, whose reach shrinks as the match improves, (3,)."""
+    with np.errstate(invalid="ignore"):
+        beams = scan.ranges <= 10.0
+    ranges, angles = scan.ranges[beams], scan.angles[beams]
+    for step in range(STEPS):
+        bearing = angles + pose[2]
+        ray = ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+        distance, gradient = distance_map.distance_and_gradient(pose[:2] + ray)
+        reach = max(CUT * 0.8**step, 0.15)
+        weight = np.where(np.abs(distance) < reach, 1.0, 0.0)
+        turned = gradient[:, 1] * ray[:, 0] - gradient[:, 0] * ray[:, 1]
+        J = np.column_stack([gradient, turned]) * weight[:, None]
+        change = np.linalg.solve(J.T @ J + 1e-3 * np.eye(3), -J.T @ (weight * distance))
+        pose = pose + np.clip(change, -0.2, 0.2)
+    return np.array([pose[0], pose[1], float(wrap_angle(pose[2]))])
+
+
+def _tips(scan: Scan) -> Array:
+    """(H, n, 2) ends of beams spread over the turn, for every heading of the fan, seen from the robot [m]."""
+    with np.errstate(invalid="ignore"):
+        beams = np.flatnonzero(scan.ranges <= 10.0)
+    chosen = beams[np.linspace(0, len(beams) - 1, min(BEAMS, len(beams))).round().astype(np.intp)]
+    angles, ranges = FAN[:, None] + scan.angles[chosen], scan.ranges[chosen]
+    return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=2)
+
+
+def _same(one: Array, other: Array) -> bool:
+    away = float(np.hypot(*(one - other)[:2]))
+    return away < SEPARATE and abs(float(wrap_angle(one[2] - other[2]))) < SEPARATE
+
+
+@compiled
+def _try_all(table: Array, places: Array, tips: Array, best: Array) -> None:
+    """Of every place the least mean distance of beams to surfaces, cut off, and the index of that heading."""
+    count = tips.shape[1]
+    for i in range(len(places)):
+        least, which = np.inf, 0
+        for k in range(len(tips)):
+            total = 0.0
+            for j in range(count):
+                away = abs(bilinear(table, places[i, 0] + tips[k, j, 0], places[i, 1] + tips[k, j, 1])[0])
+                total += min(away, CUT)
+                if total >= least:
+                    break
+            if total < least:
+                least, which = total, k
+        best[i, 0], best[i, 1] = least / max(count, 1), which

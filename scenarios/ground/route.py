@@ -1,0 +1,266 @@
+"""The global route: Dijkstra on the map, repaired where tracked discs stand in the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.errors import ScenarioError
+from unifg.files.ros_map import OccupancyMap
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.follow import PathFollower
+from unifg.scenarios.planning.grid import SPACING, plan
+from unifg.scenarios.planning.polyline import headed, path_length, resample
+from unifg.typing import Array
+
+LOOK_AHEAD = 4.0  # [m] of path checked against tracked discs
+REJOIN = 2.0  # [m] beyond the disc where the detour meets the path again
+WINDOW = 3.0  # [m] of map kept around the detour's ends
+STANDING = 0.15  # [m/s]; faster discs are left to the controller, which predicts them
+GAP = ControllerSettings.disc_clearance  # [m] between hull and disc that a path must leave
+WALL_GAP = ControllerSettings.wall_clearance  # [m] between hull and wall that a path must leave
+ALLOWANCE = 0.04  # [m] added to discs when a detour is planned
+WIDE = 0.25  # [m] added to discs when the robot is stuck
+STUCK_TICKS = 25
+STUCK_DISTANCE = 0.1  # [m]
+BESIDE = 0.3  # [m] between hulls: a mover as near as this may be waiting for the robot
+RETREAT = 1.5  # [m] that a robot goes back to let a mover pass; a path out and back must not fool the follower
+CRUMB = 0.1  # [m] between remembered places
+NEAR_GOAL = 0.5  # [m] of path left, where turning on the spot is normal
+STANDING_GAP = 0.01  # [m] a planned path needs around its start
+PATIENCE = 5  # ticks between two repairs
+ANYWHERE = 15  # ticks between two searches of the whole map
+CLOSED = 60  # ticks for which no way is to be had at all since the goal came nearer, after which there is none
+VAIN = 6  # of those ticks that a detour counts which does not lead nearer
+STALLED = 400  # ticks without coming nearer to the goal while nothing moves nearby, after which there is no use
+WAITING = 2.0  # [m] from the robot within which something that moves may be what it waits for
+FRESH_STARTS = 3  # ways round about, on each of which the goal may be farther off again
+
+
+@dataclass(frozen=True)
+class Blocked:
+    """Why a goal is given up.
+
+    Attributes:
+        place: (2,) where the way ends [m].
+        clearance: of the robot's centre that no way keeps [m].
+    """
+
+    place: Array
+    clearance: float
+
+    def __str__(self) -> str:
+        """For people."""
+        x, y = self.place.tolist()
+        return f"blocked near ({x:.1f}, {y:.1f}), no way of clearance {self.clearance:.2f} m"
+
+
+class Route:
+    """The path to one goal and the robot's progress on it.
+
+    Attributes:
+        path: (P, 3) present path [m, m, rad].
+        repairs: number of detours planned so far.
+        blocked: why there is no use going on; None as long as there may be.
+    """
+
+    def __init__(
+        self,
+        occupancy: OccupancyMap,
+        distance_map: DistanceMap,
+        start: Array,
+        goal: Array,
+        robot_radius: float,
+        wall_gap: float = WALL_GAP,
+        disc_gap: float = GAP,
+    ) -> None:
+        """Plan from ``start`` (3,) to ``goal`` (3,), with the clearances that the controller keeps.
+
+        Args:
+            occupancy: the map.
+            distance_map: of it.
+            start: (3,) pose.
+            goal: (3,) pose.
+            robot_radius: [m].
+            wall_gap: between hull and walls that a path must leave [m].
+            disc_gap: between hull and discs that a path must leave [m].
+
+        Raises:
+            ScenarioError: when there is no way.
+        """
+        self._occupancy = occupancy
+        self._distance_map = distance_map
+        self._radius = robot_radius
+        self._wall_gap, self._disc_gap = wall_gap, disc_gap
+        self.repairs = 0
+        self.blocked: Blocked | None = None
+        self._rest = self._since_anywhere = 0
+        self._closed = self._stalled = 0
+        self._nearest, self._starts = np.inf, FRESH_STARTS
+        self._trail: list[Array] = []
+        self._crumbs: list[Array] = []
+        self._follow(self._plan(start, goal))
+
+    def _plan(self, start: Array, goal: Array) -> Array:
+        """A way (P, 3) on the map alone."""
+        return plan(
+            self._occupancy, self._distance_map, start, goal, robot_radius=self._radius,
+            clearance_least=self._radius + self._wall_gap,
+        )  # fmt: skip
+
+    def _follow(self, path: Array) -> None:
+        self.path = path
+        self._follower = PathFollower(path)
+        self._reached = 0.0
+
+    def reference(self, pose: Array, ahead: Array) -> Array:
+        """(count, 3) poses along the path, so far ahead (count,) [m] of where the robot at ``pose`` is beside it."""
+        poses, self._reached = self._follower.reference(pose, ahead, self._reached)
+        return poses
+
+    def repair(self, pose: Array, tracks: Tracks) -> bool:
+        """Plan a detour if a standing disc blocks the path ahead, or the robot is stuck.
+
+        A robot that is stuck and finds no wide way nearby goes back the way it came if a mover is beside it, for each
+        may be waiting for the other. Otherwise it looks for another way on the whole map, movers left out.
+
+        Returns:
+            Whether the controller should start over from the path: it changed, or the robot is stuck on it.
+        """
+        if not self._crumbs or np.hypot(*(pose[:2] - self._crumbs[-1])) > CRUMB:
+            self._crumbs = [*self._crumbs[-round(RETREAT / CRUMB) :], pose[:2].copy()]
+        self._rest, self._since_anywhere = max(self._rest - 1, 0), self._since_anywhere + 1
+        self._trail = [*self._trail[-STUCK_TICKS + 1 :], pose[:2].copy()]
+        self._look_for_progress(pose, tracks)
+        if self._rest:
+            return False
+        arc = SPACING * np.arange(len(self.path))
+        if self._stuck(float(arc[-1])):
+            self._trail = []
+            if len(tracks):  # wide around everything, whatever it does just now: the near side has been tried
+                rejoin = min(self._reached + 2.0 * REJOIN, float(arc[-1]))
+                if self._detour(pose, rejoin, tracks, WIDE):
+                    pass
+                elif self._beside_a_mover(pose, tracks):
+                    self._retreat(pose)
+                else:
+                    self._detour(pose, float(arc[-1]), tracks.at(~tracks.mover), ALLOWANCE, everywhere=True)
+            return True
+        standing = tracks.at(np.hypot(*tracks.velocity.T) < STANDING)
+        if not len(standing):
+            return False
+        ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
+        offsets = self.path[ahead, None, :2] - standing.centre
+        room = np.hypot(offsets[..., 0], offsets[..., 1]) - standing.radius
+        blocked = (room < self._radius + self._disc_gap).any(axis=1)
+        if not blocked.any():
+            return False
+        self._rest = PATIENCE
+        last = float(arc[ahead][np.flatnonzero(blocked)[-1]])
+        staying = ~standing.mover
+        closed = (room[:, staying] < self._radius + self._disc_gap).any(axis=1)
+        if self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, ALLOWANCE):
+            if closed.any():  # what has moved and only rests says nothing of whether there is a way
+                self._closed += VAIN  # unless the goal comes nearer on it
+            return True
+        if not closed.any():  # what has moved may go on: where it alone is in the way, the robot waits
+            return False
+        return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
+
+    def _round_about(self, pose: Array, staying: Tracks, place: Array) -> bool:
+        """Whether another way was found on the whole map; if there is none, for long enough, the goal is given up."""
+        self._closed += PATIENCE + 1
+        if self._since_anywhere >= ANYWHERE:
+            self._since_anywhere = 0
+            if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
+                return True
+        if self._closed > CLOSED:
+            self.blocked = Blocked(place.copy(), self._radius + self._wall_gap)
+        return False
+
+    def _look_for_progress(self, pose: Array, tracks: Tracks) -> None:
+        """Give up a goal that has not come nearer for long, the time left out in which something moved on the way."""
+        left = float(SPACING * len(self.path)) - self._reached
+        if left < self._nearest - CRUMB:
+            self._nearest, self._stalled, self._closed = left, 0, 0
+            return
+        self._stalled += not self._waits_for_a_mover(pose, tracks)
+        if self._stalled > STALLED:
+            if self._starts and left > self._nearest + 2.0 * REJOIN:  # it is on its way round about
+                self._starts -= 1
+                self._nearest, self._stalled = left, 0
+                return
+            self.blocked = Blocked(pose[:2].copy(), self._radius + self._wall_gap)
+
+    def _stuck(self, end: float) -> bool:
+        """Whether the robot has hardly moved for a while though the goal is not near."""
+        if len(self._trail) < STUCK_TICKS or end - self._reached < NEAR_GOAL:
+            return False
+        return bool(np.ptp(np.array(self._trail), axis=0).max() < STUCK_DISTANCE)
+
+    def _waits_for_a_mover(self, pose: Array, tracks: Tracks) -> bool:
+        """Whether something that moves just now may keep the robot from going on: it will be elsewhere."""
+        speed, offset = np.hypot(*tracks.velocity.T), np.hypot(*(tracks.centre - pose[:2]).T)
+        return bool(((speed >= STANDING) & (offset - tracks.radius < WAITING)).any())
+
+    def _beside_a_mover(self, pose: Array, tracks: Tracks) -> bool:
+        gap = np.hypot(*(tracks.centre - pose[:2]).T) - tracks.radius - self._radius
+        return bool((tracks.mover & (gap < BESIDE)).any())
+
+    def _retreat(self, pose: Array) -> None:
+        """Go back the way the robot came, and then to the goal again."""
+        back = np.stack([pose[:2], *self._crumbs[::-1]])
+        if path_length(back) < CRUMB:
+            return
+        way = headed(resample(back, SPACING), float(pose[2]))
+        try:
+            onward = self._plan(back[-1], self.path[-1])
+        except ScenarioError:
+            return
+        self._follow(np.concatenate([way[:-1], onward]))
+
+    def _detour(self, pose: Array, rejoin: float, tracks: Tracks, allowance: float, everywhere: bool = False) -> bool:
+        """Whether a way around discs was found: on the map around the path up to ``rejoin`` [m], or on all of it."""
+        index = min(round(rejoin / SPACING), len(self.path) - 1)
+        target = self.path[index]
+        corners = np.stack([pose[:2], target[:2], *self.path[self._index() : index + 1, :2]])
+        # A disc the robot nearly touches is taken as small as leaves it free to go.
+        reach = np.hypot(*(tracks.centre - pose[:2]).T) - self._radius - STANDING_GAP
+        discs = np.column_stack([tracks.centre, np.clip(reach, 0.0, tracks.radius + allowance)])
+        occupancy, distance_map = (self._occupancy, self._distance_map) if everywhere else self._window(corners)
+        try:
+            detour = plan(
+                occupancy, distance_map, pose, target, robot_radius=self._radius,
+                clearance_least=self._radius + self._wall_gap, extra_discs=discs,
+            )  # fmt: skip
+        except ScenarioError:
+            return False  # the controller stops before the disc; the next scan may see a way
+        self._follow(np.concatenate([detour[:-1], self.path[index:]]))
+        self.repairs += 1
+        return True
+
+    def _index(self) -> int:
+        return min(int(self._reached / SPACING), len(self.path) - 1)
+
+    def _window(self, corners: Array) -> tuple[OccupancyMap, DistanceMap]:
+        """The part of the map around some points."""
+        cells = self._occupancy.world_to_grid(corners)
+        margin = WINDOW / self._occupancy.resolution
+        height, width = self._occupancy.shape
+        low = np.maximum(np.floor(cells.min(axis=0) - margin), 0).astype(int)
+        high = np.minimum(np.ceil(cells.max(axis=0) + margin), [width, height]).astype(int)
+        columns, rows = slice(low[0], high[0]), slice(low[1], high[1])
+        corner = self._occupancy.grid_to_world(low.astype(np.float64))
+        origin = (float(corner[0]), float(corner[1]), self._occupancy.origin[2])
+        occupancy = OccupancyMap(
+            self._occupancy.occupied[rows, columns],
+            self._occupancy.free[rows, columns],
+            self._occupancy.resolution,
+            origin,
+            self._occupancy.name,
+        )
+        values = self._distance_map.values[rows, columns]
+        return occupancy, DistanceMap(values, self._distance_map.resolution, origin)

@@ -1,0 +1,230 @@
+"""What may come in: every sample is looked at before anything is worked out from it.
+
+A sample is let in if it can be one of the sensor that it comes from: there, of the right size, finite, of the right
+sign, new, not too old. Others are dropped and counted by what is wrong with them; nothing is raised, whatever arrives.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from unifg.scenarios.perception.readings import Reading, Scan
+from unifg.typing import Array, BoolArray
+
+__all__ = ["Door", "DoorSettings"]
+
+EARLY = 1e-6  # [s] by which a stamp may lie ahead of the clock
+
+
+@dataclass(frozen=True)
+class DoorSettings:
+    """What a sample of a sensor can be.
+
+    Attributes:
+        nearest: a beam that comes back from nearer has met nothing [m].
+        farthest: beams longer than this say nothing about the map [m].
+        fewest: beams between these that a scan must have.
+        oldest: a scan older than this says where the robot was, not where it is [s].
+        moved: distance [m] and turn [rad] after which a scan that repeats the last one, bit by bit, is none.
+        fastest: greatest |v| [m/s] and |omega| [rad/s] that wheels can report.
+        heaviest: greatest specific force [m/s^2] and body rate [rad/s] that a reading can hold.
+    """
+
+    nearest: float = 0.01
+    farthest: float = 10.0
+    fewest: int = 20
+    oldest: float = 0.15
+    moved: tuple[float, float] = (0.005, 0.005)
+    fastest: tuple[float, float] = (5.0, 10.0)
+    heaviest: tuple[float, float] = (500.0, 50.0)
+
+
+class Door:
+    """Looks at samples.
+
+    Attributes:
+        settings: what they can be.
+        dropped: how many were not let in, by what was wrong with them.
+        refused: what was wrong with the last sample of each sensor; no entry where it was let in.
+    """
+
+    def __init__(self, beams: int = 0, settings: DoorSettings | None = None) -> None:
+        """Expect scans of so many beams."""
+        self.settings = settings or DoorSettings()
+        self.dropped: Counter[str] = Counter()
+        self.refused: dict[str, str] = {}
+        self._beams = beams
+        self._last: Array | None = None
+        self._time = -math.inf
+        self._since = np.zeros(2)
+
+    # ------------------------------------------------------------------ lidar
+
+    def scan(self, scan: Scan | None, now: float) -> Scan | None:
+        """A scan whose beams all can be measurements, those that cannot as dropouts; None where it is none.
+
+        Args:
+            scan: as it arrived; None where none did.
+            now: [s]. A scan whose stamp is None counts as new.
+        """
+        found, wrong = self._look(scan, now)
+        self._note("lidar", wrong)
+        return found
+
+    def _look(self, scan: Scan | None, now: float) -> tuple[Scan | None, str]:
+        if scan is None:
+            return None, "no scan came"
+        ranges, angles = _numbers(scan.ranges, (self._beams,)), _numbers(scan.angles, (self._beams,))
+        if ranges is None or angles is None or not np.isfinite(angles).all():
+            return None, "not the size of a scan"
+        stamp = now if scan.time is None else _number(scan.time)
+        if math.isnan(stamp):
+            return None, "its time is not a number"
+        if stamp > now + EARLY:
+            return None, "from the future"
+        if now - stamp > self.settings.oldest + EARLY:
+            return None, "too old"
+        if scan.time is not None and stamp <= self._time:
+            return None, "not newer than the last"
+        if self._repeats(ranges):
+            return None, "the last one once more"
+        s = self.settings
+        measured = np.isfinite(ranges) & (ranges >= s.nearest) & (ranges <= s.farthest)
+        if measured.sum() < s.fewest:
+            return None, _emptiness(ranges, s.nearest)
+        self._last, self._since[:] = ranges.copy(), 0.0
+        self._time = stamp
+        turn = _number(scan.turn)
+        turn = turn if 0.0 <= turn <= s.oldest else 0.0
+        return Scan(angles, np.where(ranges >= s.nearest, ranges, np.nan), stamp, turn), ""
+
+    def _repeats(self, ranges: Array) -> bool:
+        """Whether noise has not changed a single beam though the robot has moved."""
+        if self._last is None or not (self._since > self.settings.moved).any():
+            return False
+        return np.array_equal(ranges, self._last, equal_nan=True)
+
+    # ----------------------------------------------------------------- wheels
+
+    def odometry(self, measured: Array | None, applied: Array, dt: float) -> Array:
+        """The wheels' velocities (2,) [m/s, rad/s]; where they are none, those that were asked for.
+
+        Args:
+            measured: as they arrived; None where none did.
+            applied: (2,) asked for since the last tick.
+            dt: duration [s].
+        """
+        found, wrong = None if measured is None else _numbers(measured, (2,)), ""
+        if measured is None:
+            wrong = "none came"
+        elif found is None:
+            wrong = "not two numbers"
+        elif not np.isfinite(found).all():
+            wrong = "not finite"
+        elif (np.abs(found) > self.settings.fastest).any():
+            wrong = "faster than any wheel"
+        self._note("wheels", wrong)
+        velocities = applied if wrong or found is None else found
+        self._since += np.abs(velocities) * dt
+        return velocities
+
+    # ---------------------------------------------------------------- reading
+
+    def reading(self, reading: Reading | None, now: float, applied: Array) -> Reading:
+        """A reading that can be used: without sightings that are none, with what was asked for in place of bad rates.
+
+        Height, tilt and force that are not finite count as not measured further on.
+
+        Args:
+            reading: as it arrived; None where none did.
+            now: [s].
+            applied: (4,) body rates [rad/s] and thrust [N] since the last tick.
+        """
+        sightings, wrong = _sightings(reading)
+        self._note("detector", wrong)
+        force, rates = self.settings.heaviest
+        inertial = reading is not None and _bounded(reading.rates, 3, rates) and _bounded(reading.force, 3, force)
+        self._note("inertial unit", "" if inertial else "not three numbers that can be")
+        if reading is None:
+            nothing = np.full(3, np.nan)
+            return replace(_NOTHING, time=now, tilt=nothing, rates=applied[:3].copy(), force=nothing)
+        height, tilt = _number(reading.height), _numbers(reading.tilt, (3,))
+        self._note("altimeter", "" if math.isfinite(height) else "not finite")
+        seen = replace(sightings, time=now, height=height, tilt=np.full(3, np.nan) if tilt is None else tilt)
+        if inertial:
+            return replace(seen, rates=np.asarray(reading.rates), force=np.asarray(reading.force))
+        return replace(seen, rates=applied[:3].copy(), force=np.full(3, np.nan))
+
+    def _note(self, sensor: str, wrong: str) -> None:
+        self.refused.pop(sensor, None)
+        if wrong:
+            self.refused[sensor] = wrong
+            self.dropped[f"{sensor}: {wrong}"] += 1
+
+
+_EMPTY = np.zeros(0)
+_NOTHING = Reading(
+    0.0, np.zeros(0, dtype=np.intp), _EMPTY, _EMPTY, _EMPTY, np.zeros(0, dtype=np.intp), np.zeros(0, dtype=bool),
+    math.nan, np.full(3, math.nan), np.zeros(3), np.full(3, math.nan),
+)  # fmt: skip
+
+
+def _sightings(reading: Reading | None) -> tuple[Reading, str]:
+    """A reading with those sightings only that can be, and what was wrong with the others."""
+    if reading is None:
+        return _NOTHING, "nothing came"
+    try:
+        ids, kinds = np.asarray(reading.ids, dtype=np.intp), np.asarray(reading.kinds, dtype=np.intp)
+        moving = np.asarray(reading.moving, dtype=bool)
+        bearings, ranges, radii = (
+            np.asarray(v, dtype=np.float64) for v in (reading.bearings, reading.ranges, reading.radii)
+        )
+    except (TypeError, ValueError, OverflowError):
+        return _NOTHING, "not numbers"
+    if any(np.shape(column) != (np.size(ids),) for column in (ids, bearings, ranges, radii, kinds, moving)):
+        return _NOTHING, "columns of several lengths"
+    good: BoolArray = (
+        np.isfinite(bearings) & np.isfinite(ranges) & np.isfinite(radii) & (ranges >= 0.0) & (radii >= 0.0)
+    )
+    if good.all():
+        return reading, ""
+    kept = replace(
+        reading, ids=ids[good], bearings=bearings[good], ranges=ranges[good], radii=radii[good], kinds=kinds[good],
+        moving=moving[good],
+    )  # fmt: skip
+    return kept, "sightings that cannot be"
+
+
+def _emptiness(ranges: Array, nearest: float) -> str:
+    """Why a scan holds next to nothing."""
+    kinds = {
+        "no beam came back (not numbers)": np.isnan(ranges).sum(),
+        "no beam came back (out of range)": (ranges > 0.0).sum(),
+        "beams shorter than can be": (ranges < nearest).sum(),
+    }
+    return max(kinds, key=lambda kind: kinds[kind])
+
+
+def _numbers(value: object, shape: tuple[int, ...]) -> Array | None:
+    """An array of that shape, or None."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return array if array.shape == shape else None
+
+
+def _number(value: object) -> float:
+    """A number; NaN for what is none."""
+    found = _numbers(value, ())
+    return math.nan if found is None else float(found)
+
+
+def _bounded(value: object, count: int, most: float) -> bool:
+    """Whether these are so many finite numbers, none beyond a bound."""
+    found = _numbers(value, (count,))
+    return found is not None and bool((np.abs(found) <= most).all())

@@ -1,0 +1,167 @@
+"""What moves, and where does it go? A straight line through the last detections of each disc.
+
+A sensor that names what it sees says what moves, too. Of one that does not every cylinder is followed, and moves once a
+line through its last places is steeper than their scatter explains.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from unifg.scenarios.perception.association import places
+from unifg.scenarios.perception.belief import Landmarks
+from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.typing import Array, IntArray
+
+__all__ = ["LineTracker", "TrackerSettings"]
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How detections become tracks.
+
+    Attributes:
+        memory: age of the oldest detection that counts [s].
+        patience: for which a track that is not seen goes on [s].
+        least: detections before a velocity is believed; until then a disc stands.
+        gate: greatest distance of a detection from where its track is expected [m]; for unknown association.
+        speed_limit: greatest speed that is believed [m/s].
+        watch: age of the oldest detection that tells whether a disc moves [s]; for unknown association.
+        slowest: least speed of what moves [m/s]; a belief that is corrected makes all things seem to.
+        sure: standard deviations from rest beyond which it does.
+    """
+
+    memory: float = 0.6
+    patience: float = 1.5
+    least: int = 6
+    gate: float = 0.6
+    speed_limit: float = 1.5
+    watch: float = 1.0
+    slowest: float = 0.2
+    sure: float = 5.0
+
+
+@dataclass
+class _Track:
+    name: int
+    times: list[float] = field(default_factory=list)
+    places: list[Array] = field(default_factory=list)
+    radii: list[float] = field(default_factory=list)
+    moves: bool = False
+    line: tuple[Array, Array, float] = field(default_factory=lambda: (np.zeros(2), np.zeros(2), 0.0))
+
+    def at(self, time: float) -> Array:
+        """(2,) where it is expected [m]."""
+        place, velocity, when = self.line
+        expected: Array = place + (time - when) * velocity
+        return expected
+
+
+class LineTracker:
+    """Tracks of what moves, in the frame of the belief."""
+
+    def __init__(self, settings: TrackerSettings | None = None, association: str = "known") -> None:
+        """Begin without tracks; ``association`` "known" trusts the readings' names and flags, "unknown" finds out."""
+        self.settings = settings or TrackerSettings()
+        self._known = association == "known"
+        self._tracks: list[_Track] = []
+        self._count = 0
+
+    def told(self, reading: Reading, state: Array) -> Reading:
+        """The reading as a vehicle may know it: for unknown association with names and flags that were found out.
+
+        Args:
+            reading: as the sensor gives it.
+            state: (10,) predicted for its time.
+        """
+        if self._known:
+            return reading
+        rows = np.flatnonzero(reading.kinds == Landmarks.CYLINDER)
+        tracks = self._follow(reading, state, rows)
+        names, moving = np.full(len(reading.ids), -1, dtype=np.intp), np.zeros(len(reading.ids), dtype=bool)
+        names[rows] = [track.name for track in tracks]
+        moving[rows] = [track.moves for track in tracks]
+        return replace(reading, ids=names, moving=moving)
+
+    def update(self, reading: Reading, state: Array) -> Tracks:
+        """Where the moving discs are now, and how they move.
+
+        Args:
+            reading: as it was :meth:`told`.
+            state: (10,) believed at its time.
+        """
+        s, now = self.settings, reading.time
+        if self._known:
+            for track in self._follow(reading, state, np.flatnonzero(reading.moving)):
+                track.moves = True
+        self._tracks = [track for track in self._tracks if now - track.times[-1] <= s.patience]
+        moving = [track for track in self._tracks if track.moves]
+        if not moving:
+            return Tracks.none()
+        return Tracks(
+            centre=np.array([track.at(now) for track in moving]),
+            velocity=np.array([track.line[1] for track in moving]),
+            radius=np.array([np.mean(track.radii) for track in moving]),
+            identity=np.array([track.name for track in moving], dtype=np.intp),
+            unseen=np.array([now - track.times[-1] for track in moving]),
+            mover=np.ones(len(moving), dtype=bool),
+        )
+
+    def _follow(self, reading: Reading, state: Array, rows: IntArray) -> list[_Track]:
+        """The tracks of some detections (r,), each taken in."""
+        now, free, found = reading.time, list(self._tracks), []
+        for row, place in zip(rows.tolist(), places(state, reading.bearings[rows], reading.ranges[rows]), strict=True):
+            track = self._match(int(reading.ids[row]), place, now, free)
+            track.times.append(now)
+            track.places.append(place)
+            track.radii.append(float(reading.radii[row]))
+            self._fit(track, now)
+            found.append(track)
+        return found
+
+    def _match(self, name: int, place: Array, now: float, free: list[_Track]) -> _Track:
+        """The track a detection belongs to, taken from those that are free; otherwise a new one."""
+        if self._known:
+            fitting = [track for track in free if track.name == name]
+        else:
+            name, self._count = self._count, self._count + 1
+            near = [(float(np.linalg.norm(track.at(now) - place)), track.name, track) for track in free]
+            fitting = [track for gap, _, track in sorted(near, key=lambda row: row[:2]) if gap <= self.settings.gate]
+        if fitting:
+            free.remove(fitting[0])
+            return fitting[0]
+        self._tracks.append(_Track(name))
+        return self._tracks[-1]
+
+    def _fit(self, track: _Track, now: float) -> None:
+        """Least squares of a constant velocity."""
+        s = self.settings
+        kept = s.memory if self._known else max(s.memory, s.watch)
+        first = next(k for k, time in enumerate(track.times) if now - time <= kept)
+        del track.times[:first], track.places[:first], track.radii[: max(0, len(track.radii) - 50)]
+        if not self._known and not track.moves and len(track.times) >= s.least:
+            _, _, velocity, sigma = _line(track.times, track.places)
+            track.moves = float(np.hypot(*velocity)) > max(s.slowest, s.sure * sigma)
+        late = next(k for k, time in enumerate(track.times) if now - time <= s.memory)
+        times, places = track.times[late:], track.places[late:]
+        if len(times) < s.least:
+            track.line = np.mean(places, axis=0), np.zeros(2), now
+            return
+        middle, mean, velocity, _ = _line(times, places)
+        velocity *= min(1.0, s.speed_limit / max(float(np.hypot(*velocity)), 1e-9))
+        track.line = mean + (now - middle) * velocity, velocity, now
+
+
+def _line(times: list[float], places: list[Array]) -> tuple[float, Array, Array, float]:
+    """Mean time [s] and place (2,) [m], velocity (2,) by least squares, and its standard deviation per axis [m/s]."""
+    moments, found = np.array(times), np.array(places)
+    middle, mean = moments.mean(), found.mean(axis=0)
+    away = moments - middle
+    weight = float(away @ away)
+    velocity = away @ (found - mean) / weight
+    left = found - mean - away[:, None] * velocity
+    scatter = float(np.sqrt(np.square(left).sum() / (2 * len(moments) - 4)))
+    return float(middle), mean, velocity, scatter / float(np.sqrt(weight))

@@ -1,0 +1,284 @@
+"""What the quadrotor's horizon says, term by term (Ta et al. 2014, section V)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import unifg as fg
+from unifg.factors.residuals import Residual
+from unifg.horizon import Context, RecedingHorizon, Robot, Term, Window
+from unifg.lie import SO3
+from unifg.models import avoidance, landmarks, quadrotor
+from unifg.scenarios.perception.belief import Belief
+from unifg.scenarios.quadrotor.braking import stopping_height
+from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
+from unifg.scenarios.quadrotor.guide import Reference
+from unifg.scenarios.quadrotor.slots import FAR_AWAY, SPARE, Obstacles
+from unifg.typing import Array, ArrayLike, BoolArray
+
+UP = np.array([0.0, 0.0, 1.0])
+SLOWING = 0.3  # [s] in which a speed above the limit is to fade
+
+
+@dataclass(frozen=True)
+class Flown:
+    """What the terms are given at a tick.
+
+    Attributes:
+        belief: state, parameters and landmarks.
+        hover: (4,) control that hovers.
+        reference: where to be.
+        obstacles: what fills the slots.
+        others: the same without those that are variables of the graph.
+        held: (M,) which of the slots these are.
+        marks: the variables that stand for them, in the order of the slots.
+    """
+
+    belief: Belief
+    hover: Array
+    reference: Reference
+    obstacles: Obstacles
+    others: Obstacles
+    held: BoolArray
+    marks: list[int]
+
+
+@dataclass(frozen=True)
+class GivenMotion:
+    """The dynamics with parameters that are given."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the dynamics."""
+        parameters = graph.data("parameters", quadrotor.Parameters().packed)
+        motion = (x[:-1], u, x[1:], parameters, self.settings.dt)
+        graph.constrain(quadrotor.dynamics, *motion, lower=0, upper=0, name="dynamics")
+
+    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+        """What is believed."""
+        return {"parameters": now.given.belief.parameters.packed}
+
+
+class GivenFlight:
+    """A flight that is given its state, parameters and map.
+
+    Attributes:
+        robot: who flies.
+        window: of the past; None.
+        pull: of no consequence.
+    """
+
+    window: Window | None = None
+    pull = np.inf
+
+    def __init__(self, settings: ControllerSettings) -> None:
+        """Take the sampling time from the settings."""
+        self.robot = Robot(quadrotor.STATE, quadrotor.CONTROL)
+        self.settings = settings
+
+    def motion(self) -> list[Term]:
+        """How the vehicle moves."""
+        return [GivenMotion(self.settings)]
+
+    def apart(self, squares: bool | None) -> list[Term]:
+        """Nothing else is kept clear of."""
+        return []
+
+    def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
+        """All obstacles are data."""
+        return obstacles, np.zeros(len(obstacles.names), dtype=bool), []
+
+    def carry(self, multipliers: dict[str, Array], now: Context[Flown]) -> dict[str, Array]:
+        """Multipliers as they are."""
+        return multipliers
+
+    def moving_with(self, solution: fg.Solution, now: Context[Flown]) -> quadrotor.Parameters:
+        """Parameters with which a solution moves."""
+        return now.given.belief.parameters
+
+    def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
+        """What was given."""
+        return given
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the vehicle can do and where it may be."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Bound controls, heights and attitude."""
+        s = self.settings
+        graph.bound(u, lower=s.box[0], upper=s.box[1], name="control limits")
+        free, lean = np.inf, s.lean_limit
+        box = np.full((s.horizon, 3), free)
+        box[:, 2] = 1.0
+        low, high = (graph.data(name, sign * box, each=True) for name, sign in (("low", -1), ("high", 1)))
+        graph.bound(x.p[1:], lower=low, upper=high, name="height limits")
+        graph.constrain(
+            landmarks.tilt, x.R[1:], np.zeros(3), lower=[-lean, -lean, -free], upper=[lean, lean, free], name="lean"
+        )
+
+    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+        """Heights as far as a vehicle keeps them that stops climbing or sinking."""
+        s = self.settings
+        least, most = (np.full((s.horizon, 3), side * np.inf) for side in (-1.0, 1.0))
+        stop = stopping_height(now.present[2], now.present[9], s.dt * np.arange(1.0, s.horizon + 1))
+        least[:, 2] = np.minimum(s.height_limits[0], stop - SPARE)
+        most[:, 2] = np.maximum(s.height_limits[1], stop + SPARE)
+        return {"low": least, "high": most}
+
+
+@dataclass(frozen=True)
+class Leaning:
+    """Cost of leaning otherwise than at hover."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the cost."""
+        upright = graph.data("upright", UP)
+        sigma = self.settings.weighted(self.settings.level_sigma)
+        graph.minimize(landmarks.tilt, x.R[1:], upright, sigma=sigma, name="level")
+
+    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+        """Where up is at hover."""
+        return {"upright": SO3.act(SO3.inverse(level(now.given.belief)), UP)}
+
+
+def level(belief: Belief) -> Array:
+    """Attitude (4,) that hovers with the present heading."""
+    nose = SO3.act(belief.state[3:7], np.array([1.0, 0.0, 0.0]))
+    heading = SO3.exp(np.array([0.0, 0.0, np.arctan2(nose[1], nose[0])]))
+    return SO3.compose(quadrotor.hover_attitude(belief.parameters), heading)
+
+
+@dataclass(frozen=True)
+class Following:
+    """Costs of leaving the reference in position and velocity, others at its end."""
+
+    settings: ControllerSettings
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the costs."""
+        s = self.settings
+        n, last = s.horizon, np.sqrt(s.terminal_weight)
+        positions = graph.data("reference positions", np.zeros((n - 1, 3)), each=True)
+        velocities = graph.data("reference velocities", np.zeros((n - 1, 3)), each=True)
+        end, leaving = graph.data("end of reference", np.zeros(3)), graph.data("velocity at the end", np.zeros(3))
+        position, velocity = s.weighted(s.position_sigma), s.weighted(s.velocity_sigma)
+        graph.minimize(fg.prior, x.p[1:-1], positions, sigma=position, name="way")
+        graph.minimize(fg.prior, x.v[1:-1], velocities, sigma=velocity, name="pace")
+        graph.minimize(fg.prior, x.p[-1], end, sigma=position / last, name="end of way")
+        graph.minimize(fg.prior, x.v[-1], leaving, sigma=velocity / last, name="final pace")
+
+    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+        """The reference."""
+        places, speeds = now.given.reference.positions, now.given.reference.velocities
+        return {
+            "reference positions": places[1:-1],
+            "reference velocities": speeds[1:-1],
+            "end of reference": places[-1],
+            "velocity at the end": speeds[-1],
+        }
+
+
+@dataclass(frozen=True)
+class Clearance:
+    """Hard clearance from cylinders, moving discs and walls (W, 2, 2) [m]."""
+
+    settings: ControllerSettings
+    walls: Array
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the constraints."""
+        s = self.settings
+        n, m, count = s.horizon, s.cylinders + s.movers, len(self.walls)
+        centres, radii = slots(graph, s)
+        least = graph.data("clearances", np.zeros((n, m)), each=True)
+        discs = x.p[1:], centres, radii
+        graph.constrain(avoidance.cylinder_clearance, *discs, lower=least, name="cylinders")
+        if count:
+            beside = graph.data("wall clearances", np.zeros((n, count)), each=True)
+            segments = x.p[1:], self.walls, np.zeros(count)
+            graph.constrain(avoidance.segment_clearance, *segments, lower=beside, name="walls")
+
+    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+        """What fills the slots."""
+        others = now.given.others
+        found: dict[str, ArrayLike] = {"centres": others.centres, "radii": others.radii, "clearances": others.limits}
+        return found | ({"wall clearances": others.wall_limits} if len(self.walls) else {})
+
+
+@dataclass(frozen=True)
+class Potential:
+    """Ta's costs |p - l_g|^2 and 1/d, with d between the hull and what stands or moves (section V-A).
+
+    Far from its target a vehicle would race: its speed is limited.
+
+    Attributes:
+        settings: weights and limits.
+        walls: (W, 2, 2) [m].
+        target: (3,) [m].
+        squares: whether 1/d is stated as a sum of squares.
+    """
+
+    settings: ControllerSettings
+    walls: Array
+    target: Array
+    squares: bool
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the costs, and bound the speed."""
+        s = self.settings
+        n, most = s.horizon, s.guide.speed
+        centres, radii = slots(graph, s)
+        graph.minimize(fg.prior, x.p[1:], self.target, sigma=s.weighted(s.goal_sigma), name="goal")
+        speed = graph.data("speed", np.full((n, 3), most), each=True)
+        speed_back = graph.data("speed back", np.full((n, 3), -most), each=True)
+        graph.bound(x.v[1:], lower=speed_back, upper=speed, name="speed")
+        discs = x.p[1:], centres, radii
+        repel(graph, s, self.squares, avoidance.cylinder_clearance, *discs, name="cylinders")
+        if len(self.walls):
+            hulls = x.p[1:], self.walls, np.full(len(self.walls), s.vehicle_radius)
+            repel(graph, s, self.squares, avoidance.segment_clearance, *hulls, name="walls")
+
+    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+        """What fills the slots, and a speed that the vehicle can come down to."""
+        s, others = self.settings, now.given.others
+        times, most = s.dt * np.arange(1.0, s.horizon + 1), s.guide.speed
+        excess = np.maximum(np.abs(now.present[7:10]) - most, 0.0) + SPARE
+        allowed = most + excess * np.exp(-times / SLOWING)[:, None]
+        hulls = others.radii + s.vehicle_radius
+        return {"centres": others.centres, "radii": hulls, "speed": allowed, "speed back": -allowed}
+
+
+def slots(graph: fg.Graph, settings: ControllerSettings) -> tuple[fg.Data, fg.Data]:
+    """Data of the slots: centres and radii."""
+    n, m = settings.horizon, settings.cylinders + settings.movers
+    return graph.data("centres", np.full((n, m, 2), FAR_AWAY), each=True), graph.data("radii", np.zeros(m))
+
+
+def repel(
+    graph: fg.Graph,
+    settings: ControllerSettings,
+    squares: bool,
+    clearance: Residual,
+    *arguments: fg.Selection | fg.Data | Array,
+    name: str,
+    active: fg.Data | None = None,
+) -> None:
+    """Add 1/d of a clearance, as it is or as half the square of its root, where it is ``active``."""
+    weight, name = settings.potential_weight * settings.control_weight, f"1/d, {name}"
+    if squares:
+        root = avoidance.inverse_distance_root(clearance)
+        graph.minimize(root, *arguments, sigma=1.0 / np.sqrt(weight), active=active, name=name)
+    else:
+        inverse = avoidance.inverse_distance(clearance, weight=weight)
+        graph.minimize_scalar(inverse, *arguments, active=active, name=name)

@@ -1,0 +1,158 @@
+"""What the vehicle measures: bearing and range of cylinders and corners, height, tilt, body rates, specific force."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pymunk
+
+from unifg.lie import SO3
+from unifg.scenarios.perception.belief import Landmarks
+from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.simulation.space import OTHERS
+from unifg.typing import Array
+
+__all__ = ["Sensor", "SensorModel"]
+
+_FLANK = 0.9  # of the angle between a cylinder's axis and its silhouette
+_CORNER_GAP = 0.01  # a ray to a corner ends this much before it, for it would hit the corner's own wall [m]
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """Standard deviations and reach.
+
+    Attributes:
+        range_max: greatest distance to a cylinder's axis or a corner that is seen [m].
+        sigma_range: [m].
+        sigma_bearing: [rad].
+        sigma_radius: of a cylinder's radius [m].
+        sigma_height: [m].
+        sigma_tilt: of each component of R' e3.
+        sigma_gyro: of each body rate [rad/s].
+        sigma_force: of each component of the specific force [m/s^2].
+        sigma_force_bias: of what its sensor shows too much, throughout [m/s^2].
+    """
+
+    range_max: float = 8.0
+    sigma_range: float = 0.05
+    sigma_bearing: float = 0.01
+    sigma_radius: float = 0.0
+    sigma_height: float = 0.03
+    sigma_tilt: float = 0.01
+    sigma_gyro: float = 0.01
+    sigma_force: float = 0.1
+    sigma_force_bias: float = 0.05
+
+    @staticmethod
+    def exact(range_max: float = 8.0) -> SensorModel:
+        """A sensor without noise."""
+        return SensorModel(range_max, *[0.0] * 8)
+
+
+class Sensor:
+    """Sensors with a stream of noise each.
+
+    Every reading draws the same amount from every stream, whatever is seen: two controllers under one seed meet the
+    same noise, and movers do not shift that of what stands.
+    """
+
+    def __init__(
+        self,
+        model: SensorModel,
+        space: pymunk.Space,
+        shapes: Sequence[pymunk.Shape | None],
+        standing: int,
+        rng: np.random.Generator,
+    ) -> None:
+        """Look around in a space.
+
+        Args:
+            model: noise and reach.
+            space: where the rays go.
+            shapes: shape of each thing by id; None for a corner.
+            standing: number of things that do not move; the rest do.
+            rng: its children are spawned, itself it is not advanced.
+        """
+        self.model = model
+        self._space, self._shapes = space, tuple(shapes)
+        self._standing, self._moving = standing, len(shapes) - standing
+        self._kinds = np.array(
+            [Landmarks.CORNER if shape is None else Landmarks.CYLINDER for shape in shapes], dtype=np.intp
+        )
+        *self._streams, self._felt = rng.spawn(6)
+        self._bias = model.sigma_force_bias * self._felt.standard_normal(3)
+
+    def read(self, time: float, state: Array, things: Array, rates: Array, force: Array) -> Reading:
+        """Measure once; every call draws new noise.
+
+        Args:
+            time: [s].
+            state: (10,) true state.
+            things: (n, 3) x, y, radius of everything by id [m].
+            rates: (3,) true mean body rates [rad/s].
+            force: (3,) true mean specific force [m/s^2].
+        """
+        model = self.model
+        standing, moving, height, tilt, gyro = self._streams
+        noise = np.concatenate(
+            [standing.standard_normal((self._standing, 3)), moving.standard_normal((self._moving, 3))]
+        )
+        height_noise, tilt_noise, gyro_noise = (
+            height.standard_normal(),
+            tilt.standard_normal(3),
+            gyro.standard_normal(3),
+        )
+        rotation = SO3.matrix(state[None, 3:7])[0]
+        offset = things[:, :2] - state[:2]
+        distance = np.hypot(offset[:, 0], offset[:, 1])
+        ids = np.array(
+            [i for i in np.flatnonzero(distance <= model.range_max) if self._visible(int(i), state, things)],
+            dtype=np.intp,
+        )
+        heading = math.atan2(rotation[1, 0], rotation[0, 0])
+        bearings = np.arctan2(offset[ids, 1], offset[ids, 0]) - heading + model.sigma_bearing * noise[ids, 0]
+        return Reading(
+            time=time,
+            ids=ids,
+            bearings=(bearings + np.pi) % (2.0 * np.pi) - np.pi,
+            ranges=np.maximum(distance[ids] + model.sigma_range * noise[ids, 1], 0.0),
+            radii=np.where(
+                self._kinds[ids] == Landmarks.CORNER,
+                0.0,
+                np.maximum(things[ids, 2] + model.sigma_radius * noise[ids, 2], 0.0),
+            ),
+            kinds=self._kinds[ids],
+            moving=ids >= self._standing,
+            height=float(state[2] + model.sigma_height * height_noise),
+            tilt=rotation[2] + model.sigma_tilt * tilt_noise,
+            rates=rates + model.sigma_gyro * gyro_noise,
+            force=force + self._bias + model.sigma_force * self._felt.standard_normal(3),
+        )
+
+    def _visible(self, index: int, state: Array, things: Array) -> bool:
+        """Whether a ray to the axis, or one to either flank, meets this thing first."""
+        x, y, radius = things[index].tolist()
+        origin = (float(state[0]), float(state[1]))
+        dx, dy = x - origin[0], y - origin[1]
+        distance = math.hypot(dx, dy)
+        shape = self._shapes[index]
+        if shape is None:
+            if distance <= _CORNER_GAP:
+                return True
+            keep = 1.0 - _CORNER_GAP / distance
+            tip = (origin[0] + keep * dx, origin[1] + keep * dy)
+            return self._space.segment_query_first(origin, tip, 0.0, OTHERS) is None
+        if distance <= radius:
+            return True
+        flank = _FLANK * math.asin(radius / distance)
+        for angle in (0.0, flank, -flank):
+            c, s = math.cos(angle), math.sin(angle)
+            tip = (origin[0] + c * dx - s * dy, origin[1] + s * dx + c * dy)
+            hit = self._space.segment_query_first(origin, tip, 0.0, OTHERS)
+            if hit is not None and hit.shape is shape:
+                return True
+        return False

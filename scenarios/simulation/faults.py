@@ -1,0 +1,211 @@
+"""What can go wrong, and when: faults that are put between a simulated world and the robot in it.
+
+A fault is stated as ``KIND@SECONDS[:DURATION]``; without a duration it stays. Faults of sensors change what arrives,
+those of actuators what is done, and the robot is told of none.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.perception.belief import Landmarks
+from unifg.scenarios.perception.readings import Reading, Scan
+from unifg.typing import Array
+
+__all__ = ["DRIVE_FAULTS", "FLIGHT_FAULTS", "DriveFaults", "Fault", "FlightFaults", "elsewhere", "one_of"]
+
+DRIVE_FAULTS = (
+    "lidar-nan", "lidar-inf", "lidar-max", "lidar-negative", "lidar-frozen", "lidar-dropped", "lidar-delayed",
+    "lidar-blind", "beams-missing", "odometry-nan", "odometry-slip", "wheel-dead", "kidnapped", "wrong-map",
+    "solver-timeout", "actuator-lag",
+)  # fmt: skip
+"""Of the driving robot."""
+
+FLIGHT_FAULTS = ("detector-lost", "detector-false", "thrust-loss", "gust", "solver-timeout")
+"""Of the quadrotor."""
+
+BLIND = 0.3  # [rad] to both sides of straight ahead, where a lidar that is half covered sees nothing
+LATE = 0.4  # [s] by which a delayed scan comes late
+RANGE_MAX = 12.0  # [m]; what a lidar that sees nothing may say
+SPIN = 1.6  # wheels that slip turn so many times as far as the robot goes
+AXLE = 0.3  # [m] between the wheels
+LAG = 0.3  # [s]; time constant of a motor that lags
+CARRIED = 3.0  # [m]; a robot is carried at least so far
+ROOM = 0.5  # [m] from walls where it is put down
+PHANTOMS = 3  # things that are not there and are seen
+THRUST = 0.9  # of the thrust that is left
+GUST = 4.0  # [m/s^2]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that goes wrong.
+
+    Attributes:
+        kind: what.
+        begin: when [s].
+        duration: how long [s].
+    """
+
+    kind: str
+    begin: float
+    duration: float = math.inf
+
+    def __str__(self) -> str:
+        """As it is stated."""
+        return f"{self.kind}@{self.begin:g}" + (f":{self.duration:g}" if math.isfinite(self.duration) else "")
+
+    def holds(self, time: float) -> bool:
+        """Whether it does at a time [s]."""
+        return self.begin - 1e-9 <= time < self.begin + self.duration - 1e-9
+
+
+def one_of(kinds: Sequence[str]) -> Callable[[str], Fault]:
+    """Reads a fault of one of some kinds from a word of the command line."""
+
+    def read(text: str) -> Fault:
+        kind, _, when = text.partition("@")
+        begin, _, duration = when.partition(":")
+        try:
+            fault = Fault(kind, float(begin), float(duration) if duration else math.inf)
+        except ValueError:
+            fault = Fault(kind, math.nan)
+        if not (0.0 <= fault.begin < math.inf and fault.duration > 0.0):
+            raise argparse.ArgumentTypeError(f"{text!r} is not KIND@SECONDS[:DURATION], such as {kinds[0]}@5:2")
+        if kind not in kinds:
+            raise argparse.ArgumentTypeError(f"unknown fault {kind!r}: choose {', '.join(kinds)}")
+        return fault
+
+    return read
+
+
+class _Faults:
+    """Faults of one run."""
+
+    def __init__(self, faults: Sequence[Fault], seed: int) -> None:
+        """Keep them; what is random about them is drawn from a stream of its own."""
+        self._faults = tuple(faults)
+        self._rng = np.random.default_rng([55, seed])
+
+    def hold(self, kind: str, time: float) -> bool:
+        """Whether a fault of this kind holds at a time [s]."""
+        return any(fault.kind == kind and fault.holds(time) for fault in self._faults)
+
+    def names(self, time: float) -> str:
+        """Those that hold, for pictures."""
+        return ", ".join(fault.kind for fault in self._faults if fault.holds(time))
+
+
+class DriveFaults(_Faults):
+    """What goes wrong in a drive."""
+
+    def __init__(self, faults: Sequence[Fault], seed: int) -> None:
+        """Begin before the first tick."""
+        super().__init__(faults, seed)
+        self._scans: deque[Scan] = deque(maxlen=100)
+        self._frozen: Scan | None = None
+        self._driven = np.zeros(2)
+        self._carried = False
+
+    def scan(self, scan: Scan, now: float) -> Scan | None:
+        """What arrives of a scan."""
+        self._scans.append(scan)
+        if not self.hold("lidar-frozen", now):
+            self._frozen = scan
+        if self.hold("lidar-dropped", now):
+            return None
+        if self.hold("lidar-delayed", now):
+            late = [old for old in self._scans if old.time is not None and old.time <= now - LATE + 1e-9]
+            return late[-1] if late else None
+        if self.hold("beams-missing", now):
+            return replace(scan, angles=scan.angles[:-1], ranges=scan.ranges[:-1])
+        if self._frozen is not None and self._frozen is not scan:
+            return replace(self._frozen, time=now)  # with a stamp that does not tell
+        if self.hold("lidar-blind", now):
+            return replace(scan, ranges=np.where(np.abs(scan.angles) < BLIND, math.nan, scan.ranges))
+        flat = {"lidar-nan": math.nan, "lidar-inf": math.inf, "lidar-max": RANGE_MAX}
+        for kind, value in flat.items():
+            if self.hold(kind, now):
+                return replace(scan, ranges=np.full_like(scan.ranges, value))
+        return replace(scan, ranges=-scan.ranges) if self.hold("lidar-negative", now) else scan
+
+    def odometry(self, measured: Array, now: float) -> Array:
+        """What arrives of the wheels' velocities (2,) [m/s, rad/s]."""
+        if self.hold("odometry-nan", now):
+            return np.full(2, math.nan)
+        return measured * [SPIN, 1.0] if self.hold("odometry-slip", now) else measured
+
+    def control(self, asked: Array, now: float, dt: float) -> Array:
+        """What the motors make of the velocities (2,) asked for [m/s, rad/s] over ``dt`` [s]."""
+        done = asked
+        if self.hold("actuator-lag", now):
+            done = self._driven + (1.0 - math.exp(-dt / LAG)) * (asked - self._driven)
+        if self.hold("wheel-dead", now):  # the right one
+            left = float(done[0] - 0.5 * AXLE * done[1])
+            done = np.array([0.5 * left, -left / AXLE])
+        self._driven = done
+        return done
+
+    def carries(self, now: float) -> bool:
+        """Whether the robot is to be carried away now; it is once."""
+        due = self.hold("kidnapped", now) and not self._carried
+        self._carried |= due
+        return due
+
+    def elsewhere(self, distance_map: DistanceMap, cells: Array, here: Array) -> Array:
+        """A free pose (3,) away from ``here``; see :func:`elsewhere`."""
+        return elsewhere(distance_map, cells, here, self._rng)
+
+
+def elsewhere(distance_map: DistanceMap, places: Array, here: Array, rng: np.random.Generator) -> Array:
+    """A pose (3,) drawn from places (n, 2) [m] that are far from walls and from ``here`` (3,), with any heading."""
+    room = distance_map.distance(places) > ROOM
+    far = np.hypot(*(places - here[:2]).T) > CARRIED
+    chosen = places[room & far]
+    chosen = chosen if len(chosen) else places[room]
+    place = chosen[int(rng.integers(len(chosen)))] if len(chosen) else here[:2]
+    return np.array([*place, rng.uniform(-np.pi, np.pi)])
+
+
+class FlightFaults(_Faults):
+    """What goes wrong in a flight."""
+
+    def reading(self, reading: Reading, now: float) -> Reading:
+        """What arrives of a reading."""
+        if self.hold("detector-lost", now):
+            return _only(reading, np.zeros(0, dtype=np.intp))
+        return self._haunted(reading) if self.hold("detector-false", now) else reading
+
+    def _haunted(self, reading: Reading) -> Reading:
+        """With cylinders that are not there, at another place in every tick."""
+        bearings, ranges = self._rng.uniform(-np.pi, np.pi, PHANTOMS), self._rng.uniform(1.0, 6.0, PHANTOMS)
+        return replace(
+            reading,
+            ids=np.concatenate([reading.ids, 10_000 + self._rng.integers(10_000, size=PHANTOMS)]),
+            bearings=np.concatenate([reading.bearings, bearings]),
+            ranges=np.concatenate([reading.ranges, ranges]),
+            radii=np.concatenate([reading.radii, np.full(PHANTOMS, 0.3)]),
+            kinds=np.concatenate([reading.kinds, np.full(PHANTOMS, Landmarks.CYLINDER)]),
+            moving=np.concatenate([reading.moving, np.zeros(PHANTOMS, dtype=bool)]),
+        )
+
+    def control(self, asked: Array, now: float) -> Array:
+        """What the motors make of body rates and thrust (4,)."""
+        return asked * [1.0, 1.0, 1.0, THRUST] if self.hold("thrust-loss", now) else asked
+
+    def wind(self, now: float) -> tuple[float, float]:
+        """What a gust adds to the wind [m/s^2]."""
+        return (0.0, GUST) if self.hold("gust", now) else (0.0, 0.0)
+
+
+def _only(reading: Reading, rows: Array) -> Reading:
+    """A reading with some of its sightings."""
+    names = ("ids", "bearings", "ranges", "radii", "kinds", "moving")
+    return replace(reading, **{name: getattr(reading, name)[rows] for name in names})

@@ -1,0 +1,335 @@
+"""The simulated truth of a drive: a disc robot, walls and unforeseen obstacles, a lidar and wheel odometry.
+
+The world is built from an occupancy map and from obstacles that the map does not show. What the robot may
+know of it is what `World.scan` and `World.odometry` return; everything else (`World.pose`, `World.clearance`,
+...) is ground truth for metrics and pictures.
+
+A velocity written before the engine's step is integrated before contacts are solved, so a robot driven that way passes
+through walls: the command is written in ``velocity_func`` instead, and at the start of a tick only without its parts
+into walls already touched.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pymunk
+
+from unifg.errors import ScenarioError
+from unifg.files.ros_map import OccupancyMap
+from unifg.scenarios.options import not_negative, option, positive, share
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
+from unifg.scenarios.simulation.rectangles import wall_rectangles
+from unifg.scenarios.simulation.space import OTHERS, Obstacle, Space
+from unifg.scenarios.simulation.traffic import Person
+from unifg.typing import Array, ArrayLike
+
+__all__ = ["ROBOT_RADIUS", "LidarModel", "OdometryModel", "World"]
+
+ROBOT_RADIUS = 0.17
+"""Radius of the robot's disc [m]."""
+
+_REST_SPEED = 0.02  # [m/s]; below it the robot counts as being at rest
+
+EDGE = 0.3
+"""Neighbouring beams that differ by more have an edge between them [m]."""
+
+_WALLS = -1  # owner of all walls together; obstacles are owned by their index
+
+
+@dataclass(frozen=True)
+class LidarModel:
+    """Lidar at the robot's centre, beams evenly over its field of view.
+
+    Attributes:
+        beams: number of beams.
+        range_max: beyond it nothing returns [m].
+        sigma: standard deviation of a range, whatever the robot believes of it [m].
+        dropout: probability that a beam is lost.
+        clutter: probability that a beam returns too soon, from anywhere before what it should have met.
+        mixed: probability that a beam beside an edge returns from between what its neighbours meet.
+        turn: duration of one turn [s], during which the robot moves.
+        field: of view, its middle ahead [rad]; a full turn begins behind.
+    """
+
+    beams: int = 360
+    range_max: float = 12.0
+    sigma: float = option(0.02, text=not_negative, metavar="M", flag="range-sigma")
+    dropout: float = option(0.01, text=share, metavar="SHARE")
+    clutter: float = option(0.0, text=share, metavar="SHARE")
+    mixed: float = option(0.0, text=share, metavar="SHARE")
+    turn: float = option(0.0, text=not_negative, metavar="S", flag="scan-time")
+    field: float = option(2.0 * math.pi, text=positive, metavar="RAD", flag="field-of-view")
+
+    def __post_init__(self) -> None:
+        """Refuse a field of view that is none."""
+        if not 0.0 < self.field <= 2.0 * math.pi + 1e-9:
+            raise ScenarioError(f"the lidar's field of view must be in (0, 2 pi] rad, got {self.field:g}")
+
+    @property
+    def angles(self) -> Array:
+        """(B,) beam directions in the body frame [rad]."""
+        ends = self.beams if self.field >= 2.0 * math.pi - 1e-9 else self.beams - 1
+        return -0.5 * self.field + self.field * np.arange(self.beams) / ends
+
+
+@dataclass(frozen=True)
+class OdometryModel:
+    """Wheel odometry: measured = true * (1 + scale + noise), for v and omega each on its own.
+
+    Attributes:
+        scale_sigma: standard deviation of the wheels' scale error, drawn once per episode.
+        noise_sigma: standard deviation of the wheels' relative noise, drawn every step.
+    """
+
+    scale_sigma: float = option(0.05, text=not_negative, metavar="SHARE", flag="odometry-scale")
+    noise_sigma: float = option(0.02, text=not_negative, metavar="SHARE", flag="odometry-noise")
+
+
+class World:
+    """One robot in one building, with things the map does not show.
+
+    Each sensor draws from a stream of its own, and draws the same amount whatever it sees: two controllers
+    under one seed meet the same noise, and a sensor that is read more often does not shift another.
+    """
+
+    def __init__(
+        self,
+        occupancy: OccupancyMap,
+        start: ArrayLike,
+        obstacles: Sequence[Obstacle] = (),
+        rng: np.random.Generator | None = None,
+        *,
+        robot_radius: float = ROBOT_RADIUS,
+        lidar: LidarModel | None = None,
+        odometry: OdometryModel | None = None,
+        drivetrain: Drivetrain | None = None,
+        yields: bool = True,
+        people: Sequence[Person] = (),
+    ) -> None:
+        """Build the walls, place the obstacles and the robot.
+
+        Args:
+            occupancy: map whose occupied cells are walls; unknown cells are not solid.
+            start: (3,) true pose of the robot at time zero [m, m, rad].
+            obstacles: discs that are not on the map.
+            rng: source of all noise; its children are spawned, itself it is not advanced. None seeds with 0.
+            robot_radius: [m].
+            lidar: lidar to simulate; None for 360 beams, 12 m, 0.02 m, 1 % dropouts.
+            odometry: wheel odometry to simulate; None for 5 % scale error and 2 % noise.
+            drivetrain: what the base makes of its commands; None for a base that follows them at once.
+            yields: obstacles that move stop before a robot at rest instead of going on through it.
+            people: walk about by social forces.
+
+        Raises:
+            ScenarioError: if the start is not a finite pose, or the robot would stand in a wall or an
+                obstacle.
+        """
+        pose = np.asarray(start, dtype=np.float64)
+        if pose.shape != (3,) or not np.isfinite(pose).all():
+            raise ScenarioError(f"start must be three finite numbers x, y, theta; got {start!r}")
+        self.occupancy = occupancy
+        self.obstacles = tuple(obstacles)
+        self.robot_radius = robot_radius
+        self.lidar = lidar or LidarModel()
+        self._odometry_model = odometry or OdometryModel()
+        lidar_rng, odometry_rng = (np.random.default_rng(0) if rng is None else rng).spawn(2)
+        self._lidar_rng, self._odometry_rng = lidar_rng, odometry_rng
+        self._scale = 1.0 + self._odometry_model.scale_sigma * odometry_rng.standard_normal(2)
+        self._measured = np.zeros(2)
+        self._angles = self.lidar.angles
+        self._drivetrain = drivetrain or Drivetrain.ideal()
+        self._wheels = Wheels(self._drivetrain)
+        self._command = (0.0, 0.0)
+        self._left, self._spun, self._gripped = 0, 0.0, 0.0
+        self._space = Space(pose, robot_radius, yields)
+        self._add_walls()
+        for index, obstacle in enumerate(self.obstacles):
+            self._space.add_disc(obstacle, index)
+        self._people = tuple(people)
+        for index, person in enumerate(self._people, start=len(self.obstacles)):
+            self._space.add_thing(person, index)
+        self._robot = self._space.vehicle
+        self._trail: list[tuple[float, tuple[float, float, float]]] = [
+            (self.time, (*self._robot.position, self._robot.angle))
+        ]
+        self._robot.velocity_func = self._drive
+        self._space.add_vehicle()
+        if self.clearance() < 0.0:
+            raise ScenarioError(
+                f"the robot (radius {robot_radius:g} m) cannot start at ({pose[0]:g}, {pose[1]:g}): "
+                f"it would overlap a wall or an obstacle by {-self.clearance():.2f} m; "
+                f"choose a start in free space of map {occupancy.name!r}"
+            )
+
+    def _add_walls(self) -> None:
+        rectangles = wall_rectangles(self.occupancy.occupied)
+        low_row, high_row, low_column, high_column = rectangles.T.astype(np.float64)
+        corners = np.stack(
+            [
+                np.stack([low_column, low_row], axis=1),
+                np.stack([high_column, low_row], axis=1),
+                np.stack([high_column, high_row], axis=1),
+                np.stack([low_column, high_row], axis=1),
+            ],
+            axis=1,
+        )
+        world_corners = self.occupancy.grid_to_world(corners.reshape(-1, 2)).reshape(-1, 4, 2)
+        for polygon in world_corners.tolist():
+            self._space.add(pymunk.Poly(self._space.engine.static_body, [(x, y) for x, y in polygon]), _WALLS)
+
+    # ------------------------------------------------------------------ motion
+
+    def step(self, v: float, omega: float, dt: float = 0.1) -> None:
+        """Tell the wheels a forward velocity and a turning rate for a while; walls and obstacles stop the robot.
+
+        Args:
+            v: forward velocity [m/s].
+            omega: turning rate [rad/s].
+            dt: duration [s].
+
+        Raises:
+            ScenarioError: if a command or the duration is not a usable number.
+        """
+        if not (math.isfinite(v) and math.isfinite(omega)):
+            raise ScenarioError(
+                f"the control (v, omega) = ({v}, {omega}) is not finite; stop the robot, do not drive on it"
+            )
+        self._wheels.tell((float(v), float(omega)))
+        before, heading_before = self._robot.position, self._robot.angle
+        self._spun = self._gripped = 0.0
+        self._trail = [entry for entry in self._trail if entry[0] >= self.time - self.lidar.turn]
+        for count, pause in enumerate(self._space.substeps(dt)):
+            if not count:
+                self._left = round(dt / pause)
+                self._start_tick(pause)
+            self._space.step(pause, resting=self._robot.velocity.length < _REST_SPEED)
+            self._trail.append((self.time, (*self._robot.position, self._robot.angle)))
+        self._measure(before, heading_before, dt, self._gripped / self._spun if self._spun > 0.0 else 1.0)
+
+    def _drive(self, body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
+        """Velocity for the coming substep, along its midpoint heading: the chord of the arc."""
+        grip = 1.0 - self._drivetrain.slip
+        if self._left:  # the engine asks once more after the last substep of a tick
+            self._left -= 1
+            self._command = self._wheels.advance(dt)
+            moved = abs(self._command[0]) + abs(self._command[1])
+            self._spun, self._gripped = self._spun + moved, self._gripped + moved * grip
+        v, omega = grip * self._command[0], grip * self._command[1]
+        heading = body.angle + 0.5 * omega * dt
+        aside = -self._drivetrain.skid * v * omega
+        cosine, sine = math.cos(heading), math.sin(heading)
+        body.velocity = (v * cosine - aside * sine, v * sine + aside * cosine)
+        body.angular_velocity = omega
+
+    def _start_tick(self, pause: float) -> None:
+        """Apply a new command at once, but for its parts into things already touched.
+
+        The engine integrates positions before it calls ``velocity_func``: without this the first substep of a
+        tick would still run on the last tick's command.
+        """
+        self._drive(self._robot, (0.0, 0.0), 1.0, pause)
+        self._robot.velocity = self._space.without_contacts(self._robot.velocity, relative=False)
+
+    def _measure(self, before: pymunk.Vec2d, heading_before: float, dt: float, grip: float) -> None:
+        """Read the wheels: forward and turning part of the SE(2) logarithm of the motion made, and what was slipped."""
+        turn = self._robot.angle - heading_before
+        body_motion = (self._robot.position - before).rotated(-heading_before)
+        half = 0.5 * turn
+        stretch = half / math.tan(half) if abs(half) > 1e-9 else 1.0
+        forward = stretch * body_motion.x + half * body_motion.y
+        noise = self._odometry_model.noise_sigma * self._odometry_rng.standard_normal(2)
+        self._measured = np.array([forward, turn]) / (dt * grip) * (self._scale + noise)
+
+    def carry(self, pose: ArrayLike) -> None:
+        """Put the robot down at another pose (3,) [m, m, rad], at rest; its wheels do not turn."""
+        place = np.asarray(pose, dtype=np.float64)
+        self._robot.position, self._robot.angle = (float(place[0]), float(place[1])), float(place[2])
+        self._robot.velocity, self._measured = (0.0, 0.0), np.zeros(2)
+        self._space.engine.reindex_shapes_for_body(self._robot)
+
+    # ----------------------------------------------------------------- sensors
+
+    def scan(self) -> Scan:
+        """Turn the lidar once, so that the last beam is one of the present pose; every call draws new noise."""
+        lidar, reach = self.lidar, self.lidar.range_max
+        places = self._track(lidar.turn * (np.arange(lidar.beams) - (lidar.beams - 1)) / lidar.beams)
+        bearing = places[:, 2] + self._angles
+        tips = places[:, :2] + reach * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
+        query = self._space.engine.segment_query_first
+        hits = [
+            query((x, y), (tip[0], tip[1]), 0.0, OTHERS)
+            for (x, y), tip in zip(places[:, :2].tolist(), tips.tolist(), strict=True)
+        ]
+        ranges = np.array([math.inf if hit is None else hit.alpha for hit in hits]) * reach
+        noise = lidar.sigma * self._lidar_rng.standard_normal(lidar.beams)
+        lost = self._lidar_rng.random(lidar.beams) < lidar.dropout
+        if lidar.clutter or lidar.mixed:
+            ranges = self._spoiled(ranges)
+        seen = np.isfinite(ranges)
+        ranges[seen] = np.clip(ranges[seen] + noise[seen], 0.0, reach)
+        ranges[lost] = np.nan
+        return Scan(self._angles.copy(), ranges, self.time, lidar.turn)
+
+    def _track(self, times: Array) -> Array:
+        """(n, 3) where the robot was at times (n,) from now on, none of them positive [m, m, rad]."""
+        then, where = np.array([when for when, _ in self._trail]), np.array([pose for _, pose in self._trail])
+        at = np.maximum(self.time + times, then[0])
+        return np.column_stack([np.interp(at, then, column) for column in where.T])
+
+    def _spoiled(self, ranges: Array) -> Array:
+        """Ranges (B,) with returns that come too soon, and with some from between the two sides of an edge."""
+        lidar = self.lidar
+        early, where, mixed, between = self._lidar_rng.random((4, lidar.beams))
+        met = np.minimum(ranges, lidar.range_max)
+        found = np.where(
+            (np.abs(met - np.roll(met, 1)) > EDGE) & (mixed < lidar.mixed),
+            met + between * (np.roll(met, 1) - met),
+            ranges,
+        )
+        return np.where(early < lidar.clutter, where * np.minimum(found, lidar.range_max), found)
+
+    def odometry(self) -> tuple[float, float]:
+        """Mean body velocities (v [m/s], omega [rad/s]) over the last step, as the wheels report them.
+
+        They are proportional to the motion really made and to what the wheels slipped: wheels that a wall holds back
+        do not spin, and sliding sideways, along a wall or in a turn, is not felt. (0, 0) before the first step.
+        """
+        return float(self._measured[0]), float(self._measured[1])
+
+    # ------------------------------------------------------------ ground truth
+
+    @property
+    def pose(self) -> Array:
+        """(3,) true pose of the robot [m, m, rad], theta in [-pi, pi)."""
+        x, y = self._robot.position
+        return np.array([x, y, (self._robot.angle + math.pi) % (2.0 * math.pi) - math.pi])
+
+    @property
+    def time(self) -> float:
+        """Time since the start [s]."""
+        return self._space.time
+
+    @property
+    def collisions(self) -> int:
+        """Contact events so far."""
+        return self._space.collisions
+
+    def clearance(self) -> float:
+        """Distance from the robot's hull to the nearest wall or obstacle [m]; negative when they overlap."""
+        reach, (x, y) = 2.0, self._robot.position
+        while reach < 1000.0:  # the engine tests every shape in reach, so begin near
+            nearest = self._space.engine.point_query_nearest((x, y), reach, OTHERS)
+            if nearest is not None:
+                return float(nearest.distance) - self.robot_radius
+            reach *= 4.0
+        return math.inf
+
+    def obstacle_states(self) -> Array:
+        """(K, 4) x, y, radius [m] of obstacles and people, and 1 for those that move, else 0."""
+        people = [(*person.body.position, person.radius, 1.0) for person in self._people]
+        return np.concatenate([self._space.discs(), np.array(people).reshape(-1, 4)])

@@ -1,0 +1,164 @@
+"""People who go about in a building besides the robot.
+
+They walk to and fro along a way, at a pace of their own, by social forces (Helbing, Farkas, Vicsek, Nature 407 (2000),
+eqs. 1 to 3 without those of touching bodies): they want to go on at their pace, and keep off walls and each other. They
+do not wait for the robot.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pymunk
+
+from unifg.errors import ScenarioError
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.options import count, option, positive
+from unifg.scenarios.planning.polyline import arc_lengths, at_stations
+from unifg.typing import Array
+
+__all__ = ["Person", "Traffic", "draw_traffic"]
+
+RELAXATION = 0.5  # [s], of a person's velocity to the one that is wanted
+PUSH, REACH = 25.0, 0.08  # of a person: acceleration at a touch [m/s^2], length over which it falls to 1/e [m]
+HASTE = 1.3  # fastest walk, in shares of the pace that is wanted
+MOST = 200  # people
+CARROT = 0.5  # [m] ahead on their way that people go for
+FROM_START = 3.0  # [m] from the start, where nobody is at the beginning
+PERSON = (0.18, 0.25)  # radius [m]
+WALK = (3.0, 10.0)  # shortest and longest way of a person [m]
+STEP = 0.1  # [m] between places that are tried
+DRAWS = 200  # of each
+
+
+@dataclass(frozen=True)
+class Traffic:
+    """People in the building; none by default.
+
+    Attributes:
+        people: number of people who walk along the planned path.
+        slowest: least pace of a person; each draws one between this and ``fastest`` [m/s].
+        fastest: [m/s].
+    """
+
+    people: int = option(0, text=partial(count, most=MOST), metavar="K")
+    slowest: float = option(0.3, text=positive, metavar="M/S", flag="people-slowest")
+    fastest: float = option(1.5, text=positive, metavar="M/S", flag="people-fastest")
+
+    def __post_init__(self) -> None:
+        """Refuse numbers and paces out of bounds.
+
+        Raises:
+            ScenarioError: naming the field.
+        """
+        if not 0.0 < self.slowest <= self.fastest < math.inf:
+            raise ScenarioError(f"people walk at 0 < slowest <= fastest, got {self.slowest:g} and {self.fastest:g} m/s")
+        if not 0 <= self.people <= MOST:
+            raise ScenarioError(f"the number of people must be from 0 to {MOST}, got {self.people}")
+
+
+class Person:
+    """A disc that walks to and fro along a way.
+
+    Attributes:
+        body: kinematic; where it is, and its velocity.
+        others: bodies and radii that it keeps off, by social forces.
+    """
+
+    def __init__(self, way: Array, radius: float, pace: float, walls: DistanceMap) -> None:
+        """Stand at the beginning of a way.
+
+        Args:
+            way: (P, 2) [m].
+            radius: [m].
+            pace: at which it wants to walk [m/s].
+            walls: distance to them.
+        """
+        self.way, self.radius, self.pace = way, radius, pace
+        self.body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        self.body.position = (float(way[0, 0]), float(way[0, 1]))
+        self.shape = pymunk.Circle(self.body, radius)
+        self.others: list[tuple[pymunk.Body, float]] = []
+        self._walls, self._arc = walls, arc_lengths(way)
+        self._along, self._sense = 0.0, 1.0
+
+    def advance(self, robot: pymunk.Body, robot_radius: float, resting: bool, dt: float) -> None:
+        """Choose the velocity of the next ``dt`` [s]."""
+        place, velocity = np.array(self.body.position), np.array(self.body.velocity)
+        velocity = velocity + dt * self.force(place, velocity)
+        speed = float(np.hypot(*velocity))
+        velocity *= min(1.0, HASTE * self.pace / max(speed, 1e-12))
+        self.body.velocity = (float(velocity[0]), float(velocity[1]))
+
+    def force(self, place: Array, velocity: Array) -> Array:
+        """(2,) acceleration at a place (2,) and velocity (2,), between what is wanted and what is kept off [m/s^2]."""
+        carrot = at_stations(self.way, self._arc, np.array([self._along]))[0] - place
+        # Once to and fro: of a way that bends or is short, no point may be far enough.
+        for _ in range(math.ceil(2.0 * float(self._arc[-1]) / STEP)):
+            if float(np.hypot(*carrot)) >= CARROT:
+                break
+            self._go_on(STEP)
+            carrot = at_stations(self.way, self._arc, np.array([self._along]))[0] - place
+        made: Array = (self.pace * carrot / max(float(np.hypot(*carrot)), 1e-6) - velocity) / RELAXATION
+        for body, radius in self.others:
+            away = place - np.array(body.position)
+            distance = max(float(np.hypot(*away)), 1e-6)
+            made += PUSH * math.exp((self.radius + radius - distance) / REACH) * away / distance
+        off_walls, slope = self._walls.distance_and_gradient(place)
+        made += PUSH * math.exp(min((self.radius - float(off_walls)) / REACH, 1.0)) * slope
+        return made
+
+    def _go_on(self, length: float) -> None:
+        """Move the place on the way that is gone for, turning round at its ends."""
+        along, most = self._along + self._sense * length, float(self._arc[-1])
+        if not 0.0 <= along <= most:
+            self._sense = -self._sense
+            along = float(np.clip(2.0 * most - along if along > most else -along, 0.0, most))
+        self._along = along
+
+
+def draw_traffic(traffic: Traffic, walls: DistanceMap, path: Array, rng: np.random.Generator) -> list[Person]:
+    """Draw the people on or beside a planned path.
+
+    Args:
+        traffic: number and paces.
+        walls: distance to them.
+        path: (P, 3) planned path, from the start over all goals.
+        rng: source of all numbers.
+
+    Raises:
+        ScenarioError: there is no place for so many.
+    """
+    (of_people,) = rng.spawn(1)
+    people = [_person(traffic, walls, path[:, :2], of_people) for _ in range(traffic.people)]
+    for person in people:
+        person.others = [(other.body, other.radius) for other in people if other is not person]
+    return people
+
+
+def _stretch(points: Array, rng: np.random.Generator) -> Array:
+    """(Q, 2) a piece of a path that begins far from the robot, in one of both senses [m]."""
+    arc = arc_lengths(points)
+    where, length, back = rng.random(3)
+    begin = FROM_START + where * max(float(arc[-1]) - FROM_START, 0.0)
+    span = (WALK[0] + length * (WALK[1] - WALK[0])) * (1.0 if back < 0.5 else -1.0)
+    end = float(np.clip(begin + span, 0.0, arc[-1]))
+    stations = np.linspace(begin, end, max(2, round(abs(end - begin) / STEP) + 1))
+    return at_stations(points, arc, stations)
+
+
+def _person(traffic: Traffic, walls: DistanceMap, points: Array, rng: np.random.Generator) -> Person:
+    for _ in range(DRAWS):
+        way, (size, pace, aside) = _stretch(points, rng), rng.random(3)
+        radius = PERSON[0] + size * (PERSON[1] - PERSON[0])
+        along = np.gradient(way, axis=0)
+        normal = np.column_stack([-along[:, 1], along[:, 0]]) / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+        way = way + (aside - 0.5) * normal
+        far = np.hypot(*(way[0] - points[0])) >= FROM_START
+        if far and arc_lengths(way)[-1] > CARROT and walls.distance(way).min() >= radius + 0.02:
+            speed = traffic.slowest + pace * (traffic.fastest - traffic.slowest)
+            return Person(way, radius, float(speed), walls)
+    raise ScenarioError("there is no place for so many people along the path; ask for fewer, or for goals farther away")

@@ -1,0 +1,150 @@
+"""Large compiled functions that call each other through their addresses, and find their arrays through one.
+
+Numba compiles every callee anew into each of its callers, and unpacks every array of every argument in each of them.
+Where both are large that is most of a minute. Here a function is a number, the address of its machine code, and so is
+what it works on: the address of a block of memory that describes all arrays. Every function is compiled once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numba import typeof, types
+from numba.core import cgutils
+from numba.core.datamodel import default_manager
+
+from unifg.codegen.calls import _primitive
+from unifg.codegen.jit import _Cache, compiled, spelled
+from unifg.errors import UnifgError
+from unifg.typing import IntArray
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+NOTHING, TRUTH, NUMBER, ADDRESS = types.void, types.boolean, types.float64, types.int64
+
+
+class _LinkedCache(_Cache):
+    """A cache that also asks for what addresses of arrays mean."""
+
+    def _variant(self) -> tuple[str, ...]:
+        return *super()._variant(), spelled(memory.kind)
+
+
+def linked(function: F) -> F:
+    """Compile for calls through an address only: nothing in Python can call the result."""
+    dispatcher: Any = compiled(function)
+    dispatcher._cache = _LinkedCache(function)
+    dispatcher.targetoptions["no_cpython_wrapper"] = True
+    return cast(F, dispatcher)
+
+
+def link(function: Callable[..., Any], result: Any, *arguments: Any) -> int:
+    """Compile for arguments of the given types and say where the machine code stands.
+
+    The caller keeps ``function`` alive for as long as the address is used.
+    """
+    dispatcher: Any = function
+    dispatcher.compile(result(*arguments))
+    overload = dispatcher.overloads[arguments]
+    return int(overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name))
+
+
+def link_like(function: Callable[..., Any], result: Any, *arguments: Any) -> int:
+    """The same for arguments like these."""
+    return link(function, result, *map(typeof, arguments))
+
+
+def _calling(result: Any) -> Any:
+    """Function for compiled code, ``f(address, (argument, ...))``; the arguments have the types of the tuple."""
+
+    def primitive(typing: Any, where: Any, arguments: Any) -> Any:
+        kinds = tuple(types.unliteral(kind) for kind in arguments.types)
+
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            parts = [
+                context.cast(builder, builder.extract_value(values[1], k), given, kind)
+                for k, (given, kind) in enumerate(zip(arguments.types, kinds, strict=True))
+            ]
+            pointer = context.call_conv.get_function_type(result, kinds).as_pointer()
+            function = builder.inttoptr(values[0], pointer)
+            _, answer = context.call_conv.call_function(builder, function, result, kinds, parts)
+            return context.get_dummy_value() if result is types.none else answer
+
+        return result(types.int64, arguments), generate
+
+    return _primitive(primitive)
+
+
+run = _calling(types.none)
+"""Call a function that returns nothing."""
+
+holds = _calling(types.boolean)
+"""Call a function that returns a truth value."""
+
+number = _calling(types.float64)
+"""Call a function that returns a float."""
+
+
+# ---------------------------------------------------------------- arrays by one address
+
+LAYOUT = ("meminfo", "parent", "nitems", "itemsize", "data", "shape", "strides")
+
+
+class Memory:
+    """Tuples of tuples and arrays, all of one type, that compiled code finds by an address.
+
+    Attributes:
+        kind: their Numba type, that of the first ones described.
+    """
+
+    def __init__(self) -> None:
+        """Nothing is described yet."""
+        self.kind: Any = None
+
+    def describe(self, arrays: Any) -> IntArray:
+        """(words,) what Numba would keep in memory; without owner, so that nobody counts references.
+
+        The caller keeps the arrays and the words alive.
+
+        Raises:
+            UnifgError: the arrays have other types than the first ones, or this version of Numba describes arrays in
+                another way.
+        """
+        found = tuple(default_manager[types.Array(types.float64, 1, "C")]._fields)
+        if found != LAYOUT:
+            raise UnifgError(f"Numba describes arrays by {found}, expected {LAYOUT}: use a version up to 0.68")
+        kind = typeof(arrays)
+        if self.kind is None:
+            self.kind = kind
+        if kind != self.kind:
+            raise UnifgError(f"compiled for arrays of type {self.kind}, found {kind}")
+        return np.array(_words(arrays), dtype=np.int64)
+
+
+def _words(part: Any) -> list[int]:
+    if isinstance(part, tuple):
+        return [word for item in part for word in _words(item)]
+    return [0, 0, part.size, part.itemsize, part.ctypes.data, *part.shape, *part.strides]
+
+
+memory = Memory()
+
+
+@_primitive
+def parts(typing: Any, where: Any, names: Any) -> Any:
+    """Some of the arrays, or tuples of arrays, that are described at an address, by their names with blanks between."""
+    tuples = memory.kind.types
+    places = []
+    for name in names.literal_value.split():
+        first = next(k for k, kind in enumerate(tuples) if name in kind.fields)
+        places.append((first, tuples[first].fields.index(name)))
+    kinds = types.Tuple([tuples[first].types[second] for first, second in places])
+
+    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        pointer = builder.inttoptr(values[0], context.get_value_type(memory.kind).as_pointer())
+        found = [builder.load(cgutils.gep_inbounds(builder, pointer, 0, *place)) for place in places]
+        return context.make_tuple(builder, kinds, found)
+
+    return kinds(types.int64, names), generate

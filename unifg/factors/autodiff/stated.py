@@ -1,0 +1,51 @@
+"""Kernels that say what they take and compute it in plain NumPy; the rest is derived when it is first needed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, cast
+
+from unifg.factors.autodiff.expression import Expression, generating, traced
+from unifg.factors.kernel import Kernel
+
+
+@dataclass(frozen=True, eq=False)
+class StatedKernel(Kernel):
+    """A kernel whose ``function`` is batched NumPy: it is run once on symbols, in the shapes of ``arguments``.
+
+    A second derivative that is given takes the place of the derived one.
+    """
+
+    function: Callable[..., Any]
+
+    @property
+    def derived(self) -> bool:
+        """They are, unless they are given."""
+        return self.second is None
+
+    @property
+    def expression(self) -> Expression:
+        """Expression; one for all threads, for it owns the machine code."""
+        with generating:
+            found = self.__dict__.get("_expression")
+            if found is None:
+                found = self.__dict__["_expression"] = traced(self.function, self.arguments, name=self.name)
+            return cast(Expression, found)
+
+    @cached_property
+    def address(self) -> int:
+        """Of the machine code of residual and Jacobian."""
+        return self.expression.residual().address
+
+    @cached_property
+    def second_address(self) -> int:
+        """Of the machine code of second derivatives, 0 where all of them are zero."""
+        if self.second is not None:
+            return Kernel.second_address.func(self)  # type: ignore[attr-defined, no-any-return]
+        return 0 if self.linear or all(self.expression.linear_rows) else self.expression.second().address
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle what is stated; another process derives it anew."""
+        return {name: value for name, value in super().__getstate__().items() if name != "_expression"}

@@ -1,0 +1,482 @@
+"""One prepared graph solved tick after tick: warm starts, a deadline, the plan that is kept, and when to begin anew."""
+
+from __future__ import annotations
+
+import time as clocks
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from unifg.errors import BackendError, GraphError
+from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
+from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
+from unifg.horizon.history import instant
+from unifg.horizon.robot import Robot
+from unifg.horizon.terms import Context, Term, handles_of, looked_at, reset_all, values_of
+from unifg.horizon.window import Window
+from unifg.locks import ReentrantLock
+from unifg.modeling.variables import Data
+from unifg.solution.graph import Graph
+from unifg.solution.solution import Guess, Solution
+from unifg.solution.solver import Prepared, Solver
+from unifg.solution.status import Status
+from unifg.typing import Array, ArrayLike
+
+TIMES = 100_000  # ticks whose times are kept
+CLOSE = 1e-4  # a plan may bend constraints more, but noise of the past is as small as that
+LEAST_TIME = 1e-4  # [s] a solver is given however late it is
+
+
+@dataclass(frozen=True)
+class InitialGuesses:
+    """Initial guesses of solves without a last answer.
+
+    Attributes:
+        cold: ``cold(now)`` gives states (N + 1, storage) and controls (N, m); None: stay, with the control zero.
+        after_failure: the same after a solve whose plan was refused; None for ``cold``.
+        carry: ``carry(guess, now)`` what of a shifted last answer still holds; None for all of it.
+    """
+
+    cold: Callable[[Context[Any]], tuple[Array, Array]] | None = None
+    after_failure: Callable[[Context[Any]], tuple[Array, Array]] | None = None
+    carry: Callable[[Guess, Context[Any]], Guess] | None = None
+
+
+class RecedingHorizon:
+    """Estimates, plans and decides, tick after tick, with graphs that are stated and prepared once.
+
+    A plan that the robot may apply is kept; while later solves fail, what is left of it is there to fall back on.
+    Plans that end behind where they should for too long are caught in a dead end, where the warm start would keep
+    them: the next solve begins anew.
+
+    Attributes:
+        robot: who moves.
+        steps: N of the future.
+        coupling: of estimation and control.
+        window: of the past; None where the present is given to :meth:`plan`.
+        tie: what ties the horizon to the past.
+        x, u: nodes (N + 1) of the future, and the family of controls (N).
+        warm, cold: the prepared backend for solves with and without a warm start.
+        second: another one, asked when the plan of the first is refused; None for nobody.
+        guess: where the next solve begins; None for anew.
+        failed: whether the last plan was refused.
+        kept: the last plan that was accepted.
+        lagging: ticks for which plans have ended behind.
+        applied: (m,) control that acts until the next tick: that of the last plan, unless plans act later.
+        delay: ticks between the present of a plan and when it acts.
+        sent: (delay, m) controls that have been decided and act from the next tick on, the next one first.
+        estimate: (storage,) present state as it is believed after the last tick.
+        constants: (count, storage) constants as they are believed after the last tick, by name.
+        believed: whether both are what a joint solve says, and not the past alone.
+        solution: of the last tick; None before.
+        statuses: how often solves ended in what way.
+        sources: how often what was applied; "late" counts plans that came after the deadline.
+        rescues: how often the second backend had a plan when the first had none.
+        milliseconds: wall-clock times of the last ticks [ms].
+    """
+
+    def __init__(
+        self,
+        robot: Robot,
+        steps: int,
+        terms: Sequence[Term],
+        *,
+        solver: Solver,
+        cold: Solver | None = None,
+        second: Solver | None = None,
+        window: Window | None = None,
+        coupling: Coupling = "sequential",
+        pull: float | Sequence[float] | Array = 0.5,
+        control_weight: float = 1.0,
+        limits: tuple[ArrayLike, ArrayLike] | None = None,
+        judge: AcceptancePolicy | None = None,
+        starts: InitialGuesses | None = None,
+        believable: Callable[[Solution, Decision], bool] | None = None,
+        deadline: float = np.inf,
+        delay: int = 0,
+        patience: int = 10,
+        clock: Callable[[], float] = clocks.perf_counter,
+    ) -> None:
+        """State the graph and prepare the backends; ticks compile nothing.
+
+        Args:
+            robot: who moves.
+            steps: N of the future.
+            terms: what is said of the nodes and controls of the future.
+            solver: for a solve with a warm start.
+            cold: for one without, which may iterate longer; None for the same.
+            second: asked in the same tick when the plan of the first is refused, from where solves begin after a
+                failure; None for nobody.
+            window: of the past.
+            coupling: "separate", "sequential" or "joint".
+            pull: see :class:`unifg.horizon.coupling.JointPresent`.
+            control_weight: factor on all costs of the future; matters where they meet those of the past.
+            limits: least and greatest controls (m,), to which plans are clipped, infinite where there are none; one
+                number holds for all, None for no limits.
+            judge: decides what is applied; by default :class:`unifg.horizon.LastPlanThenBrake`.
+            starts: where solves begin that have no last answer to go on from.
+            believable: whether what a joint solve says of the present is believed; by default when its plan is
+                applied and bends no constraint by more than ``CLOSE``.
+            deadline: for a tick [s]: the solver is given what is left of it; a plan that comes later is not applied.
+            delay: ticks after which a plan acts, because solving takes time. The horizon begins where the controls
+                that have been sent until then lead by the robot's model, and the first control of a plan acts there;
+                ``applied`` is what acts in the meantime, at first zero.
+            patience: ticks of ending behind before a solve begins anew.
+            clock: seconds of the wall.
+
+        Raises:
+            GraphError: for an unknown coupling, a joint one without a window, sizes and limits that do not fit, a term
+                that cannot be stated, or a delay of a joint coupling or of a robot without a model.
+        """
+        if coupling not in COUPLINGS:
+            raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
+        if steps < 1:
+            raise GraphError(f"a horizon needs at least one step, found steps={steps}")
+        if not deadline > 0.0:
+            raise GraphError(f"the deadline must be positive, got {deadline} s")
+        if not (control_weight > 0.0 and np.isfinite(control_weight)):
+            raise GraphError(f"control_weight must be positive and finite, got {control_weight}")
+        if delay < 0 or (delay and (coupling == "joint" or robot.predict is None)):
+            raise GraphError(
+                f"delay={delay}: a plan acts now or later; later takes a robot that predicts, and not the coupling "
+                "'joint', where the future begins at the present"
+            )
+        self._lock = ReentrantLock()
+        self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
+        self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
+        between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
+        graph = Graph()
+        self.tie: PresentCoupling = self._tied(graph, pull)
+        self.x, self.u = self.tie.ahead, graph.variables("u", robot.control, steps)
+        before = len(graph.terms)
+        for term in self._terms:
+            term.state(graph, self.x, self.u)
+        weigh(graph.terms[before:], control_weight)
+        self._handles = handles_of(graph)
+        backends = solver, cold or solver, second or solver
+        timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in backends]
+        self._limits = [own.time_limit for own in timed]
+        self.warm, self.cold = (own.prepare(graph) for own in timed[:2])
+        self.second = None if second is None else timed[2].prepare(graph)
+        self.kept = LastPlan(steps, robot, between)
+        self.judge: AcceptancePolicy = judge or LastPlanThenBrake(robot)
+        self.starts: InitialGuesses = starts or InitialGuesses()
+        self._believable = believable or _close
+        self.statuses: Counter[Status] = Counter()
+        self.sources: Counter[str] = Counter()
+        self.rescues = 0
+        self.milliseconds: deque[float] = deque(maxlen=TIMES)
+        self.guess: Guess | None = None
+        self.solution: Solution | None = None
+        self._solved_by, self._verification_time = self.warm, 0.0
+        self.sent: Array = np.zeros((delay, robot.control.storage))
+        self.lagging, self.failed = 0, False
+        self._believe_nothing()
+
+    def _tied(self, graph: Graph, pull: float | Sequence[float] | Array) -> PresentCoupling:
+        if self.coupling != "joint":
+            return FixedPresent(graph, self.robot, self.steps, self.coupling == "separate")
+        if self.window is None:
+            raise GraphError("the coupling 'joint' needs a window: there is no past to join")
+        if self.window.robot is not self.robot:
+            raise GraphError("the window is of another robot")
+        return JointPresent(graph, self.window, self.steps, pull)
+
+    # ---------------------------------------------------------------- a tick
+
+    def tick(
+        self,
+        given: Any = None,
+        measured: Mapping[str, ArrayLike | None] | None = None,
+        *,
+        applied: ArrayLike | None = None,
+        time: float | None = None,
+    ) -> Plan:
+        """Let the past move on by what was applied, take in what was measured, estimate and plan.
+
+        Args:
+            given: what terms ask for in ``now.given``.
+            measured: values at the present node, by name; what is missing or None was not measured.
+            applied: (m,) since the last tick; None for what the last plan said.
+            time: of the present [s]; None for one more than at the last tick.
+
+        Raises:
+            GraphError: without a window; for a measurement, a control or a time that does not fit, which leaves
+                everything as it was; for data of a term that do not. Not for a hard problem.
+            BackendError: while another thread ticks.
+        """
+        if self.window is None:
+            raise GraphError("a tick needs a window; without one, give the present to plan()")
+        with self._alone():
+            return self._tick(self.window, given, measured, applied, time)
+
+    def _tick(
+        self,
+        window: Window,
+        given: Any,
+        measured: Mapping[str, ArrayLike | None] | None,
+        applied: ArrayLike | None,
+        time: float | None,
+    ) -> Plan:
+        begin = self._clock()
+        seen = {name: value for name, value in (measured or {}).items() if value is not None}
+        for name, value in seen.items():
+            window.history.readable(name, value)
+        last = self.applied if applied is None else self.robot.applicable(applied)
+        if window.solution is not None:
+            window.move(last, time)
+        elif time is not None:
+            window.history.times[:] = instant(time)
+        for name, value in seen.items():
+            window.record(name, value)
+        window.estimate(given)
+        return self._plan(window.now(given, last), begin)
+
+    def plan(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Plan:
+        """Plan from a present state (storage,) that somebody else has estimated.
+
+        Args:
+            present: state.
+            given: what terms ask for in ``now.given``.
+            constants: (count, storage) by name; by default those of the window, without one those at the start.
+
+        Raises:
+            GraphError: for constants that there are not, and data of a term that do not fit.
+            BackendError: while another thread plans.
+        """
+        with self._alone():
+            begin = self._clock()
+            return self._plan(self.now(present, given, constants), begin)
+
+    def idle(self, seconds: float = np.inf) -> dict[str, str]:
+        """Verify the last solution by the functions as written, while nothing is due: after the control was applied.
+
+        Nothing is done without a solution, for a verified one, and where the last verification took longer than
+        ``seconds``.
+
+        Args:
+            seconds: until the next tick.
+
+        Returns:
+            Reasons by the names of terms whose traces differ; from the next tick on they are evaluated by Python.
+
+        Raises:
+            BackendError: while another thread plans.
+        """
+        with self._alone():
+            if self.solution is None or self.solution.checked or self._verification_time > seconds:
+                return {}
+            begin = self._clock()
+            found = self._solved_by.verify(self.solution)
+            self._verification_time = self._clock() - begin
+            return found
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Refuse what another thread asks for meanwhile: it would not be in time."""
+        if not self._lock.acquire(blocking=False):
+            raise BackendError("this loop is at work in another thread: a loop has one thread at a time")
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+    def now(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Context[Any]:
+        """Context for the terms; arguments as of :meth:`plan`."""
+        history = None if self.window is None else self.window.history
+        known = (
+            {static.name: static.values for static in self.robot.constants} if history is None else history.constants
+        )
+        given_statics = {name: self._static(name, value, known) for name, value in (constants or {}).items()}
+        known = {name: values.copy() for name, values in known.items()} | given_statics
+        return Context(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
+
+    def _static(self, name: str, value: ArrayLike, known: Mapping[str, Array]) -> Array:
+        """A value (count, storage) of a static."""
+        if name not in known:
+            raise GraphError(f"the robot has no static '{name}' (there are: {', '.join(known) or 'none'})", family=name)
+        found, shape = np.asarray(value, dtype=np.float64), known[name].shape
+        if found.shape != shape or not np.isfinite(found).all():
+            raise GraphError(f"static '{name}' must be {shape} finite numbers, got {found}", family=name)
+        return found
+
+    def data(self, now: Context[Any]) -> dict[Data, ArrayLike]:
+        """Data of the whole graph."""
+        return self.tie.data(now) | values_of(self._terms, now, self._handles)
+
+    def _plan(self, present: Context[Any], begin: float) -> Plan:
+        """Solve, judge, and remember."""
+        now = self._acting(present)
+        data = self.data(now)
+        run, guess = self.begin(now)
+        if np.isfinite(self._deadline):
+            limit = self._limits[0 if run is self.warm else 1]
+            run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
+        solution, rescued = run.solve(self.tie.begin(guess, now), data=data), False
+        if self.second is not None and self._refuses(solution, now):
+            solution, rescued = self._ask(self.second, solution, now, data, begin)
+        self.solution, self._solved_by = solution, self.second if rescued and self.second else run
+        self.statuses[solution.status] += 1
+        choice = self.decide(solution, now, late=self._clock() - begin > self._deadline)
+        self._believe(solution, choice, present)
+        decided = np.concatenate([self.sent, choice.controls[:1]])
+        self.applied, self.sent = decided[0], decided[1:]
+        elapsed = 1e3 * (self._clock() - begin)
+        self.milliseconds.append(elapsed)
+        return Plan(
+            choice.controls, choice.states, solution.status, solution.iterations, choice.source, self.kept.excess,
+            elapsed, rescued,
+        )  # fmt: skip
+
+    def _refuses(self, solution: Solution, now: Context[Any]) -> bool:
+        """Test whether the judge would have something else applied than the plan."""
+        return self.judge(solution, solution[self.x], solution[self.u], now, self.kept).source != "solved"
+
+    def _ask(
+        self, other: Prepared, first: Solution, now: Context[Any], data: dict[Data, ArrayLike], begin: float
+    ) -> tuple[Solution, bool]:
+        """Solution of another backend and True, if the acceptance policy takes it; else the first and False."""
+        left = self._deadline - (self._clock() - begin)
+        if left <= 0.0:
+            return first, False
+        if np.isfinite(left):
+            other.solver.time_limit = min(self._limits[2], left)
+        start = self.starts.after_failure or self.starts.cold
+        states, controls = (
+            (np.tile(now.present, (self.steps + 1, 1)), np.zeros((self.steps, self.robot.control.storage)))
+            if start is None
+            else start(now)
+        )
+        found = other.solve(self.tie.begin(self.guess_of(states, controls, now), now), data=data)
+        if self._refuses(found, now):
+            return first, False
+        self.rescues += 1
+        return found, True
+
+    def decide(self, solution: Solution, now: Context[Any], *, late: bool = False) -> Decision:
+        """Judge a solve, keep its plan if it may be applied, and say where the next one begins.
+
+        Args:
+            solution: of this tick.
+            now: what the terms were asked with.
+            late: whether the deadline has passed, so that the plan serves the next tick only.
+        """
+        states, controls = solution[self.x], solution[self.u]
+        self.kept.age += 1
+        choice = self.judge(solution, states, controls, now, self.kept)
+        if late and choice.source == "solved":
+            instead = LastPlanThenBrake(self.robot, brake=getattr(self.judge, "brake", None)).instead(now, self.kept)
+            self._accept(solution, states, controls, choice)
+            choice = replace(instead, source="late")
+        elif choice.source == "solved":
+            self._accept(solution, states, controls, choice)
+        else:
+            self.failed = True
+            self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
+        self.sources[choice.source] += 1
+        return choice
+
+    def _acting(self, now: Context[Any]) -> Context[Any]:
+        """Context for the terms at the time the plan acts."""
+        if not self.delay:
+            return now
+        return replace(now, present=self.robot.rollout(now.present, self.sent)[-1], last=self.sent[-1].copy())
+
+    def begin(self, now: Context[Any]) -> tuple[Prepared, Guess]:
+        """Backend of the next solve, and its guess."""
+        if self.guess is not None:
+            carry = self.starts.carry
+            return self.warm, self.guess if carry is None else carry(self.guess, now)
+        if self.failed and self.starts.after_failure is not None:
+            return self.warm, self.guess_of(*self.starts.after_failure(now), now)
+        if self.starts.cold is not None:
+            return self.cold, self.guess_of(*self.starts.cold(now), now)
+        rest = np.zeros((self.steps, self.robot.control.storage))
+        return self.cold, self.guess_of(np.tile(now.present, (self.steps + 1, 1)), rest, now)
+
+    def guess_of(self, states: Array, controls: Array, now: Context[Any]) -> Guess:
+        """A guess for the graph, from states (N + 1, storage) and controls (N, m) of the future."""
+        x = self.x.family
+        nodes = np.tile(now.present, (len(x), 1))
+        nodes[len(x) - self.steps - 1 :] = states
+        return Guess({x: nodes, self.u: np.asarray(controls, dtype=np.float64)})
+
+    def _accept(self, solution: Solution, states: Array, controls: Array, choice: Decision) -> None:
+        """Keep a plan, and begin the next solve from it."""
+        self.kept.store(controls, states)
+        self.failed = False
+        self.guess = None if self.stays_behind(choice.behind) else solution.shifted(*self.tie.along, self.u)
+
+    def _believe(self, solution: Solution, choice: Decision, now: Context[Any]) -> None:
+        said = self.tie.believed(solution) if self._believable(solution, choice) else None
+        self.believed = said is not None
+        self.estimate, self.constants = said or (now.present, dict(now.constants))
+
+    def stays_behind(self, behind: bool) -> bool:
+        """Count a tick; whether plans have ended behind for too long, after which the count begins anew."""
+        self.lagging = self.lagging + 1 if behind else 0
+        if self.lagging < self._patience:
+            return False
+        self.lagging = 0
+        return True
+
+    # ---------------------------------------------------------------- beginning anew
+
+    def forget(self) -> None:
+        """Drop the warm start, as when a new reference makes it misleading."""
+        self.guess = None
+        self.failed = False
+
+    def abandon(self) -> None:
+        """Drop the warm start and the plan that is kept."""
+        self.forget()
+        self.kept.clear()
+        self.lagging = 0
+
+    def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
+        """Forget the plan that is kept, the past, and what terms keep; counts of statuses and times stay.
+
+        Args:
+            start: (storage,) believed state; None for that of the beginning.
+            sigma: (d,) its standard deviations, or its covariance; None for those of the beginning.
+
+        Raises:
+            BackendError: while another thread ticks.
+        """
+        with self._alone():
+            if self.window is not None:
+                self.window.reset(start, sigma)
+            behind = () if self.window is None else self.window.terms
+            reset_all(term for term in self._terms if not any(term is other for other in behind))
+            self.abandon()
+            self._believe_nothing()
+
+    def _believe_nothing(self) -> None:
+        """Beliefs before the first tick."""
+        self.applied = np.zeros(self.robot.control.storage)
+        self.sent = np.zeros_like(self.sent)
+        self.solution = None
+        self.estimate = self.robot.state.identity() if self.window is None else self.window.present
+        self.constants, self.believed = {static.name: static.values for static in self.robot.constants}, False
+
+
+def _looked_at(limits: tuple[ArrayLike, ArrayLike], size: int) -> tuple[Array, Array]:
+    """Least and greatest controls (m,), between which there are some."""
+    try:
+        least, most = (np.broadcast_to(np.array(limit, dtype=np.float64), (size,)) for limit in limits)
+    except (TypeError, ValueError) as error:
+        raise GraphError(
+            f"the limits must be two, ({size},) each: least and greatest controls; got {limits}"
+        ) from error
+    if not (np.all(least <= most) and np.all(least < np.inf) and np.all(most > -np.inf)):
+        raise GraphError(f"the limits leave no control: the least ({size},) is {least}, the greatest {most}")
+    return least, most
+
+
+def _close(solution: Solution, choice: Decision) -> bool:
+    """A dynamics that gives by a millimetre says as little about the past as one that is not there."""
+    return choice.source == "solved" and solution.violation <= CLOSE

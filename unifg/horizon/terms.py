@@ -1,0 +1,275 @@
+"""Terms of a window or a horizon: each defined once, whatever graphs it is added to.
+
+A term is an object with two methods. ``state(graph, x, u)`` adds costs and constraints on the nodes it is given, of the
+past or of the future; ``data(now)`` gives the values of the data that it declared, by their names. The same object may
+stand in several graphs, the one of the past alone and the one of past and future, so it keeps nothing of them. What it
+keeps between ticks, as measurements that have arrived, it forgets when a window or a loop is reset, if it has a method
+``reset()``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.horizon.history import History
+from unifg.modeling.factors import difference, prior
+from unifg.modeling.model import AnyResidual
+from unifg.modeling.variables import Data, Family, Selection
+from unifg.solution.graph import Graph
+from unifg.typing import Array, ArrayLike
+
+G = TypeVar("G")
+
+
+@dataclass(frozen=True)
+class Context(Generic[G]):
+    """Context of terms at a tick.
+
+    Attributes:
+        given: what the caller hands to this tick: a reference, a goal, a map.
+        present: (storage,) state by the past alone; for a plan that acts later, where the robot will be by then.
+        last: (m,) control that was applied last, before the horizon begins.
+        constants: (count, storage) values by the past alone, by name.
+        history: what was done and measured; None without a window.
+    """
+
+    given: G
+    present: Array
+    last: Array
+    constants: Mapping[str, Array] = field(default_factory=dict)
+    history: History | None = None
+
+    @property
+    def past(self) -> History:
+        """The history.
+
+        Raises:
+            GraphError: without a window.
+        """
+        if self.history is None:
+            raise GraphError("a term asks for the past, but there is no window")
+        return self.history
+
+
+class Term(Protocol):
+    """A part of what a window or a horizon says."""
+
+    def state(self, graph: Graph, x: Selection, u: Any) -> None:
+        """Add costs and constraints to a graph.
+
+        Args:
+            graph: which also holds the robot's constants, and of the past its steps, in ``graph.families``.
+            x: the nodes: of the past L + 1, the present being the last; of the future N + 1, the present the first.
+            u: (L,) controls that were applied, which are data; or the family of the N controls to come.
+        """
+        ...
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        """Values of the data that :meth:`state` declared, by name; others keep what they were declared with."""
+        ...
+
+
+@runtime_checkable
+class Recording(Protocol):
+    """A term of the past that has measurements recorded at nodes."""
+
+    @property
+    def records(self) -> Mapping[str, tuple[int, ...]]:
+        """Shape of a measurement at one node, by name."""
+        ...
+
+
+@runtime_checkable
+class Resetting(Protocol):
+    """A term that keeps something between ticks, as measurements that have arrived, which a new episode forgets."""
+
+    def reset(self) -> None:
+        """Forget it: the window or the loop begins anew."""
+        ...
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A measurement of the state at nodes of the past, those at which it was made.
+
+    Attributes:
+        name: under which it is recorded.
+        residual: ``residual(x, z)`` or, with constants, ``residual(x, s_1, ..., z)``: (n, m).
+        shape: of one measured value.
+        sigma: standard deviations in the residual's units.
+        constants: names of families of one member that the residual takes, too.
+        robust: loss.
+        component: of the state, as "pose"; None for all of it.
+    """
+
+    name: str
+    residual: AnyResidual
+    shape: tuple[int, ...]
+    sigma: ArrayLike
+    constants: tuple[str, ...] = ()
+    robust: Any = None
+    component: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a shape that is none."""
+        sizes = self.shape if isinstance(self.shape, tuple) else (None,)
+        if not all(isinstance(size, int | np.integer) and size >= 0 for size in sizes):
+            raise GraphError(f"measurement '{self.name}': its shape is a tuple, as (2,); found {self.shape!r}")
+
+    @property
+    def records(self) -> Mapping[str, tuple[int, ...]]:
+        """One value per node."""
+        return {self.name: self.shape}
+
+    def state(self, graph: Graph, x: Selection, u: Any) -> None:
+        """Add a cost at every node, active where something was measured."""
+        values = graph.data(self.name, np.zeros((len(x), *self.shape)), each=True)
+        measured = graph.data(f"{self.name}: measured", np.zeros(len(x), dtype=bool), each=True)
+        shared = _shared(graph, self.constants, self.name)
+        where = x if self.component is None else getattr(x, self.component)
+        graph.minimize(
+            self.residual, where, *shared, values, sigma=self.sigma, robust=self.robust, active=measured, name=self.name
+        )
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        """Measurements."""
+        values, measured = now.past.recorded(self.name)
+        return {self.name: values, f"{self.name}: measured": measured}
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """Dynamics from node to node by the controls between them: in the past or in the future.
+
+    Attributes:
+        residual: ``residual(x, u, x_next, h)`` or, with constants, ``residual(x, u, s_1, ..., x_next, h)``: (n, m).
+        step: h [s], for all steps.
+        sigma: (m,) standard deviations of the process noise; None where the model holds exactly.
+        constants: names of families of one member that the residual takes, too.
+        name: of the term, and with "past" added where the controls are those that were applied.
+    """
+
+    residual: AnyResidual
+    step: float
+    sigma: ArrayLike | None = None
+    constants: tuple[str, ...] = ()
+    name: str = "dynamics"
+
+    def state(self, graph: Graph, x: Selection, u: Any) -> None:
+        """Add a cost or an equality for every step."""
+        shared = _shared(graph, self.constants, self.name)
+        arguments, name = (x[:-1], u, *shared, x[1:], self.step), self.name
+        if isinstance(u, Data):
+            name = f"past {name}"
+        if self.sigma is not None:
+            graph.minimize(self.residual, *arguments, sigma=self.sigma, name=name)
+        else:
+            graph.constrain(self.residual, *arguments, lower=0.0, upper=0.0, name=name)
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        """None of its own."""
+        return {}
+
+
+@dataclass(frozen=True)
+class ControlCost:
+    """Costs of controls: how far they are from wanted ones, and how they change, the one applied last included.
+
+    Attributes:
+        sigma: (m,) standard deviations of the first.
+        change: (m,) of the second; None for no such cost.
+        wanted: (m,) or (N, m), for good or as ``wanted(now)`` says at a tick.
+    """
+
+    sigma: ArrayLike
+    change: ArrayLike | None = None
+    wanted: ArrayLike | Callable[[Context[Any]], ArrayLike] = 0.0
+
+    def state(self, graph: Graph, x: Selection, u: Any) -> None:
+        """Add the costs."""
+        shape = len(u), u.manifold.storage
+        constant = 0.0 if callable(self.wanted) else self.wanted
+        wanted = graph.data("wanted controls", np.broadcast_to(np.asarray(constant), shape), each=True)
+        graph.minimize(prior, u, wanted, sigma=self.sigma, name="effort")
+        if self.change is not None:
+            last = graph.data("last control", np.zeros(shape[1]))
+            graph.minimize(prior, u[0], last, sigma=self.change, name="first change")
+            if shape[0] > 1:
+                graph.minimize(difference, u[:-1], u[1:], sigma=self.change, name="change")
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        """The control applied last, and those wanted now."""
+        found: dict[str, ArrayLike] = {} if self.change is None else {"last control": now.last}
+        if callable(self.wanted):
+            found["wanted controls"] = self.wanted(now)
+        return found
+
+
+def values_of(terms: Sequence[Term], now: Context[Any], handles: Mapping[str, Data]) -> dict[Data, ArrayLike]:
+    """Data of several terms, by the handles of one graph.
+
+    Raises:
+        GraphError: when a term gives a value for data that the graph does not read, or two give the same.
+    """
+    found: dict[Data, ArrayLike] = {}
+    for term in terms:
+        for name, value in term.data(now).items():
+            if name not in handles:
+                known = ", ".join(handles) or "none"
+                raise GraphError(f"{type(term).__name__} gives data '{name}', which its graph does not read ({known})")
+            if handles[name] in found:
+                raise GraphError(f"{type(term).__name__} gives data '{name}', which another term has given")
+            found[handles[name]] = _spread_out(value, handles[name].value.shape)
+    return found
+
+
+def _spread_out(value: ArrayLike, shape: tuple[int, ...]) -> ArrayLike:
+    """A value for all factors alike, once for each; what does not fit is refused by the graph, which knows its name."""
+    own = np.shape(value)
+    alike = len(own) < len(shape) and own == shape[len(shape) - len(own) :]
+    return np.broadcast_to(np.asarray(value), shape) if alike or not own else value
+
+
+def _shared(graph: Graph, constants: Sequence[str], term: str) -> list[Family]:
+    """Families of constants that a term takes."""
+    for name in constants:
+        if name not in graph.families:
+            known = ", ".join(graph.families)
+            raise GraphError(f"term '{term}' takes static '{name}', which the robot does not have ({known})", term=term)
+    return [graph.families[name] for name in constants]
+
+
+def looked_at(terms: Iterable[Term]) -> tuple[Term, ...]:
+    """Terms that are some.
+
+    Raises:
+        GraphError: for an object without the methods of a term, or a class that has not been called.
+    """
+    found = tuple(terms)
+    for term in found:
+        lacking = [name for name in ("state", "data") if not callable(getattr(term, name, None))]
+        if lacking or isinstance(term, type):
+            name = term.__name__ if isinstance(term, type) else type(term).__name__
+            raise GraphError(f"{name} is no term: a term is an object with methods state(graph, x, u) and data(now)")
+    return found
+
+
+def reset_all(terms: Iterable[Term]) -> None:
+    """Let those terms that keep something forget it."""
+    for term in terms:
+        if isinstance(term, Resetting):
+            term.reset()
+
+
+def handles_of(graph: Graph) -> dict[str, Data]:
+    """The data that the terms and fixes of a graph read, by name."""
+    shaping = "active", "sigma", "information", "lower", "upper"
+    read: list[Any] = [fix.value for fix in graph.fixes]
+    for term in graph.terms:
+        read += [*term.arguments, *(getattr(term, name, None) for name in shaping)]
+    return {value.name: value for value in read if isinstance(value, Data)}

@@ -1,0 +1,285 @@
+"""Residuals every robot shares: priors, relative measurements, differences.
+
+They exist on any manifold: ``prior``, ``between`` and ``difference`` are completed with the manifold of the
+variables they are given. Jacobians are in right perturbation, X Exp(d); equation numbers are those of Sola et al.,
+"A micro Lie theory", arXiv:1812.01537.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field, replace
+from functools import cache
+from inspect import cleandoc
+from typing import Any, cast
+
+import numpy as np
+
+from unifg.codegen.calls import local_matrix, local_vector, vector
+from unifg.codegen.jit import compiled
+from unifg.errors import GraphError
+from unifg.factors.kernel import Kernel
+from unifg.factors.per_factor import per_factor
+from unifg.factors.residuals import Residual, residual
+from unifg.lie import LieGroup, Manifold, Rn, rn, se2
+from unifg.lie.functions import Functions, functions_of
+from unifg.typing import Array
+
+
+@dataclass(frozen=True)
+class ManifoldResidual:
+    """A residual defined on every manifold; :meth:`on` completes it.
+
+    Attributes:
+        name: shown in tables and messages.
+        build: makes the residual for one manifold.
+        about: what ``help`` says of it.
+    """
+
+    name: str
+    build: Callable[[Manifold], Residual]
+    about: str = field(default="", repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Give ``help`` its own text instead of that of the class."""
+        if self.about:
+            object.__setattr__(self, "__doc__", cleandoc(self.about))
+
+    def on(self, manifold: Manifold) -> Residual:
+        """The residual for variables on ``manifold``.
+
+        Raises:
+            GraphError: when it has no meaning there.
+        """
+        return self.build(manifold)
+
+
+# ---------------------------------------------------------------- groups with compiled functions
+
+
+def _relative(group: LieGroup, functions: Functions) -> Callable[..., None]:
+    """Write Log(p^-1 x^-1 y) and its derivatives, with p a measured element or nothing."""
+    storage, dim = group.storage, group.dim
+    between, log, adjoint = functions.between, functions.log, functions.adjoint
+    inverse_jacobian = functions.right_jacobian_inverse
+    if (between, log, adjoint, inverse_jacobian) == (se2.between, se2.log, se2.adjoint, se2.right_jacobian_inverse):
+        return _planar_relative
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        x, y = vector(v, 0, storage), vector(v, storage, storage)
+        seen, error = local_vector(storage), local_vector(storage)
+        between(x, y, seen)
+        if len(p):
+            between(p, seen, error)
+            log(error, r)
+        else:
+            log(seen, r)
+        if len(J):
+            after, transport = local_matrix(dim, dim), local_matrix(dim, dim)
+            inverse_jacobian(r, after)  # eq. 79
+            between(y, x, seen)
+            adjoint(seen, transport)
+            for i in range(dim):
+                for k in range(dim):
+                    total = 0.0
+                    for j in range(dim):
+                        total += after[i, j] * transport[j, k]
+                    J[i, k] = -total
+                    J[i, dim + k] = after[i, k]
+
+    return kernel
+
+
+@compiled
+def _planar_relative(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """The same in the plane."""
+    se2.write_relative(vector(v, 0, 3), vector(v, 3, 3), p, r, J)
+
+
+def _deviation(group: LieGroup, functions: Functions) -> Callable[..., None]:
+    """Write Log(p^-1 x) and its derivative."""
+    deviation, inverse_jacobian = functions.log_between, functions.right_jacobian_inverse
+
+    @compiled
+    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+        deviation(p, v, r)
+        if len(J):
+            inverse_jacobian(r, J)
+
+    return kernel
+
+
+# ---------------------------------------------------------------- vectors
+
+
+@compiled
+def _vector_deviation(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """X - p."""
+    for i in range(len(r)):
+        r[i] = v[i] - p[i]
+        if len(J):
+            for k in range(len(r)):
+                J[i, k] = 1.0 if i == k else 0.0
+
+
+@compiled
+def _vector_relative(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """Y - x - p, or y - x."""
+    dim = len(r)
+    for i in range(dim):
+        r[i] = rn.minus(rn.minus(v[dim + i], v[i]), p[i] if len(p) else 0.0)
+        if len(J):
+            for k in range(dim):
+                J[i, k] = -1.0 if i == k else 0.0
+                J[i, dim + k] = 1.0 if i == k else 0.0
+
+
+# ---------------------------------------------------------------- any other manifold, evaluated by NumPy
+
+
+class _Batched:
+    """A picklable function of values on one manifold, with derivatives where it is a group."""
+
+    def __init__(self, manifold: Manifold) -> None:
+        self.manifold = manifold
+        self.derivative = self.jacobian if isinstance(manifold, LieGroup) else None
+
+    def after(self, tangent: Array, count: int) -> Array:
+        """(n, d, d) inverse right Jacobians (eq. 79)."""
+        assert isinstance(self.manifold, LieGroup)
+        dim = self.manifold.dim
+        return np.broadcast_to(self.manifold.right_jacobian_inverse(tangent), (count, dim, dim))
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        raise NotImplementedError
+
+
+class _Prior(_Batched):
+    def __call__(self, x: Array, reference: Array) -> Array:
+        if isinstance(self.manifold, LieGroup):
+            return np.atleast_2d(self.manifold.log(self.manifold.between(reference, x)))
+        return np.atleast_2d(self.manifold.local(reference, x))
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        return [self.after(self(*arguments), len(arguments[0]))]
+
+
+class _Relative(_Batched):
+    def __call__(self, x: Array, y: Array, measured: Array | None = None) -> Array:
+        if not isinstance(self.manifold, LieGroup):
+            return self.manifold.local(x, y)
+        if measured is None:
+            return self.manifold.log(self.manifold.between(x, y))
+        return self.manifold.log(self.manifold.between(measured, self.manifold.between(x, y)))
+
+    def jacobian(self, *arguments: Array) -> list[Array]:
+        assert isinstance(self.manifold, LieGroup)
+        after = self.after(self(*arguments), len(arguments[0]))
+        return [-after @ self.manifold.adjoint(self.manifold.between(arguments[1], arguments[0])), after]
+
+
+@cache
+def _complete(
+    manifold: Hashable, name: str, arguments: tuple[Any, ...], vectors: Callable[..., None], groups: Any, batched: Any
+) -> Residual:
+    """The kernel for vectors, for groups with compiled functions, or the batched function for all others."""
+    assert isinstance(manifold, Manifold)
+    functions = functions_of(manifold)
+    if isinstance(manifold, Rn):
+        made = residual(Kernel(vectors, arguments, manifold.dim, name=name, linear=True))
+    elif isinstance(manifold, LieGroup) and functions is not None:
+        made = residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name))
+    elif functions is not None and not isinstance(manifold, LieGroup):
+        made = _by_differences(manifold, functions, name)
+    else:
+        function = batched(manifold)
+        made = residual(function, function.derivative, name)
+    return replace(made, elements=tuple((place, manifold) for place in range(len(arguments))))
+
+
+def _by_differences(manifold: Manifold, functions: Functions, name: str) -> Residual:
+    """``prior`` and ``difference`` of points that cannot be composed: the local step between them."""
+    local = functions.local
+    if name == "difference":
+        return residual(per_factor(local, None, manifold.dim, (manifold, manifold), (), name))
+
+    @compiled
+    def deviation(x: Array, reference: Array, r: Array) -> None:
+        local(reference, x, r)
+
+    return residual(per_factor(deviation, None, manifold.dim, (manifold, 1), ((manifold.storage,),), name))
+
+
+def _build_prior(manifold: Manifold) -> Residual:
+    return _complete(
+        cast(Hashable, manifold), "prior", (manifold, (manifold.storage,)), _vector_deviation, _deviation, _Prior
+    )
+
+
+def _build_between(manifold: Manifold) -> Residual:
+    if not isinstance(manifold, LieGroup):
+        raise GraphError(f"between needs a Lie group, found {manifold.name}; use difference")
+    return _complete(
+        cast(Hashable, manifold),
+        "between",
+        (manifold, manifold, (manifold.storage,)),
+        _vector_relative,
+        _relative,
+        _Relative,
+    )
+
+
+def _build_difference(manifold: Manifold) -> Residual:
+    return _complete(
+        cast(Hashable, manifold), "difference", (manifold, manifold), _vector_relative, _relative, _Relative
+    )
+
+
+_PRIOR = """Difference of a variable from what is believed about it: Log(reference^-1 x) on any manifold.
+
+    graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], sigma=[0.1, 0.1, 0.05])
+
+Args:
+    x: variable or selection, n members of a manifold of dimension d.
+    reference: elements of the manifold, (storage,) for all of them or (n, storage), as numbers or ``graph.data``.
+
+Returns:
+    (n, d) rows in the tangent space at the reference, in the manifold's own units (SE2: m, m, rad); plain differences
+    x - reference for vectors. Weighted by ``sigma=``, ``covariance=`` or ``information=`` of the term.
+
+Raises:
+    GraphError: the manifold has no logarithm, or shapes do not fit.
+"""
+_BETWEEN = """A relative measurement: Log(measured^-1 x^-1 y), zero where y is seen from x as measured.
+
+    graph.minimize(fg.between, x[:-1], x[1:], odometry, sigma=[0.05, 0.05, 0.02])
+
+Args:
+    x, y: variables or selections, n members each (or one, shared) of the same group of dimension d.
+    measured: x^-1 y as measured, an element of the group, (storage,) for all or (n, storage), as numbers or
+        ``graph.data``.
+
+Returns:
+    (n, d) rows in the tangent space, in the group's own units (SE2: m, m, rad; SE3: translation before rotation).
+    y - x - measured for vectors. The residual of GTSAM's BetweenFactor.
+
+Raises:
+    GraphError: the manifold is no group, or shapes do not fit.
+"""
+_DIFFERENCE = """Log(x^-1 y), zero where both agree: for rates and smoothness.
+
+    graph.minimize(fg.difference, u[:-1], u[1:], sigma=0.5)
+
+Args:
+    x, y: variables or selections, n members each (or one, shared) of the same manifold of dimension d.
+
+Returns:
+    (n, d) rows in the tangent space at x; y - x for vectors.
+
+Raises:
+    GraphError: the manifold has no logarithm, or shapes do not fit.
+"""
+prior = ManifoldResidual("prior", _build_prior, _PRIOR)
+between = ManifoldResidual("between", _build_between, _BETWEEN)
+difference = ManifoldResidual("difference", _build_difference, _DIFFERENCE)

@@ -1,0 +1,159 @@
+"""The present values of all data of a program: which have changed, and parameters of kernels brought up to date.
+
+A control loop gives all its data anew at every tick. One compiled pass finds NaN, compares, and carries numbers to
+where the loops over terms read them; Python hears only of data that something must be worked out from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from unifg.codegen.jit import compiled
+from unifg.errors import GraphError
+from unifg.modeling.elements import elements_of, nearest, particular
+from unifg.modeling.terms import Term
+from unifg.modeling.variables import Data
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+
+FLOAT64 = np.dtype(np.float64)
+
+
+class Binding:
+    """Copies of all data that nobody else writes to.
+
+    Attributes:
+        present: the value of every datum, an array that keeps its place.
+    """
+
+    def __init__(self, known: Mapping[str, Data], used: Iterable[Data], terms: Sequence[Term] = ()) -> None:
+        """Make room.
+
+        Args:
+            known: the data of a graph by their names; the mapping may grow.
+            used: those a program reads.
+            terms: that read them; what stands for elements of a manifold there is looked at as such.
+        """
+        self._elements = [
+            (f"term '{term.name}': argument {place} of {term.residual.name}", argument, manifold, term)
+            for term in terms
+            for place, manifold in elements_of(term.residual).items()
+            if isinstance(argument := term.arguments[place], Data) and argument.value.dtype == FLOAT64
+            if particular(manifold)
+        ]
+        self._known = known
+        handles = list(dict.fromkeys(used))
+        self._numbers = [handle for handle in handles if handle.value.dtype == FLOAT64]
+        self._flags = [handle for handle in handles if handle.value.dtype != FLOAT64]
+        self._starts = np.cumsum([0, *(handle.value.size for handle in self._numbers)]).astype(np.int64)
+        self._flat, self._coming = np.empty(self._starts[-1]), np.empty(self._starts[-1])
+        self._slots = dict(zip(self._numbers, self._views(self._coming), strict=True))
+        self.present = dict(zip(self._numbers, self._views(self._flat), strict=True))
+        self.present.update({handle: np.empty_like(handle.value) for handle in self._flags})
+        self._changed = np.zeros(len(self._numbers), dtype=np.bool_)
+        self._all = True
+        self.carry([], [], np.empty(0))
+
+    def _views(self, flat: Array) -> list[Array]:
+        bounds = zip(self._numbers, self._starts[:-1], self._starts[1:], strict=True)
+        return [flat[first:last].reshape(handle.value.shape) for handle, first, last in bounds]
+
+    def place(self, handle: Data) -> IntArray:
+        """Position of each number of a datum, in the shape of the datum; for :meth:`carry`."""
+        first = int(self._starts[self._numbers.index(handle)])
+        return first + np.arange(handle.value.size).reshape(handle.value.shape)
+
+    def carry(self, sources: list[IntArray], targets: list[IntArray], parameters: Array) -> None:
+        """Have numbers copied to ``parameters`` from now on, whenever data are taken.
+
+        Args:
+            sources: (n,) places as :meth:`place` gives them.
+            targets: (n,) where in ``parameters``.
+            parameters: the array.
+        """
+        none = np.zeros(0, dtype=np.int64)
+        self._sources, self._targets = (
+            np.concatenate([none, *(part.ravel() for part in parts)]).astype(np.int64) for parts in (sources, targets)
+        )
+        self._parameters = parameters
+
+    def take(self, data: Mapping[Data, ArrayLike]) -> list[Data]:
+        """Take new values, defaults for what is not named, and say what is not as it was.
+
+        Raises:
+            GraphError: on unknown data, a changed shape, NaN, or elements off their manifold; nothing has changed then.
+        """
+        slots = self._slots
+        for handle, value in data.items():
+            slot = slots.get(handle)
+            if slot is None:
+                self._require(handle, value)
+            elif type(value) is np.ndarray and value.dtype == FLOAT64 and value.shape == handle.value.shape:
+                slot[...] = value
+            else:
+                slot[...] = handle.check(value)
+        for handle, slot in slots.items():
+            if handle not in data:
+                if handle.value.shape != slot.shape:
+                    raise GraphError(
+                        f"data '{handle.name}' has a default of shape {handle.value.shape} now, but the graph was "
+                        f"compiled for {slot.shape}: declare new data"
+                    )
+                slot[...] = handle.value
+        flags = {handle: handle.check(data.get(handle, handle.value)) for handle in self._flags}
+        for what, handle, manifold, term in self._elements:
+            mask = flags[term.active].astype(bool) if isinstance(term.active, Data) else term.active
+            slots[handle][...] = nearest(what, manifold, slots[handle], mask, term.name)
+        count = _renew(
+            self._coming, self._flat, self._starts, self._changed, self._sources, self._targets, self._parameters
+        )
+        if count < 0:
+            self._numbers[-1 - count].check(slots[self._numbers[-1 - count]])
+        changed = [h for h, new in zip(self._numbers, self._changed.tolist(), strict=True) if new] if count else []
+        for handle, array in flags.items():
+            if not np.array_equal(array, self.present[handle]):
+                self.present[handle][...] = array
+                changed.append(handle)
+        if self._all:
+            self._all, changed = False, [*self._numbers, *self._flags]
+        return changed
+
+    def forget(self) -> None:
+        """Count everything as changed next time, as after a value that a term has refused."""
+        self._all = True
+
+    def _require(self, handle: Data, value: ArrayLike) -> None:
+        """Look at the value of what no kernel parameter is: flags, and data that no term uses."""
+        if self._known.get(getattr(handle, "name", "")) is not handle:
+            raise GraphError(f"data {handle!r} does not belong to this graph")
+        handle.check(value)
+
+
+@compiled
+def _renew(
+    coming: Array,
+    present: Array,
+    starts: IntArray,
+    changed: BoolArray,
+    sources: IntArray,
+    targets: IntArray,
+    parameters: Array,
+) -> int:
+    """Number of data that have changed; -1 - k without any change when the k-th holds NaN."""
+    for k in range(len(changed)):
+        for i in range(starts[k], starts[k + 1]):
+            if coming[i] != coming[i]:
+                return -1 - k
+    count = 0
+    for k in range(len(changed)):
+        new = False
+        for i in range(starts[k], starts[k + 1]):
+            if coming[i] != present[i]:
+                new = True
+            present[i] = coming[i]
+        changed[k] = new
+        count += 1 if new else 0
+    for p in range(len(sources)):
+        parameters[targets[p]] = present[sources[p]]
+    return count

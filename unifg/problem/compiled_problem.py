@@ -1,0 +1,641 @@
+"""A compiled graph: offsets, ordering and sparsity once; values, Jacobians and gradients as often as needed.
+
+Backends see only this. Rows of costs are whitened and weighted, so the objective is 1/2 |r|^2 plus scalar
+costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coordinates of the unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from itertools import pairwise
+from time import perf_counter
+from typing import Any, NamedTuple, TypeVar, cast
+
+import numpy as np
+
+from unifg.codegen.buffers import Buffers
+from unifg.codegen.threads import share, threads
+from unifg.codegen.work_queue import entrance
+from unifg.elimination.symmetric import Symmetric
+from unifg.errors import GraphError
+from unifg.factors.differences import convexified
+from unifg.locks import ReentrantLock
+from unifg.modeling.model import Model
+from unifg.modeling.terms import Constraint, Cost, ScalarCost
+from unifg.modeling.variables import Data, Family
+from unifg.problem import evaluation
+from unifg.problem.binding import Binding
+from unifg.problem.by_term import ByTerm, Places
+from unifg.problem.columns import Columns, Values
+from unifg.problem.guess import GuessReader
+from unifg.problem.limits import outside
+from unifg.problem.linearization import Evaluation, Linearization, Rows
+from unifg.problem.retraction import Retraction
+from unifg.problem.scalars import add_scalars, evaluate_scalars
+from unifg.problem.systems import Systems
+from unifg.problem.table import ENTRY, PARAMETER, ROW, WIDTH, TermArrays, TermTable
+from unifg.problem.term import CompiledTerm
+from unifg.problem.thread_partition import Shares
+from unifg.problem.verification import Verification
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+
+T = TypeVar("T")
+WORTH = 150_000  # entries of Jacobians below which threads bring nothing
+
+
+class Reader(NamedTuple):
+    """Reader of a datum.
+
+    Attributes:
+        bound: terms that have to work something out from it.
+        told: terms whose kernels find it among their parameters, already renewed.
+        fixes: numbers of the fixes whose values it is.
+    """
+
+    bound: list[CompiledTerm]
+    told: list[CompiledTerm]
+    fixes: list[int]
+
+
+class CompiledProblem:
+    """The compiled form of a graph.
+
+    Attributes:
+        graph: what was compiled, as it was then.
+        columns: numbering of the tangent coordinates.
+        size: number of unknown ones.
+        costs, constraints: patterns of the stacked Jacobians.
+        normal: pattern of the Gauss-Newton Hessian of the objective plus A'A.
+        blocks: (size,) the variable that every unknown belongs to.
+        lower, upper: (M,) limits with the present data.
+        cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
+        slices: rows of each constraint term.
+        places: name, rows and shape of each constraint term.
+        bound_rows: (M,) whether a row bounds an unknown itself.
+        systems: the normal equations and KKT matrices, their structure found once.
+        table: all terms as compiled loops take them.
+        least_squares: whether the objective is a sum of squares, robust or not, and nothing constrains it.
+        differenced: whether some derivative comes from differences, which round.
+        batched: terms without a kernel, evaluated by NumPy.
+        retraction: moves all variables.
+        scratch: memory for compiled loops.
+        python_seconds: time spent so far in terms that Python evaluates.
+        buffers: memory for linearisations.
+        verifications: of the traced terms, once a guess has been read.
+        turn: held by who binds data, until nobody needs them any more, and while anything is evaluated.
+    """
+
+    def __init__(self, graph: Model) -> None:
+        """Compile; see :func:`compile_graph`."""
+        if not graph.families:
+            raise GraphError("the graph has no variables: add a family with graph.variables(...)")
+        declared = graph._data
+        self.graph = graph = graph.snapshot()
+        self.lock = ReentrantLock()
+        self.families = list(graph.families.values())
+        self.columns = Columns(self.families, graph.fixes)
+        self.size = self.columns.size
+        self.terms = [CompiledTerm(term, self.columns) for term in graph.terms]
+        self.cost_terms = [c for c in self.terms if isinstance(c.term, Cost)]
+        self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
+        self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
+        self._require_touched()
+        variable, starts = self.columns.nodes()
+        self.blocks = variable[self.columns.free]
+        self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
+        stacked = self.cost_terms + self.constraint_terms
+        self.table = TermTable(stacked, self.scalar_terms, self.columns, self.normal)
+        self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
+        self.differenced = self.table.differenced or any(term.trace is None for term in self.scalar_terms)
+        self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
+        self.costs = Rows(self.table, self.cost_terms, True, self.size)
+        self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
+        self.systems = Systems(self.normal, self.blocks, self.constraints)
+        self._found: dict[Callable[[CompiledProblem], Any], Any] = {}
+        self._cost_slices = _slices(self.cost_terms)
+        self.slices = _slices(self.constraint_terms)
+        shaped = zip(self.constraint_terms, self.slices, strict=True)
+        self.places: Places = [(term.name, rows, (term.count, term.size)) for term, rows in shaped]
+        self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
+        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
+            self.bound_rows[rows] = term.is_bound
+        self._hessian: tuple[Symmetric, IntArray] | None = None
+        self.retraction = Retraction(self.columns, graph.fixes)
+        self._read = GuessReader(graph, self.columns, self.retraction)
+        self._names = [term.name for term in stacked]
+        self.scratch = np.empty(self.table.scratch)
+        self._shares: Shares | None = None
+        self.buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
+        self._watched: list[CompiledTerm] = []
+        self.verifications: list[Verification] = []
+        self._watching, self._watchers = False, list[Verification]()
+        self.python_seconds = 0.0
+        read = {value for term in self.terms for value in term.data}
+        read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
+        self._binding = Binding(declared, filter(read.__contains__, declared.values()), graph.terms)
+        self._vetted = False
+        self._bind_first()
+
+    @property
+    def arrays(self) -> TermArrays:
+        """Arrays of the terms for compiled loops, with the present data."""
+        return self.table.arrays
+
+    @property
+    def left_to_python(self) -> list[str]:
+        """Names of the terms that Python evaluates."""
+        return [term.name for term in self.batched + self.scalar_terms if term.trace is None]
+
+    @property
+    def fully_compiled(self) -> bool:
+        """True if a compiled loop can do without Python: every term a kernel, every loss and retraction compiled."""
+        return not (self.batched or self._general or self.table.weighed) and self.retraction.compiled
+
+    @property
+    def _general(self) -> list[CompiledTerm]:
+        """Scalar costs that Python evaluates."""
+        return [term for term in self.scalar_terms if term.kernel is None]
+
+    @property
+    def hessian(self) -> Symmetric:
+        """Pattern of the Gauss-Newton Hessian of the objective alone."""
+        return self._objective()[0]
+
+    @property
+    def objective_places(self) -> IntArray:
+        """Positions of the entries of ``hessian`` in ``normal``."""
+        return self._objective()[1]
+
+    # ---------------------------------------------------------------- data and values
+
+    def bind(self, data: Mapping[Data, ArrayLike]) -> None:
+        """Take new data; everything not named returns to its default.
+
+        Raises:
+            GraphError: on unknown data, a changed shape, NaN, or crossed limits.
+        """
+        changed = self._binding.take(data)
+        if not changed:
+            return
+        readers = [self._readers[handle] for handle in changed]
+        for term in [term for reader in readers for term in reader.told]:
+            term.forget()
+        if rebound := list(dict.fromkeys(term for reader in readers for term in reader.bound)):
+            try:
+                for term in rebound:
+                    term.bind(self._binding.present)
+                if any(isinstance(term.term, Constraint) for term in rebound):
+                    self._bind_limits()
+            except GraphError:
+                self._binding.forget()
+                raise
+            self.table.bind(rebound, self.lower, self.upper)
+        for handle, reader in zip(changed, readers, strict=True):
+            for fix in reader.fixes:
+                self.retraction.bind(fix, self._binding.present[handle])
+
+    def _bind_first(self) -> None:
+        """Take the defaults, and find out what has to be done when a datum changes."""
+        binding, fixes = self._binding, self.graph.fixes
+        binding.take({})
+        for term in self.terms:
+            if term.data:
+                term.bind(binding.present)
+        self._bind_limits()
+        self.table.bind(self.terms, self.lower, self.upper)
+        self._readers: dict[Data, Reader] = {}
+        sources, targets = [], []
+        for handle in binding.present:
+            reader = self._readers[handle] = Reader([], [], [k for k, f in enumerate(fixes) if f.value is handle])
+            for term in self.terms:
+                if handle not in term.data:
+                    continue
+                places = term.parameters_of(handle)
+                (reader.bound if places is None else reader.told).append(term)
+                for place in places or ():
+                    sources.append(np.broadcast_to(binding.place(handle).reshape(-1, place.shape[1]), place.shape))
+                    targets.append(int(term.place[PARAMETER]) + place)
+        binding.carry(sources, targets, self.arrays.parameters)
+        for k, fix in enumerate(fixes):
+            value = binding.present[fix.value] if isinstance(fix.value, Data) else np.asarray(fix.value)
+            self.retraction.bind(k, value)
+
+    def by_term(self, stacked: Array) -> ByTerm:
+        """(M,) numbers of the constraint rows, viewed as (n, m) of every term."""
+        return ByTerm(self.places, stacked)
+
+    def _bind_limits(self) -> None:
+        self.lower = _stacked([c.lower for c in self.constraint_terms])
+        self.upper = _stacked([c.upper for c in self.constraint_terms])
+        crossed = np.flatnonzero(self.lower > self.upper)
+        if len(crossed):
+            name, index = self.row_name(int(crossed[0]))
+            raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
+        self.equality = self.lower == self.upper
+
+    def values_from(self, guess: Mapping[Family, ArrayLike]) -> Values:
+        """Copy and check a guess, and give fixed variables their values.
+
+        Raises:
+            GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
+        """
+        values = self._read(guess)
+        if not self._vetted:
+            for term in self.terms:
+                term.require_clean(values)
+                if not term.stands(values):
+                    self._give_up(term)
+            self._vetted = True
+            self.renew_verifications()
+            self._watched = [term for term in self.terms if term.trace is not None and not term.trace.constant]
+        for term in self._watched:
+            if term.trace is None:
+                continue
+            if term.trace.outdated:
+                if not term.trace_again(values):
+                    self._give_up(term)
+                else:
+                    self.table.renew(term)
+                    self.table.bind([term], self.lower, self.upper)
+                self.renew_verifications()
+            elif term.trace.moved:
+                term.refresh()
+                self.table.bind([term], self.lower, self.upper)
+        return values
+
+    def mistraced(self, values: Values, slopes: bool, seed: int) -> dict[str, str]:
+        """Leave to Python the terms whose traces are not their functions at an answer.
+
+        Args:
+            values: the answer.
+            slopes: whether derivatives are compared as well.
+            seed: of the direction along which they are.
+
+        Returns:
+            Reasons by the names of these terms.
+        """
+        found: dict[str, str] = {}
+        step = np.random.default_rng(seed).uniform(-1.0, 1.0, self.size)
+        direction = np.zeros(self.columns.width)
+        direction[self.columns.free] = step
+        moved: dict[float, Values] = {}
+
+        def move(length: float) -> Values:
+            if length not in moved:
+                moved[length] = self.retract(values, length * step)
+            return moved[length]
+
+        for verification in self.verifications:
+            term = verification.term
+            if why := verification.difference(values, direction, move, slopes):
+                term.leave(why)
+                self._give_up(term)
+                found[term.name] = why
+        if found:
+            self.renew_verifications()
+        return found
+
+    def watch_conditions(self) -> None:
+        """Compile the comparisons of traces, for :meth:`conditions_changed` in a loop."""
+        self._watching = True
+        self.renew_verifications()
+
+    def conditions_changed(self, values: Values) -> bool:
+        """Test whether comparisons of watched traces come out otherwise than when this was last asked."""
+        changed = False
+        for watcher in self._watchers:
+            changed |= watcher.conditions_changed(values)
+        return changed
+
+    def renew_verifications(self) -> None:
+        """Keep what verifies the present traces."""
+        kept = {(known.term, known.kernel): known for known in self.verifications}
+        self.verifications = [
+            kept.get((term, term.trace.kernel)) or Verification(term) for term in self.terms if term.trace is not None
+        ]
+        self._watchers = [known for known in self.verifications if self._watching and known.watch()]
+
+    def _give_up(self, term: CompiledTerm) -> None:
+        """Leave a term that was traced to Python."""
+        self.differenced = True
+        self.table.give_up(term)
+        if term.kernel is None and not isinstance(term.term, ScalarCost):
+            self.batched.append(term)
+
+    def retract(self, values: Values, step: Array) -> Values:
+        """Move the unknowns by a tangent step; fixed variables stay."""
+        return self.retraction(values, step)
+
+    def within_bounds(self, values: Values) -> Values:
+        """The nearest values that respect every bound of an unknown; ``values`` itself when all do."""
+        moved = Values(self.columns, values.flat.copy())
+        for term in self.constraint_terms:
+            if not term.is_bound:
+                continue
+            selection = term.gathers[0].selection
+            part = moved[selection.family][selection.indices, selection.storage]
+            moved[selection.family][selection.indices, selection.storage] = np.clip(part, term.lower, term.upper)
+        self.retraction.fix(moved)
+        return values if np.array_equal(moved.flat, values.flat) else moved
+
+    # ---------------------------------------------------------------- evaluation
+
+    def evaluate(self, values: Mapping[Family, Array], weights: Array | None = None) -> Evaluation:
+        """Objective and constraints; ``weights`` are those of the linearisation whose line search this is."""
+        table = self.table
+        values = values if isinstance(values, Values) else self.columns.values(values)
+        residual, constraints = np.empty(table.residuals), np.empty(table.constraints)
+        squares = np.empty(table.weights)
+        with self.lock, np.errstate(all="ignore"):
+            if self.batched:
+                began = perf_counter()
+                for term in self.batched:
+                    self.rows_of(term, residual, constraints)[:] = term.residual(values)
+                self.python_seconds += perf_counter() - began
+            holding, held = weights is not None, squares if weights is None else weights
+            cost = evaluation.evaluate(
+                table.arrays, values.flat, residual, constraints, squares, held, holding, self.scratch
+            )
+            for loss, part in table.weighed:
+                if not (holding and loss.held):
+                    cost += 0.5 * float(loss.value(squares[part]).sum())
+            if self.scalar_terms:
+                cost += evaluate_scalars(table.arrays, values.flat, np.empty(table.scalars), self.scratch)
+                if general := self._general:
+                    began = perf_counter()
+                    cost += sum(float(term.residual(values).sum()) for term in general)
+                    self.python_seconds += perf_counter() - began
+        return Evaluation(cost, constraints)
+
+    def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
+        """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""
+        values = values if isinstance(values, Values) else self.columns.values(values)
+        with self.lock:
+            return self._linearize(values, search)
+
+    def _linearize(self, values: Values, search: bool) -> Linearization:
+        table = self.table
+        shares = self._shared()
+        buffers = self.buffers if shares is None else shares.buffers
+        residual, jacobian, constraints, constraint_jacobian, gradient, room = buffers.take()
+        hessian = room if shares is None else room[: self.normal.nnz]
+        squares, weights = np.empty(table.weights), np.empty(table.weights)
+        size = np.empty(len(table.arrays.fields))
+        found = np.empty(table.scalars)
+        concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
+        rounding = np.zeros(self.columns.width if self.scalar_terms else 0)
+        with np.errstate(all="ignore"):
+            if self.batched:
+                began = perf_counter()
+                for term in self.batched:
+                    self.rows_of(term, residual, constraints)[:] = term.residual(values)
+                    self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
+                self.python_seconds += perf_counter() - began
+            given = (
+                table.arrays, values.flat, search, residual, jacobian, constraints, constraint_jacobian, squares,
+                weights,
+            )  # fmt: skip
+            if shares is not None:
+                cost = _linearize_at_once(shares, given, size, gradient, room)
+            else:
+                gradient[:], hessian[:] = 0.0, 0.0
+                cost = evaluation.linearize(*given, size, gradient, hessian, self.scratch)
+            if table.weighed:
+                for loss, part in table.weighed:
+                    weights[part] = loss.weight(squares[part])
+                    cost += 0.5 * float(loss.value(squares[part]).sum())
+                evaluation.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
+            if self.scalar_terms:
+                cost += self._add_scalars(values, found, gradient, hessian, concavity, rounding)
+        norms, scalars = self.norms(size, found), self.by_scalar(found)
+        arrays = residual, jacobian, constraints, constraint_jacobian, gradient, hessian
+        return Linearization(values, cost, *arrays, norms, weights, concavity, squares, scalars, rounding)
+
+    def _shared(self) -> Shares | None:
+        """Shares of the factors for every thread, where that is worth it."""
+        count = threads()
+        if count == 1 or self.table.entries + self.table.constraint_entries <= WORTH:
+            return None
+        if self._shares is None or self._shares.count != count:
+            self._shares = Shares(self.table, self.columns.width, self.normal.nnz, count)
+        return self._shares
+
+    def _add_scalars(
+        self, values: Values, found: Array, gradient: Array, hessian: Array, concavity: Array, rounding: Array
+    ) -> float:
+        """Add the slopes and second derivatives of costs that are no squares; return what they cost."""
+        cost = float(add_scalars(self.arrays, values.flat, found, gradient, hessian, concavity, self.scratch))
+        if not (general := self._general):
+            return cost
+        began = perf_counter()
+        for term in general:
+            value = term.residual(values)
+            cost += float(value.sum())
+            found[term.place[ROW] : term.place[ROW] + term.count] = value
+            slope, curvature, doubt = term.scalar_derivatives(values)
+            columns, factor, a, b, place = self.once(_placed)[term]
+            np.add.at(gradient, columns.ravel(), slope.ravel())
+            np.add.at(rounding, columns.ravel(), doubt.ravel())
+            np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])
+            np.add.at(concavity, place, (curvature - convex)[factor, a, b])
+        self.python_seconds += perf_counter() - began
+        return cost
+
+    def norms(self, sizes: Array, scalars: Array | None = None) -> dict[str, float]:
+        """Residual norms of the terms by name, as compiled loops leave them, and of the values of scalar costs."""
+        norms = dict(zip(self._names, sizes.tolist(), strict=True))
+        if scalars is not None and len(scalars):
+            norms |= {name: float(np.abs(found).sum()) for name, found in self.by_scalar(scalars).items()}
+        return norms
+
+    def by_scalar(self, found: Array) -> dict[str, Array]:
+        """(n,) values of every scalar cost by name, of those of all."""
+        starts = [(term, int(term.place[ROW])) for term in self.scalar_terms]
+        return {term.name: found[start : start + term.count] for term, start in starts}
+
+    def rows_of(self, term: CompiledTerm, residual: Array, constraints: Array) -> Array:
+        """(n, m) rows of a term in the stacked residuals."""
+        start = int(term.place[ROW])
+        target = residual if isinstance(term.term, Cost) else constraints
+        return target[start : start + term.count * term.size].reshape(term.count, term.size)
+
+    def _entries_of(self, term: CompiledTerm, costs: Array, constraints: Array, blocks: list[Array]) -> None:
+        """Copy (n, m, d_k) blocks side by side into the stacked Jacobian."""
+        start, width = int(term.place[ENTRY]), int(term.place[WIDTH])
+        target = costs if isinstance(term.term, Cost) else constraints
+        own = target[start : start + term.count * term.size * width].reshape(term.count, term.size, width)
+        at = 0
+        for block in blocks:
+            own[:, :, at : at + block.shape[2]] = block
+            at += block.shape[2]
+
+    # ---------------------------------------------------------------- products backends need
+
+    def hessian_entries(self, lin: Linearization) -> Array:
+        """Gauss-Newton Hessian of the objective in the order of ``hessian``."""
+        return lin.hessian[self.objective_places]
+
+    def normal_entries(self, lin: Linearization, row_weights: Array) -> Array:
+        """Gauss-Newton Hessian plus A' diag(row_weights) A, in the order of ``normal``."""
+        entries = lin.hessian.copy()
+        evaluation.add_constraints(self.table.arrays, lin.constraint_jacobian, row_weights, entries)
+        return entries
+
+    def lagrangian_gradient(self, lin: Linearization, multipliers: Array) -> Array:
+        """Gradient of the objective plus A' multipliers, over the full tangent space."""
+        if not self.constraints.count:
+            return lin.gradient
+        return lin.gradient + self.constraints.transposed_times(lin.constraint_jacobian, multipliers)
+
+    def violation(self, constraints: Array) -> Array:
+        """(M,) signed distance outside the limits: positive above, negative below, zero inside."""
+        found = np.empty(len(constraints))
+        outside(constraints, self.lower, self.upper, found)
+        return found
+
+    def fixed_rows(self) -> IntArray:
+        """Constraint rows none of whose variables is unknown."""
+        return self.once(_fixed_rows)
+
+    def once(self, find: Callable[[CompiledProblem], T]) -> T:
+        """Result of a function of this program, found when first asked for and kept as long as the program."""
+        if find not in self._found:
+            self._found[find] = find(self)
+        return cast(T, self._found[find])
+
+    def __reduce__(self) -> tuple[Callable[[Model], CompiledProblem], tuple[Model]]:
+        """Pickle the graph: addresses of machine code mean nothing elsewhere, nor do views of arrays."""
+        return compile_graph, (self.graph,)
+
+    def row_name(self, row: int) -> tuple[str, int]:
+        """Term and factor of a constraint row."""
+        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
+            if rows.start <= row < rows.stop:
+                return term.name, (row - rows.start) // term.size
+        raise GraphError(f"row {row} belongs to no constraint", index=row)
+
+    def cost_rows(self, names: Sequence[str]) -> BoolArray:
+        """(C,) whether each cost row belongs to one of the named terms.
+
+        Raises:
+            GraphError: when no least-squares cost has such a name.
+        """
+        chosen = np.zeros(self.costs.count, dtype=bool)
+        slices = {term.name: rows for term, rows in zip(self.cost_terms, self._cost_slices, strict=True)}
+        for name in names:
+            if name not in slices:
+                raise GraphError(f"no cost is called '{name}' (there are: {', '.join(slices) or 'none'})", term=name)
+            chosen[slices[name]] = True
+        return chosen
+
+    def _require_touched(self) -> None:
+        """Raise unless every unknown is part of some term.
+
+        Raises:
+            GraphError: naming the first variable that is not.
+        """
+        touched = np.zeros(self.columns.width, dtype=bool)
+        for term in self.terms:
+            for part in term.columns:
+                touched[part] = True
+        idle = self.columns.free[~touched[self.columns.free]]
+        if len(idle):
+            family, index = self.columns.name(int(idle[0]))
+            raise GraphError(
+                f"{family}[{index}] is in no cost or constraint and is not fixed: {len(idle)} tangent coordinates "
+                "are free to be anything; add a term, fix it, or make the family shorter",
+                family=family,
+                index=index,
+            )
+
+    def _pattern(self, terms: Sequence[CompiledTerm], variable: IntArray, starts: IntArray) -> Symmetric:
+        """Every two variables of a factor share a block."""
+        first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
+        for term in terms:
+            members = [variable[columns[:, 0]] for columns in term.columns]
+            for k, a in enumerate(members):
+                for b in members[:k]:
+                    first.append(np.minimum(a, b))
+                    second.append(np.maximum(a, b))
+        return Symmetric.of_blocks(starts, np.concatenate(first), np.concatenate(second))
+
+    def _objective(self) -> tuple[Symmetric, IntArray]:
+        """Pattern of the objective's Hessian and where its entries stand in ``normal``."""
+        if self._hessian is None:
+            if not self.constraint_terms:
+                self._hessian = self.normal, np.arange(self.normal.nnz)
+            else:
+                variable, starts = self.columns.nodes()
+                pattern = self._pattern(self.cost_terms + self.scalar_terms, variable, starts)
+                columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+                self._hessian = pattern, self.normal.positions(pattern.indices, columns)
+        return self._hessian
+
+
+def _placed(program: CompiledProblem) -> dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]]:
+    """Positions of gradient and Hessian blocks of scalar costs."""
+    places = {}
+    for term in program.scalar_terms:
+        full = np.concatenate(term.columns, axis=1)
+        mapped = program.columns.unknown[full]
+        keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
+        factor, a, b = np.nonzero(keep)
+        places[term] = full, factor, a, b, program.normal.positions(mapped[factor, a], mapped[factor, b])
+    return places
+
+
+def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
+    """Rows of each term in the stack."""
+    ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
+    return [slice(start, end) for start, end in pairwise(ends)]
+
+
+def _linearize_at_once(shares: Shares, given: tuple[Any, ...], size: Array, gradient: Array, hessian: Array) -> float:
+    """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
+    counters = np.zeros(6, np.int64)
+    terms, *rest = given
+    into = shares.costs, shares.norms, gradient, hessian, shares.slopes, shares.contested, shares.scratch
+    share(_entrance(), (terms._replace(positions=shares.positions), *rest, *into, counters.ctypes.data))
+    size[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
+    return float(shares.costs.sum())
+
+
+@cache
+def _entrance() -> int:
+    """Of a linearisation that is shared."""
+    return entrance(evaluation.linearize_at_once)
+
+
+def _fixed_rows(program: CompiledProblem) -> IntArray:
+    touched = np.zeros(program.constraints.count, dtype=bool)
+    touched[program.constraints.free_rows] = True
+    return np.flatnonzero(~touched)
+
+
+def _stacked(parts: list[Array]) -> Array:
+    """One flat array, also of nothing."""
+    return np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
+
+
+def compile_graph(graph: Model) -> CompiledProblem:
+    """Offsets, ordering and sparsity; computed once and kept until the graph changes.
+
+    Raises:
+        GraphError: when the graph has no variable, or a variable no term touches.
+    """
+    if not isinstance(graph.compiled, CompiledProblem):
+        program = CompiledProblem(graph)
+        program.graph.compiled = graph.compiled = program
+        return program  # another thread may have compiled it, too
+    return graph.compiled
+
+
+def idle_problem(graph: Model) -> CompiledProblem:
+    """The same, or a program of its own where this thread is in the midst of a solve of it, as in a callback.
+
+    Raises:
+        GraphError: as :func:`compile_graph`.
+    """
+    program = compile_graph(graph)
+    return CompiledProblem(graph) if program.lock.mine else program

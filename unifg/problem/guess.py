@@ -1,0 +1,86 @@
+"""The values a solve starts from: a guess, checked, with fixed variables where they are fixed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.lie import LieGroup, Manifold
+from unifg.modeling.duplicates import doubles
+from unifg.modeling.model import Model
+from unifg.modeling.variables import Family
+from unifg.problem.columns import Columns, Values
+from unifg.problem.linearization import all_finite
+from unifg.problem.retraction import Retraction
+from unifg.typing import ArrayLike
+
+
+class GuessReader:
+    """Reads guesses for the families of a graph."""
+
+    def __init__(self, graph: Model, columns: Columns, retraction: Retraction) -> None:
+        """Find the parts of the families that need more of a look than whether they are finite."""
+        self._graph = graph
+        self._columns = columns
+        self._retraction = retraction
+        self._particular: list[tuple[Family, slice, Manifold]] = []
+        for family in columns.families:
+            for leaf, storage, _ in columns.leaves[family]:
+                if getattr(type(leaf), "is_valid", None) is not LieGroup.is_valid:
+                    self._particular.append((family, slice(storage, storage + leaf.storage), leaf))
+
+    def __call__(self, guess: Mapping[Family, ArrayLike]) -> Values:
+        """Copy and check a guess, and give fixed variables their values.
+
+        Raises:
+            GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
+        """
+        if isinstance(guess, Values) and guess.columns is self._columns and guess.intact:
+            values = Values(self._columns, guess.flat.copy())
+        else:
+            values = self._read(guess)
+        self._retraction.fix(values)
+        fine = all_finite(values.flat)
+        if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
+            self._name_invalid(values)
+        return values
+
+    def _read(self, guess: Mapping[Family, ArrayLike]) -> Values:
+        """A copy of values from anywhere."""
+        for family in guess:
+            if not isinstance(family, Family) or self._graph.families.get(family.name) is not family:
+                named = isinstance(family, str) and family in self._graph.families
+                hint = ": take the family itself, as graph.variables returned it, not its name" if named else ""
+                raise GraphError(f"the guess contains {family!r}, which is no family of this graph{hint}")
+        values = Values(self._columns, np.empty(self._columns.stored))
+        for family, own in values.items():
+            given = guess.get(family)
+            if given is None:
+                if not self._columns.all_fixed(family):
+                    raise GraphError(
+                        f"the guess has no values for family '{family.name}': give an array of shape {own.shape}",
+                        family=family.name,
+                    )
+                own[:] = family.manifold.identity()
+                continue
+            array = doubles(f"the guess for family '{family.name}'", given)
+            if array.shape != own.shape:
+                raise GraphError(
+                    f"the guess for family '{family.name}' has shape {array.shape}, expected {own.shape}",
+                    family=family.name,
+                )
+            own[:] = array
+        return values
+
+    def _name_invalid(self, values: Values) -> None:
+        for family, array in values.items():
+            valid = family.manifold.is_valid(array)
+            if not valid.all():
+                index = int(np.flatnonzero(~valid)[0])
+                raise GraphError(
+                    f"the guess for {family.name}[{index}] is not on {family.manifold.name}: {array[index]}",
+                    family=family.name,
+                    index=index,
+                )

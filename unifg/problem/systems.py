@@ -1,0 +1,243 @@
+"""The linear systems of a graph: each structure is found once, whoever asks; numbers belong to who asks.
+
+A solve needs the normal equations, or the KKT matrix [[H, A'], [A, 0]] with the multipliers of the rows that are held
+as nodes of their own. So do the covariances of its solution, the judge, ``graph.check`` and the picture of the
+elimination tree. Ordering and layout cost more than a factorisation, and are the same for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from threading import Lock
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+from unifg.codegen.jit import compiled
+from unifg.elimination.factorization import Factorization
+from unifg.elimination.plan import Plan
+from unifg.elimination.saddle import SaddlePoint
+from unifg.elimination.symmetric import Symmetric
+from unifg.problem.evaluation import transposed_times
+from unifg.problem.linearization import Rows
+from unifg.problem.table import TermArrays
+from unifg.typing import Array, BoolArray, IntArray
+
+T = TypeVar("T")
+KEPT = 8  # structures of KKT matrices; active rows may change from solve to solve
+
+
+class Systems:
+    """The linear systems of one program.
+
+    What it hands out shares the structure and nothing else, so that backends, solutions and threads never work in the
+    memory of another.
+    """
+
+    def __init__(self, normal: Symmetric, blocks: IntArray, constraints: Rows) -> None:
+        """Know the pattern of the normal equations, the variable of each unknown, and the rows that may be held."""
+        self._asked = normal, blocks, constraints
+        self._normal = Factorization(normal, blocks)
+        self._spare: list[Factorization] = []
+        self._held: dict[bytes, KktStructure] = {}
+        self._lock = Lock()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the structures are made from."""
+        return Systems, self._asked
+
+    def normal(self) -> Factorization:
+        """A factorisation for matrices in the pattern ``CompiledProblem.normal``, to keep."""
+        return self._normal.twin()
+
+    def borrowed(self) -> AbstractContextManager[Factorization]:
+        """The same for one question: its memory serves the next one too."""
+        return _borrowed(self._spare, self.normal)
+
+    def kkt(self, held: BoolArray) -> KktSystem:
+        """The KKT matrix with some rows of the constraints (M,) held as equalities, to keep."""
+        return KktSystem(self.structure(held))
+
+    def structure(self, held: BoolArray) -> KktStructure:
+        """Structure of all KKT matrices with these rows held."""
+        key = held.tobytes()
+        with self._lock:
+            structure = self._held.pop(key, None) or KktStructure.of(*self._asked, held)
+            self._held[key] = structure  # the one used last stands last
+            while len(self._held) > KEPT:
+                del self._held[next(iter(self._held))]
+        return structure
+
+
+@contextmanager
+def _borrowed(spare: list[T], make: Callable[[], T]) -> Iterator[T]:
+    """One that nobody uses now, or a new one; it is spare again afterwards."""
+    try:
+        found = spare.pop()
+    except IndexError:
+        found = make()
+    try:
+        yield found
+    finally:
+        spare.append(found)
+
+
+class KktArrays(NamedTuple):
+    """Arrays for compiled code.
+
+    Attributes:
+        plan: of the elimination.
+        size: unknowns and held rows.
+        rows: (E,) held rows among the constraints.
+        normal: where the entries of ``CompiledProblem.normal`` go.
+        normal_row: row of each of them.
+        normal_column: column of each of them.
+        entries: which entries of the constraint Jacobian belong to held rows and unknowns.
+        places: where they go.
+    """
+
+    plan: Plan
+    size: IntArray
+    rows: IntArray
+    normal: IntArray
+    normal_row: IntArray
+    normal_column: IntArray
+    entries: IntArray
+    places: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class KktStructure:
+    """Structure shared by KKT matrices with the same rows held.
+
+    Attributes:
+        held: (M,) which rows.
+        unknowns: number of them.
+        factorization: of the matrix, in which every pivot of a multiplier is expected to be negative; never used but
+            for its structure.
+        arrays: all of :class:`KktArrays` but the plan, in its order.
+        spare: systems that nobody uses now.
+    """
+
+    held: BoolArray
+    unknowns: int
+    factorization: Factorization
+    arrays: tuple[IntArray, ...]
+    spare: list[KktSystem] = field(default_factory=list)
+
+    def borrowed(self) -> AbstractContextManager[KktSystem]:
+        """A system for one question: its memory, and its factor if nobody has replaced it, serve the next one too."""
+        return _borrowed(self.spare, lambda: KktSystem(self))
+
+    @staticmethod
+    def of(normal: Symmetric, blocks: IntArray, constraints: Rows, held: BoolArray) -> KktStructure:
+        """Number the multipliers after the unknowns; the rows of one factor are one node."""
+        n, rows = normal.size, np.flatnonzero(held)
+        number = np.full(constraints.count, -1, dtype=np.int64)
+        number[rows] = n + np.arange(len(rows))
+        chosen = number[constraints.free_rows] >= 0
+        columns, multipliers = constraints.free_columns[chosen], number[constraints.free_rows[chosen]]
+        pattern = Symmetric(n + len(rows), [(normal.indices, normal.columns), (columns, multipliers)])
+        label = np.unique(constraints.factors[rows], return_inverse=True)[1].ravel()
+        last = int(blocks[-1]) + 1 if n else 0
+        return KktStructure(
+            held.copy(),
+            n,
+            Factorization(pattern, np.concatenate([blocks, last + label]), negative=np.arange(n + len(rows)) >= n),
+            (
+                np.array([n, len(rows)]),
+                rows,
+                pattern.positions(normal.indices, normal.columns).astype(np.int64),
+                normal.indices.astype(np.int64),
+                normal.columns.astype(np.int64),
+                constraints.free[chosen].astype(np.int64),
+                pattern.positions(columns, multipliers).astype(np.int64),
+            ),
+        )
+
+
+class KktSystem:
+    """A KKT matrix with numbers of its own.
+
+    Attributes:
+        held: (M,) which rows of the constraints are.
+        pattern: upper triangle of the matrix, unknowns first.
+        factorization: of the matrix, in which every pivot of a multiplier is expected to be negative.
+        saddle: the same, for solving without a shift.
+        loaded: entries that it was factorised with by :meth:`load`.
+    """
+
+    def __init__(self, structure: KktStructure) -> None:
+        """Take part in a structure."""
+        self._structure = structure
+        self.held = structure.held
+        self.factorization = structure.factorization.twin()
+        self.pattern = self.factorization.pattern
+        self.saddle = SaddlePoint(self.factorization, structure.unknowns)
+        self.loaded: Array | None = None
+
+    def load(self, data: Array) -> bool:
+        """Factorise ``data`` (nnz,), unless it was the last to be; False when an entry is not finite."""
+        if self.loaded is not data:
+            self.loaded = None
+            if not self.saddle.factor(data):
+                return False
+            self.loaded = data
+        return True
+
+    @cached_property
+    def arrays(self) -> KktArrays:
+        """For compiled code."""
+        return KktArrays(self.factorization.plan, *self._structure.arrays)
+
+
+def stacked(arrays: KktArrays) -> tuple[Plan, IntArray]:
+    """The plan for entries that come as those of ``normal``, then those of ``entries``, with no need to be filled in.
+
+    Returns:
+        The plan, and pairs (later, earlier) of stacked entries that mean the same entry of the matrix: only the last
+        of them counts, so the earlier ones must be added to it, pair after pair.
+    """
+    slots = arrays.plan.slots[np.concatenate([arrays.normal, arrays.places])]
+    _, inverse, counts = np.unique(slots, return_inverse=True, return_counts=True)
+    last: dict[int, int] = {}
+    pairs = []
+    for k in np.flatnonzero(counts[inverse] > 1).tolist():
+        if int(slots[k]) in last:
+            pairs.append((k, last[int(slots[k])]))
+        last[int(slots[k])] = k
+    return arrays.plan._replace(slots=slots), np.array(pairs, dtype=np.int64).ravel()
+
+
+@compiled
+def fill(kkt: KktArrays, hessian: Array, constraint_jacobian: Array, data: Array) -> None:
+    """Write the entries of the matrix."""
+    data[:] = 0.0
+    for k in range(len(kkt.normal)):
+        data[kkt.normal[k]] = hessian[k]
+    for k in range(len(kkt.entries)):
+        data[kkt.places[k]] += constraint_jacobian[kkt.entries[k]]
+
+
+@compiled
+def aim(
+    terms: TermArrays,
+    free: IntArray,
+    rows: IntArray,
+    gradient: Array,
+    constraints: Array,
+    constraint_jacobian: Array,
+    multipliers: Array,
+    bend: Array,
+    right: Array,
+) -> None:
+    """Write the right-hand side: what is left of stationarity, and of equalities moved by ``bend`` (M,)."""
+    full, n = np.zeros(len(gradient)), len(free)
+    transposed_times(terms, False, constraint_jacobian, multipliers, full)
+    for k in range(n):
+        right[k] = -(gradient[free[k]] + full[free[k]])
+    for k in range(len(rows)):
+        right[n + k] = terms.lower[rows[k]] - (constraints[rows[k]] + bend[rows[k]])

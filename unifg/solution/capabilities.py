@@ -1,0 +1,48 @@
+"""Requirements of backends: refusals by name, before the first iteration."""
+
+from __future__ import annotations
+
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from unifg.errors import BackendError
+from unifg.problem.compiled_problem import CompiledProblem
+
+Constraints: TypeAlias = Literal["none", "equalities", "all"]
+
+
+def require(program: CompiledProblem, solver: str, constraints: Constraints = "all", scalar_costs: bool = True) -> None:
+    """Raise unless a graph has no other constraints, switched on, and no other costs than these.
+
+    Args:
+        program: the compiled graph.
+        solver: to be named in the error.
+        constraints: which may be there.
+        scalar_costs: whether costs that are no squares may be there.
+
+    Raises:
+        BackendError: naming the first constraint or cost that may not.
+    """
+    if constraints == "none" and program.constraint_terms:
+        name = program.constraint_terms[0].name
+        raise BackendError(
+            f"{solver} cannot take the constraint '{name}': use InteriorPoint, AugmentedLagrangian or SQP, or "
+            "`fg.solve`, which picks; or state it as a cost"
+        )
+    if not scalar_costs and program.scalar_terms:
+        name = program.scalar_terms[0].name
+        raise BackendError(
+            f"{solver} cannot take the scalar cost '{name}': it is not a square; use InteriorPoint or SQP, or "
+            "state it as a residual"
+        )
+    if constraints != "equalities":
+        return
+    limited = np.isfinite(program.lower) | np.isfinite(program.upper)
+    rows = np.flatnonzero(limited & ~program.equality)
+    if len(rows):
+        name, index = program.row_name(int(rows[0]))
+        raise BackendError(
+            f"{solver} cannot take the inequality '{name}' (factor {index}): it knows equalities only; use "
+            "InteriorPoint, AugmentedLagrangian or SQP"
+        )

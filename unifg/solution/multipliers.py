@@ -1,0 +1,118 @@
+"""The size of multipliers in units of the problem's own: what tells that constraints have lost their slope.
+
+Where the gradients of active constraints vanish or become dependent, as of exp(x) = 0 or x^3 = 0, no multipliers
+balance the cost, and a solve ends where large ones seem to: the KKT numbers hold, divided by the mean multiplier, at a
+point that need not be an optimum. How large is a question of units. With the largest gradients of all rows and of the
+cost that were seen on the way, unknowns, rows and cost are brought to one scale by taking square roots of the largest
+entries out of both, again and again (Ruiz, RAL-TR-2001-034). The sum of the multipliers of that problem is the same for
+any units, of the order of the number of active rows where all is well, and beyond `LARGEST` what no chain of rows
+explains.
+
+A solve that stalls may do so at an optimum, with multipliers that its last linear system made of nothing. There they
+are estimated again, from the gradients alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.codegen.jit import compiled
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.typing import Array, IntArray
+
+LARGEST = 1e6
+SUSPICIOUS = 1e3  # in the graph's own units; below it nobody looks
+PASSES = 12
+DENSE = 1_000_000  # entries of A up to which multipliers are estimated, by dense algebra
+
+
+class Slopes:
+    """Largest slopes of constraints and cost along a solve.
+
+    Attributes:
+        jacobian: magnitudes of the entries of A.
+        gradient: magnitudes over the full tangent space.
+    """
+
+    def __init__(self, program: CompiledProblem, jacobian: Array, gradient: Array) -> None:
+        """Begin with those at the start, which are copied."""
+        self._program = program
+        self.jacobian, self.gradient = jacobian.copy(), gradient.copy()
+
+    def see(self, jacobian: Array, gradient: Array) -> None:
+        """Take note of another point."""
+        _raise(jacobian, gradient, self.jacobian, self.gradient)
+
+    def degenerate(self, multipliers: Array, tolerance: float) -> bool:
+        """Test whether multipliers are larger than constraints with a slope ever need.
+
+        Args:
+            multipliers: (M,).
+            tolerance: of the KKT test; a cost whose gradient never exceeded it has no scale.
+        """
+        program = self._program
+        if not _size(multipliers, self.jacobian, self.gradient, program.columns.free, tolerance) > SUSPICIOUS:
+            return False
+        gradient = np.abs(self.gradient[program.columns.free])
+        rows, columns = program.constraints.free_rows, program.constraints.free_columns
+        entries = np.abs(self.jacobian[program.constraints.free])
+        unknowns, scale, cost = np.ones(program.size), np.ones(len(multipliers)), 1.0
+        for _ in range(PASSES):
+            scaled = entries * scale[rows] * unknowns[columns]
+            sloped = cost * gradient * unknowns
+            of_rows, of_unknowns, of_cost = np.zeros(len(scale)), sloped.copy(), float(sloped.max(initial=0.0))
+            np.maximum.at(of_rows, rows, scaled)
+            np.maximum.at(of_unknowns, columns, scaled)
+            scale /= np.sqrt(np.where(of_rows > 0.0, of_rows, 1.0))
+            unknowns /= np.sqrt(np.where(of_unknowns > 0.0, of_unknowns, 1.0))
+            cost /= np.sqrt(of_cost or 1.0)
+        return bool(cost * float((np.abs(multipliers) / scale).sum()) > LARGEST)
+
+
+def estimated(program: CompiledProblem, lin: Linearization, tolerance: float) -> Array | None:
+    """(M,) multipliers of active rows that balance the gradient best, with their signs; None for a large graph.
+
+    The least squares problem min |grad f + A' lambda| with bounds (Stark and Parker, Comput. Stat. 10, 1995).
+
+    Args:
+        program: the compiled graph.
+        lin: where.
+        tolerance: distance from its limit at which an inequality is active.
+    """
+    from scipy.optimize import lsq_linear  # slow to load
+
+    at_lower, at_upper = (np.abs(lin.constraints - limit) <= tolerance for limit in (program.lower, program.upper))
+    active = np.flatnonzero(program.equality | at_lower | at_upper)
+    if not len(active) or len(active) * program.size > DENSE:
+        return None
+    slopes = program.constraints.matrix(lin.constraint_jacobian)[active].toarray()
+    free, either = lin.gradient[program.columns.free], program.equality | (at_lower & at_upper)
+    least, most = np.where(either | at_lower, -np.inf, 0.0)[active], np.where(either | at_upper, np.inf, 0.0)[active]
+    multipliers = np.zeros(program.constraints.count)
+    multipliers[active] = lsq_linear(slopes.T, -free, (least, most), method="bvls").x
+    return multipliers
+
+
+@compiled
+def _raise(jacobian: Array, gradient: Array, largest: Array, steepest: Array) -> None:
+    """Keep the numbers of larger magnitude; what is not finite does not count."""
+    for k in range(len(jacobian)):
+        if abs(largest[k]) < abs(jacobian[k]) < np.inf:
+            largest[k] = jacobian[k]
+    for k in range(len(gradient)):
+        if abs(steepest[k]) < abs(gradient[k]) < np.inf:
+            steepest[k] = gradient[k]
+
+
+@compiled
+def _size(multipliers: Array, jacobian: Array, gradient: Array, free: IntArray, tolerance: float) -> float:
+    """Sum of the multipliers times the largest slope of a row, over that of the cost."""
+    total, largest, steepest = 0.0, 0.0, tolerance
+    for multiplier in multipliers:
+        total += abs(multiplier)
+    for slope in jacobian:
+        largest = max(largest, abs(slope))
+    for k in free:
+        steepest = max(steepest, abs(gradient[k]))
+    return total * largest / steepest

@@ -1,0 +1,452 @@
+"""Solution of a backend, and guesses made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+
+from unifg.errors import GraphError, UnifgError
+from unifg.modeling.variables import Family, Selection, Variable, as_selection
+from unifg.plots.shown import Shown, apart, draw_shown
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.solution.conditioning import Conditioning, cheap, conditioning
+from unifg.solution.covariance import Covariances
+from unifg.solution.fit import Fit, fit_of
+from unifg.solution.history import HEADER, FactorNorms, History, Iteration, factor_norms, line
+from unifg.solution.marginal import Variables, information, marginal_prior
+from unifg.solution.optimality import Optimality
+from unifg.solution.outlier_report import OutlierReport
+from unifg.solution.status import Status
+from unifg.solution.warm_start import Shifts
+from unifg.typing import Array, BoolArray, Numbers
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Values of the families, multipliers and penalties of the constraints by term name.
+
+    Attributes:
+        values: (count, storage) per family.
+        multipliers: (n, m) per constraint term; absent terms start at zero.
+        penalties: (n, m) per constraint term, of backends that have them; absent terms leave them to the backend.
+    """
+
+    values: Mapping[Family, Array]
+    multipliers: Mapping[str, Array] = field(default_factory=dict)
+    penalties: Mapping[str, Array] = field(default_factory=dict)
+
+
+class Solution:
+    """The final iterate with its KKT numbers.
+
+    Attributes:
+        status: why the solve ended.
+        cost: objective, with its 1/2.
+        stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.solution.optimality`. The stationarity of
+            pure least squares is its relative offset, free of the unit of cost; above the tolerance, at least this.
+        rounding: by how much numerical differentiation may be wrong about the stationarity.
+        finite: whether everything could be evaluated there.
+        iterations: number of iterations taken.
+        seconds: wall-clock time of the solve.
+        solver: name of the backend.
+        returned: number of the iteration that is returned; 0 for the guess. Not the last one where a limit, a stall or
+            an interruption ended the solve and an earlier iterate has less cost plus price times violation.
+        in_python: seconds of them spent in residuals that Python evaluates, see ``graph.check``.
+        verdict: which measurements it believes, from solves that decide that.
+        picked: for what the backend was picked, where the caller named none.
+        checked: whether traced functions were evaluated as they were written at this answer, and agreed.
+        mistraced: terms left to Python by that check, and the reasons; the solve was repeated without their traces.
+    """
+
+    in_python = 0.0
+    checked = False
+    mistraced: Mapping[str, str] = MappingProxyType({})
+    picked = ""
+    verdict: OutlierReport[Solution] | None = None
+
+    def __init__(
+        self,
+        program: CompiledProblem,
+        linearization: Linearization,
+        multipliers: Array,
+        penalties: Array,
+        status: Status,
+        measured: Optimality,
+        history: list[Iteration] | Callable[[], list[Iteration]],
+        iterations: int,
+        seconds: float,
+        solver: str,
+        returned: int,
+    ) -> None:
+        """Assembled by :class:`unifg.Solver`."""
+        self._program = program
+        self._lin = linearization
+        self._multipliers, self._penalties = multipliers, penalties
+        self._equality = program.equality
+        self._lower, self._upper = program.lower, program.upper
+        self.status = status
+        self.cost = linearization.cost
+        self.stationarity = measured.stationarity
+        self.rounding = measured.rounding
+        self.finite = measured.finite
+        self.violation = measured.violation
+        self.complementarity = measured.complementarity
+        self._worst_row = measured.worst_row
+        self._history = history
+        self.iterations = iterations
+        self.seconds = seconds
+        self.solver = solver
+        self.returned = returned
+
+    @property
+    def history(self) -> History:
+        """One row per iteration, row 0 being the start; ``history.plot()`` draws them.
+
+        The row that is returned is marked in its details, where it is not the last.
+        """
+        if not isinstance(self._history, History):
+            self._history = History(self._history() if callable(self._history) else self._history)
+            if self.returned < len(self._history) - 1:
+                self._history[self.returned].details["returned"] = 1
+        return self._history
+
+    @history.setter
+    def history(self, rows: list[Iteration]) -> None:
+        self._history = rows
+
+    @property
+    def converged(self) -> bool:
+        """True if the KKT conditions hold to the tolerance."""
+        return self.status.converged
+
+    @property
+    def values(self) -> dict[Family, Array]:
+        """Copies of the values of every family."""
+        return self._program.columns.view(self._lin.values.flat.copy())
+
+    @property
+    def multipliers(self) -> dict[str, Array]:
+        """Multipliers of every constraint term, (n, m) each."""
+        return self._program.by_term(self._multipliers.copy())
+
+    @property
+    def penalties(self) -> dict[str, Array]:
+        """Penalties the solve ended with, (n, m) for every constraint term; empty when the backend has none."""
+        return self._program.by_term(self._penalties.copy()) if self._penalties.any() else {}
+
+    @property
+    def residuals(self) -> FactorNorms:
+        """(n,) residual norms of the factors of every term at the solution; see :mod:`unifg.solution.history`."""
+        g = self._lin.constraints
+        outside = np.maximum(g - self._upper, 0.0) - np.maximum(self._lower - g, 0.0)
+        return factor_norms(self._program, self._lin, outside)
+
+    @property
+    def fit(self) -> Fit | None:
+        """Residuals against their weights, of unconstrained least squares with more rows than unknowns; else None."""
+        return fit_of(self._program, self._lin, self.residuals) if self._program.least_squares else None
+
+    @property
+    def worst(self) -> tuple[str, int] | None:
+        """Term and factor with the largest violation, None without constraints."""
+        return None if self._worst_row < 0 else self._program.row_name(self._worst_row)
+
+    @property
+    def families(self) -> dict[str, Family]:
+        """The families of variables by their names: of a solution that another process has sent, its own."""
+        return {family.name: family for family in self._program.families}
+
+    def __getitem__(self, variable: Variable | str) -> Array:
+        """(n, storage) values of a family, by itself or by its name, or of a selection."""
+        selection = self._selection(variable)
+        return self._lin.values[selection.family][selection.indices][:, selection.storage].copy()
+
+    def selections(self, term: str) -> list[Selection]:
+        """Variable arguments of a term, in order; one of length 1 is shared by all factors.
+
+        Raises:
+            GraphError: when no term has that name.
+        """
+        for compiled in self._program.terms:
+            if compiled.name == term:
+                return compiled.term.selections
+        known = ", ".join(compiled.name for compiled in self._program.terms) or "none"
+        raise GraphError(f"no term is called '{term}' (there are: {known})", term=term)
+
+    def dual(self, name: str) -> Array:
+        """Multipliers of a constraint or bound (n, m), or reaction of fixed variables (n, d).
+
+        Positive at an active upper limit, negative at an active lower one. A reaction nu makes
+        grad f + A' lambda + nu vanish on the fixed coordinates.
+
+        Raises:
+            GraphError: when no constraint, bound or fix has that name.
+        """
+        multipliers = self.multipliers
+        if name in multipliers:
+            return multipliers[name]
+        if name in self._program.columns.fixed:
+            reaction = -self._program.lagrangian_gradient(self._lin, self._multipliers)
+            return reaction[self._program.columns.fixed[name]]
+        known = ", ".join([*multipliers, *self._program.columns.fixed]) or "none"
+        raise GraphError(f"no constraint, bound or fix is called '{name}' (there are: {known})", term=name)
+
+    def shifted(self, *families: Family, by: int = 1) -> Guess:
+        """A guess moved ``by`` stages towards the end of the horizon, for the next control tick.
+
+        Member k of each family takes the value of member k + by, the last ones repeat the end. The
+        multipliers and penalties of a factor move with the stage of its first variable.
+
+        Args:
+            *families: the families that run along the horizon.
+            by: number of stages, non-negative.
+        """
+        program = self._program
+        stored, rows = program.once(Shifts)(families, by)
+        return Guess(
+            program.columns.view(self._lin.values.flat[stored]),
+            program.by_term(self._multipliers[rows]),
+            program.by_term(self._penalties[rows]) if self._penalties.any() else {},
+        )
+
+    def covariance(self, *variables: Variable | str) -> Array:
+        """(k, k) joint covariance of the selected variables, in their tangent spaces, in the order given.
+
+        What is fixed is known: its rows and columns are zero, as are directions that an active constraint forbids.
+
+        Raises:
+            GraphError: when the system is singular, or nothing is selected.
+        """
+        if not variables:
+            raise GraphError("covariance() of what? Name families or members, as covariance(x[-1])")
+        columns = [self._program.columns.of(self._selection(variable)).ravel() for variable in variables]
+        return self._covariances.joint(np.concatenate(columns))
+
+    def marginals(self, variable: Variable | str) -> Array:
+        """(n, d, d) covariance of each selected variable by itself.
+
+        Without active constraints all of them take about as long as one solve, by the selected inverse; with some there
+        is one refined solve for each column.
+
+        Members that are fixed are known: their blocks are zero.
+
+        Raises:
+            GraphError: when the system is singular.
+        """
+        return self._covariances.blocks(self._program.columns.of(self._selection(variable)))
+
+    def pair_covariances(self, first: Variable | str, second: Variable | str) -> Array:
+        """(n, k + m, k + m) joint covariances of pairs, as of the present pose and each candidate for a loop.
+
+        Args:
+            first: one member, which is paired with all of the second, or as many as there.
+            second: (n) members.
+
+        Raises:
+            GraphError: when the system is singular, or the selections differ in length.
+        """
+        ends = [self._selection(variable) for variable in (first, second)]
+        count = max(len(end) for end in ends)
+        if any(len(end) not in (1, count) for end in ends):
+            raise GraphError(f"pairs of {len(ends[0])} and {len(ends[1])} members: give as many of both, or one")
+        columns = [self._program.columns.of(end) for end in ends]
+        return self._covariances.pairs(*[np.broadcast_to(rows, (count, rows.shape[1])) for rows in columns])
+
+    @cached_property
+    def _covariances(self) -> Covariances:
+        return Covariances(self._program, self._lin, self._equality | self._held())
+
+    def information(self, terms: Sequence[str], *variables: Variable) -> Array:
+        """(d, d) information of the named costs over the selected variables; see :mod:`unifg.solution.marginal`."""
+        columns = np.concatenate([self._program.columns.of(as_selection(v)).ravel() for v in variables])
+        return information(self._program, self._lin, terms, columns)[0]
+
+    def marginal_prior(
+        self, terms: Sequence[str], remove: Variables, keep: Variables, *, offset: bool = False
+    ) -> tuple[Array, Array]:
+        """Reference (1, S) and information (D, D) of a prior that replaces variables leaving a window.
+
+        Only the named costs and equality constraints that touch ``remove`` are marginalised, at this solution's
+        linearisation point. ``keep`` is one selection, for ``fg.prior``, or several, for ``fg.joint_prior``. With
+        ``offset`` the reference (1, S + D) is for ``fg.joint_prior(..., offset=True)``; details and errors in
+        :func:`unifg.solution.marginal.marginal_prior`.
+        """
+        return marginal_prior(self._program, self._lin, terms, remove, keep, self._equality, offset)
+
+    def plot(self, *variables: Variable | str, marginals: bool = False) -> Figure:
+        """Draw families, selections or components; all families where none is named.
+
+        Poses are drawn as paths with headings, rotations as angles, vectors over the index of the member, with the
+        limits of bounds shaded; see :mod:`unifg.plots.shown`. The figure is a matplotlib ``Figure`` that belongs to
+        nobody else.
+
+        Args:
+            *variables: what to draw.
+            marginals: whether to show two standard deviations of each member, as :meth:`marginals` has them.
+
+        Raises:
+            GraphError: for variables of another graph, or when there are no covariances.
+            ViewError: when there is more than fits into one figure.
+        """
+        selections = [self._selection(variable) for variable in variables or self._program.families]
+        parts = [self._shown(selection, marginals) for selection in selections]
+        return draw_shown(parts, f"{self.solver}: {self.status.name.lower().replace('_', ' ')}, cost {self.cost:.6g}")
+
+    def _shown(self, selection: Selection, marginals: bool) -> Shown:
+        program, family = self._program, selection.family
+        everywhere = family.count, family.manifold.storage
+        lower, upper = np.full(everywhere, -np.inf), np.full(everywhere, np.inf)
+        pairs = [np.empty((0, 2), dtype=np.intp)]
+        for term, rows in zip(program.constraint_terms, program.slices, strict=True):
+            own = term.gathers[0].selection
+            if term.is_bound and own.family is family:
+                shape, place = (
+                    (term.count, term.size),
+                    np.ix_(own.indices, np.arange(family.manifold.storage)[own.storage]),
+                )
+                lower[place] = np.maximum(lower[place], self._lower[rows].reshape(shape))
+                upper[place] = np.minimum(upper[place], self._upper[rows].reshape(shape))
+        for term in program.terms:
+            ends = [s for s in term.term.selections if s.family is family]
+            if len(ends) == 2:
+                pairs.append(np.stack([np.broadcast_to(s.indices, term.count) for s in ends], axis=1))
+        return Shown(
+            f"{family.name}.{selection.component}" if selection.component else family.name,
+            selection.manifold,
+            selection.indices,
+            self[selection],
+            lower[selection.indices, selection.storage],
+            upper[selection.indices, selection.storage],
+            apart(np.concatenate(pairs), selection.indices),
+            self.marginals(selection) if marginals else None,
+        )
+
+    @cached_property
+    def conditioning(self) -> Conditioning | None:
+        """Conditioning of the normal equations here, and accuracy of their solution; None but for pure least squares.
+
+        One factorisation and a few solves, when first asked for.
+        """
+        return conditioning(self._program, self._lin) if self._program.least_squares else None
+
+    def report(self) -> str:
+        """The status sentence with the numbers behind it."""
+        text = self._told()
+        if self.finite and self._program.least_squares and cheap(self._program) and self.conditioning is not None:
+            text += f" {self.conditioning.sentence()}"
+        return text
+
+    def _told(self) -> str:
+        """All of a report that costs nothing."""
+        kkt = (
+            f"relative offset {self.stationarity:.1e}"
+            if self._program.least_squares
+            else f"stationarity {self.stationarity:.1e}, violation {self.violation:.1e}, "
+            f"complementarity {self.complementarity:.1e}"
+        )
+        who = f"{self.solver} ({self.picked})" if self.picked else self.solver
+        text = (
+            f"{who}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations in "
+            f"{1e3 * self.seconds:.1f} ms; {kkt}."
+        )
+        if (fit := self.fit) is not None:
+            text += f" {fit.sentence()}."
+        if self.worst is not None and self.violation > 0.0 and not self.converged:
+            name, index = self.worst
+            text += f" Largest violation: '{name}', factor {index}."
+        if self.in_python > 0.01 * self.seconds:
+            names = ", ".join(f"'{name}'" for name in self._program.left_to_python)
+            share = 100.0 * self.in_python / self.seconds
+            text += f" {share:.0f} % of the time went into functions in Python: {names}."
+        for name, why in self.mistraced.items():
+            text += f" Term '{name}' was left to Python and the solve repeated: {why}."
+        if self.verdict is not None:
+            text += f" {self.verdict.sentence(self.cost)}"
+        return text
+
+    def table(self) -> str:
+        """The history as a table."""
+        return "\n".join([HEADER, *map(line, self.history)])
+
+    def __repr__(self) -> str:
+        """The report, of what costs nothing."""
+        return f"<Solution {self._told()}>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle with the history, and without factorisations, which are found again where somebody asks."""
+        kept = {name: value for name, value in self.__dict__.items() if name != "_covariances"}
+        return {**kept, "_history": self.history}
+
+    def _held(self) -> BoolArray:
+        """Inequalities that are active: the multiplier outweighs the distance to its limit."""
+        limit = np.where(self._multipliers > 0.0, self._upper, self._lower)
+        distance = np.where(np.isfinite(limit), np.abs(self._lin.constraints - limit), np.inf)
+        held: BoolArray = np.abs(self._multipliers) > distance
+        return held
+
+    def _selection(self, variable: Variable | str) -> Selection:
+        """The selection named, if it is part of this solution."""
+        if isinstance(variable, str):
+            if variable not in self.families:
+                raise GraphError(
+                    f"no family is called '{variable}' (there are: {', '.join(self.families)})", family=variable
+                )
+            variable = self.families[variable]
+        selection = as_selection(variable)
+        if selection.family not in self._lin.values:
+            name = selection.family.name
+            hint = ": that of another process has families of its own, by name in solution.families"
+            raise GraphError(
+                f"family '{name}' is not part of this solution{hint if name in self.families else ''}", family=name
+            )
+        return selection
+
+
+class NotConverged(UnifgError, RuntimeError):
+    """Raised by ``solve(..., check=True)``; carries the solution that fell short.
+
+    Also a ``RuntimeError``: the input was sound, the solve was not.
+
+    Attributes:
+        solution: the iterate the solve ended with, with its status and KKT numbers.
+        term: of the constraint violated most, None where none is.
+        index: its factor.
+    """
+
+    def __init__(self, solution: Solution) -> None:
+        """Keep the solution and repeat its report as the message."""
+        worst = solution.worst if solution.violation > 0.0 else None
+        term, index = worst or (None, None)
+        super().__init__(solution.report(), term=term, index=index)
+        self.solution = solution
+
+    def __reduce__(self) -> tuple[type[NotConverged], tuple[Solution]]:
+        """Made from the solution, not from its report."""
+        return type(self), (self.solution,)
+
+
+AnyGuess: TypeAlias = Mapping[Family, Numbers] | Guess | Solution
+
+
+def values_of(guess: AnyGuess) -> Mapping[Family, Numbers]:
+    """The values of a guess, of whatever form.
+
+    Raises:
+        GraphError: when it is none.
+    """
+    if isinstance(guess, Mapping):
+        return guess
+    if isinstance(guess, Guess | Solution):
+        return guess.values
+    raise GraphError(
+        f"a guess is {{family: array, ...}}, a Guess or a Solution, found {type(guess).__name__}: {guess!r}"[:200]
+    )

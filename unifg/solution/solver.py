@@ -1,0 +1,718 @@
+"""The frame every backend runs in: checks before, one loop state during, one judge after."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeAlias
+from weakref import ReferenceType, ref
+
+import numpy as np
+
+from unifg.codegen.inner import inner
+from unifg.errors import BackendError, GraphError
+from unifg.locks import ReentrantLock
+from unifg.modeling.model import Model
+from unifg.modeling.variables import Data
+from unifg.problem.by_term import ByTerm
+from unifg.problem.columns import Values
+from unifg.problem.compiled_problem import CompiledProblem, idle_problem
+from unifg.problem.linearization import Linearization, all_finite
+from unifg.solution.capabilities import Constraints, require
+from unifg.solution.conditioning import HARDLY
+from unifg.solution.history import HEADER, Deferred, Iteration, factor_norms, line, show
+from unifg.solution.incumbent import Incumbent, Incumbents
+from unifg.solution.multipliers import Slopes, estimated
+from unifg.solution.optimality import infeasible_stationary, optimality, within_bounds
+from unifg.solution.relative_offset import Factored
+from unifg.solution.solution import AnyGuess, NotConverged, Solution, values_of
+from unifg.solution.status import Status
+from unifg.solution.warmup_run import rehearse
+from unifg.typing import Array, Numbers
+
+logger = logging.getLogger("unifg")
+
+Callback: TypeAlias = Callable[[Iteration], bool | None]
+
+UNBOUNDED_COST = -1e20
+EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new comparisons
+FEW = 3  # iterations that are asked for as such, one after the other in a control loop
+WITHOUT_SUCCESS = (
+    Status.ITERATION_LIMIT,
+    Status.TIME_LIMIT,
+    Status.STALLED,
+    Status.SINGULAR,
+    Status.NOT_FINITE,
+    Status.INTERRUPTED,
+)
+"""Endings that return the best iterate."""
+
+
+class Backend(ABC):
+    """Solver of a graph.
+
+    Attributes:
+        constraints: which it takes.
+        scalar_costs: whether it takes costs that are no squares.
+        rehearses: whether :meth:`Solver.prepare` may take it through small problems of its own
+            (:mod:`unifg.solution.warmup_run`).
+    """
+
+    constraints: ClassVar[Constraints] = "all"
+    scalar_costs: ClassVar[bool] = True
+    rehearses: ClassVar[bool] = False
+
+    @property
+    def name(self) -> str:
+        """The backend's class name."""
+        return type(self).__name__
+
+    @abstractmethod
+    def solve(
+        self,
+        graph: Model,
+        guess: AnyGuess,
+        *,
+        data: Mapping[Data, Numbers] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve once.
+
+        Args:
+            graph: the problem.
+            guess: values per family, or a guess or solution that carries multipliers too.
+            data: values of data for this solve; others keep their defaults.
+            check: raise instead of returning a solution that did not converge.
+            callback: called with every row of the history; returning True ends the solve.
+
+        Raises:
+            GraphError: when the graph, guess or data is malformed.
+            BackendError: when this backend cannot take this class of problem.
+            NotConverged: with ``check=True``.
+        """
+
+
+@dataclass(kw_only=True)
+class Solver(Backend):
+    """Options common to all backends.
+
+    Attributes:
+        tolerance: for the KKT test of :mod:`unifg.solution.optimality`.
+        max_iterations: iterations (linear systems or subproblems solved) before giving up.
+        time_limit: seconds before giving up, checked once an iteration.
+        verbose: log one line per iteration at level INFO to the logger ``unifg``; where logging is not configured for
+            it, the lines go to standard error.
+        keep_values: keep the values of every iterate in the history, for pictures of a solve.
+        keep_residuals: keep the residual norm of every factor in the history, one number per factor and row.
+        search_iterations: the first so many steps use the search Jacobians of residuals that have one, and are taken
+            in full without a merit test. Costs and KKT numbers are the true ones throughout.
+    """
+
+    tolerance: float = 1e-6
+    max_iterations: int = 100
+    time_limit: float = np.inf
+    verbose: bool = False
+    keep_values: bool = False
+    keep_residuals: bool = False
+    search_iterations: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse options no solve could honour."""
+        if not self.tolerance > 0.0:
+            raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
+        if np.isnan(self.time_limit):
+            raise BackendError(f"{self.name}: time_limit must be a number of seconds, found {self.time_limit}")
+        if self.max_iterations < 0:
+            raise BackendError(f"{self.name}: max_iterations must not be negative, found {self.max_iterations}")
+        if self.search_iterations < 0:
+            raise BackendError(f"{self.name}: search_iterations must not be negative, found {self.search_iterations}")
+
+    def solve(
+        self,
+        graph: Model,
+        guess: AnyGuess,
+        *,
+        data: Mapping[Data, Numbers] | None = None,
+        duals: Mapping[str, Numbers] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve as :class:`Backend`; a control loop uses :meth:`prepare` and keeps structure and workspaces.
+
+        ``duals`` are multipliers by term name, overriding those of the guess.
+        """
+        return self.bound(graph).solve(guess, data=data, duals=duals, check=check, callback=callback)
+
+    def prepare(self, graph: Model) -> Prepared:
+        """Compile the graph, and everything that its solves can reach, for repeated solves.
+
+        Solves in a loop then neither compile anything nor read compiled functions from the disk, however they end.
+        """
+        prepared = self.bound(graph)
+        prepared.allocate()
+        prepared.program.watch_conditions()
+        if self.rehearses:
+            rehearse(self)
+        return prepared
+
+    def bound(self, graph: Model) -> Prepared:
+        """Compile the graph alone: a single solve compiles what it comes to need."""
+        program = idle_problem(graph)
+        self.require(program)
+        if not program.least_squares:  # there, curvature is asked for in rare cases only
+            program.table.require_second()
+        return Prepared(self, program, graph)
+
+    def require(self, program: CompiledProblem) -> None:
+        """Raise BackendError when the backend cannot take this class of problem."""
+        require(program, self.name, self.constraints, self.scalar_costs)
+
+    def runs_alone(self, program: CompiledProblem) -> bool:
+        """Test whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` if unwatched.
+
+        Such a backend minds the time limit itself.
+        """
+        return False
+
+    @abstractmethod
+    def workspace(self, program: CompiledProblem) -> Any:
+        """Memory that the backend keeps between solves of one structure."""
+
+    @abstractmethod
+    def iterate(self, run: SolveState, workspace: Any) -> Status | None:
+        """Improve ``run`` until it has a status, or return the reason to stop."""
+
+    def search_step(self, run: SolveState, workspace: Any, lin: Linearization) -> Array | None:
+        """The backend's own tangent step for the model ``lin``, which is made of search Jacobians; None for no step."""
+        raise BackendError(f"{self.name} has no search_step: set search_iterations=0")
+
+
+class SolveState:
+    """State of one solve: the present iterate, its KKT numbers, and what has been recorded.
+
+    A backend moves with :meth:`accept`; the solve is over when ``status`` is set.
+
+    Attributes:
+        program: the compiled graph with its data bound.
+        values: at the present iterate.
+        lin: linearisation there.
+        multipliers: (M,) present multipliers.
+        penalties: (M,) those of the guess, for backends that have any, who leave their last ones here; zero for none.
+        optimality: KKT numbers of both.
+        status: None while the solve goes on.
+        history: rows so far.
+        iterations: so far.
+        alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
+        tolerance: of the KKT test.
+        lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
+            squares may use and overwrite; None where the backend has no such thing.
+        slopes: the largest so far, where there are constraints.
+        incumbents: iterates one of which is returned without success.
+    """
+
+    def __init__(
+        self, solver: Solver, program: CompiledProblem, values: Values, multipliers: Array, callback: Callback | None
+    ):
+        """Linearise at the start and test it, unless the backend does."""
+        self._solver = solver
+        self._callback = callback
+        self._started = time.perf_counter()
+        self._in_python = program.python_seconds
+        self.program = program
+        self.tolerance = solver.tolerance
+        self.history: list[Iteration] = []
+        self.status: Status | None = None
+        self.incumbents = Incumbents(program)
+        self._recall: Callable[[], list[Iteration]] | None = None
+        self._least, self._least_values, self._start = np.inf, values, values
+        self.lent: Factored | None = None
+        self.slopes: Slopes | None = None
+        self.iterations = 0
+        if solver.verbose:
+            show(HEADER)
+        self.values, self.multipliers, self.penalties = values, multipliers, np.zeros(len(multipliers))
+        self.alone = not (self.watched or solver.search_iterations) and solver.runs_alone(program)
+        if not self.alone:
+            self.accept(program.linearize(values), multipliers, 0.0, 0.0)
+
+    @property
+    def seconds(self) -> float:
+        """Time since the solve began."""
+        return time.perf_counter() - self._started
+
+    @property
+    def out_of_time(self) -> bool:
+        """True if the time limit has passed."""
+        return self.seconds > self._solver.time_limit
+
+    def accept(
+        self,
+        lin: Linearization,
+        multipliers: Array,
+        step_norm: float,
+        step_length: float,
+        **details: float | int | str,
+    ) -> None:
+        """Make ``lin`` the present iterate: measure it, record a row, decide whether to go on."""
+        self.iterations = len(self.history)
+        self._move(lin, multipliers)
+        deferred = Deferred(lambda: factor_norms(self.program, lin, self.program.violation(lin.constraints)))
+        row = Iteration(
+            self.iterations,
+            lin.cost,
+            self.optimality.stationarity,
+            self.optimality.violation,
+            self.optimality.complementarity,
+            step_norm,
+            step_length,
+            self.seconds,
+            lin.norms,
+            dict(details),
+            {family: array.copy() for family, array in lin.values.items()} if self._solver.keep_values else None,
+            deferred,
+        )
+        if self._solver.keep_residuals:
+            deferred()
+        self.history.append(row)
+        if self._solver.verbose:
+            show(line(row))
+        self.status = self._decide_in_time()
+        if self._callback is not None and self._callback(row) and self.status is None:
+            self.status = Status.INTERRUPTED
+        deferred.close()
+
+    @property
+    def watched(self) -> bool:
+        """True if somebody looks at every iteration: a callback, a log, kept values or residuals."""
+        solver = self._solver
+        return bool(self._callback or solver.verbose or solver.keep_values or solver.keep_residuals)
+
+    def conclude(
+        self, lin: Linearization, multipliers: Array, iterations: int, history: Callable[[], list[Iteration]]
+    ) -> None:
+        """Make ``lin`` the last iterate of a solve that ran alone.
+
+        Args:
+            lin: linearisation at the last iterate.
+            multipliers: (M,) there.
+            iterations: how many there were.
+            history: makes their rows when somebody asks for them.
+        """
+        self.iterations, self._recall = iterations, history
+        self._move(lin, multipliers)
+        self.status = self._decide()
+
+    def _move(self, lin: Linearization, multipliers: Array) -> None:
+        self.lin, self.values, self.multipliers = lin, lin.values, multipliers
+        self.see(lin.constraint_jacobian, lin.gradient)
+        self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
+        if self.optimality.violation < self._least:
+            self._least, self._least_values = self.optimality.violation, lin.values
+        if self.optimality.finite:
+            self.consider(lin.cost, lin.constraints.copy(), lin.values.flat, multipliers)
+
+    def see(self, jacobian: Array, gradient: Array) -> None:
+        """Take note of slopes of constraints and cost, as of :class:`unifg.solution.multipliers.Slopes`."""
+        if self.slopes is not None:
+            self.slopes.see(jacobian, gradient)
+        elif len(self.multipliers):
+            self.slopes = Slopes(self.program, jacobian, gradient)
+
+    def consider(self, cost: float, constraints: Array, values: Array, multipliers: Array) -> None:
+        """Take note of an iterate that may be returned if the solve ends without success.
+
+        Args:
+            cost: objective.
+            constraints: (M,) there. None of the arrays may be written to any more.
+            values: stored ones.
+            multipliers: (M,) there.
+        """
+        self.incumbents.see(Incumbent(self.iterations, cost, constraints, values, multipliers))
+
+    def begin_at(self, lin: Linearization) -> None:
+        """Move the start, as onto the bounds, without spending an iteration."""
+        self._move(lin, self.multipliers)
+        self.status = self._decide_in_time()
+
+    def look_at_fixed(self, constraints: Array) -> None:
+        """End before the first iteration where a violated row touches nothing but fixed variables.
+
+        Args:
+            constraints: (M,) at the start.
+        """
+        rows = self.program.fixed_rows()
+        if self.status is not None or not len(rows):
+            return
+        outside = np.abs(self.program.violation(constraints)[rows])
+        if outside.max() > self.tolerance:
+            if self.alone:
+                self.accept(self.program.linearize(self.values), self.multipliers, 0.0, 0.0)
+            self.optimality = self.optimality._replace(worst_row=int(rows[outside.argmax()]))
+            self.status = Status.INFEASIBLE
+
+    def search(self, workspace: Any) -> None:
+        """Take the first steps along the search Jacobians; the multipliers wait, and the true numbers are recorded.
+
+        Without a merit test a step may lead out of the residuals' domain: the search ends before such a step.
+        """
+        program = self.program
+        if not any(term.term.residual.search for term in program.terms):
+            return
+        while self.status is None and len(self.history) <= self._solver.search_iterations:
+            step = self._solver.search_step(self, workspace, program.linearize(self.values, search=True))
+            reached = None if step is None else program.linearize(program.retract(self.values, step))
+            if step is None or reached is None or not reached.finite:
+                return
+            self.accept(reached, self.multipliers, math.sqrt(inner(step, step)), 1.0, search=1)
+
+    def keep_with(self, error: Exception) -> None:
+        """Hand what has been reached along with an error, as its attribute ``reached``, and say so in a note."""
+        if not self.incumbents:
+            return
+        with suppress(Exception):  # the functions may raise again
+            self.status = Status.INTERRUPTED
+            error.reached = self.finish(None)  # type: ignore[attr-defined]
+            error.add_note(f"after {self.iterations} iterations; the solution until then is in the error's `reached`")
+
+    @property
+    def least_violated(self) -> Values:
+        """Values of least violation among the start and all iterates."""
+        if self.alone:  # then nobody has looked at the start
+            outside = self.program.violation(self.program.evaluate(self._start).constraints)
+            size = float(np.abs(outside).max(initial=0.0))
+            if size < self._least:
+                self._least, self._least_values = size, self._start
+        return self._least_values
+
+    @property
+    def has_been_feasible(self) -> bool:
+        """True if the start or an iterate met the constraints, which proves that they can be met."""
+        _ = self.least_violated
+        return self._least <= self.tolerance
+
+    def infeasible_stationary(self) -> bool:
+        """Test whether no nearby point violates the constraints less, though they are violated."""
+        return infeasible_stationary(self.program, self.lin, self.tolerance)
+
+    def finish(self, reason: Status | None) -> Solution:
+        """Return the last iterate, or after a solve without success the best one, judged by the KKT test.
+
+        No ranking of iterates comes before the backend's own choice where it succeeded, where a stop rule fired, and
+        where a step or a few of them are all that was asked for: a step of a real-time iteration may raise every merit,
+        and would never be taken from a feasible start.
+        """
+        status = self.status or reason or Status.STALLED
+        if status is Status.STALLED and self.infeasible_stationary():
+            status = Status.LOCALLY_INFEASIBLE
+        if status is Status.LOCALLY_INFEASIBLE and self.has_been_feasible:
+            status = Status.STALLED
+        if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
+            self._move(within, self.multipliers)
+        returned = self._return_best(status)
+        if status in (Status.STALLED, Status.SINGULAR) and self.optimality.violation <= self.tolerance:
+            self._estimate()
+        measured = self.optimality
+        if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
+            status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
+            if self.slopes is not None and self.slopes.degenerate(self.multipliers, self.tolerance):
+                status = Status.DEGENERATE
+        elif measured.holds(self.tolerance) and not measured.determined:
+            status = Status.UNDETERMINED
+        elif measured.holds(self.tolerance) and status is not Status.UNBOUNDED:
+            status = Status.IMPRECISE
+        elif measured.blurred(self.tolerance) and status in (Status.STALLED, Status.ITERATION_LIMIT):
+            status = Status.IMPRECISE
+        elif status.converged:
+            status = Status.STALLED
+        solution = Solution(
+            self.program,
+            self.lin,
+            self.multipliers,
+            self.penalties,
+            status,
+            measured,
+            self._recall or self.history,
+            self.iterations,
+            self.seconds,
+            self._solver.name,
+            returned,
+        )
+        solution.in_python = self.program.python_seconds - self._in_python
+        return solution
+
+    def _estimate(self) -> None:
+        """Take multipliers that are made of the gradients here, if all KKT numbers are better with them."""
+        before, found = self.optimality, estimated(self.program, self.lin, self.tolerance)
+        if found is None or before.holds(self.tolerance):
+            return
+        after = optimality(self.program, self.lin, found, self.tolerance)
+        pairs = zip(after[:3], before[:3], strict=True)
+        if all(better <= worse for better, worse in pairs) and after[:3] != before[:3]:
+            self.multipliers, self.optimality = found, after
+
+    def returns_best(self, status: Status | None) -> bool:
+        """Test whether an ending asks for the best iterate instead of the last."""
+        asked = self._solver.max_iterations <= FEW or getattr(self._solver, "step_tolerance", 0.0) == np.inf
+        sound = asked or status not in WITHOUT_SUCCESS or self.optimality.holds(self.tolerance)
+        return not (self.optimality.finite and sound)
+
+    def _return_best(self, status: Status) -> int:
+        """Go back to the best iterate where the ending asks for it; returns the number of what is returned."""
+        if not self.returns_best(status):
+            return self.iterations
+        best = self.incumbents.best
+        if best.values is not self.values.flat or best.multipliers is not self.multipliers:
+            self._move(self.program.linearize(self.program.columns.view(best.values)), best.multipliers)
+        return best.number
+
+    def _decide(self) -> Status | None:
+        if not self.optimality.finite:
+            return Status.NOT_FINITE
+        if self.lin.cost < UNBOUNDED_COST:  # out there, derivatives may be lost to rounding and look like zero
+            return Status.UNBOUNDED
+        if self.optimality.stationarity == np.inf:  # a saddle or maximum, where no model shows a way
+            return Status.STALLED
+        if self.optimality.holds(self.tolerance):
+            if not self.optimality.determined:
+                return Status.UNDETERMINED
+            return Status.CONVERGED if self.optimality.passes(self.tolerance) else Status.IMPRECISE
+        if self.iterations >= self._solver.max_iterations:
+            return Status.ITERATION_LIMIT
+        return None
+
+    def _decide_in_time(self) -> Status | None:
+        return self._decide() or (Status.TIME_LIMIT if self.out_of_time else None)
+
+
+class Prepared:
+    """A backend bound to one compiled graph; solves repeatedly without rebuilding structure.
+
+    It solves the graph as it was when it was prepared: terms that are added, removed or replaced later need another
+    :meth:`Solver.prepare`. The first solve after such a change says so, in a warning of the logger ``unifg``.
+
+    It belongs to one thread at a time. Others prepare their own: those of one graph wait for each other, those of
+    graphs that were stated twice do not.
+
+    Answers are verified by evaluating traced functions as written. Values: in solves 1, 2, 4, ..., in every 100th, and
+    after solves in which a comparison of a trace comes out otherwise. Derivatives: in solves 1, 2, 4, ... A term whose
+    trace differs is left to Python, and the solve is repeated from there. Where the time limit has passed, the next
+    answer is verified instead.
+
+    Attributes:
+        solver: the backend and its options.
+        program: the compiled graph.
+    """
+
+    def __init__(self, solver: Solver, program: CompiledProblem, graph: Model | None = None) -> None:
+        """Made by :meth:`Solver.prepare`, for the graph that the program was made of."""
+        self.solver = solver
+        self.program = program
+        self._graph = graph or program.graph
+        self._edition = self._graph.edition
+        self._workspace: Any = None
+        self._solves, self._owed = 0, False
+        self._last: ReferenceType[Solution] | None = None
+        self._lock = ReentrantLock()
+        self._constraints = {
+            t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
+        }
+
+    def solve(
+        self,
+        guess: AnyGuess,
+        *,
+        data: Mapping[Data, Numbers] | None = None,
+        duals: Mapping[str, Numbers] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve from ``guess``; arguments and errors as for :meth:`Solver.solve`.
+
+        Raises:
+            BackendError: while another thread solves with this object, or this thread is in the midst of a solve.
+            Exception: of a function of the user's. It is passed on with notes on term, factor and variable; where an
+                iterate had been reached, its attribute ``reached`` is the solution until then.
+        """
+        if not self._lock.acquire(blocking=False):
+            raise BackendError(f"this prepared {self.solver.name} is at work in another thread: prepare one for each")
+        try:
+            if self.program.lock.mine:
+                raise BackendError(
+                    f"this prepared {self.solver.name} is asked for a solve from within a solve of its graph, whose "
+                    f"data and memory it shares: call {self.solver.name}.solve(graph, ...) there"
+                )
+            with self.program.lock:
+                return self._solve(guess, data, duals, check, callback)
+        finally:
+            self._lock.release()
+
+    def _solve(
+        self,
+        guess: AnyGuess,
+        data: Mapping[Data, Numbers] | None,
+        duals: Mapping[str, Numbers] | None,
+        check: bool,
+        callback: Callback | None,
+    ) -> Solution:
+        program = self.program
+        program.bind(data or {})
+        self._say_if_stale()
+        values = program.values_from(values_of(guess))
+        carried = {} if isinstance(guess, Mapping) else guess.multipliers
+        multipliers = self._stacked("multipliers", {**carried, **duals} if duals else carried)
+        run = SolveState(self.solver, program, values, multipliers, callback)
+        if not isinstance(guess, Mapping) and guess.penalties:
+            run.penalties = self._stacked("penalties", guess.penalties)
+        solution = self._verified(self._finished(run), run, callback)
+        self._last = ref(solution)
+        if check and not solution.converged:
+            raise NotConverged(solution)
+        return solution
+
+    def _verified(self, solution: Solution, run: SolveState, callback: Callback | None) -> Solution:
+        """Evaluate traced functions as written at an answer, and solve again without the traces that differ."""
+        program = self.program
+        self._solves += 1
+        slopes = self._solves.bit_count() == 1
+        solution.checked = not program.verifications
+        if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
+            return solution
+        values = solution._lin.values
+        due = slopes or self._solves % EVERY == 0 or program.conditions_changed(values) or self._owed
+        self._owed = due and run.out_of_time  # verified after the next solve that leaves time for it
+        if not due or self._owed:
+            return solution
+        mistraced: dict[str, str] = {}
+        while found := program.mistraced(values, slopes, self._solves):
+            mistraced |= found
+            again = SolveState(self.solver, program, program.columns.values(solution.values), run.multipliers, callback)
+            again._started, again.penalties = run._started, run.penalties
+            solution, values = self._finished(again), again.values
+            if not solution.finite:
+                break
+        solution.checked, solution.mistraced, solution.seconds = solution.finite, mistraced, run.seconds
+        return solution
+
+    def verify(self, solution: Solution) -> dict[str, str]:
+        """Evaluate traced functions as written at the last answer, with the data of that solve.
+
+        For the idle time of a control loop. Sets ``solution.checked``, and ``solution.mistraced`` where a term differs.
+
+        Args:
+            solution: returned by the last :meth:`solve`.
+
+        Returns:
+            Reasons by the names of terms whose traces differ; from the next solve on they are evaluated by Python.
+
+        Raises:
+            BackendError: while another thread solves the graph, or for a solution of another solve.
+        """
+        if self._last is None or solution is not self._last():
+            raise BackendError("only the last solution can be verified: the data of others are not kept")
+        if not self._lock.acquire(blocking=False):
+            raise BackendError(f"this prepared {self.solver.name} is at work in another thread: prepare one for each")
+        try:
+            with self.program.lock:
+                found = self.program.mistraced(solution._lin.values, True, self._solves)
+        finally:
+            self._lock.release()
+        solution.checked, solution.mistraced, self._owed = not found, {**solution.mistraced, **found}, False
+        return found
+
+    def _finished(self, run: SolveState) -> Solution:
+        """The solution of a solve that has begun."""
+        self._refuse_not_finite(run)
+        if not run.alone:  # who runs alone looks for itself
+            run.look_at_fixed(run.lin.constraints)
+        reason = None
+        if run.status is None:
+            self.allocate()
+            try:
+                run.search(self._workspace)
+                reason = self.solver.iterate(run, self._workspace)
+            except KeyboardInterrupt:
+                if not run.incumbents:
+                    raise  # there is nothing to return
+                run.status = Status.INTERRUPTED
+            except Exception as error:
+                run.keep_with(error)
+                raise
+            if run.alone and not run.iterations:
+                self._refuse_not_finite(run)
+        return run.finish(reason)
+
+    @property
+    def stale(self) -> bool:
+        """True if the graph has been changed since."""
+        return self._graph.edition != self.program.graph.edition
+
+    def _say_if_stale(self) -> None:
+        """Say once of every change that it does not reach this solver."""
+        if self._graph.edition != self._edition:
+            self._edition = self._graph.edition
+            logger.warning(
+                "a prepared %s solves the graph as it was when it was prepared, and the graph has changed since: "
+                "prepare it again", self.solver.name,
+            )  # fmt: skip
+
+    def allocate(self) -> None:
+        """Make the backend's workspace, unless there is one."""
+        if self._workspace is None:
+            self._workspace = self.solver.workspace(self.program)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""
+        return {**self.__dict__, "_workspace": None, "_last": None}
+
+    def _stacked(self, what: str, given: Mapping[str, Numbers]) -> Array:
+        """(M,) multipliers or penalties, zero where none are given."""
+        if isinstance(given, ByTerm) and given.places is self.program.places and given.intact:
+            result = given.flat.copy()
+        else:
+            result = self._read(what, given)
+        if given and not all_finite(result):
+            name = self.program.row_name(int(np.flatnonzero(~np.isfinite(result))[0]))[0]
+            raise GraphError(f"{what} of '{name}' are not finite", term=name)
+        return result
+
+    def _read(self, what: str, given: Mapping[str, Numbers]) -> Array:
+        """The same of arrays from anywhere."""
+        result = np.zeros(self.program.constraints.count)
+        for name, value in given.items():
+            if name not in self._constraints:
+                known = ", ".join(self._constraints) or "none"
+                raise GraphError(f"{what} given for '{name}', which is no constraint (there are: {known})", term=name)
+            term, rows = self._constraints[name]
+            array = np.asarray(value, dtype=np.float64)
+            if array.shape != (term.count, term.size):
+                raise GraphError(
+                    f"{what} of '{name}' have shape {array.shape}, expected {(term.count, term.size)}", term=name
+                )
+            result[rows] = array.ravel()
+        return result
+
+    def _refuse_not_finite(self, run: SolveState) -> None:
+        if run.status is not Status.NOT_FINITE:
+            return
+        for term in self.program.terms:
+            with np.errstate(all="ignore"):
+                value = term.residual(run.values)
+                bad = ~np.isfinite(value.reshape(len(value), -1)).all(axis=1)
+            if bad.any():
+                index = int(np.flatnonzero(bad)[0])
+                selection = term.gathers[0].selection
+                raise GraphError(
+                    f"term '{term.name}': the residual of factor {index} is not finite at the guess "
+                    f"(its first variable is {selection.family.name}[{selection.indices[index % len(selection)]}]); "
+                    "move the guess away from the singularity",
+                    term=term.name,
+                    family=selection.family.name,
+                    index=index,
+                )
+        raise GraphError("a Jacobian is not finite at the guess: run graph.check(guess) to find the term")
