@@ -116,6 +116,7 @@ def test_exp_is_matrix_exponential(case: Case, batch: Batch, regime: str, rng: G
     assert_close(case.group.matrix(case.group.exp(d)), exponentials(case.group.hat(d)))
 
 
+@pytest.mark.product(60)
 def test_log_inverts_exp(case: Case, batch: Batch, regime: str, rng: Generator) -> None:
     group = case.group
     x, d = elements(case, regime, batch, rng), tangents(case, regime, batch, rng)
@@ -129,6 +130,7 @@ def test_log_inverts_exp(case: Case, batch: Batch, regime: str, rng: Generator) 
         np.testing.assert_allclose(group.log(group.exp(d)), d, rtol=1e-14, atol=0.0)
 
 
+@pytest.mark.product(60)
 def test_retract_is_right_exponential(case: Case, batch: Batch, regime: str, rng: Generator) -> None:
     group = case.group
     x, d = elements(case, regime, batch, rng), tangents(case, regime, batch, rng)

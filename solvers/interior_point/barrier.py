@@ -22,8 +22,8 @@ with p, n > 0 at the penalty rho: p (rho - lambda) = mu, n (rho + lambda) = mu, 
 
 The phase begins where all of its constraints hold (`_split`), at a mu in proportion to penalty and violation: an l1
 penalty with a smooth edge, which needs no restoration. Its answers are those of the problem as long as no multiplier
-is at its penalty; where one is, the penalty is raised, until the pull of the objective is small beside the forces that the
-constraints exert on each other. Then violation is what is left to minimise, and whoever runs the loop has to find out
+is at its penalty; where one is, the penalty is raised, until the pull of the objective is small beside the forces that
+the constraints exert on each other. Then violation is what is left to minimise, and the caller of the loop finds out
 whether less of it is to be had (`VIOLATED`); compare Curtis, Schenk and Waechter, SIAM J. Optim. 20 (2010), and Thierry
 and Biegler, Optim. Methods Softw. 35 (2020).
 
@@ -400,8 +400,8 @@ def test(address: int) -> None:
             now.paid *= 10.0
             run(links[0].relax, (address,))
     if now.violation <= tolerance and now.mu <= smallest and _error(now) <= now.mu:
-        # All is done that can be done at these penalties. A multiplier near its own lets a row give way by mu / (penalty -
-        # multiplier): no violation that counts, but times the multiplier more than complementarity may be.
+        # All is done that can be done at these penalties. A multiplier near its own lets a row give way by
+        # mu / (penalty - multiplier): no violation that counts, but too much for complementarity.
         near = False
         for k in range(now.sides):
             near = near or sides[k].y * sides[k].e > tolerance * now.scale
@@ -422,7 +422,7 @@ def test(address: int) -> None:
 
 @linked
 def increase_penalty(address: int) -> None:
-    """Raise all penalties where the iterate stands, with what is elastic on its central path."""
+    """Increase the penalty parameters and re-centre the elastic variables."""
     multipliers, pairs, penalties, links = parts(address, "multipliers pairs penalties links")
     rows, scalars, sides = parts(address, "rows scalars sides")
     now = scalars[0]

@@ -56,8 +56,8 @@ class InteriorPoint(Solver):
         barrier: first mu of a cold start; a start with multipliers finds its own.
         penalty: first rho of the elastic variables; raised when constraints stay violated.
         scaling: measure rows and unknowns in units that make the largest entries of the constraint Jacobian near one,
-            where they are far from it, and penalties and mu in proportion to a large gradient. Inside only: tolerances and
-            multipliers are those of the problem as stated.
+            where they are far from it, and penalties and mu in proportion to a large gradient. Inside only: tolerances
+            and multipliers are those of the problem as stated.
         step_tolerance, violation_tolerance: stop rule on the norm of the full step and the largest violation, for
             control loops. A positive step_tolerance switches it on; it does not grant CONVERGED. An infinite one asks
             for a single step, and more of them only as long as constraints are violated. With the rule on, a solve

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import dis
 import hashlib
-import sys
 from collections.abc import Iterator
 from functools import cache, lru_cache
+from importlib.util import find_spec
 from inspect import CO_NEWLOCALS, CO_OPTIMIZED
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, cast
@@ -18,7 +18,7 @@ from typing import Any, cast
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-GENERATORS = ("borrow", "calls", "jit", "links", "mailbox", "vectors")
+GENERATORS = ("calls", "function_pointers", "jit", "vectors", "views", "work_queue")
 """Modules of this package that say what is generated for primitives and types of their own."""
 _FUNCTION = CO_OPTIMIZED | CO_NEWLOCALS
 _CONSTANTS = (int, float, complex, str, tuple, np.ndarray, np.generic)
@@ -50,8 +50,8 @@ def generators() -> str:
     """Digest of the modules that generate instructions."""
     digest = hashlib.sha256()
     for name in GENERATORS:
-        spec = sys.modules[f"{__package__}.{name}"].__spec__
-        digest.update(code_digest(cast(Any, spec).loader.get_code(f"{__package__}.{name}")).encode())
+        spec: Any = find_spec(f"{__package__}.{name}")
+        digest.update(code_digest(spec.loader.get_code(spec.name)).encode())
     return digest.hexdigest()
 
 
