@@ -159,4 +159,4 @@ def test_a_turning_base_drifts_outwards() -> None:
 def test_what_is_no_base_is_refused(field: str, value: float) -> None:
     assert field in {f.name for f in fields(Drivetrain)}
     with pytest.raises(ScenarioError, match=field):
-        Drivetrain(**{field: value})  # type: ignore[arg-type]
+        Drivetrain(**{field: value})

@@ -141,7 +141,7 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     inner = [path.parent for path in (source / "unifg").rglob("__init__.py")]
     folders |= {folder.relative_to(source).as_posix(): folder for folder in inner if folder.name not in SIDES}
     expected = {f"{name}/{path.name}" for name, folder in folders.items() for path in folder.glob("*.py")}
-    maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios" / "worlds").glob(kind)]
+    maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios" / "simulation").glob(kind)]
     assert {path.suffix for path in maps} == {".pgm", ".yaml"}, "no map is shipped"
     expected |= {f"unifg/scenarios/simulation/{path.name}" for path in maps}
     expected |= {
@@ -150,7 +150,7 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
         "unifg/view/page.html",
         "unifg/scenarios/commands/performance.jsonl",
     }
-    if (source / "unifg" / "machine" / "kernels.zip").exists():  # what may be missing is compiled on the first use
+    if (source / "unifg" / "codegen" / "kernels.zip").exists():  # what may be missing is compiled on the first use
         expected.add("unifg/codegen/kernels.zip")
     assert {name for name in names if ".dist-info/" not in name} == expected
 

@@ -235,7 +235,7 @@ def test_the_shipped_building_is_what_the_generator_draws(building: OccupancyMap
         drawn.name,
     )
     save_map(tmp_path / "building.yaml", drawn)
-    shipped = Path(__file__).parents[1] / "scenarios" / "worlds"
+    shipped = Path(__file__).parents[1] / "scenarios" / "simulation"
     for name in ("building.yaml", "building.pgm"):
         assert (tmp_path / name).read_bytes() == (shipped / name).read_bytes()
 
