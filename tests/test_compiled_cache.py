@@ -156,7 +156,7 @@ import unifg as fg
 group = fg.SO2.compose([[0.5]], [[0.25]])
 assert group[0, 0] == 0.75
 graph = fg.Graph()
-assert fg.machine.jit.folder_of(fg.kernels.kernel.evaluate_rows) is None
+assert fg.codegen.jit.folder_of(fg.factors.kernel.evaluate_rows) is None
 function = fg.compiled(eval("lambda x: 2.0 * x"))
 assert function(3.0) == 6.0
 """

@@ -124,7 +124,7 @@ class Pilot(Generic[PlannerT]):
         supervisor: how fast the robot may go.
         share: of the beams of the last scan that the map explains.
         relocated: whether the last tick has found the robot at another place.
-        slowed: whether the last stop has changed the control of the last tick.
+        slowed: true if the emergency stop has changed the control of the last tick.
         driven: (2,) control of the last tick [m/s, rad/s].
         search_said: why the last search has not found the robot, "" where it has.
         planless: whether no solve is to give a plan: a planner that is out of time.
