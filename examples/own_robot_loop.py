@@ -1,7 +1,7 @@
 """A loop for a robot and its parameter: an arm swings up while it learns the friction of its joints.
 
-Encoders measure the angles, the elbow's fails one time in five. Nobody tells the friction: it is a static, one unknown
-that past and future share. Two graphs in turn ("sequential"), then one ("joint").
+Encoders measure the angles, the elbow's fails one time in five. The friction is an unknown constant that past and
+future share. Two graphs in turn ("sequential"), then one ("joint").
 
     python examples/own_robot_loop.py [FOLDER]
 """
@@ -13,17 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import (
-    COUPLINGS,
-    Constant,
-    Context,
-    ControlCost,
-    Dynamics,
-    Measurement,
-    RecedingHorizon,
-    Robot,
-    Window,
-)
+from unifg.horizon import COUPLINGS, Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
 from unifg.models import manipulator, rkmk
 from unifg.solvers import SQP
 from unifg.typing import Array
@@ -41,7 +31,7 @@ class Reach:  # what the future is to be, besides the dynamics
         graph.minimize(fg.prior, x[1:], goal, sigma=[1.0, 1.0, 3.0, 3.0], name="reach")
         graph.bound(u, lower=-most, upper=most, name="limits")
 
-    def data(self, now: Context[None]) -> dict[str, Array]:
+    def data(self, now: object) -> dict[str, Array]:
         return {}
 
 
@@ -52,9 +42,7 @@ for coupling, ax in zip(COUPLINGS[1:], axes, strict=True):
     angles = (Measurement(name, fg.prior, (1,), 0.01, component=name) for name in ("shoulder", "elbow"))
     window = Window(robot, 12, [*angles, Dynamics(motion, h, sigma=noise, constants=rho)], start=-goal, sigma=0.1)
     future = Dynamics(motion, h, constants=rho), Reach(), ControlCost(sigma=[20.0, 10.0], change=[10.0, 5.0])
-    loop = RecedingHorizon(
-        robot, 20, future, solver=SQP(tolerance=1e-4), window=window, coupling=coupling, limits=(-most, most)
-    )
+    loop = RecedingHorizon(robot, 20, future, solver=SQP(), window=window, coupling=coupling, limits=(-most, most))
     truth = -goal[None] + [0.05, -0.05, 0.0, 0.0]
     for _ in range(60):
         q, fails = truth[-1, :2, None] + 0.01 * rng.normal(size=(2, 1)), rng.random() < 0.2
