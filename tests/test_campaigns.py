@@ -658,5 +658,6 @@ def test_chance_of_differences() -> None:
 
     assert by_chance(np.array([1.0, 1.0, 1.0, 1.0])) == 2 / 16  # all signs alike, one way or the other
     assert by_chance(np.array([1.0, -1.0])) == 1.0 and by_chance(np.zeros(3)) == 1.0
+    assert by_chance(np.array([0.3])) == 1.0  # of one pair, either sign is as far
     assert by_chance(np.full(40, 2.0)) == pytest.approx(1 / 4097)
     assert _holm([0.01, 0.04, 0.03]) == [0.03, 0.06, 0.06] and _holm([0.9, 0.8]) == [1.0, 1.0]

@@ -29,6 +29,8 @@ def by_chance(differences: Array) -> float:
     Args:
         differences: (n,) of pairs.
     """
+    if len(differences) < 2:  # either sign of a single one is as far from zero
+        return 1.0
     found = permutation_test(
         (differences,), _size, permutation_type="samples", alternative="greater", n_resamples=FLIPS, rng=0
     )
