@@ -8,6 +8,7 @@ import os
 import random
 import subprocess
 from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,7 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20260101)
 
 
+@cache
 def _seed() -> str:
     """Seed of the drawn cases: $UNIFG_TEST_SEED, else the commit."""
     if named := os.environ.get("UNIFG_TEST_SEED"):

@@ -264,19 +264,15 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 27_676, "scenarios": 11_695, "benchmarks": 5_787, "tests": 31_703, "docs examples": 1_651,
+    "unifg solvers models": 27_676, "scenarios": 11_695, "benchmarks": 5_787, "tests": 31_709, "docs examples": 1_651,
     "unifg/factors": 3_509, "unifg/problem": 2_583, "models": 2_327, "unifg/elimination": 2_407, "solvers": 4_354,
     "unifg/solution": 1_770, "unifg/smoothing": 1_751, "unifg/lie": 1_694, "unifg/view": 1_414, "unifg/files": 1_207,
     "unifg/pose_graphs": 1_128, "unifg/horizon": 1_038, "unifg/modeling": 984, "unifg/codegen": 849,
     "unifg/plots": 427, "scenarios/show": 1_564, "scenarios/simulation": 1_316, "scenarios/campaigns": 1_046,
     "scenarios/quadrotor": 1_111, "scenarios/ground": 1_092, "scenarios/safety": 775, "scenarios/commands": 599,
 }  # fmt: skip
-DENSITY = {
-    "unifg solvers models": 27_676.0,
-    "scenarios": 11_695.6,
-    "benchmarks": 5_787.9,
-    "tests": 31_703.3,
-}  # nodes a statement
+# Nodes of syntax a statement: budgets are not met by denser code.
+DENSITY = {"unifg solvers models": 10.0, "scenarios": 10.6, "benchmarks": 11.9, "tests": 12.3}
 LOST_WORDS = 352  # docstrings that begin with a question word; goes down to none
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 from functools import cache
 from typing import cast
 
@@ -135,6 +138,19 @@ def step_of(group: fg.LieGroup, count: int = 6) -> tuple[list[Array], list[fg.Ma
     return [x, u, w, after], [group, fg.Rn(group.dim), fg.Rn(group.dim), group]
 
 
+def linearized(
+    defect: fg.Residual, points: Sequence[Array], manifolds: Sequence[fg.Manifold], h: Any
+) -> tuple[Array, Array]:
+    """Residual (n, dim) and Jacobian (n, dim, d) of steps that a graph has traced; one point of a kind is shared."""
+    graph, count = fg.Graph(), len(points[0])
+    families = [graph.variables(f"x{k}", m, len(p)) for k, (m, p) in enumerate(zip(manifolds, points, strict=True))]
+    graph.minimize(defect, *families, h)
+    program = graph.compile()
+    assert program.terms[0].route.endswith("derivatives exact")
+    lin = program.linearize(dict(zip(families, points, strict=True)))
+    return lin.residual.reshape(count, -1), lin.jacobian.reshape(count, lin.residual.size // count, -1)
+
+
 @pytest.mark.parametrize("method", [*NAMES, HEUN], ids=str)
 @EVERY_GROUP
 def test_jacobians(group: fg.LieGroup, method: Method) -> None:
@@ -142,14 +158,9 @@ def test_jacobians(group: fg.LieGroup, method: Method) -> None:
     points, manifolds = step_of(group)
     defect = rkmk.integrator(group, Carried(group), method)
     numerical = np.concatenate(jacobian(lambda *p: defect(*p, 0.3), points, manifolds), axis=2)
-    graph = fg.Graph()
-    families = [graph.variables(f"x{k}", manifold, len(points[0])) for k, manifold in enumerate(manifolds)]
-    graph.minimize(defect, *families, 0.3)
-    program = graph.compile()
-    assert program.terms[0].route.endswith("derivatives exact")
-    lin = program.linearize(dict(zip(families, points, strict=True)))
-    np.testing.assert_allclose(lin.residual.reshape(-1, group.dim), defect(*points, 0.3), atol=1e-14 * 30)
-    np.testing.assert_allclose(lin.jacobian.reshape(numerical.shape), numerical, atol=1e-8)
+    found, blocks = linearized(defect, points, manifolds, 0.3)
+    np.testing.assert_allclose(found, defect(*points, 0.3), atol=1e-14 * 30)
+    np.testing.assert_allclose(blocks, numerical, atol=1e-8)
 
 
 @pytest.mark.parametrize("group", [*GROUPS, fg.SO2, fg.Rn(2)], ids=lambda g: g.name)
@@ -178,11 +189,13 @@ def test_the_bend_is_in_the_algebra_over_dual_numbers() -> None:
 
 def test_steps_may_differ_and_inputs_be_shared() -> None:
     group, field = fg.SE3, Carried(fg.SE3)
-    (x, u, w, after), _ = step_of(group)
+    (x, u, w, after), manifolds = step_of(group)
     h = RNG.uniform(0.1, 0.4, len(x))
     defect = rkmk.integrator(group, field, "rk4")
-    together = defect(x, u, w[:1], after, h)
+    together, (_, blocks) = defect(x, u, w[:1], after, h), linearized(defect, (x, u, w[:1], after), manifolds, h)
     for i in range(len(x)):
         one = [part[i : i + 1] for part in (x, u)]
         alone = defect(*one, w[:1], after[i : i + 1], float(h[i]))
         np.testing.assert_allclose(together[i], alone[0], atol=1e-15)
+        single = linearized(defect, (*one, w[:1], after[i : i + 1]), manifolds, float(h[i]))[1]
+        np.testing.assert_allclose(blocks[i], single[0], atol=1e-14)

@@ -293,3 +293,5 @@ def test_the_last_answer_is_verified_in_idle_time(wrong_above: Function) -> None
     assert found.keys() == {"own"} == late.mistraced.keys() and not late.checked
     again = prepared.solve({x: np.zeros((N, 1))}, data={target: np.full((N, 1), 2.0)})
     assert np.abs(again[x] - late[x]).max() > 1e-3 and prepared.verify(again) == {} and again.checked
+    with pytest.raises(fg.UnifgError, match="from within a solve"):
+        prepared.solve({x: np.ones((N, 1))}, callback=lambda row: bool(prepared.verify(again)))

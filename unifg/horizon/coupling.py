@@ -26,7 +26,7 @@ from unifg.typing import Array, ArrayLike
 
 Coupling: TypeAlias = Literal["separate", "sequential", "joint"]
 """Of estimation and control: "separate", the plan is given the present state, and constants as believed at the start;
- "sequential", it is given the present state and constants as they are estimated; "joint", one graph of past and
+"sequential", it is given the present state and constants as they are estimated; "joint", one graph of past and
 future."""
 COUPLINGS: tuple[Coupling, ...] = get_args(Coupling)
 
@@ -79,19 +79,19 @@ class FixedPresent:
         self.along: tuple[Family, ...] = (x,)
         self._start = graph.data("present", robot.state.identity())
         graph.fix(x[0], self._start, name="present")
-        self._statics: dict[str, Data] = {}
+        self._constants: dict[str, Data] = {}
         for static in robot.constants:
             family = static.family(graph)
             if not (static.known or at_start):
-                self._statics[static.name] = graph.data(f"{static.name}, given", static.values)
-                graph.fix(family, self._statics[static.name], name=f"{static.name}, given")
+                self._constants[static.name] = graph.data(f"{static.name}, given", static.values)
+                graph.fix(family, self._constants[static.name], name=f"{static.name}, given")
             elif not static.known:
                 graph.fix(family, static.values, name=f"{static.name}, given")
 
     def data(self, now: Context[Any]) -> dict[Data, ArrayLike]:
         """Data of a given present."""
         found: dict[Data, ArrayLike] = {self._start: now.present}
-        return found | {data: now.constants[name] for name, data in self._statics.items()}
+        return found | {data: now.constants[name] for name, data in self._constants.items()}
 
     def begin(self, guess: Guess, now: Context[Any]) -> Guess:
         """The guess as it is."""

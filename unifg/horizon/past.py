@@ -165,7 +165,7 @@ class Past:
         self._arrival = arrival
         length = history.length
         self._steps = {name: graph.variables(name, kind, length) for name, kind in robot.steps.items()}
-        self._statics = {static.name: graph.families[static.name] for static in robot.constants}
+        self._constants = {static.name: graph.families[static.name] for static in robot.constants}
         self._known = {static.name for static in robot.constants if static.known}
         self._applied = graph.data("applied controls", np.zeros((length, robot.control.storage)), each=True)
         before = len(graph.terms)
@@ -222,7 +222,7 @@ class Past:
             for name, family in self._steps.items():
                 graph.minimize(prior, family, family.manifold.identity(), active=self._empty, name=f"empty {name}")
         self._believed: dict[str, tuple[Data, Data]] = {}
-        for name, family in self._statics.items():
+        for name, family in self._constants.items():
             if name in self._known:
                 continue
             values, weights = left.constants[name]
@@ -230,7 +230,7 @@ class Past:
             weight = graph.data(f"information about {name} at the start", weights, each=True)
             graph.minimize(prior, family, reference, information=weight, name=f"prior of {name}")
             self._believed[name] = reference, weight
-        members = [family[k] for family in self._statics.values() for k in range(len(family))]
+        members = [family[k] for family in self._constants.values() for k in range(len(family))]
         about = [*(x[k] for k in range(self.reach)), *members]
         size = sum(variable.manifold.dim for variable in about)
         identity = np.concatenate([variable.manifold.identity() for variable in about])
@@ -250,7 +250,7 @@ class Past:
     @property
     def constants(self) -> tuple[Family, ...]:
         """Families of the constants."""
-        return tuple(self._statics.values())
+        return tuple(self._constants.values())
 
     def data(self, now: Context[Any]) -> dict[Data, ArrayLike]:
         """Data of the window."""
@@ -281,7 +281,7 @@ class Past:
         """Beliefs about everything but the nodes."""
         history = self._history
         steps = {family: history.steps[name] for name, family in self._steps.items()}
-        return steps | {family: history.constants[name] for name, family in self._statics.items()}
+        return steps | {family: history.constants[name] for name, family in self._constants.items()}
 
     def nodes(self) -> Array:
         """(L + 1, storage) what is believed about the nodes; empty places are guessed at the present."""
@@ -295,7 +295,7 @@ class Past:
         history.states[history.empty :] = solution[self.x][history.empty :]
         for name, family in self._steps.items():
             history.steps[name][:] = solution[family]
-        for name, family in self._statics.items():
+        for name, family in self._constants.items():
             history.constants[name][:] = solution[family]
 
     def depart(self, solution: Solution) -> None:

@@ -291,11 +291,11 @@ class RecedingHorizon:
         known = (
             {static.name: static.values for static in self.robot.constants} if history is None else history.constants
         )
-        given_statics = {name: self._static(name, value, known) for name, value in (constants or {}).items()}
-        known = {name: values.copy() for name, values in known.items()} | given_statics
+        stated = {name: self._constant(name, value, known) for name, value in (constants or {}).items()}
+        known = {name: values.copy() for name, values in known.items()} | stated
         return Context(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
 
-    def _static(self, name: str, value: ArrayLike, known: Mapping[str, Array]) -> Array:
+    def _constant(self, name: str, value: ArrayLike, known: Mapping[str, Array]) -> Array:
         """A value (count, storage) of a static."""
         if name not in known:
             raise GraphError(f"the robot has no static '{name}' (there are: {', '.join(known) or 'none'})", family=name)

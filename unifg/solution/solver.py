@@ -6,8 +6,8 @@ import logging
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 from weakref import ReferenceType, ref
@@ -539,6 +539,12 @@ class Prepared:
             Exception: of a function of the user's. It is passed on with notes on term, factor and variable; where an
                 iterate had been reached, its attribute ``reached`` is the solution until then.
         """
+        with self._alone():
+            return self._solve(guess, data, duals, check, callback)
+
+    @contextmanager
+    def _alone(self) -> Iterator[None]:
+        """Hold the locks of this solver and of its graph; refuse other threads, and calls from within a solve."""
         if not self._lock.acquire(blocking=False):
             raise BackendError(f"this prepared {self.solver.name} is at work in another thread: prepare one for each")
         try:
@@ -548,7 +554,7 @@ class Prepared:
                     f"data and memory it shares: call {self.solver.name}.solve(graph, ...) there"
                 )
             with self.program.lock:
-                return self._solve(guess, data, duals, check, callback)
+                yield
         finally:
             self._lock.release()
 
@@ -611,17 +617,12 @@ class Prepared:
             Reasons by the names of terms whose traces differ; from the next solve on they are evaluated by Python.
 
         Raises:
-            BackendError: while another thread solves the graph, or for a solution of another solve.
+            BackendError: while another thread solves with this object, within a solve, or for an older solution.
         """
         if self._last is None or solution is not self._last():
             raise BackendError("only the last solution can be verified: the data of others are not kept")
-        if not self._lock.acquire(blocking=False):
-            raise BackendError(f"this prepared {self.solver.name} is at work in another thread: prepare one for each")
-        try:
-            with self.program.lock:
-                found = self.program.mistraced(solution._lin.values, True, self._solves)
-        finally:
-            self._lock.release()
+        with self._alone():
+            found = self.program.mistraced(solution._lin.values, True, self._solves)
         solution.checked, solution.mistraced, self._owed = not found, {**solution.mistraced, **found}, False
         return found
 
