@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
-
 from functools import cache
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
