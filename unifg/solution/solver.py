@@ -415,12 +415,13 @@ class SolveState:
         if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
             self._move(within, self.multipliers)
         returned = self._return_best(status)
-        if status in (Status.STALLED, Status.SINGULAR) and self.optimality.violation <= self.tolerance:
+        earlier = status is Status.ITERATION_LIMIT and returned < self.iterations  # the multipliers of a barrier there
+        if (earlier or status in (Status.STALLED, Status.SINGULAR)) and self.optimality.violation <= self.tolerance:
             self._estimate()
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
-            if self.slopes is not None and self.slopes.degenerate(self.multipliers, self.tolerance):
+            if self.slopes is not None and self.slopes.degenerate(self.lin, self.multipliers, self.tolerance):
                 status = Status.DEGENERATE
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
