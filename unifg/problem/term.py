@@ -596,6 +596,7 @@ class CompiledTerm:
             variables, parameters, _ = kernel.split(self._for_kernel(points), self.count)
         except GraphError as error:
             raise GraphError(f"term '{self.name}': {error}", term=self.name) from None
+        self.kernel = kernel.of_shapes([part.shape[1:] for part in parameters])
         packed = side_by_side(parameters)
         self.parameter_count = packed.shape[1]
         self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
