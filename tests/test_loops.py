@@ -126,6 +126,14 @@ def test_copies_lie_at_equal_strides() -> None:
     assert loops.Repeats(tape, few).rows(few) == []
 
 
+def test_what_ends_depend_on_is_not_live() -> None:
+    tape = Tape()
+    a, b = parameters(tape, [0, 1])
+    inner = tape.apply(Op.SIN, a)
+    outer = tape.add(tape.apply(Op.COS, inner), b)
+    assert a in tape.live([outer]) and a not in tape.live([outer], {inner}) and inner in tape.live([outer], {inner})
+
+
 def test_sums_that_are_wanted_elsewhere_are_terms() -> None:
     """A partial sum with another user is one number; a deep expression ends no process."""
     tape = Tape()
