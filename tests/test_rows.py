@@ -251,7 +251,7 @@ class Stairs(Lookup):
     """A table that is read at whole numbers."""
 
     def __call__(self, x: Array) -> Array:
-        found: Array = self.take(np.floor(x)) * x
+        found: Array = self.take(np.clip(np.floor(x), 0.0, 2.0)) * x
         return found
 
 
