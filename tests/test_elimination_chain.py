@@ -56,7 +56,7 @@ def test_stages_touch_only_the_next(rng: np.random.Generator) -> None:
     pattern, _, label, _ = horizon(rng, 30, 3, 2, True)
     weight = np.bincount(label)
     pointer, neighbours = block_graph(pattern.indptr, pattern.indices, label, len(weight))
-    chain, (order, bounds, parent, passed, _) = stages(pointer, neighbours, weight)
+    chain, (order, bounds, parent, passed), _ = stages(pointer, neighbours, weight)
     assert chain
     assert sorted(order.tolist()) == list(range(len(weight)))
     stage = np.empty(len(weight), dtype=int)
