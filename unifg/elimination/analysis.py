@@ -7,7 +7,6 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from unifg.elimination.chain import stages
 from unifg.elimination.dissection import separators
 from unifg.elimination.layout import lay_out
 from unifg.elimination.metis import installed, metis_order
@@ -15,7 +14,7 @@ from unifg.elimination.ordering import block_graph, indistinguishable
 from unifg.elimination.plan import LARGEST, PANEL, PIVOTS, ROWS, SCALARS, Plan
 from unifg.elimination.symbolic import cliques, postordered, predicted_cost
 from unifg.errors import UnifgError
-from unifg.typing import BoolArray, IntArray
+from unifg.typing import IntArray
 
 Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "metis", "natural"] | IntArray
 SLACK = 16  # numbers the kernels may read beyond the last matrix
@@ -84,17 +83,15 @@ class Structure(NamedTuple):
             pivots=np.ones(size + 3),
             signs=np.ones(size + 3),
             work=np.zeros(size + largest + SLACK),
-            state=np.array([0, 0, 0, -1, 0, -1]),
+            state=np.array([0, 0, 0, -1]),
         )
 
 
-def analyse(
-    indptr: IntArray, indices: IntArray, blocks: IntArray | None, ordering: Ordering, negative: BoolArray | None
-) -> Structure:
+def analyse(indptr: IntArray, indices: IntArray, blocks: IntArray | None, ordering: Ordering) -> Structure:
     """Analyse a pattern; arguments as for `factorization.Factorization`, the pattern as its two arrays.
 
     Raises:
-        UnifgError: labels, signs or permutation are not what they should be.
+        UnifgError: labels or permutation are not what they should be.
     """
     size = len(indptr) - 1
     label = indistinguishable(indptr, indices) if blocks is None else _labels(blocks, size)
@@ -127,9 +124,6 @@ def analyse(
                 other = make()
                 if (less := predicted_cost(weight, other[0], other[1], other[3])) < cost:
                     kind, tree, cost = name, other, less
-            chain, line, least = stages(pointer, neighbours, weight)
-            if chain and least <= cost:
-                kind, tree = "chain", line
     else:
         raise UnifgError(
             f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural or "
@@ -141,11 +135,6 @@ def analyse(
     )
     largest = int((table[:, PIVOTS] + table[:, ROWS]).max(initial=0))
     panels = int(table[-1, PANEL])
-    expected = np.zeros(size, np.int8)
-    if negative is not None:
-        if np.shape(negative) != (size,):
-            raise UnifgError(f"negative has shape {np.shape(negative)}; expected one flag per scalar, ({size},)")
-        expected[:] = np.where(np.asarray(negative)[scalar_order], -1, 1)
     plan = Plan(
         shape=np.array([size, len(parent), largest, panels]),
         fronts=table,
@@ -154,7 +143,6 @@ def analyse(
         relative=relative,
         runs=runs,
         slots=slots,
-        expected=expected,
         numbers=NOTHING,
         pivots=NOTHING,
         signs=NOTHING,
