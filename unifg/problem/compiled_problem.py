@@ -34,7 +34,7 @@ from unifg.problem.linearization import Evaluation, Linearization, Rows
 from unifg.problem.retraction import Retraction
 from unifg.problem.scalars import add_scalars, evaluate_scalars
 from unifg.problem.systems import Systems
-from unifg.problem.table import ENTRY, PARAMETER, ROW, WIDTH, TermArrays, TermTable
+from unifg.problem.table import ENTRY, PARAMETER, POSITION, ROW, WIDTH, TermArrays, TermTable
 from unifg.problem.term import CompiledTerm
 from unifg.problem.thread_partition import Shares
 from unifg.problem.verification import Verification
@@ -113,6 +113,7 @@ class CompiledProblem:
         self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
         self.systems = Systems(self.normal, self.blocks, self.constraints)
         self._found: dict[Callable[[CompiledProblem], Any], Any] = {}
+        self._pairs: dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, Array, IntArray]] = {}
         self._cost_slices = _slices(self.cost_terms)
         self.slices = _slices(self.constraint_terms)
         shaped = zip(self.constraint_terms, self.slices, strict=True)
@@ -434,13 +435,28 @@ class CompiledProblem:
             cost += float(value.sum())
             found[term.place[ROW] : term.place[ROW] + term.count] = value
             slope, curvature, doubt = term.scalar_derivatives(values)
-            columns, factor, a, b, place = self.once(_placed)[term]
-            np.add.at(gradient, columns.ravel(), slope.ravel())
-            np.add.at(rounding, columns.ravel(), doubt.ravel())
-            np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])
-            np.add.at(concavity, place, (curvature - convex)[factor, a, b])
+            columns = np.concatenate(term.columns, axis=1).ravel()
+            np.add.at(gradient, columns, slope.ravel())
+            np.add.at(rounding, columns, doubt.ravel())
+            convex = convexified(curvature)
+            self.add_pairs(term, convex, hessian)
+            self.add_pairs(term, curvature - convex, concavity)
         self.python_seconds += perf_counter() - began
         return cost
+
+    def add_pairs(self, term: CompiledTerm, blocks: Array, entries: Array) -> None:
+        """Add (n, D, D) symmetric blocks of a term, by its tangent columns, to entries in the order of ``normal``."""
+        width = blocks.shape[1]
+        start, pairs = int(term.place[POSITION]), width * (width + 1) // 2
+        if term not in self._pairs:
+            where = self.arrays.positions[start : start + term.count * pairs].reshape(term.count, pairs)
+            row, column = np.tril_indices(width)
+            factor, pair = np.nonzero(where != -1)
+            place = where[factor, pair]
+            times, place = np.where(place < -1, 2.0, 1.0), np.where(place < -1, -2 - place, place)
+            self._pairs[term] = factor, row[pair], column[pair], times, place
+        factor, rows, columns, times, place = self._pairs[term]
+        np.add.at(entries, place, times * blocks[factor, rows, columns])
 
     def norms(self, sizes: Array, scalars: Array | None = None) -> dict[str, float]:
         """Residual norms of the terms by name, as compiled loops leave them, and of the values of scalar costs."""
@@ -571,18 +587,6 @@ class CompiledProblem:
                 columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
                 self._hessian = pattern, self.normal.positions(pattern.indices, columns)
         return self._hessian
-
-
-def _placed(program: CompiledProblem) -> dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]]:
-    """Positions of gradient and Hessian blocks of scalar costs."""
-    places = {}
-    for term in program.scalar_terms:
-        full = np.concatenate(term.columns, axis=1)
-        mapped = program.columns.unknown[full]
-        keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
-        factor, a, b = np.nonzero(keep)
-        places[term] = full, factor, a, b, program.normal.positions(mapped[factor, a], mapped[factor, b])
-    return places
 
 
 def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:

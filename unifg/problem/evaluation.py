@@ -461,12 +461,6 @@ def add_constraints(terms: TermArrays, constraint_jacobian: Array, weights: Arra
         if term[KIND] == COST:
             continue
         m, width, row, entry, start = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[POSITION]
-        if term[KIND] == BOUND:
-            for i in range(term[COUNT]):
-                if positions[start + i] >= 0:
-                    slope = constraint_jacobian[entry + i]
-                    hessian[positions[start + i]] += weights[row + i] * slope * slope
-            continue
         for _ in range(term[COUNT]):
             for _ in range(m):
                 w, at = weights[row], start
@@ -520,10 +514,6 @@ def transposed_times(terms: TermArrays, costs: bool, entries: Array, other: Arra
         if (term[KIND] == COST) != costs:
             continue
         m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
-        if term[KIND] == BOUND:
-            for i in range(term[COUNT]):
-                out[columns[column + i]] += other[row + i] * entries[entry + i]
-            continue
         for _ in range(term[COUNT]):
             for _ in range(m):
                 scale = other[row]
