@@ -20,7 +20,7 @@ from unifg.models import unicycle
 from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution import solver
-from unifg.solvers import AugmentedLagrangian, GaussNewton, augmented_step, augmented_usual
+from unifg.solvers import AugmentedLagrangian, GaussNewton, augmented_step
 from unifg.typing import Array
 
 HORIZON = 50
@@ -30,7 +30,6 @@ REPEATS = 20  # of a compiled pass inside one timed call
 WATCHED: dict[str, tuple[Any, str]] = {
     "linearise": (evaluation, "linearize"),
     "evaluate": (evaluation, "evaluate"),
-    "usual iteration": (augmented_usual, "usual_iteration"),
     "primal step": (augmented_step, "minimize"),
     "eliminate": (fronts, "factor"),
     "substitute": (substitution, "solve"),
@@ -122,7 +121,6 @@ def eliminations(run: fg.Prepared, guess: fg.Guess) -> float:
 
     interpreted = getattr(augmented_step.minimize, "py_func")  # noqa: B009 - an attribute of the compiled function
     with (
-        mock.patch.object(augmented_usual.UsualPrimal, "take", lambda *given: None),
         mock.patch.object(augmented_step, "minimize", interpreted),
         mock.patch.object(augmented_step, "factor", counting),
         mock.patch.object(fronts, "factor", counting),
@@ -178,9 +176,7 @@ def render(result: Result) -> str:
     parts = {part: partial(_microseconds, part=part) for part in rows[0]["parts"]}
     notes = (
         f"Horizon {rows[0]['horizon']}, from the cold guess; an iteration is a solve over its iterations, {REPEATS} "
-        "solves in a row. A usual iteration of the augmented Lagrangian is one compiled call: second derivatives, the "
-        "model's assemblies, eliminations and products, the trial with its derivatives, and the multipliers. How many "
-        "eliminations it takes is counted in a run of its own."
+        "solves in a row. How many eliminations a primal step takes is counted in a run of its own."
     )
     tables = listing(("chain",), groups, COLUMNS), listing(("chain",), split, parts)
     return "\n\n".join([tables[0], "Where an iteration goes [us]:", tables[1], notes])

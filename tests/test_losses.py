@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from unifg.modeling.terms import Cost
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.solvers import InteriorPoint
-from unifg.solvers.augmented_usual import UsualPrimal
 from unifg.solvers.names import CONSTRAINED, EQUALITIES, LEAST_SQUARES, backend
 from unifg.typing import Array
 
@@ -234,29 +232,3 @@ def test_masks_come_and_go_with_data() -> None:
         both = run.solve({x: [[0.1]]})[x][0, 0]
         np.testing.assert_allclose(found, [both, 0.0, 0.5], atol=1e-7, err_msg=str(loss))
         assert 0.0 < both < 0.5
-
-
-def test_the_usual_iteration_of_the_augmented_lagrangian_knows_losses(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In one compiled call or from Python, with or without second derivatives: the same iterates."""
-    usual, taken = UsualPrimal.take, []
-
-    def take(primal: UsualPrimal, *given: Any) -> Any:
-        found = usual(primal, *given)
-        taken.append(found is not None)
-        return found
-
-    for loss in LOSSES:
-        for hessian in ("exact", "gauss-newton"):
-            runs = []
-            for way in (take, lambda *_: None):
-                monkeypatch.setattr(UsualPrimal, "take", way)
-                graph, guess, _ = poses(loss, True)
-                graph.bound(graph.families["shared"], lower=-0.3, upper=0.3)
-                runs.append(backend("alm", hessian=hessian).solve(graph, guess))
-            assert any(taken), loss
-            taken.clear()
-            mine, other = ([row.cost for row in run.history] for run in runs)
-            np.testing.assert_allclose(mine, other, rtol=1e-9, err_msg=str(loss))
-            for name in ("weights", "squares"):
-                one, two = (getattr(run._lin, name) for run in runs)
-                np.testing.assert_allclose(one, two, rtol=1e-6, atol=1e-9)

@@ -277,7 +277,7 @@ class CompiledProblem:
             Reasons by the names of these terms.
         """
         found: dict[str, str] = {}
-        step = np.random.default_rng(seed).uniform(-1.0, 1.0, self.size)
+        step = np.random.default_rng(seed).uniform(-1.0, 1.0, self.size) if slopes else np.ones(self.size)
         direction = np.zeros(self.columns.width)
         direction[self.columns.free] = step
         moved: dict[float, Values] = {}
@@ -298,16 +298,13 @@ class CompiledProblem:
         return found
 
     def watch_conditions(self) -> None:
-        """Compile the comparisons of traces, for :meth:`conditions_changed` in a loop."""
+        """Compile the comparisons of traces, for :meth:`new_branches` in a loop."""
         self._watching = True
         self.renew_verifications()
 
-    def conditions_changed(self, values: Values) -> bool:
-        """Test whether comparisons of watched traces come out otherwise than when this was last asked."""
-        changed = False
-        for watcher in self._watchers:
-            changed |= watcher.conditions_changed(values)
-        return changed
+    def new_branches(self, values: Values, verified: bool) -> bool:
+        """Test whether comparisons in watched traces come out as at no verified answer; ``verified``: this is one."""
+        return any([watcher.new_branches(values, verified) for watcher in self._watchers])
 
     def renew_verifications(self) -> None:
         """Keep what verifies the present traces."""
