@@ -28,6 +28,7 @@ from unifg.problem import evaluation
 from unifg.problem.binding import Binding
 from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
+from unifg.problem.evaluation import LinearArrays
 from unifg.problem.guess import GuessReader
 from unifg.problem.limits import outside
 from unifg.problem.linearization import Evaluation, Linearization, Rows
@@ -390,20 +391,19 @@ class CompiledProblem:
                     self.rows_of(term, residual, constraints)[:] = term.residual(values)
                     self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
                 self.python_seconds += perf_counter() - began
-            given = (
-                table.arrays, values.flat, search, residual, jacobian, constraints, constraint_jacobian, squares,
-                weights,
-            )  # fmt: skip
+            out = LinearArrays(
+                residual, jacobian, constraints, constraint_jacobian, squares, weights, size, gradient, hessian
+            )
             if shares is not None:
-                cost = _linearize_at_once(shares, given, size, gradient, room)
+                cost = _linearize_at_once(shares, table.arrays, values.flat, search, out._replace(hessian=room))
             else:
                 gradient[:], hessian[:] = 0.0, 0.0
-                cost = evaluation.linearize(*given, size, gradient, hessian, self.scratch)
+                cost = evaluation.linearize(table.arrays, values.flat, search, out, self.scratch)
             if table.weighed:
                 for loss, part in table.weighed:
                     weights[part] = loss.weight(squares[part])
                     cost += 0.5 * float(loss.value(squares[part]).sum())
-                evaluation.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
+                evaluation.weigh(table.arrays, out)
             if self.scalar_terms:
                 cost += self._add_scalars(values, found, gradient, hessian, concavity, rounding)
         norms, scalars = self.norms(size, found), self.by_scalar(found)
@@ -592,13 +592,13 @@ def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
     return [slice(start, end) for start, end in pairwise(ends)]
 
 
-def _linearize_at_once(shares: Shares, given: tuple[Any, ...], size: Array, gradient: Array, hessian: Array) -> float:
+def _linearize_at_once(shares: Shares, terms: TermArrays, values: Array, search: bool, out: LinearArrays) -> float:
     """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
     counters = np.zeros(6, np.int64)
-    terms, *rest = given
-    into = shares.costs, shares.norms, gradient, hessian, shares.slopes, shares.contested, shares.scratch
-    share(_entrance(), (terms._replace(positions=shares.positions), *rest, *into, counters.ctypes.data))
-    size[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
+    own = shares.costs, shares.norms, shares.slopes, shares.contested, shares.scratch
+    given = terms._replace(positions=shares.positions), values, search, out
+    share(_entrance(), (*given, *own, counters.ctypes.data))
+    out.norms[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
     return float(shares.costs.sum())
 
 
