@@ -431,4 +431,4 @@ _TURNED = {
     2: np.array([[[0.0, 1.0]], [[-1.0, 0.0]]]),
     3: np.array([[np.cross(r, t) for r in np.eye(3)] for t in np.eye(3)]),
 }
-"""What a turn r makes of a translation t, r x t: axes of t, axes of r, coordinates."""
+"""Products r x t of a turn r and a translation t: axes of t, axes of r, coordinates."""
