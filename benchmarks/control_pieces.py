@@ -45,8 +45,12 @@ def measure(problem: Problem) -> dict[str, float]:
     squares, weights, gradient = lin.squares.copy(), lin.weights.copy(), lin.gradient.copy()
     calls: dict[str, Callable[[], object]] = {
         "linearise *": lambda: evaluation.linearize(
-            program.arrays, lin.values.flat, False, lin.residual, lin.jacobian, lin.constraints,
-            lin.constraint_jacobian, squares, weights, norms, gradient, entries, program.scratch,
+            program.arrays, lin.values.flat, False,
+            evaluation.LinearArrays(
+                lin.residual, lin.jacobian, lin.constraints, lin.constraint_jacobian, squares, weights, norms, gradient,
+                entries,
+            ),
+            program.scratch,
         ),
         "second derivatives *": lambda: add_curvature(
             program.arrays, lin.values.flat, lin.residual, lin.weights, work.multipliers, entries

@@ -20,6 +20,17 @@ from unifg.solvers.names import CONSTRAINED, EQUALITIES, LEAST_SQUARES, backend
 from unifg.typing import Array
 
 K = 1.3
+
+
+def surrogate(mu: float) -> Callable[[complex], complex]:
+    """Truncated least squares on the way to it, as the paper states them."""
+    least, most = K**2 * mu / (mu + 1), K**2 * (mu + 1) / mu
+    return lambda s: (
+        s if s.real <= least else K**2 + 0 * s if s.real >= most
+        else 2 * K * (s * mu * (mu + 1)) ** 0.5 - mu * (K**2 + s)
+    )  # fmt: skip
+
+
 # rho(s) as the papers state them, of a complex number whose imaginary part is infinitesimal.
 PUBLISHED: dict[Loss, Callable[[complex], complex]] = {
     fg.Huber(K): lambda s: s if s.real <= K**2 else 2.0 * K * s**0.5 - K**2,
@@ -28,11 +39,9 @@ PUBLISHED: dict[Loss, Callable[[complex], complex]] = {
     fg.DCS(K): lambda s: s if s.real <= K else 4 * K * s / (K + s) - K,
     fg.GemanMcClure(K, mu=2.0): lambda s: 2 * K**2 * s / (2 * K**2 + s),
     fg.TruncatedLeastSquares(K): lambda s: s if s.real <= K**2 else K**2 + 0 * s,
-    fg.TruncatedLeastSquares(K, 0.5): lambda s: (
-        s if s.real <= K**2 / 3 else K**2 + 0 * s if s.real >= 3 * K**2
-        else 2 * K * (s * 0.75) ** 0.5 - 0.5 * (K**2 + s)
-    ),
-}  # fmt: skip
+    fg.TruncatedLeastSquares(K, 0.5): surrogate(0.5),
+}
+SURROGATES = {fg.TruncatedLeastSquares(K, mu): surrogate(mu) for mu in (1e-5, 1.0, 50.0)}
 LOSSES = list(PUBLISHED)
 HALF = fg.Reweighted(lambda s: np.where(s < 4.0, 1.0, 0.5))
 
@@ -98,11 +107,13 @@ def poses(loss: Loss, compiled: bool) -> tuple[fg.Graph, dict[fg.Family, Array],
     return graph, guess, active
 
 
-@pytest.mark.parametrize("loss", LOSSES, ids=repr)
+@pytest.mark.parametrize("loss", PUBLISHED | SURROGATES, ids=repr)
 def test_formulas_are_those_of_the_papers(loss: Formula) -> None:
-    form, rho = form_of(loss), PUBLISHED[loss]
+    form, rho = form_of(loss), (PUBLISHED | SURROGATES)[loss]
     assert form is not None
-    for s in [0.02, 0.3, 0.9, 1.4, 2.0, 3.0, 6.0, 8.0, 70.0, 1e5]:
+    numbers = [0.02, 0.3, 0.9, 1.4, 2.0, 3.0, 6.0, 8.0, 70.0, 1e5]
+    assert np.all(np.diff(loss.value(np.array([0.0, *numbers]))) >= -1e-12) and loss.value(np.zeros(1))[0] == 0.0
+    for s in numbers:
         np.testing.assert_allclose(loss.value(np.array([s]))[0], rho(complex(s)).real, rtol=1e-12)
         np.testing.assert_allclose(loss.weight(np.array([s]))[0], slope(rho, s), rtol=1e-9, atol=1e-13)
         h = 1e-5 * s

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
 
-from unifg.factors.autodiff.expression import Expression, generating, traced
+from unifg.factors.autodiff.expression import Expression, generating
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.kernel import Kernel
 
 
