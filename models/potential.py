@@ -21,6 +21,7 @@ where it was; "aside" pushes all its poses to the side on which they are.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Literal, TypeAlias
 
@@ -28,7 +29,7 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
-from unifg.factors.residuals import Residual, residual
+from unifg.factors.residuals import Residual
 from unifg.models.profile import of_distance
 from unifg.typing import Array
 
@@ -112,6 +113,4 @@ def potential(
         )
     push, name = partial(_push, scale, near, far), f"{distance.name} potential"
     true = of_distance(distance, _repulsion, [scale, near, far], name, push)
-    if vortex == 0.0:
-        return true
-    return residual(true.function, true.jacobian, true.name, _Search(true, vortex, sense == "aside"))
+    return true if vortex == 0.0 else replace(true, search=_Search(true, vortex, sense == "aside"))

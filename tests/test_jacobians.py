@@ -352,7 +352,7 @@ def test_models_are_kernels_unless_their_functions_are_batched() -> None:
     batched = {"rkmk.trapezoid", "rkmk.trapezoid, simplified", "rkmk.trapezoid, pose and velocity"}
     batched |= {"rkmk.integrator", "rkmk.trapezoid, quadrotor"}
     batched |= {f"{robot}.dynamics" for robot in ("bicycle", "cart_pole", "manipulator")}
-    assert models - set(KERNELS) == batched | EXEMPT_SEARCH
+    assert models - set(KERNELS) == batched
 
 
 @pytest.mark.parametrize("name", KERNELS)

@@ -263,6 +263,6 @@ def test_tables_are_read_in_batches() -> None:
     graph.minimize(fg.residual(lambda x: first(x) + second(x), derivatives="trace"), x)
     program = graph.compile()
     assert program.terms[0].route.startswith("traced")
-    lin = program.linearize({x: [[0.5], [1.5], [2.5]]})
+    lin = program.linearize({x: np.array([[0.5], [1.5], [2.5]])})
     np.testing.assert_allclose(lin.residual, [5.5, 33.0, 110.0])
     np.testing.assert_allclose(lin.jacobian, [11.0, 22.0, 44.0])

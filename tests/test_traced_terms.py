@@ -727,7 +727,7 @@ def _early(x: Array) -> Array:
 
 box = types.ModuleType("box")
 GAINS = Gains()
-Copied = list | dict | tuple | types.SimpleNamespace | np.ndarray
+Copied = list[Any] | dict[str, Any] | tuple[Any, ...] | types.SimpleNamespace | np.ndarray
 
 
 def _again(x: Array, gain: float = 2.0) -> Array:
