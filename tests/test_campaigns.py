@@ -23,13 +23,12 @@ from unifg.scenarios import command
 from unifg.scenarios.campaigns import campaign as campaigns
 from unifg.scenarios.campaigns import performed
 from unifg.scenarios.campaigns.campaign import Campaign, run_campaign
-from unifg.scenarios.campaigns.dispatch import finished
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import Order, WrongLibrary, perform
 from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Statement, read, spawned, stated
 from unifg.scenarios.episode import silent
-from unifg.scenarios.workers import Inline, WorkerDied, WorkerNotStarted, Workers
+from unifg.scenarios.workers import Workers, finished
 
 WALKS = "problems.short_walks"
 TESTS = Path(__file__).resolve().parent
@@ -379,7 +378,7 @@ class Watched(Executor):
             self.waiting -= 1
             if self.deaths:
                 self.deaths -= 1
-                raise WorkerDied("worker 7 ended by signal 9")
+                raise BrokenExecutor("worker 7 ended by signal 9")
             return fn(*args, **kwargs)
 
         return self.pool.submit(later)
@@ -405,7 +404,7 @@ def test_what_a_dead_worker_did_is_done_once_more() -> None:
     found = list(finished(Watched(deaths=1), abs, [-1, -2], lambda: 1))
     assert [(job, future.result()) for job, future in found] == [(-1, 1), (-2, 2)]
     (_, future), (_, other) = finished(Watched(deaths=2), abs, [-1, -2], lambda: 1)
-    assert isinstance(future.exception(), WorkerDied) and other.result() == 2
+    assert isinstance(future.exception(), BrokenExecutor) and other.result() == 2
     with pytest.raises(ScenarioError, match="takes no more jobs"):
         list(finished(Watched(broken=True), abs, [1], lambda: 1))
 
@@ -468,22 +467,15 @@ def test_workers_are_processes_of_one_thread_that_are_replaced(tmp_path: Path) -
     assert by["die once"]["worker"] != by["threads"]["worker"]
 
 
-def test_workers_that_cannot_start_are_no_lost_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    from unifg.scenarios import workers as room
+def dies() -> None:
+    os._exit(3)
 
-    starts = list[int]()
 
-    def dead(ready: object) -> None:
-        starts.append(1)
-        raise WorkerDied("worker 5 ended with status 1")
-
-    monkeypatch.setattr(room, "_Worker", dead)
-    with Workers(1) as executor, pytest.raises(WorkerNotStarted, match="no worker can be started: worker 5"):
-        executor.submit(abs, 1).result()
-    assert len(starts) == room.STARTS
+def test_workers_that_cannot_start_are_no_lost_episodes() -> None:
+    with pytest.raises(ScenarioError, match="no worker can be started"):
+        Workers(1, dies)
     with pytest.raises(ScenarioError, match="at least one worker"):
         Workers(0)
-    assert isinstance(Inline().submit(int, "x").exception(), ValueError)
 
 
 KILLED = """

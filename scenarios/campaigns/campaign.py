@@ -16,14 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.cluster import cluster
-from unifg.scenarios.campaigns.dispatch import died, finished
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK, Order, lost, perform
 from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Statement, module_of, read
 from unifg.scenarios.episode import Progress, silent
-from unifg.scenarios.workers import Workers
+from unifg.scenarios.workers import Workers, cluster, died, finished
 
 __all__ = [
     "EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "manifest_of", "replay_command", "run_campaign",
@@ -120,7 +118,7 @@ def run_campaign(
                     error = future.exception()
                     if isinstance(error, ScenarioError):  # of the workers: every other episode would say the same
                         raise error
-                    if error is not None and not died(error):
+                    if error is not None and not died(future):
                         raise ScenarioError(f"an episode cannot be handed to a worker: {error!r}") from error
                     text = lost(order, f"the worker died, twice: {error}") if error is not None else future.result()
                     journal.add(text)
