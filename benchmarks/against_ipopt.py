@@ -1,12 +1,10 @@
 """Bazzana's Table III: one instance of the control problem after the other, his loop and others beside IPOPT.
 
-    python -m benchmarks.against_ipopt [--rounds 15]
-
 The paper gives six initial costs, six final ones, iterations and times, and neither goals nor weights, horizon, map or
 guess. What is known is kept: the costs of eq. 8 to 11 (soft dynamics, potential field with his k, mu, rho), limits of
 1, his stop test, a guess along a straight path. Such a guess fits every cost but the first step of the dynamics, where
 the robot faces elsewhere, so that an initial cost is in effect a bearing of the goal: here it is chosen so that each
-initial cost is the paper's. The hard form has the dynamics and the clearance as constraints. Writes docs/ipopt.md.
+initial cost is the paper's. The hard form has the dynamics and the clearance as constraints.
 """
 
 from __future__ import annotations
@@ -24,8 +22,9 @@ import unifg as fg
 from benchmarks.compiled_peers import COMPILER
 from benchmarks.compiled_peers import compiled as in_machine_code
 from benchmarks.printed import numbers
-from benchmarks.report import command, machine, publish, table, words
-from benchmarks.timing import interleave, number, pin
+from benchmarks.report import table, words
+from benchmarks.runner import Timing
+from benchmarks.timing import interleave, number
 from unifg.models import obstacles, potential, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
@@ -382,7 +381,6 @@ def report(rounds: int) -> str:
     """Everything as Markdown."""
     angles = ", ".join(f"{np.degrees(angle):.0f}" for angle in bearings())
     parts = [
-        machine("numpy", "numba", "casadi"),
         f"Six goals, {angles} degrees off the robot's heading. Costs are the paper's, without one half. Times are "
         f"processor times, medians over {rounds} rounds in which all solvers take turns.",
         "### His form",
@@ -400,16 +398,4 @@ def report(rounds: int) -> str:
     return "\n\n".join(parts)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure and write."""
-    parser = command(__doc__)
-    parser.add_argument("--rounds", type=int, default=15, help="solves behind every time (default: %(default)s)")
-    parser.add_argument("--no-docs", action="store_true", help="leave the page in docs/ alone")
-    chosen = parser.parse_args(arguments)
-    pin()
-    publish("ipopt", report(chosen.rounds), docs=not chosen.no_docs)
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Timing(report)

@@ -1,12 +1,9 @@
-"""Bazzana's path lengths and durations again, on maps with legs as long as his. Writes docs/experiments.md.
-
-    python -m benchmarks.experiments [--runs N] [--campaigns NAME ...] [--couplings NAME ...] [--workers K] [--report]
-        [--any-code]
+"""Bazzana's path lengths and durations, on maps with legs as long as his.
 
 The campaigns are benchmarks/campaigns/department.toml (his Table I) and factory.toml (Table II), and for the same legs
-with other planners department-others.toml and factory-others.toml. What is on file in out/benchmarks/campaigns or kept
-in benchmarks/campaigns/rows is not repeated; all of it is on the page, and kept. Thirty runs a leg with two couplings
-take some two hours of one core, those of the four other planners some six.
+with other planners department-others.toml and factory-others.toml. Drives on file in out/benchmarks/campaigns or kept
+in benchmarks/campaigns/rows are not repeated. Thirty runs a leg with two couplings take some two hours of one core,
+those of the four other planners some six.
 """
 
 from __future__ import annotations
@@ -21,15 +18,14 @@ import numpy as np
 
 from benchmarks.comparison import interval, share
 from benchmarks.kept_rows import ROWS, keep, restore
-from benchmarks.large_maps import CAMPAIGNS
 from benchmarks.printed import numbers, pairs
-from benchmarks.report import OUT, command, machine, publish, table
+from benchmarks.report import CAMPAIGNS, OUT, table
+from benchmarks.runner import Timing
 from unifg.scenarios.campaigns.account import PAIRED, differences
 from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, replay_command, run_campaign, write_manifest
 from unifg.scenarios.campaigns.performed import OK
 from unifg.scenarios.campaigns.sheet import Combination, Sheet, load
-from unifg.scenarios.campaigns.statement import Statement, read
-from unifg.scenarios.ground.drive_pilot import COUPLINGS
+from unifg.scenarios.campaigns.statement import read
 from unifg.typing import Array
 
 RUNS = 30
@@ -74,7 +70,6 @@ def rendered(sheets: Mapping[str, Sheet]) -> str:
     if len({drive.planner for drive in drives}) > 1:
         parts += ["### The same legs with other planners", beside(drives), leg_by_leg(drives)]
         parts += [part for name, sheet in sheets.items() if name not in PAPER for part in _failed(sheet)]
-    parts.append(machine("numpy", "scipy", "osqp", "piqp", "pymunk"))
     return "\n\n".join(parts)
 
 
@@ -287,43 +282,18 @@ def together(sheets: Sequence[Sheet]) -> str:
     return " ".join(say)
 
 
-def _some(statement: Statement, runs: int, couplings: Sequence[str]) -> Statement:
-    """The first runs of a campaign, with some couplings."""
-    axes = [
-        replace(axis, values={label: axis.values[label] for label in axis.values if label in couplings})
-        if axis.name == "coupling" else axis
-        for axis in statement.axes
-    ]  # fmt: skip
-    return replace(statement, seeds=statement.seeds[:runs], axes=tuple(axes))
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Drive what is missing, then write the page."""
-    parser = command(__doc__)
-    parser.add_argument("--runs", type=int, default=RUNS, help="of each leg and coupling; the page says how many")
-    parser.add_argument("--campaigns", nargs="+", choices=CAMPAIGN_NAMES, default=CAMPAIGN_NAMES, help="to go on with")
-    parser.add_argument("--couplings", nargs="+", choices=COUPLINGS, default=COUPLINGS, help="of this library's drives")
-    parser.add_argument("--workers", type=int, default=1, help="processes; times are those of one alone")
-    parser.add_argument("--report", action="store_true", help="run nothing, write the tables from what is on file")
-    parser.add_argument("--any-code", action="store_true", help="drives of earlier states of the code count, too")
-    options = parser.parse_args(arguments)
+def tables(runs: int) -> str:
+    """Drive what is missing of the first runs of all campaigns; the tables of all drives on file."""
     sheets = {}
     for name in CAMPAIGN_NAMES:
         folder, archive = OUT / "campaigns" / name, ROWS / f"{name}.jsonl.xz"
-        store = folder / EPISODES
         whole = read(CAMPAIGNS / f"{name}.toml")
-        restore(archive, store)
-        if not options.report and name in options.campaigns:
-            couplings = options.couplings if name in PAPER else COUPLINGS
-            some = _some(whole, options.runs, couplings)
-            run_campaign(some, folder, workers=options.workers, any_code=options.any_code)
-            keep(store, archive)
-        if folder.is_dir():
-            write_manifest(folder, whole, code_of_scenario("navigation"))  # not of this command's part alone
-            sheets[name] = load(folder, options.any_code, failed_too=True)
-    publish("experiments", rendered(sheets))
-    return 0
+        restore(archive, folder / EPISODES)
+        run_campaign(replace(whole, seeds=whole.seeds[:runs]), folder, any_code=True)
+        keep(folder / EPISODES, archive)
+        write_manifest(folder, whole, code_of_scenario("navigation"))  # not of the first runs alone
+        sheets[name] = load(folder, any_code=True, failed_too=True)
+    return rendered(sheets)
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Timing(tables, RUNS)

@@ -1,11 +1,9 @@
 """The localisation graph beside an adaptive Monte Carlo localiser, on the same scans and wheels.
 
-    python -m benchmarks.localisation [--seeds 200:204] [--workers K] [--fresh] [--report]
-
 A drive through the building (:mod:`benchmarks.routes`) is recorded once per seed; both localisers are given its scans
 and its odometry, so they differ in nothing else. Then the same with a wrong start, a start that is not known at all, a
 robot that is carried elsewhere, and a map on which furniture has been moved. The real log (``$UNIFG_DATA`` or
-``../shared/data``) is localised on a map of the other half of its scans. Writes docs/localisation.md.
+``../shared/data``) is localised on a map of the other half of its scans.
 """
 
 from __future__ import annotations
@@ -19,11 +17,11 @@ from typing import TypeAlias
 import numpy as np
 from scipy import ndimage
 
-from benchmarks import runs
-from benchmarks.comparison import Row, interval, where
+from benchmarks.comparison import Row, difference, where
 from benchmarks.printed import texts
-from benchmarks.report import command, listing, machine, publish, shared
+from benchmarks.report import listing, shared
 from benchmarks.routes import drawn
+from benchmarks.runner import Study
 from unifg.files.carmen import read_carmen
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2, wrap_angle
@@ -311,7 +309,6 @@ def render(rows: Sequence[Row]) -> str:
         ),
     }
     parts = [
-        machine("numpy", "scipy", "pymunk"),
         listing(["condition", "localiser"], groups, columns),
         "Errors are over all ticks of a drive, their mean and standard deviation averaged over drives; *worst* is of "
         f"all of them. A localiser knows where the robot is when it is nearer than {FOUND:g} m, and *since* is the "
@@ -334,24 +331,13 @@ def paired(drives: Sequence[Row]) -> str:
             continue
         for name, unit, scale in (("m", "mm", 1e3), ("rad", "mrad", 1e3)):
             apart = scale * np.array([graph[name] - other[name] for graph, other in both])
-            low, high = interval(apart)
-            said.append(
-                f"{condition}: graph less AMCL with all beams {apart.mean():+.1f} {unit} ({low:+.1f} .. {high:+.1f})."
-            )
+            said.append(f"{condition}: graph less AMCL with all beams {difference(apart)} {unit}.")
     return " ".join(said)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure and write."""
-    parser = command(__doc__)
-    parser.add_argument("--seeds", type=runs.seeds, default=SEEDS, help="recordings (default: 200:204)")
-    runs.options(parser)
-    chosen = parser.parse_args(arguments)
-    jobs = [Drive(seed) for seed in chosen.seeds] + [Drive(-1)]
-    rows = runs.episodes("localisation", measure, jobs, chosen)
-    publish("localisation", render(rows), {row["code"] for row in rows})
-    return 0
+def cells(seeds: Sequence[int]) -> list[Drive]:
+    """Recordings, and the real log."""
+    return [*map(Drive, seeds), Drive(-1)]
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cells, measure, render, range(200, 204))

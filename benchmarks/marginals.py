@@ -17,7 +17,7 @@ from benchmarks import pose_graphs
 from benchmarks.gtsam_peer import ANCHOR, Peer, available, joint
 from benchmarks.report import listing
 from benchmarks.section import Result, goal
-from benchmarks.timing import interleave, milliseconds, shown, spread
+from benchmarks.timing import interleave, milliseconds, ratio, shown
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solvers import GaussNewton
@@ -56,26 +56,26 @@ def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
     found: dict[str, Any] = {}
 
     def every() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         found["blocks"] = Tree(program, solution).blocks().reshape(count, dim, dim)
-        return time.perf_counter() - begin
+        return time.process_time() - begin
 
     def from_tree() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         found["joint"] = np.array([tree.factorization.inverse_block(scalars[pair].ravel()) for pair in pairs])
-        return (time.perf_counter() - begin) / len(pairs)
+        return (time.process_time() - begin) / len(pairs)
 
     def by_name() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         found["named"] = np.array([solution.covariance(x[pair]) for pair in pairs])
-        return (time.perf_counter() - begin) / len(pairs)
+        return (time.process_time() - begin) / len(pairs)
 
     others = rng.integers(0, count - 1, MANY)
 
     def of_candidates() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         found["candidates"] = solution.pair_covariances(x[-1], x[others])
-        return (time.perf_counter() - begin) / MANY
+        return (time.process_time() - begin) / MANY
 
     candidates: dict[str, Callable[[], float]] = {"all": every, "tree": from_tree}
     result: Result = {"name": case.name, "poses": count, "named": None, "difference": None, "refused": ""}
@@ -110,10 +110,10 @@ def _compared(
     blocks: dict[str, Array] = {}
 
     def theirs() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         marginals = peer.marginals(poses)
         blocks["own"] = np.array([marginals.marginalCovariance(k) for k in range(count)])
-        return time.perf_counter() - begin
+        return time.process_time() - begin
 
     times = interleave({"all": every, "gtsam": theirs}, rounds, warm=0, slow=SLOW)
     derivatives = lin.jacobian[: edges * 2 * dim * dim].reshape(edges, dim, 2 * dim)
@@ -123,7 +123,7 @@ def _compared(
     both = np.array([joint(marginals, first, second) for first, second in pairs.tolist()])
     return {
         "gtsam": milliseconds(times["gtsam"]),
-        "ratio": spread(times["gtsam"] / times["all"][: len(times["gtsam"])]),
+        "ratio": ratio(times["gtsam"], times["all"]),
         "difference": _largest(found["blocks"][chosen], single),
         "joint difference": _largest(found["joint"], both),
         "with its own": _largest(found["blocks"], np.array([peer.ours(block) for block in blocks["own"]])),

@@ -120,7 +120,7 @@ def cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
 
     def capacity() -> int:
         try:
-            return 2 * sum(client.nthreads().values())
+            return 2 * int(sum(client.nthreads().values()))
         except (OSError, ValueError, RuntimeError) as error:
             raise ScenarioError(
                 f"the scheduler at {address} is gone ({error}); what ended before is kept: start again"
@@ -134,8 +134,8 @@ def cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
 
 def died(future: Future[Any]) -> bool:
     """Test whether the worker of a finished job died; the error then says nothing about the job itself."""
-    error, distributed = future.exception(), sys.modules.get("distributed")
-    return isinstance(error, BrokenExecutor) or (distributed is not None and isinstance(error, distributed.KilledWorker))
+    error, cluster = future.exception(), sys.modules.get("distributed")
+    return isinstance(error, BrokenExecutor) or (cluster is not None and isinstance(error, cluster.KilledWorker))
 
 
 def finished(

@@ -26,7 +26,7 @@ def test_control_case(solver: str, problem: Problem) -> None:
 
 @pytest.mark.parametrize(("instance", "best"), [("ahead", 580.25905), ("goto", 3387.08409)])
 def test_a_better_optimum_than_that_of_ipopt_is_listed(instance: str, best: float) -> None:
-    """IPOPT ends at the first of the list; it stays where it is started at the others (docs/reference-problems.md)."""
+    """IPOPT ends at the first of the list; it stays where it is started at the others (tests/problems/control.py)."""
     problem = next(p for p in blocked() if (p.instance, p.horizon) == (instance, 50))
     assert min(problem.optima) == best < problem.optima[0]
     stated = problem.formulation()

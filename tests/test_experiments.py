@@ -12,8 +12,8 @@ import pytest
 
 from benchmarks.experiments import beside, drivers, leg_by_leg, rendered
 from benchmarks.kept_rows import ROWS, keep, restore
-from benchmarks.large_maps import CAMPAIGNS
 from benchmarks.localisation import LOG, made, mapped, real_ticks, replayed
+from benchmarks.report import CAMPAIGNS
 from unifg.errors import ScenarioError
 from unifg.files.carmen import read_carmen
 from unifg.scenarios.campaigns.campaign import EPISODES

@@ -9,7 +9,7 @@ from judge import judge
 from problems.control import Unicycle, sixteen
 from unifg.solvers.names import backends
 
-# Minima that are not listed, at which IPOPT stays when it is started there (docs/reference-problems.md).
+# Minima that are not listed, at which IPOPT stays when it is started there.
 CONFIRMED = {("ahead", True, 20): (586.14768,), ("ahead", True, 50): (580.25905,)}
 SOLVERS = backends("alm", "sqp", "ipm", tolerance=1e-5)
 

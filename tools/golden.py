@@ -28,7 +28,7 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks import control_starts, ecg2o, incremental, pose_graphs
+from benchmarks import control_cases, ecg2o, incremental, pose_graphs
 from benchmarks.navigation import CASES, Drive
 from benchmarks.report import OUT
 from problems import collection
@@ -167,8 +167,8 @@ def of_starts() -> Rows:
     """The control cases with obstacles, from random starts."""
     for problem in blocked():
         stated = problem.formulation()
-        runs = {name: solver.prepare(stated.graph) for name, solver in control_starts.SOLVERS.items()}
-        for k, (states, controls) in enumerate(problem.starts(control_starts.STARTS)):
+        runs = {name: solver.prepare(stated.graph) for name, solver in control_cases.SOLVERS.items()}
+        for k, (states, controls) in enumerate(problem.starts(control_cases.STARTS)):
             guess = fg.Guess({stated.x: states, stated.u: controls})
             for name, run in runs.items():
                 yield f"{problem.title}, {name}, start {k}", partial(started, run, guess)

@@ -1,4 +1,4 @@
-"""Draw the picture of docs/ipopt.md: ``python -m docs.images.draw_ipopt``."""
+"""Draw the picture of docs/results/bazzana.md: ``python -m docs.images.draw_ipopt``."""
 
 from __future__ import annotations
 
