@@ -250,7 +250,7 @@ QUASI_NEWTON: dict[str, Any] = {"hessian_approximation": "limited-memory", "max_
 
 
 def contestants(hard: bool) -> dict[str, Callable[[], Contestant]]:
-    """Who solves one form of the problem from the cold guess."""
+    """Contestants for one form of the problem, from the cold guess."""
     both: dict[str, Callable[[], Contestant]] = {
         "literal loop": lambda: Ours(AugmentedLagrangian(schedule="bazzana", **LOOP)),
         "literal loop, damped": lambda: Ours(AugmentedLagrangian(schedule="bazzana-damped", **LOOP)),
@@ -343,7 +343,7 @@ def cold(hard: bool, rounds: int) -> str:
 
 
 def warm(rounds: int) -> str:
-    """What a tick of a control loop costs: the start has moved, everything else is known."""
+    """Tick of a control loop: the start has moved, everything else is known."""
     kinds: Mapping[str, tuple[Callable[[], Contestant], Callable[[], Contestant]]] = {
         "augmented Lagrangian": (lambda: Ours(AugmentedLagrangian(tolerance=STOP)),) * 2,
         "SQP": (lambda: Ours(SQP(tolerance=STOP)),) * 2,

@@ -30,7 +30,7 @@ def runnable(peers: tuple[str, ...] = PEERS) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Rules:
-    """How a page measures and judges.
+    """Rules of measuring and judging of a page.
 
     Attributes:
         tolerance: of every solver.
@@ -51,7 +51,7 @@ class Rules:
 
 @dataclass
 class Outcome:
-    """What one solver made of one problem.
+    """Result of one solver on one problem.
 
     Attributes:
         problem, solver: which.
@@ -83,11 +83,11 @@ class Outcome:
         return float(np.median(self.times))
 
     def good(self, rules: Rules) -> bool:
-        """Whether it is a KKT point to what counts as one."""
+        """True for a KKT point, to the tolerance of the rules."""
         return self.status == "converged" or self.kkt <= rules.good
 
     def verdict(self, rules: Rules) -> str:
-        """How the cost compares with the known optima."""
+        """Comparison of the cost with the known optima."""
         if not self.good(rules):
             return self.status
         relative = [self.cost / known - 1.0 for known in self.problem.optima]

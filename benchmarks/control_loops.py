@@ -49,7 +49,7 @@ def cases() -> list[Problem]:
 
 @dataclass
 class Drive:
-    """What one solver made of one drive.
+    """Result of one solver on one drive.
 
     Attributes:
         times: of the solves after the first [ms].
@@ -72,7 +72,7 @@ Row: TypeAlias = tuple[Problem, str, Drive]
 
 
 class Contestant(Protocol):
-    """Who drives: a backend of ours or a solver of casadi."""
+    """Driver of a loop: a backend of ours or a solver of casadi."""
 
     def control(self, state: Array, index: int) -> Tick:
         """Solve for one step, from what the last one ended with."""
@@ -84,7 +84,7 @@ class Contestant(Protocol):
 
 
 def contestant(problem: Problem, name: str) -> Contestant:
-    """By the name of the tables."""
+    """Contestant of a name in the tables."""
     short, _, how = name.partition(", ")
     if name in PEERS:
         from benchmarks.control_peers import WARM, ControlPeer

@@ -83,7 +83,7 @@ def gaps(path: Array, pillars: Array) -> Array:
 
 
 class Scans(NamedTuple):
-    """What was seen.
+    """Measurements of a drive.
 
     Attributes:
         sightings: (s, 2) places in the robot's axes [m].

@@ -38,7 +38,7 @@ Pair = tuple[float, float]
 
 @dataclass(frozen=True)
 class Reported:
-    """What the paper reports of a leg: path length [m] and duration [s], his and those of the ROS stack."""
+    """Figures of the paper for a leg: path length [m] and duration [s], his and those of the ROS stack."""
 
     length: Pair
     duration: Pair
@@ -99,13 +99,13 @@ class Driver:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """How many drives, and how many succeeded."""
+        """Number of drives, and of those that succeeded."""
         counts = self.sheet.counts(self.combination)
         return counts.total(), counts[OK]
 
 
 def drivers(sheet: Sheet, name: str) -> list[Driver]:
-    """Who has driven which leg of a campaign."""
+    """Planners and legs of a campaign."""
     found = []
     for combination in sheet.combinations:
         labels = dict(zip(sheet.axes, combination, strict=True))
@@ -247,7 +247,7 @@ def _failed(sheet: Sheet) -> list[str]:
 
 
 def together(sheets: Sequence[Sheet]) -> str:
-    """What the paper says of all legs together."""
+    """Sentences about all legs together, beside the paper's."""
     spreads: dict[str, list[float]] = {LENGTH: [], DURATION: []}
     simulated, drives, runs = 0.0, 0, Counter[int]()
     for sheet in sheets:

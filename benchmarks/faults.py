@@ -152,7 +152,7 @@ def render(rows: list[Row]) -> str:
 
 
 def _avoidable(braked: float | None) -> str:
-    """What the stopping set could have done, by the clearance it leaves [m]."""
+    """Words about the clearance that the stopping set leaves [m]."""
     if braked is None:
         return ""
     return f"; the stopping set keeps {braked:.2f} m" if braked > 0.0 else "; the stopping set touches as well"

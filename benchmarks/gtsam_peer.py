@@ -24,7 +24,7 @@ ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
 
 
 def available() -> bool:
-    """Whether gtsam is installed."""
+    """Test whether gtsam is installed."""
     return find_spec("gtsam") is not None
 
 

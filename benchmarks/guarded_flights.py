@@ -31,7 +31,7 @@ KEPT = 1e-3  # violation of constraints up to which an iterate is a plan
 
 @dataclass
 class Flight:
-    """What became of one.
+    """Record of one flight.
 
     Attributes:
         times: of the ticks [ms].
@@ -116,7 +116,7 @@ def flights(ticks: int) -> dict[tuple[str, str], Callable[[], Flight]]:
 
 @dataclass
 class Starts:
-    """What became of cold starts.
+    """Record of cold starts.
 
     Attributes:
         times: [ms].
@@ -152,7 +152,7 @@ def started(form: keeping.Form, weight: float | None, count: int) -> Starts:
 
 
 def worst(flight: Flight | Starts) -> str:
-    """How ticks ended that did not converge."""
+    """Endings of the ticks that did not converge."""
     ends = [f"{count} {name}" for name, count in flight.statuses.most_common() if name != "converged"]
     return ", ".join(ends) or "none"
 

@@ -157,7 +157,7 @@ CONTROLLERS: dict[str, dict[str, Any]] = {
 
 
 def horizons(seeds: int) -> str:
-    """What each controller reaches past cylinder and sphere, and what it costs."""
+    """Distances and times of each controller past cylinder and sphere."""
     chosen: dict[Kind, list[int]] = {"static": list(range(1, seeds + 1)), "ellipse": meeting(range(1, 10_000), seeds)}
     rows = []
     longest: dict[Kind, list[Flown]] = {}

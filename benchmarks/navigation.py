@@ -36,7 +36,7 @@ MEDIAN_MS, P99_MS, LEAST_TICKS, LEAST_HORIZON = 20.0, 60.0, 2000, 30
 
 @dataclass(frozen=True)
 class Case:
-    """Where to drive.
+    """Map, start and goals of a drive.
 
     Attributes:
         map: file among the shared maps, None for the shipped building.
@@ -58,7 +58,7 @@ class Case:
 
     @property
     def available(self) -> bool:
-        """Whether it can be driven here."""
+        """True if its map is here."""
         return self.map is None or (self.path is not None and self.path.is_file())
 
 
@@ -141,7 +141,7 @@ TIMED = {
 
 
 def kept(row: Row, sentence: str) -> bool:
-    """Whether a drive kept a limit; a refused one keeps none."""
+    """True for a drive that kept a limit; a refused one keeps none."""
     return "metrics" in row and LIMITS[sentence](row["metrics"])
 
 
@@ -172,7 +172,7 @@ def _drive_line(row: Row) -> list[str]:
 
 
 def verdicts(rows: list[Row]) -> str:
-    """Which limits were kept: of each drive by case, of the times by backend."""
+    """Limits that were kept: of each drive by case, of the times by backend."""
     lines = []
     for case in CASES:
         mine = [row for row in rows if row["case"] == case]
@@ -213,7 +213,7 @@ def times(rows: list[Row]) -> str:
 
 
 def statuses(rows: list[Row]) -> str:
-    """How the control solves ended."""
+    """Endings of the control solves."""
     words = {s: Counter(w for row in where(rows, solver=s) for w in row["status"]) for s in SOLVERS}
     names = sorted({name for counts in words.values() for name in counts})
     lines = [

@@ -78,7 +78,7 @@ class Attempt(Method):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one layout.
+    """Result on one layout.
 
     Attributes:
         status: of the solver.
@@ -106,12 +106,12 @@ class Outcome:
 
     @property
     def safe(self) -> bool:
-        """Whether it can be flown to the target without a collision, optimal or not."""
+        """True if it can be flown to the target without a collision, optimal or not."""
         return self.arrived and self.clear and self.flyable
 
     @property
     def minimum(self) -> bool:
-        """Whether it is a local minimum of the problem."""
+        """True for a local minimum of the problem."""
         return self.converged and self.flyable
 
 
@@ -173,7 +173,7 @@ def lowest(results: Results, avoidance: Avoidance) -> list[Outcome | None]:
 
 
 def distinct(costs: Iterable[float]) -> int:
-    """How many costs there are that differ by more than rounding and tolerance."""
+    """Number of costs that differ by more than rounding and tolerance."""
     ordered = sorted(costs)
     return sum(b > a * (1.0 + SAME) for a, b in pairwise(ordered)) + bool(ordered)
 
@@ -200,7 +200,7 @@ def rates(results: Results) -> str:
 
 
 def endings(results: Results) -> str:
-    """How solves ended, per method."""
+    """Endings of solves, per method."""
     counts = {method: Counter(o.status for o in outcomes) for method, outcomes in results.items()}
     names = [name for name, _ in sum(counts.values(), Counter()).most_common()]
     lines = [(*method.words, *(str(found[name] or "") for name in names)) for method, found in counts.items()]
@@ -253,7 +253,7 @@ def duels(results: Results) -> str:
 
 
 def minima(results: Results) -> str:
-    """How many local minima all methods together found on each layout."""
+    """Numbers of local minima that all methods together found on a layout."""
     lines = []
     for avoidance in AVOIDANCES:
         columns = list(zip(*(some for method, some in results.items() if method.avoidance == avoidance), strict=True))

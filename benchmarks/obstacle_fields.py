@@ -126,7 +126,7 @@ def solvers(search: int) -> dict[str, fg.Solver]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one field.
+    """Result on one field.
 
     Attributes:
         solved: whether the KKT test passed.
@@ -146,7 +146,7 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        """Whether a robot could use the answer, optimal or not."""
+        """True if a robot could use the answer, optimal or not."""
         return self.free and self.reached
 
 

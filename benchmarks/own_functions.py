@@ -151,7 +151,7 @@ class Way:
 
 
 def problems() -> dict[str, Problem]:
-    """By title, those the targets speak of."""
+    """Problems by title."""
     found: list[Problem] = [
         Unicycle("straight", False, 50),
         Unicycle("straight", True, 50),

@@ -43,7 +43,7 @@ class Case:
 
     @property
     def whole(self) -> float:
-        """How many times faster than GTSAM it should be from the file to the map."""
+        """Target from the file to the map, in times faster than GTSAM."""
         return 3.0 if self.pose_graph.group is SE3 else 5.0
 
 
@@ -191,7 +191,7 @@ def _compared(times: Mapping[str, Array], best_whole: str, iterations: int, chi2
 
 
 def within(row: Result) -> str:
-    """Whether all found chi2 are the best known one."""
+    """Compare all found chi2 with the best known one."""
     known = row["known"] or row["chi2"]
     return "yes" if all(abs(row.get(end, known) - known) <= SAME * known for end in ("chi2", "gtsam_chi2")) else "no"
 

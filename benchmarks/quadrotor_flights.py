@@ -97,7 +97,7 @@ def _mass(log: FlightLog) -> dict[str, list[float]]:
 
 
 def _contact(log: FlightLog) -> Row | None:
-    """When and where the hull first came to something, and what was believed then."""
+    """Time and place of the first contact, and the belief there."""
     near = np.flatnonzero(log.clearance < TOUCH)
     if not log.collisions or not len(near):
         return None

@@ -107,7 +107,7 @@ def fly(job: Job) -> Row:
 
 
 def pulled(belief: Belief, alone: Belief) -> dict[str, float]:
-    """How far a belief is from what the past alone says."""
+    """Distance of a belief from the estimate of the past alone."""
     step = quadrotor.STATE.local(alone.state[None], belief.state[None])[0]
     rho, without = belief.parameters, alone.parameters
     moved = belief.landmarks.positions - alone.landmarks.positions
@@ -125,7 +125,7 @@ def pulled(belief: Belief, alone: Belief) -> dict[str, float]:
 
 
 def errors(belief: Belief, truth: Array, flight: Flight, cylinders: Array) -> dict[str, float]:
-    """How far a belief is from the truth."""
+    """Distance of a belief from the truth."""
     step = quadrotor.STATE.local(truth[None], belief.state[None])[0]
     true, found = flight.conditions.true, belief.parameters
     marks = belief.landmarks

@@ -53,7 +53,7 @@ def worst(runs: Sequence[Array]) -> tuple[float, float, int]:
 
 
 def _timed(rows: Sequence[Row]) -> dict[tuple[str, str], list[Array]]:
-    """By solver and coupling the times (2, n) of estimate and plan of every run [ms]."""
+    """Times (2, n) of estimate and plan of every run [ms], by solver and coupling."""
     groups: dict[tuple[str, str], dict[int, list[Array]]] = {}
     for row in where(rows, study="timing"):
         runs = groups.setdefault((row["solver"], row["coupling"]), {})
@@ -105,7 +105,7 @@ def _middle(values: list[float], places: int) -> str:
 
 
 def failures(rows: Sequence[Row]) -> str:
-    """What went wrong with hard clearance, one by one."""
+    """Failures with hard clearance, one by one."""
     lines = []
     for words, chosen in _groups(rows).items():
         if words[0].startswith("potential") or words[2] == "separate":
@@ -145,7 +145,7 @@ def couplings(rows: Sequence[Row]) -> str:
 
 
 def mass(rows: Sequence[Row]) -> str:
-    """How well the mass is known, and how well its sigma says so."""
+    """Errors of the mass, and the share within two sigmas."""
     lines = []
     for (solver, coupling), chosen in _hard(rows).items():
         for mark in sorted({mark for row in chosen for mark in row["mass"]}, key=float):

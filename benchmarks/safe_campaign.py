@@ -1,12 +1,6 @@
-"""The flights behind docs/results/factormpc.md: campaigns with an oracle, the figures of the paper, a Pareto curve, times.
+"""Flights past obstacles with a margin: campaigns with an oracle, the figures of the paper, a Pareto curve, times.
 
-Every flight is a line of out/benchmarks/safe_campaign.jsonl and is not flown again until the code changes
-(:mod:`benchmarks.runs`). Processor times are those of the thread that decides.
-
-The oracle (:mod:`unifg.scenarios.safety.oracle`) knows what the controller knows. It is asked when obstacles are first
-seen with their velocities, at the start and when a ball has left the hand; and where a margin was not kept, at every
-fifth tick from then on until it was lost. If it ever says "yes", to all obstacles at once, the flight counts against
-the controller: a way out that was there and was lost by the controller's own choice is no excuse.
+The study "campaign" flies random situations; the others are those of the paper's figures.
 """
 
 from __future__ import annotations
@@ -106,7 +100,7 @@ def first_sight(flight: SafeFlight, log: SafeLog) -> int:
 
 
 def judged(flight: SafeFlight, log: SafeLog) -> Row:
-    """What the oracle says at first sight, and of a margin that was lost whether it ever said "yes"."""
+    """Answer of the oracle at first sight, and for a lost margin whether it ever was "yes"."""
     loops = flight.settings.books.loops
     authority = Authority(VEHICLE, 0.1, loops.delay + flight.settings.dt + TILT)
     first = first_sight(flight, log)

@@ -47,7 +47,7 @@ def measure(rounds: int, small: bool = False) -> Result:
 
 
 def large() -> Case:
-    """What threads are for."""
+    """Pose graph large enough for threads."""
     ball = sphere(100, 100, seed=0)
     return Case("sphere 10000", ball.pose_graph.with_poses(ball.truth), np.nan, 2.0, 1.5)
 

@@ -126,7 +126,7 @@ class Job:
 
 
 def attempt(clean: PoseGraph, job: Job) -> Row:
-    """What a method makes of a graph with wrong closures."""
+    """Result of a method on a graph with wrong closures."""
     graph, x, guess = clean.graph()
     right = GaussNewton().solve(graph, guess, check=True)[x]
     dirty, wrong = with_wrong_closures(clean, job.share, job.seed, job.claim)

@@ -42,7 +42,7 @@ Text = Callable[[str], Any]
 
 @dataclass(frozen=True)
 class Option:
-    """What the command line is told of a field: see :func:`option`."""
+    """Declaration of a field for the command line: see :func:`option`."""
 
     text: Text | None
     metavar: str | None
@@ -151,7 +151,7 @@ def plain(kind: Any) -> Any:
 
 
 def _help(path: tuple[str, ...], settings: type, default: Any) -> str:
-    """What the docstring of the class says of a field, and its default."""
+    """Text about a field in the docstring of its class, and its default."""
     doc = inspect.getdoc(_owner(settings, path)) or ""
     found = re.search(rf"^    {path[-1]}: (.*?)(?=^ {{0,4}}\S|\Z)", doc, re.MULTILINE | re.DOTALL)
     words = " ".join(found[1].split()).rstrip(".") if found else ""

@@ -1,4 +1,4 @@
-"""What every solve of a fixed set ends with, to the last bit: recorded before the code is moved, compared after.
+"""Results of a fixed set of solves, to the last bit: recorded before the code is moved, compared after.
 
     python -m tools.golden record [--parts PART ...] [--file FILE]
     python -m tools.golden compare [--parts PART ...] [--file FILE]
@@ -52,7 +52,7 @@ CONTROL = backends("ipm", "sqp", "alm")
 
 @dataclass(frozen=True)
 class Row:
-    """How one solve ended.
+    """End of one solve.
 
     Attributes:
         status: in words; what was raised, if it was refused.
@@ -67,7 +67,7 @@ class Row:
     digest: str
 
     def change(self, before: Row) -> str:
-        """What has changed: "same", "rounding" or a few words."""
+        """Change in words: "same", "rounding" or a few others."""
         if self.digest == before.digest and self.status == before.status and self.iterations == before.iterations:
             return "same"
         if self.status != before.status:
@@ -91,7 +91,7 @@ def digest(*arrays: Any) -> str:
 
 
 def row_of(solution: fg.Solution) -> Row:
-    """What is kept of a solve."""
+    """Kept numbers of a solve."""
     values = [solution.values[family] for family in solution.values]
     return Row(solution.status.name, solution.iterations, solution.cost, digest(*values))
 

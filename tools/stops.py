@@ -54,7 +54,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
 
 
 def wrong_in(out: Path) -> list[str]:
-    """What is not whole in a folder of results."""
+    """Files of a folder of results that are not whole."""
     wrong = []
     for file in sorted(path for path in out.rglob("*") if path.is_file()):
         try:
@@ -104,7 +104,7 @@ def stopped(words: list[str], out: Path, after: float | None) -> tuple[int, floa
 
 
 def judged(status: int, said: str, out: Path, finished: int) -> list[str]:
-    """What is wrong with the end of a run."""
+    """Faults of the end of a run."""
     wrong = wrong_in(out) if out.is_dir() else []
     if status not in (INTERRUPTED, finished, *BEFORE):
         wrong.append(f"status {status}")

@@ -1,4 +1,4 @@
-"""Licences of everything that unifg needs or can use: `python docs/site/licences.py` rewrites docs/reference/licences.md.
+"""Licences of all that unifg needs or can use: `python docs/site/licences.py` rewrites docs/reference/licences.md.
 
 Read from the metadata of what is installed, dependencies of dependencies included as far as this platform needs them;
 run it where all extras are.

@@ -33,7 +33,7 @@ EPISODES, MANIFEST = "episodes.jsonl", "campaign.json"
 
 @dataclass
 class Campaign:
-    """What became of a campaign.
+    """State of a campaign.
 
     Attributes:
         folder: with its files.
@@ -53,7 +53,7 @@ class Campaign:
 
     @property
     def succeeded(self) -> bool:
-        """Whether every episode was run and did what was asked."""
+        """True if every episode was run and succeeded."""
         return self.outcomes[OK] == self.episodes
 
     @property
@@ -141,7 +141,7 @@ def code_of_scenario(scenario: str) -> str:
 
 
 def manifest_of(folder: Path) -> dict[str, Any]:
-    """What the folder of a campaign says of it: "campaign" as it was stated, "base", "code", "axes", "bundles", "keys".
+    """Manifest in the folder of a campaign: "campaign" as stated, "base", "code", "axes", "bundles", "keys".
 
     Raises:
         ScenarioError: there is no campaign.
@@ -161,7 +161,7 @@ def manifest_of(folder: Path) -> dict[str, Any]:
 
 
 def replay_command(folder: Path, key: str) -> str:
-    """What a user types to see an episode again."""
+    """Command that runs an episode again."""
     return f"unifg replay {shlex.quote(str(folder))} {key}"
 
 
@@ -261,7 +261,7 @@ def _executor(
 
 
 def _ready(module: str) -> None:
-    """What a process does before its first episode."""
+    """Prepare a process for its first episode."""
     import_module(module)
     fingerprint()
 

@@ -59,7 +59,7 @@ class Fields:
         raise ScenarioError(f"{where}: there is no setting {name!r}; {nearest(name, [*self._kinds, *self._short])}")
 
     def __contains__(self, name: str) -> bool:
-        """Whether a name means one field."""
+        """True for a name that means one field."""
         try:
             self.named(name, "")
         except ScenarioError:
@@ -136,13 +136,13 @@ class Fields:
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
-    """What somebody may have meant."""
+    """Suggestion for a misspelt name."""
     close = get_close_matches(name.lower(), known, 3, 0.5)
     return f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(sorted(known))}"
 
 
 def identity(value: Any) -> Any:
-    """What two equal values have in common, as JSON can hold it; of a file, what it holds and what is named like it."""
+    """Identity of a value as JSON can hold it; of a file, a digest of it and of the files named like it."""
     if isinstance(value, Path):
         total = hashlib.sha256()
         for beside in sorted(value.parent.glob(f"{_literal(value.stem)}.*")):
@@ -170,7 +170,7 @@ def _leaves(settings: type, before: str = "") -> Iterator[tuple[str, tuple[Any, 
 
 
 def _single(kind: Any, given: Sequence[Any]) -> bool:
-    """Whether a list is one of many values, such as a pose among poses, and not the list of them."""
+    """True for a list that is one of many values, such as a pose among poses."""
     arguments = get_args(plain(kind))
     return get_origin(arguments[0]) is tuple and not any(isinstance(one, list | tuple) for one in given)
 

@@ -1,4 +1,4 @@
-"""What a campaign is: a scenario, settings of all episodes, axes along which settings change, and seeds.
+"""Statement of a campaign: a scenario, settings of all episodes, axes along which settings change, and seeds.
 
 An episode is one combination of the axes with one seed. All of it is stated by a mapping, usually a TOML file:
 
@@ -156,7 +156,7 @@ def read(file: str | Path) -> Statement:
 
 
 def _written(path: Path, before: tuple[str, ...]) -> dict[str, Any]:
-    """What a file holds, laid over what it extends.
+    """Content of a file, laid over the file that it extends.
 
     Args:
         path: of the file.

@@ -1,4 +1,4 @@
-"""How a run on the command line ended, and how it tells of its progress."""
+"""Outcome and progress of a run on the command line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Progress: TypeAlias = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended.
+    """Outcome of a run.
 
     Attributes:
         succeeded: whether the robot did what it was asked.
