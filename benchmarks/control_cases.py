@@ -19,7 +19,7 @@ from benchmarks.runner import Timing
 from problems.control import blocked, problems
 from unifg.solvers.names import backends
 
-RULES = Rules(tolerance=1e-4, same=1e-4, good=0.0, slow=300.0, prepared=True, peers=PEERS)
+RULES = Rules(tolerance=1e-4, same=1e-4, slow=300.0, peers=PEERS)
 STARTS = 30
 SOLVERS = backends("ipm", "sqp", "alm", tolerance=RULES.tolerance)
 
@@ -38,7 +38,7 @@ def render(results: Results, rounds: int) -> str:
         "fatrop runs in casadi's virtual machine and compiled "
         f"({compiled_peers.described()}), IPOPT in the virtual machine."
     )
-    return "\n\n".join([cold.summary(results, RULES, counted), cold.every(results, RULES, {}), notes])
+    return "\n\n".join([cold.summary(results, RULES, counted), cold.every(results, RULES), notes])
 
 
 def starts(count: int) -> str:

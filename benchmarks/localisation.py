@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TypeAlias
+from unittest import mock
 
 import numpy as np
 from scipy import ndimage
@@ -84,52 +85,19 @@ def made(name: str, occupancy: OccupancyMap, pose: Array, sigma: Array, beams: i
     return MonteCarlo(occupancy, distances(occupancy), pose, sigma, rng, VARIANTS[name])
 
 
-class Listening:
-    """An estimator that notes what it is given."""
-
-    def __init__(self, inner: Estimator) -> None:
-        """Listen to another one."""
-        self.inner = inner
-        self.heard: list[tuple[Scan | None, Array | None]] = []
-
-    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
-        """Note and hand on."""
-        self.heard.append((scan, None if odometry is None else np.array(odometry)))
-        self.inner.update(scan, odometry, dt)
-
-    @property
-    def iterations(self) -> int:
-        """Of the other."""
-        return self.inner.iterations
-
-    @property
-    def refused(self) -> str:
-        """Of the other."""
-        return self.inner.refused
-
-    def reset(self, pose: Array, sigma: Array) -> None:
-        """Of the other."""
-        self.inner.reset(pose, sigma)
-
-    @property
-    def pose(self) -> Array:
-        """Of the other."""
-        return self.inner.pose
-
-    @property
-    def covariance(self) -> Array:
-        """Of the other."""
-        return self.inner.covariance
-
-
 def recorded(seed: int) -> tuple[OccupancyMap, list[Tick]]:
     """A drive of the route of a seed."""
     start, goal = drawn(seed)
     episode = Episode(NavigationSettings(start=start, goals=(goal,), obstacles=OBSTACLES, seed=seed))
-    listening = Listening(episode.pilot.estimator)
-    episode.pilot.estimator = listening
-    log = episode.run(lambda done, text: None)
-    return episode.occupancy, [(*heard, pose) for heard, pose in zip(listening.heard, log.true_pose, strict=True)]
+    inner, heard = episode.pilot.estimator.update, list[tuple[Scan | None, Array | None]]()
+
+    def noted(scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        heard.append((scan, None if odometry is None else np.array(odometry)))
+        inner(scan, odometry, dt)
+
+    with mock.patch.object(episode.pilot.estimator, "update", noted):
+        log = episode.run(lambda done, text: None)
+    return episode.occupancy, [(*given, pose) for given, pose in zip(heard, log.true_pose, strict=True)]
 
 
 def replayed(estimator: Estimator, ticks: Iterable[Tick]) -> Array:

@@ -24,7 +24,6 @@ from unifg.solvers import GaussNewton
 from unifg.typing import Array, IntArray
 
 PAIRS = 10  # joint covariances of two poses
-MANY = 300  # candidates for a loop with the last pose
 FEW = 5  # rounds at most
 SLOW = 2.0  # [s]; what takes GTSAM longer is compared once
 SAMPLE = 500  # poses whose covariance is compared with GTSAM's of the same linear factors
@@ -44,7 +43,7 @@ def measure(rounds: int, small: bool = False) -> Result:
 
 
 def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
-    """All single marginals, and some joint ones, in three ways."""
+    """All single marginals, and some joint ones."""
     graph, x = pose_graphs.posed(case.pose_graph, ANCHOR)
     solution = GaussNewton().solve(graph, {x: case.pose_graph.poses})
     program = graph.compile()
@@ -65,31 +64,9 @@ def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
         found["joint"] = np.array([tree.factorization.inverse_block(scalars[pair].ravel()) for pair in pairs])
         return (time.process_time() - begin) / len(pairs)
 
-    def by_name() -> float:
-        begin = time.process_time()
-        found["named"] = np.array([solution.covariance(x[pair]) for pair in pairs])
-        return (time.process_time() - begin) / len(pairs)
-
-    others = rng.integers(0, count - 1, MANY)
-
-    def of_candidates() -> float:
-        begin = time.process_time()
-        found["candidates"] = solution.pair_covariances(x[-1], x[others])
-        return (time.process_time() - begin) / MANY
-
-    candidates: dict[str, Callable[[], float]] = {"all": every, "tree": from_tree}
-    result: Result = {"name": case.name, "poses": count, "named": None, "difference": None, "refused": ""}
-    try:
-        by_name()
-        candidates |= {"named": by_name, "candidates": of_candidates}
-    except fg.GraphError as error:
-        result["refused"] = str(error)
-    times = interleave(candidates, rounds)
+    times = interleave({"all": every, "tree": from_tree}, rounds)
+    result: Result = {"name": case.name, "poses": count, "difference": None}
     result |= {what: milliseconds(values) for what, values in times.items()}
-    if "named" in found:
-        result["own difference"] = _largest(found["named"], found["joint"])
-        named = np.array([solution.covariance(x[[count - 1, int(other)]]) for other in others[:PAIRS]])
-        result["candidates' difference"] = _largest(found["candidates"][:PAIRS], named)
     if available():
         result |= _compared(case, tree.lin, solution[x], pairs, found, every, rounds)
     return result
@@ -165,25 +142,19 @@ COLUMNS: dict[str, Callable[[Result], str]] = {
     "with GTSAM's own Jacobians": lambda row: _power(row.get("with its own")),
     "two poses, tree [ms]": lambda row: shown(row["tree"]),
     "its difference": lambda row: _power(row.get("joint difference")),
-    "two poses, `solution.covariance` [ms]": lambda row: "refused" if row["refused"] else shown(row["named"]),
-    "difference from the tree": lambda row: _power(row.get("own difference")),
-    "last pose and one of many, `solution.pair_covariances` [ms]": lambda row: shown(row.get("candidates")),
-    "its difference from `covariance`": lambda row: _power(row.get("candidates' difference")),
 }
 
 
 def render(result: Result) -> str:
     """One table."""
-    refusals = "".join(f" {row['name']} was refused: {row['refused']}." for row in result["rows"] if row["refused"])
     notes = (
         "All poses: linearisation, ordering, factorisation and the entries of the inverse that the elimination tree "
         "holds (`Factorization.diagonal_blocks`), against `gtsam.Marginals` with one call per pose. Two poses: joint "
         f"covariance of {PAIRS} pairs anywhere in the graph, by `Factorization.inverse_block` of a factorisation "
-        f"there is, and as a user asks for it; the last pose and each of {MANY} candidates for a loop, in one call. "
-        "Differences, from GTSAM where nothing else is said, are relative to the "
-        "largest entry of a block. GTSAM is given our Jacobians for them, and every so many poses are compared; the "
-        "column after shows all poses with its own, whose derivative of the logarithm in the plane loses figures at "
-        f"small angles. {result['rounds']} rounds, one where GTSAM takes longer than {SLOW:g} s.{refusals}"
+        "there is. Differences from GTSAM are relative to the largest entry of a block. GTSAM is given our Jacobians "
+        "for them, and every so many poses are compared; the column after shows all poses with its own, whose "
+        "derivative of the logarithm in the plane loses figures at small angles. "
+        f"{result['rounds']} rounds, one where GTSAM takes longer than {SLOW:g} s."
     )
     return "\n\n".join([listing(("graph",), {(row["name"],): row for row in result["rows"]}, COLUMNS), notes])
 
