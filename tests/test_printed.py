@@ -41,8 +41,8 @@ def test_texts_are_read_as_numbers() -> None:
     assert pairs("bazzana", "Table I (a), Ours")["AC"] == (175.42, 0.68)
     assert numbers("bazzana", "Table III", "iterations")[:3] == [118.0, 445.0, 125.0]
     assert ROWS[0] == (7938.2, (53.612, 118, 0.011), (50.423, 445, 1.459)) and len(ROWS) == 6
-    assert LEGS["department"]["CD"].length == (18.71, 0.19)
-    assert LEGS["factory"]["BC"].duration == (158.96, 1.73)
+    assert LEGS["department"]["path_length_m"][0]["CD"] == (18.71, 0.19)
+    assert LEGS["factory"]["duration_s"][0]["BC"] == (158.96, 1.73)
 
 
 def test_no_generator_holds_such_a_number_itself() -> None:
