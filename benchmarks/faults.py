@@ -32,7 +32,7 @@ SEEDS = range(5)
 ROBOTS = {"drive": DRIVE_FAULTS, "flight": FLIGHT_FAULTS}
 BEGIN = {"drive": 2.0, "flight": 3.0}  # [s]
 DURATIONS = (2.0, 1000.0)  # [s]; the second one for good
-GUST_TIMES = (0.5, 2.0)  # [s]; nobody flies on against a gale for good
+GUST_TIMES = (0.5, 2.0)  # [s]; no flight goes on against a gale for good
 REACTION = 2  # ticks: the one in which something is felt, and the one that answers
 START, GOAL = (6.5, 14.0, 0.0), (13.5, 14.1, 0.0)
 

@@ -241,7 +241,7 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
         outcome: Outcome = module.run(settings, progress, **watched)
         try:
-            # whole, whoever asks for an end meanwhile
+            # each file is written whole, also after a signal
             files = outcome.write(folder)
         except OSError as error:
             return _refuse(f"--out {folder}: cannot write the results ({error})")

@@ -180,7 +180,7 @@ class _Finder:
         for child in ast.iter_child_nodes(node):
             if isinstance(child, ast.expr):
                 if isinstance(node, ast.Subscript) and child is node.slice and not _compares(child):
-                    continue  # a wrong place is seen by whoever reads it
+                    continue  # a wrong place is seen by its reader
                 yield from self._expression(child, where, compiled)
             elif isinstance(child, ast.keyword):
                 yield from self._expression(child.value, where, compiled)

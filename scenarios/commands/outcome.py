@@ -39,7 +39,7 @@ def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], st
 
     Args:
         progress: to be told.
-        pace: nobody knows how many iterations there will be: of what is left, each leaves this share.
+        pace: share of the remainder that each iteration leaves, as their number is unknown.
         say: the word about an iteration.
     """
 
