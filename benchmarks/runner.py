@@ -142,7 +142,7 @@ def recorded(
         with Journal(store) as journal:
             for key, row in tqdm(measured(task, missing, workers), total=len(missing)):
                 rows[key] = {"key": key, "code": code, **row}
-                journal.add(json.dumps(rows[key]))
+                journal.add(json.dumps(rows[key], default=lambda value: value.tolist()))  # numbers of NumPy
     return rows
 
 
