@@ -143,7 +143,7 @@ def identity(value: Any) -> Any:
     if isinstance(value, Path):
         total = hashlib.sha256()
         for beside in sorted(value.parent.glob(f"{_literal(value.stem)}.*")):
-            if beside.is_file():
+            if beside.is_file() and beside.suffix != ".toml":  # a campaign may be named like its map
                 total.update(beside.name.encode() + b"\0" + beside.read_bytes() + b"\0")
         return total.hexdigest()[:12]
     if isinstance(value, tuple):
