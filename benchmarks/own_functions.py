@@ -208,9 +208,7 @@ class Cold:
 def cold(title: str, problem: Problem, rounds: int) -> dict[str, Cold]:
     """Every way, and fatrop, interleaved."""
     solver = InteriorPoint(tolerance=TOLERANCE)
-    attempts: dict[str, Callable[[Outcome], float]] = {
-        way: attempt(solver, Way(problem, way)) for way in ways(problem)
-    }
+    attempts: dict[str, Callable[[Outcome], float]] = {way: attempt(solver, Way(problem, way)) for way in ways(problem)}
     for peer in runnable(("fatrop", "fatrop, compiled")):
         attempts[peer] = attempt_peer(peer, problem, TOLERANCE)
     outcomes = {way: Outcome(problem, way) for way in attempts}
