@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import inspect
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field, replace
@@ -190,28 +191,24 @@ def count(text: str, least: int = 0, most: int = 10**18) -> int:
     return int(text)
 
 
-def positive(text: str) -> float:
-    """A number above zero."""
-    value = _number(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
+def number(what: str, permitted: Callable[[float], bool]) -> Text:
+    """Reader of a number; ``what`` says in words which ones are permitted."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not permitted(value):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
+        return value
+
+    return read
 
 
-def not_negative(text: str) -> float:
-    """A number, zero or more."""
-    value = _number(text)
-    if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of zero or more")
-    return value
-
-
-def share(text: str) -> float:
-    """A number from 0, less than 1."""
-    value = _number(text)
-    if not 0.0 <= value < 1.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number in [0, 1)")
-    return value
+positive = number("a positive number", lambda value: 0.0 < value < math.inf)
+not_negative = number("a number of zero or more", lambda value: 0.0 <= value < math.inf)
+share = number("a number in [0, 1)", lambda value: 0.0 <= value < 1.0)
 
 
 def pose(text: str) -> tuple[float, ...]:
@@ -249,11 +246,3 @@ def existing(what: str) -> Text:
         return found
 
     return path
-
-
-def _number(text: str) -> float:
-    """A number; what is none is not a number."""
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")

@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from unifg.atomic_write import write_atomically
 from unifg.errors import ScenarioError
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK, Order, lost, perform
@@ -125,13 +126,11 @@ def run_campaign(
                     found.outcomes[json.loads(text)["outcome"]] += 1
                     found.ran += 1
                     meter.beat()
-            except KeyboardInterrupt:
-                found.interrupted = True
-            except BaseException:
+            except BaseException as error:
                 _stop(at_work)
-                raise
-            if found.interrupted:
-                _stop(at_work)
+                found.interrupted = isinstance(error, KeyboardInterrupt)
+                if not found.interrupted:
+                    raise
     return found
 
 
@@ -227,12 +226,9 @@ def write_manifest(folder: Path, statement: Statement, code: str) -> None:
         "compare": statement.compare,
         "keys": [episode.key for episode in statement.episodes()],
     }
-    text = json.dumps(said, default=str)
     path = folder / MANIFEST
     try:
-        beside = path.with_suffix(".new")
-        beside.write_text(text + "\n", encoding="utf-8")
-        beside.replace(path)
+        write_atomically(path, json.dumps(said, default=str) + "\n")
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be written ({error.strerror})") from None
 

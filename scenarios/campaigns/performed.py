@@ -87,10 +87,10 @@ def perform(order: Order) -> str:
             found = {"outcome": OK if outcome.succeeded else FAILED, "metrics": _plain(outcome.metrics, unclear)}
             if unclear:
                 found["not_finite"] = sorted(unclear)
-        except UnifgError as error:
-            found = {"outcome": ERROR, "error": f"{type(error).__name__}: {error}", "traceback": _trace(error)}
         except (Exception, SystemExit, KeyboardInterrupt) as error:
-            found = {"outcome": ERROR, "error": repr(error), "traceback": _trace(error)}
+            said = f"{type(error).__name__}: {error}" if isinstance(error, UnifgError) else repr(error)
+            trace = "".join(traceback.format_exception(error))
+            found = {"outcome": ERROR, "error": said, "traceback": trace}
     took = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
     return line(order, found, took)
 
@@ -139,10 +139,6 @@ def _warmed(order: Order, module: Any, settings: Any) -> None:
         module.run(settings, stop)
     except (Exception, SystemExit, KeyboardInterrupt):
         return  # the episode itself will say so
-
-
-def _trace(error: BaseException) -> str:
-    return "".join(traceback.format_exception(error))
 
 
 def _plain(value: Any, unclear: list[str], path: str = "") -> Any:
