@@ -174,7 +174,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class OutlierReport:
-    """What became of a mutant: "killed", "survived", or "unseen" when no test touches its line."""
+    """Fate of a mutant: "killed", "survived", or "unseen" when no test touches its line."""
 
     mutation: Mutation
     outcome: str
@@ -196,7 +196,7 @@ def copied(folder: Path) -> Path:
 
 
 def run_tests(scratch: Path, tests: Sequence[str], limit: float) -> bool:
-    """Whether all tests pass, in a child process that begins where this one has imported what never changes."""
+    """True if all tests pass, in a child process that begins after the imports that never change."""
     child = os.fork()
     if not child:
         status = 1
