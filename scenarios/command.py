@@ -137,7 +137,7 @@ def _campaign(chosen: argparse.Namespace) -> int:
 
 def _report(chosen: argparse.Namespace) -> int:
     """Write the report of a campaign."""
-    from unifg.scenarios.campaigns.account import write_report
+    from unifg.scenarios.campaigns.report import write_report
 
     for file in write_report(chosen.folder, chosen.against, chosen.any_code):
         print(file)
