@@ -161,7 +161,7 @@ class Rebound:
         kernel = residual if isinstance(residual, Kernel) else residual.kernel
         if kernel is None:
             return cast(Callable[..., Any], self.callable(residual.function))
-        called = self.function(kernel.function)
+        called = self.callable(kernel.function)
 
         def batched(*arguments: Any) -> Any:
             return called(*kernel.rows_of(arguments))
