@@ -41,7 +41,9 @@ PUBLISHED: dict[Loss, Callable[[complex], complex]] = {
     fg.TruncatedLeastSquares(K): lambda s: s if s.real <= K**2 else K**2 + 0 * s,
     fg.TruncatedLeastSquares(K, 0.5): surrogate(0.5),
 }
-SURROGATES = {fg.TruncatedLeastSquares(K, mu): surrogate(mu) for mu in (1e-5, 1.0, 50.0)}
+SURROGATES: dict[Loss, Callable[[complex], complex]] = {
+    fg.TruncatedLeastSquares(K, mu): surrogate(mu) for mu in (1e-5, 1.0, 50.0)
+}
 LOSSES = list(PUBLISHED)
 HALF = fg.Reweighted(lambda s: np.where(s < 4.0, 1.0, 0.5))
 

@@ -137,7 +137,7 @@ class CompiledTerm:
         self.place: IntArray = np.zeros(0, dtype=np.int64)
         self._shaping, self.data = frozenset(term.shaping), frozenset(term.data)
         self._blocks: dict[int, tuple[int, int]] = {}
-        self._taken = tuple(range(len(term.arguments)))
+        self._inputs = tuple(range(len(term.arguments)))
         self.trace: Trace | None = None
         self._each: tuple[int, ...] | None = None  # arguments that were found to have a row for each factor
         self._changes = 0
@@ -188,18 +188,18 @@ class CompiledTerm:
         why = "it has a search Jacobian" if own.search else ""
         if own.derivatives == "differences":
             why = "as it was asked to be"
-        taken = not why and (not attached or asked)
-        if taken or unclear_places(self._arguments, self.term.rows, self.count):
+        traceable = not why and (not attached or asked)
+        if traceable or unclear_places(self._arguments, self.term.rows, self.count):
             found, reason = find(self.batch, own.function, asked)  # also for how arrays as long as the batch are read
             self._each = None if found is None else found.each
             self._bind_batched(self._batched)
-            if taken:
+            if traceable:
                 self.trace, why = found, reason
         if self.trace is None and attached:
-            return "evaluated by Python, its derivatives attached" + (f": {why}" if taken else "")
+            return "evaluated by Python, its derivatives attached" + (f": {why}" if traceable else "")
         if self.trace is None:
             return self._by_python(why)
-        self.kernel, self._taken = self.trace.kernel, self.trace.taken
+        self.kernel, self._inputs = self.trace.kernel, self.trace.inputs
         self._jacobian = None if isinstance(self.term, ScalarCost) else self._exact
         return self._traced()
 
@@ -354,7 +354,7 @@ class CompiledTerm:
         if self.term.residual.derivatives == "trace":
             raise GraphError(f"term '{self.name}': cannot be traced: {why}", term=self.name)
         self.trace = self.kernel = self._jacobian = None
-        self._taken = tuple(range(len(self.term.arguments)))
+        self._inputs = tuple(range(len(self.term.arguments)))
         if self.term.residual.rows:
             self._call_single()
             self.route = self._said("compiled by Numba", why)
@@ -541,7 +541,7 @@ class CompiledTerm:
         gather: list[IntArray] = []
         keep: list[int] = []
         sizes, width = [], 0
-        for place, expected in zip(self._taken, self.kernel.arguments, strict=False):
+        for place, expected in zip(self._inputs, self.kernel.arguments, strict=False):
             argument = self.term.arguments[place]
             if isinstance(expected, int | tuple):
                 continue
@@ -599,13 +599,13 @@ class CompiledTerm:
         packed = side_by_side(parameters)
         self.parameter_count = packed.shape[1]
         self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
-        taken = list(zip(self._taken, kernel.arguments, strict=False))  # others are no arguments of the term
-        places = [k for k, expected in taken if not isinstance(expected, int | tuple)]
+        accepted = list(zip(self._inputs, kernel.arguments, strict=False))  # others are no arguments of the term
+        places = [k for k, expected in accepted if not isinstance(expected, int | tuple)]
         given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
         self._constants = given
         self.parameters = np.concatenate([packed.ravel(), *(array.ravel() for array in given.values())])
         self._packed = self.parameters[: packed.size].reshape(packed.shape)
-        slots = [k for k, expected in taken if isinstance(expected, int | tuple)]
+        slots = [k for k, expected in accepted if isinstance(expected, int | tuple)]
         sizes = [prod(part.shape[1:]) for part in parameters]
         starts = np.cumsum([0, *sizes]).tolist()
         self._blocks = {k: (start, size) for k, start, size in zip(slots, starts, sizes, strict=False) if size}

@@ -39,9 +39,9 @@ def enough(state: State, variable: int) -> bool:
     single.append(np.ones(len(priors), dtype=bool))  # a prior speaks of where its variables are
     pairs = np.concatenate(ties)
     label = components(count + total, pairs[:, 0] + count, np.ascontiguousarray(pairs[:, 1]))
-    here = label[variable]
-    alive = variables["alive"][:count].astype(bool) & (label[:count] == here)
-    spoken = label[count:] == here
+    component = label[variable]
+    alive = variables["alive"][:count].astype(bool) & (label[:count] == component)
+    spoken = label[count:] == component
     unknowns = int(variables["dim"][:count][alive].sum())
     return bool(np.concatenate(rows)[spoken].sum() >= unknowns and np.concatenate(single)[spoken].any())
 
