@@ -249,7 +249,7 @@ def test_kinks_jumps_and_noise_are_no_differences(function: Function, at: float)
 
 
 def test_verification_costs_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Within a loop it is a small share of the time; the figure is on docs/own-functions.md."""
+    """Within a loop it is a small share of the time; the figure is on docs/howto/own-functions.md."""
     graph, x, target = stated(lambda x: np.where(x < 0.5, np.tanh(x), np.sin(x)), constrained=True)
     prepared = InteriorPoint().prepare(graph)
     spent, honest = 0.0, prepared._verified

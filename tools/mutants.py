@@ -70,7 +70,9 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "unifg/factors/autodiff/captured.py": ("traced_terms", "derive_kinds"),
     "unifg/factors/autodiff/rows.py": ("rows", "traced_terms"),
     "unifg/factors/autodiff/symbols.py": ("derive_kinds", "derive_numpy", "rows"),
-    "unifg/factors/autodiff/tape.py": ("tape_rules", "derive", "derive_kinds"),
+    "unifg/factors/autodiff/tape.py": ("tape_rules", "derive", "derive_kinds", "loops"),
+    "unifg/factors/autodiff/loops.py": ("loops",),
+    "unifg/factors/autodiff/emit.py": ("loops", "tape_rules", "derive"),
     "unifg/factors/autodiff/trace.py": ("traced_terms", "derive_kinds", "rows"),
     "unifg/problem/traced.py": ("rows", "traced_terms"),
     "unifg/problem/verification.py": ("verification",),
@@ -172,7 +174,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class OutlierReport:
-    """What became of a mutant: "killed", "survived", or "unseen" when no test touches its line."""
+    """Fate of a mutant: "killed", "survived", or "unseen" when no test touches its line."""
 
     mutation: Mutation
     outcome: str
@@ -194,7 +196,7 @@ def copied(folder: Path) -> Path:
 
 
 def run_tests(scratch: Path, tests: Sequence[str], limit: float) -> bool:
-    """Whether all tests pass, in a child process that begins where this one has imported what never changes."""
+    """True if all tests pass, in a child process that begins after the imports that never change."""
     child = os.fork()
     if not child:
         status = 1

@@ -204,7 +204,7 @@ class Sightings:
         graph.minimize(landmarks.bearing_range, *pairs, sigma=sigma, active=seen, name="sightings")
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """What was seen."""
+        """Measurements of a drive."""
         rows = now.past.recorded("sightings")[0].reshape(-1, 3)
         seen = rows[:, 2] > 0.0
         return {"sightings": np.where(seen[:, None], rows[:, :2], 1.0), "seen": seen}

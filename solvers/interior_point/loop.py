@@ -99,7 +99,7 @@ def renew(address: int) -> None:
     fill(gradient, 0.0)
     fill(hessian, 0.0)
     out = LinearArrays(residual, jacobian, constraints, constraint_jacobian, squares, weights, norms, gradient, hessian)
-    scalars[0].cost = number(links[0].linearize, (terms, values, False, out, scratch))
+    scalars[0].cost = number(links[0].linearize, (terms, values, out, scratch))
     if len(heights):
         fill(concavity, 0.0)
         arrays = terms, values, heights, gradient, hessian, concavity, scratch
@@ -187,7 +187,7 @@ def addresses() -> Records:
     links = np.zeros(1, LINKS)
     links[0]["factor"] = link(factor, TRUTH, kinds["plan"], kinds["data"], vector)
     links[0]["solve"] = link(solve, NOTHING, kinds["plan"], vector, vector)
-    links[0]["linearize"] = link(evaluation.linearize, NUMBER, terms, values, TRUTH, linearized, scratch)
+    links[0]["linearize"] = link(evaluation.linearize, NUMBER, terms, values, linearized, scratch)
     links[0]["evaluate"] = link(
         evaluation.evaluate,
         NUMBER,

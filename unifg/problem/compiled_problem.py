@@ -384,10 +384,14 @@ class CompiledProblem:
         found = np.empty(table.scalars)
         concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
         rounding = np.zeros(self.columns.width if self.scalar_terms else 0)
+        batched, terms = self.batched, table.arrays
+        if search:  # kernels know no search Jacobians
+            searched = [term for term in self.terms if term.kernel is not None and term.term.residual.search]
+            batched, terms = [*batched, *searched], table.without(searched)
         with np.errstate(all="ignore"):
-            if self.batched:
+            if batched:
                 began = perf_counter()
-                for term in self.batched:
+                for term in batched:
                     self.rows_of(term, residual, constraints)[:] = term.residual(values)
                     self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
                 self.python_seconds += perf_counter() - began
@@ -395,10 +399,10 @@ class CompiledProblem:
                 residual, jacobian, constraints, constraint_jacobian, squares, weights, size, gradient, hessian
             )
             if shares is not None:
-                cost = _linearize_at_once(shares, table.arrays, values.flat, search, out._replace(hessian=room))
+                cost = _linearize_at_once(shares, terms, values.flat, out._replace(hessian=room))
             else:
                 gradient[:], hessian[:] = 0.0, 0.0
-                cost = evaluation.linearize(table.arrays, values.flat, search, out, self.scratch)
+                cost = evaluation.linearize(terms, values.flat, out, self.scratch)
             if table.weighed:
                 for loss, part in table.weighed:
                     weights[part] = loss.weight(squares[part])
@@ -592,11 +596,11 @@ def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
     return [slice(start, end) for start, end in pairwise(ends)]
 
 
-def _linearize_at_once(shares: Shares, terms: TermArrays, values: Array, search: bool, out: LinearArrays) -> float:
+def _linearize_at_once(shares: Shares, terms: TermArrays, values: Array, out: LinearArrays) -> float:
     """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
     counters = np.zeros(6, np.int64)
     own = shares.costs, shares.norms, shares.slopes, shares.contested, shares.scratch
-    given = terms._replace(positions=shares.positions), values, search, out
+    given = terms._replace(positions=shares.positions), values, out
     share(_entrance(), (*given, *own, counters.ctypes.data))
     out.norms[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
     return float(shares.costs.sum())

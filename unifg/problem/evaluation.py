@@ -10,7 +10,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import NamedTuple
 
-from numba import boolean, float64, int32, int64, uint8
+from numba import float64, int32, int64, uint8
 
 from unifg.codegen.calls import call_residual, matrix, vector, vector_at
 from unifg.codegen.jit import compiled, inlined
@@ -42,7 +42,6 @@ from unifg.problem.table import (
     POSITION,
     ROW,
     ROWS,
-    SEARCH,
     SIZE,
     SLOTS,
     SPREAD,
@@ -179,7 +178,7 @@ def evaluate(
 
 @compiled
 def linearize_share(
-    terms: TermArrays, values: Array, search: bool, out: LinearArrays, scratch: Array, share: int, shares: int
+    terms: TermArrays, values: Array, out: LinearArrays, scratch: Array, share: int, shares: int
 ) -> float:
     """Do what :func:`linearize` does with one of several shares of the factors of every term, counted from 0."""
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
@@ -192,7 +191,7 @@ def linearize_share(
         m, width, kind = term[ROWS], term[WIDTH], term[KIND]
         target = residual if kind == COST else out.constraints
         blocks = jacobian if kind == COST else out.constraint_jacobian
-        where = term[SEARCH] if search and term[SEARCH] != 0 else term[ADDRESS]
+        where = term[ADDRESS]
         together = term[PAIRED] if term[WHITEN] & FULL else 0
         apart = (term[WHITEN] & 1) * m * m
         total = 0.0
@@ -249,7 +248,7 @@ def linearize_share(
 
 
 @compiled
-def linearize(terms: TermArrays, values: Array, search: bool, out: LinearArrays, scratch: Array) -> float:
+def linearize(terms: TermArrays, values: Array, out: LinearArrays, scratch: Array) -> float:
     """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
 
     Factors whose loss is Python stop after whitening, see :func:`weigh`.
@@ -257,14 +256,13 @@ def linearize(terms: TermArrays, values: Array, search: bool, out: LinearArrays,
     Args:
         terms: of the program.
         values: stored ones.
-        search: use search Jacobians where there are some.
         out: receives the results; gradient and Hessian are added to.
         scratch: a factor's variables, then J with all its columns for terms that keep only some.
 
     Returns:
         The cost of all factors but those whose loss is Python.
     """
-    return linearize_share(terms, values, search, out, scratch, 0, 1)
+    return linearize_share(terms, values, out, scratch, 0, 1)
 
 
 TERM_ARRAYS = bundle(
@@ -277,7 +275,7 @@ TERM_ARRAYS = bundle(
 """Type of what compiled loops read."""
 _of_linearize = arguments_at(
     (
-        TERM_ARRAYS, arrays(float64), boolean, bundle(LinearArrays, [arrays(float64)] * 9), arrays(float64),
+        TERM_ARRAYS, arrays(float64), bundle(LinearArrays, [arrays(float64)] * 9), arrays(float64),
         arrays(float64, 2), arrays(float64, 2), arrays(int64), arrays(float64, 2), int64,
     )
 )  # fmt: skip
@@ -288,14 +286,14 @@ def linearize_at_once(where: Address) -> None:
     """Work of one thread in :func:`linearize`: shares of the factors, then of the sums of all shares.
 
     Args:
-        where: address of these arguments: ``terms``, ``values``, ``search`` and ``out`` as there, but that places are
+        where: address of these arguments: ``terms``, ``values`` and ``out`` as there, but that places are
             those of :func:`unifg.problem.thread_partition.apart`, that gradient and Hessian need not be zero, and that
             behind the entries of the Hessian is room for what all shares but the first one add to those that several
             write to; (S,) cost of each of S shares; (S, T) their norms of each term; (S - 1, n) room for the gradients
             of all shares but the first; (C,) entries that several shares write to; (S, .) scratch; counters, two
             integers for each of three phases, zero.
     """
-    terms, values, search, out, costs, norms, slopes, contested, scratch, counters = _of_linearize(where)
+    terms, values, out, costs, norms, slopes, contested, scratch, counters = _of_linearize(where)
     gradient, hessian = out.gradient, out.hessian
     shares, size, many, entries = len(costs), len(gradient), len(contested), len(hessian)
     nnz = entries - (shares - 1) * many
@@ -313,7 +311,7 @@ def linearize_at_once(where: Address) -> None:
             out.residual, out.jacobian, out.constraints, out.constraint_jacobian, out.squares, out.weights, norms[k],
             gradient if k == 0 else slopes[k - 1], hessian,
         )  # fmt: skip
-        costs[k] = linearize_share(terms, values, search, own, scratch[k], k, shares)
+        costs[k] = linearize_share(terms, values, own, scratch[k], k, shares)
         k = next_chunk(counters, 1)
     wait_for(counters, 1, shares)
     k = first_chunk(counters, 2)

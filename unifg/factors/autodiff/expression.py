@@ -22,12 +22,13 @@ from unifg.factors.autodiff.tape import Tape
 from unifg.factors.kernel import evaluate_rows
 from unifg.typing import Array, IntArray
 
+WRITERS = ("calculus", "emit", "expression", "loops", "operations", "tape")  # modules that make machine code of a tape
 generating = RLock()  # tracing rebinds names in copies of functions, and what it writes is one tape
 
 
 def _digest() -> str:
     """Of the sources that make machine code of a tape; empty where there are none."""
-    own = [Path(__file__).with_name(f"{name}.py") for name in ("calculus", "emit", "expression", "operations", "tape")]
+    own = [Path(__file__).with_name(f"{name}.py") for name in WRITERS]
     own += map(Path, SOURCES)
     try:
         return hashlib.sha256(b"".join(file.read_bytes() for file in own)).hexdigest()

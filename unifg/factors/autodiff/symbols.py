@@ -643,7 +643,8 @@ def _reduced(
             rows.append(np.frompyfunc(scalar, 2, 1)(rows[-1], row))
         return np.moveaxis(np.array(rows, dtype=object), 0, axes[0])
     rest = [k for k in range(array.ndim) if k not in axes]
-    moved = array.transpose([*axes, *rest]).reshape(-1, *(array.shape[k] for k in rest))
+    kept = [array.shape[k] for k in rest]
+    moved = array.transpose([*axes, *rest]).reshape(math.prod(array.shape[k] for k in axes), *kept)
     combine = np.frompyfunc(scalar, 2, 1)
     starts = [] if initial is None or initial is np._NoValue else [initial]
     rows = [np.broadcast_to(np.array(item, dtype=object), moved.shape[1:]) for item in starts] + list(moved)
