@@ -196,7 +196,7 @@ class CompiledTerm:
         if self.trace is None and attached:
             return "evaluated by Python, its derivatives attached" + (f": {why}" if traceable else "")
         if self.trace is None:
-            return self._by_python(why)
+            return self._said("evaluated by Python", why)
         self.kernel, self._inputs = self.trace.kernel, self.trace.inputs
         self._jacobian = None if isinstance(self.term, ScalarCost) else self._exact
         return self._traced()
@@ -229,9 +229,6 @@ class CompiledTerm:
         logger.info("term '%s' was %s: its derivatives are exact", self.name, how)
         return f"{how}, its derivatives exact"
 
-    def _by_python(self, why: str) -> str:
-        return self._said("evaluated by Python", why)
-
     def _said(self, how: str, why: str) -> str:
         if self.term.residual.derivatives != "differences" and (self.name, why) not in _told:
             _told.add((self.name, why))
@@ -260,11 +257,6 @@ class CompiledTerm:
         """Jacobian of a derived kernel, of the arguments of the function it was derived from."""
         assert self.trace is not None
         return self.trace.kernel.jacobian(*self.trace.arguments(arguments))
-
-    def exact_slopes(self, points: list[Array]) -> list[Array]:
-        """One (n, m, d_k) array per variable argument, by the trace."""
-        assert self.trace is not None
-        return self.trace.kernel.jacobian(*self._for_kernel(points))
 
     @property
     def packed(self) -> Array:
@@ -299,7 +291,7 @@ class CompiledTerm:
         """The first active factor whose exact derivatives are not finite though differences are; None for none."""
         assert self.trace is not None
         with np.errstate(all="ignore"):
-            exact = np.concatenate(self.exact_slopes(points), axis=2)
+            exact = np.concatenate(self.trace.kernel.jacobian(*self._for_kernel(points)), axis=2)
             wrong = ~np.isfinite(self._masked(exact)).all(axis=(1, 2))
             if not wrong.any():
                 return None
@@ -357,7 +349,7 @@ class CompiledTerm:
             self._call_single()
             self.route = self._said("compiled by Numba", why)
         else:
-            self.route = self._by_python(why)
+            self.route = self._said("evaluated by Python", why)
         self.differenced = True
         self._bind_parameters(self._data)
 

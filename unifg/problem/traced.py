@@ -228,16 +228,13 @@ class Trace:
         return bool((times < 2).all())
 
 
-def find(
-    batch: Batch, function: Callable[..., Any], asked: bool, names: Callable[[str], str] = str
-) -> tuple[Trace | None, str]:
+def find(batch: Batch, function: Callable[..., Any], asked: bool) -> tuple[Trace | None, str]:
     """Trace a function, and compare.
 
     Args:
         batch: the term's function and arguments.
         function: to be traced.
         asked: whether the user insists.
-        names: makes the name of the kernel.
 
     Returns:
         The trace, or None and why there is none.
@@ -485,8 +482,7 @@ def _changed(contents: Contents) -> bool:
 
 def reach_of_value(value: Any) -> Any:
     """Key of a constant; None if there is none."""
-    reach = captured_by(lambda: value)
-    return reach.key
+    return captured_by(lambda: value).key
 
 
 def _unequal(a: Array, b: Array, allowed: Any) -> BoolArray:
