@@ -178,19 +178,20 @@ def evaluate(
 
 @compiled
 def linearize_share(
-    terms: TermArrays, values: Array, out: LinearArrays, scratch: Array, share: int, shares: int
-) -> float:
+    terms: TermArrays, values: Array, residual: Array, jacobian: Array, constraints: Array, constraint_jacobian: Array,
+    squares: Array, weights: Array, norms: Array, gradient: Array, hessian: Array, scratch: Array, share: int,
+    shares: int,
+) -> float:  # fmt: skip
     """Do what :func:`linearize` does with one of several shares of the factors of every term, counted from 0."""
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
     whiteners, active, columns, positions = terms.whiteners, terms.active, terms.columns, terms.positions
-    lower, upper, residual, jacobian = terms.lower, terms.upper, out.residual, out.jacobian
-    squares, weights, gradient, hessian = out.squares, out.weights, out.gradient, out.hessian
+    lower, upper = terms.lower, terms.upper
     cost = 0.0
     for t in range(len(fields)):
         term = fields[t]
         m, width, kind = term[ROWS], term[WIDTH], term[KIND]
-        target = residual if kind == COST else out.constraints
-        blocks = jacobian if kind == COST else out.constraint_jacobian
+        target = residual if kind == COST else constraints
+        blocks = jacobian if kind == COST else constraint_jacobian
         where = term[ADDRESS]
         together = term[PAIRED] if term[WHITEN] & FULL else 0
         apart = (term[WHITEN] & 1) * m * m
@@ -243,7 +244,7 @@ def linearize_share(
                 if weight != 1.0:
                     _scale(sqrt(weight), r, J)
             _accumulate(term, i, columns, positions, r, J, residual, jacobian, gradient, hessian)
-        out.norms[t] = sqrt(total)
+        norms[t] = sqrt(total)
     return cost
 
 
@@ -262,7 +263,10 @@ def linearize(terms: TermArrays, values: Array, out: LinearArrays, scratch: Arra
     Returns:
         The cost of all factors but those whose loss is Python.
     """
-    return linearize_share(terms, values, out, scratch, 0, 1)
+    return linearize_share(
+        terms, values, out.residual, out.jacobian, out.constraints, out.constraint_jacobian, out.squares, out.weights,
+        out.norms, out.gradient, out.hessian, scratch, 0, 1,
+    )  # fmt: skip
 
 
 TERM_ARRAYS = bundle(
@@ -307,11 +311,10 @@ def linearize_at_once(where: Address) -> None:
     wait_for(counters, 0, shares)
     k = first_chunk(counters, 1)
     while k < shares:
-        own = LinearArrays(
-            out.residual, out.jacobian, out.constraints, out.constraint_jacobian, out.squares, out.weights, norms[k],
-            gradient if k == 0 else slopes[k - 1], hessian,
+        costs[k] = linearize_share(
+            terms, values, out.residual, out.jacobian, out.constraints, out.constraint_jacobian, out.squares,
+            out.weights, norms[k], gradient if k == 0 else slopes[k - 1], hessian, scratch[k], k, shares,
         )  # fmt: skip
-        costs[k] = linearize_share(terms, values, own, scratch[k], k, shares)
         k = next_chunk(counters, 1)
     wait_for(counters, 1, shares)
     k = first_chunk(counters, 2)
