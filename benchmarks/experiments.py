@@ -114,7 +114,7 @@ def drivers(sheet: Sheet, name: str) -> list[Driver]:
     found = []
     for combination in sheet.combinations:
         labels = dict(zip(sheet.axes, combination, strict=True))
-        planner = labels.get("planner", f"ours, {labels['coupling']}")
+        planner = labels.get("baseline", f"ours, {labels['coupling']}")
         found.append(Driver(planner, f"{'I' if name == 'department' else 'II'} {labels['leg']}", sheet, combination))
     return found
 
