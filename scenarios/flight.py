@@ -21,7 +21,7 @@ from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
-from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.log.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.options import count, not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.quadrotor.estimator import EstimatorSettings
@@ -246,7 +246,7 @@ class Flight:
             controls=control,
             plans=np.tile(belief.state[:3], (settings.horizon + 1, 1)) if plan is None else plan.states[:, :3],
             pasts=pilot.estimator.window.history.states[:, :3],
-            landmarks=(marks.ids, marks.positions, marks.covariances, marks.radii),
+            landmarks=landmark_rows(marks.ids, marks.positions, marks.covariances, marks.radii),
             parameters=belief.parameters.packed,
             parameters_sigma=belief.parameters_sigma,
             seen=reading.ids,

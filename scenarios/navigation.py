@@ -225,7 +225,7 @@ class Episode:
             seed=s.seed,
             control_limits=s.controller.limits,
             scan_angles=self.world.lidar.angles,
-            obstacle_moving=self.world.obstacle_states()[:, 3].astype(bool),
+            obstacle_moves=self.world.obstacle_states()[:, 3].astype(bool),
             faults=[str(fault) for fault in s.faults],
         )
         self._outcomes = ["time ran out"] * len(self.goals)

@@ -205,7 +205,7 @@ def _landmarks(log: FlightLog, tick: int, ax: Axes) -> None:
 
     row = log.landmarks[tick]
     style = {"facecolor": (*to_rgb(css("estimate")), 0.45), "edgecolor": css("estimate"), "lw": 0.8, "zorder": 6}
-    for index, (mean, covariance) in enumerate(zip(row.means.tolist(), row.covariances, strict=True)):
+    for index, (mean, covariance) in enumerate(zip(row["mean"].tolist(), row["covariance"], strict=True)):
         long, short, direction = ellipse_axes(covariance, SIGMAS)
         ellipse = Ellipse(mean, 2.0 * long, 2.0 * short, angle=math.degrees(direction), **style)
         ellipse.set_label(None if index else "landmark as believed, 2\u03c3")

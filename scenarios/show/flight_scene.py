@@ -225,10 +225,7 @@ def _pillar(radius: float, colour: str) -> list[Part]:
 
 def _landmarks(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     """Of every name: an ellipse on top of the cylinder it stands for, and the cylinder's outline as believed."""
-    row = log.landmarks[tick]
-    for name, mean, covariance, radius in zip(
-        row.ids.tolist(), row.means, row.covariances, row.radii.tolist(), strict=True
-    ):
+    for name, mean, covariance, radius in log.landmarks[tick]:
         ellipse, outline = f"landmark {name}", f"outline {name}"
         if ellipse not in scene.bodies:
             others = [body for body in scene.bodies if body.startswith("landmark ")]
@@ -264,8 +261,8 @@ def _say(frame: Frame, log: Any, tick: int, estimated: bool) -> None:
     if sigma > 0.0:
         frame.readout("mass \u00b1 \u03c3", f"{mass:.3f} \u00b1 {sigma:.3f} kg")
         frame.readout("true mass", f"{log.parameters_true[0]:.3f} kg")
-    if len(log.landmarks[tick].ids):
-        frame.readout("landmarks", str(len(log.landmarks[tick].ids)))
+    if len(log.landmarks[tick]):
+        frame.readout("landmarks", str(len(log.landmarks[tick])))
     spent = float(log.estimate_ms[tick] + log.plan_ms[tick])
     if spent > 0.0:
         new = bool(log.compiled[tick])
