@@ -201,8 +201,8 @@ class Controller:
             return Decision(kept.within(controls), states, "solved", behind=is_behind(states, given.reference))
         choices: dict[Source, tuple[Array, Array]] = {}
         if kept.age <= KEPT and kept.age < s.horizon:
-            rest = np.tile(given.hover, (kept.age, 1))
-            old = np.concatenate([kept.within(kept.left()), rest])
+            left = kept.within(kept.left())
+            old = np.concatenate([left, np.tile(given.hover, (s.horizon - len(left), 1))])
             choices["kept"] = old, quadrotor.rollout(belief.state, old, s.dt, belief.parameters)
         choices["braking"] = brake(belief.state, belief.parameters, s.horizon, s.dt, kept.least, kept.most)
         if sound:
