@@ -109,7 +109,8 @@ class Decision:
         source: "solved" for the solver's answer, which is then kept; what else it is otherwise.
         after: states (N + 1, storage) and controls (N, m) where the next solve begins after another source than
             "solved"; None for anew.
-        behind: whether a plan that was accepted ends far from where it should.
+        behind: True if a plan that was accepted ends far from where it should.
+        resumed: True if the next solve goes on from a refused one, multipliers included, instead of ``after``.
     """
 
     controls: Array
@@ -117,6 +118,7 @@ class Decision:
     source: str
     after: tuple[Array, Array] | None = None
     behind: bool = False
+    resumed: bool = False
 
 
 class AcceptancePolicy(Protocol):

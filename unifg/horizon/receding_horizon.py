@@ -16,7 +16,7 @@ from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPrese
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
 from unifg.horizon.robot import Robot
-from unifg.horizon.terms import Context, Term, handles_of, looked_at, reset_all, values_of
+from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.window import Window
 from unifg.locks import ReentrantLock
 from unifg.modeling.variables import Data
@@ -163,7 +163,7 @@ class RecedingHorizon:
         for term in self._terms:
             term.state(graph, self.x, self.u)
         weigh(graph.terms[before:], control_weight)
-        self._handles = handles_of(graph)
+        self._handles, self._families = handles_of(graph), dict(graph.families)
         backends = solver, cold or solver, second or solver
         timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in backends]
         self._limits = [own.time_limit for own in timed]
@@ -383,7 +383,10 @@ class RecedingHorizon:
             self._accept(solution, states, controls, choice)
         else:
             self.failed = True
-            self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
+            if choice.resumed:
+                self.guess = self.shifted(solution)
+            else:
+                self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
         self.sources[choice.source] += 1
         return choice
 
@@ -410,7 +413,12 @@ class RecedingHorizon:
         x = self.x.family
         nodes = np.tile(now.present, (len(x), 1))
         nodes[len(x) - self.steps - 1 :] = states
-        return Guess({x: nodes, self.u: np.asarray(controls, dtype=np.float64)})
+        values = {x: nodes, self.u: np.asarray(controls, dtype=np.float64)}
+        for term in self._terms:
+            if isinstance(term, Guessing):
+                for name, value in term.guess(now).items():
+                    values[self._families[name]] = np.asarray(value, dtype=np.float64)
+        return Guess(values)
 
     def _accept(self, solution: Solution, states: Array, controls: Array, choice: Decision) -> None:
         """Keep a plan, and begin the next solve from it."""

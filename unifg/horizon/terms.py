@@ -93,6 +93,15 @@ class Resetting(Protocol):
         ...
 
 
+@runtime_checkable
+class Guessing(Protocol):
+    """A term of the future with unknowns of its own, as slacks."""
+
+    def guess(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        """Values (count, storage) for a first guess, by the names of the families."""
+        ...
+
+
 @dataclass(frozen=True)
 class Measurement:
     """A measurement of the state at nodes of the past, those at which it was made.
