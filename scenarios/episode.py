@@ -1,4 +1,4 @@
-"""What every episode does alike: rehearse, tick until it is over, tell how far it has come, stop when the user asks."""
+"""Shared loop of all episodes: warm-up run, ticks, progress, interruption by the user."""
 
 from __future__ import annotations
 

@@ -176,7 +176,7 @@ class Flight:
         )  # fmt: skip
 
     def _outcome(self, interrupted: bool) -> str:
-        """What has become of the flight, in words."""
+        """Outcome of the flight in words."""
         cause = self.watch.verdict.cause
         if self._reached or interrupted:
             return "reached" if self._reached else "interrupted"
@@ -263,6 +263,6 @@ class Flight:
         return control
 
     def _arrived(self, state: Array) -> bool:
-        """Whether a state (10,) is at the target and slow."""
+        """Return True for a state (10,) at the target and slow."""
         away = np.linalg.norm(state[:3] - self.world.layout.target)
         return bool(away < REACHED_DISTANCE and np.linalg.norm(state[7:]) < REACHED_SPEED)

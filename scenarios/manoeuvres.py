@@ -70,7 +70,7 @@ class ManoeuvreSettings:
 
 @dataclass(frozen=True)
 class Case:
-    """What makes one manoeuvre hard.
+    """Difficulty of one manoeuvre.
 
     Attributes:
         name: on the command line and in file names.
@@ -190,14 +190,14 @@ class Manoeuvre:
 
     @property
     def within_limits(self) -> bool:
-        """Whether speeds and clearance keep their limits at every node."""
+        """True if speeds and clearance keep their limits at every node."""
         s = self.settings
         slow = bool((np.abs(self.controls) <= np.array(s.limits) + ROUNDING).all())
         return slow and bool((self.clearance[1:] >= s.clearance - ROUNDING).all())
 
     @property
     def succeeded(self) -> bool:
-        """Whether the solver converged and every limit is kept."""
+        """True if the solver converged and every limit is kept."""
         return self.solution.converged and self.within_limits
 
     def _clearance(self, states: Array) -> Array:

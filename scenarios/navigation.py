@@ -292,7 +292,7 @@ class Episode:
         return v, omega
 
     def _outcome(self, goal: int) -> str | None:
-        """What has become of a goal; None while the robot is on its way."""
+        """Outcome of a goal; None while the robot is on its way."""
         pilot, dt = self.pilot, self.settings.controller.dt
         helpless = pilot.verdict.rests or pilot.planless_for > dt
         self._helpless = self._helpless + dt if helpless else 0.0
@@ -312,7 +312,7 @@ class Episode:
         return None
 
     def _hopeless(self) -> bool:
-        """Whether the robot has not been allowed to move for so long that it gives up all goals."""
+        """Return True if the robot has not been allowed to move for so long that it gives up all goals."""
         return self._helpless > HELPLESS
 
     def _begin_leg(self, goal: int) -> None:
@@ -399,7 +399,7 @@ class Episode:
         return Route(self.occupancy, self.distance_map, begin, end, s.robot_radius, *self._gaps())
 
     def _arrived(self, goal: int) -> bool:
-        """Whether the robot believes to be there, by an estimate that leaves room for being wrong.
+        """Return True if the robot believes to be there, by an estimate that leaves room for being wrong.
 
         ``SURE`` standard deviations, in the worst direction, fit between where it believes to be and what the truth
         must confirm.
@@ -413,7 +413,7 @@ class Episode:
         return _near(self.pilot.pose, goal_pose, distance, heading)
 
     def _confirmed(self, goal: int) -> bool:
-        """Whether the robot truly is where it believes to have arrived."""
+        """Return True if the robot truly is where it believes to have arrived."""
         return _near(self.world.pose, self.goals[goal], TRUE_DISTANCE, TRUE_HEADING)
 
 

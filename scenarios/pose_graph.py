@@ -59,7 +59,7 @@ OUTLIER_WEIGHT = 0.5
 
 @dataclass(frozen=True)
 class SolveSettings:
-    """What to solve, and how.
+    """Settings of a solve.
 
     Attributes:
         file: pose graph: .g2o or .graph (TORO), also .gz.

@@ -70,7 +70,7 @@ def _true_vehicle() -> quadrotor.Parameters:
 
 @dataclass(frozen=True)
 class SafeSettings:
-    """What is to be flown; of several alphas, speeds and controllers all combinations.
+    """Flights to run; of several alphas, speeds and controllers all combinations.
 
     Attributes:
         case: static cylinder, obstacle on an ellipse, cluttered course, figure eight, or a ball thrown at a vehicle
@@ -256,7 +256,7 @@ class SafeFlight:
 
     @property
     def _windy(self) -> quadrotor.Parameters:
-        """What is believed of the vehicle, with the gust of the moment for a wind."""
+        """Believed parameters, with the gust of the moment for a wind."""
         p, (x, y, z) = self.believed, self._air[3:].tolist()
         return replace(p, wind=(p.wind[0] + x, p.wind[1] + y), updraft=p.updraft + z)
 

@@ -152,7 +152,7 @@ class Drive:
 
     @property
     def within_bounds(self) -> bool:
-        """Whether every force keeps its bounds."""
+        """True if every force keeps its bounds."""
         bounds = self.settings.force_bounds
         if bounds is None:
             return True
@@ -161,7 +161,7 @@ class Drive:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the solver converged and the bounds are kept."""
+        """True if the solver converged and the bounds are kept."""
         return self.solution.converged and self.within_bounds
 
 

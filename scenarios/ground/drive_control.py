@@ -1,4 +1,4 @@
-"""Where to go? A model-predictive controller as a factor graph (Bazzana et al. 2022, section V).
+"""Model-predictive controller of the ground robot as a factor graph (Bazzana et al. 2022, section V).
 
 Costs: distance to reference poses along the path (eq. 8), control effort, control rate, soft margins to walls and
 discs. Constraints: unicycle dynamics, limits of velocities and of accelerations, rest at the end, hard clearance from
@@ -86,7 +86,7 @@ class Controller:
         return self.loop.estimate
 
     def given(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Drive:
-        """What the terms are given; arguments as of :meth:`plan`."""
+        """Context of the terms; arguments as of :meth:`plan`."""
         cruise = np.zeros((self.settings.horizon, 2))
         cruise[:, 0] = np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
         spread = np.zeros((3, 3)) if covariance is None else covariance
@@ -118,7 +118,7 @@ class Controller:
         return best
 
     def _worth(self, states: Array, centres: Array, radii: Array) -> tuple[bool, bool, float]:
-        """How good a way out is, the greater the better: whether it touches no wall, nobody, and its least distance."""
+        """Rank of an evasion, the greater the better: clear of walls, clear of discs, least distance."""
         walls, room = self._off_walls(states), self._room(states, centres, radii)
         clear = room + self.settings.disc_clearance >= 0.0
         return walls + self.settings.wall_clearance >= OFF_WALLS, clear, min(room, walls)
@@ -210,10 +210,10 @@ class Controller:
 
 
 def is_behind(states: Array, reference: Array) -> bool:
-    """Whether a plan (N + 1, 3) ends far from its reference: it may be caught in a dead end."""
+    """Return True for a plan (N + 1, 3) that ends far from its reference: it may be caught in a dead end."""
     return bool(np.hypot(*(states[-1] - reference[-1])[:2]) > LEFT_BEHIND)
 
 
 def settled(solution: fg.Solution, choice: Decision) -> bool:
-    """Whether a joint solve says where the robot is: it ended, and its plan is driven."""
+    """Return True if a joint solve says where the robot is: it ended, and its plan is driven."""
     return choice.source == "solved" and solution.status in SETTLED

@@ -1,4 +1,4 @@
-"""What the driving robot's horizon says, term by term (Bazzana et al. 2022, section V)."""
+"""Terms of the ground robot's horizon (Bazzana et al. 2022, section V)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ENDS = "least controls", "greatest controls"
 
 @dataclass(frozen=True)
 class EvasiveTrajectory:
-    """What is driven when no plan is found.
+    """Trajectory that is driven when no plan is found.
 
     It keeps limits and accelerations, ends at rest, and keeps clear as far as anything simple does.
 
@@ -40,7 +40,7 @@ class EvasiveTrajectory:
 
 @dataclass(frozen=True)
 class Drive:
-    """What the terms are given at a tick.
+    """Context of the terms at a tick.
 
     Attributes:
         wanted: (N, 2) controls that would follow the reference [m/s, rad/s].
@@ -110,7 +110,7 @@ class Limits:
         graph.constrain(unicycle.rate, u[:-1], u[1:], lower=-s.most, upper=s.most, name="accelerations")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
-        """What can be reached in the first step, and left in one more after the last."""
+        """Controls that are reachable in the first step, and from which rest is reachable after the last."""
         s = self.settings
         least, most = s.box
         low, high = np.tile(least, (s.horizon, 1)), np.tile(most, (s.horizon, 1))
@@ -142,7 +142,7 @@ class Clearance:
         graph.constrain(discs, x[1:], centre, radius, lower=disc_limit, name="discs")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
-        """Where the discs will be, and what the way out keeps."""
+        """Predicted positions of the discs, and the clearance that the evasive trajectory keeps."""
         s, n, m = self.settings, self.settings.horizon, self.settings.discs
         pose, given, chosen = now.present, now.given, nearest(now.given.tracks, now.present, m)
         k, spread = len(chosen), in_world(pose, given.covariance)

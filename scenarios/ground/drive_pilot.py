@@ -1,4 +1,4 @@
-"""How estimation and control are coupled: two graphs one after the other, or one graph for both."""
+"""Coupling of estimation and control: two graphs one after the other, or one graph for both."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ logger = logging.getLogger("unifg")
 
 
 class Estimator(Protocol):
-    """What says where the robot is."""
+    """Localiser of the robot."""
 
     @property
     def iterations(self) -> int:
@@ -75,7 +75,7 @@ class Estimator(Protocol):
 
 
 class Planner(Protocol):
-    """What says where to go."""
+    """Controller of the robot."""
 
     settings: ControllerSettings
 
@@ -163,7 +163,7 @@ class Pilot(Generic[PlannerT]):
 
     @property
     def verdict(self) -> OutlierReport:
-        """What the supervisor said at the last tick."""
+        """Report of the supervisor at the last tick."""
         return self.supervisor.verdict
 
     @property

@@ -63,7 +63,7 @@ class EmergencyStop:
         return control
 
     def is_free(self, control: Array, scan: Scan, last: float | None = None) -> bool:
-        """Whether a control (2,), reached from a speed ``last`` [m/s] and then braked, touches nothing seen.
+        """Return True if a control (2,), reached from a speed ``last`` [m/s] and then braked, touches nothing seen.
 
         Without ``last`` the control has been reached.
         """

@@ -25,7 +25,7 @@ L = TypeVar("L")
 
 @dataclass(frozen=True)
 class Column:
-    """How a column is written and kept.
+    """Format of a column.
 
     Attributes:
         unit: of its numbers; "ms" is measured by a clock, "iterations" counts those of a solver.

@@ -85,7 +85,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
 
 
 def consistency(log: EpisodeLog) -> dict[str, float]:
-    """How well the covariances fit the errors: the mean NEES, and that of one tick drawn by the seed.
+    """Consistency of the covariances: the mean NEES, and that of one tick drawn by the seed.
 
     Errors of neighbouring ticks are correlated, so only one tick of a drive is an independent draw of chi-squared with
     three degrees of freedom.

@@ -99,7 +99,7 @@ def flight_metrics(log: FlightLog) -> dict[str, Any]:
 
 
 def has_estimate(log: FlightLog) -> bool:
-    """Whether somebody estimated the state: a flight along a given plan has neither sigmas nor windows."""
+    """Return True if the state was estimated: a flight along a given plan has neither sigmas nor windows."""
     return bool((log.believed_sigma > 0.0).any()) or any(len(past) for past in log.pasts)
 
 

@@ -64,7 +64,7 @@ def iterations(values: IntArray) -> dict[str, float]:
 
 
 def collision_words(count: int) -> str:
-    """How many collisions there were, for people."""
+    """Number of collisions in words."""
     return "no collision" if count == 0 else f"{count} collision{'s' if count > 1 else ''}"
 
 
@@ -122,7 +122,7 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def health(m: Mapping[str, Any]) -> str:
-    """How well a robot was, and what was the matter longest."""
+    """Health of a run in words, with the causes that lasted longest."""
     ticks = [f"{count} ticks {state}" for state, count in m["health"].items() if count and state != "ok"]
     if not ticks:
         return "ok throughout"

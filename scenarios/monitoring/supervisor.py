@@ -1,4 +1,4 @@
-"""How fast may the robot go with what it knows, and what is the matter? Signals become a share of its speed.
+"""Supervisor: health signals become a share of the robot's speed.
 
 Every signal grows with trouble. Up to one value all is well; from there the share of the speed falls, and at another
 one it is at its least, most often rest. From a third one on the robot does not know where it is. The worst signal
@@ -20,7 +20,7 @@ PERSISTENT = 2  # bad ticks in a row that make one lost
 
 
 class Health(Enum):
-    """How much of itself a robot can rely on."""
+    """State of a robot's sensors and estimates."""
 
     OK = "ok"
     DEGRADED = "degraded"
@@ -29,7 +29,7 @@ class Health(Enum):
 
 @dataclass(frozen=True)
 class Ramp:
-    """What a signal says about speed.
+    """Speed by the value of one signal.
 
     Attributes:
         words: the cause, for people.
@@ -55,7 +55,7 @@ class Ramp:
 
 @dataclass(frozen=True)
 class OutlierReport:
-    """What holds until the next tick.
+    """Report that holds until the next tick.
 
     Attributes:
         health: in a word.
@@ -69,7 +69,7 @@ class OutlierReport:
 
     @property
     def rests(self) -> bool:
-        """Whether the robot has to come to rest."""
+        """True if the robot has to come to rest."""
         return self.share <= 0.0
 
 

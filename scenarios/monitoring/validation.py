@@ -1,4 +1,4 @@
-"""What may come in: every sample is looked at before anything is worked out from it.
+"""Validation of sensor samples.
 
 A sample is let in if it can be one of the sensor that it comes from: there, of the right size, finite, of the right
 sign, new, not too old. Others are dropped and counted by what is wrong with them; nothing is raised, whatever arrives.
@@ -22,7 +22,7 @@ EARLY = 1e-6  # [s] by which a stamp may lie ahead of the clock
 
 @dataclass(frozen=True)
 class DoorSettings:
-    """What a sample of a sensor can be.
+    """Limits of valid samples.
 
     Attributes:
         nearest: a beam that comes back from nearer has met nothing [m].
@@ -103,7 +103,7 @@ class Door:
         return Scan(angles, np.where(ranges >= s.nearest, ranges, np.nan), stamp, turn), ""
 
     def _repeats(self, ranges: Array) -> bool:
-        """Whether noise has not changed a single beam though the robot has moved."""
+        """Return True if noise has not changed a single beam though the robot has moved."""
         if self._last is None or not (self._since > self.settings.moved).any():
             return False
         return np.array_equal(ranges, self._last, equal_nan=True)
@@ -225,6 +225,6 @@ def _number(value: object) -> float:
 
 
 def _bounded(value: object, count: int, most: float) -> bool:
-    """Whether these are so many finite numbers, none beyond a bound."""
+    """Return True for so many finite numbers, none beyond a bound."""
     found = _numbers(value, (count,))
     return found is not None and bool((np.abs(found) <= most).all())

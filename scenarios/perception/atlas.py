@@ -1,4 +1,4 @@
-"""What the landmarks' slots hold: names, kinds and radii, and what had to leave its slot."""
+"""Slots of landmarks: names, kinds and radii, and the landmarks that had to leave their slot."""
 
 from __future__ import annotations
 

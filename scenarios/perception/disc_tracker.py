@@ -1,4 +1,4 @@
-"""What a lidar tells of obstacles that are not on the map: discs tracked over scans.
+"""Discs that are not on the map, tracked over lidar scans.
 
 `unifg.scenarios.perception.discs` finds discs in one scan; here they become tracks. Each track runs two small Kalman
 filters side by side, one of a disc that stands still and one of a disc at constant velocity (Bar-Shalom, Li,

@@ -1,4 +1,4 @@
-"""What moves, and where does it go? A straight line through the last detections of each disc.
+"""Tracks of moving discs: a straight line through the last detections of each.
 
 A sensor that names what it sees says what moves, too. Of one that does not every cylinder is followed, and moves once a
 line through its last places is steeper than their scatter explains.
@@ -21,7 +21,7 @@ __all__ = ["LineTracker", "TrackerSettings"]
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """How detections become tracks.
+    """Settings of the tracks.
 
     Attributes:
         memory: age of the oldest detection that counts [s].
@@ -87,7 +87,7 @@ class LineTracker:
         return replace(reading, ids=names, moving=moving)
 
     def update(self, reading: Reading, state: Array) -> Tracks:
-        """Where the moving discs are now, and how they move.
+        """Tracks of the discs that move, now.
 
         Args:
             reading: as it was :meth:`told`.

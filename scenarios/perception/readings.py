@@ -1,4 +1,4 @@
-"""What the sensors return: one turn of the lidar, and one reading of the quadrotor's sensors."""
+"""Measurements: one turn of the lidar, and one reading of the quadrotor's sensors."""
 
 from __future__ import annotations
 

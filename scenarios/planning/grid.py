@@ -92,7 +92,7 @@ class _Clearance:
         return distance, gradient
 
     def free(self, points: Array) -> BoolArray:
-        """Whether points (..., 2) lie in cells of the map that are known to be free."""
+        """Flags of points (..., 2) that lie in cells of the map known to be free."""
         cells = np.floor(self.occupancy.world_to_grid(points)).astype(np.intp)
         height, width = self.occupancy.shape
         row, column = cells[..., 1], cells[..., 0]
@@ -219,7 +219,7 @@ def path_exists(
     clearance: float,
     discs: ArrayLike | None = None,
 ) -> bool:
-    """Whether start and goal are joined by free space with this clearance to walls and discs.
+    """Return True if free space with this clearance to walls and discs joins start and goal.
 
     Args:
         occupancy: the map.
@@ -403,7 +403,7 @@ def _straightened(
     stride: int,
     robot_radius: float,
 ) -> IntArray:
-    """Which of points (n, 2) are left: from each the farthest that a good line leads to."""
+    """Indices of the points (n, 2) that are left: from each the farthest that a good line leads to."""
     last = len(points) - 1
     kept, count, anchor = np.zeros(last + 1, dtype=np.int64), 1, 0
     while anchor < last:
@@ -433,7 +433,7 @@ def _good_line(
     end: int,
     robot_radius: float,
 ) -> bool:
-    """Whether a straight line keeps the clearance of its ends, stays on free cells, and costs no more."""
+    """Return True if a straight line keeps the clearance of its ends, stays on free cells, and costs no more."""
     across, along = points[end, 0] - points[begin, 0], points[end, 1] - points[begin, 1]
     length, allowed, total = math.hypot(across, along), min(floor[begin], floor[end]) - 1e-9, 0.0
     pieces = max(1, 2 * math.ceil(length * math.hypot(table[0], table[3])))  # half a cell each

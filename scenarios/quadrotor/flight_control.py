@@ -1,4 +1,4 @@
-"""How to fly there? The model-predictive controller of the quadrotor as a factor graph (Ta et al. 2014, V-B).
+"""Model-predictive controller of the quadrotor as a factor graph (Ta et al. 2014, V-B).
 
 Costs: a reference through what is known, level attitude, effort about hover, change of control. Constraints: the
 dynamics with the believed mass, drag and wind, limits of control and attitude, clearance from cylinders, moving discs
@@ -53,7 +53,7 @@ Source: TypeAlias = Literal["solved", "violating", "kept", "braking"]
 
 
 class FlightPast(Protocol):
-    """How a flight is tied to the past: state, parameters and map that are given, or estimated in the same graph.
+    """Coupling of a flight to its past: state, parameters and map are given, or estimated in the same graph.
 
     Attributes:
         robot: who flies.
@@ -66,7 +66,7 @@ class FlightPast(Protocol):
     pull: float
 
     def motion(self) -> list[Term]:
-        """How the vehicle moves."""
+        """Terms of the motion."""
         ...
 
     def apart(self, squares: bool | None) -> list[Term]:
@@ -78,7 +78,7 @@ class FlightPast(Protocol):
         ...
 
     def carry(self, multipliers: dict[str, Array], now: Context[Flown]) -> dict[str, Array]:
-        """What of the shifted multipliers still holds."""
+        """Shifted multipliers that still hold."""
         ...
 
     def moving_with(self, solution: fg.Solution, now: Context[Flown]) -> quadrotor.Parameters:
@@ -86,7 +86,7 @@ class FlightPast(Protocol):
         ...
 
     def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
-        """What is believed after a solve for which a belief was given."""
+        """Belief after a solve for which a belief was given."""
         ...
 
 
@@ -164,7 +164,7 @@ class Controller:
         return plan
 
     def given(self, belief: Belief, movers: Tracks) -> Flown:
-        """What the terms are given."""
+        """Context of the terms."""
         s = self.settings
         reference = self.guide.reference(belief.state, belief.landmarks, s.horizon + 1, s.dt)
         obstacles = self.slots.fill(belief.state, reference.positions, belief.landmarks, movers)
@@ -222,7 +222,7 @@ class Controller:
 
 
 def moves(controls: Array, states: Array, dt: float, parameters: quadrotor.Parameters, tolerance: float) -> bool:
-    """Whether states (N + 1, 10) follow from controls (N, 4), each row of the dynamics to a tolerance."""
+    """Return True if states (N + 1, 10) follow from controls (N, 4), each row of the dynamics to a tolerance."""
     if not (np.isfinite(controls).all() and np.isfinite(states).all()):
         return False
     defects = quadrotor.dynamics(states[:-1], controls, states[1:], parameters.packed, dt)
@@ -230,7 +230,7 @@ def moves(controls: Array, states: Array, dt: float, parameters: quadrotor.Param
 
 
 def is_behind(states: Array, reference: Reference) -> bool:
-    """Whether a plan (N + 1, 10) ends far from its reference: it may be caught behind something."""
+    """Return True for a plan (N + 1, 10) that ends far from its reference: it may be caught behind something."""
     return bool(np.hypot(*(states[-1, :2] - reference.positions[-1, :2])) > LEFT_BEHIND)
 
 

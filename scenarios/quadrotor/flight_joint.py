@@ -43,7 +43,7 @@ BELIEVABLE = 1e-4  # largest violation of an estimate; a plan may have more, but
 
 @dataclass(frozen=True)
 class JointSettings:
-    """How far the future may lean on the past.
+    """Bounds on the pull of the future on the past.
 
     Attributes:
         pull: how far the plan may move state, parameters and landmarks, in standard deviations of what the past
@@ -110,7 +110,7 @@ class KeepClear:
             repel(graph, s, self.squares, kept, *pairs, name="landmarks", active=near)
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """Which of them are obstacles now, how wide they are, and how far to keep off."""
+        """Flags of the landmarks that are obstacles now, their radii, and the clearances to keep."""
         s, given, count = self.settings, now.given, len(now.constants["landmarks"])
         hulls, limits = np.zeros((2, s.horizon, count))
         counting = np.zeros((s.horizon, count), dtype=bool)
@@ -148,7 +148,7 @@ class SharedFlight:
         self.names = estimator.atlas.names.copy()
 
     def motion(self) -> list[Term]:
-        """How the vehicle moves."""
+        """Terms of the motion."""
         return [SharedMotion(self.settings, "drag" in self.estimator.own.estimated)]
 
     def apart(self, squares: bool | None) -> list[Term]:
@@ -181,7 +181,7 @@ class SharedFlight:
         return flyable(packed({static.name: solution[families[static.name]] for static in self.robot.constants}))
 
     def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
-        """What the joint solve says, with the covariances of the past; what was given where it says nothing."""
+        """Belief by the joint solve, with the covariances of the past; the given one where it says nothing."""
         atlas = self.estimator.atlas
         self.names = atlas.names.copy()
         self.latest = given
@@ -202,5 +202,5 @@ class SharedFlight:
 
 
 def believable(solution: fg.Solution, choice: object) -> bool:
-    """Whether a solve says something about the past, whatever came of its plan; not if its violation is no number."""
+    """Return True for a solve that says something about the past, whatever came of its plan."""
     return solution.violation <= BELIEVABLE

@@ -1,4 +1,4 @@
-"""What the quadrotor's horizon says, term by term (Ta et al. 2014, section V)."""
+"""Terms of the quadrotor's horizon (Ta et al. 2014, section V)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SLOWING = 0.3  # [s] in which a speed above the limit is to fade
 
 @dataclass(frozen=True)
 class Flown:
-    """What the terms are given at a tick.
+    """Context of the terms at a tick.
 
     Attributes:
         belief: state, parameters and landmarks.
@@ -60,7 +60,7 @@ class GivenMotion:
         graph.constrain(quadrotor.dynamics, *motion, lower=0, upper=0, name="dynamics")
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """What is believed."""
+        """Parameters as believed."""
         return {"parameters": now.given.belief.parameters.packed}
 
 
@@ -82,7 +82,7 @@ class GivenFlight:
         self.settings = settings
 
     def motion(self) -> list[Term]:
-        """How the vehicle moves."""
+        """Terms of the motion."""
         return [GivenMotion(self.settings)]
 
     def apart(self, squares: bool | None) -> list[Term]:
@@ -102,13 +102,13 @@ class GivenFlight:
         return now.given.belief.parameters
 
     def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
-        """What was given."""
+        """Belief that was given."""
         return given
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the vehicle can do and where it may be."""
+    """Limits of controls, heights and attitude."""
 
     settings: ControllerSettings
 
@@ -148,7 +148,7 @@ class Leaning:
         graph.minimize(landmarks.tilt, x.R[1:], upright, sigma=sigma, name="level")
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """Where up is at hover."""
+        """Vertical axis in the body at hover."""
         return {"upright": SO3.act(SO3.inverse(level(now.given.belief)), UP)}
 
 
@@ -210,7 +210,7 @@ class Clearance:
             graph.constrain(avoidance.segment_clearance, *segments, lower=beside, name="walls")
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """What fills the slots."""
+        """Contents of the slots."""
         others = now.given.others
         found: dict[str, ArrayLike] = {"centres": others.centres, "radii": others.radii, "clearances": others.limits}
         return found | ({"wall clearances": others.wall_limits} if len(self.walls) else {})
@@ -250,7 +250,7 @@ class Potential:
             repel(graph, s, self.squares, avoidance.segment_clearance, *hulls, name="walls")
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """What fills the slots, and a speed that the vehicle can come down to."""
+        """Contents of the slots, and a speed that the vehicle can come down to."""
         s, others = self.settings, now.given.others
         times, most = s.dt * np.arange(1.0, s.horizon + 1), s.guide.speed
         excess = np.maximum(np.abs(now.present[7:10]) - most, 0.0) + SPARE

@@ -1,4 +1,4 @@
-"""What tells the quadrotor's supervisor that something is the matter, and what is flown instead of a plan then.
+"""Health signals of the quadrotor, and the control in place of a plan.
 
 A vehicle that may not go on hovers, by what it still measures; one that cannot go on for long lands where it is.
 """
@@ -115,7 +115,7 @@ class FlightWatch:
         )
 
     def planned(self, sound: bool) -> None:
-        """Whether the tick has a plan of its own."""
+        """Record if the tick has a plan of its own."""
         self._plan = 0.0 if sound else self._plan + self._dt
 
     def hover(self, belief: Belief, least: Array, most: Array) -> Array:

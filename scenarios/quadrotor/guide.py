@@ -1,4 +1,4 @@
-"""Which way? The reference of the controller: a shortest way through what is known, at a speed that bends allow.
+"""Reference of the controller: a shortest way through what is known, at a speed that bends allow.
 
 Space that has not been seen counts as free. The widest clearance that leaves a way is used. A way is kept as long as
 it passes and no other is much shorter, so that small corrections of the map do not send the vehicle to and fro.
@@ -26,7 +26,7 @@ SMOOTHING = 5  # points of a smoothing window
 
 @dataclass(frozen=True)
 class GuideSettings:
-    """How the reference is made.
+    """Settings of the reference.
 
     Attributes:
         speed: cruise [m/s].
@@ -45,7 +45,7 @@ class GuideSettings:
 
 @dataclass(frozen=True)
 class Reference:
-    """Where to be at the nodes of the horizon.
+    """Positions and velocities at the nodes of the horizon.
 
     Attributes:
         positions: (N + 1, 3) [m].
@@ -182,6 +182,6 @@ def smoothed(way: Array) -> Array:
 
 
 def _onwards(way: Array, position: Array) -> Array:
-    """What is left of a way, from ``position`` on."""
+    """Rest of a way, from ``position`` on."""
     at, _, _ = nearest_piece(way, position)
     return np.concatenate([position[None], way[at + 1 :]])

@@ -123,7 +123,7 @@ what noise and gusts leave.
 
 @dataclass(frozen=True)
 class Obstacles:
-    """What is seen of M obstacles at one time.
+    """Sightings of M obstacles at one time.
 
     Attributes:
         position, velocity: (M, 3) [m, m/s].
@@ -568,7 +568,7 @@ class Barriers(Held):
             )
 
     def data(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
-        """What fills the slots."""
+        """Contents of the slots."""
         near = now.given.obstacles
         flat = np.ones((self.settings.slots, 3))
         flat[near.upright, 2] = 0.0

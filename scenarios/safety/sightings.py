@@ -1,4 +1,4 @@
-"""Where obstacles are and how fast, from looks that are not exact; and how far that is to be believed.
+"""Positions and velocities of obstacles from noisy sightings, and their uncertainty.
 
 The last looks at M obstacles are factors on place and velocity of now, one graph for all of them: what goes straight
 on, or falls, was at c + s v + s^2/2 a when it was seen at the time s. Noise is the same along every axis, so place and

@@ -1,4 +1,4 @@
-"""What the vehicle weighs and how much the air holds it, from how its velocity has changed (FactorMPC, reference 29).
+"""Mass and drag from the change of the velocity (FactorMPC, reference 29).
 
 Over a stretch of the past, thrust and attitude are known from what was told and seen. The mean of v' is
 

@@ -14,7 +14,7 @@ _HEIGHT = 2.0  # up to which obstacles are drawn; they have no top [m]
 
 
 def course_stage(settings: CourseSettings) -> Scene:
-    """What stands there, start and target."""
+    """Obstacles, start and target."""
     layout = settings.layout()
     scene = Scene(f"unifg: {layout.name or 'a course'}, as it is solved", counts="iteration")
     scene.discs("cylinders", layout.cylinders, height=_HEIGHT, colour="fixed")

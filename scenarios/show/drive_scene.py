@@ -58,7 +58,7 @@ def drive_scene(log: EpisodeLog) -> Scene:
 
 
 def drive_stage(log: Any) -> Scene:
-    """What stays throughout a drive, and the bodies that move in it.
+    """Static parts of a drive's scene, and the bodies that move in it.
 
     Args:
         log: an `EpisodeLog`, or one in the making: what is known before the first tick is asked of it.
@@ -94,7 +94,7 @@ def drive_stage(log: Any) -> Scene:
 
 
 def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
-    """What a tick of a drive shows.
+    """Draw a tick of a drive.
 
     Args:
         frame: to be drawn on.

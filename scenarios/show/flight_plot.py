@@ -144,7 +144,7 @@ def moments(log: FlightLog, count: int = 6) -> IntArray:
 
 
 def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bool = True) -> Axes:
-    """What stood there, was believed and meant at one tick, from above.
+    """Obstacles, belief and plan at one tick, from above.
 
     Args:
         log: the flight.
@@ -311,7 +311,7 @@ def _limits(log: FlightLog, index: int) -> list[float]:
 
 
 def _title(log: FlightLog, what: str) -> str:
-    """What a figure shows and of which flight."""
+    """Title of a figure: its content and the flight."""
     settings = log.settings
     words = [what, str(settings.get("scenario", "")), log.layout.name]
     if settings.get("solver"):

@@ -80,7 +80,7 @@ def sensor_reach(log: FlightLog) -> float | None:
 
 
 def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Scene:
-    """What stays throughout a flight, and the bodies that move in it.
+    """Static parts of a flight's scene, and the bodies that move in it.
 
     Args:
         log: a `FlightLog`, or one in the making: what is known before the first tick is asked of it.
@@ -112,7 +112,7 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
 
 
 def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
-    """What a tick of a flight shows.
+    """Draw a tick of a flight.
 
     Args:
         scene: begun by `flight_stage`.

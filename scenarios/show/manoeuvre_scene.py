@@ -65,7 +65,7 @@ def manoeuvre_scene(manoeuvre: Manoeuvre) -> Scene:
 
 
 def manoeuvre_stage(case: Case) -> Scene:
-    """What is asked of the robot, for a scene of the iterates of a solve."""
+    """Static parts of a manoeuvre's scene, for the iterates of a solve."""
     scene = Scene(f"unifg: manoeuvre '{case.name}', as it is solved", counts="iteration")
     scene.way("path", case.reference(ManoeuvreSettings())[:, :2], colour="goal", legend="path it is asked to follow")
     if case.discs:

@@ -31,7 +31,7 @@ __all__ = [
 
 
 class Timed(Protocol):
-    """What panels over time need of a log."""
+    """Columns that panels over time need."""
 
     @property
     def ticks(self) -> int:

@@ -88,7 +88,7 @@ def _floor(scene: Scene, low: Array, high: Array) -> None:
 
 
 def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
-    """What is to be kept clear of, with its margin on the ground."""
+    """Obstacles, with the margin on the ground."""
     first: dict[str, str] = {}
     for index, (radius, upright) in enumerate(zip(log.radii.tolist(), log.upright.tolist(), strict=True)):
         colour = "fixed" if still[index] else "moving"
@@ -105,7 +105,7 @@ def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
 
 
 def safe_frame(frame: Frame, log: Any, tick: int) -> None:
-    """What a tick of a `SafeLog`, or of one in the making, shows."""
+    """Draw a tick of a `SafeLog`, or of one in the making."""
     state, plan = log.states[tick], log.plans[tick]
     frame.place("drone", state[:7])
     frame.place("shadow", [state[0], state[1], 0.0])
@@ -129,12 +129,12 @@ def safe_frame(frame: Frame, log: Any, tick: int) -> None:
 
 
 def _rests(points: Array) -> bool:
-    """Whether places (n, 3) are all the same."""
+    """Return True if places (n, 3) are all the same."""
     return bool(np.ptp(points, axis=0).max() < _STILL)
 
 
 def _words(scene: Scene, log: SafeLog) -> None:
-    """How it ended."""
+    """Outcome and facts of the flight."""
     words = "kept its distance" if not log.violated else "came TOO NEAR" if not log.touched else "TOUCHED something"
     arrived = "" if log.end is None else ", arrived" if log.arrived else ", did NOT arrive"
     stopped = ", interrupted by the user" if log.interrupted else ""

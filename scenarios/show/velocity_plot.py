@@ -47,7 +47,7 @@ def plot_speed(drive: Drive, ax: Axes) -> Axes:
 
 
 def plot_error(drive: Drive, ax: Axes) -> Axes:
-    """What the vehicle is faster than the profile."""
+    """Deviation of the speed from the profile."""
     ax.axhline(0.0, color=GREY, lw=0.8)
     ax.plot(drive.time, drive.error, color=_MISSED, lw=1.1)
     return face(ax, "Deviation from the profile", "v - v_ref [m/s]")
@@ -86,7 +86,7 @@ def plot_numbers(drive: Drive, ax: Axes) -> Axes:
     styles = {name: {"color": c, "marker": mark, "ms": 4, "ls": line} for name, (c, mark, line) in shown.items()}
 
     def values(name: str) -> list[float]:
-        """What is exactly zero, as complementarity with zero multipliers, has no place on a logarithmic axis."""
+        """Values of a row; exact zeros, which have no place on a logarithmic axis, are NaN."""
         return [value if (value := getattr(row, name)) > 0.0 else np.nan for row in history]
 
     plot_convergence(ax, history, styles, drive.settings.tolerance, values)

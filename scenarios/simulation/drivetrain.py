@@ -1,4 +1,4 @@
-"""What a base makes of its commands: how soon, how briskly, and how much of it the floor takes.
+"""Response of a base to its commands: latency, lag, accelerations, slip and drift.
 
 A command acts after the latency. The motors follow it with a lag of first order, dv/dt = (command - v) / lag, but they
 change the wheels' velocities no faster than their accelerations allow, divided by what the base carries besides itself.

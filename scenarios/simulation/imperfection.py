@@ -1,4 +1,4 @@
-"""How a building differs from its map: walls drawn a little off, and furniture that has been moved.
+"""Differences between a building and its map: walls drawn a little off, and furniture that has been moved.
 
 The robot's map shows the furniture where it once stood; the world is the map warped, with the furniture where it stands
 now. Everything is drawn by seed, and redrawn until the robot can get through in both.
@@ -30,7 +30,7 @@ DRAWS = 200  # of one piece
 
 @dataclass(frozen=True)
 class Imperfection:
-    """How wrong the robot's map is.
+    """Errors of the robot's map.
 
     Attributes:
         map_error: standard deviation by which walls stand elsewhere than on the map, smoothly from place to place [m].
@@ -120,6 +120,6 @@ def _standing(occupancy: OccupancyMap, corner: Array, size: Array, ends: Array) 
 
 
 def _passable(occupancy: OccupancyMap, ends: Array) -> bool:
-    """Whether the start is joined to every goal."""
+    """Return True if the start is joined to every goal."""
     field = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
     return all(path_exists(occupancy, field, ends[0], end, WAY) for end in ends[1:])
