@@ -172,7 +172,7 @@ class Flight:
         interrupted = run_ticks(round(settings.time_limit / dt), lambda number: self._tick(recorder), progress)
         return recorder.finish(
             collisions=world.collisions, reached=self._reached, interrupted=interrupted,
-            outcome=self._outcome(interrupted), dropped=dict(self.watch.door.dropped),
+            outcome=self._outcome(interrupted), dropped=dict(self.watch.validator.dropped),
         )  # fmt: skip
 
     def _outcome(self, interrupted: bool) -> str:

@@ -243,7 +243,7 @@ class Episode:
             collisions=self.world.collisions,
             reached=[outcome == REACHED for outcome in self._outcomes],
             outcomes=self._outcomes,
-            dropped=dict(self.pilot.door.dropped),
+            dropped=dict(self.pilot.validator.dropped),
             interrupted=interrupted,
         )
 

@@ -90,9 +90,9 @@ class Controller:
         cruise = np.zeros((self.settings.horizon, 2))
         cruise[:, 0] = np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
         spread = np.zeros((3, 3)) if covariance is None else covariance
-        return Drive(cruise, reference, tracks, spread, self._way_out(pose, tracks))
+        return Drive(cruise, reference, tracks, spread, self._evasion_from(pose, tracks))
 
-    def _way_out(self, pose: Array, tracks: Tracks) -> EvasiveTrajectory:
+    def _evasion_from(self, pose: Array, tracks: Tracks) -> EvasiveTrajectory:
         """Rest along the path of the last plan; if a mover would come too near there, the best simple way of evading.
 
         Which is the best is judged by the least distance on the way, of discs and of walls alike, beyond what is to be
@@ -169,7 +169,7 @@ class Controller:
         if solution.violation <= self.settings.feasible:
             driven = self._within_reach(kept.within(controls), now.last)
             return Decision(driven, states, "solved", behind=is_behind(states, now.given.reference))
-        way = now.given.way_out
+        way = now.given.evasive
         return Decision(way.controls, way.states, "evading" if way.evades else "braking")
 
     def _within_reach(self, controls: Array, last: Array) -> Array:
@@ -180,7 +180,7 @@ class Controller:
 
     def leaving(self, now: Context[Drive]) -> tuple[Array, Array]:
         """Guess the way out, which is feasible: a solver that failed finds the near side of what stopped it."""
-        return now.given.way_out.states, now.given.way_out.controls
+        return now.given.evasive.states, now.given.evasive.controls
 
     def along(self, now: Context[Drive]) -> tuple[Array, Array]:
         """Guess how a simple pursuit would follow the reference, which leads around whatever the route leads around.

@@ -22,8 +22,8 @@ from unifg.scenarios.ground.emergency_stop import EmergencyStop
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.relocalise import Relocaliser
 from unifg.scenarios.ground.route import Route
-from unifg.scenarios.monitoring.supervisor import Health, OutlierReport, Supervisor
-from unifg.scenarios.monitoring.validation import Door
+from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Supervisor
+from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.perception.disc_tracker import DiscTracker
 from unifg.scenarios.perception.explaining import PointWatch, explained
 from unifg.scenarios.perception.readings import Scan
@@ -120,7 +120,7 @@ class Pilot(Generic[PlannerT]):
         pose: (3,) present estimate [m, m, rad]; that of the joint solve, if there is one.
         iterations: of the estimator at the last tick.
         clock: how long the stages of the last tick took: localise, perceive, route, plan.
-        door: what samples have to pass.
+        validator: of samples.
         supervisor: how fast the robot may go.
         share: of the beams of the last scan that the map explains.
         relocated: whether the last tick has found the robot at another place.
@@ -146,7 +146,7 @@ class Pilot(Generic[PlannerT]):
         self.tracks = Tracks.none()
         self.clock = Stopwatch()
         self.pose = estimator.pose
-        self.door, self.supervisor = Door(beams), Supervisor(RAMPS)
+        self.validator, self.supervisor = Validator(beams), Supervisor(RAMPS)
         self.emergency_stop = EmergencyStop(s.robot_radius, float(s.most[0]) / s.dt, s.dt)
         self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
         self.driven = np.zeros(2)
@@ -162,7 +162,7 @@ class Pilot(Generic[PlannerT]):
         return self.estimator.iterations
 
     @property
-    def verdict(self) -> OutlierReport:
+    def verdict(self) -> HealthReport:
         """Report of the supervisor at the last tick."""
         return self.supervisor.verdict
 
@@ -174,7 +174,7 @@ class Pilot(Generic[PlannerT]):
     def wake(self, scan: Scan | None, now: float) -> None:
         """Look where the robot stands before anything is decided, as where to go from there; the first tick goes on."""
         try:
-            self._first = self.door.scan(scan, now)
+            self._first = self.validator.scan(scan, now)
             self.estimator.update(self._first, None, self.controller.settings.dt)
         except (UnifgError, ArithmeticError, ValueError):
             return  # the first tick tries again, and says what is wrong
@@ -207,8 +207,8 @@ class Pilot(Generic[PlannerT]):
     def _decide(self, scan: Scan | None, odometry: Array | None, route: Route, now: float, first: bool) -> Plan:
         s = self.controller.settings
         looked = first and self._awake
-        seen = self._first if looked else self.door.scan(scan, now)
-        wheels = None if first else self.door.odometry(odometry, self.driven, s.dt)
+        seen = self._first if looked else self.validator.scan(scan, now)
+        wheels = None if first else self.validator.odometry(odometry, self.driven, s.dt)
         predicted = (
             self.estimator.pose if wheels is None else unicycle.step(self.estimator.pose[None], wheels[None], s.dt)[0]
         )
@@ -229,11 +229,12 @@ class Pilot(Generic[PlannerT]):
         signals.note(
             corrected=found is not None and not self.estimator.refused, share=self.share, predicted=predicted,
             pose=pose, covariance=self.estimator.covariance, wheels=wheels,
-            trusted="wheels" not in self.door.refused, asked=self.driven,
+            trusted="wheels" not in self.validator.refused, asked=self.driven,
             blind=0.0 if seen is None else seen.blind,
         )  # fmt: skip
-        why = self.door.refused.get("lidar", "") or self.estimator.refused
-        verdict = self.supervisor.judge(signals.values(), {"fix": why, "odometry": self.door.refused.get("wheels", "")})
+        refused = self.validator.refused
+        why = {"fix": refused.get("lidar", "") or self.estimator.refused, "odometry": refused.get("wheels", "")}
+        verdict = self.supervisor.judge(signals.values(), why)
         self._find_again(seen)
         if verdict.rests:
             plan = self._rest(pose)
@@ -301,7 +302,7 @@ class Pilot(Generic[PlannerT]):
 
     def take_over(self, other: Pilot[PlannerT]) -> None:
         """Go on where another pilot, with another map, was."""
-        self.door, self.supervisor, self._signals = other.door, other.supervisor, other._signals
+        self.validator, self.supervisor, self._signals = other.validator, other.supervisor, other._signals
         self.driven, self.share = other.driven, other.share
 
 

@@ -171,7 +171,7 @@ class Route:
         return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
 
     def _round_about(self, pose: Array, staying: Tracks, place: Array) -> bool:
-        """Search another way on the whole map; True if found. After enough searches without one the goal is given up."""
+        """Search another way on the whole map; True if found. After enough failures the goal is given up."""
         self._closed += PATIENCE + 1
         if self._since_anywhere >= ANYWHERE:
             self._since_anywhere = 0

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Health", "OutlierReport", "Ramp", "Supervisor"]
+__all__ = ["Health", "HealthReport", "Ramp", "Supervisor"]
 
 RISE = 0.1  # of the speed that comes back in a tick
 STEADY = 5  # ticks in a row in which nothing says that it is lost, after which a robot that was is not
@@ -54,7 +54,7 @@ class Ramp:
 
 
 @dataclass(frozen=True)
-class OutlierReport:
+class HealthReport:
     """Report that holds until the next tick.
 
     Attributes:
@@ -84,11 +84,11 @@ class Supervisor:
     def __init__(self, ramps: Mapping[str, Ramp]) -> None:
         """Begin with confidence."""
         self.ramps = dict(ramps)
-        self.verdict = OutlierReport(Health.OK, 1.0, "")
+        self.verdict = HealthReport(Health.OK, 1.0, "")
         self._bad = 0
         self._good = STEADY
 
-    def judge(self, signals: Mapping[str, float], notes: Mapping[str, str] | None = None) -> OutlierReport:
+    def judge(self, signals: Mapping[str, float], notes: Mapping[str, str] | None = None) -> HealthReport:
         """Weigh the signals of a tick.
 
         Args:
@@ -107,13 +107,13 @@ class Supervisor:
         is_lost = self._bad >= PERSISTENT or (before.health is Health.LOST and self._good < STEADY)
         if is_lost:
             named = self._cause(worst if allowed < 1.0 else "", notes) or before.cause
-            self.verdict = OutlierReport(Health.LOST, 0.0, named)
+            self.verdict = HealthReport(Health.LOST, 0.0, named)
         elif allowed < 1.0:
-            self.verdict = OutlierReport(Health.DEGRADED, min(allowed, before.share + RISE), self._cause(worst, notes))
+            self.verdict = HealthReport(Health.DEGRADED, min(allowed, before.share + RISE), self._cause(worst, notes))
         else:
             share = min(1.0, before.share + RISE)
             returning = share < 1.0
-            self.verdict = OutlierReport(
+            self.verdict = HealthReport(
                 Health.DEGRADED if returning else Health.OK, share, before.cause if returning else ""
             )
         return self.verdict
@@ -122,7 +122,7 @@ class Supervisor:
         """Note a tick that came to no end."""
         self._good = 0
         health = Health.LOST if self.verdict.health is Health.LOST else Health.DEGRADED
-        self.verdict = OutlierReport(health, 0.0, f"the tick failed: {why}")
+        self.verdict = HealthReport(health, 0.0, f"the tick failed: {why}")
 
     def _cause(self, name: str, notes: Mapping[str, str] | None) -> str:
         if not name:
