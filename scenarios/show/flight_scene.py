@@ -16,6 +16,8 @@ from unifg.errors import ViewError
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.log.metrics import collision_words, health
+from unifg.scenarios.show.numbers import Number, declare, in_words, metres, show
+from unifg.scenarios.show.parts import floor, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
@@ -27,8 +29,62 @@ SIGMAS = 2.0
 """Half axes of ellipses in standard deviations."""
 
 _HEIGHT = 2.0  # of walls, cylinders and movers [m]; there they have no top
-_FLOOR = -0.02  # drawn a little lower than it is, clear of what stands on it [m]
 _NODES = 16  # of a way that changes from frame to frame
+
+
+def _error(log: Any, k: int) -> float:
+    """Position error [cm]."""
+    return 100.0 * float(np.linalg.norm(log.believed[k][:3] - log.truth[k][:3]))
+
+
+def _mass(log: Any, k: int) -> str:
+    """Mass as believed, where it is estimated."""
+    mass, sigma = log.parameters[k][0], log.parameters_sigma[k][0]
+    return f"{mass:.3f} \u00b1 {sigma:.3f} kg" if sigma > 0.0 else ""
+
+
+def _spent(log: Any, k: int) -> float:
+    """Time of a tick [ms]; NaN where no clock ran."""
+    return float(log.estimate_ms[k] + log.plan_ms[k]) or math.nan
+
+
+def _times(log: Any, k: int) -> str:
+    """Times of estimate and plan, where a clock ran."""
+    spent = f"{log.estimate_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + " (compiled)" * bool(log.compiled[k])
+    return "" if math.isnan(_spent(log, k)) else spent
+
+
+NUMBERS_OF_A_PLAN = (
+    Number("speed", lambda log, k: f"{np.linalg.norm(log.truth[k][7:]):.2f} m/s"),
+    Number("height", lambda log, k: f"{log.truth[k][2]:.2f} m"),
+    Number(
+        "health", lambda log, k: in_words(log.health[k], log.causes[k]), alarm=lambda log, k: log.health[k] != "ok"
+    ),
+    Number("fault", lambda log, k: (log.fault[k] or "none now") if log.settings.get("faults") else ""),
+    Number(
+        "clearance", lambda log, k: metres(log.clearance[k]), lambda log, k: log.clearance[k],
+        plot={"unit": "m", "limit": 0.0, "colour": "horizon"},
+    ),
+    Number("thrust", lambda log, k: f"{log.controls[k][3]:.1f} N"),
+    Number("landmarks", lambda log, k: str(len(log.landmarks[k]) or "")),
+    Number(
+        "plan", lambda log, k: log.statuses[k].lower() + ": stored one flown" * bool(log.emergency[k]),
+        alarm=lambda log, k: log.emergency[k],
+    ),
+)  # fmt: skip
+"""Lines and curves of a flight that nothing estimates."""
+
+NUMBERS = (
+    *NUMBERS_OF_A_PLAN,
+    Number("estimate + plan", None, _spent, plot={"unit": "ms", "log": True}),
+    Number(
+        "position error", lambda log, k: f"{_error(log, k):.1f} cm", _error, plot={"unit": "cm", "colour": "estimate"}
+    ),
+    Number("mass \u00b1 \u03c3", _mass),
+    Number("true mass", lambda log, k: f"{log.parameters_true[0]:.3f} kg" if _mass(log, k) else ""),
+    Number("estimate, plan", _times, alarm=lambda log, k: log.compiled[k] > 0),
+)  # fmt: skip
+"""Lines and curves of a flight."""
 
 
 def flight_scene(log: FlightLog) -> Scene:
@@ -102,12 +158,8 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
     _ends(scene, log)
     scene.label("start", log.layout.start[:2])
     scene.label("target", log.layout.target)
-    scene.label("drone", follows="drone", above=True)
     _views(scene, log)
-    if estimated:
-        scene.plot("estimate + plan", unit="ms", log=True)
-        scene.plot("position error", unit="cm", colour="estimate")
-    scene.plot("clearance", unit="m", limit=0.0, colour="horizon")
+    declare(scene, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
     return scene
 
 
@@ -135,7 +187,9 @@ def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
         if name not in scene.bodies:
             words = "cylinder that moves" if index == 0 else ""
             like = "mover 0" if index else None
-            scene.body(name, _pillar(radius, "moving"), colour="moving", legend=words, like=like)
+            rim = shapes.ring(np.zeros(2), radius - 0.03, 0.03, _HEIGHT + 0.01, corners=32)
+            parts = [pillar(radius, _HEIGHT, "moving"), Part("rim", rim, "start", False)]
+            scene.body(name, parts, colour="moving", legend=words, like=like)
         frame.place(name, [x, y, 0.0])
     for name, way in (("past", log.pasts[tick]), ("horizon", log.plans[tick])):
         points = shapes.thin(way, _NODES) if len(way) > 1 and np.isfinite(way).all() else way[:0]
@@ -144,7 +198,7 @@ def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
             if name == "horizon":
                 below = shapes.ribbon(points, 0.06, 0.018)
                 frame.mesh("below", below, opacity=0.35)
-    _say(frame, log, tick, estimated)
+    show(frame, log, tick, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
 
 
 def _layers(scene: Scene, sensed: bool, estimated: bool) -> None:
@@ -162,11 +216,7 @@ def _layers(scene: Scene, sensed: bool, estimated: bool) -> None:
 
 def _bodies(scene: Scene, reach: float | None) -> None:
     """The vehicle, its shadow with a plumb line, and the circle the sensor reaches."""
-    scene.body("drone", "quadrotor", size=VEHICLE_RADIUS, colour="robot", legend="")
-    plumb = shapes.tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), 0.012)
-    disc = shapes.ring(np.zeros(2), 0.0, VEHICLE_RADIUS, 0.016, corners=24)
-    shadow = [Part("disc", disc, "start", False, 0.4), Part("plumb", plumb, "start", False, 0.5)]
-    scene.body("shadow", shadow, colour="start", legend="")
+    vehicle(scene, VEHICLE_RADIUS, plumb=True)
     if reach is not None:
         ring = shapes.ring(np.zeros(2), reach - 0.07, 0.07, 0.014, corners=96)
         scene.body(
@@ -176,13 +226,7 @@ def _bodies(scene: Scene, reach: float | None) -> None:
 
 def _ground(scene: Scene, log: Any) -> None:
     """The floor, with lines every metre to judge distances by, and the walls."""
-    (left, low), (right, high) = log.layout.size
-    floor = np.array([[[left, low, _FLOOR], [right, low, _FLOOR], [right, high, _FLOOR], [left, high, _FLOOR]]])
-    scene.mesh("floor", shapes.quads(floor), colour="floor", legend="")
-    across = [[[x, low], [x, high]] for x in np.arange(math.ceil(left), right + 1e-9)]
-    along = [[[left, y], [right, y]] for y in np.arange(math.ceil(low), high + 1e-9)]
-    lines = [shapes.ribbon(np.array(line), 0.02, 0.0) for line in across + along]
-    scene.mesh("metres", shapes.merge(lines), colour="metres", legend="")
+    floor(scene, *log.layout.size)
     sheets, frames = [], []
     for wall in log.layout.walls:
         foot, top = (np.column_stack([wall, np.full(2, z)]) for z in (0.0, _HEIGHT))
@@ -217,12 +261,6 @@ def _cylinders(frame: Frame, log: Any, tick: int, sensed: bool) -> None:
         frame.discs("unseen", rows[~known], height=_HEIGHT, opacity=0.22)
 
 
-def _pillar(radius: float, colour: str) -> list[Part]:
-    column = shapes.copies(shapes.column(), np.zeros((1, 3)), np.diag([radius, radius, _HEIGHT])[None])
-    rim = shapes.ring(np.zeros(2), radius - 0.03, 0.03, _HEIGHT + 0.01, corners=32)
-    return [Part("body", column, colour), Part("rim", rim, "start", False)]
-
-
 def _landmarks(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     """Of every name: an ellipse on top of the cylinder it stands for, and the cylinder's outline as believed."""
     for name, mean, covariance, radius in log.landmarks[tick]:
@@ -238,39 +276,6 @@ def _landmarks(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
         frame.ellipse(ellipse, mean, covariance, sigmas=SIGMAS, z=_HEIGHT + 0.02 if radius > 0.0 else 0.03)
         if outline in scene.bodies:
             frame.place(outline, [*mean, 0.0])
-
-
-def _say(frame: Frame, log: Any, tick: int, estimated: bool) -> None:
-    """Numbers of the moment."""
-    truth, clearance = log.truth[tick], float(log.clearance[tick])
-    frame.readout("speed", f"{np.linalg.norm(truth[7:]):.2f} m/s")
-    frame.readout("height", f"{truth[2]:.2f} m")
-    if log.health[tick]:
-        state, cause = log.health[tick], log.causes[tick]
-        frame.readout("health", state + (f": {cause}" if cause else ""), alarm=state != "ok")
-    if log.settings.get("faults"):
-        frame.readout("fault", log.fault[tick] or "none now")
-    frame.readout("clearance", f"{clearance:.2f} m" if np.isfinite(clearance) else "\u2013")
-    frame.readout("thrust", f"{log.controls[tick][3]:.1f} N")
-    frame.value("clearance", clearance)
-    if estimated:
-        error = 100.0 * float(np.linalg.norm(log.believed[tick][:3] - truth[:3]))
-        frame.readout("position error", f"{error:.1f} cm")
-        frame.value("position error", error)
-    mass, sigma = log.parameters[tick][0], log.parameters_sigma[tick][0]
-    if sigma > 0.0:
-        frame.readout("mass \u00b1 \u03c3", f"{mass:.3f} \u00b1 {sigma:.3f} kg")
-        frame.readout("true mass", f"{log.parameters_true[0]:.3f} kg")
-    if len(log.landmarks[tick]):
-        frame.readout("landmarks", str(len(log.landmarks[tick])))
-    spent = float(log.estimate_ms[tick] + log.plan_ms[tick])
-    if spent > 0.0:
-        new = bool(log.compiled[tick])
-        words = f"{log.estimate_ms[tick]:.1f} ms, {log.plan_ms[tick]:.1f} ms" + " (compiled)" * new
-        frame.readout("estimate, plan", words, alarm=new)
-        frame.value("estimate + plan", spent)
-    stored = bool(log.emergency[tick])
-    frame.readout("plan", log.statuses[tick].lower() + ": stored one flown" * stored, alarm=stored)
 
 
 def _views(scene: Scene, log: Any) -> None:
