@@ -192,11 +192,7 @@ def _sightings(reading: Reading | None) -> tuple[Reading, str]:
     )
     if good.all():
         return reading, ""
-    kept = replace(
-        reading, ids=ids[good], bearings=bearings[good], ranges=ranges[good], radii=radii[good], kinds=kinds[good],
-        moving=moving[good],
-    )  # fmt: skip
-    return kept, "sightings that cannot be"
+    return reading.only(good), "sightings that cannot be"
 
 
 def _emptiness(ranges: Array, min_range: float) -> str:

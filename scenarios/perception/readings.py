@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -127,3 +128,9 @@ class Reading:
     tilt: Array
     rates: Array
     force: Array
+
+    def only(self, rows: IntArray | BoolArray) -> Reading:
+        """The reading with some of its sightings, by indices or flags (K,)."""
+        names = ("ids", "bearings", "ranges", "radii", "kinds", "moving")
+        chosen: dict[str, Any] = {name: np.asarray(getattr(self, name))[rows] for name in names}
+        return replace(self, **chosen)

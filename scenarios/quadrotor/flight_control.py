@@ -7,7 +7,7 @@ and walls. With ``avoidance="potential"`` the costs are Ta's own, |p - l_g|^2 an
 
 from __future__ import annotations
 
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from unifg.horizon import (
     LastPlan,
     Plan,
     RecedingHorizon,
-    Robot,
-    Term,
-    Window,
 )
 from unifg.models import quadrotor
 from unifg.scenarios.perception.belief import Belief
@@ -43,51 +40,13 @@ from unifg.scenarios.quadrotor.flight_settings import ControllerSettings, backen
 from unifg.scenarios.quadrotor.guide import Guide, Reference
 from unifg.scenarios.quadrotor.slots import Obstacles, Slots
 from unifg.solvers import names
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array
 
 LEFT_BEHIND = 1.0  # [m] between the ends of plan and reference
 PATIENCE = 10  # ticks of being left behind before the plan starts over from the reference
 KEPT = 8  # ticks for which an old plan may be flown
 
 Source: TypeAlias = Literal["solved", "violating", "kept", "braking"]
-
-
-class FlightPast(Protocol):
-    """Coupling of a flight to its past: state, parameters and map are given, or estimated in the same graph.
-
-    Attributes:
-        robot: who flies.
-        window: of the past, in one graph with it; None where its belief is given.
-        pull: see :class:`unifg.horizon.coupling.JointPresent`.
-    """
-
-    robot: Robot
-    window: Window | None
-    pull: float
-
-    def motion(self) -> list[Term]:
-        """Terms of the motion."""
-        ...
-
-    def apart(self, squares: bool | None) -> list[Term]:
-        """Keep clear of what is a variable: hard, or for Ta's potential as sums of squares or not."""
-        ...
-
-    def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
-        """Obstacles without those that are variables; which (M,) these are, and the variables."""
-        ...
-
-    def carry(self, multipliers: dict[str, Array], now: Context[Flown]) -> dict[str, Array]:
-        """Shifted multipliers that still hold."""
-        ...
-
-    def moving_with(self, solution: fg.Solution, now: Context[Flown]) -> quadrotor.Parameters:
-        """Parameters with which a solution moves."""
-        ...
-
-    def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
-        """Belief after a solve for which a belief was given."""
-        ...
 
 
 class Controller:
@@ -109,7 +68,7 @@ class Controller:
         solver: str = "ipm",
         settings: ControllerSettings | None = None,
         bounds: Array | None = None,
-        past: FlightPast | None = None,
+        past: GivenFlight | None = None,
     ) -> None:
         """State the graph and prepare the backend.
 
@@ -128,7 +87,7 @@ class Controller:
         self.settings = s = settings or ControllerSettings()
         if s.avoidance not in ("clearance", "potential"):
             raise fg.ScenarioError(f"unknown avoidance '{s.avoidance}': choose clearance or potential")
-        self.past: FlightPast = past or GivenFlight(s)
+        self.past: GivenFlight = past or GivenFlight(s)
         self.walls = np.asarray(walls, dtype=np.float64)
         target = np.asarray(target, dtype=np.float64)
         self.guide = Guide(target, self.walls, s.guide, bounds)

@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import Context, RecedingHorizon, Term, Window
+from unifg.horizon import Context, RecedingHorizon, Term
 from unifg.models import avoidance, quadrotor
 from unifg.scenarios.perception.belief import Belief
 from unifg.scenarios.quadrotor.estimator import Estimator, flyable
-from unifg.scenarios.quadrotor.flight_parts import Flown, repel
+from unifg.scenarios.quadrotor.flight_parts import Flown, GivenFlight, repel
 from unifg.scenarios.quadrotor.flight_past import packed, parameters_in
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
 from unifg.scenarios.quadrotor.slots import FAR_AWAY, Obstacles
@@ -121,7 +121,7 @@ class KeepClear:
         return found | ({"clearances of landmarks": limits.reshape(-1, 1)} if self.squares is None else {})
 
 
-class SharedFlight:
+class SharedFlight(GivenFlight):
     """A flight whose first state, parameters and map are estimated in the same solve.
 
     Attributes:
@@ -141,9 +141,8 @@ class SharedFlight:
             settings: weights and limits of the future.
             joint: how far it may lean on the past.
         """
-        self.estimator, self.robot = estimator, estimator.window.robot
-        self.window: Window | None = estimator.window
-        self.settings, self.pull = settings, joint.pull
+        super().__init__(settings, estimator.window.robot, estimator.window, joint.pull)
+        self.estimator = estimator
         self.latest = estimator.belief()
         self.names = estimator.atlas.names.copy()
 

@@ -65,36 +65,40 @@ class GivenMotion:
 
 
 class GivenFlight:
-    """A flight that is given its state, parameters and map.
+    """Coupling of a flight to its past: state, parameters and map are given, or estimated by a subclass.
 
     Attributes:
-        robot: who flies.
-        window: of the past; None.
-        pull: of no consequence.
+        settings: weights and limits.
+        robot: of the horizon.
+        window: of the past, in one graph with the horizon; None where its belief is given.
+        pull: see :class:`unifg.horizon.coupling.JointPresent`.
     """
 
-    window: Window | None = None
-    pull = np.inf
-
-    def __init__(self, settings: ControllerSettings) -> None:
-        """Take the sampling time from the settings."""
-        self.robot = Robot(quadrotor.STATE, quadrotor.CONTROL)
-        self.settings = settings
+    def __init__(
+        self,
+        settings: ControllerSettings,
+        robot: Robot | None = None,
+        window: Window | None = None,
+        pull: float = np.inf,
+    ) -> None:
+        """Keep what is given."""
+        self.robot = robot or Robot(quadrotor.STATE, quadrotor.CONTROL)
+        self.settings, self.window, self.pull = settings, window, pull
 
     def motion(self) -> list[Term]:
         """Terms of the motion."""
         return [GivenMotion(self.settings)]
 
     def apart(self, squares: bool | None) -> list[Term]:
-        """Nothing else is kept clear of."""
+        """Terms that keep clear of variables: hard, or for Ta's potential as sums of squares or not."""
         return []
 
     def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
-        """All obstacles are data."""
+        """Obstacles without those that are variables; which (M,) these are, and the variables."""
         return obstacles, np.zeros(len(obstacles.names), dtype=bool), []
 
     def carry(self, multipliers: dict[str, Array], now: Context[Flown]) -> dict[str, Array]:
-        """Multipliers as they are."""
+        """Shifted multipliers that still hold."""
         return multipliers
 
     def moving_with(self, solution: fg.Solution, now: Context[Flown]) -> quadrotor.Parameters:
@@ -102,7 +106,7 @@ class GivenFlight:
         return now.given.belief.parameters
 
     def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
-        """Belief that was given."""
+        """Belief after a solve for which a belief was given."""
         return given
 
 

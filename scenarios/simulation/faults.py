@@ -180,7 +180,7 @@ class FlightFaults(_Faults):
     def reading(self, reading: Reading, now: float) -> Reading:
         """Reading that arrives."""
         if self.hold("detector-lost", now):
-            return _only(reading, np.zeros(0, dtype=np.intp))
+            return reading.only(np.zeros(0, dtype=np.intp))
         return self._haunted(reading) if self.hold("detector-false", now) else reading
 
     def _haunted(self, reading: Reading) -> Reading:
@@ -203,9 +203,3 @@ class FlightFaults(_Faults):
     def wind(self, now: float) -> tuple[float, float]:
         """Wind that a gust adds [m/s^2]."""
         return (0.0, GUST) if self.hold("gust", now) else (0.0, 0.0)
-
-
-def _only(reading: Reading, rows: Array) -> Reading:
-    """A reading with some of its sightings."""
-    names = ("ids", "bearings", "ranges", "radii", "kinds", "moving")
-    return replace(reading, **{name: getattr(reading, name)[rows] for name in names})
