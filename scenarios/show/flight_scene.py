@@ -17,7 +17,7 @@ from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.log.metrics import collision_words, health
 from unifg.scenarios.show.numbers import Number, declare, in_words, metres, show
-from unifg.scenarios.show.parts import floor, pillar, vehicle
+from unifg.scenarios.show.parts import layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
@@ -154,8 +154,7 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
     scene.facts["solver"] = solver
     _layers(scene, sensed, estimated)
     _bodies(scene, float(log.settings.get("sensor_range", SensorModel().range_max)) if sensed else None)
-    _ground(scene, log)
-    _ends(scene, log)
+    layout(scene, log.layout, _HEIGHT)
     scene.label("start", log.layout.start[:2])
     scene.label("target", log.layout.target)
     _views(scene, log)
@@ -222,29 +221,6 @@ def _bodies(scene: Scene, reach: float | None) -> None:
         scene.body(
             "sensor", [Part("ring", ring, "scan", False)], colour="scan", swatch="ring", legend="reach of the sensor"
         )
-
-
-def _ground(scene: Scene, log: Any) -> None:
-    """The floor, with lines every metre to judge distances by, and the walls."""
-    floor(scene, *log.layout.size)
-    sheets, frames = [], []
-    for wall in log.layout.walls:
-        foot, top = (np.column_stack([wall, np.full(2, z)]) for z in (0.0, _HEIGHT))
-        sheets.append(shapes.quads(np.concatenate([foot, top[::-1]])[None]))
-        frames += [shapes.tube(line, 0.03, 4) for line in (foot, top)]
-        frames += [shapes.tube(np.stack([foot[k], top[k]]), 0.03, 4) for k in range(2)]
-    if sheets:
-        scene.mesh("walls", shapes.merge(sheets), colour="wall", opacity=0.22, legend="")
-        scene.mesh("wall frames", shapes.merge(frames), colour="wall", lit=True, legend="")
-
-
-def _ends(scene: Scene, log: Any) -> None:
-    start, target = log.layout.start, log.layout.target
-    scene.mesh("start", shapes.ring(start[:2], 0.18, 0.07, 0.012, corners=32), colour="start", legend="")
-    rings = [shapes.ring(target[:2], r, 0.07, 0.012, corners=40) for r in (0.12, 0.4)]
-    ball = shapes.copies(shapes.sphere(), target[None], 0.16 * np.eye(3)[None])
-    scene.mesh("target", shapes.merge([*rings, ball]), colour="goal", swatch="disc", legend="target")
-    scene.discs("pole", [[target[0], target[1], 0.025]], height=float(target[2]), colour="pole", legend="")
 
 
 def _cylinders(frame: Frame, log: Any, tick: int, sensed: bool) -> None:
