@@ -140,19 +140,19 @@ class Flight:
     def __init__(self, settings: FlightSettings, *, rehearsal: bool = False) -> None:
         """Draw the world and wake the pilot, and rehearse unless this is a rehearsal."""
         self.settings = settings
-        self.conditions = found = draw_conditions(settings.seed, settings.mass_error)
+        self.conditions = drawn = draw_conditions(settings.seed, settings.mass_error)
         calm, k = DisturbanceModel(), settings.gusts
         x, y, z = calm.gust
         gusty = replace(calm, gust=(k * x, k * y, k * z))
-        self.world = QuadrotorWorld(found.layout, settings.seed, found.true, settings.movers, disturbance=gusty)
-        error = settings.estimator.state_sigma * found.deviation
+        self.world = QuadrotorWorld(drawn.layout, settings.seed, drawn.true, settings.movers, disturbance=gusty)
+        error = settings.estimator.state_sigma * drawn.deviation
         believed = quadrotor.STATE.retract(self.world.state[None], error[None])[0]
         self.pilot = make_pilot(
-            settings.coupling, settings.solver, found.layout, believed, found.nominal, settings.estimator,
+            settings.coupling, settings.solver, drawn.layout, believed, drawn.nominal, settings.estimator,
             settings.flown,
         )  # fmt: skip
         self.faults = FlightFaults(settings.faults, settings.seed)
-        self.watch = FlightWatch(settings.controller.dt, settings.estimator.parameters_sigma(found.nominal))
+        self.watch = FlightWatch(settings.controller.dt, settings.estimator.parameters_sigma(drawn.nominal))
         self.pilot.pushed = self.watch.pushed
         self._speed = self.pilot.controller.guide.settings
         self._wind = self.world.parameters.wind

@@ -1,8 +1,8 @@
-"""Two manoeuvres nobody programmed: reversing out of a wrong heading, and deflecting around a disc.
+"""Two manoeuvres that are not programmed: reversing out of a wrong heading, and deflecting around a disc.
 
 Each is one control graph solved once, cold, from a guess that the robot cannot drive (Bazzana et al. 2022, section
 VII-B and Fig. 7). In ``behind`` the path to follow leaves behind the robot's back; in ``obstacle`` it leads straight
-through a disc that nobody had foreseen. Every iterate is kept for the picture.
+through an unforeseen disc. Every iterate is kept for the picture.
 """
 
 from __future__ import annotations

@@ -92,7 +92,7 @@ class SafeSettings:
         patience: by how much the vehicle, at the speed of the path, may be late before time on the path stands still
             [s].
         dt: length of a tick [s].
-        books: vehicle that everybody believes in at first.
+        books: vehicle as believed at first.
         truth: mass and drag of the vehicle.
         true_loops: its loops.
         gains: of the controller by flatness where it predicts; where it does not it has those of a new `Gains`, for

@@ -387,7 +387,7 @@ def test_estimates_and_controls_show_what_there_is(log: FlightLog) -> None:
     titles = [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")]
     assert len(titles) == 6 + 9 and titles[0].startswith("Mass, ends +0.0 %")
     assert "Position error, z, 4.0 cm rms; 100 % within 2\u03c3" in titles
-    with pytest.raises(ViewError, match="nobody estimated"):
+    with pytest.raises(ViewError, match="has no estimate"):
         estimates(flight(estimated=False))
     panels = [ax for part in control(log).subfigs for ax in part.axes]
     assert len(panels) == 8

@@ -193,18 +193,18 @@ class Controller:
         states, last = np.tile(now.present, (s.horizon + 1, 1)), now.last
         aim = 0
         for k in range(s.horizon):
-            here = states[k]
-            while aim < s.horizon and np.hypot(*(reference[aim] - here)[:2]) < PURSUIT:
+            pose = states[k]
+            while aim < s.horizon and np.hypot(*(reference[aim] - pose)[:2]) < PURSUIT:
                 aim += 1
-            ahead = reference[aim] - here
+            ahead = reference[aim] - pose
             distance = float(np.hypot(*ahead[:2]))
             bearing = np.arctan2(ahead[1], ahead[0]) if distance > ARRIVED else reference[aim, 2]
-            turn = float(wrap_angle(bearing - here[2]))
+            turn = float(wrap_angle(bearing - pose[2]))
             speed = min(speeds[k], distance / s.dt) * max(np.cos(turn), 0.0) ** 2 if distance > ARRIVED else 0.0
             fastest = np.minimum(s.box[1], s.most * (s.horizon - k))
             wanted = np.clip([speed, turn / PURSUIT_TIME], -fastest, fastest)
             controls[k] = np.clip(wanted, last - s.most, last + s.most)
-            states[k + 1] = unicycle.step(here[None], 0.5 * (last + controls[k])[None], s.dt)[0]
+            states[k + 1] = unicycle.step(pose[None], 0.5 * (last + controls[k])[None], s.dt)[0]
             last = controls[k]
         return states, controls
 

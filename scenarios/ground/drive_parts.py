@@ -30,7 +30,7 @@ class EvasiveTrajectory:
     Attributes:
         states: (N + 1, 3) poses from the present on [m, m, rad].
         controls: (N, 2) [m/s, rad/s].
-        evades: whether it is not to come to rest at once, but to get out of somebody's way.
+        evades: True if it evades a mover before it comes to rest.
     """
 
     states: Array
@@ -193,7 +193,7 @@ def wall_limits(s: ControllerSettings, field: SmoothField, evasive: Array, refer
 def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
     """(N, k, 2) centres along the horizon.
 
-    A mover goes straight on, whoever stands there; it is not trusted to go away, for it may turn round.
+    A mover goes straight on, even through the robot. It is not expected to go away, for it may turn round.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)
     centres: Array = tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])

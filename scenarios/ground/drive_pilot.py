@@ -284,14 +284,14 @@ class Pilot(Generic[PlannerT]):
         self._pause = max(0, self._pause - 1)
         if not search.searching and not self._pause:
             search.begin(scan)
-        found = search.search()
-        if found is None:
+        result = search.search()
+        if result is None:
             return
         self._pause = SEARCH_AGAIN
-        self.search_said = found.cause
-        if found.pose is None:
+        self.search_said = result.cause
+        if result.pose is None:
             return
-        self.estimator.reset(found.pose, FOUND_SIGMA)
+        self.estimator.reset(result.pose, FOUND_SIGMA)
         self.pose, self.relocated = self.estimator.pose, True
         self.tracker, self.points = DiscTracker(self._map), PointWatch()
         self.tracks = Tracks.none()

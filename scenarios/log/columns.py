@@ -108,8 +108,8 @@ class SoFar:
                 return place[name]
         if name.startswith("_"):
             raise AttributeError(name)
-        found = getattr(self._log, name)
-        return found.fget(self) if isinstance(found, property) and found.fget is not None else found
+        attribute = getattr(self._log, name)
+        return attribute.fget(self) if isinstance(attribute, property) and attribute.fget is not None else attribute
 
 
 _watch: ContextVar[Callable[[SoFar], None] | None] = ContextVar("watch", default=None)

@@ -109,7 +109,7 @@ class EpisodeLog(StoredLog):
     goal_index: IntArray = column(dtype=np.intp)
     """Goal being approached."""
     emergency: BoolArray = column(dtype=np.bool_)
-    """True where the robot braked or got out of the way because nobody found a plan."""
+    """True where the robot braked or got out of the way because there was no plan."""
     rescued: BoolArray = column(dtype=np.bool_)
     """True where the plan is that of the second backend, asked because the first had none."""
     health: list[str] = words()

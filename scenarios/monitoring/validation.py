@@ -216,11 +216,11 @@ def _numbers(value: object, shape: tuple[int, ...]) -> Array | None:
 
 def _number(value: object) -> float:
     """A number; NaN for what is none."""
-    found = _numbers(value, ())
-    return math.nan if found is None else float(found)
+    number = _numbers(value, ())
+    return math.nan if number is None else float(number)
 
 
 def _bounded(value: object, count: int, most: float) -> bool:
     """Return True for so many finite numbers, none beyond a bound."""
-    found = _numbers(value, (count,))
-    return found is not None and bool((np.abs(found) <= most).all())
+    numbers = _numbers(value, (count,))
+    return numbers is not None and bool((np.abs(numbers) <= most).all())

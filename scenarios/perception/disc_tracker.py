@@ -4,7 +4,7 @@
 filters side by side, one of a disc that stands still and one of a disc at constant velocity (Bar-Shalom, Li,
 Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, chapter 6). A track is still until
 its velocity is beyond doubt, and again once it was seen in one place for long: a disc half hidden behind another
-seems to move while the robot passes, and nobody should wait for it ever after. Things out of view are remembered
+seems to move while the robot passes, and the robot should not wait for it ever after. Things out of view are remembered
 while they stand still, and forgotten soon once they move.
 """
 

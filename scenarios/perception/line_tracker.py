@@ -112,15 +112,15 @@ class LineTracker:
 
     def _follow(self, reading: Reading, state: Array, rows: IntArray) -> list[_Track]:
         """The tracks of some detections (r,), each taken in."""
-        now, free, found = reading.time, list(self._tracks), []
+        now, free, followed = reading.time, list(self._tracks), []
         for row, place in zip(rows.tolist(), places(state, reading.bearings[rows], reading.ranges[rows]), strict=True):
             track = self._match(int(reading.ids[row]), place, now, free)
             track.times.append(now)
             track.places.append(place)
             track.radii.append(float(reading.radii[row]))
             self._fit(track, now)
-            found.append(track)
-        return found
+            followed.append(track)
+        return followed
 
     def _match(self, name: int, place: Array, now: float, free: list[_Track]) -> _Track:
         """The track a detection belongs to, taken from those that are free; otherwise a new one."""
@@ -157,11 +157,11 @@ class LineTracker:
 
 def _line(times: list[float], places: list[Array]) -> tuple[float, Array, Array, float]:
     """Mean time [s] and place (2,) [m], velocity (2,) by least squares, and its standard deviation per axis [m/s]."""
-    moments, found = np.array(times), np.array(places)
-    middle, mean = moments.mean(), found.mean(axis=0)
+    moments, positions = np.array(times), np.array(places)
+    middle, mean = moments.mean(), positions.mean(axis=0)
     away = moments - middle
     weight = float(away @ away)
-    velocity = away @ (found - mean) / weight
-    left = found - mean - away[:, None] * velocity
+    velocity = away @ (positions - mean) / weight
+    left = positions - mean - away[:, None] * velocity
     scatter = float(np.sqrt(np.square(left).sum() / (2 * len(moments) - 4)))
     return float(middle), mean, velocity, scatter / float(np.sqrt(weight))

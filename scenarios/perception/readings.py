@@ -78,10 +78,10 @@ class Scan:
         count = len(self.angles)
         since = self.turn * (np.arange(count) - (count - 1)) / count
         motion = since[:, None] * np.array([velocity[0], 0.0, velocity[1]])
-        there = SE2.exp(motion)
+        poses = SE2.exp(motion)
         ranges = np.where(self.valid, self.ranges, 1.0)
-        points = SE2.act(there, ranges[:, None] * np.column_stack([np.cos(self.angles), np.sin(self.angles)]))
-        bearing = np.where(self.valid, np.arctan2(points[:, 1], points[:, 0]), self.angles + there[:, 2])
+        points = SE2.act(poses, ranges[:, None] * np.column_stack([np.cos(self.angles), np.sin(self.angles)]))
+        bearing = np.where(self.valid, np.arctan2(points[:, 1], points[:, 0]), self.angles + poses[:, 2])
         # Nearly the old directions, and rising as they did: not wrapped anew.
         angles = self.angles + wrap_angle(bearing - self.angles)
         return replace(self, angles=angles, ranges=np.where(self.valid, np.hypot(*points.T), self.ranges), turn=0.0)

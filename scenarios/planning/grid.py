@@ -48,7 +48,7 @@ class _Clearance:
             )
         self.occupancy = occupancy
         self.field = distance_map
-        # Compiled for one layout: a part of a map, or what somebody else has locked, would be compiled for anew.
+        # Compiled for one layout: a part of a map, or a read-only array, would be compiled for anew.
         self.discs: Array = _plain(np.asarray([] if discs is None else discs, dtype=np.float64).reshape(-1, 3))
         self.known: BoolArray = _plain(occupancy.free)
         self.grid: Array = distance_map.values
@@ -323,7 +323,7 @@ def _search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -
     spent[begin] = 0.0
     keys[0], places[0], size = 0.0, begin, 1
     while size > 0:
-        here = places[0]
+        current = places[0]
         size -= 1
         key, place, at = keys[size], places[size], 0
         while True:  # the last one sinks from the top of the heap
@@ -336,31 +336,31 @@ def _search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -
                 break
             keys[at], places[at], at = keys[child], places[child], child
         keys[at], places[at] = key, place
-        if done[here]:
+        if done[current]:
             continue
-        done[here] = True
-        if here == goal:
+        done[current] = True
+        if current == goal:
             break
-        row, column = here // width, here % width
+        row, column = current // width, current % width
         for k in range(9):
             i, j = row + k // 3 - 1, column + k % 3 - 1
             if i < 0 or i >= height or j < 0 or j >= width or not cells[i, j]:
                 continue
-            there = i * width + j
-            if done[there] or not (cells[row, j] and cells[i, column]):
+            neighbour = i * width + j
+            if done[neighbour] or not (cells[row, j] and cells[i, column]):
                 continue
             length = math.sqrt(2.0) if i != row and j != column else 1.0
-            total = spent[here] + 0.5 * length * (cost[row, column] + cost[i, j])
-            if total >= spent[there] or size + 1 >= len(keys):
+            total = spent[current] + 0.5 * length * (cost[row, column] + cost[i, j])
+            if total >= spent[neighbour] or size + 1 >= len(keys):
                 continue
-            spent[there], before[there] = total, here
+            spent[neighbour], before[neighbour] = total, current
             away, aside = abs(i - source[0]), abs(j - source[1])
             key = total + max(away, aside) + (math.sqrt(2.0) - 1.0) * min(away, aside)
             at, size = size, size + 1
             while at > 0 and keys[(at - 1) // 2] > key:
                 keys[at], places[at] = keys[(at - 1) // 2], places[(at - 1) // 2]
                 at = (at - 1) // 2
-            keys[at], places[at] = key, there
+            keys[at], places[at] = key, neighbour
     return before
 
 
@@ -407,15 +407,15 @@ def _straightened(
     last = len(points) - 1
     kept, count, anchor = np.zeros(last + 1, dtype=np.int64), 1, 0
     while anchor < last:
-        found = anchor + 1  # the path itself
+        farthest = anchor + 1  # the path itself
         for k in range(_LOOKAHEAD, 0, -1):
             end = min(anchor + stride * k, last)
             if k > 1 and end == min(anchor + stride * (k - 1), last):
                 continue
             if _good_line(table, free, discs, points, spent, floor, anchor, end, robot_radius):
-                found = end
+                farthest = end
                 break
-        anchor = found
+        anchor = farthest
         kept[count] = anchor
         count += 1
     return kept[:count]

@@ -337,8 +337,8 @@ class Estimator:
         columns = FIRST_LANDMARK + 2 * used
         forecast, innovation = expected(self.window.present, self.covariance, self.landmarks[used], columns, noise)
         possible = reading.kinds[own][:, None] == atlas.kinds[used][None]
-        found = nearest(sightings, forecast, innovation, possible, self.settings.gates)
-        return np.where(found >= 0, used[np.maximum(found, 0)], found)
+        pairs = nearest(sightings, forecast, innovation, possible, self.settings.gates)
+        return np.where(pairs >= 0, used[np.maximum(pairs, 0)], pairs)
 
     def _slot(self) -> int | None:
         """A free slot, if need be that of the landmark not seen for longest; None when the window sees them all."""

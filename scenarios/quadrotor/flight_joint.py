@@ -117,8 +117,8 @@ class KeepClear:
         counting[:, given.marks] = True
         hulls[:, given.marks] = given.obstacles.radii[given.held] + (0.0 if self.squares is None else s.vehicle_radius)
         limits[:, given.marks] = given.obstacles.limits[:, given.held]
-        found = {"radii of landmarks": hulls.ravel(), "landmarks to keep clear of": counting.ravel()}
-        return found | ({"clearances of landmarks": limits.reshape(-1, 1)} if self.squares is None else {})
+        values = {"radii of landmarks": hulls.ravel(), "landmarks to keep clear of": counting.ravel()}
+        return values | ({"clearances of landmarks": limits.reshape(-1, 1)} if self.squares is None else {})
 
 
 class SharedFlight(GivenFlight):

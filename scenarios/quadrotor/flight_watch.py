@@ -57,7 +57,7 @@ class FlightWatch:
 
         Args:
             dt: duration of a tick [s].
-            sigma: (7,) standard deviations of parameters that nobody estimates; see :class:`Unmodelled`.
+            sigma: (7,) standard deviations of parameters that are not estimated; see :class:`Unmodelled`.
         """
         self.validator, self.supervisor, self.felt = Validator(), Supervisor(RAMPS), Unmodelled(sigma)
         self.lands = False

@@ -62,5 +62,5 @@ class Track:
         span, gone = self._times[k + 1] - self._times[k], later - self._times[k]
         (p, v), ahead = self._nodes[k].reshape(2, 3), self._nodes[k + 1, 3:]
         push = (ahead - v) / span
-        found = p + gone * v + 0.5 * gone * gone * push, v + gone * push, push, np.zeros(3)
-        return Flown(*(part[None] for part in found))
+        parts = p + gone * v + 0.5 * gone * gone * push, v + gone * push, push, np.zeros(3)
+        return Flown(*(part[None] for part in parts))

@@ -127,14 +127,14 @@ def exists_among(threats: Sequence[Threat], authority: Authority) -> Answer:
     ways = np.concatenate([level, _directions(3)])
     certain, lost = np.full(len(ways), np.inf), False
     for threat in threats:
-        there = times <= threat.until
+        present = times <= threat.until
         flat = np.array([1.0, 1.0, 0.0 if threat.upright else 1.0])
-        straight = threat.away + times[there, None] * threat.speed
+        straight = threat.away + times[present, None] * threat.speed
         if threat.pull is not None:
-            straight = straight - 0.5 * times[there, None] ** 2 * threat.pull
-        straight, moved = straight * flat, a.usable * ways[:, None, :] * late[None, there, None] * flat
-        lost |= bool((np.linalg.norm(straight, axis=1) + a.usable * late[there] < threat.keep).any())
-        far = np.linalg.norm(straight + moved, axis=2) - 0.5 * threat.bend * times[there] ** 2 - threat.keep
+            straight = straight - 0.5 * times[present, None] ** 2 * threat.pull
+        straight, moved = straight * flat, a.usable * ways[:, None, :] * late[None, present, None] * flat
+        lost |= bool((np.linalg.norm(straight, axis=1) + a.usable * late[present] < threat.keep).any())
+        far = np.linalg.norm(straight + moved, axis=2) - 0.5 * threat.bend * times[present] ** 2 - threat.keep
         certain = np.minimum(certain, far.min(axis=1))
     return "no" if lost else "yes" if certain.max() >= 0.0 else "unknown"
 

@@ -77,9 +77,9 @@ class StateFilter:
         s = self.covariance
         missed = quadrotor.STATE.local(self.state[None], seen[None])[0]
         gain = np.linalg.solve(s[:9, :9] + np.diag(self._noise), s[:9]).T
-        found = gain @ missed
-        self.state = quadrotor.STATE.retract(self.state[None], found[None, :9])[0]
-        self.gust = self.gust + found[9:]
+        correction = gain @ missed
+        self.state = quadrotor.STATE.retract(self.state[None], correction[None, :9])[0]
+        self.gust = self.gust + correction[9:]
         s = s - gain @ s[:9]
         self.covariance = 0.5 * (s + s.T)
         return self.state

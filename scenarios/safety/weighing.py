@@ -5,7 +5,7 @@ Over a stretch of the past, thrust and attitude are known from what was told and
     (v_1 - v_0) / t = (1/m) (mean of T R e3 - mean of R diag(R' v) drag) - g e3
 
 one residual of mass and drag for each stretch, whose standard deviation is that of two velocities. These terms stand
-in the graph of whoever plans, or alone.
+in the graph of the plan, or alone.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class Weighing:
     def _weigh(self) -> None:
         p = self.believed
         given = {self._handles[name]: value for name, value in self.data().items()}
-        found = self._alone.solve({self._mass: [[p.mass]], self._drag: [p.drag]}, data=given)
-        mass = max(float(found[self._mass][0, 0]), self.settings.least)
-        drag = np.maximum(found[self._drag][0], 0.0).tolist()
+        solution = self._alone.solve({self._mass: [[p.mass]], self._drag: [p.drag]}, data=given)
+        mass = max(float(solution[self._mass][0, 0]), self.settings.least)
+        drag = np.maximum(solution[self._drag][0], 0.0).tolist()
         self.believed = quadrotor.Parameters(mass, (drag[0], drag[1], drag[2]), p.wind, p.updraft)

@@ -14,7 +14,7 @@ _FRAMES_PER_STEP = 4
 
 
 def course_log(course: Course) -> FlightLog:
-    """The flight as planned, in the form scenes and plots of flights read; nobody estimates anything in it."""
+    """The flight as planned, in the form scenes and plots of flights read; nothing is estimated in it."""
     c, s = course, course.settings
     settings: dict[str, object] = {
         "scenario": "quadrotor-obstacles", "solver": f"{s.solver}, {s.chosen_hessian} Hessian",

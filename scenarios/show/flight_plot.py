@@ -88,7 +88,7 @@ def estimates(log: FlightLog) -> Figure:
         ViewError: the flight has no tick or no estimate.
     """
     if log.ticks and not has_estimate(log):
-        raise ViewError("nobody estimated in this flight: it has neither sigmas nor windows")
+        raise ViewError("this flight has no estimate: it has neither sigmas nor windows")
     parameters = np.flatnonzero(estimated_parameters(log)).tolist()
     rows = math.ceil(len(parameters) / _COLUMNS) + len(_STATES) // _COLUMNS
     with new_figure((15.0, 2.05 * rows + 0.9), log.ticks) as figure:

@@ -1,7 +1,7 @@
 """A flight as a scene: what stood there, what was believed of it, and where the vehicle flew and meant to fly.
 
-The same few functions show a whole log, and a flight while it goes on: they read one tick of it. A flight that nobody
-estimated, such as a plan flown as it is, has no sigmas, windows, landmarks or sightings; it is shown without them, and
+The same few functions show a whole log, and a flight while it goes on: they read one tick of it. A flight without an
+estimate, such as a plan flown as it is, has no sigmas, windows, landmarks or sightings; it is shown without them, and
 with all cylinders solid from the start.
 """
 
@@ -141,7 +141,7 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
     Args:
         log: a `FlightLog`, or one in the making: what is known before the first tick is asked of it.
         sensed: whether there is a sensor.
-        estimated: whether somebody estimates.
+        estimated: True for a flight with an estimate.
     """
     name = str(log.settings.get("scenario", "quadrotor"))
     scene = Scene(f"unifg: {name}" + (f", {log.layout.name}" if log.layout.name else ""), dt=log.dt)

@@ -97,8 +97,8 @@ def shade_trouble(ax: Axes, dt: float, health: Sequence[str], causes: Sequence[s
         shade(ax, np.array(health) == state, dt, css(colour), 0.18)
     named = Counter(cause for cause in causes if cause)
     if named:
-        found = " and ".join(state for state in ("degraded", "lost") if state in health)
-        ax.set_title(fill(f"{what}; {found}: {named.most_common(1)[0][0]}", 72), fontsize=8)
+        states = " and ".join(state for state in ("degraded", "lost") if state in health)
+        ax.set_title(fill(f"{what}; {states}: {named.most_common(1)[0][0]}", 72), fontsize=8)
 
 
 def plot_clearance(log: Any, ax: Axes | None = None) -> Axes:

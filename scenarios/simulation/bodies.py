@@ -117,9 +117,9 @@ class Shuttle:
         if not length > 0.0:
             raise ScenarioError(f"a shuttle needs two places, got {self}")
         share = (self.phase + self.speed * times / (2.0 * length)) % 1.0
-        there = 1.0 - np.abs(2.0 * share - 1.0)
+        share_along = 1.0 - np.abs(2.0 * share - 1.0)
         sense = np.where(share < 0.5, 1.0, -1.0)
-        return np.array(self.start) + there[:, None] * span, sense[:, None] * span * (self.speed / length)
+        return np.array(self.start) + share_along[:, None] * span, sense[:, None] * span * (self.speed / length)
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,7 @@ def _advance(x: Array, loop: Array, told: Array, noise: Array, rho: Array, step:
 
 
 class BodyRatePlant:
-    """One vehicle in the air, or somebody's model of it.
+    """One vehicle in the air, or a model of it.
 
     Attributes:
         airframe: what flies.
@@ -180,9 +180,9 @@ class BodyRatePlant:
         self.state = state.copy()
         if rows:
             self._fly(np.array(rows), np.zeros(6) if noise is None else np.asarray(noise, dtype=np.float64))
-        found = self.state, self.loops
+        predicted = self.state, self.loops
         self.state, self.loops, self.time = kept
-        return found
+        return predicted
 
     def _fly(self, told: Array, noise: Array) -> Array:
         path = np.empty((len(told) + 1, 3))

@@ -93,7 +93,7 @@ def _warped(occupancy: OccupancyMap, sigma: float, rng: np.random.Generator) -> 
 def _furnished(
     given: OccupancyMap, true: OccupancyMap, ends: Array, rng: np.random.Generator
 ) -> tuple[OccupancyMap | None, OccupancyMap | None]:
-    """Both maps with one more piece, drawn at random; None where it would stand in something or before somebody."""
+    """Both maps with one more piece, drawn at random; None where there is no room for it."""
     rows, columns = np.nonzero(given.free)
     cell = rng.integers(len(rows))
     size, turn, far = rng.uniform(*SIZES, 2), rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*MOVED)

@@ -284,12 +284,12 @@ class World:
         lidar = self.lidar
         early, where, mixed, between = self._lidar_rng.random((4, lidar.beams))
         met = np.minimum(ranges, lidar.range_max)
-        found = np.where(
+        mixed_ranges = np.where(
             (np.abs(met - np.roll(met, 1)) > EDGE) & (mixed < lidar.mixed),
             met + between * (np.roll(met, 1) - met),
             ranges,
         )
-        return np.where(early < lidar.clutter, where * np.minimum(found, lidar.range_max), found)
+        return np.where(early < lidar.clutter, where * np.minimum(mixed_ranges, lidar.range_max), mixed_ranges)
 
     def odometry(self) -> tuple[float, float]:
         """Mean body velocities (v [m/s], omega [rad/s]) over the last step, as the wheels report them.

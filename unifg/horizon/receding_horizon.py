@@ -62,7 +62,7 @@ class RecedingHorizon:
         tie: what ties the horizon to the past.
         x, u: nodes (N + 1) of the future, and the family of controls (N).
         warm, cold: the prepared backend for solves with and without a warm start.
-        second: another one, asked when the plan of the first is refused; None for nobody.
+        second: another one, asked when the plan of the first is refused; None for none.
         guess: where the next solve begins; None for anew.
         failed: whether the last plan was refused.
         kept: the last plan that was accepted.
@@ -114,7 +114,7 @@ class RecedingHorizon:
             solver: for a solve with a warm start.
             cold: for one without, which may iterate longer; None for the same.
             second: asked in the same tick when the plan of the first is refused, from where solves begin after a
-                failure; None for nobody.
+                failure; None for none.
             window: of the past.
             coupling: "separate", "sequential" or "joint".
             pull: see :class:`unifg.horizon.coupling.JointPresent`.
@@ -244,7 +244,7 @@ class RecedingHorizon:
         return self._plan(window.now(given, last), begin)
 
     def plan(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Plan:
-        """Plan from a present state (storage,) that somebody else has estimated.
+        """Plan from a present state (storage,) that is estimated elsewhere.
 
         Args:
             present: state.
