@@ -27,7 +27,7 @@ LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
 PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
 PURSUIT_TIME = 0.2  # [s] in which it would turn there
 ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
-SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
+ENDED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
 COMMITTED = 0.1  # [m] more room than the evasion of the last tick has another one to have
 OFF_WALLS = 0.015  # [m] from the hull to walls: less is touching, as far as maps and estimates can tell
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
@@ -60,7 +60,7 @@ class Controller:
             robot(s.dt) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
             cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND, s, COLD_PATIENCE), window=window,
             coupling="sequential" if window is None else "joint", pull=s.pull, limits=s.box, judge=self.judge,
-            starts=InitialGuesses(self.along, self.leaving), believable=settled, patience=PATIENCE,
+            starts=InitialGuesses(self.along, self.leaving), believable=is_believable, patience=PATIENCE,
         )  # fmt: skip
 
     def stations(self) -> Array:
@@ -161,7 +161,7 @@ class Controller:
     def judge(
         self, solution: fg.Solution, states: Array, controls: Array, now: Context[Drive], kept: LastPlan
     ) -> Decision:
-        """Drive a plan that keeps the constraints; leave by the way out otherwise.
+        """Drive a plan that keeps the constraints; drive the evasive trajectory otherwise.
 
         Of a solve that ended early this is where it stopped. The cheapest iterate it has passed that keeps the
         constraints was tried: such plans brush past obstacles and creep up to those that stand in the way.
@@ -214,6 +214,6 @@ def is_behind(states: Array, reference: Array) -> bool:
     return bool(np.hypot(*(states[-1] - reference[-1])[:2]) > LEFT_BEHIND)
 
 
-def settled(solution: fg.Solution, choice: Decision) -> bool:
+def is_believable(solution: fg.Solution, choice: Decision) -> bool:
     """Return True if a joint solve says where the robot is: it ended, and its plan is driven."""
-    return choice.source == "solved" and solution.status in SETTLED
+    return choice.source == "solved" and solution.status in ENDED

@@ -186,7 +186,7 @@ class DiscTracker:
         rows.unseen[track] = 0.0
         rows.clear[track] = 0
         self._judge_motion(track, variance)
-        self._settle(track, dt)
+        self._count_rest(track, dt)
 
     def _judge_motion(self, track: IntArray, variance: Array) -> None:
         """Decide which tracks move: velocity beyond doubt to begin, plainly slow to end."""
@@ -201,19 +201,19 @@ class DiscTracker:
         rows.anchor[moved] = rows.mean[moved, 0]
         rows.anchor_variance[moved] = variance[moving]
 
-    def _settle(self, track: IntArray, dt: float) -> None:
+    def _count_rest(self, track: IntArray, dt: float) -> None:
         """Take for standing what has not left its place for long."""
         rows = self._rows
         left = np.linalg.norm(rows.mean[track, 0] - rows.home[track], axis=1) > _HOME
         rows.home[track[left]] = rows.mean[track[left], 0]
         rows.stayed[track] = np.where(left, 0.0, rows.stayed[track] + dt)
-        settled = track[rows.has_moved[track] & (rows.stayed[track] > _SETTLED)]
-        rows.has_moved[settled] = rows.moving[settled] = False
-        rows.mean[settled, 1] = 0.0
-        rows.covariance[settled, 0, 1] = rows.covariance[settled, 1, 0] = 0.0
-        rows.covariance[settled, 1, 1] = _FIRST_SPEED**2
-        rows.anchor[settled] = rows.mean[settled, 0]
-        rows.anchor_variance[settled] = rows.covariance[settled, 0, 0]
+        resting = track[rows.has_moved[track] & (rows.stayed[track] > _SETTLED)]
+        rows.has_moved[resting] = rows.moving[resting] = False
+        rows.mean[resting, 1] = 0.0
+        rows.covariance[resting, 0, 1] = rows.covariance[resting, 1, 0] = 0.0
+        rows.covariance[resting, 1, 1] = _FIRST_SPEED**2
+        rows.anchor[resting] = rows.mean[resting, 0]
+        rows.anchor_variance[resting] = rows.covariance[resting, 0, 0]
 
     def _review(self, missed: BoolArray, scan: Scan, pose: Array, dt: float) -> None:
         """Age the tracks that were not seen; drop those seen through, gone or found by chance."""

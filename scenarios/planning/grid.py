@@ -200,7 +200,7 @@ def plan(
     for stride in (1, 5):
         points = _shorten(clearance, resample(points, SPACING), float(level), robot_radius, stride)
     points = _smooth(clearance, resample(points, SPACING), preferred)
-    return headed(_settle(clearance, resample(points, SPACING), float(level)), float(goal_pose[2]))
+    return headed(_off_corners(clearance, resample(points, SPACING), float(level)), float(goal_pose[2]))
 
 
 def smoothed(values: Array) -> Array:
@@ -488,7 +488,7 @@ def _diffuse(table: Array, free: BoolArray, discs: Array, points: Array, preferr
                 known[i, 0], known[i, 1], known[i, 2] = trial, trial_x, trial_y
 
 
-def _settle(clearance: _Clearance, points: Array, level: float) -> Array:
+def _off_corners(clearance: _Clearance, points: Array, level: float) -> Array:
     """Undo the millimetres by which the chords of the last resampling cut a corner below the inflation."""
     points = points.copy()
     for _ in range(4):

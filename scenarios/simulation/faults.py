@@ -19,7 +19,7 @@ from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.typing import Array
 
-__all__ = ["DRIVE_FAULTS", "FLIGHT_FAULTS", "DriveFaults", "Fault", "FlightFaults", "elsewhere", "one_of"]
+__all__ = ["DRIVE_FAULTS", "FLIGHT_FAULTS", "DriveFaults", "Fault", "FlightFaults", "one_of"]
 
 DRIVE_FAULTS = (
     "lidar-nan", "lidar-inf", "lidar-max", "lidar-negative", "lidar-frozen", "lidar-dropped", "lidar-delayed",
@@ -159,19 +159,14 @@ class DriveFaults(_Faults):
         self._carried |= due
         return due
 
-    def elsewhere(self, distance_map: DistanceMap, cells: Array, here: Array) -> Array:
-        """A free pose (3,) away from ``here``; see :func:`elsewhere`."""
-        return elsewhere(distance_map, cells, here, self._rng)
-
-
-def elsewhere(distance_map: DistanceMap, places: Array, here: Array, rng: np.random.Generator) -> Array:
-    """A pose (3,) drawn from places (n, 2) [m] that are far from walls and from ``here`` (3,), with any heading."""
-    room = distance_map.distance(places) > ROOM
-    far = np.hypot(*(places - here[:2]).T) > CARRIED
-    chosen = places[room & far]
-    chosen = chosen if len(chosen) else places[room]
-    place = chosen[int(rng.integers(len(chosen)))] if len(chosen) else here[:2]
-    return np.array([*place, rng.uniform(-np.pi, np.pi)])
+    def elsewhere(self, distance_map: DistanceMap, places: Array, pose: Array) -> Array:
+        """Draw a pose (3,) from places (n, 2) [m] far from walls and from ``pose`` (3,), with any heading."""
+        room = distance_map.distance(places) > ROOM
+        far = np.hypot(*(places - pose[:2]).T) > CARRIED
+        chosen = places[room & far]
+        chosen = chosen if len(chosen) else places[room]
+        place = chosen[int(self._rng.integers(len(chosen)))] if len(chosen) else pose[:2]
+        return np.array([*place, self._rng.uniform(-np.pi, np.pi)])
 
 
 class FlightFaults(_Faults):
