@@ -19,6 +19,7 @@ from unifg.scenarios.ground.drive_past import Smoother
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
+from unifg.scenarios.ground.local_planner import PlannerAdapter
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.relocalise import Relocaliser
 from unifg.scenarios.ground.route import Route
@@ -74,38 +75,7 @@ class Estimator(Protocol):
         ...
 
 
-class Planner(Protocol):
-    """Controller of the robot."""
-
-    settings: ControllerSettings
-
-    @property
-    def estimate(self) -> Array:
-        """(3,) present pose as it is believed after the last plan [m, m, rad]."""
-        ...
-
-    def stations(self) -> Array:
-        """(N + 1,) how far ahead along the path the reference is [m]."""
-        ...
-
-    def plan(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Plan:
-        """Decide the next control from a pose (3,), poses (N + 1, 3) along the route, discs, and the pose's (3, 3)."""
-        ...
-
-    def rest(self, pose: Array) -> tuple[Array, Array]:
-        """Controls (N, 2) and states (N + 1, 3) of coming to rest, the first of which is taken as applied."""
-        ...
-
-    def driven(self, control: Array) -> None:
-        """Be told that another control (2,) than the first of the plan is applied."""
-        ...
-
-    def forget(self) -> None:
-        """Drop the warm start, as when a new route makes it misleading."""
-        ...
-
-
-PlannerT = TypeVar("PlannerT", bound=Planner)
+PlannerT = TypeVar("PlannerT", bound=Controller | PlannerAdapter)
 
 
 class Pilot(Generic[PlannerT]):
