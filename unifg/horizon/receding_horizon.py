@@ -15,7 +15,7 @@ from unifg.errors import BackendError, GraphError
 from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
-from unifg.horizon.robot import Robot
+from unifg.horizon.robot import Robot, numbers
 from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.window import Window
 from unifg.locks import ReentrantLock
@@ -306,10 +306,7 @@ class RecedingHorizon:
         """A value (count, storage) of a static."""
         if name not in known:
             raise GraphError(f"the robot has no static '{name}' (there are: {', '.join(known) or 'none'})", family=name)
-        found, shape = np.asarray(value, dtype=np.float64), known[name].shape
-        if found.shape != shape or not np.isfinite(found).all():
-            raise GraphError(f"static '{name}' must be {shape} finite numbers, got {found}", family=name)
-        return found
+        return numbers(value, known[name].shape, f"static '{name}'", family=name)
 
     def data(self, now: Context[Any]) -> dict[Data, ArrayLike]:
         """Data of the whole graph."""

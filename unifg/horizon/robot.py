@@ -125,14 +125,7 @@ class Robot:
         Raises:
             GraphError: when it is none.
         """
-        size = self.control.storage
-        try:
-            applied = np.asarray(control, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GraphError(f"the control that was applied must be ({size},) finite: {control!r}") from error
-        if applied.shape != (size,) or not np.isfinite(applied).all():
-            raise GraphError(f"the control that was applied must be ({size},) finite: {applied}")
-        return applied
+        return numbers(control, (self.control.storage,), "the control that was applied")
 
     def point(self, state: ArrayLike, what: str) -> Array:
         """A point (storage,) of the robot's manifold.
@@ -140,13 +133,10 @@ class Robot:
         Raises:
             GraphError: when it is none.
         """
-        try:
-            found = np.array(state, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GraphError(f"{what} {state!r} is not a point of {self.state.name}") from error
-        if found.shape != (self.state.storage,) or not np.all(self.state.is_valid(found)):
-            raise GraphError(f"{what} {found} is not a point of {self.state.name}")
-        return found
+        point = numbers(state, (self.state.storage,), what).copy()
+        if not np.all(self.state.is_valid(point)):
+            raise GraphError(f"{what} {point} is not a point of {self.state.name}")
+        return point
 
     def rollout(self, state: Array, controls: Array, lengths: Array | None = None) -> Array:
         """(k + 1, storage) states that controls (k, m) lead to, in steps of ``lengths`` (k,) [s]; None for ticks."""
@@ -154,6 +144,23 @@ class Robot:
         for k, control in enumerate(controls):
             states.append(self.predicted(states[-1], control, None if lengths is None else float(lengths[k])))
         return np.array(states)
+
+
+def numbers(value: ArrayLike, shape: tuple[int, ...], what: str, *, finite: bool = True, family: str = "") -> Array:
+    """An array of that shape.
+
+    Raises:
+        GraphError: when the value is none, or holds numbers that are not finite where they should be.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise GraphError(f"{what} must be {shape} numbers, got {value!r}", family=family) from error
+    if array.shape != shape:
+        raise GraphError(f"{what} has shape {array.shape}, expected {shape}", family=family)
+    if finite and not np.isfinite(array).all():
+        raise GraphError(f"{what} must be finite numbers, got {value!r}", family=family)
+    return array
 
 
 def information_of(sigma: Array) -> Array:
