@@ -349,13 +349,8 @@ class RecedingHorizon:
             return first, False
         if np.isfinite(left):
             other.solver.time_limit = min(self._limits[2], left)
-        start = self.starts.after_failure or self.starts.cold
-        states, controls = (
-            (np.tile(now.present, (self.steps + 1, 1)), np.zeros((self.steps, self.robot.control.storage)))
-            if start is None
-            else start(now)
-        )
-        found = other.solve(self.tie.begin(self.guess_of(states, controls, now), now), data=data)
+        start = self.starts.after_failure or self.starts.cold or self._stay
+        found = other.solve(self.tie.begin(self.guess_of(*start(now), now), now), data=data)
         if self._refuses(found, now):
             return first, False
         self.rescues += 1
@@ -400,10 +395,11 @@ class RecedingHorizon:
             return self.warm, self.guess if carry is None else carry(self.guess, now)
         if self.failed and self.starts.after_failure is not None:
             return self.warm, self.guess_of(*self.starts.after_failure(now), now)
-        if self.starts.cold is not None:
-            return self.cold, self.guess_of(*self.starts.cold(now), now)
-        rest = np.zeros((self.steps, self.robot.control.storage))
-        return self.cold, self.guess_of(np.tile(now.present, (self.steps + 1, 1)), rest, now)
+        return self.cold, self.guess_of(*(self.starts.cold or self._stay)(now), now)
+
+    def _stay(self, now: Context[Any]) -> tuple[Array, Array]:
+        """States and controls of staying with the control zero."""
+        return np.tile(now.present, (self.steps + 1, 1)), np.zeros((self.steps, self.robot.control.storage))
 
     def guess_of(self, states: Array, controls: Array, now: Context[Any]) -> Guess:
         """A guess for the graph, from states (N + 1, storage) and controls (N, m) of the future."""
