@@ -250,7 +250,7 @@ def test_motors_that_follow_late_are_named_and_wheels_of_the_wrong_size_are_not(
     for asked in (start, turns):
         assert following(0.0, asked).seconds == 0.0
         for scale in (0.9, 1.1):
-            assert following(0.0, asked, scale).seconds == 0.0 and following(0.0, asked, scale).evidence < 4.0
+            assert following(0.0, asked, scale).seconds == 0.0 and following(0.0, asked, scale)._evidence.max() < 4.0
     assert following(0.3, start).seconds == pytest.approx(0.3, abs=0.1)
     assert following(0.3, turns).seconds == pytest.approx(0.3, abs=0.1)
     steady = following(0.3, np.tile([1.0, 0.0], (20, 1)))

@@ -55,11 +55,6 @@ class MotorLag:
         best = int(np.argmax(self._evidence))
         return float(LAGS[best]) if self._evidence[best] > THRESHOLD else 0.0
 
-    @property
-    def evidence(self) -> float:
-        """Of the lag that explains the wheels best, against none."""
-        return float(self._evidence.max())
-
     def note(self, asked: Array, done: Array | None) -> None:
         """Take in a tick.
 

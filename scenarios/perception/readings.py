@@ -92,12 +92,6 @@ class Scan:
         returned: BoolArray = np.isfinite(self.ranges)
         return returned
 
-    def endpoints(self) -> Array:
-        """(n, 2) body-frame points [m] of the n beams that came back, in beam order."""
-        keep = self.valid
-        angles, ranges = self.angles[keep], self.ranges[keep]
-        return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=1)
-
 
 @dataclass(frozen=True)
 class Reading:
