@@ -52,9 +52,9 @@ class Validator:
         refused: what was wrong with the last sample of each sensor; no entry where it was let in.
     """
 
-    def __init__(self, beams: int = 0, settings: ValidationSettings | None = None) -> None:
+    def __init__(self, beams: int = 0) -> None:
         """Expect scans of so many beams."""
-        self.settings = settings or ValidationSettings()
+        self.settings = ValidationSettings()
         self.dropped: Counter[str] = Counter()
         self.refused: dict[str, str] = {}
         self._beams = beams

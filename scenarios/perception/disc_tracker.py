@@ -78,14 +78,13 @@ class DiscTracker:
     per track serves both axes, and all tracks are filtered together.
     """
 
-    def __init__(self, distance_map: DistanceMap, *, finder: DiscFinder | None = None) -> None:
+    def __init__(self, distance_map: DistanceMap) -> None:
         """Start without tracks.
 
         Args:
             distance_map: distance to the surfaces of the map the robot was given.
-            finder: how discs are found in a scan; None for the usual settings.
         """
-        self.finder = finder or DiscFinder(distance_map)
+        self.finder = DiscFinder(distance_map)
         self._next_identity = 0
         self._rows = _Filters.of(Discs.none(), np.zeros(0, dtype=np.intp))
 

@@ -63,9 +63,9 @@ class _Track:
 class LineTracker:
     """Tracks of what moves, in the frame of the belief."""
 
-    def __init__(self, settings: TrackerSettings | None = None, association: str = "known") -> None:
+    def __init__(self, association: str = "known") -> None:
         """Begin without tracks; ``association`` "known" trusts the readings' names and flags, "unknown" finds out."""
-        self.settings = settings or TrackerSettings()
+        self.settings = TrackerSettings()
         self._known = association == "known"
         self._tracks: list[_Track] = []
         self._count = 0

@@ -140,7 +140,6 @@ def plan(
     goal: ArrayLike,
     *,
     robot_radius: float,
-    clearance_preferred: float | None = None,
     clearance_least: float | None = None,
     extra_discs: ArrayLike | None = None,
 ) -> Array:
@@ -152,9 +151,8 @@ def plan(
         start: (3,) or (2,) [m, m, rad]; the heading is not used.
         goal: (3,) [m, m, rad].
         robot_radius: radius of the robot's disc [m].
-        clearance_preferred: distance from the robot's centre to walls that is tried first [m], by default the
-            radius plus 0.15 m; where no such way exists it is lowered step by step.
-        clearance_least: the lowest that is tried [m], by default the radius.
+        clearance_least: lowest distance from the robot's centre to walls that is tried [m], by default the radius.
+            The radius plus 0.15 m is tried first; where no such way exists it is lowered step by step.
         extra_discs: (K, 3) x, y, radius [m] of obstacles that are not on the map.
 
     Returns:
@@ -174,7 +172,7 @@ def plan(
     for name, pose in (("start", start_pose), ("goal", goal_pose)):
         _check_standing(clearance, name, pose, robot_radius)
     least = robot_radius if clearance_least is None else max(clearance_least, robot_radius)
-    preferred = max(robot_radius + _COMFORT if clearance_preferred is None else clearance_preferred, least)
+    preferred = max(robot_radius + _COMFORT, least)
 
     if least > robot_radius:
         clearance.restrict(least)
