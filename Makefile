@@ -10,12 +10,12 @@
 #   make performance  time what the library does against the record of the checkout; fails for a loss of 15 % (half a minute)
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make sample   repeat two figures of a page, drawn by the date: counts, not times
-#   make results PAGE=control-cases    measure one page of docs/ again; without PAGE, list them
+#   make results PAGE=control    measure one page of docs/results again; without PAGE, list them
 #   make release-build    build sdist and wheel twice, compare, try the wheel with every Python here (some minutes each)
 #   make release-check    the same, and fail for kernels that are out of date
 #   make kernels  compile everything anew into unifg/codegen/kernels.zip, which spares a first use most of it (minutes)
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/ground/drive_past.py')
-#   make examples run all scripts of examples/ and draw the pictures of docs/examples.md again
+#   make examples run all scripts of examples/ and draw the pictures of docs/guide/examples.md again
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make docs     build the site with the reference of all public names into out/site, every link checked
 #   make notebooks  run the notebooks of docs/notebooks as a reader does, with a kernel, into out/notebooks
@@ -79,14 +79,14 @@ pyright: $(VENV)/ready-dev
 	$(BIN)/basedpyright
 
 bench: $(VENV)/ready-bench
-	$(BIN)/python -m benchmarks.pages measure all
+	$(BIN)/python -m benchmarks all
 
 results: $(VENV)/ready-bench
-	@test -n "$(PAGE)" || { $(BIN)/python -m benchmarks.pages; echo "Choose: make results PAGE=name"; exit 2; }
-	$(BIN)/python -m benchmarks.pages measure $(PAGE)
+	@test -n "$(PAGE)" || { $(BIN)/python -m benchmarks; echo "Choose: make results PAGE=name"; exit 2; }
+	$(BIN)/python -m benchmarks $(PAGE)
 
 sample: $(VENV)/ready
-	@$(ONE_THREAD) $(BIN)/python -m benchmarks.collection --sample
+	@$(ONE_THREAD) $(BIN)/python -m benchmarks.collection
 
 release-build: $(VENV)/ready
 	$(BIN)/python docs/check_release.py $(RELEASE)

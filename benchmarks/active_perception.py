@@ -1,25 +1,25 @@
 """Plans that go where they learn: the error at the goal against the time it costs, paired over layouts.
 
-    python -m benchmarks.active_perception [--seeds 100:110] [--drives 300] [--workers K] [--fresh] [--report]
-
 On each random layout of discs and of beacons beside the way a unicycle drives to a goal in the dark. One plan has the
 predicted deviation at the goal in its cost, with the weight swept; another counts on near sightings only; the rule of
 thumb is the fastest way that passes one of the beacons within a distance, of which the best beacon and distance are
 taken. All are driven with a filter, feedback and noise, on the same random numbers. Layouts are the random effect:
-intervals are bootstrapped over them. Writes docs/active-perception.md.
+intervals are bootstrapped over them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pandas as pd
 
 import unifg as fg
-from benchmarks import runs
-from benchmarks.comparison import Row, where
-from benchmarks.covariance_plans import difference, mean
-from benchmarks.report import command, machine, publish, table
+from benchmarks.comparison import Row
+from benchmarks.covariance_plans import by_setting, counted, mean, plans_of
+from benchmarks.report import table
+from benchmarks.runner import Study
 from problems import belief_plans
 from problems.belief_plans import SENSOR, Guess, Layout, Plan, Planner
 
@@ -27,6 +27,7 @@ MARGIN = 0.3  # from discs, of all plans [m]
 WEIGHTS = (3.0, 10.0, 30.0)  # of the deviation at the goal [s/m]
 PASSES = (2.0, 1.2, 0.6)  # distances at which a rule passes a beacon [m]
 DISCS = 3
+DRIVES = 300  # of each plan
 WAYS: dict[str, tuple[str, ...]] = {
     "rule": tuple(f"{distance:g}" for distance in PASSES),
     "in the cost": tuple(f"{weight:g}" for weight in WEIGHTS),
@@ -48,11 +49,10 @@ LONGER = (0.3, 1.0, 3.0)  # than the fastest plan [s]
 
 @dataclass(frozen=True)
 class Job:
-    """One layout, planned in one way, and how often each plan is driven."""
+    """One layout, planned in one way."""
 
     seed: int
     way: str
-    drives: int
 
 
 def dark(seed: int) -> Layout:
@@ -90,12 +90,12 @@ def planned(job: Job) -> list[tuple[str, Plan | None]]:
 def attempt(job: Job) -> Row:
     """Plan in one way, and drive all plans."""
     world = dark(job.seed)
-    found: list[Row] = []
+    plans: list[Row] = []
     for words, plan in planned(job):
         if plan is None:
             continue
-        drives = belief_plans.drive(plan, world, job.drives, job.seed)
-        found.append(
+        drives = belief_plans.drive(plan, world, DRIVES, job.seed)
+        plans.append(
             {
                 "setting": words,
                 "time": plan.duration,
@@ -105,72 +105,49 @@ def attempt(job: Job) -> Row:
                 "collisions": drives.collisions,
             }
         )
-    return {"found": found}
+    return {"plans": plans}
 
 
-class Campaign:
-    """What was found, by way and layout.
-
-    Attributes:
-        seeds: layouts that all ways have met.
-    """
-
-    def __init__(self, rows: list[Row], drives: int) -> None:
-        """Sort the rows of some drives per plan."""
-        ways = {way: {row["seed"]: row["found"] for row in where(rows, way=way, drives=drives)} for way in WAYS}
-        self.seeds = sorted(set[int].intersection(*(set(found) for found in ways.values())))
-        self._found = {way: [found[seed] for seed in self.seeds] for way, found in ways.items()}
-
-    def of(self, way: str, setting: str, what: str) -> list[float]:
-        """A number of each layout, of the fastest plan with a setting; not a number where there is none."""
-        return [
-            min(((row["time"], row[what]) for row in found if row["setting"] == setting), default=(0.0, np.nan))[1]
-            for found in self._found[way]
-        ]
-
-    def fastest(self, way: str, target: float) -> list[float]:
-        """The least time of each layout among all plans whose drives end with no more than a target's error."""
-        return [
-            min((row["time"] for row in found if row["error"] <= target), default=np.nan) for found in self._found[way]
-        ]
-
-    def surest(self, way: str, longer: float) -> list[float]:
-        """The least error of each layout among all plans that take no more than this beyond the fastest of any way."""
-        least = [
-            min((row["time"] for way in WAYS for row in self._found[way][i]), default=np.nan)
-            for i in range(len(self.seeds))
-        ]
-        return [
-            min((row["error"] for row in found if row["time"] <= time + longer), default=np.nan)
-            for found, time in zip(self._found[way], least, strict=True)
-        ]
+def fastest(plans: pd.DataFrame, target: float) -> dict[str, pd.Series[float]]:
+    """Least time of each layout by way, among all plans whose drives end with no more than a target's error."""
+    return by_way(plans[plans["error"] <= target].groupby(["way", "seed"])["time"].min())
 
 
-def render(found: Campaign, drives: int) -> str:
+def surest(plans: pd.DataFrame, longer: float) -> dict[str, pd.Series[float]]:
+    """Least error of each layout by way, among all plans that take no more than this beyond the fastest of any way."""
+    least = plans.groupby("seed")["time"].transform("min")
+    return by_way(plans[plans["time"] <= least + longer].groupby(["way", "seed"])["error"].min())
+
+
+def by_way(values: pd.Series[float]) -> dict[str, pd.Series[float]]:
+    """Values of the layouts, by way; none for a way without plans."""
+    return {way: values.xs(way) if way in values.index else pd.Series(dtype=float) for way in WAYS}
+
+
+def render(rows: Sequence[Row]) -> str:
     """Markdown of all settings, and of both ways at equal error and at equal time."""
+    plans = plans_of(rows)
+    count, base = len(plans.index.unique("seed")), "rule"
+    quickest = by_setting(plans.sort_values("time").groupby(["way", "setting", "seed"], sort=False).first())
     lines = [
         [
             f"{way}, {setting} {UNITS[way]}",
-            *(mean(found.of(way, setting, what), scale) for what, scale in COLUMNS.values()),
+            *(mean(quickest[way, setting][what], scale) for what, scale in COLUMNS.values()),
         ]
-        for way, settings in WAYS.items()
-        for setting in settings
-    ]
-    count, base = len(found.seeds), "rule"
+        for way, settings in WAYS.items() for setting in settings if (way, setting) in quickest
+    ]  # fmt: skip
     error, late, beside = [], [], [f"{way}, to the rule" for way in WAYS if way != base]
     for target in TARGETS:
-        times = {way: found.fastest(way, target) for way in WAYS}
-        kept = [f"{np.isfinite(times[way]).sum()} / {count}" for way in WAYS]
-        against = [difference(times[way], times[base]) for way in WAYS if way != base]
-        error.append([f"{100.0 * target:g} cm", *kept, *against])
+        times = fastest(plans, target)
+        reached = [f"{len(times[way])} / {count}" for way in WAYS]
+        error.append([f"{100.0 * target:g} cm", *reached, *(counted(times[w], times[base]) for w in WAYS if w != base)])
     for longer in LONGER:
-        errors = {way: [100.0 * value for value in found.surest(way, longer)] for way in WAYS}
-        against = [difference(errors[way], errors[base]) for way in WAYS if way != base]
+        errors = {way: 100.0 * found for way, found in surest(plans, longer).items()}
+        against = [counted(errors[way], errors[base]) for way in WAYS if way != base]
         late.append([f"{longer:g} s", *(mean(errors[way]) for way in WAYS), *against])
     return "\n\n".join(
         [
-            machine("numpy", "scipy", "osqp", "piqp", "numba"),
-            f"{count} layouts, {drives} drives of each plan; in brackets 95 % intervals over layouts. The rule's lines "
+            f"{count} layouts, {DRIVES} drives of each plan; in brackets 95 % intervals over layouts. The rule's lines "
             "are those of the beacon that takes the least time.",
             "### Every setting",
             table(["plan", *COLUMNS], lines),
@@ -182,21 +159,9 @@ def render(found: Campaign, drives: int) -> str:
     )
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run what is missing and rewrite docs/active-perception.md."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--seeds", type=runs.seeds, default=range(100, 110), metavar="FIRST:END")
-    parser.add_argument("--drives", type=int, default=300, help="of each plan")
-    options = parser.parse_args(arguments)
-    jobs = [Job(seed, way, options.drives) for seed in options.seeds for way in WAYS]
-    rows = runs.episodes("active_perception", attempt, jobs, options)
-    asked = [row for row in rows if row["seed"] in options.seeds]
-    publish(
-        "active-perception", render(Campaign(asked, options.drives), options.drives), {row["code"] for row in asked}
-    )
-    return 0
+def cells(seeds: Sequence[int]) -> list[Job]:
+    """Every layout, planned in every way."""
+    return [Job(seed, way) for seed in seeds for way in WAYS]
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cells, attempt, render, range(100, 110))

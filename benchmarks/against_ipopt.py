@@ -1,18 +1,16 @@
 """Bazzana's Table III: one instance of the control problem after the other, his loop and others beside IPOPT.
 
-    python -m benchmarks.against_ipopt [--rounds 15]
-
 The paper gives six initial costs, six final ones, iterations and times, and neither goals nor weights, horizon, map or
 guess. What is known is kept: the costs of eq. 8 to 11 (soft dynamics, potential field with his k, mu, rho), limits of
 1, his stop test, a guess along a straight path. Such a guess fits every cost but the first step of the dynamics, where
 the robot faces elsewhere, so that an initial cost is in effect a bearing of the goal: here it is chosen so that each
-initial cost is the paper's. The hard form has the dynamics and the clearance as constraints. Writes docs/ipopt.md.
+initial cost is the paper's. The hard form has the dynamics and the clearance as constraints.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from typing import Any, TypeAlias
@@ -23,9 +21,11 @@ from scipy.optimize import brentq
 import unifg as fg
 from benchmarks.compiled_peers import COMPILER
 from benchmarks.compiled_peers import compiled as in_machine_code
+from benchmarks.control_peers import unicycle_gap
 from benchmarks.printed import numbers
-from benchmarks.report import command, machine, publish, table, words
-from benchmarks.timing import interleave, number, pin
+from benchmarks.report import table, words
+from benchmarks.runner import Timing
+from benchmarks.timing import interleave, number
 from unifg.models import obstacles, potential, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
@@ -157,16 +157,22 @@ class Ours:
         """Of the last solve."""
         return words(self.solution.status), 2.0 * self.solution.cost, self.solution.iterations
 
-    @property
-    def answer(self) -> tuple[Array, Array]:
-        """Poses and controls."""
-        return self.solution[self.x], self.solution[self.u]
-
-    def again_from(self, instance: Instance, earlier: Ours) -> None:
-        """Solve a moved instance from the answer of the unmoved one."""
+    def move(self, instance: Instance) -> None:
+        """Prepare a moved instance, with the last answer as its guess."""
+        states, controls = self.solution[self.x], self.solution[self.u]
         self.state(instance)
-        guess = fg.Guess({self.x: earlier.solution[earlier.x], self.u: earlier.solution[earlier.u]})
-        self.guess = guess
+        self.guess = fg.Guess({self.x: states, self.u: controls})
+
+
+gap = partial(unicycle_gap, dt=DT)
+"""Defect of the dynamics in symbols of casadi."""
+
+
+def clearances(instance: Instance, x: Any) -> list[Any]:
+    """Distances of the hull from the discs in symbols of casadi [m]."""
+    import casadi as ca
+
+    return [ca.norm_2(x[:2] - ca.DM([a, b])) - r - HULL for a, b, r in instance.discs]
 
 
 class Casadi:
@@ -187,19 +193,17 @@ class Casadi:
         rows: list[Any] = []
         equality: list[bool] = []
         for k in range(STEPS):
-            middle = x[k][2] + 0.5 * DT * u[k][1]
-            moved = ca.vertcat(DT * u[k][0] * ca.cos(middle), DT * u[k][0] * ca.sin(middle), DT * u[k][1])
-            defect = x[k + 1] - x[k] - moved
+            defect = gap(x[k], u[k], x[k + 1])
             cost += ca.dot(EFFORT, (u[k] - ca.DM([SPEED, 0.0])) ** 2)
             cost += ca.dot(PATH, (x[k + 1] - ca.DM(reference[k + 1])) ** 2)
-            gaps = [ca.norm_2(x[k + 1][:2] - ca.DM([a, b])) - r - HULL for a, b, r in instance.discs]
+            clear = clearances(instance, x[k + 1])
             if instance.hard:
-                rows += [defect, *(gap - CLEAR for gap in gaps)]
-                equality += [True] * 3 + [False] * len(gaps)
+                rows += [defect, *(distance - CLEAR for distance in clear)]
+                equality += [True] * 3 + [False] * len(clear)
             else:
                 cost += STIFF * ca.sumsqr(defect)
-                for gap in gaps:
-                    bounded = ca.fmin(ca.fmax(gap, potential.NEAR), potential.FAR)
+                for distance in clear:
+                    bounded = ca.fmin(ca.fmax(distance, potential.NEAR), potential.FAR)
                     cost += PUSH * (potential.SCALE * (1.0 / bounded - 1.0 / potential.FAR)) ** 2
         pairs = zip(u, x[1:], strict=True)
         unknowns = ca.vertcat(*(part for pair in pairs for part in pair))
@@ -228,17 +232,10 @@ class Casadi:
         how = "converged" if stats["success"] else str(stats.get("return_status", "failed")).replace("_", " ").lower()
         return how, 2.0 * float(self.found["f"]), int(stats["iter_count"])
 
-    @property
-    def answer(self) -> tuple[Array, Array]:
-        """Poses after the first, and controls."""
-        both = np.asarray(self.found["x"]).reshape(STEPS, 5)
-        return both[:, 2:], both[:, :2]
-
-    def again_from(self, instance: Instance, earlier: Casadi) -> None:
-        """Solve a moved instance from the answer and the multipliers of the unmoved one."""
-        self.solver, self.call = earlier.solver, dict(earlier.call)
-        self.call |= {"p": instance.start, "x0": earlier.found["x"]}
-        self.call |= {"lam_x0": earlier.found["lam_x"], "lam_g0": earlier.found["lam_g"]}
+    def move(self, instance: Instance) -> None:
+        """Take a moved start, with the last answer and its multipliers as the guess."""
+        found = self.found
+        self.call |= {"p": instance.start, "x0": found["x"], "lam_x0": found["lam_x"], "lam_g0": found["lam_g"]}
 
 
 Contestant: TypeAlias = Ours | Casadi
@@ -251,7 +248,7 @@ QUASI_NEWTON: dict[str, Any] = {"hessian_approximation": "limited-memory", "max_
 
 
 def contestants(hard: bool) -> dict[str, Callable[[], Contestant]]:
-    """Who solves one form of the problem from the cold guess."""
+    """Contestants for one form of the problem, from the cold guess."""
     both: dict[str, Callable[[], Contestant]] = {
         "literal loop": lambda: Ours(AugmentedLagrangian(schedule="bazzana", **LOOP)),
         "literal loop, damped": lambda: Ours(AugmentedLagrangian(schedule="bazzana-damped", **LOOP)),
@@ -288,13 +285,7 @@ class Fatrop(Casadi):
             cost = 0.5 * ca.dot(PATH, (x - ca.DM(reference[k])) ** 2) if k else ca.SX(0.0)
             if u is not None:
                 cost += 0.5 * ca.dot(EFFORT, (u - ca.DM([SPEED, 0.0])) ** 2)
-            discs = [ca.norm_2(x[:2] - ca.DM([a, b])) - r - HULL - CLEAR for a, b, r in instance.discs] if k else []
-            return cost, zero, discs
-
-        def gap(x: Any, u: Any, after: Any) -> Any:
-            middle = x[2] + 0.5 * DT * u[1]
-            moved = ca.vertcat(DT * u[0] * ca.cos(middle), DT * u[0] * ca.sin(middle), DT * u[1])
-            return after - x - moved
+            return cost, zero, [distance - CLEAR for distance in clearances(instance, x)] if k else []
 
         free = np.array([np.inf, np.inf, np.inf, LIMIT, LIMIT])
         self.staged = Staged("fatrop", (3, 2, STEPS), stage, gap, ca.SX.sym("none", 0), (-free, free), tol=STOP)
@@ -320,21 +311,12 @@ def cold(hard: bool, rounds: int) -> str:
         for who in running.values():
             who.state(instance)
         seconds = interleave({name: who for name, who in running.items()}, rounds, warm=1, slow=1.0)
+        taken = {name: 1e3 * float(np.median(some)) for name, some in seconds.items()}
         for name, who in running.items():
             how, cost, iterations = who.outcome
-            taken = 1e3 * float(np.median(seconds[name]))
-            quickest = 1e3 * float(np.median(seconds["augmented Lagrangian"]))
-            ratios.setdefault(name, []).append(taken / quickest)
-            lines.append(
-                [
-                    f"{row[0]:.2f}",
-                    name,
-                    how,
-                    f"{cost:.3f}" if cost < 1e6 else f"{cost:.0e}",
-                    str(iterations),
-                    number(taken),
-                ]
-            )
+            ratios.setdefault(name, []).append(taken[name] / taken["augmented Lagrangian"])
+            shown = f"{cost:.3f}" if cost < 1e6 else f"{cost:.0e}"
+            lines.append([f"{row[0]:.2f}", name, how, shown, str(iterations), number(taken[name])])
         if not hard:
             for name, (final, count, took) in (("the paper's solver", row[1]), ("the paper's IPOPT", row[2])):
                 lines.append([f"{row[0]:.2f}", name, "", f"{final:.3f}", str(count), f"{1e3 * took:.0f}"])
@@ -344,30 +326,23 @@ def cold(hard: bool, rounds: int) -> str:
 
 
 def warm(rounds: int) -> str:
-    """What a tick of a control loop costs: the start has moved, everything else is known."""
-    kinds: Mapping[str, tuple[Callable[[], Contestant], Callable[[], Contestant]]] = {
-        "augmented Lagrangian": (lambda: Ours(AugmentedLagrangian(tolerance=STOP)),) * 2,
-        "SQP": (lambda: Ours(SQP(tolerance=STOP)),) * 2,
-        "interior point": (lambda: Ours(InteriorPoint(tolerance=STOP)),) * 2,
-        "IPOPT, no warm start": (lambda: Casadi(tol=STOP),) * 2,
-        "IPOPT, warm": (lambda: Casadi(tol=STOP, **WARM),) * 2,
+    """Tick of a control loop: the start has moved, everything else is known."""
+    kinds: dict[str, Callable[[], Contestant]] = {
+        name: make
+        for name, make in contestants(True).items()
+        if name in ("augmented Lagrangian", "SQP", "interior point")
     }
+    kinds["IPOPT, no warm start"] = lambda: Casadi(tol=STOP)
+    kinds["IPOPT, warm"] = lambda: Casadi(tol=STOP, **WARM)
     if COMPILER is not None:
-        kinds = {**kinds, "IPOPT, warm, compiled": (lambda: Casadi(compiled=True, tol=STOP, **WARM),) * 2}
+        kinds["IPOPT, warm, compiled"] = lambda: Casadi(compiled=True, tol=STOP, **WARM)
     found: dict[str, list[tuple[float, int]]] = {name: [] for name in kinds}
     for bearing in bearings():
-        running: dict[str, Contestant] = {}
-        for name, (first, second) in kinds.items():
-            before, after = first(), second()
-            before.state(Instance(bearing, hard=True))
-            before()
-            if isinstance(before, Ours):
-                assert isinstance(after, Ours)
-                after.again_from(Instance(bearing, True, NEARLY), before)
-            else:
-                assert isinstance(after, Casadi)
-                after.again_from(Instance(bearing, True, NEARLY), before)
-            running[name] = after
+        running = {name: make() for name, make in kinds.items()}
+        for who in running.values():
+            who.state(Instance(bearing, hard=True))
+            who()
+            who.move(Instance(bearing, True, NEARLY))
         seconds = interleave({name: who for name, who in running.items()}, rounds, warm=2)
         for name, who in running.items():
             found[name].append((1e3 * float(np.median(seconds[name])), who.outcome[2]))
@@ -382,7 +357,6 @@ def report(rounds: int) -> str:
     """Everything as Markdown."""
     angles = ", ".join(f"{np.degrees(angle):.0f}" for angle in bearings())
     parts = [
-        machine("numpy", "numba", "casadi"),
         f"Six goals, {angles} degrees off the robot's heading. Costs are the paper's, without one half. Times are "
         f"processor times, medians over {rounds} rounds in which all solvers take turns.",
         "### His form",
@@ -400,16 +374,4 @@ def report(rounds: int) -> str:
     return "\n\n".join(parts)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure and write."""
-    parser = command(__doc__)
-    parser.add_argument("--rounds", type=int, default=15, help="solves behind every time (default: %(default)s)")
-    parser.add_argument("--no-docs", action="store_true", help="leave the page in docs/ alone")
-    chosen = parser.parse_args(arguments)
-    pin()
-    publish("ipopt", report(chosen.rounds), docs=not chosen.no_docs)
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Timing(report)

@@ -21,7 +21,7 @@ TOLERANCE = 1e-6
 
 
 def available() -> bool:
-    """Whether casadi is installed."""
+    """Test whether casadi is installed."""
     return find_spec("casadi") is not None
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -17,7 +16,6 @@ from benchmarks.casadi_peer import available
 from benchmarks.report import listing, words
 from benchmarks.timing import interleave, number
 from problems.control import Formulated, Problem
-from unifg.typing import Array
 
 PEERS = ("ipopt", "fatrop", "fatrop, compiled")
 """The last one with its functions in machine code, the others in the virtual machine of casadi."""
@@ -30,28 +28,24 @@ def runnable(peers: tuple[str, ...] = PEERS) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Rules:
-    """How a page measures and judges.
+    """Rules of measuring and judging of a page.
 
     Attributes:
         tolerance: of every solver.
         same: relative difference below which two costs are one optimum.
-        good: KKT numbers below which an answer counts though its solver has not converged.
         slow: a solve that takes longer is not repeated [ms].
-        prepared: whether ours are prepared once for all rounds; else every solve allocates its workspaces.
         peers: beside ours, of :data:`PEERS`.
     """
 
     tolerance: float
     same: float
-    good: float
     slow: float
-    prepared: bool
     peers: tuple[str, ...]
 
 
 @dataclass
 class Outcome:
-    """What one solver made of one problem.
+    """Result of one solver on one problem.
 
     Attributes:
         problem, solver: which.
@@ -59,10 +53,6 @@ class Outcome:
         iterations: of the solver.
         cost: with its 1/2.
         times: one per round [ms].
-        kkt: largest KKT number, not a number for a peer.
-        routes: how many subproblems each QP route of SQP solved.
-        states, controls: where it ended.
-        refined: what IPOPT does when it is started there; a dash where it was not asked.
     """
 
     problem: Problem
@@ -71,24 +61,15 @@ class Outcome:
     iterations: int = 0
     cost: float = np.nan
     times: list[float] = field(default_factory=list)
-    kkt: float = np.nan
-    routes: Counter[str] = field(default_factory=Counter)
-    states: Array = field(default_factory=lambda: np.zeros((0, 3)))
-    controls: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    refined: str = "-"
 
     @property
     def median(self) -> float:
         """[ms]."""
         return float(np.median(self.times))
 
-    def good(self, rules: Rules) -> bool:
-        """Whether it is a KKT point to what counts as one."""
-        return self.status == "converged" or self.kkt <= rules.good
-
     def verdict(self, rules: Rules) -> str:
-        """How the cost compares with the known optima."""
-        if not self.good(rules):
+        """Comparison of the cost with the known optima."""
+        if self.status != "converged":
             return self.status
         relative = [self.cost / known - 1.0 for known in self.problem.optima]
         if abs(relative[0]) < rules.same:
@@ -103,22 +84,17 @@ Results: TypeAlias = Mapping[Problem, Outcomes]
 Told: TypeAlias = Callable[[Outcome], str]
 
 
-def attempt(solver: fg.Solver, problem: Formulated, prepared: bool) -> Callable[[Outcome], float]:
+def attempt(solver: fg.Solver, problem: Formulated) -> Callable[[Outcome], float]:
     """A cold solve by one of ours, the graph compiled before; its processor time [ms]."""
     stated = problem.formulation()
-    kept = solver.prepare(stated.graph)
+    run = solver.prepare(stated.graph)
 
     def solve(outcome: Outcome) -> float:
-        run = kept if prepared else solver.prepare(stated.graph)
         begin = time.thread_time()
         solution = run.solve(stated.guess)
         elapsed = 1e3 * (time.thread_time() - begin)
         outcome.status = words(solution.status)
         outcome.iterations, outcome.cost = solution.iterations, solution.cost
-        outcome.kkt = max(solution.stationarity, solution.violation, solution.complementarity)
-        outcome.states, outcome.controls = solution[stated.x], solution[stated.u]
-        routes = (str(row.details.get("qp", "")).partition(":")[0] for row in solution.history)
-        outcome.routes = Counter(route for route in routes if route not in ("", "none"))
         return elapsed
 
     return solve
@@ -142,7 +118,7 @@ def attempt_peer(name: str, problem: Problem, tolerance: float) -> Callable[[Out
 
 def measure(problem: Problem, solvers: Mapping[str, fg.Solver], rules: Rules, rounds: int) -> Outcomes:
     """Solve a problem with every solver, ``rounds`` times after one that is not counted."""
-    attempts = {name: attempt(solver, problem, rules.prepared) for name, solver in solvers.items()}
+    attempts = {name: attempt(solver, problem) for name, solver in solvers.items()}
     attempts |= {name: attempt_peer(name, problem, rules.tolerance) for name in runnable(rules.peers)}
     outcomes = {name: Outcome(problem, name) for name in attempts}
     times = interleave(
@@ -186,8 +162,8 @@ def summary(results: Results, rules: Rules, counted: Mapping[str, Callable[[Outc
     return listing(["solver"], groups, columns)
 
 
-def every(results: Results, rules: Rules, more: Mapping[str, Told]) -> str:
-    """One row per problem and solver; ``more`` are columns a page adds."""
+def every(results: Results, rules: Rules) -> str:
+    """One row per problem and solver."""
 
     def times(peer: str) -> Told:
         return lambda outcome: f"{ratio(results, outcome, peer):.2f}".replace("nan", "-")
@@ -199,7 +175,6 @@ def every(results: Results, rules: Rules, more: Mapping[str, Told]) -> str:
         "iterations": lambda outcome: str(outcome.iterations),
         "ms": lambda outcome: number(outcome.median),
         **{f"times {peer}": times(peer) for peer in runnable(rules.peers)},
-        **more,
     }
     every_one = [outcome for outcomes in results.values() for outcome in outcomes.values()]
     return listing(["case", "solver"], {(one.problem.title, one.solver): one for one in every_one}, columns)

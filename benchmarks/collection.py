@@ -1,11 +1,10 @@
 """Every backend on a collection of small problems with known answers; IPOPT beside them.
 
-    python -m benchmarks.collection
-    python -m benchmarks.collection --sample [DAY]   repeats two cells of the page, drawn by the date
+    python -m benchmarks.collection [DAY]   repeats two cells of the page, drawn by the date
 
 The problems are those of the tests (tests/problems/collection.py): Hock and Schittkowski's, least squares, degenerate
-and infeasible ones, and problems on Lie groups. A backend takes what its class allows. What it returns is judged by
-`tests/judge.py`, which shares no code with the solvers. Writes docs/collection.md.
+and infeasible ones, and problems on Lie groups. A backend takes the problems of its class. Answers are judged by
+`tests/judge.py`, which shares no code with the solvers.
 """
 
 from __future__ import annotations
@@ -16,8 +15,8 @@ import re
 from collections import Counter
 from importlib.util import find_spec
 
-from benchmarks.pages import PAGES
-from benchmarks.report import command, machine, publish, table
+from benchmarks.report import command, table
+from benchmarks.runner import RESULTS, Timing
 from problems.collection import (
     BACKENDS,
     CASES,
@@ -51,7 +50,7 @@ def measure() -> dict[str, dict[str, Outcome]]:
 
 def render(results: dict[str, dict[str, Outcome]]) -> str:
     """The page."""
-    notes = f"{machine('numpy', 'scipy', 'casadi')} Default options, one solve from the standard start of each problem."
+    notes = "Default options, one solve from the standard start of each problem."
     parts = [notes, _summary(results), "## What is not solved", _failures(results)]
     for title, cases in GROUPS.items():
         parts += [f"## Iterations: {title}", _iterations(results, cases)]
@@ -124,16 +123,16 @@ def _cell(outcome: Outcome | None) -> str:
     return f"{outcome.iterations}{mark}"
 
 
+STUDY = Timing(lambda rounds: render(measure()), 1)
+
+
 def main(arguments: list[str] | None = None) -> int:
-    """Solve everything and write the tables, or repeat some cells; 1 if one of these differs."""
+    """Repeat two cells of the page; 1 if one of them differs."""
     parser = command(__doc__)
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    parser.add_argument("--sample", nargs="?", const=today, metavar="DAY", help="repeat two cells, drawn by the date")
+    parser.add_argument("day", nargs="?", default=today, help="draws the cells")
     chosen = parser.parse_args(arguments)
-    if chosen.sample is not None:
-        return 0 if repeated(PAGES["collection"].path.read_text(encoding="utf-8"), chosen.sample) else 1
-    publish("collection", render(measure()))
-    return 0
+    return 0 if repeated((RESULTS / "collection.md").read_text(encoding="utf-8"), chosen.day) else 1
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Rows of a measurement by variant: which of them met the same seeds, and how far these differ."""
+"""Rows of a measurement by variant, and paired differences over the seeds that variants share."""
 
 from __future__ import annotations
 
@@ -24,15 +24,6 @@ def where(rows: Iterable[Row], **wanted: Any) -> list[Row]:
     return [row for row in rows if "error" not in row and all(row[name] == value for name, value in wanted.items())]
 
 
-def crossed(rows: Iterable[Row], *names: str) -> dict[Key, list[Row]]:
-    """Rows by their values of some fields, in the order of seeds; a seed counts when all groups have it."""
-    groups: dict[Key, dict[int, Row]] = {}
-    for row in where(rows):
-        groups.setdefault(tuple(row[name] for name in names), {})[row["seed"]] = row
-    common = sorted(set[int].intersection(*map(set, groups.values()))) if groups else []
-    return {key: [found[seed] for seed in common] for key, found in groups.items()}
-
-
 def paired(mine: Iterable[Row], base: Iterable[Row], read: Read) -> tuple[Array, Array]:
     """(n,) values of two variants for the seeds of which both have one."""
     a, b = ({row["seed"]: read(row) for row in rows} for rows in (mine, base))
@@ -51,9 +42,21 @@ def against(mine: Sequence[Row], base: Sequence[Row], read: Read) -> str:
         return "-"
     if mine is base:
         return f"{values.mean():.3g}"
-    low, high = interval(values - others)
     pairs = "" if len(values) == min(len(mine), len(base)) else f", n={len(values)}"
-    return f"{values.mean():.3g} ({digits(low, '+')} .. {digits(high, '+')}){pairs}"
+    return f"{values.mean():.3g} {bracketed(values - others)}{pairs}"
+
+
+def bracketed(differences: Array) -> str:
+    """Interval of the mean difference, of two or fewer their span, in brackets."""
+    low, high = interval(differences) if len(differences) > 2 else (differences.min(), differences.max())
+    return f"({digits(low, '+')} .. {digits(high, '+')})"
+
+
+def difference(values: Array, scale: float = 1.0) -> str:
+    """Mean of paired differences and, in brackets, its interval; differences that are not finite are left out."""
+    known = scale * np.asarray(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return f"{digits(known.mean(), '+')} {bracketed(known)}" if len(known) else "-"
 
 
 def comparison(measures: Mapping[str, Read], variants: Mapping[str, Sequence[Row]], base: str, head: str = "") -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,13 +42,13 @@ class ControlPeer(Staged):
         import casadi as ca
 
         self.problem = problem
-        model = MODELS[problem.robot](problem.dt)
+        error, gap = MODELS[problem.robot]
         size, controls, n = len(problem.start), len(problem.effort), problem.horizon
         start, reference = ca.SX.sym("start", size), ca.SX.sym("reference", size, n + 1)
         cruise = ca.SX.sym("cruise", controls, n)
 
         def stage(k: int, x: Any, u: Any) -> tuple[Any, list[Any], list[Any]]:
-            off = model.error(x, reference[:, k])
+            off = error(x, reference[:, k])
             cost = 0.5 * ca.dot(ca.DM(problem.stage if k < n else problem.terminal) * off, off)
             if k < n:
                 effort = u - cruise[:, k]
@@ -60,7 +62,8 @@ class ControlPeer(Staged):
         free = np.full(size, np.inf)
         limits = np.append(-free, problem.lower), np.append(free, problem.upper)
         given = ca.vertcat(start, ca.vec(reference), ca.vec(cruise))
-        super().__init__(plugin, (size, controls, n), stage, model.gap, given, limits, compiled, **options)
+        dynamics = partial(gap, dt=problem.dt)
+        super().__init__(plugin, (size, controls, n), stage, dynamics, given, limits, compiled, **options)
 
     def solve(self, states: Array, controls: Array, state: Array | None = None, first: int = 0, **duals: Any) -> float:
         """Solve closed-loop step ``first`` from a guess; returns the processor time of the call [ms]."""
@@ -79,81 +82,68 @@ class ControlPeer(Staged):
         return Tick(self.trajectory[1][0], elapsed, self.iterations, self.status)
 
 
-class _UnicycleModel:
-    """Midpoint rule; headings are not wrapped."""
-
-    def __init__(self, dt: float) -> None:
-        self._dt = dt
-
-    def error(self, x: Any, wanted: Any) -> Any:
-        return x - wanted
-
-    def gap(self, x: Any, u: Any, after: Any) -> Any:
-        import casadi as ca
-
-        dt = self._dt
-        heading = x[2] + 0.5 * dt * u[1]
-        moved = ca.vertcat(dt * u[0] * ca.cos(heading), dt * u[0] * ca.sin(heading), dt * u[1])
-        return after - (x + moved)
+def difference(x: Any, wanted: Any) -> Any:
+    """Error of a state of numbers; headings are not wrapped."""
+    return x - wanted
 
 
-class _QuadrotorModel:
-    """Unit quaternions, which keep their norm: rates are integrated exactly."""
+def unicycle_gap(x: Any, u: Any, after: Any, dt: float) -> Any:
+    """Defect of the midpoint rule."""
+    import casadi as ca
 
-    def __init__(self, dt: float) -> None:
-        self._dt = dt
-
-    def error(self, x: Any, wanted: Any) -> Any:
-        import casadi as ca
-
-        q = quaternion_times(ca.vertcat(wanted[3], -wanted[4:7]), x[3:7])
-        length = ca.sqrt(ca.dot(q[1:], q[1:]) + 1e-8)
-        return ca.vertcat(x[:3] - wanted[:3], 2 * ca.atan2(length, q[0]) / length * q[1:], x[7:] - wanted[7:])
-
-    def gap(self, x: Any, u: Any, after: Any) -> Any:
-        import casadi as ca
-
-        def up(q: Any) -> Any:
-            w, a, b, c = q[0], q[1], q[2], q[3]
-            return ca.vertcat(2 * (a * c + w * b), 2 * (b * c - w * a), 1 - 2 * (a * a + b * b))
-
-        dt = self._dt
-        # Series in the squared angle: square roots have no derivative at zero. |turn| is below 0.5.
-        turn = dt * u[:3]
-        s = ca.dot(turn, turn) / 4
-        cosine = 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56)))
-        sinc = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))
-        q = quaternion_times(x[3:7], ca.vertcat(cosine, 0.5 * sinc * turn))
-        v = x[7:] + dt * (0.5 * u[3] * (up(x[3:7]) + up(q)) - ca.DM([0, 0, GRAVITY]))
-        return after - ca.vertcat(x[:3] + 0.5 * dt * (x[7:] + v), q, v)
+    heading = x[2] + 0.5 * dt * u[1]
+    moved = ca.vertcat(dt * u[0] * ca.cos(heading), dt * u[0] * ca.sin(heading), dt * u[1])
+    return after - (x + moved)
 
 
-class _CartPoleModel:
-    """Runge-Kutta of order four."""
+def quadrotor_error(x: Any, wanted: Any) -> Any:
+    """Position, rotation vector and velocity; unit quaternions keep their norm, as rates are integrated exactly."""
+    import casadi as ca
 
-    def __init__(self, dt: float) -> None:
-        self._dt = dt
-
-    def error(self, x: Any, wanted: Any) -> Any:
-        return x - wanted
-
-    def gap(self, x: Any, u: Any, after: Any) -> Any:
-        import casadi as ca
-
-        def velocity(state: Any) -> Any:
-            sine, cosine = ca.sin(state[1]), ca.cos(state[1])
-            total = POLE + CART
-            push = (u[0] + POLE * LENGTH * state[3] ** 2 * sine) / total
-            turn = (GRAVITY * sine - cosine * push) / (LENGTH * (4.0 / 3.0 - POLE * cosine**2 / total))
-            return ca.vertcat(state[2], state[3], push - POLE * LENGTH * turn * cosine / total, turn)
-
-        dt = self._dt
-        a = velocity(x)
-        b = velocity(x + 0.5 * dt * a)
-        c = velocity(x + 0.5 * dt * b)
-        d = velocity(x + dt * c)
-        return after - (x + dt / 6.0 * (a + 2.0 * b + 2.0 * c + d))
+    q = quaternion_times(ca.vertcat(wanted[3], -wanted[4:7]), x[3:7])
+    length = ca.sqrt(ca.dot(q[1:], q[1:]) + 1e-8)
+    return ca.vertcat(x[:3] - wanted[:3], 2 * ca.atan2(length, q[0]) / length * q[1:], x[7:] - wanted[7:])
 
 
-MODELS: dict[str, Any] = {"unicycle": _UnicycleModel, "quadrotor": _QuadrotorModel, "cart-pole": _CartPoleModel}
-"""By robot."""
+def quadrotor_gap(x: Any, u: Any, after: Any, dt: float) -> Any:
+    """Defect of the rotation's exponential and of the trapezoidal rule."""
+    import casadi as ca
+
+    def up(q: Any) -> Any:
+        w, a, b, c = q[0], q[1], q[2], q[3]
+        return ca.vertcat(2 * (a * c + w * b), 2 * (b * c - w * a), 1 - 2 * (a * a + b * b))
+
+    # Series in the squared angle: square roots have no derivative at zero. |turn| is below 0.5.
+    turn = dt * u[:3]
+    s = ca.dot(turn, turn) / 4
+    cosine = 1 - s / 2 * (1 - s / 12 * (1 - s / 30 * (1 - s / 56)))
+    sinc = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))
+    q = quaternion_times(x[3:7], ca.vertcat(cosine, 0.5 * sinc * turn))
+    v = x[7:] + dt * (0.5 * u[3] * (up(x[3:7]) + up(q)) - ca.DM([0, 0, GRAVITY]))
+    return after - ca.vertcat(x[:3] + 0.5 * dt * (x[7:] + v), q, v)
+
+
+def cart_pole_gap(x: Any, u: Any, after: Any, dt: float) -> Any:
+    """Defect of the Runge-Kutta method of order four."""
+    import casadi as ca
+
+    def velocity(state: Any) -> Any:
+        sine, cosine = ca.sin(state[1]), ca.cos(state[1])
+        total = POLE + CART
+        push = (u[0] + POLE * LENGTH * state[3] ** 2 * sine) / total
+        turn = (GRAVITY * sine - cosine * push) / (LENGTH * (4.0 / 3.0 - POLE * cosine**2 / total))
+        return ca.vertcat(state[2], state[3], push - POLE * LENGTH * turn * cosine / total, turn)
+
+    a = velocity(x)
+    b = velocity(x + 0.5 * dt * a)
+    c = velocity(x + 0.5 * dt * b)
+    d = velocity(x + dt * c)
+    return after - (x + dt / 6.0 * (a + 2.0 * b + 2.0 * c + d))
+
+
+MODELS: dict[str, tuple[Callable[..., Any], Callable[..., Any]]] = {
+    "unicycle": (difference, unicycle_gap),
+    "quadrotor": (quadrotor_error, quadrotor_gap),
+    "cart-pole": (difference, cart_pole_gap),
+}
+"""Error of a state and defect of the dynamics, by robot."""

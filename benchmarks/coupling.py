@@ -1,21 +1,19 @@
-"""What one graph buys: sequential against joint coupling, paired over seeds, with the control weight swept.
-
-    python -m benchmarks.coupling [--seeds 0:50] [--solvers sqp] [--workers K] [--fresh] [--report]
+"""Sequential against joint coupling, paired over seeds, with the control weight swept.
 
 Every variant drives the same seeds: same building, same unforeseen obstacles, same sensor noise. Differences are
 taken seed by seed; intervals are 95 % bootstrap intervals of the mean difference. Needs the department's map for
-the first route (``$UNIFG_DATA`` or ``../shared/data``); the building ships with the package. Writes docs/joint.md.
+the first route (``$UNIFG_DATA`` or ``../shared/data``); the building ships with the package.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from itertools import product
 
-from benchmarks import runs
-from benchmarks.comparison import Read, Row, comparison, digits, interval, paired, where
+from benchmarks.comparison import Read, Row, comparison, where
 from benchmarks.navigation import DEPARTMENT, Case, Drive, drive
-from benchmarks.report import command, machine, publish
+from benchmarks.runner import Study
 
 VARIANTS = {
     "sequential": ("sequential", 1.0),
@@ -50,7 +48,7 @@ def variants_of(rows: list[Row], route: str, solver: str) -> dict[str, list[Row]
 
 def render(rows: list[Row]) -> str:
     """Markdown of all routes and backends."""
-    parts = [machine("numpy", "scipy", "osqp", "piqp", "pymunk")]
+    parts = list[str]()
     for route, solver in product(ROUTES, SOLVERS):
         of = variants_of(rows, route, solver)
         if of[BASE]:
@@ -59,50 +57,14 @@ def render(rows: list[Row]) -> str:
             parts.append(comparison(MEASURES, of, BASE))
     refused = sum("error" in row for row in rows)
     parts.append(f"In brackets: 95 % interval of the paired difference to sequential. Episodes refused: {refused}.")
-    return "\n\n".join([*parts, sayings(rows)])
+    return "\n\n".join(parts)
 
 
-def sayings(rows: list[Row]) -> str:
-    """What the tables say, in sentences that are computed from them."""
-    lines = []
-    for route, solver in product(ROUTES, SOLVERS):
-        of, words = variants_of(rows, route, solver), []
-        for name, variant in (("the joint graph", "joint"), ("ten times the control weight", "joint, weight 10")):
-            mine, base = paired(of[variant], of[BASE], MEASURES["localisation, mean [mm]"])
-            if len(mine):
-                low, high = interval(mine - base)
-                words.append(
-                    f"{name} localises {digits((mine - base).mean(), '+')} mm ({digits(low, '+')} to "
-                    f"{digits(high, '+')}, {digits((mine - base).max(), '+')} at most) beside the sequential coupling"
-                )
-        for what in ("median", "p99"):
-            mine, base = paired(of["joint"], of[BASE], MEASURES[f"localise + plan, {what} [ms]"])
-            if len(mine):
-                words.append(f"its {what} of the time is {100.0 * (mine.mean() / base.mean() - 1.0):+.0f} %")
-        if words:
-            lines.append(f"- {route}, {solver}: {'; '.join(words)}.")
-    driven = [row["metrics"] for row in where(rows)]
-    lines.append(
-        f"- {len(driven)} drives, {sum(m['collisions'] for m in driven)} collisions, "
-        f"{sum(not m['reached'] for m in driven)} goals missed; both obstacles stand still in this campaign."
-    )
-    return "\n".join(lines)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run what is missing and rewrite docs/joint.md."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--seeds", type=runs.seeds, default=range(50), metavar="FIRST:END")
-    parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=SOLVERS)
-    options = parser.parse_args(arguments)
+def cells(seeds: Sequence[int]) -> list[Drive]:
+    """Every variant on every route."""
     routes = [name for name, case in ROUTES.items() if case.available]
-    variants = product(options.seeds, options.solvers, routes, VARIANTS.values())
-    jobs = [Drive(route, solver, coupling, seed, weight) for seed, solver, route, (coupling, weight) in variants]
-    rows = runs.episodes("coupling", partial(drive, cases=ROUTES), jobs, options)
-    publish("joint", render(rows), {row["code"] for row in rows})
-    return 0
+    variants = product(seeds, SOLVERS, routes, VARIANTS.values())
+    return [Drive(route, solver, coupling, seed, weight) for seed, solver, route, (coupling, weight) in variants]
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cells, partial(drive, cases=ROUTES), render, range(50))

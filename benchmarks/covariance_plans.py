@@ -1,12 +1,9 @@
 """Covariance in a plan against a fixed margin: time, clearance and collisions, paired over layouts.
 
-    python -m benchmarks.covariance_plans [--seeds 0:12] [--drives 400] [--workers K] [--fresh] [--report]
-
 On each random layout of discs and beacons a unicycle plans the fastest way to a goal. One plan keeps a fixed margin
-from the discs, swept over its range; another keeps k standard deviations of where it will be, which its graph predicts
 along the way; a third keeps k deviations of its previous plan, over and over, without a variable for them. All are
 driven with a filter, feedback and noise, on the same random numbers. Layouts are the random effect: intervals are
-bootstrapped over them. Writes docs/covariance-plans.md.
+bootstrapped over them.
 """
 
 from __future__ import annotations
@@ -14,13 +11,15 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import unifg as fg
-from benchmarks import runs
-from benchmarks.comparison import Row, digits, interval, where
-from benchmarks.report import command, machine, publish, table
+from benchmarks.comparison import Row, difference, interval, where
+from benchmarks.report import table
+from benchmarks.runner import Study
 from problems import belief_plans
 from problems.belief_plans import Guess, Plan
 
@@ -32,20 +31,20 @@ WAYS: dict[str, tuple[float, ...]] = {
     "in the graph": DEVIATIONS,
 }
 UNITS = {"margin": "m", "lagging": "sigma", "in the graph": "sigma"}
+DRIVES = 400  # of each plan
 TARGETS = (0.1, 0.05, 0.02)  # shares of drives that may touch something
 
 
 @dataclass(frozen=True)
 class Job:
-    """One layout, all settings of one way, and how often each plan is driven."""
+    """One layout and all settings of one way."""
 
     seed: int
     way: str
-    drives: int
 
 
 def attempt(job: Job) -> Row:
-    """Plan with every setting, and drive."""
+    """Plan with every setting, and drive; NaN where there is no plan."""
     world = belief_plans.layout(job.seed)
     planner = belief_plans.Planner(world, foresees=job.way == "in the graph")
 
@@ -59,142 +58,107 @@ def attempt(job: Job) -> Row:
     begin = time.process_time()
     plans = belief_plans.sweep(planner, solve, WAYS[job.way])
     seconds = (time.process_time() - begin) / len(plans) / len(belief_plans.SIDES)
-    found: list[Row | None] = []
-    for plan in plans:
-        if plan is None:
-            found.append(None)
-            continue
-        drives = belief_plans.drive(plan, world, job.drives, job.seed)
-        found.append(
-            {
+    plans_found = []
+    for setting, plan in zip(WAYS[job.way], plans, strict=True):
+        measured: Row = {"setting": setting, "seconds": seconds}
+        if plan is not None:
+            drives = belief_plans.drive(plan, world, DRIVES, job.seed)
+            measured |= {
                 "time": plan.duration,
                 "collisions": drives.collisions,
                 "clearance": float(np.quantile(drives.clearance, 0.05)),
-                "miss": float(np.sqrt(np.mean(drives.miss**2))),
                 "sigma": float(plan.deviation.max()),
             }
-        )
-    return {"found": found, "seconds": seconds}
+        plans_found.append(measured)
+    return {"plans": plans_found}
 
 
-class Campaign:
-    """What was found, by way, setting and layout.
-
-    Attributes:
-        seeds: layouts that all ways have met.
-        seconds: processor time of a plan from one guess, by way.
-    """
-
-    def __init__(self, rows: list[Row], drives: int) -> None:
-        """Sort the rows of some drives per plan."""
-        ways = {way: {row["seed"]: row for row in where(rows, way=way, drives=drives)} for way in WAYS}
-        self.seeds = sorted(set[int].intersection(*(set(found) for found in ways.values())))
-        self._found = {way: [found[seed]["found"] for seed in self.seeds] for way, found in ways.items()}
-        self.seconds = {
-            way: float(np.mean([found[seed]["seconds"] for seed in self.seeds])) for way, found in ways.items()
-        }
-
-    def of(self, way: str, index: int, what: str) -> list[float]:
-        """A number of each layout, not a number where there was no plan."""
-        return [np.nan if row[index] is None else row[index][what] for row in self._found[way]]
-
-    def collisions(self, way: str, index: int) -> float:
-        """Mean share over the layouts with a plan."""
-        return float(np.nanmean(self.of(way, index, "collisions")))
-
-    def setting(self, way: str, target: float) -> int | None:
-        """The fastest setting for all layouts whose mean share of collisions is no more than a target."""
-        kept = [i for i in range(len(WAYS[way])) if self.collisions(way, i) <= target]
-        return min(kept, key=lambda i: float(np.nanmean(self.of(way, i, "time"))), default=None)
-
-    def best(self, way: str, target: float) -> list[float]:
-        """The least time of each layout among all settings that keep to the target there: the choice of hindsight."""
-        times = []
-        for row in self._found[way]:
-            kept = [found["time"] for found in row if found is not None and found["collisions"] <= target]
-            times.append(min(kept, default=np.nan))
-        return times
+def plans_of(rows: Sequence[Row]) -> pd.DataFrame:
+    """Plans by way, setting and layout, of the layouts that all ways have met; NaN where there is no plan."""
+    found = pd.DataFrame(
+        [{"way": row["way"], "seed": row["seed"], **plan} for row in where(rows) for plan in row["plans"]]
+    )
+    ways = found.groupby("seed")["way"].transform("nunique")
+    return found[ways == found["way"].nunique()].set_index(["way", "setting", "seed"])
 
 
-def mean(values: Sequence[float], scale: float = 1.0) -> str:
+def mean(values: Any, scale: float = 1.0) -> str:
     """Mean and, in brackets, its bootstrap interval over layouts."""
-    known = scale * np.array(values)[np.isfinite(values)]
+    known = scale * np.asarray(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
     if not len(known):
         return "-"
     low, high = interval(known)
     return f"{known.mean():.3g} ({low:.3g} .. {high:.3g})"
 
 
-def difference(mine: Sequence[float], base: Sequence[float]) -> str:
-    """Mean of the paired difference, its interval, and the number of pairs."""
-    pairs = np.array(mine) - np.array(base)
-    pairs = pairs[np.isfinite(pairs)]
-    if not len(pairs):
-        return "-"
-    low, high = interval(pairs)
-    return f"{digits(pairs.mean(), '+')} ({digits(low, '+')} .. {digits(high, '+')}), n={len(pairs)}"
+def by_setting(plans: pd.DataFrame) -> dict[tuple[str, Any], pd.DataFrame]:
+    """Plans of all layouts by way and setting."""
+    groups = plans.groupby(["way", "setting"], sort=False)
+    return {(str(way), setting): found.droplevel(["way", "setting"]) for (way, setting), found in groups}
 
 
-def render(found: Campaign, drives: int) -> str:
+def counted(mine: pd.Series[float], base: pd.Series[float]) -> str:
+    """Mean of the paired difference over layouts, its interval, and the number of pairs."""
+    pairs = (mine - base).dropna()
+    return f"{difference(pairs)}, n={len(pairs)}" if len(pairs) else "-"
+
+
+def render(rows: Sequence[Row]) -> str:
     """Markdown of the sweep and of the comparisons at equal risk."""
-    count = len(found.seeds)
+    plans = plans_of(rows)
+    of, seeds = by_setting(plans), plans.index.unique("seed")
     lines = [
         [
-            f"{way} {value:g} {UNITS[way]}",
-            f"{np.isfinite(found.of(way, i, 'time')).sum()} / {count}",
-            mean(found.of(way, i, "time")),
-            mean(found.of(way, i, "collisions"), 100.0),
-            mean(found.of(way, i, "clearance"), 100.0),
-            mean(found.of(way, i, "sigma"), 100.0),
+            f"{way} {setting:g} {UNITS[way]}", f"{found['time'].notna().sum()} / {len(seeds)}", mean(found["time"]),
+            mean(found["collisions"], 100.0), mean(found["clearance"], 100.0), mean(found["sigma"], 100.0),
         ]
-        for way, values in WAYS.items()
-        for i, value in enumerate(values)
-    ]
+        for (way, setting), found in of.items()
+    ]  # fmt: skip
     head = ["setting", "plans", "time [s]", "collisions [%]", "clearance of 95 % [cm]", "greatest deviation [cm]"]
-    once, each = [], []
+    once, each, none = [], [], pd.Series(dtype=float)
     for target in TARGETS:
-        base, hindsight = [np.nan] * count, found.best("margin", target)
-        for way, values in WAYS.items():
-            index = found.setting(way, target)
-            times = [np.nan] * count if index is None else found.of(way, index, "time")
-            base = times if way == "margin" else base
-            words = "none" if index is None else f"{values[index]:g} {UNITS[way]}"
-            against = "" if way == "margin" else difference(times, base)
-            once.append([f"{target:.0%}", way, words, mean(times), against])
-            best = found.best(way, target)
-            against = "" if way == "margin" else difference(best, hindsight)
-            each.append([f"{target:.0%}", way, f"{np.isfinite(best).sum()} / {count}", against])
+        settings, best = chosen(plans, target), hindsight(plans, target)
+        for way in WAYS:
+            if way in settings:
+                times = of[way, settings[way]]["time"]
+                base = of["margin", settings["margin"]]["time"] if "margin" in settings else none
+                against = "" if way == "margin" else counted(times, base)
+                once.append([f"{target:.0%}", way, f"{settings[way]:g} {UNITS[way]}", mean(times), against])
+            kept = best.get(way, none)
+            against = "" if way == "margin" else counted(kept, best.get("margin", none))
+            each.append([f"{target:.0%}", way, f"{len(kept)} / {len(seeds)}", against])
+    seconds = plans.groupby("way", sort=False)["seconds"].mean()
     return "\n\n".join(
         [
-            machine("numpy", "scipy", "osqp", "piqp", "numba"),
-            f"{count} layouts, {drives} drives of each plan; in brackets 95 % intervals over layouts.",
+            f"{len(seeds)} layouts, {DRIVES} drives of each plan; in brackets 95 % intervals over layouts.",
             "### Every setting",
             table(head, lines),
             "### One setting for all layouts, chosen afterwards",
             table(["collisions at most", "way", "setting", "time [s]", "difference to the margin [s]"], once, 2),
             "### The best setting of each layout, chosen afterwards",
             table(["collisions at most", "way", "layouts kept", "difference to the margin [s]"], each, 2),
-            "Processor time of a plan from one guess, mean: "
-            + ", ".join(f"{way} {1e3 * found.seconds[way]:.0f} ms" for way in WAYS)
-            + ".",
+            f"Processor time of a plan from one guess, mean [ms]: {(1e3 * seconds).round().to_dict()}.",
         ]
     )
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run what is missing and rewrite docs/covariance-plans.md."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--seeds", type=runs.seeds, default=range(12), metavar="FIRST:END")
-    parser.add_argument("--drives", type=int, default=400, help="of each plan")
-    options = parser.parse_args(arguments)
-    jobs = [Job(seed, way, options.drives) for seed in options.seeds for way in WAYS]
-    rows = runs.episodes("covariance_plans", attempt, jobs, options)
-    asked = [row for row in rows if row["seed"] in options.seeds]
-    found = Campaign(asked, options.drives)
-    publish("covariance-plans", render(found, options.drives), {row["code"] for row in asked})
-    return 0
+def chosen(plans: pd.DataFrame, target: float) -> dict[str, float]:
+    """Fastest setting of each way whose mean share of collisions is no more than a target."""
+    means = plans.groupby(["way", "setting"])[["time", "collisions"]].mean()
+    kept = means[means["collisions"] <= target]["time"]
+    return dict(kept.groupby("way").idxmin().to_list())
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def hindsight(plans: pd.DataFrame, target: float) -> dict[str, pd.Series[float]]:
+    """Least time of each layout by way, among all settings that keep to the target there."""
+    times = plans[plans["collisions"] <= target].groupby(["way", "seed"])["time"].min()
+    return {str(way): found.droplevel("way") for way, found in times.groupby("way")}
+
+
+def cells(seeds: Sequence[int]) -> list[Job]:
+    """Every layout, planned in every way."""
+    return [Job(seed, way) for seed in seeds for way in WAYS]
+
+
+STUDY = Study(cells, attempt, render, range(12))

@@ -1,32 +1,27 @@
-"""The two case studies of ecg2o (Abdelkarim et al. 2026), every backend on both.
-
-    python -m benchmarks.ecg2o [--solves 1000] [--no-docs]
+"""Both case studies of ecg2o (Abdelkarim et al. 2026), every backend on both.
 
 The profile of the first study is looked for in ``$UNIFG_DATA`` or ``../shared/data`` beside the checkout; without it
-nothing is measured, because the page compares with costs on that profile. Numbers go to
-``out/benchmarks/ecg2o.json`` and, unless ``--no-docs`` is given, to docs/velocity-tracking.md.
+nothing is measured, because the page compares with costs on that profile.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import OUT, command, listing, machine, publish, shared, table
+from benchmarks.report import listing, shared, table
+from benchmarks.runner import Timing
 from benchmarks.timing import clock, interleave, number
 from problems.known import STARTS, Guess, ecg2o_inequality
 from problems.known import ecg2o as small
 from unifg.errors import ScenarioError
 from unifg.scenarios.velocity_tracking import TrackingSettings, state_problem
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, Penalty
-
-Result: TypeAlias = dict[str, Any]
 
 LENGTHS = (50, 100, 200, 385)
 COSTS = {  # J of the first study, worked out independently with IPOPT and Newton's method
@@ -241,7 +236,7 @@ def case_study_2() -> tuple[str, str]:
     return table(head, rows), text
 
 
-def times(solves: int) -> tuple[str, list[Result]]:
+def times(solves: int) -> str:
     """Fig. 4: mean time per iteration over many solves from the cold guess."""
     kinds: dict[str, fg.Solver] = {
         "KKT, full steps": KKT(full_steps=True),
@@ -250,7 +245,7 @@ def times(solves: int) -> tuple[str, list[Result]]:
         "AL": AugmentedLagrangian(),
         "IPM": InteriorPoint(),
     }
-    rows, results = [], []
+    rows = []
     for length in LENGTHS:
         candidates: dict[str, Callable[[], float]] = {}
         taken: dict[str, int] = {}
@@ -265,16 +260,13 @@ def times(solves: int) -> tuple[str, list[Result]]:
         ratio = float(np.median(seconds["KKT, full steps"] / seconds["AL, literal"]))
         ratio *= taken["AL, literal"] / taken["KKT, full steps"]
         rows.append([str(length), *(number(value) for value in each.values()), number(ratio)])
-        results.append({"length": length, "milliseconds": each, "iterations": taken, "kkt_over_al": ratio})
-    return table(["N", *(f"{name} [ms]" for name in kinds), "KKT / AL, both literal"], rows, 0), results
+    return table(["N", *(f"{name} [ms]" for name in kinds), "KKT / AL, both literal"], rows, 0)
 
 
-def report(solves: int) -> tuple[str, Result]:
-    """Everything as Markdown, and the times as numbers."""
-    timed, numbers = times(solves)
+def report(solves: int) -> str:
+    """Everything as Markdown."""
     second, variant = case_study_2()
     parts = [
-        machine("numpy", "numba"),
         "The first study drives the paper's profile. A dagger marks solves that ended without the KKT conditions at "
         "1e-6.",
         "### First study: iterations",
@@ -292,7 +284,7 @@ def report(solves: int) -> tuple[str, Result]:
         "### First study: time per iteration",
         f"Mean over {solves} whole solves from the cold guess, divided by their iterations; the backends take turns. "
         "The last column is a median of ratios within a round.",
-        timed,
+        times(solves),
         "### Second study: iterations",
         f"To a KKT tolerance of 1e-6 but for the first column; the literal loop has rho = {LITERAL_SMALL:g}.",
         second,
@@ -301,22 +293,7 @@ def report(solves: int) -> tuple[str, Result]:
         "Iterations from each of the six starts in turn, to a KKT tolerance of 1e-6.",
         small_sensitivity(),
     ]
-    return "\n\n".join(parts), {"solves": solves, "times": numbers}
+    return "\n\n".join(parts)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure and write."""
-    parser = command(__doc__)
-    parser.add_argument("--solves", type=int, default=1000, help="solves behind every time (default: %(default)s)")
-    parser.add_argument("--no-docs", action="store_true", help="leave the page in docs/ alone")
-    chosen = parser.parse_args(arguments)
-    if chosen.solves < 1:
-        parser.error("--solves must be at least 1")
-    text, numbers = report(chosen.solves)
-    publish("velocity-tracking", text, docs=not chosen.no_docs)
-    (OUT / "ecg2o.json").write_text(json.dumps(numbers, indent=2) + "\n", encoding="utf-8")
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Timing(report, 1000)

@@ -1,11 +1,8 @@
-"""Pasts that cannot have been: what hard constraints tell an estimate, paired over layouts.
-
-    python -m benchmarks.excluded_pasts [--seeds 0:12] [--drives 20] [--workers K] [--fresh] [--report]
+"""Past states under hard constraints, paired over layouts.
 
 Two studies. In an orchard of close pillars a robot sees some of them, without names, misses others and sees some that
-are not there; nobody drives through a pillar, which excludes associations. Beside a wall and with drag, a past is
+are not there; no drive leads through a pillar, which excludes associations. Beside a wall and with drag, a past is
 estimated with and without what is impossible. Layouts are the random effect: intervals are bootstrapped over them.
-Writes docs/excluded-pasts.md.
 """
 
 from __future__ import annotations
@@ -17,9 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import unifg as fg
-from benchmarks import impossible_states, runs
-from benchmarks.comparison import Row, digits, interval, where
-from benchmarks.report import command, machine, publish, table
+from benchmarks import impossible_states
+from benchmarks.comparison import Row, bracketed, where
+from benchmarks.report import table
+from benchmarks.runner import Study
 from unifg.lie import SE2
 from unifg.models import landmarks, obstacles
 from unifg.solvers import GaussNewton, InteriorPoint
@@ -34,6 +32,7 @@ REACH, SIGMA = 1.5, 0.1  # of the sensor, and deviation of a sighting in each di
 GATE = 0.35  # of an association [m]
 NEAREST = 3  # pillars that a pose keeps off
 ROUNDS = 3  # of association
+DRIVES = 20  # in each layout
 CONDITIONS = {
     "nearly all are seen": (0.9, 0.2),
     "half are missed": (0.5, 0.5),
@@ -84,7 +83,7 @@ def gaps(path: Array, pillars: Array) -> Array:
 
 
 class Scans(NamedTuple):
-    """What was seen.
+    """Measurements of a drive.
 
     Attributes:
         sightings: (s, 2) places in the robot's axes [m].
@@ -229,20 +228,19 @@ def explained(world: Orchard, scans: Scans, chance: float, clutter: float) -> di
 
 @dataclass(frozen=True)
 class Job:
-    """One layout, one condition, and how many drives' noise; the orchard, or one of the simple pasts."""
+    """One layout and one condition, of the orchard or of one of the simple pasts."""
 
     seed: int
     study: str
-    drives: int
 
 
 def attempt(job: Job) -> Row:
     """Share of drives that were placed wrong, and their errors, by method."""
     if job.study in impossible_states.STUDIES:
-        return {"errors": impossible_states.STUDIES[job.study](job.seed, 4 * job.drives)}
+        return {"errors": impossible_states.STUDIES[job.study](job.seed, 4 * DRIVES)}
     world, errors = orchard(job.seed), dict[str, list[float]]()
     chance, clutter = CONDITIONS[job.study]
-    for k in range(job.drives):
+    for k in range(DRIVES):
         scans = scanned(world, chance, clutter, 1000 * job.seed + k)
         for name, path in explained(world, scans, chance, clutter).items():
             off = np.hypot(*(path - world.path)[:, :2].T)
@@ -265,24 +263,22 @@ def compared(of: Sequence[Sequence[float]], base: Sequence[Sequence[float]], wha
     mine, theirs = (np.array([MEASURES[what](np.array(errors)) for errors in some]) for some in (of, base))
     if of is base:
         return f"{mine.mean():.3g}"
-    low, high = interval(mine - theirs)
-    return f"{mine.mean():.3g} ({digits(low, '+')} .. {digits(high, '+')})"
+    return f"{mine.mean():.3g} {bracketed(mine - theirs)}"
 
 
-def render(rows: list[Row], drives: int) -> str:
+def render(rows: list[Row]) -> str:
     """Markdown of both studies."""
-    parts = [machine("numpy", "scipy", "numba")]
     lines, count = list[list[str]](), 0
     for study in CONDITIONS:
-        found = [row["errors"] for row in where(rows, study=study, drives=drives)]
+        found = [row["errors"] for row in where(rows, study=study)]
         count = len(found)
         by = {name: [errors[name] for errors in found] for name in METHODS}
         for name in METHODS if found else ():
             cells = [compared(by[name], by[METHODS[0]], what) for what in ("wrong", "rms", "median")]
             lines.append([study, name, *cells])
     head = ["condition", "method", f"placed wrong by {WRONG:g} m [%]", "error, rms [cm]", "error, median [cm]"]
-    parts += [
-        f"{count} layouts, {drives} drives in each; in brackets the 95 % interval, over layouts, of the paired "
+    parts = [
+        f"{count} layouts, {DRIVES} drives in each; in brackets the 95 % interval, over layouts, of the paired "
         "difference to the first line.",
         "### Which pillars were seen",
         table(head, lines, 2),
@@ -290,29 +286,18 @@ def render(rows: list[Row], drives: int) -> str:
     ]
     lines = []
     for study, unit in impossible_states.UNITS.items():
-        found = [row["errors"] for row in where(rows, study=study, drives=drives)]
+        found = [row["errors"] for row in where(rows, study=study)]
         for name in found[0] if found else ():
             by = {n: [errors[n] for errors in found] for n in found[0]}
             lines.append([study, name, unit, compared(by[name], by[next(iter(by))], "rms")])
     parts.append(table(["past", "what is known", "unit", "error, rms"], lines, 3))
-    parts.append(f"{4 * drives} drives in each layout.")
+    parts.append(f"{4 * DRIVES} drives in each layout.")
     return "\n\n".join(parts)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run what is missing and rewrite docs/excluded-pasts.md."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--seeds", type=runs.seeds, default=range(12), metavar="FIRST:END")
-    parser.add_argument("--drives", type=int, default=20, help="in each layout")
-    options = parser.parse_args(arguments)
-    studies = [*CONDITIONS, *impossible_states.STUDIES]
-    jobs = [Job(seed, study, options.drives) for seed in options.seeds for study in studies]
-    rows = runs.episodes("excluded_pasts", attempt, jobs, options)
-    asked = [row for row in rows if row["seed"] in options.seeds]
-    publish("excluded-pasts", render(asked, options.drives), {row["code"] for row in asked})
-    return 0
+def cells(seeds: Sequence[int]) -> list[Job]:
+    """Every layout under every condition."""
+    return [Job(seed, study) for seed in seeds for study in [*CONDITIONS, *impossible_states.STUDIES]]
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cells, attempt, render, range(12))

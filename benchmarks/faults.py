@@ -1,14 +1,10 @@
-"""The table of faults in docs/reliability.md: what robots do when something goes wrong, fault by fault.
+"""Faults of sensors and actuators, one by one: how drives and flights end.
 
-    python -m benchmarks.faults [--seeds 0:5] [--only FAULT ...] [--workers K] [--fresh] [--report]
-
-Drives along the corridor of the shipped building and flights through the corridor of cylinders, each with one fault
-from second 2 (flights 3) on: for two seconds, after which a robot is to go on, and for good, where it is to stop or
-to go on as well as it can. Counted are drives and flights that ended by name, contacts, and exceptions; none may be
-raised. Of a flight that touched something it is asked what the stopping set could have done: from the state in which
-the fault found it, the same world is flown on as it was for a reaction time, and then braked with true state and true
-wind in view. Where that touches nothing, the contact could have been avoided. Every finished one is a line of
-out/benchmarks/faults.jsonl.
+Drives along the corridor of the shipped building and flights through the corridor of cylinders, each with one fault,
+for a while or for good. Counted are drives and flights that ended by name, contacts, and exceptions; none may be
+raised. Of a flight that touched something the stopping set is tested: from the state in which the fault found it, the
+same world is flown on as it was for a reaction time, and then braked with true state and true wind in view. Where that
+touches nothing, the contact could have been avoided.
 """
 
 from __future__ import annotations
@@ -18,9 +14,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import product
 
-from benchmarks import runs
 from benchmarks.comparison import Row
-from benchmarks.report import command, machine, publish, table
+from benchmarks.report import table
+from benchmarks.runner import Study
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.log.flight_log import FlightLog
@@ -36,7 +32,7 @@ SEEDS = range(5)
 ROBOTS = {"drive": DRIVE_FAULTS, "flight": FLIGHT_FAULTS}
 BEGIN = {"drive": 2.0, "flight": 3.0}  # [s]
 DURATIONS = (2.0, 1000.0)  # [s]; the second one for good
-GUST_TIMES = (0.5, 2.0)  # [s]; nobody flies on against a gale for good
+GUST_TIMES = (0.5, 2.0)  # [s]; no flight goes on against a gale for good
 REACTION = 2  # ticks: the one in which something is felt, and the one that answers
 START, GOAL = (6.5, 14.0, 0.0), (13.5, 14.1, 0.0)
 
@@ -94,13 +90,13 @@ def stopped_clear(case: Case, log: FlightLog) -> float:
     return clearance
 
 
-def cases(seeds: Iterable[int], only: Iterable[str]) -> list[Case]:
+def cases(seeds: Iterable[int]) -> list[Case]:
     """All of them."""
     found = []
     for robot, faults in ROBOTS.items():
         for fault, seed in product(faults, seeds):
             times = GUST_TIMES if fault == "gust" else DURATIONS
-            found += [Case(robot, fault, time, seed) for time in times if fault in only]
+            found += [Case(robot, fault, time, seed) for time in times]
     return found
 
 
@@ -152,29 +148,14 @@ def render(rows: list[Row]) -> str:
     ]
     listed = "\n".join(f"- {line}" for line in contacts)
     parts = [sums, table(head, lines, text=3), *([f"Episodes with contacts:\n\n{listed}"] if contacts else [])]
-    return "\n\n".join([*parts, machine("numpy", "scipy", "pymunk")])
+    return "\n\n".join(parts)
 
 
 def _avoidable(braked: float | None) -> str:
-    """What the stopping set could have done, by the clearance it leaves [m]."""
+    """Words about the clearance that the stopping set leaves [m]."""
     if braked is None:
         return ""
     return f"; the stopping set keeps {braked:.2f} m" if braked > 0.0 else "; the stopping set touches as well"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run what is missing, then write the table; 0 only if nothing was raised."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--only", nargs="+", default=[*DRIVE_FAULTS, *FLIGHT_FAULTS], metavar="FAULT")
-    parser.add_argument("--seeds", type=runs.seeds, default=SEEDS, metavar="FIRST:END", help="fewer are no page")
-    chosen = parser.parse_args(arguments)
-    rows = runs.episodes("faults", episode, cases(chosen.seeds, chosen.only), chosen)
-    rows = [row for row in rows if row["seed"] in chosen.seeds]
-    complete = len(rows) == len(cases(SEEDS, [*DRIVE_FAULTS, *FLIGHT_FAULTS]))
-    publish("reliability", render(rows), {row["code"] for row in rows}, docs=complete)
-    return 0 if not any("raised" in row for row in rows) else 1
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cases, episode, render, range(5))

@@ -1,4 +1,4 @@
-"""What a first use costs: README's worked problem in fresh processes whose cache is empty.
+"""Cost of a first use: README's worked problem in fresh processes whose cache is empty.
 
 ``python -m benchmarks.first_use`` prints a row for each backend, and one for all of them one after another in one
 process: processor time with the half compiled kernels that come with the library, from the sources alone, and from a

@@ -1,9 +1,7 @@
-"""A figure eight past three spheres at 100 Hz: what a tick costs, by the form of its barriers and by backend.
-
-    python -m benchmarks.guarded_flights [--ticks N] [--quick]
+"""Figure eight past three spheres at 100 Hz: time of a tick by the form of its barriers and by backend.
 
 The flight of tests/problems/guarded_flight.py in closed loop, under gusts; processor time of the solve of each tick,
-warm. Writes docs/barriers.md.
+warm.
 """
 
 from __future__ import annotations
@@ -16,8 +14,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import command, listing, machine, publish, words
-from benchmarks.timing import pin
+from benchmarks.report import listing, words
+from benchmarks.runner import Timing
 from problems.guarded_flight import PACE, START, VEHICLE, GuardedFlight, figure_eight, gust
 from unifg.models import keeping, quadrotor
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
@@ -33,7 +31,7 @@ KEPT = 1e-3  # violation of constraints up to which an iterate is a plan
 
 @dataclass
 class Flight:
-    """What became of one.
+    """Record of one flight.
 
     Attributes:
         times: of the ticks [ms].
@@ -118,7 +116,7 @@ def flights(ticks: int) -> dict[tuple[str, str], Callable[[], Flight]]:
 
 @dataclass
 class Starts:
-    """What became of cold starts.
+    """Record of cold starts.
 
     Attributes:
         times: [ms].
@@ -154,7 +152,7 @@ def started(form: keeping.Form, weight: float | None, count: int) -> Starts:
 
 
 def worst(flight: Flight | Starts) -> str:
-    """How ticks ended that did not converge."""
+    """Endings of the ticks that did not converge."""
     ends = [f"{count} {name}" for name, count in flight.statuses.most_common() if name != "converged"]
     return ", ".join(ends) or "none"
 
@@ -194,32 +192,19 @@ COLD_COLUMNS: dict[str, Callable[[Starts], str]] = {
 }
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Fly, and write the page."""
-    parser = command(__doc__)
-    parser.add_argument("--ticks", type=int, default=12000, help="of each flight; slow backends fly a fortieth")
-    parser.add_argument("--quick", action="store_true", help="forty ticks, and no page")
-    chosen = parser.parse_args(arguments)
-    pin()
-    ticks = 40 if chosen.quick else chosen.ticks
-    flown = {}
-    for names, flight in flights(ticks).items():
-        flown[names] = flight()
-        print(" | ".join([*names, *(tell(flown[names]) for tell in COLUMNS.values())]), flush=True)
-    cold_ones = {names: started(*how, 10 if chosen.quick else 150) for names, how in COLD.items()}
-    text = "\n\n".join(
+def tables(ticks: int) -> str:
+    """Flights and cold starts."""
+    flown = {names: flight() for names, flight in flights(ticks).items()}
+    cold_ones = {names: started(*how, max(ticks // 80, 10)) for names, how in COLD.items()}
+    return "\n\n".join(
         [
             listing(["barriers", "backend"], flown, COLUMNS),
             listing(["barriers", "weight"], cold_ones, COLD_COLUMNS),
             f"Laps of {2.0 * np.pi / PACE:.1f} s, 20 intervals, the first of 10 ms and the others of 50 ms, tolerance "
             f"{TOLERANCE:g}. Processor time of the solve, one core of a shared server; a limit of 10 ms is one of the "
             "clock, which runs for others as well. Without barriers the reference leads through the spheres.",
-            machine("unifg", "numpy", "osqp"),
         ]
     )
-    publish("barriers", text, docs=not chosen.quick and ticks >= 10000)
-    return 0
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Timing(tables, 12000)

@@ -1,13 +1,10 @@
-"""What a horizon buys over a filter of one step, and what a velocity in the barrier buys at equal tracking error.
+"""Horizon beside a filter of one step, and velocity in the barrier at equal tracking error.
 
-    python -m benchmarks.horizon_and_velocity [--phases 16] [--seeds 3] [--quick]
-
-A sphere that runs round an ellipse across the line of a quadrotor (:mod:`unifg.scenarios.safe_flight`). Of random
-phases those count in which the path itself would come nearer than :data:`MEETS`: in the others nobody has anything to
-do. alpha is set for each gamma so that the distance from the path, on phases of their own, is the same for all. Then
-plans, filters and both together past cylinder and sphere, with what they cost. Everybody flies the same phases, and
-what is compared is the difference in each: the scatter from phase to phase, which is far larger than that of the
-differences, drops out. Writes docs/horizon-and-velocity.md.
+A sphere runs round an ellipse across the line of a quadrotor (:mod:`unifg.scenarios.safe_flight`). Of random phases
+those count in which the path itself would come nearer than :data:`MEETS`: in the others there is nothing to avoid.
+alpha is set for each gamma so that the distance from the path, on phases of their own, is the same for all. Then
+plans, filters and both together fly past cylinder and sphere. All fly the same phases, and the difference in each
+phase is compared: the scatter from phase to phase, which is far larger, drops out.
 """
 
 from __future__ import annotations
@@ -20,7 +17,8 @@ from typing import Any, Literal
 import numpy as np
 
 from benchmarks.comparison import digits, interval
-from benchmarks.report import command, machine, publish, table
+from benchmarks.report import table
+from benchmarks.runner import Timing
 from unifg.scenarios.safe_flight import SafeSettings, flights
 from unifg.scenarios.safety.cascade import CascadeSettings
 from unifg.scenarios.safety.cbf_mpc import KeeperSettings
@@ -159,7 +157,7 @@ CONTROLLERS: dict[str, dict[str, Any]] = {
 
 
 def horizons(seeds: int) -> str:
-    """What each controller reaches past cylinder and sphere, and what it costs."""
+    """Distances and times of each controller past cylinder and sphere."""
     chosen: dict[Kind, list[int]] = {"static": list(range(1, seeds + 1)), "ellipse": meeting(range(1, 10_000), seeds)}
     rows = []
     longest: dict[Kind, list[Flown]] = {}
@@ -180,20 +178,12 @@ def horizons(seeds: int) -> str:
     return table(head, rows)
 
 
-def main() -> None:
-    """See the module's docstring."""
-    parser = command(__doc__)
-    parser.add_argument("--phases", type=int, default=16)
-    parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="two phases, one seed, no page")
-    options = parser.parse_args()
-    phases, seeds, steps = (2, 1, 1) if options.quick else (options.phases, options.seeds, 4)
-    text = "\n\n".join([
-        "## Velocity", velocities(phases, steps), "## Horizon", horizons(seeds),
-        "Processor time of a decision, everything in it. " + machine("unifg", "numpy", "numba", "piqp"),
+def tables(phases: int) -> str:
+    """Velocity and horizon."""
+    return "\n\n".join([
+        "### Velocity", velocities(phases, 4), "### Horizon", horizons(max(phases // 5, 1)),
+        "Processor time of a decision, everything in it.",
     ])  # fmt: skip
-    publish("horizon-and-velocity", text, docs=not options.quick)
 
 
-if __name__ == "__main__":
-    main()
+STUDY = Timing(tables, 16)

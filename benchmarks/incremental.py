@@ -1,12 +1,9 @@
 """Smoothing pose by pose, beside GTSAM's iSAM2 and its fixed-lag smoothers.
 
-    python -m benchmarks.incremental [--poses K] [--rounds R]
-
-M3500 (or the graph named) is fed one pose at a time, with the edges that end at it; the new pose starts where the
-estimate and the odometry put it. Only ``update`` is timed, on both sides, and stating the factors apart from it. Both
-have the same thresholds, of relinearisation and of back-substitution (iSAM2's default, 0.001).
-Candidates run in turn, for several rounds; of each update the fastest round counts, because a shared machine only ever
-makes things slower.
+M3500 is fed one pose at a time, with the edges that end at it; the new pose starts where the estimate and the odometry
+put it. Only ``update`` is timed, on both sides, and stating the factors apart from it. Both have the same thresholds,
+of relinearisation and of back-substitution (iSAM2's default, 0.001). Of each update the fastest round counts, because
+a shared machine only ever makes things slower.
 """
 
 from __future__ import annotations
@@ -21,8 +18,9 @@ import numpy as np
 
 import unifg as fg
 from benchmarks.gtsam_peer import as_array, available
-from benchmarks.report import command, listing, machine, publish, shared
-from benchmarks.timing import interleave, pin
+from benchmarks.report import listing, shared
+from benchmarks.runner import Timing
+from benchmarks.timing import interleave
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import PoseGraph, manhattan
 from unifg.pose_graphs.pose_graph import Edges
@@ -255,31 +253,24 @@ def first_poses(graph: PoseGraph, count: int) -> PoseGraph:
     return PoseGraph(graph.ids[:count], graph.poses[:count], graph.edges[inside])
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Drive all, and put the tables into the documentation."""
-    parser = command(__doc__)
-    parser.add_argument("--poses", type=int, default=POSES, help="of the graph; with fewer the page is left alone")
-    parser.add_argument("--rounds", type=int, default=3)
-    options = parser.parse_args(arguments)
-    pin()
+def tables(rounds: int) -> str:
+    """Smoothers of the whole history and of a window."""
     folder, peer = shared("pose_graphs"), available()
-    whole = manhattan(options.poses).pose_graph if folder is None else read_g2o(folder / "M3500.g2o.gz")
-    graph, little = first_poses(whole, options.poses), first_poses(whole, 60)
+    graph = manhattan(POSES).pose_graph if folder is None else read_g2o(folder / "M3500.g2o.gz")
+    little = first_poses(graph, 60)
     stated, x, guess = graph.graph()
     optimum = GaussNewton().solve(stated, guess)
     for compiles in (incremental(little, False) | fixed_lag(little, little.poses, False)).values():
         compiles()
-    windows = fixed_lag(graph, optimum[x], peer)
-    text = [
-        f"{'M3500' if folder else 'A generated grid'}, {len(graph.poses)} poses, {len(graph.edges)} edges; "
-        f"{options.rounds} rounds. {machine('numpy', 'numba', 'gtsam')}",
-        told(incremental(graph, peer), options.rounds, "relinearise, every", "1/2 chi2 at the end"),
-        f"The batch optimum is {optimum.cost:.6g}; GTSAM's value is that of its complete back-substitution.",
-        told(windows, options.rounds, "lag", "error of a relative position [m]"),
-    ]
-    publish("smoothing", "\n\n".join(text), docs=options.poses >= POSES)
-    return 0
+    return "\n\n".join(
+        [
+            f"{'M3500' if folder else 'A generated grid'}, {len(graph.poses)} poses, {len(graph.edges)} edges; "
+            f"{rounds} rounds.",
+            told(incremental(graph, peer), rounds, "relinearise, every", "1/2 chi2 at the end"),
+            f"The batch optimum is {optimum.cost:.6g}; GTSAM's value is that of its complete back-substitution.",
+            told(fixed_lag(graph, optimum[x], peer), rounds, "lag", "error of a relative position [m]"),
+        ]
+    )
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Timing(tables, 3)

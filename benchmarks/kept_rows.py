@@ -9,7 +9,8 @@ import json
 import lzma
 from pathlib import Path
 
-from benchmarks.large_maps import CAMPAIGNS
+from benchmarks.report import CAMPAIGNS
+from unifg.atomic_write import write_atomically
 from unifg.errors import ScenarioError
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 
@@ -23,9 +24,7 @@ def keep(store: Path, archive: Path) -> None:
     last = {str(row["key"]): row for row in lines_of(store)}
     text = "".join(json.dumps(last[key]) + "\n" for key in sorted(last))
     archive.parent.mkdir(parents=True, exist_ok=True)
-    beside = archive.with_suffix(".new")
-    beside.write_bytes(lzma.compress(text.encode(), preset=9))
-    beside.replace(archive)
+    write_atomically(archive, lzma.compress(text.encode(), preset=9))
 
 
 def restore(archive: Path, store: Path) -> int:

@@ -1,11 +1,9 @@
 """The localisation graph beside an adaptive Monte Carlo localiser, on the same scans and wheels.
 
-    python -m benchmarks.localisation [--seeds 200:204] [--workers K] [--fresh] [--report]
-
 A drive through the building (:mod:`benchmarks.routes`) is recorded once per seed; both localisers are given its scans
 and its odometry, so they differ in nothing else. Then the same with a wrong start, a start that is not known at all, a
 robot that is carried elsewhere, and a map on which furniture has been moved. The real log (``$UNIFG_DATA`` or
-``../shared/data``) is localised on a map of the other half of its scans. Writes docs/localisation.md.
+``../shared/data``) is localised on a map of the other half of its scans.
 """
 
 from __future__ import annotations
@@ -15,15 +13,16 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TypeAlias
+from unittest import mock
 
 import numpy as np
 from scipy import ndimage
 
-from benchmarks import runs
-from benchmarks.comparison import Row, interval, where
+from benchmarks.comparison import Row, difference, where
 from benchmarks.printed import texts
-from benchmarks.report import command, listing, machine, publish, shared
+from benchmarks.report import listing, shared
 from benchmarks.routes import drawn
+from benchmarks.runner import Study
 from unifg.files.carmen import read_carmen
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2, wrap_angle
@@ -86,52 +85,19 @@ def made(name: str, occupancy: OccupancyMap, pose: Array, sigma: Array, beams: i
     return MonteCarlo(occupancy, distances(occupancy), pose, sigma, rng, VARIANTS[name])
 
 
-class Listening:
-    """An estimator that notes what it is given."""
-
-    def __init__(self, inner: Estimator) -> None:
-        """Listen to another one."""
-        self.inner = inner
-        self.heard: list[tuple[Scan | None, Array | None]] = []
-
-    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
-        """Note and hand on."""
-        self.heard.append((scan, None if odometry is None else np.array(odometry)))
-        self.inner.update(scan, odometry, dt)
-
-    @property
-    def iterations(self) -> int:
-        """Of the other."""
-        return self.inner.iterations
-
-    @property
-    def refused(self) -> str:
-        """Of the other."""
-        return self.inner.refused
-
-    def reset(self, pose: Array, sigma: Array) -> None:
-        """Of the other."""
-        self.inner.reset(pose, sigma)
-
-    @property
-    def pose(self) -> Array:
-        """Of the other."""
-        return self.inner.pose
-
-    @property
-    def covariance(self) -> Array:
-        """Of the other."""
-        return self.inner.covariance
-
-
 def recorded(seed: int) -> tuple[OccupancyMap, list[Tick]]:
     """A drive of the route of a seed."""
     start, goal = drawn(seed)
     episode = Episode(NavigationSettings(start=start, goals=(goal,), obstacles=OBSTACLES, seed=seed))
-    listening = Listening(episode.pilot.estimator)
-    episode.pilot.estimator = listening
-    log = episode.run(lambda done, text: None)
-    return episode.occupancy, [(*heard, pose) for heard, pose in zip(listening.heard, log.true_pose, strict=True)]
+    inner, heard = episode.pilot.estimator.update, list[tuple[Scan | None, Array | None]]()
+
+    def noted(scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        heard.append((scan, None if odometry is None else np.array(odometry)))
+        inner(scan, odometry, dt)
+
+    with mock.patch.object(episode.pilot.estimator, "update", noted):
+        log = episode.run(lambda done, text: None)
+    return episode.occupancy, [(*given, pose) for given, pose in zip(heard, log.true_pose, strict=True)]
 
 
 def replayed(estimator: Estimator, ticks: Iterable[Tick]) -> Array:
@@ -311,7 +277,6 @@ def render(rows: Sequence[Row]) -> str:
         ),
     }
     parts = [
-        machine("numpy", "scipy", "pymunk"),
         listing(["condition", "localiser"], groups, columns),
         "Errors are over all ticks of a drive, their mean and standard deviation averaged over drives; *worst* is of "
         f"all of them. A localiser knows where the robot is when it is nearer than {FOUND:g} m, and *since* is the "
@@ -334,24 +299,13 @@ def paired(drives: Sequence[Row]) -> str:
             continue
         for name, unit, scale in (("m", "mm", 1e3), ("rad", "mrad", 1e3)):
             apart = scale * np.array([graph[name] - other[name] for graph, other in both])
-            low, high = interval(apart)
-            said.append(
-                f"{condition}: graph less AMCL with all beams {apart.mean():+.1f} {unit} ({low:+.1f} .. {high:+.1f})."
-            )
+            said.append(f"{condition}: graph less AMCL with all beams {difference(apart)} {unit}.")
     return " ".join(said)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Measure and write."""
-    parser = command(__doc__)
-    parser.add_argument("--seeds", type=runs.seeds, default=SEEDS, help="recordings (default: 200:204)")
-    runs.options(parser)
-    chosen = parser.parse_args(arguments)
-    jobs = [Drive(seed) for seed in chosen.seeds] + [Drive(-1)]
-    rows = runs.episodes("localisation", measure, jobs, chosen)
-    publish("localisation", render(rows), {row["code"] for row in rows})
-    return 0
+def cells(seeds: Sequence[int]) -> list[Drive]:
+    """Recordings, and the real log."""
+    return [*map(Drive, seeds), Drive(-1)]
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cells, measure, render, range(200, 204))

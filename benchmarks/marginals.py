@@ -17,14 +17,13 @@ from benchmarks import pose_graphs
 from benchmarks.gtsam_peer import ANCHOR, Peer, available, joint
 from benchmarks.report import listing
 from benchmarks.section import Result, goal
-from benchmarks.timing import interleave, milliseconds, shown, spread
+from benchmarks.timing import interleave, milliseconds, ratio, shown
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, IntArray
 
 PAIRS = 10  # joint covariances of two poses
-MANY = 300  # candidates for a loop with the last pose
 FEW = 5  # rounds at most
 SLOW = 2.0  # [s]; what takes GTSAM longer is compared once
 SAMPLE = 500  # poses whose covariance is compared with GTSAM's of the same linear factors
@@ -44,7 +43,7 @@ def measure(rounds: int, small: bool = False) -> Result:
 
 
 def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
-    """All single marginals, and some joint ones, in three ways."""
+    """All single marginals, and some joint ones."""
     graph, x = pose_graphs.posed(case.pose_graph, ANCHOR)
     solution = GaussNewton().solve(graph, {x: case.pose_graph.poses})
     program = graph.compile()
@@ -56,40 +55,18 @@ def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
     found: dict[str, Any] = {}
 
     def every() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         found["blocks"] = Tree(program, solution).blocks().reshape(count, dim, dim)
-        return time.perf_counter() - begin
+        return time.process_time() - begin
 
     def from_tree() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         found["joint"] = np.array([tree.factorization.inverse_block(scalars[pair].ravel()) for pair in pairs])
-        return (time.perf_counter() - begin) / len(pairs)
+        return (time.process_time() - begin) / len(pairs)
 
-    def by_name() -> float:
-        begin = time.perf_counter()
-        found["named"] = np.array([solution.covariance(x[pair]) for pair in pairs])
-        return (time.perf_counter() - begin) / len(pairs)
-
-    others = rng.integers(0, count - 1, MANY)
-
-    def of_candidates() -> float:
-        begin = time.perf_counter()
-        found["candidates"] = solution.pair_covariances(x[-1], x[others])
-        return (time.perf_counter() - begin) / MANY
-
-    candidates: dict[str, Callable[[], float]] = {"all": every, "tree": from_tree}
-    result: Result = {"name": case.name, "poses": count, "named": None, "difference": None, "refused": ""}
-    try:
-        by_name()
-        candidates |= {"named": by_name, "candidates": of_candidates}
-    except fg.GraphError as error:
-        result["refused"] = str(error)
-    times = interleave(candidates, rounds)
+    times = interleave({"all": every, "tree": from_tree}, rounds)
+    result: Result = {"name": case.name, "poses": count, "difference": None}
     result |= {what: milliseconds(values) for what, values in times.items()}
-    if "named" in found:
-        result["own difference"] = _largest(found["named"], found["joint"])
-        named = np.array([solution.covariance(x[[count - 1, int(other)]]) for other in others[:PAIRS]])
-        result["candidates' difference"] = _largest(found["candidates"][:PAIRS], named)
     if available():
         result |= _compared(case, tree.lin, solution[x], pairs, found, every, rounds)
     return result
@@ -110,10 +87,10 @@ def _compared(
     blocks: dict[str, Array] = {}
 
     def theirs() -> float:
-        begin = time.perf_counter()
+        begin = time.process_time()
         marginals = peer.marginals(poses)
         blocks["own"] = np.array([marginals.marginalCovariance(k) for k in range(count)])
-        return time.perf_counter() - begin
+        return time.process_time() - begin
 
     times = interleave({"all": every, "gtsam": theirs}, rounds, warm=0, slow=SLOW)
     derivatives = lin.jacobian[: edges * 2 * dim * dim].reshape(edges, dim, 2 * dim)
@@ -123,7 +100,7 @@ def _compared(
     both = np.array([joint(marginals, first, second) for first, second in pairs.tolist()])
     return {
         "gtsam": milliseconds(times["gtsam"]),
-        "ratio": spread(times["gtsam"] / times["all"][: len(times["gtsam"])]),
+        "ratio": ratio(times["gtsam"], times["all"]),
         "difference": _largest(found["blocks"][chosen], single),
         "joint difference": _largest(found["joint"], both),
         "with its own": _largest(found["blocks"], np.array([peer.ours(block) for block in blocks["own"]])),
@@ -165,25 +142,19 @@ COLUMNS: dict[str, Callable[[Result], str]] = {
     "with GTSAM's own Jacobians": lambda row: _power(row.get("with its own")),
     "two poses, tree [ms]": lambda row: shown(row["tree"]),
     "its difference": lambda row: _power(row.get("joint difference")),
-    "two poses, `solution.covariance` [ms]": lambda row: "refused" if row["refused"] else shown(row["named"]),
-    "difference from the tree": lambda row: _power(row.get("own difference")),
-    "last pose and one of many, `solution.pair_covariances` [ms]": lambda row: shown(row.get("candidates")),
-    "its difference from `covariance`": lambda row: _power(row.get("candidates' difference")),
 }
 
 
 def render(result: Result) -> str:
     """One table."""
-    refusals = "".join(f" {row['name']} was refused: {row['refused']}." for row in result["rows"] if row["refused"])
     notes = (
         "All poses: linearisation, ordering, factorisation and the entries of the inverse that the elimination tree "
         "holds (`Factorization.diagonal_blocks`), against `gtsam.Marginals` with one call per pose. Two poses: joint "
         f"covariance of {PAIRS} pairs anywhere in the graph, by `Factorization.inverse_block` of a factorisation "
-        f"there is, and as a user asks for it; the last pose and each of {MANY} candidates for a loop, in one call. "
-        "Differences, from GTSAM where nothing else is said, are relative to the "
-        "largest entry of a block. GTSAM is given our Jacobians for them, and every so many poses are compared; the "
-        "column after shows all poses with its own, whose derivative of the logarithm in the plane loses figures at "
-        f"small angles. {result['rounds']} rounds, one where GTSAM takes longer than {SLOW:g} s.{refusals}"
+        "there is. Differences from GTSAM are relative to the largest entry of a block. GTSAM is given our Jacobians "
+        "for them, and every so many poses are compared; the column after shows all poses with its own, whose "
+        "derivative of the logarithm in the plane loses figures at small angles. "
+        f"{result['rounds']} rounds, one where GTSAM takes longer than {SLOW:g} s."
     )
     return "\n\n".join([listing(("graph",), {(row["name"],): row for row in result["rows"]}, COLUMNS), notes])
 

@@ -1,27 +1,22 @@
-"""The campaign behind docs/navigation.md: closed-loop drives of both backends, judged against fixed limits.
-
-    python -m benchmarks.navigation [--coupling joint] [--only CASE ...] [--seeds 0:5] [--workers K] [--fresh]
-        [--report]
+"""Closed-loop drives of all backends with both couplings, judged against fixed limits.
 
 The maps of the department and of the TurtleBot arena are looked for in ``$UNIFG_DATA`` or ``../shared/data`` beside the
-checkout; without them only the building that ships with the package is driven, and the page in docs/ is left alone.
-Every finished drive is a line of out/benchmarks/navigation.jsonl, and is not repeated until the code changes
-(:mod:`benchmarks.campaign`). The joint coupling has a page of its own, docs/joint-drives.md.
+checkout; without them only the building that ships with the package is driven.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks import runs
 from benchmarks.comparison import Row, where
-from benchmarks.report import command, machine, publish, shared, table
+from benchmarks.report import shared, table
+from benchmarks.runner import Study
 from unifg.scenarios.ground.drive_pilot import COUPLINGS
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.log.drive_metrics import episode_metrics
@@ -41,7 +36,7 @@ MEDIAN_MS, P99_MS, LEAST_TICKS, LEAST_HORIZON = 20.0, 60.0, 2000, 30
 
 @dataclass(frozen=True)
 class Case:
-    """Where to drive.
+    """Map, start and goals of a drive.
 
     Attributes:
         map: file among the shared maps, None for the shipped building.
@@ -63,7 +58,7 @@ class Case:
 
     @property
     def available(self) -> bool:
-        """Whether it can be driven here."""
+        """True if its map is here."""
         return self.map is None or (self.path is not None and self.path.is_file())
 
 
@@ -146,7 +141,7 @@ TIMED = {
 
 
 def kept(row: Row, sentence: str) -> bool:
-    """Whether a drive kept a limit; a refused one keeps none."""
+    """True for a drive that kept a limit; a refused one keeps none."""
     return "metrics" in row and LIMITS[sentence](row["metrics"])
 
 
@@ -164,7 +159,7 @@ def render(rows: list[Row]) -> str:
         table(("case", "backend", "seed", *MEASURED), map(_drive_line, rows), text=2),
         "Time per tick, pooled over all drives of a backend.", times(rows),
         "Outcome of the control solve, share of ticks.", statuses(rows),
-        f"{machine('numpy', 'scipy', 'osqp', 'piqp', 'pymunk')} {at_once}",
+        at_once,
     ]  # fmt: skip
     return "\n\n".join(parts)
 
@@ -177,7 +172,7 @@ def _drive_line(row: Row) -> list[str]:
 
 
 def verdicts(rows: list[Row]) -> str:
-    """Which limits were kept: of each drive by case, of the times by backend."""
+    """Limits that were kept: of each drive by case, of the times by backend."""
     lines = []
     for case in CASES:
         mine = [row for row in rows if row["case"] == case]
@@ -218,7 +213,7 @@ def times(rows: list[Row]) -> str:
 
 
 def statuses(rows: list[Row]) -> str:
-    """How the control solves ended."""
+    """Endings of the control solves."""
     words = {s: Counter(w for row in where(rows, solver=s) for w in row["status"]) for s in SOLVERS}
     names = sorted({name for counts in words.values() for name in counts})
     lines = [
@@ -229,29 +224,19 @@ def statuses(rows: list[Row]) -> str:
     return table(("backend", *(name.replace("_", " ") for name in names)), lines)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Drive what is missing, then write the tables; 0 only if every drive keeps its limits."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--only", nargs="+", choices=CASES, default=list(CASES), metavar="CASE", help="some cases")
-    parser.add_argument("--seeds", type=runs.seeds, default=SEEDS, metavar="FIRST:END", help="fewer are no page")
-    parser.add_argument("--coupling", choices=COUPLINGS, default=COUPLINGS[0])
-    options = parser.parse_args(arguments)
-    page = "navigation" if options.coupling == COUPLINGS[0] else f"{options.coupling}-drives"
-    missing = [name for name, case in CASES.items() if not case.available]
-    if missing:
-        print(f"Without maps in $UNIFG_DATA or ../shared/data these are not driven: {', '.join(missing)}.")
-    chosen = [name for name in options.only if name not in missing]
-    variants = product(chosen, options.seeds, SOLVERS)
-    jobs = [Drive(case, solver, options.coupling, seed) for case, seed, solver in variants]
-    found = runs.episodes("navigation", drive, jobs, options)
-    rows = [row for row in found if row["coupling"] == options.coupling and row["seed"] in options.seeds]
-    complete = set(product(CASES, SOLVERS, SEEDS)) <= {(row["case"], row["solver"], row["seed"]) for row in rows}
-    publish(page, render(rows), {row["code"] for row in rows}, docs=complete)
-    if not complete:
-        print(f"\nThe campaign is incomplete, so docs/{page}.md is left as it was.")
-    return 0 if all(kept(row, sentence) for row in rows for sentence in LIMITS) else 1
+def tables(rows: list[Row]) -> str:
+    """Tables of both couplings."""
+    parts = []
+    for coupling in COUPLINGS:
+        mine = [row for row in rows if row["coupling"] == coupling]
+        parts += [f"### Coupling: {coupling}", render(mine)] if mine else []
+    return "\n\n".join(parts)
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def cells(seeds: Sequence[int]) -> list[Drive]:
+    """Every case that can be driven here, by every backend with every coupling."""
+    chosen = [name for name, case in CASES.items() if case.available]
+    return [Drive(*variant) for variant in product(chosen, SOLVERS, COUPLINGS, seeds)]
+
+
+STUDY = Study(cells, drive, tables, range(5))

@@ -1,12 +1,9 @@
-"""Two hundred obstacle courses: which backend finds a way past three walls and a cylinder, and where it gets stuck.
-
-    python -m benchmarks.obstacle_courses [--layouts K] [--tuning] [--fresh] [--report]
+"""Two hundred obstacle courses: ways past three walls and a cylinder, by backend, Hessian and guess.
 
 Ta et al. 2014, section V-A, vary the positions of the obstacles: "the drone often manages to get to the target", and
-sometimes ends in a local minimum. Here this is counted, on the layouts of ``COURSE_SEEDS``, for every backend with the
-exact and the Gauss-Newton Hessian, with their potential 1/d and with hard clearance, from three guesses: hovering at
-the start, the straight line to the target, and a shortest way. Weights were chosen on ``TUNING_SEEDS``
-(``--tuning`` runs these, and writes no page). Writes docs/quadrotor-obstacles.md.
+sometimes ends in a local minimum. This is counted on the layouts of ``COURSE_SEEDS``, for every backend with the exact
+and the Gauss-Newton Hessian, with their potential 1/d and with hard clearance, from three guesses: hovering at the
+start, the straight line to the target, and a shortest way. Weights were chosen on ``TUNING_SEEDS``.
 """
 
 from __future__ import annotations
@@ -21,10 +18,9 @@ from itertools import pairwise, product
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks import runs
-from benchmarks.comparison import Row, crossed, share
-from benchmarks.report import command, listing, machine, publish, table, words
-from benchmarks.timing import pin
+from benchmarks.comparison import Row, share, where
+from benchmarks.report import listing, table, words
+from benchmarks.runner import Study
 from unifg.scenarios.course import (
     AVOIDANCES,
     HESSIANS,
@@ -38,7 +34,7 @@ from unifg.scenarios.course import (
     state_problem,
 )
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
-from unifg.scenarios.simulation.layouts import COURSE_SEEDS, TUNING_SEEDS, Layout, obstacle_course
+from unifg.scenarios.simulation.layouts import COURSE_SEEDS, Layout, obstacle_course
 
 SAME = 1e-3  # relative difference of cost below which two minima are one
 BACKENDS = tuple(product(("sqp", "ipm", "alm"), HESSIANS))
@@ -82,7 +78,7 @@ class Attempt(Method):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one layout.
+    """Result on one layout.
 
     Attributes:
         status: of the solver.
@@ -110,12 +106,12 @@ class Outcome:
 
     @property
     def safe(self) -> bool:
-        """Whether it can be flown to the target without a collision, optimal or not."""
+        """True if it can be flown to the target without a collision, optimal or not."""
         return self.arrived and self.clear and self.flyable
 
     @property
     def minimum(self) -> bool:
-        """Whether it is a local minimum of the problem."""
+        """True for a local minimum of the problem."""
         return self.converged and self.flyable
 
 
@@ -160,12 +156,12 @@ def _compiled(method: Method) -> None:
     attempt(method, obstacle_course())
 
 
-def results_of(rows: Iterable[Row]) -> Results:
-    """Outcomes of every method, on the layouts that all have tried."""
+def results_of(rows: Sequence[Row]) -> Results:
+    """Outcomes of every method, layout by layout."""
     names = [field.name for field in fields(Outcome)]
-    groups = crossed(rows, *(field.name for field in fields(Method)))
-    found = {Method(*key): [Outcome(*(row[name] for name in names)) for row in some] for key, some in groups.items()}
-    return {method: found[method] for method in METHODS}
+    return {
+        method: [Outcome(*(row[name] for name in names)) for row in where(rows, **vars(method))] for method in METHODS
+    }
 
 
 def lowest(results: Results, avoidance: Avoidance) -> list[Outcome | None]:
@@ -177,7 +173,7 @@ def lowest(results: Results, avoidance: Avoidance) -> list[Outcome | None]:
 
 
 def distinct(costs: Iterable[float]) -> int:
-    """How many costs there are that differ by more than rounding and tolerance."""
+    """Number of costs that differ by more than rounding and tolerance."""
     ordered = sorted(costs)
     return sum(b > a * (1.0 + SAME) for a, b in pairwise(ordered)) + bool(ordered)
 
@@ -204,7 +200,7 @@ def rates(results: Results) -> str:
 
 
 def endings(results: Results) -> str:
-    """How solves ended, per method."""
+    """Endings of solves, per method."""
     counts = {method: Counter(o.status for o in outcomes) for method, outcomes in results.items()}
     names = [name for name, _ in sum(counts.values(), Counter()).most_common()]
     lines = [(*method.words, *(str(found[name] or "") for name in names)) for method, found in counts.items()]
@@ -257,7 +253,7 @@ def duels(results: Results) -> str:
 
 
 def minima(results: Results) -> str:
-    """How many local minima all methods together found on each layout."""
+    """Numbers of local minima that all methods together found on a layout."""
     lines = []
     for avoidance in AVOIDANCES:
         columns = list(zip(*(some for method, some in results.items() if method.avoidance == avoidance), strict=True))
@@ -302,8 +298,7 @@ def render(results: Results, layouts: Sequence[Layout]) -> str:
             minima(results),
             "How solves ended:",
             endings(results),
-            "Iterations and times are medians, times are the processor's. `python -m benchmarks.obstacle_courses`. "
-            + machine("numpy", "scipy", "osqp", "piqp"),
+            "Iterations and times are medians, times are the processor's.",
         )
     )
 
@@ -312,26 +307,14 @@ def _middle(values: Sequence[float]) -> str:
     return f"{np.median(values):.0f}" if values else "-"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Solve every layout by every method and write the tables."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--layouts", type=int, default=len(COURSE_SEEDS), help="number of layouts")
-    parser.add_argument("--tuning", action="store_true", help="the layouts settings were chosen on; writes no page")
-    options = parser.parse_args(arguments)
-    if options.layouts < 1:
-        parser.error(f"--layouts must be positive, found {options.layouts}")
-    if options.workers == 1:
-        pin()
-    seeds = (TUNING_SEEDS if options.tuning else COURSE_SEEDS)[: options.layouts]
-    jobs = [Attempt(**vars(method), seed=seed) for seed in seeds for method in METHODS]
-    rows = [row for row in runs.episodes("obstacle_courses", attempted, jobs, options) if row["seed"] in seeds]
-    flown = sorted({row["seed"] for row in rows})
-    text = render(results_of(rows), [obstacle_course(seed) for seed in flown])
-    name = "obstacle-courses-tuning" if options.tuning else "quadrotor-obstacles"
-    publish(name, text, {row["code"] for row in rows})
-    return 0
+def cells(seeds: Sequence[int]) -> list[Attempt]:
+    """Every layout by every method."""
+    return [Attempt(**vars(method), seed=seed) for seed in seeds for method in METHODS]
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def tables(rows: list[Row]) -> str:
+    """Tables of all rows."""
+    return render(results_of(rows), [obstacle_course(seed) for seed in sorted({row["seed"] for row in rows})])
+
+
+STUDY = Study(cells, attempted, tables, COURSE_SEEDS)

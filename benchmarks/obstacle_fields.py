@@ -1,28 +1,26 @@
-"""A hundred random fields of discs: potential field, potential field with vortex, and hard clearance.
+"""Hundred random fields of discs: potential field, potential field with vortex, and hard clearance.
 
-    python -m benchmarks.obstacle_fields [--fields K]
-
-A unicycle shall follow a straight line that leads through 3 to 6 discs. Horizon, weights, limits and cold guess (the
-line itself, through the discs) are those of :mod:`benchmarks.reference_problems`, the dynamics are hard. Only the way
-of keeping clear of the discs differs. Discs leave gaps a robot fits through, so that every field can be passed.
-
-The fields are drawn from seeds 0 to K - 1. Weight and vortex were chosen on the twenty fields of TUNING, never on
-these. Beside the vortex stands a control: the same number of first steps in full and without a merit test, but along
-the true gradient (a vortex of weight 1e-9). Writes docs/models.md.
+A unicycle shall follow a straight line that leads through 3 to 6 discs, with hard dynamics, from the line itself as a
+guess. Only the way of keeping clear of the discs differs. Discs leave gaps a robot fits through, so that every field
+can be passed. Weight and vortex were chosen on the twenty fields of TUNING, never on these. Beside the vortex stands a
+control: the same number of first steps in full and without a merit test, but along the true gradient (a vortex of
+weight 1e-9).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
 from functools import cache
+from itertools import product
 
 import numpy as np
-from tqdm import tqdm
 
 import unifg as fg
-from benchmarks.report import command, machine, publish, table
+from benchmarks.comparison import Row
+from benchmarks.report import table
+from benchmarks.runner import Study
 from problems.control import Stated, Unicycle
 from unifg.models import obstacles
 from unifg.models.potential import Sense, potential
@@ -128,7 +126,7 @@ def solvers(search: int) -> dict[str, fg.Solver]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one field.
+    """Result on one field.
 
     Attributes:
         solved: whether the KKT test passed.
@@ -148,7 +146,7 @@ class Outcome:
 
     @property
     def passed(self) -> bool:
-        """Whether a robot could use the answer, optimal or not."""
+        """True if a robot could use the answer, optimal or not."""
         return self.free and self.reached
 
 
@@ -204,9 +202,8 @@ def render(results: Results, fields: int) -> str:
     parts = [
         table(("method", "solver", *FACTS, "cost", "iterations", "ms"), lines, text=2),
         table(("change", "solver", "passed: rescued", "broken", "passed and solved: rescued", "broken"), moves, text=2),
-        f"{fields} fields, seeds 0 to {fields - 1}; tolerance {TOLERANCE:g}; `python -m benchmarks.obstacle_fields`. "
-        f"Iterations and processor times are medians. {machine('numpy', 'scipy', 'osqp', 'piqp')}",
-        sayings(results),
+        f"{fields} fields, seeds 0 to {fields - 1}; tolerance {TOLERANCE:g}. "
+        "Iterations and processor times are medians.",
     ]
     return "\n\n".join(parts)
 
@@ -216,52 +213,34 @@ def moved(plain: list[Outcome], outcomes: list[Outcome], what: Callable[[Outcome
     return sum(what(was) is before and what(now) is not before for was, now in zip(plain, outcomes, strict=True))
 
 
-def sayings(results: Results) -> str:
-    """What the tables say, in sentences that are computed from them."""
+@dataclass(frozen=True)
+class Cell:
+    """A method and a backend on the field of a seed."""
 
-    def each(name: str, what: Callable[[Outcome], bool]) -> str:
-        return " and ".join(f"{sum(map(what, results[name, backend]))} ({backend})" for backend in BACKENDS)
-
-    def changed(name: str, before: bool) -> str:
-        pairs = ((b, results["potential", b], results[name, b]) for b in BACKENDS)
-        return " and ".join(f"{moved(plain, some, FACTS['passed'], before)} ({b})" for b, plain, some in pairs)
-
-    total = len(results["potential", BACKENDS[0]])
-    lines = [
-        f"- **Hard clearance** passes {each('hard clearance', lambda o: o.passed)} of {total} fields and solves "
-        f"{each('hard clearance', lambda o: o.solved)}.",
-        f"- **Potential.** {each('potential', lambda o: o.passed)} passed. "
-        f"{each('potential', lambda o: not o.free)} plans collide, of which "
-        f"{each('potential', lambda o: o.solved and not o.free)} pass the KKT test: they are answers, with poses in "
-        f"the flat part inside a disc. {each('potential', lambda o: not o.solved)} do not meet the KKT test within the "
-        "iterations.",
-    ]
-    for method in METHODS[2:]:
-        lines.append(
-            f"- **{method.name.partition(', ')[2].capitalize()}.** Against the plain potential it rescues "
-            f"{changed(method.name, False)} fields and breaks {changed(method.name, True)}; "
-            f"{each(method.name, lambda o: o.reached)} reach the end of the line, with the plain potential "
-            f"{each('potential', lambda o: o.reached)}."
-        )
-    return "\n".join(lines)
+    seed: int
+    method: int
+    backend: str
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Solve every field by every method and write the tables; 0 only if hard clearance passes everywhere."""
-    parser = command(__doc__)
-    parser.add_argument("--fields", type=int, default=100, help="number of random fields")
-    options = parser.parse_args(arguments)
-    if options.fields < 1:
-        parser.error(f"--fields must be positive, found {options.fields}")
+def measure(cell: Cell) -> Row:
+    """Solve one field by one method."""
+    method = METHODS[cell.method]
+    return vars(attempt(method, solvers(method.search)[cell.backend], cell.seed))
+
+
+def tables(rows: list[Row]) -> str:
+    """Tables of all rows."""
     results: Results = {}
-    for seed in tqdm(range(options.fields), unit="field"):
-        for method in METHODS:
-            for backend, solver in solvers(method.search).items():
-                results.setdefault((method.name, backend), []).append(attempt(method, solver, seed))
-    publish("models", render(results, options.fields))
-    hard = (outcome for (name, _), outcomes in results.items() if name == "hard clearance" for outcome in outcomes)
-    return 0 if all(outcome.passed for outcome in hard) else 1
+    names = [field.name for field in fields(Outcome)]
+    for row in rows:
+        outcome = Outcome(*(row[name] for name in names))
+        results.setdefault((METHODS[row["method"]].name, row["backend"]), []).append(outcome)
+    return render(results, len({row["seed"] for row in rows}))
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+def cells(seeds: Sequence[int]) -> list[Cell]:
+    """Every method with both backends on every field."""
+    return [Cell(*variant) for variant in product(seeds, range(len(METHODS)), BACKENDS)]
+
+
+STUDY = Study(cells, measure, tables, range(100))

@@ -1,11 +1,9 @@
-"""What a function of one's own costs: control problems stated with plain functions, beside shipped kernels and fatrop.
-
-    python -m benchmarks.own_functions [--rounds R] [--fields K]
+"""Cost of functions of one's own: control problems stated with plain functions, beside shipped kernels and fatrop.
 
 The same problems with the same solver, the interior point, with their dynamics, costs and clearances as they ship, as
 batched NumPy functions, as functions of one factor under ``numba.njit``, and as NumPy functions that are differenced in
-batches. Each way is stated in a new process, which tells how long it takes from the first statement to the first answer
-where compiled functions are in the cache. Writes docs/own-functions.md.
+batches. Each way is stated in a new process, which measures the time from the first statement to the first answer
+where compiled functions are in the cache.
 """
 
 from __future__ import annotations
@@ -25,22 +23,18 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks import control_loops
-from benchmarks.casadi_peer import available
 from benchmarks.cold import Outcome, attempt, attempt_peer, runnable
-from benchmarks.hard_guesses import STUDIES
-from benchmarks.hard_guesses import Outcome as Ending
-from benchmarks.report import CHECKOUT, command, machine, publish, table
-from benchmarks.timing import interleave, number, shown, spread
+from benchmarks.report import CHECKOUT, table
+from benchmarks.runner import Timing
+from benchmarks.timing import interleave, number, ratio, shown
 from problems.cart_pole import CartPole, CartPoleGraph, cart_pole_dynamics, cart_pole_dynamics_of_one
-from problems.control import Driver, Problem, Quadrotor, QuadrotorGraph, Stated, Unicycle, UnicycleGraph
+from problems.control import Problem, Quadrotor, QuadrotorGraph, Stated, Unicycle, UnicycleGraph
 from unifg.lie import wrap_angle
 from unifg.models.quadrotor import GRAVITY
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 
 TOLERANCE = 1e-4
-LOOP = 30  # horizon of the cart-pole
 WAYS = ("shipped", "numpy", "njit", "differences")
 NAMES = {
     "shipped": "shipped",
@@ -157,13 +151,13 @@ class Way:
 
 
 def problems() -> dict[str, Problem]:
-    """By title, those the targets speak of."""
+    """Problems by title."""
     found: list[Problem] = [
         Unicycle("straight", False, 50),
         Unicycle("straight", True, 50),
         Unicycle("ahead", True, 50),
     ]
-    found += [Quadrotor("figure8", False, 20), Quadrotor("figure8", True, 20), CartPole("upright", False, LOOP)]
+    found += [Quadrotor("figure8", False, 20), Quadrotor("figure8", True, 20), CartPole("upright", False, 30)]
     return {problem.title: problem for problem in found}
 
 
@@ -214,9 +208,7 @@ class Cold:
 def cold(title: str, problem: Problem, rounds: int) -> dict[str, Cold]:
     """Every way, and fatrop, interleaved."""
     solver = InteriorPoint(tolerance=TOLERANCE)
-    attempts: dict[str, Callable[[Outcome], float]] = {
-        way: attempt(solver, Way(problem, way), True) for way in ways(problem)
-    }
+    attempts: dict[str, Callable[[Outcome], float]] = {way: attempt(solver, Way(problem, way)) for way in ways(problem)}
     for peer in runnable(("fatrop", "fatrop, compiled")):
         attempts[peer] = attempt_peer(peer, problem, TOLERANCE)
     outcomes = {way: Outcome(problem, way) for way in attempts}
@@ -225,11 +217,7 @@ def cold(title: str, problem: Problem, rounds: int) -> dict[str, Cold]:
     for way, outcome in outcomes.items():
         outcome.times = times[way].tolist()
         first = (math.nan, math.nan) if way not in ways(problem) else _in_a_process(title, way)
-        ratio = None
-        if "fatrop" in times:
-            shared = min(len(times[way]), len(times["fatrop"]))
-            ratio = spread(times[way][:shared] / times["fatrop"][:shared])
-        found[way] = Cold(first, outcome, ratio)
+        found[way] = Cold(first, outcome, ratio(times[way], times["fatrop"]) if "fatrop" in times else None)
     return found
 
 
@@ -247,88 +235,14 @@ def render_cold(results: Mapping[str, Mapping[str, Cold]]) -> str:
     return table((*head, "times fatrop"), rows, 3)
 
 
-def loop() -> dict[str, control_loops.Drive]:
-    """The cart-pole in closed loop."""
-    problem = CartPole("upright", False, LOOP)
-    solver = InteriorPoint(tolerance=TOLERANCE)
-    who: dict[str, control_loops.Contestant] = {way: Driver(Way(problem, way), solver) for way in ways(problem)}
-    for peer in runnable(("fatrop", "fatrop, compiled")):
-        who[peer] = control_loops.contestant(problem, peer)
-    return control_loops.race(problem, who)
+def tables(rounds: int) -> str:
+    """Every way of every problem."""
+    results = {title: cold(title, problem, rounds) for title, problem in tqdm(problems().items(), unit="problem")}
+    notes = (
+        f"Tolerance {TOLERANCE:.0e}, median processor time of {rounds} interleaved solves; ratios with 95 % intervals. "
+        "To prepared and first solve: processor time in a new process whose compiled functions are in the cache."
+    )
+    return f"{render_cold(results)}\n\n{notes}"
 
 
-def render_loop(drives: Mapping[str, control_loops.Drive]) -> str:
-    """A row for each way."""
-    rows = []
-    for way, drive in drives.items():
-        ratio = "-"
-        if "fatrop" in drives:
-            ratio = shown(spread(np.array(drive.times) / np.array(drives["fatrop"].times)))
-        rows.append(
-            (
-                NAMES[way], f"{np.median(drive.times):.3f}", f"{np.percentile(drive.times, 99):.3f}",
-                f"{np.mean(drive.iterations):.1f}", str(sum(drive.failures.values())), f"{drive.cost:.5g}", ratio,
-            )
-        )  # fmt: skip
-    head = ("functions", "median [ms]", "p99 [ms]", "iterations", "failures", "cost", "times fatrop")
-    return table(head, rows)
-
-
-def fields(count: int) -> str:
-    """The random fields of :mod:`benchmarks.hard_guesses`, stated with functions of one factor, beside fatrop."""
-    study = STUDIES["discs"]
-    solves = {"njit": study.ours(InteriorPoint())} | {name: study.peer(name) for name in runnable(("fatrop",))}
-    ended: dict[str, list[Ending]] = {name: [] for name in solves}
-    times: dict[str, list[float]] = {name: [] for name in solves}
-    for solve in solves.values():  # whatever is found out once
-        solve(0)
-    for seed in tqdm(range(count), unit="field"):
-        for name, solve in solves.items():
-            begin = time.thread_time()
-            ended[name].append(solve(seed))
-            times[name].append(1e3 * (time.thread_time() - begin))
-    rows = []
-    for name, mine in ended.items():
-        others = ended.get("fatrop", mine)
-        solved = np.array([one.solved for one in mine])
-        both = solved & np.array([one.solved for one in others])
-        spent, steps = np.array(times[name]), np.array([one.iterations for one in mine])
-        ratios = spent[both] / np.array(times.get("fatrop", times[name]))[both]
-        counts = steps[both] / np.array([one.iterations for one in others])[both]
-        rows.append(
-            (
-                NAMES[name], f"{solved.sum()} / {count}", f"{np.median(steps[solved]):.0f}",
-                number(float(np.median(spent[solved]))), str(both.sum()), shown(spread(ratios)), shown(spread(counts)),
-            )
-        )  # fmt: skip
-    head = ("functions", "converged", "iterations", "solve [ms]", "both converged")
-    return table((*head, "time / fatrop's", "iterations / fatrop's"), rows)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Measure and write the page."""
-    parser = command(__doc__)
-    parser.add_argument("--rounds", type=int, default=20, help="cold solves of every problem in every way")
-    parser.add_argument("--fields", type=int, default=200, help="random fields of discs")
-    options = parser.parse_args(arguments)
-    stated_so = tqdm(problems().items(), unit="problem")
-    results = {title: cold(title, problem, options.rounds) for title, problem in stated_so}
-    peers = ("casadi",) if available() else ()
-    parts = [
-        "### Cold", render_cold(results),
-        f"Tolerance {TOLERANCE:.0e}, median processor time of {options.rounds} interleaved solves; ratios with "
-        "quartiles. To prepared and first solve: processor time in a new process whose compiled functions are in the "
-        "cache.",
-        "### A cart-pole in closed loop", render_loop(loop()),
-        f"Horizon of {LOOP} steps, {control_loops.STEPS} ticks after a cold one, warm starts, interleaved.",
-        "### Fields of twenty discs", fields(options.fields),
-        "Forty steps, the guess is the straight line through the discs, tolerance 1e-6; dynamics and clearance are "
-        "functions of one factor (tests/problems/disc_fields.py). One solve each, with what its call costs.",
-        machine("numpy", "numba", *peers),
-    ]  # fmt: skip
-    publish("own-functions", "\n\n".join(parts), docs=options.fields >= 200)
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Timing(tables, 20)

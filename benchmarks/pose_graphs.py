@@ -1,14 +1,12 @@
-"""Gauss-Newton on published pose graphs, beside GTSAM: per iteration, whole solves, and where our time goes."""
+"""Gauss-Newton on published pose graphs, beside GTSAM: per iteration, whole solves, and from the file."""
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,33 +14,14 @@ import unifg as fg
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import listing, shared, words
 from benchmarks.section import Result, goal
-from benchmarks.timing import Split, interleave, milliseconds, number, shown, spread, timed
-from unifg.elimination import factorization, fronts, substitution
+from benchmarks.timing import clock, interleave, milliseconds, ratio, shown, timed
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.lie import SE3
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
-from unifg.problem import evaluation
-from unifg.problem.compiled_problem import CompiledProblem
-from unifg.solution import solver
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
 SAME = 1e-6  # relative difference of chi2
-# What the compiled passes and Python around them do in a solve; linearising adds up the normal equations too.
-WATCHED: dict[str, tuple[Any, str]] = {
-    "linearise": (evaluation, "linearize"),
-    "eliminate": (fronts, "factor"),
-    "substitute": (substitution, "solve"),
-    "retract": (CompiledProblem, "retract"),
-    "KKT test": (solver, "optimality"),
-    "bind data": (CompiledProblem, "bind"),
-}
-FROM_FILE: dict[str, tuple[Any, str]] = {
-    "read": (sys.modules[__name__], "read_g2o"),
-    "state": (PoseGraph, "graph"),
-    "compile": (GaussNewton, "prepare"),
-}
-STRUCTURE: dict[str, tuple[Any, str]] = {"compile": (GaussNewton, "prepare"), "analyse": (factorization, "analyse")}
 
 
 @dataclass(frozen=True)
@@ -64,7 +43,7 @@ class Case:
 
     @property
     def whole(self) -> float:
-        """How many times faster than GTSAM it should be from the file to the map."""
+        """Target from the file to the map, in times faster than GTSAM."""
         return 3.0 if self.pose_graph.group is SE3 else 5.0
 
 
@@ -120,11 +99,11 @@ def measure_case(case: Case, rounds: int) -> Result:
         graph, _, start = pose_graph.graph()
         return graph, start
 
-    split = Split(WATCHED, partial(run.solve, guess), count)
-    whole = Split(STRUCTURE, lambda graph, start: GaussNewton().prepare(graph).solve(start), setup=fresh)
-    candidates: dict[str, Callable[[], float]] = {
-        "ours": timed(partial(run.solve, guess), count), "split": split, "whole": whole
-    }  # fmt: skip
+    def whole() -> float:
+        graph, start = fresh()
+        return clock(lambda: GaussNewton().prepare(graph).solve(start))
+
+    candidates: dict[str, Callable[[], float]] = {"ours": timed(partial(run.solve, guess), count), "whole": whole}
     ends: list[tuple[int, float]] = []
     best_whole = ""
     if available():
@@ -145,9 +124,6 @@ def measure_case(case: Case, rounds: int) -> Result:
         "status": words(first.status),
         "ours": milliseconds(times["ours"]),
         "whole": milliseconds(times["whole"]),
-        "compile": whole.milliseconds(rounds)["compile"],
-        "analyse": whole.milliseconds(rounds)["analyse"],
-        "parts": split.milliseconds(rounds),
         "ratio": None,
     }
     result["file"] = measure_file(case, rounds)
@@ -172,22 +148,19 @@ def measure_file(case: Case, rounds: int) -> Result:
             ends[ordering] = iterations, chi2
             return elapsed
 
-        split = Split(FROM_FILE, ours)
-        candidates: dict[str, Callable[[], float]] = {"ours": split}
+        candidates: dict[str, Callable[[], float]] = {"ours": timed(ours)}
         if available():
             candidates |= {ordering: partial(theirs, ordering) for ordering in ORDERINGS}
         times = interleave(candidates, rounds)
-    parts = split.milliseconds(rounds)
-    parts["solve"] = parts.pop("Python")
     result: Result = {
-        "name": case.name, "ours": milliseconds(times["ours"]), "parts": parts, "iterations": ends["ours"][0],
+        "name": case.name, "ours": milliseconds(times["ours"]), "iterations": ends["ours"][0],
         "chi2": ends["ours"][1], "ratio": None, "target": case.whole,
     }  # fmt: skip
     if available():
         best = min(ORDERINGS, key=lambda ordering: float(np.median(times[ordering])))
         result |= {
             "gtsam": milliseconds(times[best]), "best": best, "gtsam_iterations": ends[best][0],
-            "gtsam_chi2": ends[best][1], "ratio": spread(times[best] / times["ours"]),
+            "gtsam_chi2": ends[best][1], "ratio": ratio(times[best], times["ours"]),
         }  # fmt: skip
     return result
 
@@ -208,17 +181,17 @@ def _compared(times: Mapping[str, Array], best_whole: str, iterations: int, chi2
     return {
         "gtsam": {ordering: milliseconds(times[ordering]) for ordering in ORDERINGS},
         "best": best,
-        "ratio": spread(times[best] / times["ours"]),
+        "ratio": ratio(times[best], times["ours"]),
         "gtsam_whole": milliseconds(times["GTSAM, whole"]),
         "best_whole": best_whole,
-        "ratio_whole": spread(times["GTSAM, whole"] / times["whole"]),
+        "ratio_whole": ratio(times["GTSAM, whole"], times["whole"]),
         "gtsam_iterations": iterations,
         "gtsam_chi2": chi2,
     }
 
 
 def within(row: Result) -> str:
-    """Whether all found chi2 are the best known one."""
+    """Compare all found chi2 with the best known one."""
     known = row["known"] or row["chi2"]
     return "yes" if all(abs(row.get(end, known) - known) <= SAME * known for end in ("chi2", "gtsam_chi2")) else "no"
 
@@ -237,8 +210,6 @@ ITERATIONS: Columns = {
 }
 WHOLE: Columns = {
     "ours [ms]": lambda row: shown(row["whole"]),
-    "of it compiling": lambda row: number(row["compile"][0]),
-    "of it ordering and symbolic": lambda row: number(row["analyse"][0]),
     "iterations": lambda row: f"{row['iterations']}, {row['status']}",
     "GTSAM [ms]": lambda row: shown(row.get("gtsam_whole")),
     "ordering": lambda row: str(row.get("best_whole", "-")),
@@ -251,13 +222,8 @@ WHOLE: Columns = {
 }
 
 
-def _milliseconds_of(row: Result, part: str) -> str:
-    return number(row["parts"][part][0])
-
-
 FILED: Columns = {
     "ours [ms]": lambda row: shown(row["ours"]),
-    **{part: partial(_milliseconds_of, part=part) for part in (*FROM_FILE, "solve")},
     "iterations": lambda row: str(row["iterations"]),
     "GTSAM [ms]": lambda row: shown(row.get("gtsam")),
     "ordering": lambda row: str(row.get("best", "-")),
@@ -279,8 +245,6 @@ def render(result: Result) -> str:
         [
             f"{source} Per Gauss-Newton iteration:",
             listing(("graph",), graphs, ITERATIONS),
-            "Where an iteration of ours goes [ms]:",
-            listing(("graph",), graphs, {part: partial(_part, part=part) for part in result["rows"][0]["parts"]}),
             "Whole solves, symbolic work included:",
             listing(("graph",), graphs, WHOLE),
             "From the file to the map: a g2o file is read, stated, ordered and solved until the cost falls by less "
@@ -288,11 +252,6 @@ def render(result: Result) -> str:
             listing(("graph",), {(row["name"],): row["file"] for row in result["rows"]}, FILED),
         ]
     )
-
-
-def _part(row: Result, part: str) -> str:
-    median, total = row["parts"][part][0], sum(value[0] for value in row["parts"].values())
-    return f"{number(median)} ({100 * median / total:.0f} %)"
 
 
 def posed(pose_graph: PoseGraph, sigma: float) -> tuple[fg.Graph, fg.Family]:

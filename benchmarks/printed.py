@@ -18,7 +18,7 @@ def printed() -> dict[str, Any]:
 
 
 def texts(paper: str, place: str) -> dict[str, str]:
-    """What a place of a paper prints, by name."""
+    """Texts that a place of a paper prints, by name."""
     found: dict[str, str] = printed()[paper][place]
     return found
 

@@ -1,11 +1,7 @@
-"""The campaigns behind docs/quadrotor-mpc.md: success, accuracy and times of flights through unknown corridors.
+"""Flights through unknown corridors: success, accuracy and times.
 
-    python -m benchmarks.quadrotor_flights [--studies NAME ...] [--seeds 0:100] [--solvers NAME ...]
-        [--couplings NAME ...] [--workers 2] [--fresh] [--report]
-
-Every flight is a line of out/benchmarks/quadrotor_flights.jsonl and is not flown again until the code changes
-(:mod:`benchmarks.campaign`). The study "timing" runs one flight at a time, whatever ``--workers`` says. All variants of
-a seed meet the same corridor, mass, drag, wind, disturbances and sensor noise.
+The study "timing" runs one flight at a time, whatever ``--workers`` says. All variants of a seed meet the same
+corridor, mass, drag, wind, disturbances and sensor noise.
 """
 
 from __future__ import annotations
@@ -16,10 +12,9 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks import runs
 from benchmarks.comparison import Row
 from benchmarks.quadrotor_tables import HEADLINE, render
-from benchmarks.report import command, machine, publish
+from benchmarks.runner import Study
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics
@@ -27,10 +22,9 @@ from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS
 from unifg.scenarios.quadrotor.flight_settings import Avoidance
 from unifg.scenarios.simulation.layouts import CORRIDOR_SEEDS
 
-STUDIES = ("flights", "potential", "association", "movers", "weights", "timing")
+STUDIES = ("flights", "potential", "association", "movers", "timing")
 SOLVERS = ("ipm", "sqp", "alm")
-WEIGHTS = (0.1, 1.0, 10.0)
-FEWER = {"weights": 20, "timing": 20}  # seeds at most; 20 flights are some 6000 ticks
+FEWER = {"timing": 20}  # seeds at most; 20 flights are some 6000 ticks
 TIMED_RUNS = 3
 MARKS = (1.0, 2.0, 5.0, 10.0)  # [s] at which the mass is looked at
 TOUCH = 0.01  # [m]; a hull nearer than this has touched, or will
@@ -47,7 +41,6 @@ class Job:
     avoidance: Avoidance = "clearance"
     association: str = "known"
     movers: int = 0
-    weight: float = 1.0
     run: int = 0
 
     def settings(self) -> FlightSettings:
@@ -56,34 +49,31 @@ class Job:
         return replace(
             plain,
             estimator=replace(plain.estimator, association=self.association),
-            controller=replace(plain.controller, avoidance=self.avoidance, control_weight=self.weight),
+            controller=replace(plain.controller, avoidance=self.avoidance),
         )
 
 
-def jobs_of(
-    studies: Sequence[str], solvers: Sequence[str], couplings: Sequence[str], seeds: Sequence[int]
-) -> list[Job]:
-    """What there is to fly.
+def cells(seeds: Sequence[int]) -> list[Job]:
+    """All flights.
 
     Backends other than the headline's fly sequential and joint; potential costs, unknown association and movers are
     flown sequential.
     """
     jobs: list[Job] = []
-    for study, solver in product(studies, solvers):
+    for study, solver in product(STUDIES, SOLVERS):
         first, plain = solver == HEADLINE, Job(study, solver, "sequential", 0)
         variants = {
             "flights": [replace(plain, coupling=c) for c in COUPLINGS if first or c != "separate"],
             "potential": [replace(plain, avoidance="potential")],
             "association": [replace(plain, association="unknown")] if first else [],
             "movers": [replace(plain, movers=2)] if first else [],
-            "weights": [replace(plain, coupling="joint", weight=w) for w in WEIGHTS] if first else [],
             "timing": [
                 replace(plain, coupling=c, run=r)
                 for r in range(TIMED_RUNS if first else 1) for c in COUPLINGS if c != "separate"
             ],
         }[study]  # fmt: skip
         some = seeds[: FEWER.get(study)]
-        jobs += [replace(job, seed=seed) for job in variants for seed in some if job.coupling in couplings]
+        jobs += [replace(job, seed=seed) for job in variants for seed in some]
     return jobs
 
 
@@ -107,7 +97,7 @@ def _mass(log: FlightLog) -> dict[str, list[float]]:
 
 
 def _contact(log: FlightLog) -> Row | None:
-    """When and where the hull first came to something, and what was believed then."""
+    """Time and place of the first contact, and the belief there."""
     near = np.flatnonzero(log.clearance < TOUCH)
     if not log.collisions or not len(near):
         return None
@@ -121,23 +111,4 @@ def _contact(log: FlightLog) -> Row | None:
     }
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Fly what is missing and rewrite the results in docs/quadrotor-mpc.md."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--studies", nargs="+", choices=STUDIES, default=STUDIES)
-    parser.add_argument("--seeds", type=runs.seeds, default=CORRIDOR_SEEDS, metavar="FIRST:END")
-    parser.add_argument("--solvers", nargs="+", choices=SOLVERS, default=SOLVERS)
-    parser.add_argument("--couplings", nargs="+", choices=COUPLINGS, default=COUPLINGS)
-    options = parser.parse_args(arguments)
-    jobs = jobs_of(options.studies, options.solvers, options.couplings, options.seeds)
-    found = runs.episodes("quadrotor_flights", fly, jobs, options, alone=lambda job: job.study == "timing")
-    # Flights on other seeds, such as those for tuning, are no results.
-    rows = [row for row in found if row["seed"] in options.seeds]
-    text = f"{machine('numpy', 'scipy', 'numba', 'osqp', 'piqp', 'pymunk')}\n\n{render(rows)}"
-    publish("quadrotor-mpc", text, {row["code"] for row in rows}, docs=set(options.seeds) <= set(CORRIDOR_SEEDS))
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cells, fly, render, CORRIDOR_SEEDS, alone=lambda job: job.study == "timing")

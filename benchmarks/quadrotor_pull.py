@@ -1,10 +1,8 @@
-"""How far one graph pulls its estimate: the plan's costs against what the past alone says, tick by tick.
-
-    python -m benchmarks.quadrotor_pull [--seeds 1000:1008] [--seconds 6] [--workers K] [--fresh] [--report]
+"""Pull of the plan on the estimate of a joint graph: the plan's costs against what the past alone gives, tick by tick.
 
 The first seconds of flights through corridors on seeds that are open to tuning, with the weight of the future's costs,
 the bound on the pull and what the window carries on swept. Every variant of a seed meets the same corridor, mass,
-wind, disturbances and noise; differences are taken seed by seed. Writes docs/quadrotor-joint.md.
+wind, disturbances and noise; differences are taken seed by seed.
 """
 
 from __future__ import annotations
@@ -17,10 +15,10 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks import runs
 from benchmarks.comparison import Row, against, digits, where
 from benchmarks.quadrotor_flights import SOLVERS
-from benchmarks.report import command, listing, machine, publish
+from benchmarks.report import listing
+from benchmarks.runner import Study
 from unifg.models import quadrotor
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.perception.belief import Belief, Landmarks
@@ -33,6 +31,7 @@ from unifg.typing import Array
 WEIGHTS = (0.01, 0.1, 1.0, 10.0)
 PULLS = (np.inf, 0.5)
 WARMING_UP = 5  # ticks whose times do not count
+SECONDS = 6.0  # of each flight
 
 
 @dataclass(frozen=True)
@@ -40,7 +39,6 @@ class Job:
     """The beginning of one flight; the fields after the first two are what is varied."""
 
     seed: int
-    seconds: float
     coupling: str = "joint"
     solver: str = "ipm"
     weight: float = 1.0
@@ -48,11 +46,11 @@ class Job:
     avoidance: Avoidance = "clearance"
 
 
-def jobs_of(seeds: Sequence[int], seconds: float) -> list[Job]:
+def jobs_of(seeds: Sequence[int]) -> list[Job]:
     """All variants on some seeds."""
     jobs = []
     for seed in seeds:
-        plain = Job(seed, seconds)
+        plain = Job(seed)
         ta = replace(plain, avoidance="potential")
         jobs += [replace(job, coupling="sequential") for job in (plain, ta)]
         jobs += [replace(plain, weight=weight, pull=pull) for pull, weight in product(PULLS, WEIGHTS)]
@@ -81,7 +79,7 @@ def fly(job: Job) -> Row:
     ticks: list[dict[str, float]] = []
     cylinders = world.layout.cylinders[:, :2]
     clearance, emergencies = np.inf, 0
-    for _ in range(round(job.seconds / dt)):
+    for _ in range(round(SECONDS / dt)):
         reading = world.sense()
         begin = time.process_time()
         plan = pilot.tick(reading, control)
@@ -109,7 +107,7 @@ def fly(job: Job) -> Row:
 
 
 def pulled(belief: Belief, alone: Belief) -> dict[str, float]:
-    """How far a belief is from what the past alone says."""
+    """Distance of a belief from the estimate of the past alone."""
     step = quadrotor.STATE.local(alone.state[None], belief.state[None])[0]
     rho, without = belief.parameters, alone.parameters
     moved = belief.landmarks.positions - alone.landmarks.positions
@@ -127,7 +125,7 @@ def pulled(belief: Belief, alone: Belief) -> dict[str, float]:
 
 
 def errors(belief: Belief, truth: Array, flight: Flight, cylinders: Array) -> dict[str, float]:
-    """How far a belief is from the truth."""
+    """Distance of a belief from the truth."""
     step = quadrotor.STATE.local(truth[None], belief.state[None])[0]
     true, found = flight.conditions.true, belief.parameters
     marks = belief.landmarks
@@ -200,7 +198,7 @@ def bound(pull: float) -> str:
     return "none" if np.isinf(pull) else f"{pull:g}"
 
 
-def render(rows: list[Row], seeds: Sequence[int], seconds: float) -> str:
+def render(rows: list[Row]) -> str:
     """Markdown of all variants."""
     plain = {"coupling": "joint", "solver": "ipm", "weight": 1.0, "pull": 0.5, "avoidance": "clearance"}
 
@@ -215,8 +213,7 @@ def render(rows: list[Row], seeds: Sequence[int], seconds: float) -> str:
     backends: Groups = {(solver,): of(solver=solver) for solver in SOLVERS}
     return "\n\n".join(
         [
-            machine("numpy", "scipy", "numba", "pymunk"),
-            f"Flights on {len(seeds)} seeds from {seeds[0]} on, the first {seconds:g} s of each.",
+            f"Flights on {len({row['seed'] for row in rows})} seeds, the first {SECONDS:g} s of each.",
             "### How far the plan pulls",
             pull_table(sweep, ["pull", "control weight"]),
             "Distance from what the past alone says: mean over ticks, in brackets the greatest of any tick.",
@@ -235,18 +232,4 @@ def render(rows: list[Row], seeds: Sequence[int], seconds: float) -> str:
     )
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Fly what is missing and rewrite docs/quadrotor-joint.md."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--seeds", type=runs.seeds, default=TUNING_SEEDS[:8], metavar="FIRST:END")
-    parser.add_argument("--seconds", type=float, default=6.0)
-    options = parser.parse_args(arguments)
-    found = runs.episodes("quadrotor_pull", fly, jobs_of(options.seeds, options.seconds), options)
-    rows = [row for row in found if row["seed"] in options.seeds and row["seconds"] == options.seconds]
-    publish("quadrotor-joint", render(rows, options.seeds, options.seconds), {row["code"] for row in rows})
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(jobs_of, fly, render, TUNING_SEEDS[:8])

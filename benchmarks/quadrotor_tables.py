@@ -10,8 +10,6 @@ from benchmarks.comparison import Read, Row, comparison, share, where
 from benchmarks.report import listing, table
 from unifg.typing import Array
 
-MEDIAN_MS, P99_MS, LEAST_TICKS = 15.0, 40.0, 5000  # limits of a tick
-SUCCEEDED = 0.95
 MASS_ERROR, COVERED = 0.01, 0.9
 EARLY = "5"  # [s]
 
@@ -42,34 +40,10 @@ HEADLINE = "ipm"
 def render(rows: Sequence[Row]) -> str:
     """Markdown of everything that was flown."""
     flown = where(rows)
-    parts = [section(flown) for section in (goals, ticks, success, failures, couplings, mass, weights)]
+    parts = [section(flown) for section in (ticks, success, failures, couplings, mass)]
     if len(flown) < len(rows):
         parts.append(f"Flights refused: {len(rows) - len(flown)}.")
     return "\n\n".join(part for part in parts if part)
-
-
-def goals(rows: Sequence[Row]) -> str:
-    """What was asked for, and what came of it."""
-    lines = []
-    for (solver, coupling), whole in _timed(rows).items():
-        median, p99, count = worst(whole)
-        text = f"median {median:.1f} ms, p99 {p99:.1f} ms, {count} ticks, worst of {len(whole)}"
-        wanted = f"median < {MEDIAN_MS:g} ms, p99 < {P99_MS:g} ms over {LEAST_TICKS} ticks"
-        kept = median < MEDIAN_MS and p99 < P99_MS and count >= LEAST_TICKS
-        lines.append([f"a tick, {solver}, {coupling}", wanted, text, _yes(kept)])
-    for (solver, coupling), chosen in _hard(rows).items():
-        good, count = sum(bool(row["metrics"]["succeeded"]) for row in chosen), len(chosen)
-        about = f"{solver}, {coupling}"
-        wanted = f"{100 * SUCCEEDED:g} % reach the target without collision"
-        lines.append([f"flights, {about}", wanted, f"{good} of {count}", _yes(good >= SUCCEEDED * count)])
-        errors, sigmas = _known(chosen, EARLY)
-        if not len(errors):
-            continue
-        error, covered = float(np.median(errors)), float((errors <= 2.0 * sigmas).mean())
-        text = f"{100 * error:.2f} %, {100 * covered:.0f} % of {len(errors)}"
-        wanted = f"median error < {100 * MASS_ERROR:g} % after 5 s, in 2 sigma in {100 * COVERED:g} %"
-        lines.append([f"mass, {about}", wanted, text, _yes(error < MASS_ERROR and covered >= COVERED)])
-    return _section("### In short", ["what", "wanted", "found", "kept"], lines, 4)
 
 
 def worst(runs: Sequence[Array]) -> tuple[float, float, int]:
@@ -79,7 +53,7 @@ def worst(runs: Sequence[Array]) -> tuple[float, float, int]:
 
 
 def _timed(rows: Sequence[Row]) -> dict[tuple[str, str], list[Array]]:
-    """By solver and coupling the times (2, n) of estimate and plan of every run [ms]."""
+    """Times (2, n) of estimate and plan of every run [ms], by solver and coupling."""
     groups: dict[tuple[str, str], dict[int, list[Array]]] = {}
     for row in where(rows, study="timing"):
         runs = groups.setdefault((row["solver"], row["coupling"]), {})
@@ -131,7 +105,7 @@ def _middle(values: list[float], places: int) -> str:
 
 
 def failures(rows: Sequence[Row]) -> str:
-    """What went wrong with hard clearance, one by one."""
+    """Failures with hard clearance, one by one."""
     lines = []
     for words, chosen in _groups(rows).items():
         if words[0].startswith("potential") or words[2] == "separate":
@@ -171,7 +145,7 @@ def couplings(rows: Sequence[Row]) -> str:
 
 
 def mass(rows: Sequence[Row]) -> str:
-    """How well the mass is known, and how well its sigma says so."""
+    """Errors of the mass, and the share within two sigmas."""
     lines = []
     for (solver, coupling), chosen in _hard(rows).items():
         for mark in sorted({mark for row in chosen for mark in row["mass"]}, key=float):
@@ -196,19 +170,6 @@ def _known(rows: Sequence[Row], mark: str) -> tuple[Array, Array]:
     return np.abs(values[:, 0]), values[:, 1]
 
 
-def weights(rows: Sequence[Row]) -> str:
-    """The joint graph under other weights of the control costs: what they do to the estimate."""
-    names = ["position error, rms [mm]", "velocity error, rms [mm/s]", "attitude error, rms [mrad]"]
-    names += ["mass error after 5 s [%]", "reached without collision [%]"]
-    lines = []
-    for weight in sorted({row["weight"] for row in where(rows, study="weights")}):
-        chosen = where(rows, study="weights", weight=weight)
-        cells = [[v for row in chosen if (v := MEASURES[name](row)) is not None] for name in names]
-        lines.append([f"{weight:g}", str(len(chosen)), *(f"{np.mean(c):.3g}" if c else "-" for c in cells)])
-    text = "### Do wishes bias the estimate?\n\nJoint coupling, all control costs times a weight."
-    return _section(text, ["weight", "flights", *names], lines, 1)
-
-
 def _groups(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:
     """Flights by study, solver and coupling, in words."""
     groups: dict[tuple[str, str, str], list[Row]] = {}
@@ -227,10 +188,6 @@ def _hard(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
 def _section(text: str, head: Sequence[str], lines: Sequence[Sequence[str]], words: int) -> str:
     """A table with what stands before it, nothing when there are no lines."""
     return f"{text}\n\n{table(head, lines, words)}" if lines else ""
-
-
-def _yes(kept: bool) -> str:
-    return "yes" if kept else "no"
 
 
 def _times(factor: float, value: float | None) -> float | None:

@@ -1,37 +1,26 @@
-"""The flights behind docs/safety.md: campaigns with an oracle, the figures of the paper, a Pareto curve, times.
+"""Flights past obstacles with a margin: campaigns with an oracle, the figures of the paper, a Pareto curve, times.
 
-    python -m benchmarks.safe_campaign [--case NAME ...] [--seeds 1:101] [--studies NAME ...] [--workers 2]
-        [--fresh] [--report] [--quick]
-
-Every flight is a line of out/benchmarks/safe_campaign.jsonl and is not flown again until the code changes
-(:mod:`benchmarks.runs`). Processor times are those of the thread that decides.
-
-The oracle (:mod:`unifg.scenarios.safety.oracle`) knows what the controller knows. It is asked when obstacles are first
-seen with their velocities, at the start and when a ball has left the hand; and where a margin was not kept, at every
-fifth tick from then on until it was lost. If it ever says "yes", to all obstacles at once, the flight counts against
-the controller: a way out that was there and was lost by the controller's own choice is no excuse.
+The study "campaign" flies random situations; the others are those of the paper's figures.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import cast
 
 import numpy as np
 
-from benchmarks import runs
-from benchmarks.comparison import Row, digits, interval
-from benchmarks.flight_floor import floor
-from benchmarks.report import CHECKOUT, command, machine, publish, table
+from benchmarks.comparison import Row, difference, where
+from benchmarks.report import table
+from benchmarks.runner import Study
 from unifg.models.quadrotor import GRAVITY
 from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
-from unifg.scenarios.safe_flight import Controller, Knowledge, SafeFlight, SafeSettings, flights, run_safe_flights
+from unifg.scenarios.safe_flight import Controller, Knowledge, SafeFlight, SafeSettings, flights
 from unifg.scenarios.safety.oracle import Answer, Authority, Threat, exists_among
 from unifg.scenarios.safety.situations import Kind
-from unifg.scenarios.show.safe_plot import picture
 from unifg.scenarios.simulation.bodies import Ellipse, Thrown
-from unifg.style.figures import write_figure
 
 VEHICLE = 5.0  # horizontal acceleration at a tilt of 27 degrees [m/s^2]
 TILT = 0.15  # time to get there [s]
@@ -111,7 +100,7 @@ def first_sight(flight: SafeFlight, log: SafeLog) -> int:
 
 
 def judged(flight: SafeFlight, log: SafeLog) -> Row:
-    """What the oracle says at first sight, and of a margin that was lost whether it ever said "yes"."""
+    """Answer of the oracle at first sight, and for a lost margin whether it ever was "yes"."""
     loops = flight.settings.books.loops
     authority = Authority(VEHICLE, 0.1, loops.delay + flight.settings.dt + TILT)
     first = first_sight(flight, log)
@@ -143,10 +132,10 @@ def fly(job: Job) -> Row:
     return row
 
 
-def jobs_of(studies: list[str], cases: list[Kind], seeds: range) -> list[Job]:
-    """What there is to fly."""
+def cells(seeds: Sequence[int]) -> list[Job]:
+    """All flights."""
     many: dict[str, list[Job]] = {
-        "campaign": [Job("campaign", case, seed=seed) for case in cases for seed in seeds],
+        "campaign": [Job("campaign", case, seed=seed) for case in RANDOM for seed in seeds],
         "static": [Job("static", "static", alpha=alpha) for alpha in (0.1, 0.3, 1.2, 3.0)],
         "ellipse": [Job("ellipse", "ellipse", gamma=gamma) for gamma in (0.0, 0.1, 0.3, 1.3)],
         "eights": [
@@ -163,12 +152,7 @@ def jobs_of(studies: list[str], cases: list[Kind], seeds: range) -> list[Job]:
         ],
         "ball": [Job("ball", "ball", alpha=3.0, speed=3.2, seed=seed) for seed in (-1, *range(1, 11))],
     }
-    return [job for study in studies for job in many[study]]
-
-
-def where(rows: list[Row], **asked: object) -> list[Row]:
-    """Rows with these fields."""
-    return [row for row in rows if all(row[key] == value for key, value in asked.items())]
+    return [job for jobs in many.values() for job in jobs]
 
 
 def times_of(rows: list[Row]) -> list[str]:
@@ -255,10 +239,8 @@ def eights(rows: list[Row]) -> str:
         if not seeds:
             continue
         apart = np.array([plans[seed] - flat[seed] for seed in seeds])
-        low, high = interval(apart) if len(seeds) > 2 else (apart.min(), apart.max())
         means = [f"{np.mean([side[seed] for seed in seeds]):.2f}" for side in (plans, flat)]
-        words = f"{digits(apart.mean(), '+')} ({digits(low, '+')} .. {digits(high, '+')})"
-        lines.append([known, f"{speed:g}", str(len(seeds)), *means, words])
+        lines.append([known, f"{speed:g}", str(len(seeds)), *means, difference(apart)])
     head = ["knowledge", "peak speed [m/s]", "seeds", "plan [mm rms]", "flatness [mm rms]", "difference, paired [mm]"]
     return table(head, lines)
 
@@ -308,17 +290,6 @@ def balls(rows: list[Row]) -> str:
     return table(["throw", "boundary [mm]", "oracle", "margin kept", "back in place"], lines)
 
 
-def draw() -> None:
-    """The figures of the page, of the flights as they are described."""
-    for case in FIGURES:
-        write_figure(CHECKOUT / "docs" / "images" / f"quadrotor-cbf-{case}.png", picture(_described(case)), 90)
-
-
-def _described(case: Kind) -> list[SafeLog]:
-    gammas = (0.0, 0.1, 1.3) if case == "ellipse" else None
-    return run_safe_flights(SafeSettings(case=case, gamma=gammas, speed=(2.0,) if case == "figure8" else None))
-
-
 def render(rows: list[Row]) -> str:
     """Markdown of all tables."""
     parts = [
@@ -327,34 +298,13 @@ def render(rows: list[Row]) -> str:
         ("Fig. 6: gamma", swept(rows, "ellipse", "gamma")),
         ("Fig. 7: times with and without barriers", barriers_cost(rows)),
         ("Fig. 10: figure eights", eights(rows)),
-        ("What noise and gusts leave of a figure eight, by the linear loop", floor()),
         ("Fig. 11 b: a ball", balls(rows)),
         ("What sight and margin cost", sight(rows)),
     ]
     workers = sorted({row["workers"] for row in rows})
     told = f"Flown {' and '.join(map(str, workers))} at a time; processor times of the thread that decides."
     text = "\n\n".join(f"### {title}\n\n{body}" for title, body in parts)
-    return f"{text}\n\n{told}\n\n{machine('unifg', 'numpy', 'piqp')}"
+    return f"{text}\n\n{told}"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Fly what is missing and rewrite the results of docs/safety.md."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--case", nargs="+", choices=RANDOM, default=list(RANDOM), metavar="NAME")
-    parser.add_argument("--seeds", type=runs.seeds, default=range(1, 101), metavar="FIRST:END")
-    parser.add_argument("--studies", nargs="+", choices=STUDIES, default=list(STUDIES), metavar="NAME")
-    parser.add_argument("--quick", action="store_true", help="two flights of each case, and no page")
-    chosen = parser.parse_args(arguments)
-    seeds = range(1, 3) if chosen.quick else chosen.seeds
-    jobs = jobs_of(["campaign"] if chosen.quick else chosen.studies, chosen.case, seeds)
-    rows = runs.episodes("safe_campaign", fly, jobs, chosen)
-    whole = not chosen.quick and set(chosen.studies) == set(STUDIES)
-    if whole and not chosen.report:
-        draw()
-    publish("safety", render(rows), {row["code"] for row in rows}, docs=whole)
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cells, fly, render, range(1, 101))

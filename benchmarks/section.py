@@ -26,12 +26,12 @@ class Section(NamedTuple):
 
 
 def goal(name: str, unit: str, value: Spread, target: float, floor: float | None = None) -> Result:
-    """What a measured value should reach (target) and must reach (floor)."""
+    """Measured value with the target it should reach and the floor it must reach."""
     return {"name": name, "unit": unit, "value": value, "target": target, "floor": floor}
 
 
 def met(goal: Result, bound: str = "target") -> bool:
-    """Whether a goal's median reaches its target or floor."""
+    """Test whether the median of a goal reaches its target or floor."""
     if goal[bound] is None:
         return True
     value = goal["value"][0]

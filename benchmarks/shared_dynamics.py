@@ -1,13 +1,10 @@
-"""What the past gains from the vehicle's dynamics, and the plan from estimated parameters, each by itself.
-
-    python -m benchmarks.shared_dynamics [--seeds 0:12] [--workers K] [--fresh] [--report]
+"""Vehicle dynamics in the past, and estimated parameters in the plan, each by itself.
 
 A quadrotor flies through unknown corridors (:mod:`benchmarks.quadrotor_flights`). Its past knows no dynamics, those
 with the parameters believed at the start, or those with mass, drag and wind as unknowns; its plan is made with the
-parameters believed at the start, or with estimates; an accelerometer is there or not, for everybody. Where a past
+parameters believed at the start, or with estimates; an accelerometer is there or not, for all of them. Where a past
 without unknowns meets a plan with estimates, a second past beside it hands on its parameters and nothing else. All
 flights of a seed meet the same corridor, parameters, disturbances and noise; intervals are bootstrapped over corridors.
-Writes docs/shared-dynamics.md.
 """
 
 from __future__ import annotations
@@ -18,9 +15,9 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks import runs
-from benchmarks.comparison import Row, digits, interval, paired, where
-from benchmarks.report import command, listing, machine, publish
+from benchmarks.comparison import Row, difference, paired, where
+from benchmarks.report import listing
+from benchmarks.runner import Study
 from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.episode import silent
@@ -163,8 +160,7 @@ def mean(name: str, some: Sequence[Row]) -> str:
 def change(name: str, pair: tuple[Sequence[Row], Sequence[Row]]) -> str:
     """Mean of the paired differences of a measure, and its interval."""
     old, new = paired(*pair, lambda row: float(row[name]))
-    low, high = interval(new - old)
-    return f"{digits(float(np.mean(new - old)), '+')} ({digits(low, '+')} .. {digits(high, '+')})"
+    return difference(new - old)
 
 
 def render(rows: Sequence[Row]) -> str:
@@ -190,7 +186,6 @@ def render(rows: Sequence[Row]) -> str:
         head: partial(change, name) for head, name in MEASURES.items()
     }
     parts = [
-        machine("numpy", "scipy", "numba", "pymunk"),
         "### The combinations",
         "Errors are root mean squares over a flight; everything is the mean over flights.",
         listing(["accelerometer", "dynamics of the past", "parameters of the plan"], levels, told),
@@ -201,22 +196,13 @@ def render(rows: Sequence[Row]) -> str:
     return "\n\n".join(parts)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Fly what is missing and rewrite docs/shared-dynamics.md."""
-    parser = command(__doc__)
-    runs.options(parser)
-    parser.add_argument("--seeds", type=runs.seeds, default=range(12), metavar="FIRST:END")
-    options = parser.parse_args(arguments)
-    jobs = [
+def cells(seeds: Sequence[int]) -> list[Job]:
+    """Every combination on every seed."""
+    return [
         Job(seed, past, plan, accelerometer)
-        for seed in options.seeds for accelerometer in (False, True) for past in PASTS for plan in PLANS
+        for seed in seeds for accelerometer in (False, True) for past in PASTS for plan in PLANS
         if past != "none" or plan == "nominal"
     ]  # fmt: skip
-    rows = runs.episodes("shared_dynamics", fly, jobs, options)
-    asked = [row for row in rows if row["seed"] in options.seeds]
-    publish("shared-dynamics", render(asked), {row["code"] for row in asked})
-    return 0
 
 
-if __name__ == "__main__":
-    raise SystemExit(main())
+STUDY = Study(cells, fly, render, range(12))

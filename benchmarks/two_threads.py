@@ -1,8 +1,8 @@
-"""What two threads gain: that share the work of one solve (`fg.use_threads`), and that solve two graphs, one each.
+"""Gain of two threads that share one solve (`fg.use_threads`), or that solve two graphs, one each.
 
 Wall time of one thread over that of two. Nothing is gained on a machine whose two cores have other work, and a second
 core that has rested needs some tenths of a second, so that everything is repeated for a while before it counts. Of each
-turn the fastest repetition counts, on both sides: what else a shared machine does only makes things slower.
+turn the fastest repetition counts, on both sides: other work of a shared machine only makes things slower.
 """
 
 from __future__ import annotations
@@ -18,18 +18,15 @@ import unifg as fg
 from benchmarks.pose_graphs import Case, cases
 from benchmarks.report import listing
 from benchmarks.section import Result, goal
-from benchmarks.timing import all_cores, interleave, milliseconds, shown, spread
+from benchmarks.timing import all_cores, interleave, milliseconds, ratio, shown
 from unifg.elimination.factorization import Factorization
-from unifg.elimination.fronts import BLOCK, WIDE
-from unifg.elimination.plan import PIVOTS, ROWS, Plan
-from unifg.elimination.subtrees import PARTS, WORTH
+from unifg.elimination.subtrees import WORTH
 from unifg.lie import SE3
 from unifg.pose_graphs import sphere
 from unifg.solvers import GaussNewton
 
 ROUNDS = 7  # at most
 BEFORE, WHILE = 0.3, 0.2  # how long something is repeated before it counts, and while it does [s]
-CORES = 2, 4, 8
 WANTED = 1.6  # times, of graphs in space
 PIECES = {"linearise": "linearise", "eliminate": "eliminate", "substitute": "substitute", "solve": "whole solve"}
 
@@ -50,7 +47,7 @@ def measure(rounds: int, small: bool = False) -> Result:
 
 
 def large() -> Case:
-    """What threads are for."""
+    """Pose graph large enough for threads."""
     ball = sphere(100, 100, seed=0)
     return Case("sphere 10000", ball.pose_graph.with_poses(ball.truth), np.nan, 2.0, 1.5)
 
@@ -91,14 +88,12 @@ def measure_case(case: Case, rounds: int, before: float, during: float) -> Resul
         rounds,
         warm=0,
     )  # fmt: skip
-    plan = graph.compile().systems.normal().plan
     return {
         "graph": case.name,
         "space": case.pose_graph.group is SE3,
         "alone": {name: milliseconds(times[f"{name} 1"]) for name in pieces},
-        "ratio": {name: spread(times[f"{name} 1"] / times[f"{name} 2"]) for name in pieces},
-        "apart": spread(2.0 * times["solve 1"] / times["apart"]),
-        "cores": [speedup(plan, cores) for cores in CORES] if len(plan.part) else None,
+        "ratio": {name: ratio(times[f"{name} 1"], times[f"{name} 2"]) for name in pieces},
+        "apart": ratio(2.0 * times["solve 1"], times["apart"]),
     }
 
 
@@ -113,25 +108,6 @@ def steady(action: Callable[[], object], before: float, during: float) -> float:
     return min(times)
 
 
-def speedup(plan: Plan, cores: int) -> float:
-    """How many times faster so many cores eliminate, if multiplications were all there is."""
-    alone = shared = 0.0
-    load = np.zeros(cores)
-    parts = np.zeros(PARTS)
-    for part, pivots, rows in zip(plan.part, plan.fronts[:-1, PIVOTS], plan.fronts[:-1, ROWS], strict=True):
-        size = pivots + rows
-        work = 0.5 * float(np.square(size - np.arange(pivots)).sum())
-        corners = work if size <= WIDE else pivots * BLOCK**2 / 6.0  # what one core does while the others wait
-        alone += work
-        if part < PARTS:
-            parts[part] += work
-        else:
-            shared += corners + (work - corners) / cores
-    for work in parts:  # each by the core that is free first
-        load[np.argmin(load)] += work
-    return float(alone / (load.max() + shared))
-
-
 def _gain(name: str) -> Callable[[Result], str]:
     return lambda row: shown(row["ratio"][name])
 
@@ -139,9 +115,6 @@ def _gain(name: str) -> Callable[[Result], str]:
 COLUMNS: dict[str, Callable[[Result], str]] = {
     "whole solve by one thread [ms]": lambda row: shown(row["alone"]["solve"]),
     **{f"{title}, times faster": _gain(name) for name, title in PIECES.items()},
-    f"eliminate on {CORES[0]} / {CORES[1]} / {CORES[2]} cores, by its multiplications": lambda row: (
-        " / ".join(f"{times:.1f}" for times in row["cores"]) if row["cores"] else "too small to be shared"
-    ),
     "two graphs in two threads, times faster": lambda row: shown(row["apart"]),
 }
 
@@ -150,9 +123,7 @@ def render(result: Result) -> str:
     """A table, and what its columns are."""
     text = (
         "Wall time of one thread over that of two on two cores, `fg.use_threads(2)`, of the fastest repetition of each "
-        "turn. What more cores would gain is counted, not measured: every part "
-        "of the elimination tree by the core that is free first, then the fronts "
-        "above them one by one, of which diagonal blocks are one core's work. An elimination of fewer than "
+        "turn. An elimination of fewer than "
         f"{WORTH / 1e6:.0f} million multiplications is not shared out. The last column: two graphs stated apart, each "
         f"solved by a thread of its own, against one after the other. {result['rounds']} rounds."
     )

@@ -1,11 +1,11 @@
 """Build what is released, twice, and try it where nothing else is: `make release-build`, part of `make release-check`.
 
 Both builds begin with a copy of what git tracks and end in dist/: a wheel, and an sdist whose times, owners and order
-are made the same. They have to be equal to the last bit, within the size that docs/releases.md allows. Then, with every
-Python that the classifiers name and this machine has, the wheel has to solve and answer `unifg doctor` in an
-environment of its own, and with its extras pass the tests of `TESTS`, drive, and solve a file, in a folder without
-sources: with the newest of all packages, and with the lowest where these have wheels for that Python, as they must for
-the oldest. What could not be tried is said.
+are made the same. They have to be equal to the last bit, within the size that the page of releases allows.
+Then, with every Python that the classifiers name and this machine has, the wheel has to solve and answer
+`unifg doctor` in an environment of its own, and with its extras pass the tests of `TESTS`, drive, and solve a file,
+in a folder without sources: with the newest of all packages, and with the lowest where these have wheels for that
+Python, as they must for the oldest. What could not be tried is said.
 
 `--no-install` builds only, for the rest fetches packages; `--python 3.12` (repeated) chooses among the Pythons;
 `--newest` leaves the lowest packages out, `--lowest` the newest.
@@ -198,20 +198,20 @@ def evened(archive: bytes, epoch: int) -> bytes:
 
 
 def too_large(sizes: dict[str, int]) -> Iterator[str]:
-    """Messages on files, by name, that have more bytes than docs/releases.md allows."""
+    """Messages on files, by name, that have more bytes than docs/reference/releases.md allows."""
     for name, size in sizes.items():
         kind = "wheel" if name.endswith(".whl") else "sdist"
         if size > 1e6 * allowed(kind):
-            yield f"{name} has {size / 1e6:.1f} MB, more than the {allowed(kind):g} MB that docs/releases.md allows"
+            yield f"{name} has {size / 1e6:.1f} MB, more than the {allowed(kind):g} MB that the page of releases allows"
 
 
 def allowed(kind: str) -> float:
-    """Megabytes that docs/releases.md allows."""
+    """Megabytes that docs/reference/releases.md allows."""
     found = re.search(
-        rf"^\| {kind} \| (\d+) MB \|$", (CHECKOUT / "docs" / "releases.md").read_text(), flags=re.MULTILINE
+        rf"^\| {kind} \| (\d+) MB \|$", (CHECKOUT / "docs/reference/releases.md").read_text(), flags=re.MULTILINE
     )
     if found is None:
-        raise SystemExit(f"docs/releases.md does not say how large a {kind} may be")
+        raise SystemExit(f"docs/reference/releases.md does not say how large a {kind} may be")
     return float(found[1])
 
 

@@ -1,7 +1,7 @@
 """A backend of your own for equality constraints: Newton's method on the KKT conditions, by SciPy's sparse LU.
 
 A backend sees the compiled program: residuals, Jacobians, limits, and where to put a step. It hands iterates with their
-multipliers to run.accept, which measures the KKT conditions and alone says CONVERGED (docs/own-backend.md).
+multipliers to run.accept, which measures the KKT conditions and alone says CONVERGED (docs/howto/own-backend.md).
 
     python examples/own_backend_constrained.py [FOLDER]
 """

@@ -21,80 +21,59 @@ where it was; "aside" pushes all its poses to the side on which they are.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import partial
 from typing import Literal, TypeAlias
+
+import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
-from unifg.factors.residuals import Residual, residual
-from unifg.models.profile import first_order, of_distance
+from unifg.factors.residuals import Residual
+from unifg.models.profile import of_distance
 from unifg.typing import Array
 
 SCALE = 0.075  # [m], the paper's k
 NEAR = 0.05  # [m], its mu
 FAR = 0.8  # [m], its rho
 TINY = 1e-300
-NUMBERS = 5  # that stand in front of the table of a distance
 
 Sense: TypeAlias = Literal["circulate", "aside"]
 
 
 @compiled
-def _repulsion(d: float, numbers: Array) -> tuple[float, float, float]:
-    """Return g and its slope; the numbers are scale, near, far, vortex and whether it turns aside."""
+def _repulsion(d: float, numbers: Array) -> tuple[float, float]:
+    """Return g and its slope; the numbers are scale, near and far."""
     scale, near, far = numbers[0], numbers[1], numbers[2]
     slope = -scale / (d * d) if near < d < far else 0.0
     if d < near:
         d = near
     if d > far:
         d = far
-    return scale * (1.0 / d - 1.0 / far), slope, 0.0
+    return scale * (1.0 / d - 1.0 / far), slope
 
 
-@compiled
-def _steer(J: Array, vortex: float, aside: float) -> None:
-    """Add to derivatives along a pose, (m, 3), a multiple of the same turned a quarter to the left in the plane."""
-    for a in range(len(J)):
-        # Components along and across the body: a quarter turn there is a quarter turn in the world.
-        along, across, weight = J[a, 0], J[a, 1], vortex
-        if aside != 0.0:
-            # The tangential part of a push, as strong as the repulsion, across the body and away.
-            side = -1.0 if across > 0.0 else 1.0
-            weight = -vortex * side * along / max(math.sqrt(along * along + across * across), TINY)
-        J[a, 0] -= weight * across
-        J[a, 1] += weight * along
-
-
-@cache
-def _steered(distance: Callable[..., None]) -> Callable[..., None]:
-    """Write g and what to search with."""
-    repel = first_order(distance, _repulsion, NUMBERS)
-
-    @compiled
-    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-        repel(v, p, table, r, J)
-        if len(J):
-            _steer(J, table[3], table[4])
-
-    return kernel
+def _push(scale: float, near: float, far: float, d: Array) -> Array:
+    g: Array = scale * (1.0 / np.clip(d, near, far) - 1.0 / far)
+    return g
 
 
 class _Search:
-    """Search for a distance without a kernel."""
+    """Derivatives along a pose, (n, m, 3), plus a multiple of the same turned a quarter to the left in the plane."""
 
-    def __init__(self, true: Residual, vortex: float, aside: float) -> None:
+    def __init__(self, true: Residual, vortex: float, aside: bool) -> None:
         self.true, self.vortex, self.aside = true, vortex, aside
 
     def __call__(self, *arguments: Array) -> list[Array]:
         assert self.true.jacobian is not None
         pose, *rest = self.true.jacobian(*arguments)
-        pose = pose.copy()
-        for block in pose:
-            _steer(block, self.vortex, self.aside)
-        return [pose, *rest]
+        # Components along and across the body: a quarter turn there is a quarter turn in the world.
+        along, across, weight = pose[:, :, 0], pose[:, :, 1], np.full(pose.shape[:2], self.vortex)
+        if self.aside:
+            # The tangential part of a push, as strong as the repulsion, across the body and away.
+            side = np.where(across > 0.0, -1.0, 1.0)
+            weight = -self.vortex * side * along / np.maximum(np.hypot(along, across), TINY)
+        return [np.stack([along - weight * across, across + weight * along, pose[:, :, 2]], axis=2), *rest]
 
 
 def potential(
@@ -132,10 +111,6 @@ def potential(
         raise ModelError(
             f"potential: sense must be 'circulate', or 'aside' with a positive vortex; found {sense!r}, {vortex}"
         )
-    aside = float(sense == "aside")
-    true = of_distance(distance, _repulsion, [scale, near, far, vortex, aside], f"{distance.name} potential")
-    if vortex == 0.0:
-        return true
-    if distance.kernel is not None and true.kernel is not None:
-        return residual(true.kernel, search=replace(true.kernel, function=_steered(distance.kernel.function)))
-    return residual(true.function, true.jacobian, true.name, _Search(true, vortex, aside))
+    push, name = partial(_push, scale, near, far), f"{distance.name} potential"
+    true = of_distance(distance, _repulsion, [scale, near, far], name, push)
+    return true if vortex == 0.0 else replace(true, search=_Search(true, vortex, sense == "aside"))

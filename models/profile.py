@@ -1,24 +1,42 @@
 """Profiles of soft margins and potentials: scalar functions of a distance, row by row.
 
-With r = g(d) the Jacobian is g' times that of the distance, and the Hessian of w' r is that of the distance under the
-weights w g', and g'' times its gradients. A profile is compiled: ``profile(d, numbers)`` returns g, g' and g''.
+Of a distance that is a plain function, the profile is one, too, and derivatives are derived. Of one that is compiled
+by hand, as those that look up a map, it is compiled: ``profile(d, numbers)`` returns g and g', and with
+r = g(d) the Jacobian is g' times that of the distance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import TypeAlias
 
 import numpy as np
 
 from unifg.codegen.calls import vector
 from unifg.codegen.jit import compiled
+from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual, residual
 from unifg.typing import Array
 
-Profile: TypeAlias = Callable[[float, Array], tuple[float, float, float]]
+Profile: TypeAlias = Callable[[float, Array], tuple[float, float]]
+
+
+def plain(distance: Residual, profile: Callable[[Array], Array], name: str) -> Residual | None:
+    """``profile(distance(...))``, same shape, of a distance that is a plain function; None for others."""
+    kernel = distance.kernel
+    function = kernel.function if isinstance(kernel, StatedKernel) else distance.function
+    if not isinstance(kernel, StatedKernel) and (kernel is not None or distance.jacobian or distance.rows):
+        return None
+    composed = partial(_composed, profile, function)
+    if kernel is None:
+        return residual(composed, name=name)
+    return residual(replace(kernel, function=composed, name=name, linear=False, second=None))
+
+
+def _composed(profile: Callable[[Array], Array], function: Callable[..., Array], *arguments: Array) -> Array:
+    return profile(function(*arguments))
 
 
 @cache
@@ -29,7 +47,7 @@ def first_order(distance: Callable[..., None], profile: Profile, count: int) -> 
     def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
         distance(v, p, vector(table, count, len(table) - count), r, J)
         for a in range(len(r)):
-            value, slope, _ = profile(r[a], table)
+            value, slope = profile(r[a], table)
             r[a] = value
             if len(J):
                 for d in range(J.shape[1]):
@@ -39,44 +57,17 @@ def first_order(distance: Callable[..., None], profile: Profile, count: int) -> 
 
 
 @cache
-def _second_order(
-    distance: Callable[..., None], second: Callable[..., None], profile: Profile, count: int
-) -> Callable[..., None]:
-    """Write the Hessian of w' g."""
-
-    @compiled
-    def kernel(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
-        rows, width = len(w), len(S)
-        rest = vector(table, count, len(table) - count)
-        reached, slopes, gradient = np.empty(rows), np.empty(rows), np.empty((rows, width))
-        distance(v, p, rest, reached, gradient)
-        for a in range(rows):
-            _, slope, _ = profile(reached[a], table)
-            slopes[a] = w[a] * slope
-        second(v, p, rest, slopes, S)
-        for a in range(rows):
-            _, _, curvature = profile(reached[a], table)
-            for i in range(width):
-                pull = w[a] * curvature * gradient[a, i]
-                if pull != 0.0:
-                    for k in range(width):
-                        S[i, k] += pull * gradient[a, k]
-
-    return kernel
-
-
-@cache
 def _loop(profile: Profile) -> Callable[..., None]:
     @compiled
     def loop(distance: Array, numbers: Array, value: Array, slope: Array) -> None:
         for i in range(len(distance)):
-            value[i], slope[i], _ = profile(distance[i], numbers)
+            value[i], slope[i] = profile(distance[i], numbers)
 
     return loop
 
 
 class _Batched:
-    """The same for a distance without a kernel."""
+    """The same for a distance without a kernel whose Jacobian is attached."""
 
     def __init__(self, distance: Residual, profile: Profile, numbers: Array) -> None:
         self.distance, self.profile, self.numbers = distance, profile, numbers
@@ -97,24 +88,25 @@ class _Batched:
         return [slope[:, :, None] * block for block in self.distance.jacobian(*arguments)]
 
 
-def of_distance(distance: Residual, profile: Profile, numbers: list[float], name: str, twice: bool = False) -> Residual:
+def of_distance(
+    distance: Residual, profile: Profile, numbers: list[float], name: str, function: Callable[[Array], Array]
+) -> Residual:
     """``g(distance(...))``, same shape.
 
     Args:
-        distance: with a Jacobian attached [m].
-        profile: g.
+        distance: with a Jacobian, attached or derived [m].
+        profile: g, compiled.
         numbers: that it reads.
         name: of the residual.
-        twice: whether g is twice differentiable; the distance then has to be compiled, with a second derivative.
+        function: g, plain.
     """
+    made = plain(distance, function, name)
+    if made is not None:
+        return made
     first, kernel = np.array(numbers, dtype=np.float64), distance.kernel
     if kernel is None:
-        function = _Batched(distance, profile, first)
-        return residual(function, function.jacobian, name)
-    second = None
-    if twice:
-        assert kernel.second is not None
-        second = _second_order(kernel.function, kernel.second, profile, len(first))
-    made = first_order(kernel.function, profile, len(first))
+        batched = _Batched(distance, profile, first)
+        return residual(batched, batched.jacobian, name)
     table = np.concatenate([first, kernel.table])
-    return residual(replace(kernel, function=made, table=table, name=name, linear=False, second=second))
+    composed = first_order(kernel.function, profile, len(first))
+    return residual(replace(kernel, function=composed, table=table, name=name, linear=False))

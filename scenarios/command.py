@@ -18,15 +18,16 @@ import shlex
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from unifg import __version__
+from unifg.codegen import precompiled
 from unifg.errors import UnifgError
 from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
@@ -39,6 +40,32 @@ SUCCEEDED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 
 _PAIRED_OPTIONS = ("--start", "--goal", "--force-bounds")
 _NEGATIVE = re.compile(r"-[\d.]")
+
+
+@dataclass(frozen=True)
+class Command:
+    """Entry of `COMMANDS`.
+
+    Attributes:
+        does: takes what the parser found and returns the exit status.
+        summary: a few words for the list of commands.
+        about: a sentence for its own help.
+        arguments: names and options of each, as for `argparse.ArgumentParser.add_argument`.
+        exclusive: of these arguments at most one may be given.
+    """
+
+    does: Callable[[argparse.Namespace], int]
+    summary: str
+    about: str
+    arguments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    exclusive: tuple[str, ...] = ()
+
+    def add(self, parser: argparse.ArgumentParser) -> None:
+        """Add the arguments."""
+        group = parser.add_mutually_exclusive_group()
+        for name, options in self.arguments.items():
+            (group if name in self.exclusive else parser).add_argument(name, **options)
+        parser.set_defaults(does=self.does)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -54,21 +81,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _refuse(f"scenarios need {error.name}: pip install 'unifg[scenarios]'")
     except SystemExit as stop:  # argparse has said what is wrong, or has printed help
         return stop.code if isinstance(stop.code, int) else REFUSED
-    does = {
-        "warmup": _warm_up, "campaign": _campaign, "report": _report, "replay": _replay, "doctor": _doctor,
-        "bench": _bench, "mcap": _mcap,
-    }  # fmt: skip
     try:
-        return does.get(chosen.name, _run)(chosen)
+        does: Callable[[argparse.Namespace], int] = chosen.does
+        return does(chosen)
     except UnifgError as error:
         return _refuse(str(error))
+    except OSError as error:
+        return _refuse(f"{error.filename}: cannot be written ({error.strerror})")
     except KeyboardInterrupt:
         print("unifg: interrupted before there was anything to write", file=sys.stderr)
         return INTERRUPTED
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
-    """The parser of the command line; only the scenario named by the words has its options."""
+    """Parser of the command line; only the scenario named by the words has its options."""
     parser = argparse.ArgumentParser(
         prog="unifg", description="Robot estimation and control as one factor graph.", allow_abbrev=False
     )
@@ -78,84 +104,16 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     scenarios = run.add_subparsers(title="scenarios", required=True, metavar="SCENARIO")
     for name, scenario in SCENARIOS.items():
         one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary, allow_abbrev=False)
-        one.set_defaults(name=name)
+        one.set_defaults(name=name, does=_run)
         if list(words[:2]) == ["run", name]:
             scenario.add_options(one)
     solve = commands.add_parser("solve", help="solve a pose graph", description=SOLVE.summary, allow_abbrev=False)
-    solve.set_defaults(name="solve")
+    solve.set_defaults(name="solve", does=_run)
     if list(words[:1]) == ["solve"]:
         SOLVE.add_options(solve)
-    about = "Compile, once for all programs to come, what the library and its scenarios can reach."
-    warm = commands.add_parser("warmup", help="compile everything beforehand", description=about, allow_abbrev=False)
-    warm.set_defaults(name="warmup")
-    other = warm.add_mutually_exclusive_group()
-    other.add_argument("--ship", action="store_true", help="write the half compiled kernels that come with unifg anew")
-    other.add_argument("--check", action="store_true", help="say whether these are out of date; compile nothing")
-    if list(words[:1]) == ["warmup"]:
-        warm.set_defaults(module=import_module("unifg.scenarios.commands.warm"))
-    _add_examinations(commands)
-    _add_campaigns(commands)
-    about = "Write the log of a drive, drive.npz, as messages that Foxglove, PlotJuggler and mcap's tools play."
-    played = commands.add_parser("mcap", help="a drive for other tools", description=about, allow_abbrev=False)
-    played.set_defaults(name="mcap")
-    played.add_argument("folder", type=Path, metavar="DIR", help="results of unifg run navigation, or the log itself")
-    played.add_argument("--out", type=Path, metavar="FILE", help="to write (default: drive.mcap beside the log)")
+    for name, entry in COMMANDS.items():
+        entry.add(commands.add_parser(name, help=entry.summary, description=entry.about, allow_abbrev=False))
     return parser
-
-
-def _add_examinations(commands: Any) -> None:
-    """Whether all is well, and how fast."""
-    about = "Say whether all is well: versions, caches, threads, every backend on a problem with a known answer."
-    well = commands.add_parser("doctor", help="whether all is well", description=about, allow_abbrev=False)
-    well.set_defaults(name="doctor")
-    about = "Time what the library does beside a reference, and compare the ratios with a record."
-    fast = commands.add_parser("bench", help="how fast it is here", description=about, allow_abbrev=False)
-    fast.set_defaults(name="bench")
-    fast.add_argument("--quick", action="store_true", help="fewer rounds: less than a minute")
-    fast.add_argument("--against", type=Path, metavar="FILE", help="records to compare with (default: those of unifg)")
-    fast.add_argument("--record", type=Path, metavar="FILE", help="append what is measured to this file")
-    fast.add_argument(
-        "--strict", action="store_true", help="fail if a case is slower than the last record of such a machine"
-    )
-
-
-def _add_campaigns(commands: Any) -> None:
-    """Campaigns, what they say, and one of their episodes again."""
-    about = (
-        "Run every episode of a campaign that is not on file: a scenario, settings, seeds, as a TOML file states them."
-    )
-    many = commands.add_parser("campaign", help="run many episodes", description=about, allow_abbrev=False)
-    many.set_defaults(name="campaign")
-    many.add_argument("file", type=Path, metavar="FILE.toml", help="what to run")
-    many.add_argument("--out", type=Path, metavar="DIR", help="folder for results (default: out/campaigns/FILE)")
-    where = many.add_mutually_exclusive_group()
-    where.add_argument(
-        "--workers",
-        type=partial(count, least=1),
-        default=1,
-        metavar="N",
-        help="processes, one thread each (default: 1)",
-    )
-    where.add_argument(
-        "--scheduler", metavar="ADDRESS", help="of a dask.distributed cluster, such as tcp://10.0.0.1:8786"
-    )
-    many.add_argument("--again", action="store_true", help="repeat episodes that ended in an error or were lost")
-    many.add_argument("--any-code", action="store_true", help="keep episodes that other states of the code have run")
-    about = "Write tables and pictures of a campaign, finished or not, as report.html and report.md in its folder."
-    said = commands.add_parser("report", help="what a campaign says", description=about, allow_abbrev=False)
-    said.set_defaults(name="report")
-    said.add_argument("folder", type=Path, metavar="DIR", help="of the campaign")
-    said.add_argument("--against", type=Path, metavar="DIR2", help="compare with the same episodes of another campaign")
-    said.add_argument(
-        "--any-code", action="store_true", help="episodes that other states of the code have run count, too"
-    )
-    about = "Run one episode of a campaign again, with scene, pictures and metrics."
-    one = commands.add_parser("replay", help="an episode again", description=about, allow_abbrev=False)
-    one.set_defaults(name="replay")
-    one.add_argument("folder", type=Path, metavar="DIR", help="of the campaign")
-    one.add_argument("key", metavar="KEY", help="of the episode, as the report names it")
-    one.add_argument("--out", type=Path, metavar="DIR2", help="folder for results (default: DIR/replay/KEY)")
-    one.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
 
 
 def _campaign(chosen: argparse.Namespace) -> int:
@@ -181,11 +139,7 @@ def _report(chosen: argparse.Namespace) -> int:
     """Write what a campaign says."""
     from unifg.scenarios.campaigns.account import write_report
 
-    try:
-        files = write_report(chosen.folder, chosen.against, chosen.any_code)
-    except OSError as error:
-        return _refuse(f"{chosen.folder}: cannot write the report ({error})")
-    for file in files:
+    for file in write_report(chosen.folder, chosen.against, chosen.any_code):
         print(file)
     return SUCCEEDED
 
@@ -211,30 +165,30 @@ def _mcap(chosen: argparse.Namespace) -> int:
         write_mcap(out, log)
     except ImportError as error:
         return _refuse(str(error))
-    except OSError as error:
-        return _refuse(f"--out {out}: cannot write it ({error.strerror})")
     print(legible(out))
     return SUCCEEDED
 
 
 def _warm_up(chosen: argparse.Namespace) -> int:
-    """Compile everything, and say how much there was to do."""
+    """Compile everything, and print how much there was to do."""
+    from unifg.scenarios.commands import warm
+
     if chosen.check:
-        changed = chosen.module.outdated()
-        if changed:
+        if changed := precompiled.outdated():
             print("out of date: " + ", ".join(changed) + "; write it anew with `unifg warmup --ship`")
         return FAILED if changed else SUCCEEDED
     began = time.perf_counter()
     with _progress_bar("warmup") as progress:
-        done = chosen.module.ship(progress) if chosen.ship else chosen.module.run(progress)
-    if chosen.ship:
-        print(f"{done}: {done.stat().st_size / 1e6:.1f} MB")
-    else:
-        parts = (len(done.compiled), "compiled"), (len(done.generated), "generated"), (len(done.read), "read")
-        text = ", ".join(f"{count} functions {what}" for count, what in parts if count)
-        print(f"{text or 'everything is there: found'} in {time.perf_counter() - began:.1f} s")
-        if lacking := chosen.module.missing():
-            print(f"scenarios are left out, they need {lacking}: pip install 'unifg[scenarios]'")
+        if chosen.ship:
+            archive = warm.ship(progress)
+            print(f"{archive}: {archive.stat().st_size / 1e6:.1f} MB")
+            return SUCCEEDED
+        done = warm.run(progress)
+    parts = (len(done.compiled), "compiled"), (len(done.generated), "generated"), (len(done.read), "read")
+    text = ", ".join(f"{count} functions {what}" for count, what in parts if count)
+    print(f"{text or 'everything is there: found'} in {time.perf_counter() - began:.1f} s")
+    if lacking := warm.missing():
+        print(f"scenarios are left out, they need {lacking}: pip install 'unifg[scenarios]'")
     return SUCCEEDED
 
 
@@ -244,7 +198,7 @@ def _doctor(chosen: argparse.Namespace) -> int:
 
     with _progress_bar("doctor") as progress:
         findings = list(doctor.examined(progress))
-    print(doctor.told(findings))
+    print(doctor.report(findings))
     return FAILED if any(finding.good is False for finding in findings) else SUCCEEDED
 
 
@@ -257,14 +211,14 @@ def _bench(chosen: argparse.Namespace) -> int:
         now = performance.measured(performance.QUICK if chosen.quick else performance.LONG, progress)
     alike = performance.last(records, now.machine)
     then = alike or performance.last(records)
-    rows = performance.compared(now, then) if then is not None else []
-    print(performance.told(now, rows))
+    rows = performance.compared(now, then) if then is not None else {}
+    print(performance.report(now, rows))
     if then is not None:
-        other = "" if alike else f"; another machine ({then.machine}), so factors say little"
+        other = "" if alike else f"; another machine ({then.machine}), so factors mean little"
         print(f"\nmachine: {now.machine}\nrecord: unifg {then.version}, {then.when}{other}")
     if chosen.record is not None:
         performance.append(chosen.record, now)
-    slower = [row.name for row in rows if row.slower] if alike else []
+    slower = [name for name, row in rows.items() if row.slower] if alike else []
     if slower:
         print(f"slower by more than {100 * (performance.SLOWER - 1):.0f} %: {', '.join(slower)}")
     return FAILED if slower and chosen.strict else SUCCEEDED
@@ -287,7 +241,7 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
         outcome: Outcome = module.run(settings, progress, **watched)
         try:
-            # whole, whoever asks for an end meanwhile
+            # each file is written whole, also after a signal
             files = outcome.write(folder)
         except OSError as error:
             return _refuse(f"--out {folder}: cannot write the results ({error})")
@@ -346,7 +300,7 @@ def _progress_bar(name: str, begun: bool = False) -> Iterator[Progress]:
 
 @contextmanager
 def _bar(name: str) -> Iterator[Progress]:
-    """What is told how far a run has come; nothing is drawn where tqdm is not installed."""
+    """Progress bar; nothing is drawn where tqdm is not installed."""
     try:
         from tqdm import tqdm
     except ImportError:
@@ -381,6 +335,83 @@ def _join_negative(arguments: list[str]) -> list[str]:
         else:
             joined.append(argument)
     return joined
+
+
+_ANY_CODE = {"action": "store_true", "help": "episodes that other states of the code have run count, too"}
+_LIVE = {"action": "store_true", "help": "show it in a browser while it runs; says where"}
+
+COMMANDS = {
+    "warmup": Command(
+        _warm_up, "compile everything beforehand",
+        "Compile, once for all programs to come, what the library and its scenarios can reach.",
+        {
+            "--ship": {"action": "store_true", "help": "write the half compiled kernels that come with unifg anew"},
+            "--check": {"action": "store_true", "help": "say whether these are out of date; compile nothing"},
+        },
+        ("--ship", "--check"),
+    ),
+    "doctor": Command(
+        _doctor, "whether all is well",
+        "Say whether all is well: versions, caches, threads, every backend on a problem with a known answer.",
+    ),
+    "bench": Command(
+        _bench, "how fast it is here",
+        "Time what the library does beside a reference, and compare the ratios with a record.",
+        {
+            "--quick": {"action": "store_true", "help": "fewer rounds: less than a minute"},
+            "--against": {"type": Path, "metavar": "FILE", "help": "records to compare with (default: those of unifg)"},
+            "--record": {"type": Path, "metavar": "FILE", "help": "append what is measured to this file"},
+            "--strict": {"action": "store_true", "help": "fail if a case is slower than its last record"},
+        },
+    ),
+    "campaign": Command(
+        _campaign, "run many episodes",
+        "Run every episode of a campaign that is not on file: a scenario, settings, seeds, as a TOML file states them.",
+        {
+            "file": {"type": Path, "metavar": "FILE.toml", "help": "what to run"},
+            "--out": {"type": Path, "metavar": "DIR", "help": "folder for results (default: out/campaigns/FILE)"},
+            "--workers": {
+                "type": partial(count, least=1), "default": 1, "metavar": "N",
+                "help": "processes, one thread each (default: 1)",
+            },
+            "--scheduler": {
+                "metavar": "ADDRESS", "help": "of a dask.distributed cluster, such as tcp://10.0.0.1:8786",
+            },
+            "--again": {"action": "store_true", "help": "repeat episodes that ended in an error or were lost"},
+            "--any-code": {"action": "store_true", "help": "keep episodes that other states of the code have run"},
+        },
+        ("--workers", "--scheduler"),
+    ),
+    "report": Command(
+        _report, "what a campaign says",
+        "Write tables and pictures of a campaign, finished or not, as report.html and report.md in its folder.",
+        {
+            "folder": {"type": Path, "metavar": "DIR", "help": "of the campaign"},
+            "--against": {
+                "type": Path, "metavar": "DIR2", "help": "compare with the same episodes of another campaign",
+            },
+            "--any-code": _ANY_CODE,
+        },
+    ),
+    "replay": Command(
+        _replay, "an episode again", "Run one episode of a campaign again, with scene, pictures and metrics.",
+        {
+            "folder": {"type": Path, "metavar": "DIR", "help": "of the campaign"},
+            "key": {"metavar": "KEY", "help": "of the episode, as the report names it"},
+            "--out": {"type": Path, "metavar": "DIR2", "help": "folder for results (default: DIR/replay/KEY)"},
+            "--live": _LIVE,
+        },
+    ),
+    "mcap": Command(
+        _mcap, "a drive for other tools",
+        "Write the log of a drive, drive.npz, as messages that Foxglove, PlotJuggler and mcap's tools play.",
+        {
+            "folder": {"type": Path, "metavar": "DIR", "help": "results of unifg run navigation, or the log itself"},
+            "--out": {"type": Path, "metavar": "FILE", "help": "to write (default: drive.mcap beside the log)"},
+        },
+    ),
+}  # fmt: skip
+"""Everything beside ``unifg run`` and ``unifg solve``."""
 
 
 if __name__ == "__main__":

@@ -10,27 +10,31 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import inspect
+import math
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from unifg.files.contents import legible
 
 __all__ = [
+    "Leaf",
     "Option",
     "Text",
     "add_options",
     "count",
     "existing",
+    "leaves",
     "not_negative",
     "option",
     "pair",
     "plain",
     "pose",
     "positive",
+    "replaced",
     "settings_of",
     "share",
 ]
@@ -42,7 +46,7 @@ Text = Callable[[str], Any]
 
 @dataclass(frozen=True)
 class Option:
-    """What the command line is told of a field: see :func:`option`."""
+    """Declaration of a field for the command line: see :func:`option`."""
 
     text: Text | None
     metavar: str | None
@@ -74,6 +78,45 @@ def option(
     return field(default=default, metadata={"option": declared})
 
 
+class Leaf(NamedTuple):
+    """A field of settings, or of settings inside them.
+
+    Attributes:
+        path: names that lead to it.
+        owner: class that declares it.
+        kind: its annotation.
+        declared: the field.
+    """
+
+    path: tuple[str, ...]
+    owner: type
+    kind: Any
+    declared: dataclasses.Field[Any]
+
+    @property
+    def option(self) -> Option | None:
+        """Declaration of :func:`option`, if it is one."""
+        return self.declared.metadata.get("option")
+
+
+def leaves(settings: type, before: tuple[str, ...] = ()) -> Iterator[Leaf]:
+    """Fields of a class of settings and of the settings inside."""
+    kinds = get_type_hints(settings)
+    for declared in dataclasses.fields(settings):
+        kind, path = plain(kinds[declared.name]), (*before, declared.name)
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            yield from leaves(kind, path)
+        elif declared.init:
+            yield Leaf(path, settings, kinds[declared.name], declared)
+
+
+def replaced(settings: S, path: Sequence[str], value: Any) -> S:
+    """Settings with another value at a path."""
+    first, *rest = path
+    inner = replaced(getattr(settings, first), rest, value) if rest else value
+    return replace(settings, **{first: inner})  # type: ignore[type-var]
+
+
 def add_options(parser: argparse.ArgumentParser, settings: type, **defaults: Any) -> None:
     """Add the options of a class of settings.
 
@@ -82,66 +125,46 @@ def add_options(parser: argparse.ArgumentParser, settings: type, **defaults: Any
         settings: the class.
         defaults: values of fields where the command line does not give one; None for the field's own.
     """
-    for path, declared, chosen in _options(settings):
-        name = path[-1]
-        default = defaults.get(name, declared.default)
-        words: dict[str, Any] = {"help": _help(path, settings, default).replace("%", "%%"), "metavar": chosen.metavar}
-        kind = plain(get_type_hints(_owner(settings, path))[name])
+    for leaf in leaves(settings):
+        chosen, name = leaf.option, leaf.path[-1]
+        if chosen is None:
+            continue
+        default = defaults.get(name, leaf.declared.default)
+        words: dict[str, Any] = {"help": _help(leaf, default).replace("%", "%%"), "metavar": chosen.metavar}
+        kind = plain(leaf.kind)
         if kind is bool:
             del words["metavar"]
             words["action"] = "store_true"
         else:
-            choices = chosen.choices or (get_args(kind) if get_origin(kind) is Literal else ())
-            words["choices"] = choices or None
+            words["choices"] = chosen.choices or (get_args(kind) if get_origin(kind) is Literal else ()) or None
             words["type"] = chosen.text or (count if kind is int else str)
             if chosen.many:
                 words["action"] = "append"
-        if declared.default is MISSING:
+        if leaf.declared.default is MISSING:
             parser.add_argument(name, **words)
         else:
             flag = "--" + (chosen.flag or name).replace("_", "-")
-            parser.add_argument(flag, dest=".".join(path), default=defaults.get(name, argparse.SUPPRESS), **words)
+            parser.add_argument(flag, dest=".".join(leaf.path), default=defaults.get(name, argparse.SUPPRESS), **words)
 
 
 def settings_of(settings: type[S], chosen: argparse.Namespace, **more: Any) -> S:
-    """The settings that were chosen; what was not named keeps its default.
+    """The settings that were chosen; fields that were not named keep their defaults.
 
     Args:
         settings: the class.
-        chosen: what the parser found.
+        chosen: result of the parser.
         more: further fields.
     """
-    given = {path: getattr(chosen, ".".join(path)) for path, _, _ in _options(settings) if ".".join(path) in chosen}
-    many = {path: declared.many for path, _, declared in _options(settings)}
-    outer = {path[0]: tuple(v) if many[path] else v for path, v in given.items() if len(path) == 1}
-    made: Any = settings(**outer, **more)
-    for (outside, *inside), value in given.items():
-        if inside:
-            made = replace(made, **{outside: replace(getattr(made, outside), **{inside[0]: value})})
-    return made  # type: ignore[no-any-return]
-
-
-def _options(settings: type) -> Iterator[tuple[tuple[str, ...], dataclasses.Field[Any], Option]]:
-    """Every option with its path, at most one level down."""
-    for declared in dataclasses.fields(settings):
-        inner = declared.default_factory
-        if "option" in declared.metadata:
-            yield (declared.name,), declared, declared.metadata["option"]
-        elif isinstance(inner, type) and dataclasses.is_dataclass(inner):
-            yield from (
-                ((declared.name, f.name), f, f.metadata["option"])
-                for f in dataclasses.fields(inner)
-                if "option" in f.metadata
-            )
-
-
-def _owner(settings: type, path: tuple[str, ...]) -> type:
-    """The class that declares an option."""
-    if len(path) == 1:
-        return settings
-    inner = next(f.default_factory for f in dataclasses.fields(settings) if f.name == path[0])
-    assert isinstance(inner, type)
-    return inner
+    given = {
+        leaf.path: tuple(value) if leaf.option.many else value
+        for leaf in leaves(settings)
+        if leaf.option is not None and (value := getattr(chosen, ".".join(leaf.path), MISSING)) is not MISSING
+    }
+    made = settings(**{path[0]: value for path, value in given.items() if len(path) == 1}, **more)
+    for path, value in given.items():
+        if len(path) > 1:
+            made = replaced(made, path, value)
+    return made
 
 
 def plain(kind: Any) -> Any:
@@ -150,10 +173,10 @@ def plain(kind: Any) -> Any:
     return kinds[0] if NoneType in get_args(kind) and len(kinds) == 1 else kind
 
 
-def _help(path: tuple[str, ...], settings: type, default: Any) -> str:
-    """What the docstring of the class says of a field, and its default."""
-    doc = inspect.getdoc(_owner(settings, path)) or ""
-    found = re.search(rf"^    {path[-1]}: (.*?)(?=^ {{0,4}}\S|\Z)", doc, re.MULTILINE | re.DOTALL)
+def _help(leaf: Leaf, default: Any) -> str:
+    """Text about a field in the docstring of its class, and its default."""
+    doc = inspect.getdoc(leaf.owner) or ""
+    found = re.search(rf"^    {leaf.path[-1]}: (.*?)(?=^ {{0,4}}\S|\Z)", doc, re.MULTILINE | re.DOTALL)
     words = " ".join(found[1].split()).rstrip(".") if found else ""
     quiet = default is MISSING or default is None or isinstance(default, bool)
     return words if quiet else f"{words} (default: {default})"
@@ -168,28 +191,24 @@ def count(text: str, least: int = 0, most: int = 10**18) -> int:
     return int(text)
 
 
-def positive(text: str) -> float:
-    """A number above zero."""
-    value = _number(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
+def number(what: str, permitted: Callable[[float], bool]) -> Text:
+    """Reader of a number; ``what`` says in words which ones are permitted."""
+
+    def read(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not permitted(value):
+            raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
+        return value
+
+    return read
 
 
-def not_negative(text: str) -> float:
-    """A number, zero or more."""
-    value = _number(text)
-    if not 0.0 <= value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of zero or more")
-    return value
-
-
-def share(text: str) -> float:
-    """A number from 0, less than 1."""
-    value = _number(text)
-    if not 0.0 <= value < 1.0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number in [0, 1)")
-    return value
+positive = number("a positive number", lambda value: 0.0 < value < math.inf)
+not_negative = number("a number of zero or more", lambda value: 0.0 <= value < math.inf)
+share = number("a number in [0, 1)", lambda value: 0.0 <= value < 1.0)
 
 
 def pose(text: str) -> tuple[float, ...]:
@@ -227,11 +246,3 @@ def existing(what: str) -> Text:
         return found
 
     return path
-
-
-def _number(text: str) -> float:
-    """A number; what is none is not a number."""
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")

@@ -1,256 +1,213 @@
-"""Processes that each do one thing at a time, as an executor: one that dies takes down only what it was doing.
+"""Executors for episodes: processes of this machine, or the workers of a dask.distributed cluster.
 
-A pool of the standard library breaks as a whole when one of its processes dies, and cannot say whose work killed it.
+A process pool breaks as a whole when one of its processes dies. The jobs it had are then repeated one at a time in a
+new pool, so that a second death names the job that caused it.
 """
 
 from __future__ import annotations
 
-import contextlib
+import itertools
 import multiprocessing
 import os
-import pickle
-import queue
 import signal
+import sys
 import threading
-import traceback
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future
-from multiprocessing.connection import Connection
-from typing import Any, TypeAlias, TypeVar
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
+from typing import Any, TypeVar
+from unittest import mock
 
 from unifg.errors import ScenarioError
 
-__all__ = ["Inline", "WorkerDied", "WorkerNotStarted", "Workers"]
+__all__ = ["Workers", "cluster", "died", "finished"]
 
 T = TypeVar("T")
-_Call: TypeAlias = tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+J = TypeVar("J")
 
 _NUMBERS = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "NUMBA")
 THREADS = (*(f"{name}_NUM_THREADS" for name in _NUMBERS), "VECLIB_MAXIMUM_THREADS")
-STARTS = 3  # a worker may fail to start, as when the machine is short of memory
-_starting = threading.Lock()
-
-
-class WorkerDied(RuntimeError):
-    """The process ended before what it was doing."""
-
-
-class WorkerNotStarted(ScenarioError):
-    """No process could be made ready."""
-
-
-class Inline(Executor):
-    """This thread: what is submitted is done at once."""
-
-    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Do it."""
-        future: Future[T] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
+BEAT = 0.25  # [s]
+PATIENCE = 10.0  # [s] until a scheduler must have answered
 
 
 class Workers(Executor):
-    """Processes with one thread for linear algebra each, started when there is work and replaced when they die."""
+    """Process pool with one thread for linear algebra in each process.
 
-    def __init__(self, count: int, ready: Callable[[], None] | None = None) -> None:
-        """Start no process yet.
+    Attributes:
+        count: number of processes.
+    """
+
+    def __init__(self, count: int, ready: Callable[[], object] = int) -> None:
+        """Start the first process.
 
         Args:
-            count: of processes.
-            ready: called once in each process before its first work; can be pickled.
+            count: number of processes.
+            ready: called once in each process before its first job; can be pickled.
+
+        Raises:
+            ScenarioError: the count is below one, or no process can be started.
         """
         if count < 1:
             raise ScenarioError(f"at least one worker is needed, found {count}")
-        self.count = count
-        self._ready = ready
-        self._queue: queue.SimpleQueue[tuple[Future[Any], _Call] | None] = queue.SimpleQueue()
-        self._killed = False
-        self._workers: dict[int, _Worker] = {}
-        self._lanes = [threading.Thread(target=self._serve, args=(k,), daemon=True) for k in range(count)]
-        for lane in self._lanes:
-            lane.start()
+        self.count, self._ready = count, ready
+        self.renew()
 
-    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
-        """Have it done by the next process that is free."""
-        future: Future[T] = Future()
-        self._queue.put((future, (fn, args, kwargs)))
-        return future
-
-    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes, after what was submitted or without."""
-        if cancel_futures:
-            with contextlib.suppress(queue.Empty):
-                while True:
-                    item = self._queue.get_nowait()
-                    if item is not None:
-                        item[0].cancel()
-        for _ in self._lanes:
-            self._queue.put(None)
-        for lane in self._lanes if wait else ():
-            lane.join()
-
-    def kill(self) -> None:
-        """End the processes now, whatever they are doing."""
-        self._killed = True
-        for worker in list(self._workers.values()):
-            worker.process.kill()
-        self.shutdown(cancel_futures=True)
-
-    def _serve(self, lane: int) -> None:
-        while (item := self._queue.get()) is not None:
-            future, call = item
-            if not future.set_running_or_notify_cancel():
-                continue
-            try:
-                if lane not in self._workers:
-                    self._workers[lane] = self._started()
-                    if self._killed:  # while it was started
-                        self._workers[lane].process.kill()
-                found = self._workers[lane].do(call)
-            except BaseException as error:
-                if isinstance(error, WorkerDied):
-                    self._workers.pop(lane, None)
-                future.set_exception(error)
-            else:
-                future.set_result(found)
-            del item, future, call
-        worker = self._workers.pop(lane, None)
-        if worker is not None:
-            worker.end()
-
-    def _started(self) -> _Worker:
-        tries = 0
-        while not self._killed:
-            try:
-                return _Worker(self._ready)
-            except WorkerDied as error:
-                tries += 1
-                if tries == STARTS:
-                    raise WorkerNotStarted(
-                        f"no worker can be started: {error}; a script that starts workers keeps what it does below "
-                        "`if __name__ == '__main__':`"
-                    ) from None
-        raise WorkerDied("stopped")
-
-
-class _Worker:
-    """One process, and this end of the pipe to it."""
-
-    def __init__(self, ready: Callable[[], None] | None) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.connection, there = context.Pipe()
-        self.process = context.Process(target=_work, args=(there, ready), daemon=True)
-        with _starting, _one_thread(), _unheard():
-            self.process.start()
-        there.close()
-        self._answer()
-
-    def do(self, call: _Call) -> Any:
-        """Have something done.
+    def renew(self) -> None:
+        """Replace the pool, after it broke.
 
         Raises:
-            WorkerDied: while doing it.
-            Exception: what it raised.
+            ScenarioError: no process can be started.
         """
-        data = pickle.dumps(call)
+        spawn = multiprocessing.get_context("spawn")
+        self._pool = ProcessPoolExecutor(self.count, spawn, _begin, (self._ready,))
         try:
-            self.connection.send_bytes(data)
-        except OSError as error:
-            raise self._dead() from error
-        return self._answer()
+            self.submit(os.getpid).result()
+        except BrokenExecutor as error:
+            raise ScenarioError(
+                f"no worker can be started: {error}; a script that starts workers keeps what it does below "
+                "`if __name__ == '__main__':`"
+            ) from None
 
-    def end(self) -> None:
-        """Let it go."""
-        self.connection.close()
-        self.process.join(5.0)
-        if self.process.is_alive():
-            self.process.kill()
-            self.process.join()
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> Future[T]:
+        """Run a function in the next free process; a process started for it finds one thread in its environment."""
+        with mock.patch.dict(os.environ, dict.fromkeys(THREADS, "1")):
+            return self._pool.submit(fn, *args, **kwargs)
 
-    def _answer(self) -> Any:
-        try:
-            found, error = pickle.loads(self.connection.recv_bytes())
-        except (EOFError, OSError) as gone:
-            raise self._dead() from gone
-        if error is not None:
-            raise error
-        return found
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes after their jobs."""
+        self._pool.shutdown(wait, cancel_futures=cancel_futures)
 
-    def _dead(self) -> WorkerDied:
-        self.connection.close()
-        self.process.join(5.0)
-        code = self.process.exitcode
-        how = f"by signal {-code}" if code is not None and code < 0 else f"with status {code}"
-        return WorkerDied(f"worker {self.process.pid} ended {how}")
+    def kill(self) -> None:
+        """End the processes at once."""
+        for process in list((self._pool._processes or {}).values()):  # kill_workers() comes with Python 3.14
+            process.kill()
+        self.shutdown(cancel_futures=True)
 
 
-def _work(connection: Connection, ready: Callable[[], None] | None) -> None:
-    """What a process does until the other end of the pipe is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a terminal sends it to all; who has started us decides
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+def _begin(ready: Callable[[], object]) -> None:
+    """Prepare a process: control-C is left to the parent, and the process ends with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_follow_parent, daemon=True).start()
-    _answer(connection, lambda: ready() if ready is not None else None)
-    with contextlib.suppress(EOFError, OSError):
-        while True:
-            data = connection.recv_bytes()
-            _answer(connection, lambda data=data: _done(data))  # type: ignore[misc]
-
-
-def _done(data: bytes) -> Any:
-    function, arguments, named = pickle.loads(data)
-    return function(*arguments, **named)
-
-
-def _answer(connection: Connection, what: Callable[[], Any]) -> None:
-    """Send what it returns, or what it raises."""
-    try:
-        data = pickle.dumps((what(), None))
-    except BaseException as error:
-        told = traceback.format_exc()
-        error.add_note(f"in a worker:\n{told}")
-        try:
-            data = pickle.dumps((None, error))
-            pickle.loads(data)
-        except Exception:  # an exception of somebody's own that does not survive the way
-            data = pickle.dumps((None, RuntimeError(told)))
-    connection.send_bytes(data)
+    ready()
 
 
 def _follow_parent() -> None:
-    """End when the process that has started us ends, however it ends."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()
         os._exit(1)
 
 
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """What processes started meanwhile find in their environment; libraries read it when they are loaded."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
+@contextmanager
+def cluster(address: str) -> Iterator[tuple[Executor, Callable[[], int]]]:
+    """Workers behind a dask.distributed scheduler, and how many jobs to submit: two for each thread there is now.
+
+    Args:
+        address: of the scheduler, such as tcp://10.0.0.1:8786.
+
+    Raises:
+        ScenarioError: dask.distributed is not installed, or no scheduler answers.
+    """
     try:
-        yield
+        from distributed import Client
+    except ImportError:
+        raise ScenarioError("a cluster needs dask.distributed: pip install 'unifg[campaign]'") from None
+    try:
+        client = Client(address, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        raise ScenarioError(f"no scheduler answers at {address} ({error})") from None
+
+    def capacity() -> int:
+        try:
+            return 2 * int(sum(client.nthreads().values()))
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ScenarioError(
+                f"the scheduler at {address} is gone ({error}); what ended before is kept: start again"
+            ) from None
+
+    try:
+        yield client.get_executor(pure=False, retries=0), capacity
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
+        client.close()
+
+
+def died(future: Future[Any]) -> bool:
+    """Test whether the worker of a finished job died; the error then says nothing about the job itself."""
+    error, cluster = future.exception(), sys.modules.get("distributed")
+    return isinstance(error, BrokenExecutor) or (cluster is not None and isinstance(error, cluster.KilledWorker))
+
+
+def finished(
+    executor: Executor,
+    task: Callable[[J], Any],
+    jobs: Iterable[J],
+    at_once: Callable[[], int],
+    beat: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[J, Future[Any]]]:
+    """Yield jobs as they end, with their finished futures.
+
+    A job whose worker died is repeated once, alone; if its worker dies again, its future says so.
+
+    Args:
+        executor: runs them.
+        task: can be pickled, as the jobs can, where the executor asks for that.
+        jobs: taken one by one, when there is room.
+        at_once: how many may be submitted; asked again and again, as machines come and go.
+        beat: called several times a second, also while nothing ends; may raise.
+
+    Raises:
+        ScenarioError: the executor takes no more jobs.
+    """
+    renew = executor.renew if isinstance(executor, Workers) else None
+    coming = iter(jobs)
+    waiting: dict[Future[Any], J] = {}
+    while True:
+        room = max(1, at_once()) - len(waiting)
+        for job in itertools.islice(coming, max(0, room)):
+            try:
+                future = executor.submit(task, job)
+            except BrokenExecutor as error:
+                if renew is None:
+                    raise _closed(error) from error
+                coming = itertools.chain([job], coming)
+                if not waiting:
+                    renew()
+                break
+            except RuntimeError as error:
+                raise _closed(error) from error
+            waiting[future] = job
+            if future.done():
+                break  # reported before more is begun: in one thread nothing runs beside it
+        if not waiting:
+            return
+        done, _ = wait(waiting, BEAT, FIRST_COMPLETED)
+        beat()
+        if renew is not None and any(map(_broke, done)):
+            done, _ = wait(waiting)  # a pool breaks as a whole
+        suspects = []
+        for future in done:
+            job = waiting.pop(future)
+            if future.cancelled():
+                raise ScenarioError("the executor has dropped its jobs; what ended before is kept: start again")
+            if _broke(future):
+                suspects.append(job)
             else:
-                os.environ[name] = value
+                yield job, future
+        if suspects and renew is not None:
+            renew()
+        for job in suspects:
+            future = executor.submit(task, job)
+            while not wait([future], BEAT).done:
+                beat()
+            if _broke(future) and renew is not None:
+                renew()
+            yield job, future
 
 
-@contextlib.contextmanager
-def _unheard() -> Iterator[None]:
-    """Processes started meanwhile do not hear control-C while they load."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _broke(future: Future[Any]) -> bool:
+    return not future.cancelled() and isinstance(future.exception(), BrokenExecutor)
+
+
+def _closed(error: RuntimeError) -> ScenarioError:
+    return ScenarioError(f"the executor takes no more jobs ({error}); what ended before is kept: start again")

@@ -30,7 +30,6 @@ from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import STRAIGHT, damped_step, model_step
-from unifg.solvers.augmented_usual import UsualPrimal
 from unifg.solvers.globalize.damping import Damping
 from unifg.solvers.globalize.feasibility_restoration import leave, resume, settle
 from unifg.solvers.globalize.norms import largest, norm
@@ -95,17 +94,17 @@ class AugmentedLagrangian(Solver):
         if self.penalty is not None and not self.penalty > 0.0:
             raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
 
-    def workspace(self, program: CompiledProblem) -> UsualPrimal:
+    def workspace(self, program: CompiledProblem) -> Primal:
         """The factorisation of the primal step."""
-        return UsualPrimal(program)
+        return Primal(program)
 
-    def search_step(self, run: SolveState, workspace: UsualPrimal, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The primal step at the initial damping, with the penalty that suits the present iterate."""
         rho, weights = self._first_penalties(run, workspace)
         found = model_step(workspace, lin, run.multipliers, rho * weights, self.damping)
         return None if found is None else found[0]
 
-    def iterate(self, run: SolveState, workspace: UsualPrimal) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Alternate primal and dual steps."""
         rho, weights = self._first_penalties(run, workspace)
         if self.schedule == "bazzana":
@@ -152,7 +151,7 @@ class AugmentedLagrangian(Solver):
                 return Status.STOP_RULE
         return None
 
-    def _tightening(self, run: SolveState, primal: UsualPrimal, rho: float, weights: Array) -> Status | None:
+    def _tightening(self, run: SolveState, primal: Primal, rho: float, weights: Array) -> Status | None:
         """Solve each subproblem only as accurately as its multipliers deserve."""
         multipliers = expected = run.multipliers
         damping = Damping(self.damping)
@@ -175,27 +174,21 @@ class AugmentedLagrangian(Solver):
             after = primal.next_multipliers(run.lin.constraints, multipliers, penalty)
             slope = primal.slope(run.lin, after)
             while slope > gradient_goal and len(run.history) - before < self.inner_iterations:
-                steep, used = slope, None
-                if hopeful:
-                    bent_by = expected if exact else STRAIGHT
-                    used = primal.take(run.lin, multipliers, bent_by, penalty, damping, gradient_goal)
-                if used is not None:
-                    (lin, step, expected, after, slope), rejected = used, 0
-                else:
-                    bend = primal.bend(run.lin, expected) if exact else STRAIGHT
-                    primal.hopeful, primal.reached = hopeful, None
-                    taken = damped_step(primal, run.lin, multipliers, penalty, damping, bend)
-                    if taken is None:
-                        stalled = True
-                        break
-                    values, step, rejected = taken
-                    expected = primal.expected_multipliers(run.lin, step, multipliers, penalty, damping.base)
-                    lin, hopeful = primal.linearized(values), rejected == 0 and damping.base is run.lin.constraints
-                    after, slope = expected, primal.slope(lin, expected)
-                    if not slope <= gradient_goal:
-                        plus = primal.next_multipliers(lin.constraints, multipliers, penalty)
-                        if not slope < (balance := primal.slope(lin, plus)):
-                            after, slope = plus, balance
+                steep = slope
+                bend = primal.bend(run.lin, expected) if exact else STRAIGHT
+                primal.hopeful, primal.reached = hopeful, None
+                taken = damped_step(primal, run.lin, multipliers, penalty, damping, bend)
+                if taken is None:
+                    stalled = True
+                    break
+                values, step, rejected = taken
+                expected = primal.expected_multipliers(run.lin, step, multipliers, penalty, damping.base)
+                lin, hopeful = primal.linearized(values), rejected == 0 and damping.base is run.lin.constraints
+                after, slope = expected, primal.slope(lin, expected)
+                if not slope <= gradient_goal:
+                    plus = primal.next_multipliers(lin.constraints, multipliers, penalty)
+                    if not slope < (balance := primal.slope(lin, plus)):
+                        after, slope = plus, balance
                 if largest(unit) > 1.0 and (less := self._lighter(primal, lin, unit)) is not None:
                     unit, weights, scale = unit * less, weights * less**2, scale * less
                     run.penalties = penalty = rho * weights

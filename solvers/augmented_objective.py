@@ -109,8 +109,7 @@ class Primal:
         Empty where there are none, and where they are not finite: a factor may have a kink or a pole there.
         """
         left_out: Array = lagrangian_hessian(self.program, lin, multipliers)
-        left_out -= lin.hessian
-        return left_out if left_out.any() and np.isfinite(left_out.sum()) else np.zeros(0)
+        return left_out if _subtract(left_out, lin.hessian) else np.zeros(0)
 
     def direction(self, curvature: Array, gradient: Array) -> Array | None:
         """Solve H d = -gradient; None when the matrix cannot be factorised."""
@@ -132,6 +131,18 @@ class Primal:
         """Linearisation at the values of a step, which may be at hand since its trial."""
         found = self.reached
         return found if found is not None and found.values is values else self.program.linearize(values)
+
+
+@compiled
+def _subtract(entries: Array, others: Array) -> bool:
+    """Subtract in place; True if the results are finite and not all zero."""
+    largest = 0.0
+    for k in range(len(entries)):
+        entries[k] -= others[k]
+        if not abs(entries[k]) < np.inf:
+            return False
+        largest = max(largest, abs(entries[k]))
+    return largest > 0.0
 
 
 @compiled

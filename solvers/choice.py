@@ -1,6 +1,6 @@
 """A backend for whoever names none: what a graph states decides, and a second one tries where the first ends without.
 
-The order is the measured one (docs/choosing.md): from cold guesses the damped Gauss-Newton method solves sums of
+The order is the measured one (docs/guide/solvers.md): from cold guesses the damped Gauss-Newton method solves sums of
 squares, the interior point takes the fewest iterations as soon as there is a constraint or a scalar cost, and the
 augmented Lagrangian gets there from guesses that lead the interior point into a corner.
 """

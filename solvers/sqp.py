@@ -28,9 +28,9 @@ from unifg.solvers.globalize.line_search import Taken, search
 from unifg.solvers.globalize.merit import RowPrices
 from unifg.solvers.globalize.norms import largest, norm
 from unifg.solvers.globalize.slow_convergence import converges_slowly
+from unifg.solvers.quadratic_programs.routes import Subproblems
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
-from unifg.solvers.sqp_usual import NOISE, ROUNDING, UsualSubproblems
 from unifg.typing import Array
 
 FAILURES = 4  # damped attempts at one step before giving up
@@ -41,6 +41,7 @@ SECANT_DECAY = 0.3  # of curvature that was seen along an earlier step
 SECANT_MATTERS = 0.5  # of the known curvature; less only slows convergence down
 SHORTEST_SECANT = 1e-7  # below it, differences of gradients are rounding
 EXACT_DECAY = 0.1  # with the exact Hessian nothing is left to cycle about
+NOISE, ROUNDING = 1e-8, 1e-13  # of the merit: for each unit of the penalty, and relative
 SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
 
@@ -98,9 +99,9 @@ class SQP(Solver):
         if self.qp == "elimination":
             require(program, f"{self.name}(qp='elimination')", "equalities")
 
-    def workspace(self, program: CompiledProblem) -> UsualSubproblems:
+    def workspace(self, program: CompiledProblem) -> Subproblems:
         """QP workspaces."""
-        return UsualSubproblems(
+        return Subproblems(
             program,
             hessian=self.hessian,
             qp=self.qp,
@@ -110,14 +111,14 @@ class SQP(Solver):
             tolerance=self.tolerance,
         )
 
-    def search_step(self, run: SolveState, workspace: UsualSubproblems, lin: Linearization) -> Array | None:
+    def search_step(self, run: SolveState, workspace: Subproblems, lin: Linearization) -> Array | None:
         """The full step of the subproblem."""
         workspace.start(lin)
         qp = subproblem(run.program, lin, SMALLEST_DAMPING * workspace.scaling.metric, workspace.pattern)
         answer = workspace.solve(qp, run.multipliers, self._accuracy(run, workspace))
         return answer.step if np.isfinite(answer.error) else None
 
-    def iterate(self, run: SolveState, workspace: UsualSubproblems) -> Status | None:
+    def iterate(self, run: SolveState, workspace: Subproblems) -> Status | None:
         """Iterate to convergence."""
         # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
         within = run.program.within_bounds(run.values)
@@ -187,27 +188,23 @@ class SQP(Solver):
         return None
 
     def _attempt(
-        self, run: SolveState, workspace: UsualSubproblems, merit: RowPrices, qp: QP
+        self, run: SolveState, workspace: Subproblems, merit: RowPrices, qp: QP
     ) -> tuple[QPAnswer, Linearization, Array, Array, float, bool] | None:
         """Solve the subproblem and search along its step; None when there is no answer or no length helps."""
         accuracy = self._accuracy(run, workspace)
-        used = None if self.full_steps else workspace.take(run, merit, qp, accuracy, self.second_order_correction)
-        if used is None:
-            answer = workspace.solve(qp, run.multipliers, accuracy)
-            if not np.isfinite(answer.error):
-                return None
-            merit.raise_above(answer.multipliers)
-            found = self._search(run, workspace, merit, qp, answer, accuracy)
-            if found is None:
-                return None
-        else:
-            answer, found = used
+        answer = workspace.solve(qp, run.multipliers, accuracy)
+        if not np.isfinite(answer.error):
+            return None
+        merit.raise_above(answer.multipliers)
+        found = self._search(run, workspace, merit, qp, answer, accuracy)
+        if found is None:
+            return None
         multipliers = answer.multipliers if found.dual is None else found.dual
         if found.length < 1.0:
             multipliers = run.multipliers + found.length * (multipliers - run.multipliers)
         return answer, found.reached, multipliers, found.step, found.length, found.dual is not None
 
-    def _accuracy(self, run: SolveState, workspace: UsualSubproblems) -> float:
+    def _accuracy(self, run: SolveState, workspace: Subproblems) -> float:
         """Ask the QP for what the outer iteration can use."""
         size = _size(run, workspace)
         share = min(1e-3, size) if workspace.exact else 1e-3
@@ -215,7 +212,7 @@ class SQP(Solver):
         return min(max(share * size, 0.1 * self.tolerance * workspace.scaling.smallest), 1e-4)
 
     def _search(
-        self, run: SolveState, workspace: UsualSubproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
+        self, run: SolveState, workspace: Subproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
     ) -> Taken | None:
         """Step length."""
         program, lin = run.program, run.lin
@@ -265,7 +262,7 @@ def missing_curvature(
     return missing if missing > SECANT_MATTERS * known else 0.0
 
 
-def _bounded(run: SolveState, workspace: UsualSubproblems, damping: float) -> float:
+def _bounded(run: SolveState, workspace: Subproblems, damping: float) -> float:
     """With the exact Hessian damping must vanish with the error, or convergence would be linear."""
     return max(min(damping, _size(run, workspace)), SMALLEST_DAMPING) if workspace.exact else damping
 
@@ -277,7 +274,7 @@ def _next_damping(exact: bool, damping: float, length: float) -> float:
     return max((EXACT_DECAY if exact else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
 
 
-def _size(run: SolveState, workspace: UsualSubproblems) -> float:
+def _size(run: SolveState, workspace: Subproblems) -> float:
     """The largest KKT number of the present iterate, in scaled units."""
     program, scaling, measured = run.program, workspace.scaling, run.optimality
     if scaling.neutral:

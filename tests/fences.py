@@ -39,9 +39,9 @@ def relative(path: Path) -> str:
 
 
 def documents(root: Path = CHECKOUT) -> list[Path]:
-    """List the pages whose code is executed: README.md and docs/*.md."""
+    """List the pages whose code is executed: README.md and all pages below docs/."""
     readme = root / "README.md"
-    return ([readme] if readme.is_file() else []) + sorted((root / "docs").glob("*.md"))
+    return ([readme] if readme.is_file() else []) + sorted((root / "docs").rglob("*.md"))
 
 
 def fences(path: Path) -> Iterator[Fence]:

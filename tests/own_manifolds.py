@@ -73,6 +73,55 @@ class SphereManifold(fg.ManifoldBase):
 
 S2 = SphereManifold()
 
+
+class Sphere:
+    """The same in NumPy alone, inheriting from nothing."""
+
+    name = "Sphere"
+    storage = 3
+    dim = 2
+
+    def identity(self) -> Array:
+        return np.array([0.0, 0.0, 1.0])
+
+    def retract(self, x: Array, d: Array) -> Array:
+        step = (self._basis(x) @ d[..., None])[..., 0]
+        angle = np.linalg.norm(d, axis=-1, keepdims=True)
+        moved: Array = np.cos(angle) * x + np.sinc(angle / np.pi) * step
+        return moved
+
+    def local(self, x: Array, y: Array) -> Array:
+        across = (np.swapaxes(self._basis(x), -1, -2) @ y[..., None])[..., 0]
+        sine = np.linalg.norm(across, axis=-1, keepdims=True)
+        angle = np.arctan2(sine, (x * y).sum(axis=-1, keepdims=True))
+        step: Array = across / np.sinc(angle / np.pi)
+        return step
+
+    def random(self, rng: Generator, shape: Batch = ()) -> Array:
+        x = rng.standard_normal((*shape, 3))
+        unit: Array = x / np.linalg.norm(x, axis=-1, keepdims=True)
+        return unit
+
+    def is_valid(self, x: Array) -> BoolArray:
+        return np.asarray(np.abs(np.linalg.norm(x, axis=-1) - 1.0) < 1e-9)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Sphere)
+
+    def __hash__(self) -> int:
+        return hash(Sphere)
+
+    @staticmethod
+    def _basis(x: Array) -> Array:
+        """Two orthonormal tangent directions, (..., 3, 2); Duff et al. 2017, equation 7."""
+        sign = np.where(x[..., 2] < 0, -1.0, 1.0)
+        a = -1.0 / (sign + x[..., 2])
+        b = x[..., 0] * x[..., 1] * a
+        first = np.stack([1 + sign * x[..., 0] ** 2 * a, sign * b, -sign * x[..., 0]], axis=-1)
+        second = np.stack([b, sign + x[..., 1] ** 2 * a, -x[..., 1]], axis=-1)
+        return np.stack([first, second], axis=-1)
+
+
 # ---------------------------------------------------------------- position, velocity and orientation, which turn as one
 
 

@@ -13,15 +13,14 @@ import unifg as fg
 from judge import judge
 from out_of_reach import goal_too_far
 from problems.cart_pole import cart_pole_dynamics
-from problems.control import Driver, Quadrotor, Unicycle
+from problems.control import Driver, Unicycle
 from problems.cylinders import flight
 from problems.known import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, short_drive
-from unifg.models import avoidance, obstacles, unicycle
+from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import model_step
-from unifg.solvers.augmented_usual import Taken, UsualPrimal
 from unifg.typing import Array
 from units import drive
 
@@ -331,72 +330,7 @@ def test_no_steps_are_taken_at_what_rounding_leaves_of_a_gradient() -> None:
     assert solution.iterations <= 18
 
 
-# ---------------------------------------------------------------- iterations in one compiled call
-
-
-def compare_ways(
-    monkeypatch: pytest.MonkeyPatch, graph: fg.Graph, guess: fg.Guess, **options: object
-) -> tuple[fg.Solution, int, int]:
-    """Solve with and without compiled iterations; the solution, how many of them there were, and how many were not."""
-    used: list[bool] = []
-    take = UsualPrimal.take
-
-    def counting(primal: UsualPrimal, *given: Any) -> Taken | None:
-        found = take(primal, *given)
-        used.append(found is not None)
-        return found
-
-    with monkeypatch.context() as patched:
-        patched.setattr(UsualPrimal, "take", counting)
-        mine = AugmentedLagrangian(**options).solve(graph, guess)  # type: ignore[arg-type]
-        patched.setattr(UsualPrimal, "take", lambda *given: None)
-        python = AugmentedLagrangian(**options).solve(graph, guess)  # type: ignore[arg-type]
-    assert mine.status is python.status and mine.iterations == python.iterations
-    for row, other in zip(mine.history, python.history, strict=True):
-        assert row.cost == pytest.approx(other.cost, rel=1e-9)
-        assert row.step_norm == pytest.approx(other.step_norm, rel=1e-6, abs=1e-12)
-        assert row.details == pytest.approx(other.details, rel=1e-6)
-        assert row.terms == pytest.approx(other.terms, rel=1e-6, abs=1e-12)
-    for family, values in mine.values.items():
-        np.testing.assert_allclose(values, python.values[family], rtol=1e-9, atol=1e-9)
-    for name, dual in mine.multipliers.items():
-        np.testing.assert_allclose(dual, python.multipliers[name], rtol=1e-5, atol=1e-6)
-    return mine, sum(used), len(used) - sum(used)
-
-
-@pytest.mark.parametrize("hessian", ["exact", "gauss-newton"])
-@pytest.mark.parametrize(
-    "problem", [Unicycle("behind", True, 20), Unicycle("ahead", False, 50), Quadrotor("figure8", True, 20)]
-)
-def test_compiled_iterations_are_those_of_python(
-    problem: Unicycle | Quadrotor, hessian: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stated = problem.formulation()
-    solution, used, _ = compare_ways(monkeypatch, stated.graph, stated.guess, hessian=hessian, tolerance=1e-4)
-    assert solution.converged and used > 0
-
-
-def test_what_is_not_usual_is_left_to_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trials that are rejected, corrected, and models that are not convex: all of them occur in these starts."""
-    problem, unusual = Unicycle("curve", True, 50), 0
-    stated = problem.formulation()
-    for states, controls in problem.starts(4):
-        guess = fg.Guess({stated.x: states, stated.u: controls})
-        unusual += compare_ways(monkeypatch, stated.graph, guess, max_iterations=40)[2]
-    assert unusual > 0
-
-
-def test_a_trial_that_cannot_be_evaluated_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 1)
-    graph.minimize(fg.prior, x, [[0.0, 0.0, 0.0]], sigma=1.0)
-    centre = np.zeros((1, 3))
-    graph.constrain(avoidance.sphere_clearance, x, centre, np.ones(1), lower=0.0, name="clear")
-    _, _, unusual = compare_ways(monkeypatch, graph, fg.Guess({x: np.array([[2.0, 0.0, 0.0]])}), max_iterations=20)
-    assert unusual > 0, "the first step leads to the centre, where the clearance has no slope"
-
-
-def test_fixed_variables_stay_and_limits_may_change_in_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fixed_variables_stay_and_limits_may_change_in_kind() -> None:
     graph = fg.Graph()
     x = graph.variables("x", fg.SO3, 3)
     start = graph.data("start", [1.0, 0.0, 0.0, 0.0])
@@ -412,20 +346,6 @@ def test_fixed_variables_stay_and_limits_may_change_in_kind(monkeypatch: pytest.
         np.testing.assert_array_equal(solution[x][0], unnormal)
         turns = fg.SO3.local(solution[x][:-1], solution[x][1:])
         np.testing.assert_allclose(turns[:, 0], limits[0], atol=1e-5)
-
-
-@pytest.mark.parametrize("what", ["loss of one's own", "numpy"])
-def test_what_compiled_code_does_not_know_is_not_asked_of_it(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    graph, guess = short_drive()
-    x = graph.families["x"]
-    if what != "numpy":
-        graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], sigma=1.0, robust=fg.Reweighted(np.ones_like), name="anchor")
-    else:
-        own = fg.residual(lambda v: np.tanh(v[:, :1]), derivatives="differences")
-        graph.minimize(own, x[0], sigma=1.0, name="anchor")
-    primal = AugmentedLagrangian().prepare(graph)
-    primal.solve(guess)
-    assert not primal._workspace.fast
 
 
 def test_a_trace_that_is_given_up_between_two_solves_is_left_to_python() -> None:
@@ -444,10 +364,8 @@ def test_a_trace_that_is_given_up_between_two_solves_is_left_to_python() -> None
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=4.0, name="disc")
     run = AugmentedLagrangian().prepare(graph)
     assert run.solve({x: [[1.0, 1.0]]}, check=True)[x][0, 0] == pytest.approx(0.5, abs=1e-6)
-    assert run._workspace.fast
     factor[0] = 3.0
     assert run.solve({x: [[1.0, 1.0]]}, check=True)[x][0, 0] == pytest.approx(0.3, abs=1e-6)
-    assert not run._workspace.fast
 
 
 def swing_up() -> tuple[fg.Graph, dict[fg.Family, Array]]:

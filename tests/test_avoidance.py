@@ -174,11 +174,11 @@ def test_what_the_potential_needs() -> None:
         avoidance.inverse_distance_root(avoidance.cylinder_clearance, 0.0)
     with pytest.raises(fg.ModelError, match="positive distance"):
         avoidance.inverse_distance(avoidance.cylinder_clearance, np.nan)
-    plain: Residual = residual(lambda p: p[:, :1])
-    with pytest.raises(fg.ModelError, match="compiled clearance"):
-        avoidance.inverse_distance_root(plain)
-    with pytest.raises(fg.ModelError, match="second derivative, found 'disc clearance margin'"):
-        avoidance.inverse_distance_root(obstacles.shortfall(obstacles.disc_clearance, 0.1))
+    attached: Residual = residual(lambda p: p[:, :1], lambda p: [np.ones((len(p), 1, 3))], "attached")
+    with pytest.raises(fg.ModelError, match="plain function, found 'attached'"):
+        avoidance.inverse_distance_root(attached)
+    own = avoidance.inverse_distance_root(residual(lambda p: p[:, :1]))
+    np.testing.assert_allclose(own(np.array([[2.0, 0.0, 0.0]])), [[1.0]])
     planar = avoidance.inverse_distance_root(obstacles.disc_clearance)  # any clearance, also of other robots
     np.testing.assert_allclose(planar(np.array([[2.5, 0.0, 0.3]]), *ALONE), [[1.0]])
 

@@ -13,9 +13,9 @@ import unifg as fg
 from judge import judge
 from problems.guarded_flight import NAMES, SPHERES, START, GuardedFlight
 from unifg.errors import GraphError, ModelError
-from unifg.factors.autodiff.expression import traced
 from unifg.factors.autodiff.operations import Op
 from unifg.factors.autodiff.rates import rate
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.models import (
     avoidance,

@@ -1,20 +1,39 @@
-"""The benchmark of the elimination engine runs on tiny inputs; nothing here depends on time."""
+"""Measurements on tiny inputs, the runner, and sentences and pages made from rows; nothing here depends on time."""
 
 from __future__ import annotations
 
+import argparse
 import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks import chains, collection, elimination, gtsam_peer, marginals, own_functions, own_residuals, pose_graphs
-from benchmarks.section import Result, goal, met
-from benchmarks.timing import Split, interleave, number, shown, spread
+from benchmarks import (
+    collection,
+    elimination,
+    gtsam_peer,
+    horizon_and_velocity,
+    marginals,
+    own_functions,
+    pose_graphs,
+    runner,
+)
+from benchmarks.comparison import Row
+from benchmarks.horizon_and_velocity import Flown
+from benchmarks.report import END, begin, put_results
+from benchmarks.runner import PAGES, RESULTS, Study, Timing
+from benchmarks.section import goal, met
+from benchmarks.timing import interleave, number, ratio, shown, spread
 from problems.collection import BACKENDS, CASES, attempt
+from unifg.errors import ScenarioError
 from unifg.pose_graphs import manhattan
-from unifg.problem.compiled_problem import CompiledProblem
+from unifg.scenarios.campaigns.journal import lines_of
 from unifg.solvers import GaussNewton, InteriorPoint
 
 
@@ -26,30 +45,17 @@ def test_a_section_measures_survives_json_and_renders(name: str) -> None:
     assert all(line.count("|") == text.splitlines()[0].count("|") for line in text.split("\n\n")[0].splitlines()[1:2])
     assert "nan" not in text
     assert result["goals"] or not gtsam_peer.available()
-    store: Result = {}
-    elimination.record(store, name, result, 1.0, "code")
-    elimination.record(store, name, result, 1.0, "code")
-    assert store[name]["previous"]["goals"].keys() == {goal["name"] for goal in result["goals"]}
-    assert section.title in elimination.render(store)
+    assert section.title in elimination.render({name: result})
 
 
-def test_the_page_shows_the_run_before(tmp_path: Path) -> None:
-    found = goal("it", "times faster than GTSAM", [5.0, 4.0, 6.0], 6.0, 4.0)
-    store: Result = {}
-    elimination.record(store, "chains", {"goals": [found], "rounds": 15}, 1.0, "code")
-    elimination.record(store, "chains", {"goals": [{**found, "value": [3.0, 3.0, 3.5]}], "rounds": 15}, 1.0, "code")
-    (row,) = elimination.summary(store).splitlines()[2:]
-    assert [cell.strip() for cell in row.split("|")[3:-1]] == [
-        "3.00 (3.00 to 3.50)",
-        "6 (floor 4)",
-        "no",
-        "5.00 (4.00 to 6.00)",
-    ]
-    assert not met({**found, "value": [3.0, 3.0, 3.0]}, "floor")
+def test_goals_have_targets_and_floors() -> None:
+    found = goal("it", "times faster than GTSAM", [3.0, 3.0, 3.5], 6.0, 4.0)
+    (row,) = elimination.render(
+        {"chains": {**elimination.SECTIONS["chains"].measure(1, True), "goals": [found]}}
+    ).splitlines()[2:3]
+    assert [cell.strip() for cell in row.split("|")[3:-1]] == ["3.00 (3.00 to 3.50)", "6 (floor 4)", "no"]
+    assert not met(found, "floor")
     assert met({**found, "unit": "ms", "value": [5.0, 5.0, 5.0]})
-    (tmp_path / "store.json").write_text(json.dumps({"sections": store}))
-    assert elimination.load(tmp_path / "store.json") == store
-    assert elimination.load(tmp_path / "none.json") == {}
 
 
 def test_rounds_are_interleaved_and_the_warm_ones_do_not_count() -> None:
@@ -69,45 +75,9 @@ def test_rounds_are_interleaved_and_the_warm_ones_do_not_count() -> None:
 
 def test_spreads_and_digits() -> None:
     assert spread(np.arange(1.0, 6.0)) == [3.0, 2.0, 4.0]
+    assert ratio(np.array([2.0, 6.0, 9.0, 1.0]), np.array([1.0, 3.0, 3.0]))[0] == 2.0
     assert shown([12.345, 1.0, 123.4]) == "12.3 (1.00 to 123)"
     assert [number(value) for value in (0.0123, 0.0, 4567.0)] == ["0.0123", "0.000", "4567"]
-
-
-def test_a_split_counts_adds_up_and_puts_back() -> None:
-    graph, _, guess = manhattan(20).pose_graph.graph()
-    run, original = GaussNewton().prepare(graph), CompiledProblem.linearize
-    split = Split({"linearise": (CompiledProblem, "linearize")}, run.solve, per=2.0, setup=lambda: (guess,))
-    elapsed = [split(), split()]
-    assert CompiledProblem.linearize is original
-    assert split.calls["linearise"] == run.solve(guess).iterations + 1
-    np.testing.assert_allclose(np.sum(list(split.parts.values()), axis=0), elapsed, rtol=1e-9)
-    assert split.milliseconds(1)["linearise"][0] == pytest.approx(1e3 * split.parts["linearise"][1])
-    assert min(split.parts["linearise"]) > 0.0
-
-
-@pytest.mark.parametrize("kind", chains.CASES)
-def test_eliminations_are_counted(kind: str) -> None:
-    backend, graph, guess = chains.chain(kind, 4)
-    run = backend.prepare(graph)
-    solution = run.solve(guess)
-    assert solution.converged
-    count = chains.eliminations(run, guess)
-    if kind == "bounded":
-        assert count >= solution.iterations
-    else:
-        assert count == solution.iterations
-
-
-def test_residuals_written_by_hand_are_the_shipped_one() -> None:
-    pose_graph, known = own_residuals.drive(25)
-    reference = None
-    for name, residual in own_residuals.RESIDUALS.items():
-        graph, x = own_residuals.stated(pose_graph, known, residual)
-        lin = graph.compile().linearize({x: pose_graph.poses})
-        reference = reference or lin
-        np.testing.assert_allclose(lin.residual, reference.residual, rtol=1e-9, atol=1e-11)
-        tolerance = 1e-9 if name == "derived" else 1e-6  # the others are differentiated numerically
-        np.testing.assert_allclose(lin.jacobian, reference.jacobian, rtol=tolerance, atol=tolerance)
 
 
 def test_marginals_are_blocks_of_the_inverse() -> None:
@@ -165,3 +135,135 @@ def test_every_way_to_state_a_problem_is_the_same_problem(title: str) -> None:
     for solution in found.values():
         assert solution.iterations == first.iterations
         assert solution.cost == pytest.approx(first.cost, rel=1e-7)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A cell of a made-up study."""
+
+    seed: int
+    alone: bool = False
+
+
+def doubled(cell: Cell) -> Row:
+    if cell.seed == 9:
+        raise ScenarioError("no wind today")
+    return {"double": 2 * cell.seed}
+
+
+def cells(seeds: Sequence[int]) -> list[Cell]:
+    return [Cell(seed, alone) for seed in seeds for alone in (False, True)]
+
+
+def told(rows: list[Row]) -> str:
+    return ", ".join(str(row.get("double", row.get("error"))) for row in rows)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_study_measures_the_cells_that_are_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    monkeypatch.setattr(runner, "OUT", tmp_path)
+    monkeypatch.setattr(runner, "machine", lambda codes: "here")
+    study = Study(cells, doubled, told, range(2), alone=lambda cell: cell.alone)
+
+    def run(code: str, seeds: range | None = None, **chosen: bool) -> str:
+        monkeypatch.setattr(runner, "commit", lambda: code)
+        options = {"report": False, "any_code": False, "fresh": False, **chosen}
+        return study.run("doubles", argparse.Namespace(seeds=seeds, workers=workers, **options))
+
+    store = tmp_path / "doubles.jsonl"
+    assert run("old") == "0, 0, 2, 2\n\nhere"
+    assert run("old", range(3)) == "0, 0, 2, 2, 4, 4\n\nhere"
+    assert len(store.read_text().splitlines()) == 6, "nothing is measured twice"
+    store.write_text(store.read_text() + '{"cut off')
+    assert run("new", range(1)) == "0, 0\n\nhere"
+    assert run("new", range(3), report=True) == run("new", range(3), any_code=True)
+    assert len(list(lines_of(store))) == 8, "other states of the code stay on file"
+    run("new", range(1), fresh=True)
+    assert len(list(lines_of(store))) == 10
+    assert run("new", range(9, 10)) == "no wind today, no wind today\n\nhere"
+    with pytest.raises(SystemExit, match="Nothing on file"):
+        run("new", range(20, 21), report=True)
+
+
+def test_every_measured_section_has_a_study_and_says_commit_date_and_machine() -> None:
+    marked = dict[tuple[str, str], str]()
+    for path in RESULTS.glob("*.md"):
+        text = path.read_text(encoding="utf-8")
+        parts = text.split("<!-- results:begin ")[1:]
+        marked |= {(path.stem, part.partition(" ")[0]): part.partition(END)[0] for part in parts}
+    assert set(marked) == {(page, name) for page, studies in PAGES.items() for name in studies}
+    assert [name for name, text in marked.items() if "Measured at commit `" not in text] == []
+
+
+@pytest.mark.parametrize("name", [name for studies in PAGES.values() for name in studies])
+def test_studies_state_their_cells(name: str) -> None:
+    """Every cell has a key of its own that JSON gives back."""
+    if name == "claims":
+        pytest.importorskip("casadi", reason="the judge differentiates with casadi, which comes with the extra 'bench'")
+    study = import_module(f"benchmarks.{name}").STUDY
+    if isinstance(study, Timing):
+        assert study.rounds > 0
+        return
+    keys = [tuple(runner.stated(cell).values()) for cell in study.cells(study.seeds)]
+    assert len(set(keys)) == len(keys) > 0
+    assert [tuple(key) for key in json.loads(json.dumps(keys))] == keys
+
+
+def test_results_replace_what_stands_between_the_markers(tmp_path: Path) -> None:
+    page, marker = tmp_path / "notes.md", begin("one")
+    page.write_text("# Notes\n")
+    put_results(page, "one", "text")
+    assert page.read_text() == f"# Notes\n\n{marker}\ntext\n{END}\n"
+    page.write_text(page.read_text() + "below\n")
+    put_results(page, "two", "more")
+    put_results(page, "one", "new")
+    assert page.read_text() == f"# Notes\n\n{marker}\nnew\n{END}\nbelow\n\n{begin('two')}\nmore\n{END}\n"
+    page.write_text(f"# Notes\n{marker}\n")
+    with pytest.raises(ValueError, match="has no"):
+        put_results(page, "one", "new")
+
+
+def test_a_sample_compares_counts_with_the_page(capsys: pytest.CaptureFixture[str]) -> None:
+    page = "## Iterations: some\n\n| problem | SQP |\n|---|---:|\n| HS23 | {} |\n| HS35 | {} |\n"
+    assert collection.main(["2026-11-24"]) == 0
+    assert not collection.repeated(page.format("90", "3 (no)"), "any")
+    assert capsys.readouterr().out.count("not the same") == 2
+
+
+def test_claims_survive_the_file_and_are_counted() -> None:
+    pytest.importorskip("casadi", reason="the judge differentiates with casadi, which comes with the extra 'bench'")
+    from benchmarks import claims
+    from exact_judge import Answer, Peer
+
+    peer = Peer("Solve_Succeeded", True, 9, 1.0, 0.0, 1.0)
+    answers = {
+        "sqp": Answer("CONVERGED", 5, 0.1, 1.0, 1e-7, 0.0, 0.0, "true"),
+        "ipm": Answer("CONVERGED", 5, 0.1, 0.5, 3e-3, 0.0, 0.0, "false", "stationarity is 0.003"),
+        "alm": Answer("LOCALLY_INFEASIBLE", 5, 0.1, 2.0, 1.0, 0.1, 0.0, "saddle"),
+    }
+    case = claims.Case("parking", 3, False, answers, peer, None)
+    assert claims.restored(json.loads(json.dumps({"code": "now", **asdict(case)}))) == case
+    text = claims.render([case])
+    assert "- parking 3, ipm: `CONVERGED`, but stationarity is 0.003." in text
+    assert "| alm | 0 / 1 | 0 | - | 0 / 1 / 0 | 1 | 0 |" in text
+    assert "| ipm | 1 / 1 | 1 | 3.00e-03 | 0 / 0 / 0 | 0 | 0 | 1 / 0 / 0 |" in text
+
+
+def test_alpha_is_found_between_two_that_were_flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    def flown(seed: int, gamma: float, alpha: float) -> Flown:
+        return Flown(1.0 + gamma - 0.3 * float(np.log(alpha)), 0.0, 0.0, True)
+
+    monkeypatch.setattr(horizon_and_velocity, "past_the_sphere", flown)
+    wanted = [horizon_and_velocity.alpha_for(gamma, 1.0, [1, 2], 5) for gamma in (0.0, 0.2)]
+    np.testing.assert_allclose(wanted, np.exp([0.0, 0.2 / 0.3]), rtol=1e-9)
+
+
+def test_flights_are_compared_seed_by_seed() -> None:
+    def some(*errors: float) -> list[Flown]:
+        return [Flown(error, 0.0, 0.0, True) for error in errors]
+
+    one: Any = some(0.1, 0.5, 0.9)
+    assert horizon_and_velocity.paired(one, one, "error") == "-"
+    assert horizon_and_velocity.paired(some(0.102, 0.502, 0.902), one, "error") == "+2 (+2 .. +2)"

@@ -23,13 +23,12 @@ from unifg.scenarios import command
 from unifg.scenarios.campaigns import campaign as campaigns
 from unifg.scenarios.campaigns import performed
 from unifg.scenarios.campaigns.campaign import Campaign, run_campaign
-from unifg.scenarios.campaigns.dispatch import finished
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import Order, WrongLibrary, perform
 from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Statement, read, spawned, stated
 from unifg.scenarios.episode import silent
-from unifg.scenarios.workers import Inline, WorkerDied, WorkerNotStarted, Workers
+from unifg.scenarios.workers import Workers, finished
 
 WALKS = "problems.short_walks"
 TESTS = Path(__file__).resolve().parent
@@ -144,13 +143,13 @@ def test_the_same_episode_has_the_same_key_however_it_is_stated(tmp_path: Path) 
         ({"settings": {"pace": 101.0}}, "walks: nobody walks that fast"),
         ({"grid": {"pace": [1.0, 101.0]}}, r"walks \(pace 101\): nobody walks that fast"),
         ({"settings": {"seed": 3}}, "seeds are stated by `seeds`"),
-        ({"settings": {"pace": 1.0}, "grid": {"pace": [1.0]}}, "pace stands in `settings` and in the axis 'pace'"),
-        ({"grid": {"pace": [1.0], "leg": [{"pace": 2.0}]}}, "the axes 'pace' and 'leg' both set pace"),
+        ({"settings": {"pace": 1.0}, "grid": {"pace": [1.0]}}, "pace is set by `settings` and by the axis 'pace'"),
+        ({"grid": {"pace": [1.0], "leg": [{"pace": 2.0}]}}, "pace is set by the axis 'pace' and by the axis 'leg'"),
         ({"grid": {"pace": [1, 1.0]}}, "grid.pace: 1 is stated twice"),
         ({"grid": {"pace": []}}, "a list of values is expected"),
         ({"grid": {"pace": 3.0}}, "a list of values is expected"),
         ({"grid": {"pace": [{"mark": "x"}]}}, "an axis of tables needs a name that is no setting"),
-        ({"grid": {"leg": [{"name": "A"}, {"name": "A"}]}}, "two of its tables are named 'A'"),
+        ({"grid": {"leg": [{"name": "A"}, {"name": "A"}]}}, "grid.leg: A is stated twice"),
         ({"grid": {"leg": [{}, {}]}}, "state the same episode more than once"),
         ({"settings": {"shoes.grip": 1, "grip": 1}}, "shoes.grip is stated twice"),
         ({"seeds": None}, "`seeds` must be a list"),
@@ -379,7 +378,7 @@ class Watched(Executor):
             self.waiting -= 1
             if self.deaths:
                 self.deaths -= 1
-                raise WorkerDied("worker 7 ended by signal 9")
+                raise BrokenExecutor("worker 7 ended by signal 9")
             return fn(*args, **kwargs)
 
         return self.pool.submit(later)
@@ -405,7 +404,7 @@ def test_what_a_dead_worker_did_is_done_once_more() -> None:
     found = list(finished(Watched(deaths=1), abs, [-1, -2], lambda: 1))
     assert [(job, future.result()) for job, future in found] == [(-1, 1), (-2, 2)]
     (_, future), (_, other) = finished(Watched(deaths=2), abs, [-1, -2], lambda: 1)
-    assert isinstance(future.exception(), WorkerDied) and other.result() == 2
+    assert isinstance(future.exception(), BrokenExecutor) and other.result() == 2
     with pytest.raises(ScenarioError, match="takes no more jobs"):
         list(finished(Watched(broken=True), abs, [1], lambda: 1))
 
@@ -468,22 +467,15 @@ def test_workers_are_processes_of_one_thread_that_are_replaced(tmp_path: Path) -
     assert by["die once"]["worker"] != by["threads"]["worker"]
 
 
-def test_workers_that_cannot_start_are_no_lost_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    from unifg.scenarios import workers as room
+def dies() -> None:
+    os._exit(3)
 
-    starts = list[int]()
 
-    def dead(ready: object) -> None:
-        starts.append(1)
-        raise WorkerDied("worker 5 ended with status 1")
-
-    monkeypatch.setattr(room, "_Worker", dead)
-    with Workers(1) as executor, pytest.raises(WorkerNotStarted, match="no worker can be started: worker 5"):
-        executor.submit(abs, 1).result()
-    assert len(starts) == room.STARTS
+def test_workers_that_cannot_start_are_no_lost_episodes() -> None:
+    with pytest.raises(ScenarioError, match="no worker can be started"):
+        Workers(1, dies)
     with pytest.raises(ScenarioError, match="at least one worker"):
         Workers(0)
-    assert isinstance(Inline().submit(int, "x").exception(), ValueError)
 
 
 KILLED = """

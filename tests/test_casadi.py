@@ -8,7 +8,7 @@ import pytest
 import unifg as fg
 from test_derive import compared, curved, evaluated
 from unifg.errors import ModelError
-from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.rows import traced
 from unifg.lie import SE2, Rn
 from unifg.solvers import KKT
 from unifg.typing import Array

@@ -13,7 +13,7 @@ import unifg as fg
 from unifg.errors import BackendError, GraphError
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import Edges, PoseGraph, Simulated, best_guess, certify, chordal, judge, manhattan, sphere
-from unifg.pose_graphs.certificate import _Judge
+from unifg.pose_graphs.certificate import _Judge, _measured_in
 from unifg.pose_graphs.information import bounded_below
 from unifg.pose_graphs.relaxation import Relaxation
 from unifg.solvers import DogLeg, GaussNewton, LevenbergMarquardt, names
@@ -172,6 +172,7 @@ def test_the_unit_of_length_decides_nothing(made: Simulated) -> None:
     asked = certify(graph)
     assert asked.certified and 0.0 < asked.gap < 1e-5 * asked.chi2
     for unit in (1000.0, 0.3048, 1e-3, 1e-9):
+        np.testing.assert_array_equal(_measured_in(graph, unit).poses, in_units(graph, unit).poses)
         found = certify(in_units(graph, unit))
         assert found.certified and found.gap == pytest.approx(asked.gap, rel=1e-3)
         assert found.tolerance == pytest.approx(asked.tolerance, rel=1e-9)

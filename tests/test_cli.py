@@ -25,6 +25,7 @@ from unifg.scenarios import command
 from unifg.scenarios import navigation as navigation_scenario
 from unifg.scenarios.commands import drives
 from unifg.scenarios.episode import run_ticks
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.metrics import write_metrics
 from unifg.scenarios.navigation import NavigationSettings
@@ -85,23 +86,35 @@ def test_writes_every_file_and_names_it(
 
 
 @pytest.mark.usefixtures("no_files")
-def test_defaults_leave_the_scenario_its_own(navigation: FakeNavigation, tmp_path: Path) -> None:
-    run(tmp_path)
-    (settings,) = navigation.settings
-    assert (settings.map, settings.start, settings.goals) == (None, None, None)
-    assert (settings.coupling, settings.seed) == ("sequential", 0)
-    assert settings == NavigationSettings(obstacles=3)
-
-
-@pytest.mark.usefixtures("no_files")
-def test_arguments_arrive(navigation: FakeNavigation, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("", NavigationSettings(obstacles=3)),
+        (
+            "--map m.yaml --start=0,0,0 --goal=1,2,0.5 --goal 2,1e0,-3 --solver alm --obstacles 4 --seed 17",
+            NavigationSettings(
+                Path("m.yaml"), (0.0, 0.0, 0.0), ((1.0, 2.0, 0.5), (2.0, 1.0, -3.0)), "alm", "sequential", 4, seed=17
+            ),
+        ),
+        (
+            "--coupling joint --control-weight 0.1",
+            NavigationSettings(
+                obstacles=3, coupling="joint", controller=replace(ControllerSettings(), control_weight=0.1)
+            ),
+        ),
+    ],
+    ids=["none", "many", "of the controller"],
+)
+def test_arguments_arrive(
+    navigation: FakeNavigation,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: str,
+    expected: NavigationSettings,
+) -> None:
+    monkeypatch.chdir(tmp_path)
     save_map(tmp_path / "m.yaml", room())
-    words = ["--map", str(tmp_path / "m.yaml"), "--start=0,0,0", "--goal=1,2,0.5", "--goal", "2,1e0,-3"]
-    words += ["--solver", "alm", "--coupling", "sequential", "--obstacles", "4", "--seed", "17"]
-    assert run(tmp_path, *words) == 0
-    expected = NavigationSettings(
-        tmp_path / "m.yaml", (0.0, 0.0, 0.0), ((1.0, 2.0, 0.5), (2.0, 1.0, -3.0)), "alm", "sequential", 4, seed=17
-    )
+    assert run(tmp_path, *words.split()) == 0
     assert navigation.settings == [expected]
 
 
@@ -131,6 +144,7 @@ def test_values_that_begin_with_a_minus(navigation: FakeNavigation, tmp_path: Pa
         (["--seed", "1.5"], r"'1\.5' is not a whole number"),
         (["--map", "nowhere.yaml"], r"nowhere\.yaml: no such file"),
         (["--sol", "alm"], r"unrecognized arguments: --sol"),
+        *(([f"--control-weight={weight}"], r"positive") for weight in ("0", "-1", "nan", "much")),
     ],
 )
 def test_bad_arguments_exit_2(
@@ -212,85 +226,46 @@ def test_interrupt_before_the_first_tick(
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
-def test_first_interrupt_waits_for_the_end_of_the_tick(
-    navigation: FakeNavigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before = signal.getsignal(signal.SIGINT)
-    finished: list[int] = []
-
-    def loop(settings: NavigationSettings, progress: Progress) -> EpisodeLog:
-        try:
-            for tick in range(10):
-                if tick == 3:
-                    os.kill(os.getpid(), signal.SIGINT)
-                finished.append(tick)  # reached although the interrupt came first
-                progress(tick / 10, "driving")
-        except KeyboardInterrupt:
-            return replace(navigation.log, interrupted=True)
-        return navigation.log
-
-    monkeypatch.setattr(navigation_scenario, "run_navigation", loop)
-    assert run(tmp_path) == 130
-    assert finished == [0, 1, 2, 3]
-    assert (tmp_path / "out" / "scene.html").exists()
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
-@pytest.mark.parametrize("when", ["before", "last tick", "while writing"])
+@pytest.mark.parametrize(
+    ("when", "status", "count"),
+    [("before", 130, 0), ("swallowed", 130, 1), ("a tick", 130, 3), ("last tick", 0, 5), ("while writing", 0, 5)],
+)
 def test_an_end_asked_for_at_any_moment_loses_nothing(
-    when: str, navigation: FakeNavigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    when: str, status: int, count: int, navigation: FakeNavigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before the first tick it ends at once; what was run to its end is written whole."""
+    """Before the first tick it ends at once, later after the tick; what was run to its end is written whole.
+
+    Python prints and drops what is raised in finalisers, also the interrupt; the first tick is then the last.
+    """
     ticks: list[int] = []
     written = drives.write_results
 
+    def ask(moment: str) -> None:
+        if when == moment:
+            os.kill(os.getpid(), signal.SIGTERM)
+
     def loop(settings: NavigationSettings, progress: Progress) -> EpisodeLog:
         def tick(number: int) -> tuple[float, str] | None:
-            ticks.append(number)
-            if number == 4 and when == "last tick":
-                os.kill(os.getpid(), signal.SIGTERM)
+            ask({2: "a tick", 4: "last tick"}.get(number, ""))
+            ticks.append(number)  # reached although the signal came first
             return None if number == 4 else (number / 5, "driving")
 
-        if when == "before":
-            os.kill(os.getpid(), signal.SIGTERM)
+        ask("before")
+        with contextlib.suppress(KeyboardInterrupt):  # as a finaliser does
+            ask("swallowed")
         return replace(navigation.log, interrupted=run_ticks(10, tick, progress))
 
     def write(folder: Path, log: EpisodeLog) -> list[Path]:
-        if when == "while writing":
-            os.kill(os.getpid(), signal.SIGTERM)
+        ask("while writing")
         return written(folder, log)
 
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(navigation_scenario, "run_navigation", loop)
     monkeypatch.setattr(drives, "write_results", write)
-    assert run(tmp_path) == (130 if when == "before" else 0)
-    assert len(ticks) == (0 if when == "before" else 5)
+    assert run(tmp_path) == status
+    assert len(ticks) == count
     assert (tmp_path / "out" / "scene.html").exists() is (when != "before")
     assert signal.getsignal(signal.SIGTERM) is before
-
-
-@pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
-def test_an_end_that_a_finaliser_swallows_is_not_forgotten(
-    navigation: FakeNavigation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Python prints and drops what is raised in finalisers, also the interrupt; the first tick is then the last."""
-    ticks: list[int] = []
-
-    def loop(settings: NavigationSettings, progress: Progress) -> EpisodeLog:
-        with contextlib.suppress(KeyboardInterrupt):  # as a finaliser does
-            os.kill(os.getpid(), signal.SIGTERM)
-
-        def tick(number: int) -> tuple[float, str] | None:
-            ticks.append(number)
-            return None if number == 4 else (number / 5, "driving")
-
-        return replace(navigation.log, interrupted=run_ticks(10, tick, progress))
-
-    monkeypatch.setattr(navigation_scenario, "run_navigation", loop)
-    assert run(tmp_path) == 130
-    assert ticks == [0]
-    assert (tmp_path / "out" / "scene.html").exists()
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals work otherwise on Windows")
@@ -356,21 +331,6 @@ def test_help_loads_the_scenario_it_speaks_of_and_no_other(words: list[str], abs
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"usage: unifg {' '.join(words[:-1])}".rstrip())
-
-
-def test_control_weight_reaches_the_controller(navigation: FakeNavigation, no_files: None, tmp_path: Path) -> None:
-    assert (
-        command.main(["run", "navigation", "--coupling", "joint", "--control-weight", "0.1", "--out", str(tmp_path)])
-        == 0
-    )
-    assert navigation.settings[0].coupling == "joint"
-    assert navigation.settings[0].controller.control_weight == 0.1
-
-
-@pytest.mark.parametrize("weight", ["0", "-1", "nan", "much"])
-def test_control_weight_must_be_positive(weight: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.main(["run", "navigation", f"--control-weight={weight}"]) == 2
-    assert "positive" in capsys.readouterr().err
 
 
 @dataclass(frozen=True)

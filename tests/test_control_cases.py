@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.control import Driver, Problem, Quadrotor, Unicycle, blocked, problems
+from problems.control import Driver, Problem, Quadrotor, Unicycle, blocked, problems, sixteen
 from unifg.models import quadrotor
 from unifg.solvers import InteriorPoint
 from unifg.solvers.names import backends
@@ -15,18 +15,25 @@ from unifg.solvers.names import backends
 SOLVERS = backends("ipm", "sqp", "alm", tolerance=1e-4)
 
 
-@pytest.mark.parametrize("problem", problems(), ids=lambda p: p.title)
+# Minima that are not listed, at which IPOPT stays when it is started there.
+CONFIRMED = {("ahead", True, 20): (586.14768,), ("ahead", True, 50): (580.25905,)}
+
+
+@pytest.mark.parametrize("problem", list(dict.fromkeys([*problems(), *sixteen()])), ids=lambda p: p.title)
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_control_case(solver: str, problem: Problem) -> None:
     stated = problem.formulation()
     solution = SOLVERS[solver].solve(stated.graph, stated.guess)
     assert solution.converged, solution.report()
-    assert np.abs(solution.cost / np.array(problem.optima) - 1.0).min() < 1e-4
+    known = np.array([*problem.optima, *CONFIRMED.get((problem.instance, problem.blocked, problem.horizon), ())])
+    assert np.abs(solution.cost / known - 1.0).min() < 1e-4
+    if isinstance(problem, Unicycle) and problem.horizon == 20:  # the judge differentiates densely
+        assert judge(stated.graph, solution).worst() < 1e-3
 
 
 @pytest.mark.parametrize(("instance", "best"), [("ahead", 580.25905), ("goto", 3387.08409)])
 def test_a_better_optimum_than_that_of_ipopt_is_listed(instance: str, best: float) -> None:
-    """IPOPT ends at the first of the list; it stays where it is started at the others (docs/reference-problems.md)."""
+    """IPOPT ends at the first of the list; it stays where it is started at the others (tests/problems/control.py)."""
     problem = next(p for p in blocked() if (p.instance, p.horizon) == (instance, 50))
     assert min(problem.optima) == best < problem.optima[0]
     stated = problem.formulation()

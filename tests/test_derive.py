@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.factors.autodiff.expression import Expression, traced
+from unifg.factors.autodiff.expression import Expression
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.kernel import Argument, evaluate_rows
 from unifg.lie import SE2, SE3, SE23, SO2, SO3, Rn
 from unifg.typing import Array

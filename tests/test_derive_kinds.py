@@ -16,7 +16,7 @@ import pytest
 
 import unifg as fg
 from unifg.factors.autodiff.captured import captured_by
-from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.symbols import TraceError
 from unifg.lie import Rn
 from unifg.typing import Array

@@ -11,7 +11,7 @@ import unifg as fg
 from own_manifolds import OWN
 from test_derive import compared, curved, evaluated, packed, points
 from unifg.codegen.native import Native
-from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.symbols import TraceError
 from unifg.factors.kernel import Argument, evaluate_rows
 from unifg.lie import SE2, SE3, SO2, SO3, Rn

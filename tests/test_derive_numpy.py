@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import unifg as fg
 from test_derive import curved, evaluated
-from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.symbols import TraceError
 from unifg.factors.kernel import evaluate_rows
 from unifg.lie import Rn

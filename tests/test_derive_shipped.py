@@ -13,8 +13,8 @@ from scipy.special import zeta
 import unifg as fg
 from test_derive import Open, compared, curved, evaluated, numpy_of_casadi
 from test_jacobians import CAR, CASES, COUNT, GRID, MOUNT, slopes_of
-from unifg.factors.autodiff.expression import traced
 from unifg.factors.autodiff.lookup import Lookup
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.kernel import Argument, evaluate_rows
 from unifg.factors.residuals import Residual
 from unifg.lie import SE2, SE3, SO2, SO3, Rn, wrap_angle

@@ -103,6 +103,7 @@ def anchors(page: Path) -> set[str]:
 
 def broken_links(page: Path) -> list[str]:
     """List the relative links of a page that lead nowhere."""
+    root = next((folder.parent for folder in page.resolve().parents if folder.name == "docs"), page.resolve().parent)
     broken = []
     for target in sorted(link_targets(page.read_text(encoding="utf-8"))):
         if re.match(r"^[a-z][a-z0-9+.-]*:", target):  # https:, mailto:
@@ -111,7 +112,7 @@ def broken_links(page: Path) -> list[str]:
         file = (page.parent / name).resolve() if name else page
         if (
             not file.exists()
-            or not file.is_relative_to(page.parent.resolve().parents[0])
+            or not file.is_relative_to(root)
             or (anchor and file.suffix == ".md" and anchor.lower() not in anchors(file))
         ):
             broken.append(target)

@@ -33,13 +33,13 @@ def said(findings: Iterator[Finding] | list[Finding], good: bool | None) -> list
 
 def test_a_loss_is_told_from_noise() -> None:
     def slower(now: Record, then: Record) -> list[str]:
-        return [row.name for row in performance.compared(now, then) if row.slower]
+        return [name for name, row in performance.compared(now, then).items() if row.slower]
 
     assert slower(record(1.3, seed=1), record()) == ["a"]
     assert slower(record(1.1, seed=1), record()) == [], "less than is asked for"
     assert slower(record(1.3, noise=0.9, seed=1), record(noise=0.9)) == [], "nobody knows"
     assert slower(record(0.5, seed=1), record()) == []
-    (a, _) = performance.compared(record(1.3, seed=1), record())
+    a = performance.compared(record(1.3, seed=1), record())["a"]
     assert a.low < a.factor < a.high and abs(a.factor - 1.3) < 0.1
 
 
@@ -96,7 +96,7 @@ def test_every_case_can_be_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     shipped = performance.last(performance.history())
     assert shipped is not None and now.ratios.keys() == shipped.ratios.keys(), "record anew: unifg bench --record"
     assert all(len(row) == 1 and row[0] > 0.0 for row in now.ratios.values())
-    assert performance.told(now, performance.compared(now, shipped)).count("\n") == len(now.ratios)
+    assert performance.report(now, performance.compared(now, shipped)).count("\n") == len(now.ratios)
 
 
 def test_a_healthy_installation_is_called_well(capsys: pytest.CaptureFixture[str]) -> None:

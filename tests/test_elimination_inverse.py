@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from test_elimination import full, grid, system
-from test_elimination_chain import horizon
+from test_elimination_horizons import horizon
 from unifg.elimination.factorization import Factorization
 from unifg.errors import UnifgError
 
@@ -124,7 +124,7 @@ def test_pickles_carry_the_structure(rng: np.random.Generator) -> None:
 
 
 def test_wrong_shapes_are_refused(rng: np.random.Generator) -> None:
-    pattern, data, label, negative = grid(rng, 3, 2)
+    pattern, data, label, _ = grid(rng, 3, 2)
     factorization = Factorization(pattern, label)
     for refused in (data[:-1], np.append(data, 0.0)):
         with pytest.raises(UnifgError, match="data has shape"):
@@ -135,7 +135,5 @@ def test_wrong_shapes_are_refused(rng: np.random.Generator) -> None:
     for right in (np.zeros(pattern.size + 1), np.zeros((3, 2)), np.zeros((pattern.size, 2, 2))):
         with pytest.raises(UnifgError, match="shape"):
             factorization.solve(right)
-    with pytest.raises(UnifgError, match="negative has shape"):
-        Factorization(pattern, label, negative=negative[1:]).factor(data)
     with pytest.raises(UnifgError, match="unknown"):
         Factorization(pattern, label, ordering="amd").factor(data)  # type: ignore[arg-type]

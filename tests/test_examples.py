@@ -16,7 +16,7 @@ from unifg.models import rkmk
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((CHECKOUT / "examples").glob("*.py"))
-PAGE = CHECKOUT / "docs" / "examples.md"
+PAGE = CHECKOUT / "docs" / "guide" / "examples.md"
 PICTURES = CHECKOUT / "docs" / "images" / "examples"
 LONGEST, LARGEST = 60, 60_000  # lines of a script, bytes of a picture
 
@@ -63,8 +63,8 @@ def test_is_short_tested_and_shown(path: Path) -> None:
     known = set(re.findall(r"^\s*(?:from|import) ([\w.]+)", text, re.MULTILINE))
     inside = {path.stem for path in EXAMPLES} | {"benchmarks", "tests", "judge", "problems"}
     assert not {name for name in known if name.split(".")[0] in inside or name.startswith("unifg.scenarios")}
-    assert f"](../examples/{path.name})" in page
-    assert f"](images/examples/{path.stem}.png)" in page
+    assert f"](../../examples/{path.name})" in page
+    assert f"](../images/examples/{path.stem}.png)" in page
     assert (PICTURES / f"{path.stem}.png").stat().st_size < LARGEST
     assert f"test_{path.stem}" in globals(), "a test has to say what is right about it"
 

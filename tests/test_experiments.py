@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from benchmarks.experiments import beside, drivers, leg_by_leg, rendered
+from benchmarks.experiments import beside, drives_of, leg_by_leg, rendered
 from benchmarks.kept_rows import ROWS, keep, restore
-from benchmarks.large_maps import CAMPAIGNS
 from benchmarks.localisation import LOG, made, mapped, real_ticks, replayed
+from benchmarks.report import CAMPAIGNS
 from unifg.errors import ScenarioError
 from unifg.files.carmen import read_carmen
 from unifg.scenarios.campaigns.campaign import EPISODES
@@ -81,7 +82,7 @@ def cells(text: str, *first: str) -> list[str]:
 
 
 def test_planners_are_compared_over_what_both_have_driven() -> None:
-    drives = [*drivers(OURS, "department"), *drivers(THEIRS, "department")]
+    drives = pd.concat([drives_of(OURS, "department"), drives_of(THEIRS, "department")])
     text = beside(drives)
     ours, teb = cells(text, "ours, sequential"), cells(text, "teb")
     assert ours[1:4] == ["2", "6", "5"] and teb[1:4] == ["2", "5", "4"]
@@ -93,7 +94,7 @@ def test_planners_are_compared_over_what_both_have_driven() -> None:
 
 
 def test_legs_say_who_drove_them() -> None:
-    text = leg_by_leg([*drivers(OURS, "department"), *drivers(THEIRS, "factory")])
+    text = leg_by_leg(pd.concat([drives_of(OURS, "department"), drives_of(THEIRS, "factory")]))
     assert cells(text, "I CB", "ours, sequential")[2:] == ["3", "2", "210.00 ± 14.14 (6.73 %)",
                                                           "21.00 ± 1.41 (6.73 %)", "-1", "2"]  # fmt: skip
     assert cells(text, "II AC", "teb")[2:4] == ["3", "2"]

@@ -13,7 +13,8 @@ from scipy.optimize import least_squares
 import unifg as fg
 from dense import Batch, drive, one_by_one
 from unifg.codegen.views import described
-from unifg.elimination.elements import arrange
+from unifg.elimination.symbolic import cliques as find_cliques
+from unifg.elimination.symbolic import separators as find_separators
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.smoothing import Incremental
@@ -284,7 +285,12 @@ def test_cliques_hold_what_they_must(seed: int) -> None:
     pointer = np.cumsum([0, *map(len, elements)])
     given_order = rng.permutation(n) if chronological else np.zeros(0, dtype=np.int64)
     last = int(rng.integers(n))
-    order, first, separator, bounds, parent, home = arrange(weight, last, given_order, pool, pointer)
+    stage, alone = np.zeros(n, dtype=np.int64), np.full(n, chronological)
+    stage[last], alone[last] = not chronological, True
+    order, first, parent, passed, begin, size, lists = find_cliques(
+        weight, stage, alone, given_order, False, pool, pointer
+    )
+    separator, bounds, home = find_separators(order, begin, size, lists, first, pool, pointer)
     assert sorted(order) == list(range(n)) and first[-1] == n
     if chronological:
         assert list(order) == list(given_order) and (np.diff(first) == 1).all()
@@ -297,6 +303,7 @@ def test_cliques_hold_what_they_must(seed: int) -> None:
         assert element[np.argmin(place[element])] in cliques[home[e]]
         assert set(element) <= cliques[home[e]] | set(separators[home[e]])
     for k, members in enumerate(separators):
+        assert passed[k] == weight[members].sum()
         assert (np.diff(place[members]) > 0).all() if len(members) else parent[k] == -1
         if members:
             assert members[0] in cliques[parent[k]] and parent[k] > k

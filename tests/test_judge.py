@@ -291,11 +291,17 @@ def test_degenerate_multipliers_have_no_units(
     slopes.see(lin.constraint_jacobian, lin.gradient)
     multipliers = np.array([-cost * (point - 1.0) / (rows * slope)])
     assert np.abs(program.lagrangian_gradient(lin, multipliers)).max() < 1e-6 * cost / unknown
-    assert slopes.degenerate(multipliers, 1e-6) is degenerate
+    assert slopes.degenerate(lin, multipliers, 1e-6) is degenerate
 
 
-@pytest.mark.parametrize("solver", [SQP(), SQP(hessian="exact"), KKT()], ids=["sqp", "sqp-exact", "kkt"])
-@pytest.mark.parametrize(("row", "start"), [(np.exp, 0.0), (np.exp, 2.0), (lambda p: p**3, 1.0)])
+LOSING = [SQP(), SQP(hessian="exact"), KKT(), InteriorPoint(), AugmentedLagrangian()]
+
+
+@pytest.mark.parametrize(
+    ("solver", "row", "start"),
+    [(solver, lambda p: p**3, start) for solver in LOSING for start in (1.0, 2.0)]
+    + [(solver, np.exp, start) for solver in LOSING[:3] for start in (0.0, 2.0)],
+)
 def test_rows_that_lose_their_slope_are_no_success(solver: Solver, row: Callable[[Array], Array], start: float) -> None:
     """They used to be CONVERGED, with multipliers of 1e8 that the test divides by."""
     graph, x = flat(row, 1.0, 1.0, 1.0)
@@ -309,7 +315,7 @@ def test_rows_that_lose_their_slope_are_no_success(solver: Solver, row: Callable
     for unit in (1e-3, 1e3):
         scaled, x = flat(row, unit, unit, 1.0)
         again = replace(solver, tolerance=1e-6 * unit).solve(scaled, {x: guess[next(iter(guess))]})
-        assert again.status is fg.Status.DEGENERATE, (unit, again.report())
+        assert again.status in (fg.Status.DEGENERATE, fg.Status.ITERATION_LIMIT), (unit, again.report())
 
 
 def test_the_second_backend_is_asked_where_the_first_ends_degenerate(monkeypatch: pytest.MonkeyPatch) -> None:

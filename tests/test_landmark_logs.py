@@ -203,7 +203,7 @@ def test_odometry_that_does_not_fit(call: object, message: str) -> None:
 
 @pytest.mark.data
 def test_the_log_of_a_mower_without_a_map(shared_data: Path) -> None:
-    """Plaza 1 whole, as in docs/landmarks.md: beacons, factor and offset of the ranges are unknown."""
+    """Plaza 1 whole, as in docs/guide/sensors.md: beacons, factor and offset of the ranges are unknown."""
     folder = shared_data / "landmarks"
     log = read_plaza(folder / "Plaza1_DR.txt.gz", folder / "Plaza1_TD.txt.gz")
     assert len(log.steps) == 9657 and np.unique(log.beacon).tolist() == [0, 1, 5, 6]

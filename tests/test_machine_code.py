@@ -25,7 +25,8 @@ from unifg.codegen.objects import SWITCH, Objects
 from unifg.errors import GraphError
 from unifg.factors.autodiff import derived as derived_room
 from unifg.factors.autodiff import expression as expression_room
-from unifg.factors.autodiff.expression import Expression, traced
+from unifg.factors.autodiff.expression import Expression
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.kernel import evaluate_rows
 from unifg.models.spline import SplineCurve

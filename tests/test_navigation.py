@@ -387,7 +387,7 @@ def test_department_map_is_planned_end_to_end(shared_data: Path) -> None:
 
 
 def test_a_drive_plans_with_the_backend_that_the_page_names() -> None:
-    page = (Path(__file__).parents[1] / "docs" / "navigation.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "docs" / "results" / "navigation.md").read_text(encoding="utf-8")
     row = next(line for line in page.splitlines() if line.startswith("| `--solver"))
     assert f"`{NavigationSettings().solver}`" in row.split("|")[2]
     assert NavigationSettings().solver == SOLVERS[0]

@@ -12,7 +12,7 @@ import pytest
 import unifg as fg
 from problems import offsets
 from unifg.codegen.jit import compiled
-from unifg.factors.differences import gradient_and_hessian, jacobian
+from unifg.factors.differences import directions_of, jacobian, one_by_one, scalar_slopes
 from unifg.lie.rn import minus
 from unifg.models import quadrotor, unicycle
 from unifg.problem.hessian import lagrangian_hessian
@@ -150,7 +150,7 @@ def test_gradient_and_hessian_of_a_scalar(manifold: fg.Manifold, offset: float) 
         R = fg.SO2.matrix(points[:, 2:3]) if manifold is fg.SE2 else fg.SO3.matrix(points[:, 3:7])
         return np.asarray(np.einsum("nk,nk->n", line, R[:, :, 0]))  # p' R e1
 
-    gradient, hessian, _ = gradient_and_hessian(ahead, [x + away], [manifold])
+    gradient, hessian, _ = scalar_slopes(one_by_one(ahead), directions_of((manifold,)), [x + away])
     R = fg.SO2.matrix(x[:, 2:3]) if manifold is fg.SE2 else fg.SO3.matrix(x[:, 3:7])
     body = np.einsum("nk,nki->ni", x[:, :axes], R)  # p in the frame of the body
     expected = np.zeros_like(gradient)
@@ -232,7 +232,8 @@ def test_a_moved_world_is_the_same_problem(asked: str) -> None:
 def test_the_gradient_of_a_logarithm_near_zero() -> None:
     """Accuracy where four points at a step of 1e-4 are wrong by 2e-4, and two at a sixteenth of it by 2e-5."""
     x = np.array([[7e-4], [3e-3], [0.2], [5.0]])
-    gradient, hessian, _ = gradient_and_hessian(lambda p: p[:, 0] * np.log(p[:, 0]), [x], [fg.Rn(1)])
+    entropy = one_by_one(lambda p: np.asarray(p[:, 0] * np.log(p[:, 0])))
+    gradient, hessian, _ = scalar_slopes(entropy, directions_of((fg.Rn(1),)), [x])
     exact = 1.0 + np.log(x)
     np.testing.assert_allclose(gradient[0], exact[0], atol=3e-5)
     np.testing.assert_allclose(gradient[1:], exact[1:], atol=3e-6)

@@ -1,4 +1,4 @@
-"""The backends that docs/own-backend.md builds, on the table of problems."""
+"""The backends that docs/howto/own-backend.md builds, on the table of problems."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from judge import judge
 from problems.known import PROBLEMS, Problem
 from unifg.solvers import KKT
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "own-backend.md"
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "howto" / "own-backend.md"
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +66,6 @@ def test_solves_equalities_and_refuses_the_rest(page: dict[str, Any], problem: P
 
 
 def test_page_and_example_have_the_same_backend() -> None:
-    example = (PAGE.parent.parent / "examples" / "own_backend_constrained.py").read_text(encoding="utf-8")
+    example = (PAGE.parents[2] / "examples" / "own_backend_constrained.py").read_text(encoding="utf-8")
     (own,) = (block.code for block in fences(PAGE) if "class Lagrange" in block.code)
     assert own[own.index("class Lagrange") :].strip() in example

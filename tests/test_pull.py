@@ -1,4 +1,4 @@
-"""Effect of a plan on the estimate it shares a graph with: -Sigma grad V, and nothing else (docs/unification.md)."""
+"""Effect of a plan on the estimate it shares a graph with: -Sigma grad V (docs/results/unification.md)."""
 
 from __future__ import annotations
 

@@ -5,18 +5,15 @@ from __future__ import annotations
 import copy
 import json
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks import quadrotor_flights, quadrotor_tables, report, runs
+from benchmarks import quadrotor_flights, quadrotor_tables
 from benchmarks.comparison import against, paired, share
-from benchmarks.quadrotor_flights import SOLVERS, STUDIES, Job, jobs_of
-from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.journal import lines_of
+from benchmarks.quadrotor_flights import STUDIES, Job, cells
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.log.flight_log import FlightLog
 
@@ -42,52 +39,16 @@ def moment(settings: FlightSettings) -> FlightLog:
 
 
 def test_every_study_flies_what_it_should() -> None:
-    jobs = jobs_of(STUDIES, SOLVERS, quadrotor_tables.VARIANTS, range(100))
+    jobs = cells(range(100))
     count = {study: sum(job.study == study for job in jobs) for study in STUDIES}
     assert count == {
-        "flights": 7 * 100, "potential": 3 * 100, "association": 100, "movers": 100, "weights": 60,
+        "flights": 7 * 100, "potential": 3 * 100, "association": 100, "movers": 100,
         "timing": 20 * 2 * (3 + 1 + 1),
     }  # fmt: skip
     assert len(set(jobs)) == len(jobs)
-    weighted = next(job for job in jobs if job.weight == 10.0).settings()
-    assert (weighted.coupling, weighted.controller.control_weight) == ("joint", 10.0)
     assert next(job for job in jobs if job.study == "potential").settings().controller.avoidance == "potential"
     assert next(job for job in jobs if job.study == "association").settings().estimator.association == "unknown"
     assert next(job for job in jobs if job.study == "movers").settings().movers == 2
-
-
-def test_finished_flights_are_not_repeated(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    flown: list[Job] = []
-
-    def fly(job: Job) -> Row:
-        flown.append(job)
-        raise ScenarioError("no wind today")
-
-    def run(*words: str) -> int:
-        flown.clear()
-        given = ["--seeds", "1000:1003", "--studies", "flights", "timing", "--solvers", "sqp", *words]
-        assert quadrotor_flights.main(given) == 0
-        return len(flown)
-
-    monkeypatch.setattr(quadrotor_flights, "fly", fly)
-    monkeypatch.setattr(runs, "OUT", tmp_path)
-    monkeypatch.setattr(report, "OUT", tmp_path)
-    monkeypatch.setattr(runs, "commit", lambda: "now")
-    store = tmp_path / "quadrotor_flights.jsonl"
-    assert run() == 12
-    assert [job.study for job in flown] == ["flights"] * 6 + ["timing"] * 6
-    store.write_text(store.read_text() + '{"cut off')
-    assert run() == 0
-    monkeypatch.setattr(runs, "commit", lambda: "later")
-    assert run("--any-code") == run("--report") == 0
-    assert run() == 12
-    assert run("--fresh", "--solvers", "alm") == 12
-    codes = [row["code"] for row in lines_of(store)]
-    assert codes == ["now"] * 12 + ["later"] * 24
-    assert "Flights refused: 24." in (tmp_path / "quadrotor-mpc.md").read_text()
-    with pytest.raises(SystemExit, match="Nothing on file"):
-        monkeypatch.setattr(runs, "OUT", tmp_path / "elsewhere")
-        run("--report")
 
 
 def test_rows_have_what_tables_need(short_rows: dict[str, Row]) -> None:
@@ -126,16 +87,13 @@ def test_differences_are_paired(short_rows: dict[str, Row]) -> None:
     assert against(mine[2:3], base, read) == "-"
 
 
-def test_the_worst_run_counts_and_enough_ticks_are_needed() -> None:
+def test_the_worst_run_counts() -> None:
     def row(run: int, milliseconds: float, ticks: int) -> Row:
         times = {"estimate_ms": [milliseconds] * ticks, "plan_ms": [1.0] * ticks}
         return {"study": "timing", "solver": "ipm", "coupling": "joint", "run": run, "metrics": {}, **times}
 
     rows = [row(0, 4.0, 3000), row(0, 6.0, 2500), row(1, 9.0, 5000)]
     assert "| ipm | joint | 2 | 5000 | 10.0 | 10.0 | 10.0 | 9.0 / 9.0 | 1.0 / 1.0 |" in quadrotor_tables.ticks(rows)
-    assert "| yes |" in quadrotor_tables.goals(rows)
-    assert "| no |" in quadrotor_tables.goals([row(0, 4.0, 4999)])
-    assert "| no |" in quadrotor_tables.goals([row(0, 20.0, 5000)])
 
 
 def test_wilson_intervals() -> None:

@@ -343,9 +343,10 @@ def test_a_pull_of_nothing_is_refused() -> None:
 # ---------------------------------------------------------------- what is measured
 
 
-def test_the_pull_is_measured() -> None:
+def test_the_pull_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two short flights of the benchmark: without a bound, and with so small a weight that nothing pulls."""
-    strong = quadrotor_pull.Job(SEED, 0.5, weight=10.0, pull=np.inf)
+    monkeypatch.setattr(quadrotor_pull, "SECONDS", 0.5)
+    strong = quadrotor_pull.Job(SEED, weight=10.0, pull=np.inf)
     weak = replace(strong, weight=1e-6)
     rows = {job.weight: {**asdict(job), **quadrotor_pull.fly(job)} for job in (strong, weak)}
     assert rows[10.0]["mean"]["sigma"] > 0.5 > 1e-2 > rows[1e-6]["max"]["sigma"]

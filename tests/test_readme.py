@@ -54,6 +54,6 @@ def test_pictures_and_links_survive_a_package_index() -> None:
     for name in pictures:
         assert Path(CHECKOUT / name).is_file()
         assert f"https://example.org/owner/unifg/raw/v1.2.3/{name}" in text
-    assert "](https://example.org/owner/unifg/blob/v1.2.3/docs/tutorial.md)" in text
+    assert "](https://example.org/owner/unifg/blob/v1.2.3/docs/guide/tutorial.md)" in text
     assert "](https://gtsam.org)" in text, "what is absolute stays"
     assert not re.search(r'\]\((?![a-z]+:|#)|(?:src|srcset)="(?!https:)', text)

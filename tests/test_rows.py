@@ -10,6 +10,7 @@ import pytest
 import unifg as fg
 from unifg.errors import GraphError
 from unifg.factors.autodiff.captured import captured_by
+from unifg.factors.autodiff.lookup import Lookup
 from unifg.factors.autodiff.rows import Common, Each, RowsError, Shared, lengths_for, traced_rows
 from unifg.factors.autodiff.symbols import Length, symbols
 from unifg.problem import traced
@@ -244,3 +245,24 @@ def test_mixed_inputs_are_named() -> None:
         traced_rows(function, [fg.Rn(2), Each((2,))], [], (3, 4))
     assert raised.value.mixed == {1} and raised.value.row == 1
     assert captured_by(function).key is not None
+
+
+class Stairs(Lookup):
+    """A table that is read at whole numbers."""
+
+    def __call__(self, x: Array) -> Array:
+        found: Array = self.take(np.clip(np.floor(x), 0.0, 2.0)) * x
+        return found
+
+
+def test_tables_are_read_in_batches() -> None:
+    """Two tables, of which the second stands behind the first."""
+    first, second = Stairs([1.0, 2.0, 4.0]), Stairs([10.0, 20.0, 40.0, 80.0])
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 3)
+    graph.minimize(fg.residual(lambda x: first(x) + second(x), derivatives="trace"), x)
+    program = graph.compile()
+    assert program.terms[0].route.startswith("traced")
+    lin = program.linearize({x: np.array([[0.5], [1.5], [2.5]])})
+    np.testing.assert_allclose(lin.residual, [5.5, 33.0, 110.0])
+    np.testing.assert_allclose(lin.jacobian, [11.0, 22.0, 44.0])

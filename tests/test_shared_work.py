@@ -69,12 +69,11 @@ def test_parts_of_a_tree_are_eliminated_to_the_bit(lattice: PoseGraph) -> None:
             factorization.plan.numbers[:] = np.nan
             factorization.plan.numbers[factorization.plan.shape[3] :] = 0.0
             assert factorization.factor(hessian)
-            assert factorization.inertia == inertia and factorization.failure == -1 and factorization.unexpected == -1
+            assert factorization.inertia == inertia and factorization.failure == -1
             seen.append(factorization.solve(right))
             held = factorization.plan.shape[3]
             assert np.array_equal(factorization.plan.numbers[:held], panels[:held])
-    np.testing.assert_allclose(seen[0], solved, rtol=0.0, atol=1e-12 * abs(solved).max())
-    assert all(np.array_equal(other, seen[0]) for other in seen)
+    assert all(np.array_equal(other, solved) for other in seen)
 
 
 def test_what_fails_fails_at_the_same_pivot(lattice: PoseGraph) -> None:
@@ -90,21 +89,6 @@ def test_what_fails_fails_at_the_same_pivot(lattice: PoseGraph) -> None:
             fg.use_threads(count)
             found.append((factorization.factor(damaged), factorization.inertia, factorization.failure))
         assert found[0] == found[1]
-
-
-def test_signs_that_nobody_announced_are_told_alike(lattice: PoseGraph) -> None:
-    _, hessian = system(lattice)
-    graph, _, _ = lattice.graph()
-    program = graph.compile()
-    announced = np.zeros(program.size, dtype=bool)
-    announced[[100, 1000, 2000]] = True
-    factorization = Factorization(program.normal, program.blocks, negative=announced)
-    found = []
-    for count in (1, 2):
-        fg.use_threads(count)
-        assert factorization.factor(hessian)
-        found.append((factorization.unexpected, factorization.inertia))
-    assert found[0] == found[1] and found[0][0] in (100, 1000, 2000)
 
 
 def test_chunks_of_a_triangle_cover_it_once_in_rows_of_eight() -> None:

@@ -20,7 +20,7 @@ import reference  # noqa: E402
 def test_every_page_has_a_place() -> None:
     sections = yaml.safe_load((CHECKOUT / "mkdocs.yml").read_text())["nav"]
     listed = [page for section in sections for pages in section.values() if isinstance(pages, list) for page in pages]
-    written = {path.name for path in (CHECKOUT / "docs").glob("*.md")}
+    written = {path.relative_to(CHECKOUT / "docs").as_posix() for path in (CHECKOUT / "docs").rglob("*.md")}
     made = {name for name in reference.pages() if name.endswith(".md") and not name.startswith("api/")}
     assert sorted(listed) == sorted((written | made) - {"license.md"})
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from own_manifolds import Sphere
 from unifg.errors import GraphError
 from unifg.smoothing import FixedLag, Incremental
 from unifg.solvers import LevenbergMarquardt
@@ -220,49 +221,6 @@ def test_components_constants_repetitions_and_many_variables(kind: str) -> None:
     np.testing.assert_allclose(smoother.estimate(v), solution[y], atol=1e-8)
     assert smoother.cost == pytest.approx(solution.cost, rel=1e-8)
     np.testing.assert_allclose(smoother.covariance(u[3].velocity), solution.covariance(x[3].velocity), rtol=1e-6)
-
-
-class Sphere(fg.Manifold):
-    """Directions as unit vectors, moved by NumPy alone; no group."""
-
-    name, storage, dim = "S2", 3, 2
-
-    def identity(self) -> Array:
-        return np.array([0.0, 0.0, 1.0])
-
-    def _basis(self, x: Array) -> Array:
-        """(..., 3, 2) axes of the tangent plane."""
-        axis = np.where(np.abs(x[..., :1]) < 0.6, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-        first = np.cross(x, axis)
-        first /= np.linalg.norm(first, axis=-1, keepdims=True)
-        return np.stack([first, np.cross(x, first)], axis=-1)
-
-    def retract(self, x: Any, d: Any, /) -> Array:
-        x, d = np.asarray(x, dtype=float), np.asarray(d, dtype=float)
-        length = np.linalg.norm(d, axis=-1, keepdims=True)
-        along = np.einsum("...ij,...j->...i", self._basis(x), d)
-        moved: Array = np.cos(length) * x + np.sinc(length / np.pi) * along
-        return np.asarray(moved / np.linalg.norm(moved, axis=-1, keepdims=True))
-
-    def local(self, x: Any, y: Any, /) -> Array:
-        x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-        along = np.einsum("...ij,...i->...j", self._basis(x), np.broadcast_to(y, np.broadcast_shapes(x.shape, y.shape)))
-        sine = np.linalg.norm(along, axis=-1, keepdims=True)
-        angle = np.arctan2(sine, (x * y).sum(axis=-1, keepdims=True))
-        return np.asarray(along * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 1.0))
-
-    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
-        found = rng.standard_normal((*shape, 3))
-        return np.asarray(found / np.linalg.norm(found, axis=-1, keepdims=True))
-
-    def is_valid(self, x: Any, /) -> Any:
-        return np.abs(np.linalg.norm(np.asarray(x), axis=-1) - 1.0) < 1e-6
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Sphere)
-
-    def __hash__(self) -> int:
-        return hash(Sphere)
 
 
 @pytest.mark.parametrize("kind", ["incremental", "fixed lag"])

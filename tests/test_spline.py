@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline, RectBivariateSpline
 import unifg as fg
 from test_derive import compared, curved, evaluated
 from unifg.errors import ModelError
-from unifg.factors.autodiff.expression import traced
+from unifg.factors.autodiff.rows import traced
 from unifg.lie import SE2, Rn
 from unifg.models.distance_map import DistanceMap
 from unifg.models.spline import BEYOND, SplineCurve, SplineField

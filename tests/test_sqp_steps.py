@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.control import Unicycle
 from problems.hock_schittkowski import SMALL
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import subproblem
 from unifg.solvers.sqp import missing_curvature
+from unifg.typing import Array
 
 CASES = {case.name: case for case in SMALL}
 
@@ -67,3 +69,70 @@ def test_missing_curvature_by_hand() -> None:
     short = program.linearize(program.retract(before.values, 1e-9 * step))
     qp = subproblem(program, before, 0.0)
     assert missing_curvature(Scaling.none(program), qp, before, short, np.array([2.0]), 1e-9 * step) == 0.0
+
+
+def test_subproblems_on_the_graph_begin_from_the_last_multipliers() -> None:
+    stated = Unicycle("behind", True, 20).formulation()
+    solution = SQP(qp="graph").solve(stated.graph, stated.guess, check=True)
+    taken = [int(row.details["qp_iterations"]) for row in solution.history[1:]]
+    assert max(taken[-2:]) <= 4 < taken[0], taken
+
+
+@pytest.mark.parametrize("correction", [True, False])
+def test_a_point_that_cannot_be_evaluated_is_not_taken(correction: bool) -> None:
+    """The first step leads to where there is no logarithm."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [-5.0])
+    graph.constrain(lambda p: np.log(p), x, lower=-3.0, name="log")
+    solution = SQP(qp="graph", second_order_correction=correction).solve(graph, {x: np.ones((1, 1))})
+    assert solution.converged
+    assert solution[x][0, 0] == pytest.approx(np.exp(-3.0), rel=1e-4)
+
+
+def test_positions_in_small_units_beside_headings_are_scaled() -> None:
+    """Positions in units of 0.1 mm: the answers of subproblems are polished."""
+    unit = np.array([1e-4, 1e-4, 1.0])
+
+    def motion(a: Array, u: Array, b: Array) -> Array:
+        a, b = a * unit, b * unit
+        heading = a[:, 2] + 0.1 * u[:, 1]
+        along = np.stack([u[:, 0] * np.cos(heading), u[:, 0] * np.sin(heading), u[:, 1]], axis=1)
+        gap: Array = b - a - 0.2 * along
+        return gap
+
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.Rn(3), 9), graph.variables("u", fg.Rn(2), 8)
+    graph.fix(x[0], np.zeros(3))
+    graph.minimize(fg.prior, x[-1], np.array([1.0, 0.5, 0.3]) / unit, sigma=0.1 / unit)
+    graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
+    graph.constrain(motion, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")
+    graph.bound(u, lower=-0.7, upper=0.7)
+    guess = {x: np.linspace(np.zeros(3), [1.0, 0.1, 0.1], 9) / unit, u: np.full((8, 2), 0.3)}
+    prepared = SQP(qp="graph").prepare(graph)
+    assert prepared.solve(guess).converged and not prepared._workspace.scaling.neutral
+
+
+def test_limits_may_change_in_kind_between_solves() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SO3, 3)
+    start = graph.data("start", [1.0, 0.0, 0.0, 0.0])
+    lower, upper = graph.data("lower", np.zeros(3)), graph.data("upper", np.zeros(3))
+    graph.fix(x[0], start)
+    graph.minimize(fg.prior, x, np.tile([0.8, 0.6, 0.0, 0.0], (3, 1)), sigma=1.0)
+    graph.constrain(fg.difference, x[:-1], x[1:], lower=lower, upper=upper, name="turn")
+    run = SQP(qp="graph").prepare(graph)
+    guess = {x: np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))}
+    unnormal = np.array([1.0, 4e-10, 0.0, 0.0])  # as it was given, to the last digit
+    kinds = [
+        (np.zeros(3), np.array([0.2, 0.2, 0.0])),
+        (np.zeros(3), np.zeros(3)),
+        (np.array([-np.inf, 0.0, 0.0]), np.full(3, 0.2)),
+        (np.full(3, -np.inf), np.full(3, np.inf)),
+        (np.zeros(3), np.array([0.2, 0.2, 0.0])),
+    ]
+    for low, high in kinds:
+        solution = run.solve(guess, data={start: unnormal, lower: low, upper: high}, check=True)
+        turns = fg.SO3.local(solution[x][:-1], solution[x][1:])
+        assert (turns > low - 1e-6).all() and (turns < high + 1e-6).all()
+        np.testing.assert_array_equal(solution[x][0], unnormal)

@@ -91,6 +91,8 @@ def test_structure_is_analysed_once(solver: fg.Solver, kind: str, analyses: list
 
 def test_covariances_of_many_ticks_make_one_analysis(analyses: list[int]) -> None:
     graph, x, start = chain("free", 40)
+    rehearse(GaussNewton())
+    del analyses[:]
     prepared = GaussNewton().prepare(graph)
     guess = {x: np.zeros((len(x), 3))}
     found = [prepared.solve(guess, data={start: [0.1 * tick, 0.0, 0.0]}) for tick in range(20)]
@@ -129,6 +131,7 @@ def test_threads_share_structure_and_nothing_else(analyses: list[int]) -> None:
     guesses = [{x: np.tile([k, 0.0, 0.1 * k], (len(x), 1))} for k in range(4)]
     alone = [KKT().solve(graph, guess) for guess in guesses]
     wanted = [(solution[x], solution.marginals(x)) for solution in alone]
+    rehearse(KKT())
     del analyses[:]
     graph.compiled = None
     program, found = graph.compile(), {}

@@ -10,8 +10,9 @@ import scipy.special
 
 from test_derive import curved, evaluated
 from unifg.factors.autodiff import symbols
-from unifg.factors.autodiff.expression import Expression, traced
+from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.operations import GROUPED, STEADY, UNARY, Op
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.tape import Tape
 from unifg.lie import Rn
 

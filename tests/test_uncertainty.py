@@ -115,6 +115,20 @@ def test_the_recursion_is_the_marginal_of_the_graph(rng: np.random.Generator) ->
     np.testing.assert_allclose(P.covariance[0], solution.covariance(poses[-1]), rtol=1e-5, atol=1e-9)
 
 
+def test_deviations_are_those_of_the_direction_in_the_world(rng: np.random.Generator) -> None:
+    """The covariance is that of a tangent step of the pose: its axes turn with the heading."""
+    poses, roots = SE2.random(rng, (5,)), rng.normal(size=(5, 3, 3))
+    covariance = roots @ np.swapaxes(roots, 1, 2)
+    centre = rng.normal(size=(4, 2)) * 5.0
+    found = uncertainty.deviations(uncertainty.packed(covariance), poses, centre)
+    for k, pose in enumerate(poses):
+        turn = np.array([[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]])
+        world = turn @ covariance[k, :2, :2] @ turn.T
+        for m, point in enumerate(centre):
+            to = (pose[:2] - point) / np.linalg.norm(pose[:2] - point)
+            assert found[k, m] == pytest.approx(np.sqrt(to @ world @ to), rel=1e-5)
+
+
 def test_clearance_counts_deviations_towards_the_disc() -> None:
     """A robot that looks along y is unsure along its own axis only: a disc ahead is nearer, one aside is not."""
     P = uncertainty.packed(np.diag([0.09, 0.0, 0.01])[None])

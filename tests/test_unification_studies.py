@@ -13,18 +13,18 @@ from benchmarks import (
     covariance_plans,
     excluded_pasts,
     impossible_states,
-    potential_weights,
     shared_dynamics,
 )
 
 
 def row(way: str, seed: int, found: list[tuple[float, float] | None]) -> dict[str, object]:
     """A row of the campaign with (time, collisions) of each setting."""
-    numbers = {"clearance": 0.1, "miss": 0.1, "sigma": 0.1}
-    return {
-        "way": way, "seed": seed, "drives": 10, "seconds": 0.1,
-        "found": [None if f is None else {"time": f[0], "collisions": f[1], **numbers} for f in found],
-    }  # fmt: skip
+    numbers = {"clearance": 0.1, "sigma": 0.1}
+    plans = [
+        {"setting": setting, "seconds": 0.1, **({} if f is None else {"time": f[0], "collisions": f[1], **numbers})}
+        for setting, f in zip(covariance_plans.WAYS[way], found, strict=True)
+    ]
+    return {"way": way, "seed": seed, "plans": plans}
 
 
 def test_settings_are_compared_at_equal_risk(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,15 +34,13 @@ def test_settings_are_compared_at_equal_risk(monkeypatch: pytest.MonkeyPatch) ->
         row("in the graph", 0, [(10.5, 0.01), (11.5, 0.0)]), row("in the graph", 1, [(10.2, 0.03), (11.0, 0.0)]),
         row("in the graph", 2, [None, None]),
     ]  # fmt: skip
-    found = covariance_plans.Campaign(rows, 10)
-    assert found.seeds == [0, 1]
-    assert found.collisions("margin", 0) == pytest.approx(0.12)
-    settings = [found.setting("in the graph", target) for target in (0.05, 0.001)]
-    assert found.setting("margin", 0.05) == 1 and settings == [0, 1]
-    assert found.setting("margin", 0.001) is None
-    np.testing.assert_array_equal(found.best("margin", 0.02), [12.0, np.nan])
-    np.testing.assert_array_equal(found.best("in the graph", 0.02), [10.5, 11.0])
-    text = covariance_plans.render(found, 10)
+    plans = covariance_plans.plans_of(rows)
+    assert plans.index.unique("seed").tolist() == [0, 1]
+    assert covariance_plans.chosen(plans, 0.05) == {"margin": 0.5, "in the graph": 1.0}
+    assert covariance_plans.chosen(plans, 0.001) == {"in the graph": 3.0}
+    best = covariance_plans.hindsight(plans, 0.02)
+    assert best["margin"].to_dict() == {0: 12.0} and best["in the graph"].to_dict() == {0: 10.5, 1: 11.0}
+    text = covariance_plans.render(rows)
     assert "| margin 0.5 m | 1 / 2 |" in text and "| 2% | in the graph | 2 / 2 | -1.5 (-1.5 .. -1.5), n=1 |" in text
 
 
@@ -91,37 +89,24 @@ def test_errors_are_compared_layout_by_layout() -> None:
     assert excluded_pasts.compared(mine, base, "median").startswith("25 (-20")
 
 
-def test_weights_are_compared_with_the_constraint() -> None:
-    def flight(seed: int, weight: float, reached: bool, clearance: float) -> dict[str, object]:
-        numbers = {"collisions": int(clearance <= 0.0), "time": 15.0, "emergencies": 1}
-        return {"seed": seed, "weight": weight, "reached": reached, "clearance": clearance, **numbers}
-
-    rows = [
-        flight(seed, weight, weight < 3.0 or seed == 0, 0.3 - weight / 10) for seed in (0, 1) for weight in (0.0, 3.0)
-    ]
-    text = potential_weights.render(rows)
-    assert "| hard clearance | 2 of 2 | 0 |" in text
-    assert "| 3 | 1 of 2 | 2 | 15 (+0 .. +0), n=1 | 0 (-30 .. -30) | 0 | 2 |" in text
-
-
 def test_ways_are_compared_at_equal_error_and_at_equal_time() -> None:
     def met(way: str, seed: int, *plans: tuple[str, float, float]) -> dict[str, object]:
         numbers = {"foreseen": 0.1, "miss": 0.2, "collisions": 0.0}
         found = [{"setting": s, "time": time, "error": error, **numbers} for s, time, error in plans]
-        return {"way": way, "seed": seed, "drives": 5, "found": found}
+        return {"way": way, "seed": seed, "plans": found}
 
     rows = [
         met("rule", 1, ("2", 10.0, 0.8), ("2", 10.5, 0.6), ("0.6", 12.0, 0.3)), met("rule", 2, ("2", 11.0, 0.9)),
         met("in the cost", 1, ("3", 10.2, 0.6), ("10", 11.0, 0.3)), met("in the cost", 2, ("3", 10.0, 0.8)),
-        met("cautious", 1), met("cautious", 2), met("cautious", 3),
+        met("cautious", 1, ("3", 20.0, 0.9)), met("cautious", 2, ("3", 20.0, 0.9)), met("cautious", 3, ("3", 1.0, 0.0)),
     ]  # fmt: skip
-    found = active_perception.Campaign(rows, 5)
-    assert found.seeds == [1, 2]
-    np.testing.assert_array_equal(found.of("rule", "2", "error"), [0.8, 0.9])  # the fastest with that setting
-    np.testing.assert_array_equal(found.fastest("rule", 0.35), [12.0, np.nan])
-    np.testing.assert_array_equal(found.fastest("in the cost", 0.35), [11.0, np.nan])
-    np.testing.assert_array_equal(found.surest("rule", 0.3), [0.8, np.nan])  # 10.0 is the fastest of any way
-    text = active_perception.render(found, 5)
+    plans = covariance_plans.plans_of(rows)
+    assert plans.index.unique("seed").tolist() == [1, 2]
+    fastest = active_perception.fastest(plans, 0.35)
+    assert fastest["rule"].to_dict() == {1: 12.0} and fastest["in the cost"].to_dict() == {1: 11.0}
+    assert active_perception.surest(plans, 0.3)["rule"].to_dict() == {1: 0.8}  # 10.0 is the fastest of any way
+    text = active_perception.render(rows)
+    assert "| rule, 2 m | 10.5 (10 .. 11) | 85 (80 .. 90) |" in text  # the fastest with that setting
     assert "| 35 cm | 1 / 2 | 1 / 2 | 0 / 2 | -1 (-1 .. -1), n=1 | - |" in text
 
 

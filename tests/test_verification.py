@@ -195,6 +195,25 @@ def test_a_fault_that_begins_to_matter_late_is_found(wrong_above: Function, prep
     np.testing.assert_allclose(y - 2.5 + np.tanh(y) * (1.0 - np.tanh(y) ** 2), 0.0, atol=1e-5)
 
 
+def test_branches_are_verified_once_and_within_a_ration() -> None:
+    """In a noisy loop comparisons come out otherwise at every tick: most answers would be verified."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(8), 1)
+    target = graph.data("target", np.zeros(8))
+    graph.minimize(lambda x, target: np.where(x > 0.0, x, 2.0 * x) - target, x, target, name="own")
+    prepared = GaussNewton().prepare(graph)
+    signs = np.sign(np.random.default_rng(1).uniform(-1.0, 1.0, (60, 8)))
+
+    def checked(number: int) -> bool:
+        return prepared.solve({x: signs[:1]}, data={target: signs[number]}).checked
+
+    extra = [n for n in range(1, 60) if checked(n) and n.bit_count() > 1]
+    assert extra == [3, 5, 6, 7]  # AT_ONCE
+    prepared._of_branches = 0
+    assert not any(checked(number) for number in extra), "verified before"
+    assert checked(9)
+
+
 RNG = np.random.default_rng(0)
 
 
@@ -230,7 +249,7 @@ def test_kinks_jumps_and_noise_are_no_differences(function: Function, at: float)
 
 
 def test_verification_costs_little(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Within a loop it is a small share of the time; the figure is on docs/own-functions.md."""
+    """Within a loop it is a small share of the time; the figure is on docs/howto/own-functions.md."""
     graph, x, target = stated(lambda x: np.where(x < 0.5, np.tanh(x), np.sin(x)), constrained=True)
     prepared = InteriorPoint().prepare(graph)
     spent, honest = 0.0, prepared._verified

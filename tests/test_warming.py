@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from unifg import precompile
+from unifg.codegen import precompiled
 from unifg.codegen.compile_counter import tally
 from unifg.scenarios import command
-from unifg.scenarios.commands import warm
+from unifg.scenarios.commands.warm import missing
 
 
 @pytest.fixture
@@ -63,7 +64,7 @@ def test_every_job_has_a_title_and_every_mode_is_rehearsed() -> None:
 def test_the_command_says_what_the_archive_is_behind(
     changed: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(warm, "outdated", lambda: changed)
+    monkeypatch.setattr(precompiled, "outdated", lambda: changed)
     assert command.main(["warmup", "--check"]) == (1 if changed else 0)
     assert all(name in capsys.readouterr().out for name in changed)
 
@@ -96,4 +97,4 @@ def test_the_library_is_compiled_without_extras() -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("library 2\n")
     assert "scenarios are left out, they need pymunk: pip install 'unifg[scenarios]'" in done.stdout
-    assert warm.missing() == ""
+    assert missing() == ""

@@ -1,4 +1,4 @@
-"""What every solve of a fixed set ends with, to the last bit: recorded before the code is moved, compared after.
+"""Results of a fixed set of solves, to the last bit: recorded before the code is moved, compared after.
 
     python -m tools.golden record [--parts PART ...] [--file FILE]
     python -m tools.golden compare [--parts PART ...] [--file FILE]
@@ -28,7 +28,7 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks import control_starts, ecg2o, incremental, pose_graphs
+from benchmarks import control_cases, ecg2o, incremental, pose_graphs
 from benchmarks.navigation import CASES, Drive
 from benchmarks.report import OUT
 from problems import collection
@@ -52,7 +52,7 @@ CONTROL = backends("ipm", "sqp", "alm")
 
 @dataclass(frozen=True)
 class Row:
-    """How one solve ended.
+    """End of one solve.
 
     Attributes:
         status: in words; what was raised, if it was refused.
@@ -67,7 +67,7 @@ class Row:
     digest: str
 
     def change(self, before: Row) -> str:
-        """What has changed: "same", "rounding" or a few words."""
+        """Change in words: "same", "rounding" or a few others."""
         if self.digest == before.digest and self.status == before.status and self.iterations == before.iterations:
             return "same"
         if self.status != before.status:
@@ -91,7 +91,7 @@ def digest(*arrays: Any) -> str:
 
 
 def row_of(solution: fg.Solution) -> Row:
-    """What is kept of a solve."""
+    """Kept numbers of a solve."""
     values = [solution.values[family] for family in solution.values]
     return Row(solution.status.name, solution.iterations, solution.cost, digest(*values))
 
@@ -167,8 +167,8 @@ def of_starts() -> Rows:
     """The control cases with obstacles, from random starts."""
     for problem in blocked():
         stated = problem.formulation()
-        runs = {name: solver.prepare(stated.graph) for name, solver in control_starts.SOLVERS.items()}
-        for k, (states, controls) in enumerate(problem.starts(control_starts.STARTS)):
+        runs = {name: solver.prepare(stated.graph) for name, solver in control_cases.SOLVERS.items()}
+        for k, (states, controls) in enumerate(problem.starts(control_cases.STARTS)):
             guess = fg.Guess({stated.x: states, stated.u: controls})
             for name, run in runs.items():
                 yield f"{problem.title}, {name}, start {k}", partial(started, run, guess)

@@ -1,4 +1,4 @@
-"""Which tests touch which lines of a file: one traced run, fixtures counted for every test that uses them."""
+"""Tests that touch the lines of a file: one traced run, fixtures counted for every test that uses them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import pytest
 
 @dataclass(frozen=True)
 class Touched:
-    """What a run of the tests saw.
+    """Record of a traced run of the tests.
 
     Attributes:
         lines: of the file, by test.
@@ -38,7 +38,7 @@ class Touched:
         return sorted(found, key=lambda name: self.took[name])
 
     def seconds(self, tests: Collection[str]) -> float:
-        """How long some tests took together [s]."""
+        """Time of some tests together [s]."""
         return sum(self.took[name] for name in tests)
 
 

@@ -146,7 +146,7 @@ class _Finder:
 
     @staticmethod
     def _omissible(node: ast.stmt) -> bool:
-        """Whether the code without a statement still means something: what it sets elsewhere exists already."""
+        """True if the code without a statement is still meaningful: its targets exist elsewhere already."""
         if isinstance(node, ast.Assign):
             return all(isinstance(target, ast.Attribute | ast.Subscript) for target in node.targets)
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
@@ -180,7 +180,7 @@ class _Finder:
         for child in ast.iter_child_nodes(node):
             if isinstance(child, ast.expr):
                 if isinstance(node, ast.Subscript) and child is node.slice and not _compares(child):
-                    continue  # a wrong place is seen by whoever reads it
+                    continue  # a wrong place is seen by its reader
                 yield from self._expression(child, where, compiled)
             elif isinstance(child, ast.keyword):
                 yield from self._expression(child.value, where, compiled)
@@ -231,7 +231,7 @@ def _own(function: ast.FunctionDef) -> Iterator[ast.AST]:
 
 
 def _words(node: ast.BinOp) -> bool:
-    """Whether text is put together, or types."""
+    """True for an operation on text or types."""
     return any(
         isinstance(part, ast.JoinedStr)
         or (isinstance(part, ast.Constant) and (part.value is None or isinstance(part.value, str)))

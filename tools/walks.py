@@ -1,4 +1,4 @@
-"""How far it is from what a user states to where the work is done: files on the way, and calls from file to file.
+"""Distance from a user's statement to the work: files on the way, and calls from file to file.
 
     python -m tools.walks [WALK ...] [--list]
 

@@ -24,6 +24,7 @@ from unifg.codegen.jit import folder_of, processor
 from unifg.codegen.precompiled import versions
 from unifg.codegen.threads import cores, threads, use_threads
 from unifg.errors import UnifgError
+from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.kernel import Kernel, evaluate_rows
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import DCS, Cauchy, GemanMcClure, Huber, TruncatedLeastSquares, Tukey
@@ -160,10 +161,11 @@ def _models() -> None:
 
 
 def _compile(found: Any) -> None:
-    kernels = (found.kernel, found.search_kernel) if isinstance(found, Residual) else (found,)
-    for kernel in kernels:
-        if isinstance(kernel, Kernel):
-            _ = kernel.address, kernel.second_address
+    kernel = found.kernel if isinstance(found, Residual) else found
+    if isinstance(kernel, StatedKernel) and any(isinstance(argument, int) for argument in kernel.arguments):
+        return  # made for the shapes that it is used with
+    if isinstance(kernel, Kernel):
+        _ = kernel.address, kernel.second_address
 
 
 def _drive() -> None:

@@ -1,4 +1,4 @@
-"""Draw the picture of docs/active-perception.md: ``PYTHONPATH=. python docs/images/draw_active_perception.py``."""
+"""Draw the picture of docs/results/unification.md: ``PYTHONPATH=. python docs/images/draw_active_perception.py``."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SEED = 104
 def main() -> None:
     """Write the picture."""
     world = dark(SEED)
-    chosen = {way: [plan for _, plan in planned(Job(SEED, way, 0)) if plan is not None][-1] for way in WORDS}
+    chosen = {way: [plan for _, plan in planned(Job(SEED, way)) if plan is not None][-1] for way in WORDS}
     with new_figure((7.6, 8.6)) as figure:
         for ax, (way, plan) in zip(figure.subplots(2, 1, sharex=True), chosen.items(), strict=True):
             drawn(ax, world, plan)

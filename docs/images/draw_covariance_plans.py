@@ -1,4 +1,4 @@
-"""Draw the picture of docs/covariance-plans.md: ``python -m docs.images.draw_covariance_plans`` from the checkout."""
+"""Draw the picture of docs/results/unification.md: ``python -m docs.images.draw_covariance_plans``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/examples.md: every script of examples/, or those named, draws its own (`make examples`)."""
+"""Draw the pictures of docs/guide/examples.md: every script of examples/, or those named (`make examples`)."""
 
 from __future__ import annotations
 

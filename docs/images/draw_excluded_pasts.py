@@ -1,4 +1,4 @@
-"""Draw the picture of docs/excluded-pasts.md: ``python -m docs.images.draw_excluded_pasts`` from the checkout."""
+"""Draw the picture of docs/results/unification.md: ``python -m docs.images.draw_excluded_pasts`` from the checkout."""
 
 from __future__ import annotations
 

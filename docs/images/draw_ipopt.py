@@ -1,4 +1,4 @@
-"""Draw the picture of docs/ipopt.md: ``python -m docs.images.draw_ipopt``."""
+"""Draw the picture of docs/results/bazzana.md: ``python -m docs.images.draw_ipopt``."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def main() -> None:
         who()
     ways = [row.values[ours.x] for row in ours.solution.history if row.values is not None]
     times = DT * np.arange(STEPS)
-    (states, controls), (_, theirs) = ours.answer, ipopt.answer
+    states, controls = ours.solution[ours.x], ours.solution[ours.u]
+    theirs = np.asarray(ipopt.found["x"]).reshape(STEPS, 5)[:, :2]
     with new_figure((9.0, 3.6)) as figure:
         left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.3])
         for k, way in enumerate(ways):

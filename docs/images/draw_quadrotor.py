@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/quadrotor-mpc.md: ``python docs/images/draw_quadrotor.py`` from the checkout."""
+"""Draw the pictures of docs/results/ta.md: ``python docs/images/draw_quadrotor.py`` from the checkout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draw the picture of docs/quadrotor-joint.md: ``python docs/images/draw_quadrotor_joint.py`` from the checkout."""
+"""Draw the picture of docs/results/ta.md: ``python docs/images/draw_quadrotor_joint.py`` from the checkout."""
 
 from __future__ import annotations
 

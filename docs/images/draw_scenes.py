@@ -1,4 +1,4 @@
-"""Make the scenes of docs/gallery.md: `python docs/images/draw_scenes.py` from an environment with unifg[view]."""
+"""Make the scenes of docs/guide/examples.md: `python docs/images/draw_scenes.py` with unifg[view]."""
 
 from __future__ import annotations
 

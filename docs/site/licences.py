@@ -1,4 +1,4 @@
-"""Licences of everything that unifg needs or can use: `python docs/site/licences.py` rewrites docs/licences.md.
+"""Licences of all that unifg needs or can use: `python docs/site/licences.py` rewrites docs/reference/licences.md.
 
 Read from the metadata of what is installed, dependencies of dependencies included as far as this platform needs them;
 run it where all extras are.
@@ -14,7 +14,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 CHECKOUT = Path(__file__).resolve().parent.parent.parent
-PAGE = CHECKOUT / "docs" / "licences.md"
+PAGE = CHECKOUT / "docs" / "reference" / "licences.md"
 # Extras; those for tests, style and this site stay with us.
 USED = ("view", "scenarios", "casadi", "campaign", "mcap", "metis", "bench")
 HEAD = """# Licences

@@ -21,6 +21,11 @@ SHELVES = ("unifg.models", "unifg.files")
 """Their modules are."""
 ALONE = ("unifg.errors", "unifg.solution.status", "unifg.solution.solver", "unifg.solvers.names")
 MOVED = {
+    "](../../README.md": "](../readme.md",
+    "](../../CHANGELOG.md": "](../changelog.md",
+    "](../../CONTRIBUTING.md": "](../contributing.md",
+    "](../../LICENSE": "](../license.md",
+    "](../../examples/": "](../examples/",
     "](../README.md": "](readme.md",
     "](../CHANGELOG.md": "](changelog.md",
     "](../CONTRIBUTING.md": "](contributing.md",

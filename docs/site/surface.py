@@ -1,4 +1,4 @@
-"""List the public surface: `python docs/site/surface.py` rewrites docs/surface.md, which a test holds fast.
+"""List the public surface: `python docs/site/surface.py` rewrites docs/reference/surface.md, which a test holds fast.
 
 A name that appears or goes is thereby a line of a change, seen by whoever reads it.
 """
@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 import reference
 
-PAGE = reference.CHECKOUT / "docs" / "surface.md"
+PAGE = reference.CHECKOUT / "docs" / "reference" / "surface.md"
 HEAD = """# The public surface
 
 Every name that a release promises, by the module it is imported from; what it does is in the reference of the site

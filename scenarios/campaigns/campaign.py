@@ -15,15 +15,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from unifg.atomic_write import write_atomically
 from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.cluster import cluster
-from unifg.scenarios.campaigns.dispatch import died, finished
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK, Order, lost, perform
 from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Statement, module_of, read
 from unifg.scenarios.episode import Progress, silent
-from unifg.scenarios.workers import Workers
+from unifg.scenarios.workers import Workers, cluster, died, finished
 
 __all__ = [
     "EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "manifest_of", "replay_command", "run_campaign",
@@ -35,7 +34,7 @@ EPISODES, MANIFEST = "episodes.jsonl", "campaign.json"
 
 @dataclass
 class Campaign:
-    """What became of a campaign.
+    """State of a campaign.
 
     Attributes:
         folder: with its files.
@@ -55,7 +54,7 @@ class Campaign:
 
     @property
     def succeeded(self) -> bool:
-        """Whether every episode was run and did what was asked."""
+        """True if every episode was run and succeeded."""
         return self.outcomes[OK] == self.episodes
 
     @property
@@ -120,20 +119,18 @@ def run_campaign(
                     error = future.exception()
                     if isinstance(error, ScenarioError):  # of the workers: every other episode would say the same
                         raise error
-                    if error is not None and not died(error):
+                    if error is not None and not died(future):
                         raise ScenarioError(f"an episode cannot be handed to a worker: {error!r}") from error
                     text = lost(order, f"the worker died, twice: {error}") if error is not None else future.result()
                     journal.add(text)
                     found.outcomes[json.loads(text)["outcome"]] += 1
                     found.ran += 1
                     meter.beat()
-            except KeyboardInterrupt:
-                found.interrupted = True
-            except BaseException:
+            except BaseException as error:
                 _stop(at_work)
-                raise
-            if found.interrupted:
-                _stop(at_work)
+                found.interrupted = isinstance(error, KeyboardInterrupt)
+                if not found.interrupted:
+                    raise
     return found
 
 
@@ -143,7 +140,7 @@ def code_of_scenario(scenario: str) -> str:
 
 
 def manifest_of(folder: Path) -> dict[str, Any]:
-    """What the folder of a campaign says of it: "campaign" as it was stated, "base", "code", "axes", "bundles", "keys".
+    """Manifest in the folder of a campaign: "campaign" as stated, "base", "code", "axes", "bundles", "keys".
 
     Raises:
         ScenarioError: there is no campaign.
@@ -163,7 +160,7 @@ def manifest_of(folder: Path) -> dict[str, Any]:
 
 
 def replay_command(folder: Path, key: str) -> str:
-    """What a user types to see an episode again."""
+    """Command that runs an episode again."""
     return f"unifg replay {shlex.quote(str(folder))} {key}"
 
 
@@ -229,12 +226,9 @@ def write_manifest(folder: Path, statement: Statement, code: str) -> None:
         "compare": statement.compare,
         "keys": [episode.key for episode in statement.episodes()],
     }
-    text = json.dumps(said, default=str)
     path = folder / MANIFEST
     try:
-        beside = path.with_suffix(".new")
-        beside.write_text(text + "\n", encoding="utf-8")
-        beside.replace(path)
+        write_atomically(path, json.dumps(said, default=str) + "\n")
     except OSError as error:
         raise ScenarioError(f"{path}: cannot be written ({error.strerror})") from None
 
@@ -263,7 +257,7 @@ def _executor(
 
 
 def _ready(module: str) -> None:
-    """What a process does before its first episode."""
+    """Prepare a process for its first episode."""
     import_module(module)
     fingerprint()
 

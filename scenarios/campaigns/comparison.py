@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import binomtest, permutation_test
+from scipy.stats import binomtest, bootstrap, permutation_test
 
 from unifg.typing import Array
 
@@ -14,11 +14,11 @@ FLIPS = 4096
 
 
 def interval(differences: Array) -> tuple[float, float]:
-    """95 % bootstrap interval of the mean."""
-    rng = np.random.default_rng(0)
-    means = rng.choice(differences, (RESAMPLES, len(differences))).mean(axis=1)
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)
+    """95 % bootstrap interval of the mean; of one value the value itself."""
+    if len(differences) < 2:
+        return float(differences[0]), float(differences[0])
+    found = bootstrap((differences,), np.mean, n_resamples=RESAMPLES, method="percentile", rng=0).confidence_interval
+    return float(found.low), float(found.high)
 
 
 def by_chance(differences: Array) -> float:

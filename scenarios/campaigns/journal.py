@@ -21,7 +21,7 @@ __all__ = ["Journal", "lines_of"]
 
 
 class Journal:
-    """A file of rows, opened to be continued by nobody else.
+    """File of rows, locked for this process.
 
     Attributes:
         path: of the file; beside it lies one that ends in ``.lock``.
@@ -147,7 +147,7 @@ if sys.platform == "win32":
     import msvcrt
 
     def _locked(file: BinaryIO) -> bool:
-        """Keep others out as long as the file is open; False if somebody is in. The byte lies behind the words."""
+        """Lock the file as long as it is open; False if it is locked already. The byte lies behind the words."""
         file.seek(1 << 20)
         try:
             msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
@@ -159,7 +159,7 @@ else:
     import fcntl
 
     def _locked(file: BinaryIO) -> bool:
-        """Keep others out as long as the file is open; False if somebody is in."""
+        """Lock the file as long as it is open; False if it is locked already."""
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 import traceback
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -83,14 +83,14 @@ def perform(order: Order) -> str:
             _warmed(order, module, settings)
             began, cpu = time.perf_counter(), time.process_time()
             outcome = module.run(settings, silent)
-            metrics = _plain(outcome.metrics)
-            found = {"outcome": OK if outcome.succeeded else FAILED, "metrics": _finite(metrics)}
-            if unclear := sorted(_not_finite(metrics)):
-                found["not_finite"] = unclear
-        except UnifgError as error:
-            found = {"outcome": ERROR, "error": f"{type(error).__name__}: {error}", "traceback": _trace(error)}
+            unclear = list[str]()
+            found = {"outcome": OK if outcome.succeeded else FAILED, "metrics": _plain(outcome.metrics, unclear)}
+            if unclear:
+                found["not_finite"] = sorted(unclear)
         except (Exception, SystemExit, KeyboardInterrupt) as error:
-            found = {"outcome": ERROR, "error": repr(error), "traceback": _trace(error)}
+            said = f"{type(error).__name__}: {error}" if isinstance(error, UnifgError) else repr(error)
+            trace = "".join(traceback.format_exception(error))
+            found = {"outcome": ERROR, "error": said, "traceback": trace}
     took = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
     return line(order, found, took)
 
@@ -141,41 +141,21 @@ def _warmed(order: Order, module: Any, settings: Any) -> None:
         return  # the episode itself will say so
 
 
-def _trace(error: BaseException) -> str:
-    return "".join(traceback.format_exception(error))
+def _plain(value: Any, unclear: list[str], path: str = "") -> Any:
+    """Value as JSON can hold it, None for numbers that are not finite.
 
-
-def _plain(value: Any) -> Any:
-    """What JSON can hold, numbers of NumPy as Python's."""
+    Args:
+        value: numbers of Python or NumPy, words, lists and mappings of them.
+        unclear: receives the paths of numbers that are not finite.
+        path: of the value.
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, Mapping):
-        return {str(name): _plain(inner) for name, inner in value.items()}
+        return {str(name): _plain(inner, unclear, f"{path}.{name}".lstrip(".")) for name, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    return str(value)
-
-
-def _finite(value: Any) -> Any:
-    """The same without numbers that are not finite, which JSON does not know: they are None."""
-    if isinstance(value, dict):
-        return {name: _finite(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _not_finite(value: Any, path: str = "") -> Iterator[str]:
-    """Where numbers are not finite."""
-    if isinstance(value, dict):
-        for name, inner in value.items():
-            yield from _not_finite(inner, f"{path}.{name}" if path else name)
-    elif isinstance(value, list):
-        for number, inner in enumerate(value):
-            yield from _not_finite(inner, f"{path}.{number}")
-    elif isinstance(value, float) and not math.isfinite(value):
-        yield path
+        return [_plain(inner, unclear, f"{path}.{number}") for number, inner in enumerate(value)]
+    if isinstance(value, float) and not math.isfinite(value):
+        unclear.append(path)
+        return None
+    return value if value is None or isinstance(value, str | bool | int | float) else str(value)

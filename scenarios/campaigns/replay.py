@@ -16,7 +16,7 @@ __all__ = ["episode_of"]
 
 
 def episode_of(folder: Path, key: str) -> tuple[ModuleType, Any]:
-    """What runs an episode, and its settings.
+    """Module that runs an episode, and its settings.
 
     Args:
         folder: of the campaign.

@@ -150,10 +150,11 @@ def sheet_of(folder: Path, kept: Mapping[str, Any], rows: list[dict[str, Any]], 
 
 
 def _numbers(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
-    """Numbers inside metrics by their path; flags are 0 or 1, lists of numbers are left out."""
+    """Numbers inside metrics by their path; flags are 0 or 1, lists of numbers and settings are left out."""
     if isinstance(value, dict):
         for name, inner in value.items():
-            yield from _numbers(inner, f"{path}.{name}" if path else name)
+            if name != "settings":
+                yield from _numbers(inner, f"{path}.{name}" if path else name)
     elif isinstance(value, list) and value and all(isinstance(inner, dict) for inner in value):
         for number, inner in enumerate(value):
             yield from _numbers(inner, f"{path}.{number}" if len(value) > 1 else path)

@@ -7,16 +7,15 @@ that are no options: ``controller.speed`` is the field ``speed`` of the settings
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.options import Option, Text, plain
+from unifg.scenarios.options import Option, Text, leaves, plain, replaced
 
 __all__ = ["Fields", "identity", "nearest"]
 
@@ -35,12 +34,11 @@ class Fields:
     def __init__(self, settings: type, base: Path, choices: Mapping[str, Sequence[str]] | None = None) -> None:
         """Look at a class."""
         self.settings, self.base, self.choices = settings, base, dict(choices or {})
-        self._kinds = dict(_leaves(settings))
+        self._leaves = {".".join(leaf.path): leaf for leaf in leaves(settings)}
         self._short: dict[str, list[str]] = {}
-        for path, (_, declared) in self._kinds.items():
-            flag = declared.metadata["option"].flag if "option" in declared.metadata else ""
-            for short in {path.rpartition(".")[2], flag} - {"", path}:
-                if "option" in declared.metadata:
+        for path, leaf in self._leaves.items():
+            if leaf.option is not None:
+                for short in {leaf.path[-1], leaf.option.flag} - {"", path}:
                     self._short.setdefault(short, []).append(path)
 
     def named(self, name: str, where: str) -> str:
@@ -49,17 +47,17 @@ class Fields:
         Raises:
             ScenarioError: there is none, or more than one.
         """
-        if name in self._kinds:
+        if name in self._leaves:
             return name
         found = self._short.get(name.replace("-", "_"), [])
         if len(found) == 1:
             return found[0]
         if found:
             raise ScenarioError(f"{where}: {name!r} may mean {' or '.join(found)}; write which")
-        raise ScenarioError(f"{where}: there is no setting {name!r}; {nearest(name, [*self._kinds, *self._short])}")
+        raise ScenarioError(f"{where}: there is no setting {name!r}; {nearest(name, [*self._leaves, *self._short])}")
 
     def __contains__(self, name: str) -> bool:
-        """Whether a name means one field."""
+        """True for a name that means one field."""
         try:
             self.named(name, "")
         except ScenarioError:
@@ -72,8 +70,7 @@ class Fields:
         Raises:
             ScenarioError: it does not fit.
         """
-        kind, declared = self._kinds[path]
-        option: Option | None = declared.metadata.get("option")
+        kind, option = self._leaves[path].kind, self._leaves[path].option
         many = option is not None and option.many
         values = given if not many or (isinstance(given, list | tuple) and not _single(kind, given)) else [given]
         found = self._fitting(plain(kind), values, where, option.text if option is not None else None)
@@ -85,7 +82,7 @@ class Fields:
         """The settings that have these values; the others are the defaults."""
         made = self.settings(**{name: value for name, value in defaults.items() if name not in values})
         for path, value in values.items():
-            made = _replaced(made, path.split("."), value)
+            made = replaced(made, path.split("."), value)
         return made
 
     def _fitting(self, kind: Any, given: Any, where: str, text: Text | None) -> Any:
@@ -136,17 +133,17 @@ class Fields:
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
-    """What somebody may have meant."""
+    """Suggestion for a misspelt name."""
     close = get_close_matches(name.lower(), known, 3, 0.5)
     return f"did you mean {' or '.join(close)}?" if close else f"there are {', '.join(sorted(known))}"
 
 
 def identity(value: Any) -> Any:
-    """What two equal values have in common, as JSON can hold it; of a file, what it holds and what is named like it."""
+    """Identity of a value as JSON can hold it; of a file, a digest of it and of the files named like it."""
     if isinstance(value, Path):
         total = hashlib.sha256()
         for beside in sorted(value.parent.glob(f"{_literal(value.stem)}.*")):
-            if beside.is_file():
+            if beside.is_file() and beside.suffix != ".toml":  # a campaign may be named like its map
                 total.update(beside.name.encode() + b"\0" + beside.read_bytes() + b"\0")
         return total.hexdigest()[:12]
     if isinstance(value, tuple):
@@ -159,26 +156,10 @@ def _literal(name: str) -> str:
     return "".join(f"[{c}]" if c in "*?[" else c for c in name)
 
 
-def _leaves(settings: type, before: str = "") -> Iterator[tuple[str, tuple[Any, dataclasses.Field[Any]]]]:
-    kinds = get_type_hints(settings)
-    for declared in dataclasses.fields(settings):
-        kind = plain(kinds[declared.name])
-        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-            yield from _leaves(kind, f"{before}{declared.name}.")
-        elif declared.init:
-            yield f"{before}{declared.name}", (kinds[declared.name], declared)
-
-
 def _single(kind: Any, given: Sequence[Any]) -> bool:
-    """Whether a list is one of many values, such as a pose among poses, and not the list of them."""
+    """True for a list that is one of many values, such as a pose among poses."""
     arguments = get_args(plain(kind))
     return get_origin(arguments[0]) is tuple and not any(isinstance(one, list | tuple) for one in given)
-
-
-def _replaced(settings: S, path: Sequence[str], value: Any) -> S:
-    first, *rest = path
-    inner = _replaced(getattr(settings, first), rest, value) if rest else value
-    return dataclasses.replace(settings, **{first: inner})  # type: ignore[type-var]
 
 
 def _words(kind: Any) -> str:

@@ -1,4 +1,4 @@
-"""What a campaign is: a scenario, settings of all episodes, axes along which settings change, and seeds.
+"""Statement of a campaign: a scenario, settings of all episodes, axes along which settings change, and seeds.
 
 An episode is one combination of the axes with one seed. All of it is stated by a mapping, usually a TOML file:
 
@@ -156,7 +156,7 @@ def read(file: str | Path) -> Statement:
 
 
 def _written(path: Path, before: tuple[str, ...]) -> dict[str, Any]:
-    """What a file holds, laid over what it extends.
+    """Content of a file, laid over the file that it extends.
 
     Args:
         path: of the file.
@@ -208,17 +208,12 @@ def stated(given: Mapping[str, Any], base: str | Path = ".", name: str = "campai
     known = fields_of(scenario, base)
     fixed = _assigned(known, _table(given, "settings", name), f"{name}, settings")
     axes = tuple(_axis(known, axis, values, name) for axis, values in _table(given, "grid", name).items())
+    set_by = dict.fromkeys(fixed, "`settings`")
     for axis in axes:
-        for values in axis.values.values():
-            for path in values:
-                if path in fixed:
-                    raise ScenarioError(
-                        f"{name}: {path} stands in `settings` and in the axis {axis.name!r} of the grid"
-                    )
-    for k, axis in enumerate(axes):
-        for other in axes[:k]:
-            for path in {p for v in axis.values.values() for p in v} & {p for v in other.values.values() for p in v}:
-                raise ScenarioError(f"{name}: the axes {other.name!r} and {axis.name!r} both set {path}")
+        for path in dict.fromkeys(path for values in axis.values.values() for path in values):
+            if path in set_by:
+                raise ScenarioError(f"{name}: {path} is set by {set_by[path]} and by the axis {axis.name!r}")
+            set_by[path] = f"the axis {axis.name!r}"
     made = Statement(
         scenario, str(given.get("title", name)), fixed, axes, _seeds(given, known, name),
         _names(given, "measures", name), _compared(given, axes, name), bool(given.get("succeeded_only", False)),
@@ -315,25 +310,20 @@ def _axis(known: Fields, name: str, values: Any, file: str) -> Axis:
         return _axis(known, *inner, file)
     if not isinstance(values, list) or not values:
         raise ScenarioError(f"{where}: a list of values is expected, at least one")
-    if all(isinstance(value, Mapping) for value in values):
-        if name in known:
-            raise ScenarioError(f"{where}: an axis of tables needs a name that is no setting")
-        found: dict[str, dict[str, Any]] = {}
-        for number, value in enumerate(values, start=1):
-            label = str(value.get("name", number))
-            if label in found:
-                raise ScenarioError(f"{where}: two of its tables are named {label!r}")
-            rest = {word: inner for word, inner in value.items() if word != "name"}
-            found[label] = _assigned(known, rest, f"{where} {label!r}")
-        return Axis(name, found, True)
-    path = known.named(name, where)
-    singles: dict[str, dict[str, Any]] = {}
-    for value in values:
-        label = _label(known.value(path, value, where))
-        if label in singles:
+    bundle = all(isinstance(value, Mapping) for value in values)
+    if bundle and name in known:
+        raise ScenarioError(f"{where}: an axis of tables needs a name that is no setting")
+    path = name if bundle else known.named(name, where)
+    found: dict[str, dict[str, Any]] = {}
+    for number, value in enumerate(values, start=1):
+        if bundle:
+            label, given = str(value.get("name", number)), {word: value[word] for word in value if word != "name"}
+        else:
+            label, given = _label(known.value(path, value, where)), {path: value}
+        if label in found:
             raise ScenarioError(f"{where}: {label} is stated twice")
-        singles |= {label: _assigned(known, {path: value}, where)}
-    return Axis(name, singles, False)
+        found[label] = _assigned(known, given, f"{where} {label}")
+    return Axis(name, found, bundle)
 
 
 def _label(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""Whether an installation is well: ``unifg doctor``.
+"""Examination of an installation: ``unifg doctor``.
 
 Versions, what is missing and for what; the caches of compiled functions, where they are, whether they can be written
 and are whole; threads; every backend on a problem with a known answer, and its time beside the recorded one.
@@ -205,7 +205,7 @@ def _pace(solve: Callable[[], object]) -> tuple[float, float]:
     return float(np.median(ratios)), 1e3 * float(np.median(times))
 
 
-def told(findings: list[Finding]) -> str:
+def report(findings: list[Finding]) -> str:
     """The report."""
     lines, part = list[str](), ""
     for finding in findings:

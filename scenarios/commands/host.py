@@ -12,7 +12,7 @@ __all__ = ["machine"]
 
 
 def machine() -> str:
-    """What has to be the same for two ratios to be compared."""
+    """Properties that two comparable ratios share."""
     name = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()

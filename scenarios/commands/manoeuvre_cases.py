@@ -20,7 +20,7 @@ __all__ = ["SETTINGS", "run"]
 
 @dataclass(frozen=True)
 class CaseSettings:
-    """What to solve.
+    """Settings of manoeuvres.
 
     Attributes:
         case: which manoeuvre.

@@ -1,4 +1,4 @@
-"""How a run on the command line ended, and how it tells of its progress."""
+"""Outcome and progress of a run on the command line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Progress: TypeAlias = Callable[[float, str], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended.
+    """Outcome of a run.
 
     Attributes:
         succeeded: whether the robot did what it was asked.
@@ -39,7 +39,7 @@ def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], st
 
     Args:
         progress: to be told.
-        pace: nobody knows how many iterations there will be: of what is left, each leaves this share.
+        pace: share of the remainder that each iteration leaves, as their number is unknown.
         say: the word about an iteration.
     """
 

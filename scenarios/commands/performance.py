@@ -1,8 +1,8 @@
-"""How fast this machine is at what the library does: ``unifg bench``.
+"""Speed of this machine at what the library does: ``unifg bench``.
 
 Milliseconds differ from machine to machine, and on a shared one from minute to minute. So every case is measured right
 after a reference that does the same everywhere, a little arithmetic in Python and a little in NumPy, both in processor
-time, and what counts is the ratio. A record is a line of a file: the ratios of all rounds, and the kind of machine.
+time, and the ratio counts. A record is a line of a file: the ratios of all rounds, and the kind of machine.
 Against one of the same kind, a case is slower if the 95 % bootstrap interval of the ratio of its medians lies
 above `SLOWER`.
 """
@@ -12,14 +12,15 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from scipy.stats import bootstrap
 
 import unifg as fg
 from unifg.errors import ScenarioError
@@ -30,7 +31,7 @@ from unifg.scenarios.commands.outcome import Progress
 from unifg.solvers.names import TABLE, backend
 from unifg.typing import Array
 
-__all__ = ["HISTORY", "SLOWER", "Case", "Record", "cases", "compared", "measured", "reference", "self_tests"]
+__all__ = ["HISTORY", "SLOWER", "Record", "cases", "compared", "measured", "reference", "self_tests"]
 
 HISTORY = Path(__file__).with_name("performance.jsonl")
 SLOWER = 1.15  # times the recorded ratio
@@ -41,21 +42,8 @@ Action: TypeAlias = Callable[[], object]
 
 
 @dataclass(frozen=True)
-class Case:
-    """Something that is timed.
-
-    Attributes:
-        name: in tables and files.
-        action: some milliseconds long, ready to be called again and again.
-    """
-
-    name: str
-    action: Action
-
-
-@dataclass(frozen=True)
 class Record:
-    """What was measured once.
+    """Result of one measurement.
 
     Attributes:
         version: of unifg.
@@ -123,14 +111,13 @@ def _rim(inequality: bool) -> tuple[fg.Graph, dict[fg.Family, Array], float]:
     return graph, {x: np.array([[0.6, 0.9, 0.1]])}, 0.5 * (np.sqrt(2.0) - 1.0) ** 2
 
 
-def cases() -> list[Case]:
-    """Everything that is timed; solves are run once beforehand, so nothing compiles later."""
-    found = [Case(f"backend {name}", solve) for name, solve, _ in self_tests()]
-    found += [Case(f"tick {name}", _tick(name)) for name in ("ipm", "alm", "sqp")]
-    found += [Case("pose graph", _poses()), Case("covariances", _covariances()), Case("smoothing", _smooth)]
-    found.append(Case("statement", _state))
-    for case in found:
-        case.action()
+def cases() -> dict[str, Action]:
+    """Actions of some milliseconds by name, each run once beforehand, so that nothing compiles later."""
+    found: dict[str, Action] = {f"backend {name}": solve for name, solve, _ in self_tests()}
+    found |= {f"tick {name}": _tick(name) for name in ("ipm", "alm", "sqp")}
+    found |= {"pose graph": _poses(), "covariances": _covariances(), "smoothing": _smooth, "statement": _state}
+    for action in found.values():
+        action()
     return found
 
 
@@ -198,17 +185,15 @@ def _state() -> None:
 def measured(rounds: int, progress: Progress) -> Record:
     """Time everything, in turn, each beside the reference."""
     progress(0.0, "compiling")
-    found = cases()
-    rng = np.random.default_rng(0)
-    ratios: dict[str, list[float]] = {case.name: [] for case in found}
-    spent: dict[str, list[float]] = {name: [] for name in ("reference", *ratios)}
+    found, rng = cases(), np.random.default_rng(0)
+    ratios: dict[str, list[float]] = {name: [] for name in found}
+    spent: dict[str, list[float]] = {name: [] for name in ("reference", *found)}
     for k in range(rounds):
         progress(k / rounds, f"round {k + 1} of {rounds}")
-        for index in rng.permutation(len(found)):
-            case = found[index]
-            before, took, after = seconds(reference), seconds(case.action), seconds(reference)
-            ratios[case.name].append(2.0 * took / (before + after))
-            spent[case.name].append(took)
+        for name in rng.permutation(list(found)):
+            before, took, after = seconds(reference), seconds(found[name]), seconds(reference)
+            ratios[name].append(2.0 * took / (before + after))
+            spent[name].append(took)
             spent["reference"] += [before, after]
     progress(1.0, "done")
     milliseconds = {name: round(1e3 * float(np.median(times)), 4) for name, times in spent.items()}
@@ -216,6 +201,7 @@ def measured(rounds: int, progress: Progress) -> Record:
 
 
 def seconds(action: Action) -> float:
+    """Processor time of a call [s]."""
     began = time.process_time()
     action()
     return time.process_time() - began
@@ -233,24 +219,12 @@ def history(file: Path = HISTORY) -> list[Record]:
         raise ScenarioError(f"{file}: cannot be read ({error.strerror})") from error
     try:
         records = [Record(**json.loads(line)) for line in lines if line.strip()]
-        whole = all(map(_has_ratios, records))
-    except (ValueError, TypeError) as error:
+        ratios = [np.array(row, dtype=np.float64) for record in records for row in record.ratios.values()]
+        if not all(row.ndim == 1 and row.size and (row > 0.0).all() for row in ratios):
+            raise ValueError("each case needs positive ratios")
+    except (ValueError, TypeError, AttributeError) as error:
         raise ScenarioError(f"{file}: holds a line that is no record of `unifg bench` ({error})") from error
-    if not whole:
-        raise ScenarioError(
-            f"{file}: holds a line that is no record of `unifg bench` (each case needs positive ratios)"
-        )
     return records
-
-
-def _has_ratios(record: Record) -> bool:
-    """Whether every case has ratios, and all are positive."""
-    if not isinstance(record.ratios, dict):
-        return False
-    return all(
-        isinstance(row, list) and row and np.all(np.array(row, dtype=np.float64) > 0.0)
-        for row in record.ratios.values()
-    )
 
 
 def append(file: Path, record: Record) -> None:
@@ -271,54 +245,48 @@ def last(records: list[Record], kind: str | None = None) -> Record | None:
     return next((record for record in reversed(records) if kind in (None, record.machine)), None)
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """A case now and as it was.
+class Comparison(NamedTuple):
+    """Ratio of the medians of a case now and before, above one where it is slower now, and its 95 % interval."""
 
-    Attributes:
-        name: of the case.
-        factor: of the median ratios, above one where it is slower now.
-        low, high: 95 % bootstrap interval of that.
-    """
-
-    name: str
     factor: float
     low: float
     high: float
 
     @property
     def slower(self) -> bool:
-        """Whether there is no doubt about it."""
+        """True beyond doubt."""
         return self.low > SLOWER
 
 
-def compared(now: Record, then: Record) -> list[Comparison]:
-    """Every case that both have."""
-    rng, rows = np.random.default_rng(0), []
-    for name in now.ratios.keys() & then.ratios.keys():
-        new, old = np.array(now.ratios[name]), np.array(then.ratios[name])
+def compared(now: Record, then: Record) -> dict[str, Comparison]:
+    """Comparisons of the cases that both records have."""
+    rows = {}
+    for name in sorted(now.ratios.keys() & then.ratios.keys()):
+        both = np.array(now.ratios[name]), np.array(then.ratios[name])
+        factor = float(_ratio_of_medians(*both))
+        low = high = factor
+        if min(map(len, both)) > 1:
+            found = bootstrap(both, _ratio_of_medians, n_resamples=RESAMPLES, method="percentile", rng=0)
+            low, high = map(float, found.confidence_interval)
+        rows[name] = Comparison(factor, low, high)
+    return rows
 
-        def medians(values: Array) -> Array:
-            return np.asarray(np.median(rng.choice(values, (RESAMPLES, len(values))), axis=1))
 
-        low, high = np.quantile(medians(new) / medians(old), [0.025, 0.975])
-        rows.append(Comparison(name, float(np.median(new) / np.median(old)), float(low), float(high)))
-    return sorted(rows, key=lambda row: row.name)
+def _ratio_of_medians(new: Array, old: Array, axis: int = -1) -> Array:
+    return np.asarray(np.median(new, axis=axis) / np.median(old, axis=axis))
 
 
-def told(now: Record, rows: list[Comparison]) -> str:
-    """A table: time, times the reference, and that over the record."""
-    beside = {row.name: row for row in rows}
+def report(now: Record, rows: Mapping[str, Comparison]) -> str:
+    """Table: time, times the reference, and that over the record."""
     lines = [f"{'case':18} {'ms':>9} {'x reference':>12}  over the record"]
     for name, ratios in now.ratios.items():
-        row = beside.get(name)
-        against = "-" if row is None else f"{row.factor:.2f} ({row.low:.2f} to {row.high:.2f})"
-        mark = "  SLOWER" if row is not None and row.slower else ""
+        against = "{:.2f} ({:.2f} to {:.2f})".format(*rows[name]) if name in rows else "-"
+        mark = "  SLOWER" if name in rows and rows[name].slower else ""
         lines.append(f"{name:18} {now.milliseconds[name]:9.3f} {float(np.median(ratios)):12.3f}  {against}{mark}")
     return "\n".join(lines)
 
 
 def threads() -> dict[str, str]:
-    """What decides how many threads linear algebra takes."""
+    """Environment variables that limit the threads of linear algebra."""
     names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
     return {name: os.environ[name] for name in names if name in os.environ}

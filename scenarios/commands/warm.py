@@ -6,14 +6,11 @@ from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
-import unifg as fg
 from unifg.codegen import precompiled
 from unifg.codegen.compile_counter import Tally
 from unifg.precompile import Job, Progress, jobs, perform
 
-__all__ = ["missing", "outdated", "run", "ship"]
-
-LIBRARY = Path(fg.__file__).resolve().parent
+__all__ = ["missing", "run", "ship"]
 
 
 def missing() -> str:
@@ -39,11 +36,6 @@ def ship(progress: Progress) -> Path:
         run(progress, anew=True)
     recorder.write(precompiled.ARCHIVE)
     return precompiled.ARCHIVE
-
-
-def outdated() -> list[str]:
-    """Functions that have changed since the archive was written."""
-    return precompiled.outdated()
 
 
 def _scenarios() -> Iterator[Job]:

@@ -13,7 +13,7 @@ from unifg.view import Frame, Live, Scene
 __all__ = ["Announce", "watching_iterates", "watching_ticks"]
 
 Announce: TypeAlias = Callable[[str], None]
-"""Is told where the browser finds the scene; None where nobody wants to see it."""
+"""Receives the address of the scene; None without a viewer."""
 
 
 @contextmanager
@@ -58,7 +58,7 @@ def watching_ticks(
 def watching_iterates(
     announce: Announce | None, scene: Scene, draw: Callable[[Frame, Iteration], None]
 ) -> Iterator[Callable[[Iteration], None]]:
-    """A callback of a solver that shows every iterate; one that does nothing where nobody wants to see it.
+    """Callback of a solver that shows every iterate; without a viewer it does nothing.
 
     Args:
         announce: see `Announce`.

@@ -18,7 +18,7 @@ from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.perception.tracks import nearest
 from unifg.typing import ArrayLike
 
-VORTEX = 0.3  # weight of the tangent vector: of those tried on random fields of discs, see docs/models.md
+VORTEX = 0.3  # weight of the tangent vector: of those tried on random fields of discs, see docs/results/ta.md
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,7 @@ TRACKING = KeeperSettings(
     position=180.0, attitude=5e-3, velocity=2.7, rate=2.9e-5, thrust=8.3e-5, rate_change=1.3e-6, thrust_change=3.7e-5,
     tolerance=1e-5, settled=True,
 )  # fmt: skip
-"""Weights for flights with nothing in the way; ``python -m benchmarks.flight_tuning --controller barrier`` finds them.
+"""Weights for flights with nothing in the way, found by a search on a flight that appears in no table.
 
 They make controls cheap, which is what following a path closely takes; among obstacles, where the path may lie inside
 of things, they do harm. What they weigh are millimetres: a plan that is stopped after one step is off by a good part of

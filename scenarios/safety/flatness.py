@@ -83,7 +83,7 @@ class Gains:
 
 
 TUNED = Gains((225.0, 644.0), (32.8, 25.6), 65.5, 2.0)
-"""What ``python -m benchmarks.flight_tuning --controller flatness`` finds, from the gains of a new :class:`Gains`."""
+"""Gains found by a search on a flight that appears in no table, from the gains of a new :class:`Gains`."""
 
 
 class FlatnessController:

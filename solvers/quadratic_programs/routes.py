@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -61,6 +61,9 @@ class Subproblems:
         self.program = program
         self.elastic_asked = False
         self.tolerance = tolerance
+        routes: dict[str, Any] = {"qp": qp, "fallback": fallback, "qp_iterations": qp_iterations}
+        self._options = routes | {"scaling": scaling}
+        self._curved: Subproblems | None = None
         self.exact = hessian == "exact"
         self._exact = ExactHessian(program) if self.exact else None
         self.pattern = program.hessian if self._exact is None else program.normal
@@ -73,6 +76,12 @@ class Subproblems:
         self.scaling = self._neutral = Scaling.none(program)
         self._misses = self._resting = 0
         self._first_answered = False
+
+    def curved(self) -> Subproblems:
+        """The same with the Hessian of the Lagrangian, made at the first call."""
+        if self._curved is None:
+            self._curved = Subproblems(self.program, hessian="exact", tolerance=self.tolerance, **self._options)
+        return self._curved
 
     def start(self, lin: Linearization) -> None:
         """Begin a new solve at ``lin``: the first route is trusted again, and nothing of the last one is left.
@@ -110,13 +119,13 @@ class Subproblems:
         self.elastic_asked = self._first_answered = False
         enough = max(10.0 * accuracy, GOOD_ENOUGH)
         if self.fallback is None or self.elastic is None:
-            answer = self.by_first(qp, multipliers, accuracy)
+            answer = solve_convex(self.first, qp, multipliers, accuracy)
             return answer if holds(qp, answer, enough) else replace(answer, error=np.inf)
         answers = []
         if self._resting:
             self._resting -= 1
         else:
-            answers.append(self.by_first(qp, multipliers, accuracy))
+            answers.append(solve_convex(self.first, qp, multipliers, accuracy))
             if not holds(qp, answers[-1], enough):
                 return replace(answers[-1], error=np.inf)
             if answers[-1].error <= 10.0 * accuracy and not self._contradicts(qp, answers[-1]):
@@ -135,10 +144,6 @@ class Subproblems:
         # Where no step satisfies the rows, nothing says along which steps the curvature of constraints should count.
         self.elastic_asked = True
         return self.elastic.solve(elastic(), max(10.0 * float(np.abs(multipliers).max(initial=0.0)), 1e3))
-
-    def by_first(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
-        """Answer of the first route."""
-        return solve_convex(self.first, qp, multipliers, accuracy)
 
     def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
         """Test whether an answer leaves most of the violation, as the least error of contradicting rows does."""

@@ -59,10 +59,13 @@ class Native:
         raise TypeError("machine code is neither copied nor pickled: its owner generates it anew")
 
 
-def generated(arguments: tuple[Any, ...], body: Sequence[str], declarations: Iterable[str] = ()) -> bytes:
+def generated(
+    arguments: tuple[Any, ...], body: Sequence[str], declarations: Iterable[str] = (), loops: bool = False
+) -> bytes:
     """Object code of one function.
 
-    No optimiser runs: what is written states nothing twice and has nothing to move. The second level of code generation
+    The optimiser runs only where there are loops, for their vectors: what is written states nothing twice and has
+    nothing to move. The second level of code generation
     gives code no quicker than the first, the lowest four times slower code ten times sooner, which serves functions so
     long that the first takes seconds.
 
@@ -71,6 +74,7 @@ def generated(arguments: tuple[Any, ...], body: Sequence[str], declarations: Ite
         body: instructions. They find the numbers of the k-th array at ``%data<k>`` and the length of its a-th axis
             in ``%shape<k>_<a>``, and leave by the end.
         declarations: of the functions that the body calls, as they stand in a module.
+        loops: whether the body has any.
     """
     head, before, after = _frame(arguments)
     source = "\n".join((*declarations, head.replace(_MARK, _NAME), before, *body, after))
@@ -78,6 +82,11 @@ def generated(arguments: tuple[Any, ...], body: Sequence[str], declarations: Ite
         module.triple = binding.get_default_triple()
         machine = _machine(0 if source.count("\n") > LONG else 1)
         module.data_layout = str(machine.target_data)
+        if loops:
+            options = binding.create_pipeline_tuning_options(speed_level=2)
+            options.loop_vectorization = True
+            passes = binding.create_pass_builder(machine, options)
+            passes.getModulePassManager().run(module, passes)
         return bytes(machine.emit_object(module))
 
 

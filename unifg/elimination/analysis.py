@@ -2,25 +2,55 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from unifg.elimination.chain import stages
 from unifg.elimination.dissection import separators
 from unifg.elimination.layout import lay_out
 from unifg.elimination.metis import installed, metis_order
-from unifg.elimination.ordering import block_graph, indistinguishable, minimum_degree
+from unifg.elimination.ordering import block_graph, indistinguishable
 from unifg.elimination.plan import LARGEST, PANEL, PIVOTS, ROWS, SCALARS, Plan
-from unifg.elimination.symbolic import supernodes
+from unifg.elimination.symbolic import cliques, postordered, predicted_cost
 from unifg.errors import UnifgError
-from unifg.typing import BoolArray, IntArray
+from unifg.typing import IntArray
 
 Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "metis", "natural"] | IntArray
 SLACK = 16  # numbers the kernels may read beyond the last matrix
 DISSECT = 4e6, 3e3  # predicted nanoseconds, in all and per node, from which nested dissection is tried
-COST = 4  # where `supernodes` returns its forecast
 NOTHING = np.zeros(0)
+
+
+Tree: TypeAlias = tuple[IntArray, IntArray, IntArray, IntArray]
+"""Nodes front after front, pointers to it, parents, and the scalars each front passes on."""
+
+
+class Graph(NamedTuple):
+    """Graph of the nodes of a matrix.
+
+    Attributes:
+        weight: (nodes,) scalars of each node.
+        pointer, neighbours: the symmetric graph.
+    """
+
+    weight: IntArray
+    pointer: IntArray
+    neighbours: IntArray
+
+    def tree(self, order: IntArray | None = None, stage: IntArray | None = None) -> Tree:
+        """Elimination tree of a given order, or of minimum degree within stages; dense nodes come last."""
+        nodes, degree = len(self.weight), np.diff(self.pointer)
+        stage = np.zeros(nodes, np.int64) if stage is None else stage
+        if order is None:
+            stage[degree > 16 + int(10.0 * np.sqrt(nodes))] = stage.max(initial=0) + 1
+        first = np.repeat(np.arange(nodes), degree)
+        pairs = np.column_stack([first, self.neighbours])[self.neighbours > first]
+        given = np.zeros(0, np.int64) if order is None else order
+        pointer = np.arange(0, pairs.size + 1, 2)
+        found = cliques(self.weight, stage, np.zeros(nodes, np.bool_), given, True, pairs.ravel(), pointer)
+        tree: Tree = postordered(*found[:4])
+        return tree
 
 
 class Structure(NamedTuple):
@@ -53,17 +83,15 @@ class Structure(NamedTuple):
             pivots=np.ones(size + 3),
             signs=np.ones(size + 3),
             work=np.zeros(size + largest + SLACK),
-            state=np.array([0, 0, 0, -1, 0, -1]),
+            state=np.array([0, 0, 0, -1]),
         )
 
 
-def analyse(
-    indptr: IntArray, indices: IntArray, blocks: IntArray | None, ordering: Ordering, negative: BoolArray | None
-) -> Structure:
+def analyse(indptr: IntArray, indices: IntArray, blocks: IntArray | None, ordering: Ordering) -> Structure:
     """Analyse a pattern; arguments as for `factorization.Factorization`, the pattern as its two arrays.
 
     Raises:
-        UnifgError: labels, signs or permutation are not what they should be.
+        UnifgError: labels or permutation are not what they should be.
     """
     size = len(indptr) - 1
     label = indistinguishable(indptr, indices) if blocks is None else _labels(blocks, size)
@@ -72,49 +100,41 @@ def analyse(
     weight = np.diff(starts)
     pointer, neighbours = block_graph(indptr, indices, label, nodes)
     kind: str = ordering if isinstance(ordering, str) else "given order"
+    graph = Graph(weight, pointer, neighbours)
     if not isinstance(ordering, str):
-        tree = supernodes(pointer, neighbours, weight, _permutation(ordering, nodes))
+        tree = graph.tree(_permutation(ordering, nodes))
     elif ordering == "natural":
-        tree = supernodes(pointer, neighbours, weight, np.arange(nodes))
+        tree = graph.tree(np.arange(nodes))
     elif ordering == "nested-dissection":
-        staged = minimum_degree(pointer, neighbours, weight, separators(pointer, neighbours, weight))
-        tree = supernodes(pointer, neighbours, weight, staged)
+        tree = graph.tree(stage=separators(pointer, neighbours, weight))
     elif ordering == "metis":
-        kind, tree = "METIS", supernodes(pointer, neighbours, weight, metis_order(pointer, neighbours, weight))
+        kind, tree = "METIS", graph.tree(metis_order(pointer, neighbours, weight))
     elif ordering in ("auto", "minimum-degree"):
-        flat = np.zeros(nodes, np.int64)
-        tree = supernodes(pointer, neighbours, weight, minimum_degree(pointer, neighbours, weight, flat))
+        tree = graph.tree()
         if ordering == "auto":
-            kind = "minimum-degree"
-            if tree[COST][1] > max(DISSECT[0], DISSECT[1] * nodes):
-                staged = minimum_degree(pointer, neighbours, weight, separators(pointer, neighbours, weight))
-                dissected = supernodes(pointer, neighbours, weight, staged)
-                if dissected[COST][1] < tree[COST][1]:
-                    kind, tree = "nested-dissection", dissected
+            kind, cost = "minimum-degree", predicted_cost(weight, tree[0], tree[1], tree[3])
+            candidates: list[tuple[str, Callable[[], Tree]]] = []
+            if cost > max(DISSECT[0], DISSECT[1] * nodes):
+                candidates.append(
+                    ("nested-dissection", lambda: graph.tree(stage=separators(pointer, neighbours, weight)))
+                )
                 if installed():
-                    theirs = metis_order(pointer, neighbours, weight)
-                    multilevel = supernodes(pointer, neighbours, weight, theirs)
-                    if multilevel[COST][1] < tree[COST][1]:
-                        kind, tree = "METIS", multilevel
-            chain, line = stages(pointer, neighbours, weight)
-            if chain and line[COST][1] <= tree[COST][1]:
-                kind, tree = "chain", line
+                    candidates.append(("METIS", lambda: graph.tree(metis_order(pointer, neighbours, weight))))
+            for name, make in candidates:
+                other = make()
+                if (less := predicted_cost(weight, other[0], other[1], other[3])) < cost:
+                    kind, tree, cost = name, other, less
     else:
         raise UnifgError(
             f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural or "
             "give a permutation"
         )
-    order, bounds, parent, passed, _ = tree
+    order, bounds, parent, passed = tree
     table, scalar_order, rows, relative, runs, slots, part, waiting = lay_out(
         indptr, indices, starts, pointer, neighbours, order, bounds, parent, passed
     )
     largest = int((table[:, PIVOTS] + table[:, ROWS]).max(initial=0))
     panels = int(table[-1, PANEL])
-    expected = np.zeros(size, np.int8)
-    if negative is not None:
-        if np.shape(negative) != (size,):
-            raise UnifgError(f"negative has shape {np.shape(negative)}; expected one flag per scalar, ({size},)")
-        expected[:] = np.where(np.asarray(negative)[scalar_order], -1, 1)
     plan = Plan(
         shape=np.array([size, len(parent), largest, panels]),
         fronts=table,
@@ -123,7 +143,6 @@ def analyse(
         relative=relative,
         runs=runs,
         slots=slots,
-        expected=expected,
         numbers=NOTHING,
         pivots=NOTHING,
         signs=NOTHING,

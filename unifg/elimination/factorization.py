@@ -21,7 +21,6 @@ from unifg.elimination.plan import (
     PIVOTS,
     POSITIVE,
     ROWS,
-    SURPRISE,
     ZERO,
     Plan,
 )
@@ -39,16 +38,14 @@ class Symbolic:
 
     Attributes:
         pattern: upper triangle of the matrices.
-        asked: labels, ordering and signs, as for :class:`Factorization`.
+        asked: labels and ordering, as for :class:`Factorization`.
         indptr, indices: the pattern as compiled code reads it.
     """
 
-    def __init__(
-        self, pattern: Symmetric, blocks: IntArray | None, ordering: Ordering, negative: BoolArray | None
-    ) -> None:
+    def __init__(self, pattern: Symmetric, blocks: IntArray | None, ordering: Ordering) -> None:
         """Remember what is asked for."""
         self.pattern = pattern
-        self.asked = blocks, ordering, negative
+        self.asked = blocks, ordering
         self.indptr = pattern.indptr.astype(np.int64, copy=False)
         self.indices = pattern.indices.astype(np.int64, copy=False)
         self._structure: Structure | None = None
@@ -80,7 +77,6 @@ class Factorization:
         blocks: IntArray | None = None,
         *,
         ordering: Ordering = "auto",
-        negative: BoolArray | None = None,
     ) -> None:
         """Remember the structure.
 
@@ -89,11 +85,10 @@ class Factorization:
             blocks: (n,) non-decreasing label of the node each scalar belongs to; by default scalars that follow each
                 other and have the same neighbours are one node.
             ordering: how to order the nodes, or a permutation of them: the nodes in the order of elimination. "auto"
-                takes the cheapest of minimum degree, nested dissection (large graphs; METIS' too, where the extra
-                ``unifg[metis]`` is installed) and a chain of stages.
-            negative: (n,) whether the pivot of each scalar is expected to be negative; see `unexpected`.
+                takes the cheaper of minimum degree and, for large graphs, nested dissection (METIS' too, where the
+                extra ``unifg[metis]`` is installed).
         """
-        self._begin(Symbolic(pattern, blocks, ordering, negative))
+        self._begin(Symbolic(pattern, blocks, ordering))
 
     def _begin(self, symbolic: Symbolic) -> None:
         self.symbolic, self.pattern = symbolic, symbolic.pattern
@@ -116,7 +111,7 @@ class Factorization:
         """Result of the symbolic analysis.
 
         Raises:
-            UnifgError: labels, signs or permutation are not what they should be.
+            UnifgError: labels or permutation are not what they should be.
         """
         return self.symbolic.structure
 
@@ -183,7 +178,7 @@ class Factorization:
         if right.ndim == 1:
             right = _numbers(right, self.pattern.size, "the right-hand side")
             out = np.empty(len(right))
-            (sharing.solve_at_once if self._shared else substitution.solve)(self.plan, right, out)
+            substitution.solve(self.plan, right, out)
             return out
         rows = np.array(right.T, dtype=np.float64, order="C")
         if rows.ndim != 2 or rows.shape[1] != self.pattern.size:
@@ -229,11 +224,6 @@ class Factorization:
     def failure(self) -> int:
         """Scalar whose pivot vanished or was not finite in the last factorisation, or -1."""
         return int(self.plan.state[FAILED])
-
-    @property
-    def unexpected(self) -> int:
-        """Scalar of the first pivot whose sign is not the one ``negative`` announced, or -1."""
-        return int(self.plan.state[SURPRISE])
 
     def pivots(self) -> Array:
         """(n,) diagonal D of the factorisation L D L' with unit L, in the order of elimination.
@@ -396,10 +386,8 @@ class Factorization:
             raise UnifgError(f"{what} called before a successful factor: call factor, and look whether it returns True")
 
 
-def _rebuilt(
-    pattern: Symmetric, blocks: IntArray | None, ordering: Ordering, negative: BoolArray | None
-) -> Factorization:
-    return Factorization(pattern, blocks, ordering=ordering, negative=negative)
+def _rebuilt(pattern: Symmetric, blocks: IntArray | None, ordering: Ordering) -> Factorization:
+    return Factorization(pattern, blocks, ordering=ordering)
 
 
 def _numbers(array: Array, size: int, name: str) -> Array:

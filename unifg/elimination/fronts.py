@@ -27,8 +27,6 @@ from unifg.elimination.plan import (
     ROWS,
     SIBLING,
     STRIDE,
-    SURPRISE,
-    SURPRISES,
     UPDATE,
     UPDATE_STRIDE,
     ZERO,
@@ -161,7 +159,6 @@ def add_child(plan: Plan, numbers: Address, s: int, child: int, start: int, stop
 def begin_count(state: IntArray) -> None:
     """Nothing has been eliminated, nothing has failed."""
     state[POSITIVE], state[NEGATIVE], state[ZERO], state[FAILED] = 0, 0, 0, -1
-    state[SURPRISES], state[SURPRISE] = 0, -1
 
 
 @inlined
@@ -171,13 +168,8 @@ def count_front(plan: Plan, s: int, failed: int, state: IntArray) -> None:
     width = failed if failed >= 0 else plan.fronts[s, PIVOTS]
     negative = 0
     for i in range(first, first + width):
-        sign = get(plan.signs, i)
-        if sign < 0.0:
+        if get(plan.signs, i) < 0.0:
             negative += 1
-        if get(plan.expected, i) * sign < 0.0:
-            if state[SURPRISES] == 0:
-                state[SURPRISE] = order[i]
-            state[SURPRISES] += 1
     state[POSITIVE] += width - negative
     state[NEGATIVE] += negative
     if failed >= 0:
@@ -192,7 +184,7 @@ def eliminate_part(plan: Plan, part: int, state: IntArray) -> bool:
     Args:
         plan: with a matrix in its panels.
         part: see above.
-        state: (6,) receives what ``plan.state`` holds, of these fronts.
+        state: (4,) receives what ``plan.state`` holds, of these fronts.
     """
     fronts, shared = plan.fronts, plan.part
     numbers, pivots, signs, scale = (

@@ -42,7 +42,7 @@ def lay_out(
         starts: (nodes + 1,) first scalar of each node.
         pointer: symmetric graph of the nodes.
         neighbours: see above.
-        order: this and the following as `symbolic.supernodes` returns them.
+        order: this and the following as `symbolic.postordered` returns them.
         bounds: see above.
         parent: see above.
         passed: see above.

@@ -15,7 +15,7 @@ COLUMNS = 12
 # Entries of ``Plan.shape``.
 SCALARS, FRONTS, LARGEST, PANELS = range(4)
 # Entries of ``Plan.state``.
-POSITIVE, NEGATIVE, ZERO, FAILED, SURPRISES, SURPRISE = range(6)
+POSITIVE, NEGATIVE, ZERO, FAILED = range(4)
 
 
 class Plan(NamedTuple):
@@ -35,12 +35,11 @@ class Plan(NamedTuple):
         relative: where these rows are found in the parent's front.
         runs: how many rows from this one on follow each other there.
         slots: (nnz,) where the entries of the pattern go in ``numbers``.
-        expected: (n,) sign each pivot should have, 0 when any will do.
         numbers: panels, then update matrices.
         pivots: (n,) inverse of the diagonal of the factor.
         signs: (n,) S.
         work: (n + largest front) for solves.
-        state: positive, negative, vanished pivots, failed scalar or -1, unexpected signs and the first of them or -1.
+        state: positive, negative, vanished pivots, failed scalar or -1.
         part: (S,) part of each front, see :mod:`unifg.elimination.subtrees`; empty where the work is not shared out.
     """
 
@@ -51,7 +50,6 @@ class Plan(NamedTuple):
     relative: NDArray[np.int32]
     runs: NDArray[np.int32]
     slots: NDArray[np.int32]
-    expected: NDArray[np.int8]
     numbers: Array
     pivots: Array
     signs: Array

@@ -1,11 +1,10 @@
-"""Numeric elimination and substitution by several threads.
+"""Numeric elimination by several threads.
 
 All threads walk through the same phases: write the matrix, eliminate the parts of the tree, then one by one the fronts
 above them. The chunks of a phase write to different places; whoever is free takes the next one, and nobody goes on
 before all are done. A thread that comes late finds nothing left to do, and none waits for one that has not begun.
 
-Factors are the same to the bit as those of one thread, whatever the number of threads. A solution is the same for every
-number of threads from two on: what parts take from the right-hand side above them is added up part by part.
+Factors are the same to the bit as those of one thread, whatever the number of threads.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ from functools import cache
 from math import sqrt
 
 import numpy as np
-from numba import float64, int8, int32, int64
+from numba import float64, int32, int64
 
 from unifg.codegen.jit import compiled
 from unifg.codegen.threads import share
-from unifg.codegen.vectors import Address, address, get, put
+from unifg.codegen.vectors import Address, address
 from unifg.codegen.waiting import first_chunk, next_chunk, wait_for
 from unifg.codegen.work_queue import arguments_at, arrays, bundle, entrance
 from unifg.elimination.dense import complete, eliminate, subtract_signed
@@ -41,20 +40,16 @@ from unifg.elimination.plan import (
     FAILED,
     FIRST,
     FRONTS,
-    INDEX,
     PANEL,
     PANELS,
     PIVOTS,
     ROWS,
-    SCALARS,
     SIBLING,
     STRIDE,
-    SURPRISE,
     UPDATE,
     UPDATE_STRIDE,
     Plan,
 )
-from unifg.elimination.substitution import backward, forward
 from unifg.elimination.subtrees import PARTS
 from unifg.typing import Array, IntArray
 
@@ -62,7 +57,7 @@ PLAN = bundle(
     Plan,
     (
         arrays(int64), arrays(int64, 2), arrays(int64), arrays(int32), arrays(int32), arrays(int32), arrays(int32),
-        arrays(int8), *[arrays(float64)] * 4, arrays(int64), arrays(int64),
+        *[arrays(float64)] * 4, arrays(int64), arrays(int64),
     ),
 )  # fmt: skip
 """Type of a plan."""
@@ -116,7 +111,7 @@ def work_on(plan: Plan, data: Array, added: Array, counters: Address, told: IntA
         data: as for :func:`fronts.factor`.
         added: as above.
         counters: of two integers for each phase, zero: chunks taken and chunks done.
-        told: (PARTS + 1, 6) receives what ``plan.state`` holds, of each part and of the fronts above them.
+        told: (PARTS + 1, 4) receives what ``plan.state`` holds, of each part and of the fronts above them.
     """
     numbers = address(plan.numbers)
     panels, entries, count = plan.shape[PANELS], len(plan.slots), plan.shape[FRONTS]
@@ -235,105 +230,7 @@ def _front(plan: Plan, numbers: Address, s: int, counters: Address, phase: int, 
     return phase + 1
 
 
-@compiled
-def _sweep(
-    plan: Plan, part: int, x: Address, numbers: Address, pivots: Address, signs: Address, space: int, back: bool
-) -> None:
-    """Forward or backward substitution through the fronts of a part.
-
-    Args:
-        plan: factorised.
-        part: see above.
-        x: address of the right-hand side in the order of elimination, and of room for a front.
-        numbers: address of the panels.
-        pivots: of the inverse diagonal.
-        signs: of its signs.
-        space: offset of the room.
-        back: see above.
-    """
-    fronts, rows, count = plan.fronts, plan.rows, plan.shape[FRONTS]
-    for k in range(count):
-        s = count - 1 - k if back else k
-        if plan.part[s] != part:
-            continue
-        first, width, below, panel, stride = (
-            fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, PANEL], fronts[s, STRIDE],
-        )  # fmt: skip
-        index = fronts[s, INDEX]
-        for i in range(width):
-            put(x, space + i, get(x, first + i))
-        for i in range(below):
-            put(x, space + width + i, get(x, get(rows, index + i)))
-        if back:
-            backward(x, space, numbers, panel, stride, width, width + below, pivots, first)
-        else:
-            forward(x, space, numbers, panel, stride, width, width + below, pivots, signs, first)
-            for i in range(below):
-                put(x, get(rows, index + i), get(x, space + width + i))
-        for i in range(width):
-            put(x, first + i, get(x, space + i))
-
-
-@compiled
-def substitute(plan: Plan, right: Array, out: Array, own: Array, counters: Address) -> None:
-    """Work of one thread for a solution.
-
-    Args:
-        plan: factorised, with parts.
-        right: (n,) right-hand side.
-        out: (n,) receives the solution.
-        own: (PARTS, n + room for a front) what each part works in.
-        counters: of two integers for each of three phases, zero.
-    """
-    fronts, order, scalars, count = plan.fronts, plan.order, plan.shape[SCALARS], plan.shape[FRONTS]
-    numbers, pivots, signs, x = address(plan.numbers), address(plan.pivots), address(plan.signs), address(plan.work)
-    k = first_chunk(counters, 0)
-    while k < PARTS:
-        mine = own[k]
-        for s in range(count):
-            if plan.part[s] == k:
-                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
-                    mine[i] = right[order[i]]
-            elif plan.part[s] == PARTS:
-                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
-                    mine[i] = 0.0
-        _sweep(plan, k, address(mine), numbers, pivots, signs, scalars, False)
-        k = next_chunk(counters, 0)
-    wait_for(counters, 0, PARTS)
-    if first_chunk(counters, 1) == 0:
-        for s in range(count):
-            if plan.part[s] == PARTS:
-                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
-                    total = right[order[i]]
-                    for part in range(PARTS):
-                        total += own[part, i]
-                    put(x, i, total)
-        _sweep(plan, PARTS, x, numbers, pivots, signs, scalars, False)
-        _sweep(plan, PARTS, x, numbers, pivots, signs, scalars, True)
-        for s in range(count):
-            if plan.part[s] == PARTS:
-                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
-                    out[order[i]] = get(x, i)
-        next_chunk(counters, 1)
-    wait_for(counters, 1, 1)
-    k = first_chunk(counters, 2)
-    while k < PARTS:
-        mine = own[k]
-        for s in range(count):
-            if plan.part[s] == PARTS:
-                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
-                    mine[i] = get(x, i)
-        _sweep(plan, k, address(mine), numbers, pivots, signs, scalars, True)
-        for s in range(count):
-            if plan.part[s] == k:
-                for i in range(fronts[s, FIRST], fronts[s, FIRST] + fronts[s, PIVOTS]):
-                    out[order[i]] = mine[i]
-        k = next_chunk(counters, 2)
-    wait_for(counters, 2, PARTS)
-
-
 _of_factor = arguments_at((PLAN, arrays(float64), arrays(float64), int64, arrays(int64, 2)))
-_of_substitution = arguments_at((PLAN, arrays(float64), arrays(float64), arrays(float64, 2), int64))
 
 
 @compiled
@@ -342,32 +239,18 @@ def _factor_share(where: Address) -> None:
     work_on(plan, data, added, counters, told)
 
 
-@compiled
-def _substitution_share(where: Address) -> None:
-    plan, right, out, own, counters = _of_substitution(where)
-    substitute(plan, right, out, own, counters)
-
-
 @cache
-def _entrances() -> tuple[Address, Address]:
-    return entrance(_factor_share), entrance(_substitution_share)
+def _entrance() -> Address:
+    return entrance(_factor_share)
 
 
 def factor_at_once(plan: Plan, data: Array, added: Array) -> bool:
     """Parallel :func:`fronts.factor`, with the same bits."""
     told = np.empty((PARTS + 1, len(plan.state)), np.int64)
     counters = np.zeros(2 * phases_of(plan), np.int64)
-    share(_entrances()[0], (plan, data, added, counters.ctypes.data, told))
+    share(_entrance(), (plan, data, added, counters.ctypes.data, told))
     if told[:, FAILED].max() >= 0:
         return bool(factor(plan, data, added))  # which stops where the first pivot vanishes, and says where
     plan.state[:] = told.sum(axis=0)
     plan.state[FAILED] = -1
-    surprised = np.isin(plan.order, told[told[:, SURPRISE] >= 0, SURPRISE])
-    plan.state[SURPRISE] = plan.order[np.argmax(surprised)] if surprised.any() else -1
     return True
-
-
-def solve_at_once(plan: Plan, right: Array, out: Array) -> None:
-    """Parallel :func:`substitution.solve`; ``out`` is not ``right``."""
-    own, counters = np.empty((PARTS, len(plan.work))), np.zeros(6, np.int64)
-    share(_entrances()[1], (plan, right, out, own, counters.ctypes.data))

@@ -232,19 +232,8 @@ class Near:
         return result
 
     def after(self, steps: Steps, moves: Moves, k: int) -> list[Array]:
-        """(n, storage) points after one move, one array per variable; what it leaves where it is is not copied."""
-        result = []
-        for point, (move, axis, place, times), turned in zip(self.points, moves.added, moves.turned, strict=True):
-            entries = np.flatnonzero(move == k)
-            parts = [(part, leaf, columns, many[rows == k]) for part, leaf, columns, rows, many in turned if k in rows]
-            moved = np.array(point) if len(entries) or parts else point
-            for e in entries:
-                moved[:, place[e]] += times[e] * steps.length[:, axis[e]]
-            for part, leaf, columns, multiples in parts:
-                stored = moved[:, part.start : part.start + part.storage]
-                stored[:] = leaf.retract(stored, multiples[0] * steps.length[:, columns])
-            result.append(moved)
-        return result
+        """(n, storage) points after one move, one array per variable."""
+        return [stack[0] for stack in self.moved(steps, moves, k, k + 1)]
 
     def rotations(self) -> list[tuple[slice, Array]]:
         """Columns of the positions that belong to a rotation, and the (n, d, d) rotations."""
@@ -302,26 +291,14 @@ def slopes(many: Many, directions: Directions, points: Sequence[Array]) -> list[
     return np.split(blocks, directions.ends, axis=-1)
 
 
-def gradient_and_hessian(
-    function: Callable[..., Array], points: Sequence[Array], manifolds: Sequence[Manifold]
-) -> tuple[Array, Array, Array]:
-    """Gradient (n, D), symmetric Hessian (n, D, D), and rounding of the gradient (n, D), of a batched scalar function.
-
-    D is the sum of d_k. The gradient comes from two points near the centre, and from four points further away where
-    these agree as nearly as rounding of the two lets them: they know more digits of a large value. Directions of
-    different variables commute; within one variable the symmetrised second derivative of ``t -> f(x Exp(t d))`` is
-    taken, which is the Hessian a Newton step along Exp needs.
-
-    Args:
-        function: maps arrays like ``points`` to (n,).
-        points: one (n, storage_k) array per variable.
-        manifolds: the manifold of each variable.
-    """
-    return scalar_slopes(one_by_one(function), directions_of(tuple(manifolds)), points)
-
-
 def scalar_slopes(many: Many, directions: Directions, points: Sequence[Array]) -> tuple[Array, Array, Array]:
-    """Result of :func:`gradient_and_hessian`, for a function (n,) of many moves."""
+    """Gradient (n, D), symmetric Hessian (n, D, D), and rounding of the gradient (n, D), of a scalar function.
+
+    The function is (n,) of many moves, and D the sum of d_k. The gradient comes from two points near the centre, and
+    from four points further away where these agree as nearly as rounding of the two lets them: they know more digits
+    of a large value. Directions of different variables commute; within one variable the symmetrised second derivative
+    of ``t -> f(x Exp(t d))`` is taken, which is the Hessian a Newton step along Exp needs.
+    """
     near, width = Near(directions, points), directions.width
     first, steps = near.steps(FIRST), near.steps(SECOND)
     values = many(near, first, directions.two_sided)
@@ -431,4 +408,4 @@ _TURNED = {
     2: np.array([[[0.0, 1.0]], [[-1.0, 0.0]]]),
     3: np.array([[np.cross(r, t) for r in np.eye(3)] for t in np.eye(3)]),
 }
-"""What a turn r makes of a translation t, r x t: axes of t, axes of r, coordinates."""
+"""Products r x t of a turn r and a translation t: axes of t, axes of r, coordinates."""

@@ -91,6 +91,10 @@ class Kernel:
         """The number of rows m, given the shape of each parameter for one factor."""
         return self.rows if isinstance(self.rows, int) else int(self.rows(*shapes))
 
+    def of_shapes(self, shapes: Sequence[tuple[int, ...]]) -> Kernel:
+        """The kernel for parameters of these shapes, for one factor: itself, unless code depends on them."""
+        return self
+
     def rows_of(self, arguments: Sequence[Any]) -> list[Any]:
         """The arguments with one row per factor or a single one.
 
@@ -161,19 +165,21 @@ class Kernel:
         variables, parameters, _ = self.split(arguments, len(weights))
         width = sum(manifold.dim for manifold in self.manifolds)
         second = np.zeros((len(weights), width, width))
-        if self.second_address and len(weights):
+        where = self.of_shapes([part.shape[1:] for part in parameters]).second_address if len(weights) else 0
+        if where:
             packed, shared = side_by_side(variables, len(weights)), side_by_side(parameters)
-            evaluate_rows(self.second_address, packed, shared, self.table, np.ascontiguousarray(weights), second)
+            evaluate_rows(where, packed, shared, self.table, np.ascontiguousarray(weights), second)
         return second
 
     def _run(self, arguments: Sequence[Any], derive: bool) -> tuple[Array, Array]:
         variables, parameters, count = self.split(arguments, None)
-        m = self.size([parameter.shape[1:] for parameter in parameters])
+        kernel = self.of_shapes(shapes := [parameter.shape[1:] for parameter in parameters])
+        m = kernel.size(shapes)
         residual = np.empty((count, m))
         jacobian = np.empty((count, m, sum(manifold.dim for manifold in self.manifolds)) if derive else (0, 0, 0))
         if count:
             packed, shared = side_by_side(variables, count), side_by_side(parameters)
-            evaluate_rows(self.address, packed, shared, self.table, residual, jacobian)
+            evaluate_rows(kernel.address, packed, shared, self.table, residual, jacobian)
         return residual, jacobian
 
 

@@ -31,7 +31,6 @@ class Residual:
         search: like ``jacobian``, but not a derivative: a direction to look in during the first
             ``Solver.search_iterations`` iterations. Answers are never judged by it.
         kernel: ``function`` and ``jacobian`` for one factor, compiled; graphs run it in one loop with all others.
-        search_kernel: the same with ``search`` in the place of the Jacobian.
         rows: m, of a ``function`` that a user has compiled for one factor.
         derivatives: "trace" to insist on exact ones, "differences" to refuse them, empty for what is possible.
         elements: place and manifold of arguments that are elements of one, where a kernel does not say so.
@@ -42,7 +41,6 @@ class Residual:
     name: str = ""
     search: JacobianFunction | None = None
     kernel: Kernel | None = None
-    search_kernel: Kernel | None = None
     rows: int = 0
     derivatives: str = ""
     elements: tuple[tuple[int, Manifold], ...] = field(default=(), compare=False, repr=False)
@@ -56,7 +54,7 @@ def residual(
     function: Function | Kernel,
     jacobian: JacobianFunction | None = None,
     name: str = "",
-    search: JacobianFunction | Kernel | None = None,
+    search: JacobianFunction | None = None,
     rows: int = 0,
     derivatives: Derivatives | None = None,
     about: str = "",
@@ -89,8 +87,6 @@ def residual(
     """
     if derivatives not in (None, "trace", "differences"):
         raise GraphError(f"derivatives must be 'trace' or 'differences', found {derivatives!r}")
-    search_kernel = search if isinstance(search, Kernel) else None
-    looked_in = search.jacobian if isinstance(search, Kernel) else search
     own = is_compiled(function)
     about = about or getdoc(function) or "" if isinstance(function, FunctionType) else about
     if own and rows < 1:
@@ -98,13 +94,13 @@ def residual(
             f"the residual '{getattr(function, '__name__', name)}' is compiled: say how many numbers it writes, rows="
         )
     if isinstance(function, Kernel) and jacobian is None:
-        made = Residual(function, function.jacobian, name or function.name, looked_in, function, search_kernel)
+        made = Residual(function, function.jacobian, name or function.name, search, function)
     else:
         made = Residual(
             function,
             jacobian,
             name or getattr(function, "__name__", "residual"),
-            looked_in,
+            search,
             rows=rows if own else 0,
             derivatives=derivatives or "",
         )

@@ -59,6 +59,15 @@ class Formula:
 
     held = False
 
+    def __post_init__(self) -> None:
+        """Refuse parameters that are not positive and finite.
+
+        Raises:
+            GraphError: naming the loss.
+        """
+        for value in vars(self).values():
+            positive(value, type(self).__name__)
+
     @property
     def form(self) -> Form:
         """Form of the loss in compiled code."""
@@ -89,10 +98,6 @@ class Huber(Formula):
 
     threshold: float = 1.345
 
-    def __post_init__(self) -> None:
-        """Refuse a threshold that is not positive."""
-        positive(self.threshold, "Huber")
-
     @property
     def form(self) -> Form:
         """Form with k."""
@@ -108,10 +113,6 @@ class Cauchy(Formula):
     """
 
     scale: float = 2.385
-
-    def __post_init__(self) -> None:
-        """Refuse a scale that is not positive."""
-        positive(self.scale, "Cauchy")
 
     @property
     def form(self) -> Form:
@@ -130,10 +131,6 @@ class Tukey(Formula):
     """
 
     threshold: float = 4.685
-
-    def __post_init__(self) -> None:
-        """Refuse a threshold that is not positive."""
-        positive(self.threshold, "Tukey")
 
     @property
     def form(self) -> Form:
@@ -154,10 +151,6 @@ class DCS(Formula):
     """
 
     phi: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse a parameter that is not positive."""
-        positive(self.phi, "DCS")
 
     def scaling(self, squared: Array) -> Array:
         """t(s), the factor on the residual: what a switch variable would have become."""
@@ -180,11 +173,6 @@ class GemanMcClure(Formula):
 
     scale: float = 1.0
     mu: float = 1.0
-
-    def __post_init__(self) -> None:
-        """Refuse parameters that are not positive."""
-        positive(self.scale, "GemanMcClure")
-        positive(self.mu, "GemanMcClure")
 
     @property
     def form(self) -> Form:

@@ -46,7 +46,7 @@ FAR = 4096.0  # size of coordinates from which on two points alone are wrong by 
 ROUNDINGS = 4.0  # of the largest coordinate in what a derivative by two points divides
 
 VECTOR, ANGLE, TURN, OTHER = range(4)
-"""How a part of a variable moves: numbers that are added to, an angle, a quaternion, by a retraction of its own."""
+"""Kinds of parts of a variable: numbers that are added to, an angle, a quaternion, a retraction of its own."""
 
 
 class Part(NamedTuple):

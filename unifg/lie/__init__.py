@@ -3,7 +3,7 @@
 ``SO2``, ``SE2``, ``SO3``, ``SE3`` and ``SE23`` are ready-made objects, ``Rn(n)`` and ``Product(name=manifold, ...)``
 make equal objects from equal arguments. Each group is one file: its formulas as compiled functions of one element, and
 the class that states them (:func:`elementwise`). A manifold of one's own derives from :class:`ManifoldBase`, a group
-from :class:`LieGroup`. Conventions are collected in ``docs/conventions.md``.
+from :class:`LieGroup`. Conventions are collected in ``docs/reference/conventions.md``.
 """
 
 from unifg.lie.axioms import Axioms, Breach, check_manifold

@@ -48,7 +48,7 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "left_jacobian_inverse": ((DIM,), (DIM, DIM)),
     "bend": ((DIM, DIM), (DIM, DIM)),
 }
-"""What may be stated for one element: the sizes of the arguments, and of the result, as attributes of the manifold."""
+"""Functions of one element: the sizes of the arguments, and of the result, as attributes of the manifold."""
 
 
 @overload

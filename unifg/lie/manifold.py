@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import sys
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from unifg.codegen.fingerprint import is_compiled
 from unifg.errors import UnifgError
 from unifg.lie.defaults import RULES, STEP
-from unifg.lie.elementwise import method, stated
+from unifg.lie.elementwise import LAYOUTS, One, Two, method, stated
 from unifg.typing import Array, ArrayLike, BoolArray
 
 
@@ -126,7 +128,7 @@ class LieGroup(ManifoldBase):
     ``Exp(d + e) = Exp(d) Exp(Jr(d) e) = Exp(Jl(d) e) Exp(d)`` to first order in e.
 
     A subclass states ``identity``, ``random`` and, by compiled functions, ``exp``, ``log``, ``compose`` and
-    ``inverse``: all else follows (``lie/consequences.py``), and is stated only where a closed form is quicker. What is
+    ``inverse``: all else follows (``lie/defaults.py``), and is stated only where a closed form is quicker. What is
     stated as an ordinary method is run by NumPy, and so is what follows from it; adjoint and Jacobians then have to be
     stated.
 
@@ -141,9 +143,18 @@ class LieGroup(ManifoldBase):
     point_dim: int = 0
     matrix_dim: int = 0
 
-    def __init_subclass__(cls, **options: Any) -> None:
-        """Make what follows from the compiled functions that the class states or inherits."""
+    def __init_subclass__(cls, methods: Mapping[str, Any] | None = None, **options: Any) -> None:
+        """Add the methods given, and derive what follows from the compiled functions that the class states or inherits.
+
+        Args:
+            methods: compiled functions of one element, or batched methods, by the names in ``LAYOUTS``; others are
+                ignored, so a module that names its formulas like methods passes ``globals()``.
+            **options: of other bases.
+        """
         super().__init_subclass__(**options)
+        for name in LAYOUTS.keys() & (methods or {}).keys():
+            made = methods[name]  # type: ignore[index]
+            setattr(cls, name, method(cls, name, made) if is_compiled(made) else made)
         for name, (needs, make) in RULES.items():
             if not getattr(getattr(cls, name), "follows", getattr(cls, name) is getattr(LieGroup, name)):
                 continue
@@ -249,6 +260,15 @@ class LieGroup(ManifoldBase):
     def hat(self, d: ArrayLike, /) -> Array:
         """Return (..., matrix_dim, matrix_dim) algebra matrices: ``matrix(Exp(d)) = expm(hat(d))``."""
         raise UnifgError(f"{self.name} states no hat")
+
+
+class CompiledGroup(LieGroup):
+    """Base of the groups whose modules state their formulas as compiled functions with the names of the methods."""
+
+    exp: One
+    log: One
+    compose: Two
+    inverse: One
 
 
 def identities(like: Array, dim: int) -> Array:

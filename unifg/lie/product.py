@@ -10,7 +10,7 @@ from typing import Any, overload
 import numpy as np
 
 from unifg.errors import UnifgError
-from unifg.lie.elementwise import DIM, LAYOUTS, MATRIX, POINT, STORAGE, OneMethod, TwoMethod
+from unifg.lie.elementwise import DIM, LAYOUTS, MATRIX, POINT, STORAGE
 from unifg.lie.manifold import LieGroup, Manifold
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -161,31 +161,25 @@ class Product:
         return _rebuild, ({name: part.manifold for name, part in self.components.items()},)
 
 
-def _one_by_one(name: str) -> OneMethod:
-    """The method of a product that does the same to every component."""
+def _componentwise(name: str) -> Callable[..., Array]:
+    """Make the method of a product that does the same to every component."""
     square = len(LAYOUTS[name][1]) == 2
 
-    def each(self: Any, x: ArrayLike, /) -> Array:
-        x = np.asarray(x, dtype=np.float64)
-        found = [of(x[..., at]) for of, at in self._of(name)]
+    def each(self: Any, *arguments: ArrayLike) -> Array:
+        arrays = [np.asarray(argument, dtype=np.float64) for argument in arguments]
+        found = [of(*(x[..., at] for x, at in zip(arrays, parts, strict=True))) for of, *parts in self._of(name)]
         return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)
 
     return each
 
 
-def _two_by_two(name: str) -> TwoMethod:
-    """The same with two arguments."""
-    square = len(LAYOUTS[name][1]) == 2
-
-    def each(self: Any, x: ArrayLike, y: ArrayLike, /) -> Array:
-        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-        found = [of(x[..., at], y[..., beside]) for of, at, beside in self._of(name)]
-        return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)
-
-    return each
+COMPONENTWISE = (
+    "exp", "log", "compose", "inverse", "act", "matrix", "hat", "adjoint", "ad", "right_jacobian",
+    "right_jacobian_inverse", "bend",
+)  # fmt: skip
 
 
-class ProductGroup(Product, LieGroup):
+class ProductGroup(Product, LieGroup, methods={name: _componentwise(name) for name in COMPONENTWISE}):
     """A product whose components are all groups; ``Product(...)`` makes it.
 
     Matrices, adjoints and Jacobians are block diagonal. ``act`` moves concatenated points, each component its
@@ -222,19 +216,6 @@ class ProductGroup(Product, LieGroup):
         for (_, at), block in zip(self._places, blocks, strict=True):
             result[..., at[size], at[size]] = block
         return result
-
-    exp = _one_by_one("exp")
-    log = _one_by_one("log")
-    compose = _two_by_two("compose")
-    inverse = _one_by_one("inverse")
-    act = _two_by_two("act")
-    matrix = _one_by_one("matrix")
-    hat = _one_by_one("hat")
-    adjoint = _one_by_one("adjoint")
-    ad = _one_by_one("ad")
-    right_jacobian = _one_by_one("right_jacobian")
-    right_jacobian_inverse = _one_by_one("right_jacobian_inverse")
-    bend = _two_by_two("bend")
 
 
 def leaves(manifold: Manifold, storage: int = 0, tangent: int = 0) -> Iterator[tuple[Manifold, int, int]]:

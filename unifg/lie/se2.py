@@ -12,8 +12,7 @@ import math
 import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.lie.elementwise import elementwise
-from unifg.lie.manifold import LieGroup
+from unifg.lie.manifold import CompiledGroup
 from unifg.lie.series import c_value, k_slope, k_value, sinc, sinc_and_cos, x_cot_x
 from unifg.lie.so2 import PI, wrap
 from unifg.typing import Array, ArrayLike
@@ -230,7 +229,7 @@ def bend(d: Array, v: Array, out: Array) -> None:
     out[2, 0] = out[2, 1] = out[2, 2] = 0.0
 
 
-class SE2Group(LieGroup):
+class SE2Group(CompiledGroup, methods=globals()):
     """Rigid motions of the plane; use the ready-made object ``SE2``.
 
     Storage is ``(x, y, theta)`` [m, m, rad], theta returned in [-pi, pi) by every operation and accepted with
@@ -243,20 +242,6 @@ class SE2Group(LieGroup):
     dim = 3
     point_dim = 2
     matrix_dim = 3
-
-    exp = elementwise(exp)
-    log = elementwise(log)
-    compose = elementwise(compose)
-    inverse = elementwise(inverse)
-    between = elementwise(between)
-    retract = elementwise(retract)
-    local = elementwise(local)
-    act = elementwise(act)
-    matrix = elementwise(matrix)
-    adjoint = elementwise(adjoint)
-    right_jacobian = elementwise(right_jacobian)
-    right_jacobian_inverse = elementwise(right_jacobian_inverse)
-    bend = elementwise(bend)
 
     def identity(self) -> Array:
         """Return the (3,) zero pose."""

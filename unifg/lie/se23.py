@@ -21,8 +21,9 @@ from unifg.codegen.calls import local_matrix, local_vector
 from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
 from unifg.lie import se3
-from unifg.lie.elementwise import elementwise
-from unifg.lie.manifold import LieGroup
+from unifg.lie.defaults import RULES
+from unifg.lie.elementwise import Scalar
+from unifg.lie.manifold import CompiledGroup
 from unifg.lie.so3 import SO3, write_matrix
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -60,71 +61,66 @@ def join_blocks(p: Array, v: Array, out: Array) -> None:
             out[i, 3 + k] = out[3 + i, k] = out[6 + i, k] = out[6 + i, 3 + k] = 0.0
 
 
-@compiled
-def exp(d: Array, out: Array) -> None:
-    """Exponential ``(Jl(omega) rho, Jl(omega) nu, Exp(omega))``."""
-    part, p, v = local_vector(6), local_vector(7), local_vector(7)
-    take(d, 0, part)
-    se3.exp(part, p)
-    take(d, 3, part)
-    se3.exp(part, v)
-    join(p, v, out)
+def _twice_of_one(function: Scalar, given: int, result: int) -> Scalar:
+    """Compile ``f(x, out)`` of two vectors that turn as one from that of SE(3).
+
+    Args:
+        function: compiled, of SE(3).
+        given: length of its argument.
+        result: length of its result.
+    """
+
+    @compiled
+    def twice(x: Array, out: Array) -> None:
+        part, p, v = local_vector(given), local_vector(result), local_vector(result)
+        take(x, 0, part)
+        function(part, p)
+        take(x, 3, part)
+        function(part, v)
+        join(p, v, out)
+
+    return twice
 
 
-@compiled
-def log(x: Array, out: Array) -> None:
-    """Logarithm with a rotation of at most pi."""
-    part, p, v = local_vector(7), local_vector(6), local_vector(6)
-    take(x, 0, part)
-    se3.log(part, p)
-    take(x, 3, part)
-    se3.log(part, v)
-    join(p, v, out)
+def _twice_of_two(function: Scalar) -> Scalar:
+    """Compile ``f(x, y, out)`` of elements from that of SE(3)."""
+
+    @compiled
+    def twice(x: Array, y: Array, out: Array) -> None:
+        a, b, p, v = local_vector(7), local_vector(7), local_vector(7), local_vector(7)
+        take(x, 0, a)
+        take(y, 0, b)
+        function(a, b, p)
+        take(x, 3, a)
+        take(y, 3, b)
+        function(a, b, v)
+        join(p, v, out)
+
+    return twice
 
 
-@compiled
-def compose(x: Array, y: Array, out: Array) -> None:
-    """``x y``: ``(p + R p', v + R v', R R')``."""
-    a, b, p, v = local_vector(7), local_vector(7), local_vector(7), local_vector(7)
-    take(x, 0, a)
-    take(y, 0, b)
-    se3.compose(a, b, p)
-    take(x, 3, a)
-    take(y, 3, b)
-    se3.compose(a, b, v)
-    join(p, v, out)
+def _blocks(function: Scalar, given: int) -> Scalar:
+    """Compile ``f(x, out)`` with a square result from that of SE(3), whose argument has this length."""
+
+    @compiled
+    def twice(x: Array, out: Array) -> None:
+        part, p, v = local_vector(given), local_matrix(6, 6), local_matrix(6, 6)
+        take(x, 0, part)
+        function(part, p)
+        take(x, 3, part)
+        function(part, v)
+        join_blocks(p, v, out)
+
+    return twice
 
 
-@compiled
-def inverse(x: Array, out: Array) -> None:
-    """``x^-1``: ``(-R' p, -R' v, R')``."""
-    part, p, v = local_vector(7), local_vector(7), local_vector(7)
-    take(x, 0, part)
-    se3.inverse(part, p)
-    take(x, 3, part)
-    se3.inverse(part, v)
-    join(p, v, out)
-
-
-@compiled
-def between(x: Array, y: Array, out: Array) -> None:
-    """``x^-1 y``; positions differ before they are turned."""
-    a, b, p, v = local_vector(7), local_vector(7), local_vector(7), local_vector(7)
-    take(x, 0, a)
-    take(y, 0, b)
-    se3.between(a, b, p)
-    take(x, 3, a)
-    take(y, 3, b)
-    se3.between(a, b, v)
-    join(p, v, out)
-
-
-@compiled
-def local(x: Array, y: Array, out: Array) -> None:
-    """``Log(x^-1 y)``, the short way round."""
-    seen = local_vector(10)
-    between(x, y, seen)
-    log(seen, out)
+exp = _twice_of_one(se3.exp, 6, 7)
+log = _twice_of_one(se3.log, 7, 6)
+inverse = _twice_of_one(se3.inverse, 7, 7)
+compose, between = _twice_of_two(se3.compose), _twice_of_two(se3.between)
+local = RULES["local"].make(10, 9, between, log)
+adjoint = _blocks(se3.adjoint, 7)
+right_jacobian, right_jacobian_inverse = _blocks(se3.right_jacobian, 6), _blocks(se3.right_jacobian_inverse, 6)
 
 
 @compiled
@@ -147,39 +143,6 @@ def matrix(x: Array, out: Array) -> None:
 
 
 @compiled
-def adjoint(x: Array, out: Array) -> None:
-    """Write ``[R, 0, [p]x R; 0, R, [v]x R; 0, 0, R]``, (9, 9)."""
-    part, p, v = local_vector(7), local_matrix(6, 6), local_matrix(6, 6)
-    take(x, 0, part)
-    se3.adjoint(part, p)
-    take(x, 3, part)
-    se3.adjoint(part, v)
-    join_blocks(p, v, out)
-
-
-@compiled
-def right_jacobian(d: Array, out: Array) -> None:
-    """Write Jr, (9, 9)."""
-    part, p, v = local_vector(6), local_matrix(6, 6), local_matrix(6, 6)
-    take(d, 0, part)
-    se3.right_jacobian(part, p)
-    take(d, 3, part)
-    se3.right_jacobian(part, v)
-    join_blocks(p, v, out)
-
-
-@compiled
-def right_jacobian_inverse(d: Array, out: Array) -> None:
-    """Write Jr^-1, (9, 9); singular at a rotation of 2 pi."""
-    part, p, v = local_vector(6), local_matrix(6, 6), local_matrix(6, 6)
-    take(d, 0, part)
-    se3.right_jacobian_inverse(part, p)
-    take(d, 3, part)
-    se3.right_jacobian_inverse(part, v)
-    join_blocks(p, v, out)
-
-
-@compiled
 def bend(d: Array, v: Array, out: Array) -> None:
     """Write the (9, 9) derivative of ``Jr^-1(d) v`` along d."""
     part, along, first, second = local_vector(6), local_vector(6), local_matrix(6, 6), local_matrix(6, 6)
@@ -192,7 +155,7 @@ def bend(d: Array, v: Array, out: Array) -> None:
     join_blocks(first, second, out)
 
 
-class ExtendedPoses(LieGroup):
+class ExtendedPoses(CompiledGroup, methods=globals()):
     """Position, velocity and orientation that turn as one; use the ready-made object ``SE23``.
 
     Storage is ``(px, py, pz, vx, vy, vz, qw, qx, qy, qz)``: position [m] and velocity [m/s] in the world, then a
@@ -204,19 +167,6 @@ class ExtendedPoses(LieGroup):
     dim = 9
     point_dim = 3
     matrix_dim = 5
-
-    exp = elementwise(exp)
-    log = elementwise(log)
-    compose = elementwise(compose)
-    inverse = elementwise(inverse)
-    between = elementwise(between)
-    local = elementwise(local)
-    act = elementwise(act)
-    matrix = elementwise(matrix)
-    adjoint = elementwise(adjoint)
-    right_jacobian = elementwise(right_jacobian)
-    right_jacobian_inverse = elementwise(right_jacobian_inverse)
-    bend = elementwise(bend)
 
     # Constructors, and back.
 

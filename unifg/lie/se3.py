@@ -22,8 +22,7 @@ import numpy as np
 from unifg.codegen.calls import vector
 from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
-from unifg.lie.elementwise import elementwise
-from unifg.lie.manifold import LieGroup
+from unifg.lie.manifold import CompiledGroup
 from unifg.lie.series import b_slope, c_slope, c_value, k_curve, k_slope, k_value, x_cot_x
 from unifg.lie.so3 import (
     SO3,
@@ -264,7 +263,7 @@ def _rows(pose: ArrayLike) -> Array:
     return x
 
 
-class SE3Group(LieGroup):
+class SE3Group(CompiledGroup, methods=globals()):
     """Rigid motions of space; use the ready-made object ``SE3``.
 
     Storage is ``(px, py, pz, qw, qx, qy, qz)``: the position [m], then a rotation as ``SO3`` stores it, unit norm and
@@ -278,20 +277,6 @@ class SE3Group(LieGroup):
     dim = 6
     point_dim = 3
     matrix_dim = 4
-
-    exp = elementwise(exp)
-    log = elementwise(log)
-    compose = elementwise(compose)
-    inverse = elementwise(inverse)
-    between = elementwise(between)
-    retract = elementwise(retract)
-    local = elementwise(local)
-    act = elementwise(act)
-    matrix = elementwise(matrix)
-    adjoint = elementwise(adjoint)
-    right_jacobian = elementwise(right_jacobian)
-    right_jacobian_inverse = elementwise(right_jacobian_inverse)
-    bend = elementwise(bend)
 
     # Constructors, and back.
 

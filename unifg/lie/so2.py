@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.lie.elementwise import elementwise, over_one
-from unifg.lie.manifold import LieGroup
+from unifg.lie.elementwise import over_one
+from unifg.lie.manifold import CompiledGroup
 from unifg.typing import Array, ArrayLike
 
 PI = math.pi
@@ -102,7 +102,12 @@ def straight(d: Array, v: Array, out: Array) -> None:
     out[:] = 0.0
 
 
-class SO2Group(LieGroup):
+log, retract, local = exp, compose, between
+adjoint = right_jacobian = right_jacobian_inverse = unit
+bend = straight
+
+
+class SO2Group(CompiledGroup, methods=globals()):
     """Rotations of the plane; use the ready-made object ``SO2``.
 
     Storage is the angle ``(theta,)`` [rad], returned in [-pi, pi) by every operation and accepted with any
@@ -114,15 +119,6 @@ class SO2Group(LieGroup):
     dim = 1
     point_dim = 2
     matrix_dim = 2
-
-    exp = log = elementwise(exp)
-    compose = retract = elementwise(compose)
-    inverse = elementwise(inverse)
-    between = local = elementwise(between)
-    act = elementwise(act)
-    matrix = elementwise(matrix)
-    adjoint = right_jacobian = right_jacobian_inverse = elementwise(unit)
-    bend = elementwise(straight)
 
     def identity(self) -> Array:
         """Return the zero angle, (1,)."""

@@ -20,8 +20,8 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
-from unifg.lie.elementwise import elementwise, over_one
-from unifg.lie.manifold import LieGroup
+from unifg.lie.elementwise import over_one
+from unifg.lie.manifold import CompiledGroup
 from unifg.lie.series import TINY, c_value, k_slope, k_value, x_cot_x
 from unifg.lie.so2 import wrap
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -198,6 +198,9 @@ def matrix(x: Array, out: Array) -> None:
     write_matrix(x[0], x[1], x[2], x[3], out, 0)
 
 
+adjoint = matrix
+
+
 @compiled
 def right_jacobian(d: Array, out: Array) -> None:
     """Write Jr, (3, 3); Sola eq. 143."""
@@ -320,7 +323,7 @@ def _reordered(quaternion: ArrayLike, order: Order, by: int) -> Array:
     return np.roll(q, by, axis=-1) if order == "xyzw" else q
 
 
-class SO3Group(LieGroup):
+class SO3Group(CompiledGroup, methods=globals()):
     """Rotations of space; use the ready-made object ``SO3``.
 
     Storage is the unit quaternion ``(w, x, y, z)``, scalar first, Hamilton's product. A quaternion and its negative are
@@ -335,19 +338,6 @@ class SO3Group(LieGroup):
     dim = 3
     point_dim = 3
     matrix_dim = 3
-
-    exp = elementwise(exp)
-    log = elementwise(log)
-    compose = elementwise(compose)
-    inverse = elementwise(inverse)
-    between = elementwise(between)
-    retract = elementwise(retract)
-    local = elementwise(local)
-    act = elementwise(act)
-    matrix = adjoint = elementwise(matrix)
-    right_jacobian = elementwise(right_jacobian)
-    right_jacobian_inverse = elementwise(right_jacobian_inverse)
-    bend = elementwise(bend)
 
     # Constructors, and back.
 

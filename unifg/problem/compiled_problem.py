@@ -28,13 +28,14 @@ from unifg.problem import evaluation
 from unifg.problem.binding import Binding
 from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
+from unifg.problem.evaluation import LinearArrays
 from unifg.problem.guess import GuessReader
 from unifg.problem.limits import outside
 from unifg.problem.linearization import Evaluation, Linearization, Rows
 from unifg.problem.retraction import Retraction
 from unifg.problem.scalars import add_scalars, evaluate_scalars
 from unifg.problem.systems import Systems
-from unifg.problem.table import ENTRY, PARAMETER, ROW, WIDTH, TermArrays, TermTable
+from unifg.problem.table import ENTRY, PARAMETER, POSITION, ROW, WIDTH, TermArrays, TermTable
 from unifg.problem.term import CompiledTerm
 from unifg.problem.thread_partition import Shares
 from unifg.problem.verification import Verification
@@ -113,6 +114,7 @@ class CompiledProblem:
         self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
         self.systems = Systems(self.normal, self.blocks, self.constraints)
         self._found: dict[Callable[[CompiledProblem], Any], Any] = {}
+        self._pairs: dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, Array, IntArray]] = {}
         self._cost_slices = _slices(self.cost_terms)
         self.slices = _slices(self.constraint_terms)
         shaped = zip(self.constraint_terms, self.slices, strict=True)
@@ -276,7 +278,7 @@ class CompiledProblem:
             Reasons by the names of these terms.
         """
         found: dict[str, str] = {}
-        step = np.random.default_rng(seed).uniform(-1.0, 1.0, self.size)
+        step = np.random.default_rng(seed).uniform(-1.0, 1.0, self.size) if slopes else np.ones(self.size)
         direction = np.zeros(self.columns.width)
         direction[self.columns.free] = step
         moved: dict[float, Values] = {}
@@ -297,16 +299,13 @@ class CompiledProblem:
         return found
 
     def watch_conditions(self) -> None:
-        """Compile the comparisons of traces, for :meth:`conditions_changed` in a loop."""
+        """Compile the comparisons of traces, for :meth:`new_branches` in a loop."""
         self._watching = True
         self.renew_verifications()
 
-    def conditions_changed(self, values: Values) -> bool:
-        """Test whether comparisons of watched traces come out otherwise than when this was last asked."""
-        changed = False
-        for watcher in self._watchers:
-            changed |= watcher.conditions_changed(values)
-        return changed
+    def new_branches(self, values: Values, verified: bool) -> bool:
+        """Test whether comparisons in watched traces come out as at no verified answer; ``verified``: this is one."""
+        return any([watcher.new_branches(values, verified) for watcher in self._watchers])
 
     def renew_verifications(self) -> None:
         """Keep what verifies the present traces."""
@@ -385,27 +384,30 @@ class CompiledProblem:
         found = np.empty(table.scalars)
         concavity = np.zeros(self.normal.nnz if self.scalar_terms else 0)
         rounding = np.zeros(self.columns.width if self.scalar_terms else 0)
+        batched, terms = self.batched, table.arrays
+        if search:  # kernels know no search Jacobians
+            searched = [term for term in self.terms if term.kernel is not None and term.term.residual.search]
+            batched, terms = [*batched, *searched], table.without(searched)
         with np.errstate(all="ignore"):
-            if self.batched:
+            if batched:
                 began = perf_counter()
-                for term in self.batched:
+                for term in batched:
                     self.rows_of(term, residual, constraints)[:] = term.residual(values)
                     self._entries_of(term, jacobian, constraint_jacobian, term.jacobians(values, search=search))
                 self.python_seconds += perf_counter() - began
-            given = (
-                table.arrays, values.flat, search, residual, jacobian, constraints, constraint_jacobian, squares,
-                weights,
-            )  # fmt: skip
+            out = LinearArrays(
+                residual, jacobian, constraints, constraint_jacobian, squares, weights, size, gradient, hessian
+            )
             if shares is not None:
-                cost = _linearize_at_once(shares, given, size, gradient, room)
+                cost = _linearize_at_once(shares, terms, values.flat, out._replace(hessian=room))
             else:
                 gradient[:], hessian[:] = 0.0, 0.0
-                cost = evaluation.linearize(*given, size, gradient, hessian, self.scratch)
+                cost = evaluation.linearize(terms, values.flat, out, self.scratch)
             if table.weighed:
                 for loss, part in table.weighed:
                     weights[part] = loss.weight(squares[part])
                     cost += 0.5 * float(loss.value(squares[part]).sum())
-                evaluation.weigh(table.arrays, weights, residual, jacobian, gradient, hessian)
+                evaluation.weigh(table.arrays, out)
             if self.scalar_terms:
                 cost += self._add_scalars(values, found, gradient, hessian, concavity, rounding)
         norms, scalars = self.norms(size, found), self.by_scalar(found)
@@ -434,13 +436,28 @@ class CompiledProblem:
             cost += float(value.sum())
             found[term.place[ROW] : term.place[ROW] + term.count] = value
             slope, curvature, doubt = term.scalar_derivatives(values)
-            columns, factor, a, b, place = self.once(_placed)[term]
-            np.add.at(gradient, columns.ravel(), slope.ravel())
-            np.add.at(rounding, columns.ravel(), doubt.ravel())
-            np.add.at(hessian, place, (convex := convexified(curvature))[factor, a, b])
-            np.add.at(concavity, place, (curvature - convex)[factor, a, b])
+            columns = np.concatenate(term.columns, axis=1).ravel()
+            np.add.at(gradient, columns, slope.ravel())
+            np.add.at(rounding, columns, doubt.ravel())
+            convex = convexified(curvature)
+            self.add_pairs(term, convex, hessian)
+            self.add_pairs(term, curvature - convex, concavity)
         self.python_seconds += perf_counter() - began
         return cost
+
+    def add_pairs(self, term: CompiledTerm, blocks: Array, entries: Array) -> None:
+        """Add (n, D, D) symmetric blocks of a term, by its tangent columns, to entries in the order of ``normal``."""
+        width = blocks.shape[1]
+        start, pairs = int(term.place[POSITION]), width * (width + 1) // 2
+        if term not in self._pairs:
+            where = self.arrays.positions[start : start + term.count * pairs].reshape(term.count, pairs)
+            row, column = np.tril_indices(width)
+            factor, pair = np.nonzero(where != -1)
+            place = where[factor, pair]
+            times, place = np.where(place < -1, 2.0, 1.0), np.where(place < -1, -2 - place, place)
+            self._pairs[term] = factor, row[pair], column[pair], times, place
+        factor, rows, columns, times, place = self._pairs[term]
+        np.add.at(entries, place, times * blocks[factor, rows, columns])
 
     def norms(self, sizes: Array, scalars: Array | None = None) -> dict[str, float]:
         """Residual norms of the terms by name, as compiled loops leave them, and of the values of scalar costs."""
@@ -573,31 +590,19 @@ class CompiledProblem:
         return self._hessian
 
 
-def _placed(program: CompiledProblem) -> dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, IntArray, IntArray]]:
-    """Positions of gradient and Hessian blocks of scalar costs."""
-    places = {}
-    for term in program.scalar_terms:
-        full = np.concatenate(term.columns, axis=1)
-        mapped = program.columns.unknown[full]
-        keep = (mapped[:, :, None] <= mapped[:, None, :]) & (mapped[:, :, None] >= 0)
-        factor, a, b = np.nonzero(keep)
-        places[term] = full, factor, a, b, program.normal.positions(mapped[factor, a], mapped[factor, b])
-    return places
-
-
 def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
     """Rows of each term in the stack."""
     ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
     return [slice(start, end) for start, end in pairwise(ends)]
 
 
-def _linearize_at_once(shares: Shares, given: tuple[Any, ...], size: Array, gradient: Array, hessian: Array) -> float:
+def _linearize_at_once(shares: Shares, terms: TermArrays, values: Array, out: LinearArrays) -> float:
     """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
     counters = np.zeros(6, np.int64)
-    terms, *rest = given
-    into = shares.costs, shares.norms, gradient, hessian, shares.slopes, shares.contested, shares.scratch
-    share(_entrance(), (terms._replace(positions=shares.positions), *rest, *into, counters.ctypes.data))
-    size[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
+    own = shares.costs, shares.norms, shares.slopes, shares.contested, shares.scratch
+    given = terms._replace(positions=shares.positions), values, out
+    share(_entrance(), (*given, *own, counters.ctypes.data))
+    out.norms[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
     return float(shares.costs.sum())
 
 

@@ -8,8 +8,9 @@ already stand where a kernel would have written them.
 from __future__ import annotations
 
 from math import sqrt
+from typing import NamedTuple
 
-from numba import boolean, float64, int32, int64, uint8
+from numba import float64, int32, int64, uint8
 
 from unifg.codegen.calls import call_residual, matrix, vector, vector_at
 from unifg.codegen.jit import compiled, inlined
@@ -41,7 +42,6 @@ from unifg.problem.table import (
     POSITION,
     ROW,
     ROWS,
-    SEARCH,
     SIZE,
     SLOTS,
     SPREAD,
@@ -55,6 +55,35 @@ from unifg.problem.table import (
     TermArrays,
 )
 from unifg.typing import Array, IntArray
+
+
+class LinearArrays(NamedTuple):
+    """Arrays that a linearisation writes.
+
+    Attributes:
+        residual: (C,) whitened rows of costs, scaled by the square roots of robust weights.
+        jacobian: entries of their Jacobian.
+        constraints: (M,) rows of constraints.
+        constraint_jacobian: entries of their Jacobian.
+        squares: squared norms of robust factors.
+        weights: of robust factors.
+        norms: (T,) residual norm of each term; of constraints, of the violation.
+        gradient: over the full tangent space; J'r of all costs is added.
+        hessian: entries of the normal matrix; J'J of all costs is added.
+    """
+
+    residual: Array
+    jacobian: Array
+    constraints: Array
+    constraint_jacobian: Array
+    squares: Array
+    weights: Array
+    norms: Array
+    gradient: Array
+    hessian: Array
+
+
+# These take arrays and not the tuples that hold them: taking an array out of a tuple counts references.
 
 
 @inlined
@@ -76,17 +105,9 @@ def gather_variables(
 
 @inlined
 def _run(
-    term: IntArray,
-    where: int,
-    i: int,
-    gather: IntArray,
-    sizes: IntArray,
-    parameters: Array,
-    values: Array,
-    scratch: Array,
-    r: Array,
-    J: Array,
-) -> None:
+    term: IntArray, where: int, i: int, gather: IntArray, sizes: IntArray, parameters: Array, values: Array,
+    scratch: Array, r: Array, J: Array,
+) -> None:  # fmt: skip
     """Call a kernel of factor i."""
     gather_variables(term, i, gather, sizes, parameters, values, scratch)
     call_residual(
@@ -157,33 +178,20 @@ def evaluate(
 
 @compiled
 def linearize_share(
-    terms: TermArrays,
-    values: Array,
-    search: bool,
-    residual: Array,
-    jacobian: Array,
-    constraints: Array,
-    constraint_jacobian: Array,
-    squares: Array,
-    weights: Array,
-    norms: Array,
-    gradient: Array,
-    hessian: Array,
-    scratch: Array,
-    share: int,
-    shares: int,
+    terms: TermArrays, values: Array, out: LinearArrays, scratch: Array, share: int, shares: int
 ) -> float:
     """Do what :func:`linearize` does with one of several shares of the factors of every term, counted from 0."""
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
     whiteners, active, columns, positions = terms.whiteners, terms.active, terms.columns, terms.positions
-    lower, upper, parameters = terms.lower, terms.upper, terms.parameters
+    lower, upper, residual, jacobian = terms.lower, terms.upper, out.residual, out.jacobian
+    squares, weights, gradient, hessian = out.squares, out.weights, out.gradient, out.hessian
     cost = 0.0
     for t in range(len(fields)):
         term = fields[t]
         m, width, kind = term[ROWS], term[WIDTH], term[KIND]
-        target = residual if kind == COST else constraints
-        blocks = jacobian if kind == COST else constraint_jacobian
-        where = term[SEARCH] if search and term[SEARCH] != 0 else term[ADDRESS]
+        target = residual if kind == COST else out.constraints
+        blocks = jacobian if kind == COST else out.constraint_jacobian
+        where = term[ADDRESS]
         together = term[PAIRED] if term[WHITEN] & FULL else 0
         apart = (term[WHITEN] & 1) * m * m
         total = 0.0
@@ -235,79 +243,58 @@ def linearize_share(
                 if weight != 1.0:
                     _scale(sqrt(weight), r, J)
             _accumulate(term, i, columns, positions, r, J, residual, jacobian, gradient, hessian)
-        norms[t] = sqrt(total)
+        out.norms[t] = sqrt(total)
     return cost
 
 
 @compiled
-def linearize(
-    terms: TermArrays,
-    values: Array,
-    search: bool,
-    residual: Array,
-    jacobian: Array,
-    constraints: Array,
-    constraint_jacobian: Array,
-    squares: Array,
-    weights: Array,
-    norms: Array,
-    gradient: Array,
-    hessian: Array,
-    scratch: Array,
-) -> float:
+def linearize(terms: TermArrays, values: Array, out: LinearArrays, scratch: Array) -> float:
     """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
 
-    Factors whose loss is Python stop after whitening, see :func:`weigh`; returns the cost of all others. ``scratch``
-    holds a factor's variables, then J with all its columns for terms that keep only some.
+    Factors whose loss is Python stop after whitening, see :func:`weigh`.
+
+    Args:
+        terms: of the program.
+        values: stored ones.
+        out: receives the results; gradient and Hessian are added to.
+        scratch: a factor's variables, then J with all its columns for terms that keep only some.
+
+    Returns:
+        The cost of all factors but those whose loss is Python.
     """
-    return linearize_share(
-        terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms,
-        gradient, hessian, scratch, 0, 1,
-    )  # fmt: skip
+    return linearize_share(terms, values, out, scratch, 0, 1)
+
+
+TERM_ARRAYS = bundle(
+    TermArrays,
+    (
+        arrays(int64, 2), arrays(int64, 2), *[arrays(int64)] * 4, arrays(int32), arrays(int64, 2), arrays(uint8),
+        *[arrays(float64)] * 4,
+    ),
+)  # fmt: skip
+"""Type of what compiled loops read."""
+_of_linearize = arguments_at(
+    (
+        TERM_ARRAYS, arrays(float64), bundle(LinearArrays, [arrays(float64)] * 9), arrays(float64),
+        arrays(float64, 2), arrays(float64, 2), arrays(int64), arrays(float64, 2), int64,
+    )
+)  # fmt: skip
 
 
 @compiled
-def _linearize_together(
-    terms: TermArrays,
-    values: Array,
-    search: bool,
-    residual: Array,
-    jacobian: Array,
-    constraints: Array,
-    constraint_jacobian: Array,
-    squares: Array,
-    weights: Array,
-    costs: Array,
-    norms: Array,
-    gradient: Array,
-    hessian: Array,
-    slopes: Array,
-    contested: IntArray,
-    scratch: Array,
-    counters: Address,
-) -> None:
+def linearize_at_once(where: Address) -> None:
     """Work of one thread in :func:`linearize`: shares of the factors, then of the sums of all shares.
 
     Args:
-        terms: as there, and so the next eight; places as :func:`unifg.problem.thread_partition.apart` has them.
-        values: see above.
-        search: see above.
-        residual: see above.
-        jacobian: see above.
-        constraints: see above.
-        constraint_jacobian: see above.
-        squares: see above.
-        weights: see above.
-        costs: (S,) receives the cost of each of S shares.
-        norms: (S, T) receives their norms of each term.
-        gradient: (n,) need not be zero.
-        hessian: (nnz + (S - 1) C,) need not be zero; behind the entries is room for what all shares but the first
-            one add to those that several write to.
-        slopes: (S - 1, n) room for the gradients of all shares but the first.
-        contested: (C,) entries that several shares write to.
-        scratch: (S, .) as there.
-        counters: of two integers for each of three phases, zero.
+        where: address of these arguments: ``terms``, ``values`` and ``out`` as there, but that places are
+            those of :func:`unifg.problem.thread_partition.apart`, that gradient and Hessian need not be zero, and that
+            behind the entries of the Hessian is room for what all shares but the first one add to those that several
+            write to; (S,) cost of each of S shares; (S, T) their norms of each term; (S - 1, n) room for the gradients
+            of all shares but the first; (C,) entries that several shares write to; (S, .) scratch; counters, two
+            integers for each of three phases, zero.
     """
+    terms, values, out, costs, norms, slopes, contested, scratch, counters = _of_linearize(where)
+    gradient, hessian = out.gradient, out.hessian
     shares, size, many, entries = len(costs), len(gradient), len(contested), len(hessian)
     nnz = entries - (shares - 1) * many
     k = first_chunk(counters, 0)
@@ -320,10 +307,11 @@ def _linearize_together(
     wait_for(counters, 0, shares)
     k = first_chunk(counters, 1)
     while k < shares:
-        costs[k] = linearize_share(
-            terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms[k],
-            gradient if k == 0 else slopes[k - 1], hessian, scratch[k], k, shares,
+        own = LinearArrays(
+            out.residual, out.jacobian, out.constraints, out.constraint_jacobian, out.squares, out.weights, norms[k],
+            gradient if k == 0 else slopes[k - 1], hessian,
         )  # fmt: skip
+        costs[k] = linearize_share(terms, values, own, scratch[k], k, shares)
         k = next_chunk(counters, 1)
     wait_for(counters, 1, shares)
     k = first_chunk(counters, 2)
@@ -337,46 +325,13 @@ def _linearize_together(
     wait_for(counters, 2, shares)
 
 
-TERM_ARRAYS = bundle(
-    TermArrays,
-    (
-        arrays(int64, 2), arrays(int64, 2), *[arrays(int64)] * 4, arrays(int32), arrays(int64, 2), arrays(uint8),
-        *[arrays(float64)] * 4,
-    ),
-)  # fmt: skip
-"""Type of what compiled loops read."""
-_of_linearize = arguments_at(
-    (
-        TERM_ARRAYS, arrays(float64), boolean, *[arrays(float64)] * 7, arrays(float64, 2), *[arrays(float64)] * 2,
-        arrays(float64, 2), arrays(int64), arrays(float64, 2), int64,
-    )
-)  # fmt: skip
-
-
 @compiled
-def linearize_at_once(where: Address) -> None:
-    """Work of one thread in :func:`linearize`, by the address of its arguments."""
-    (
-        terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, costs, norms,
-        gradient, hessian, slopes, contested, scratch, counters,
-    ) = _of_linearize(where)  # fmt: skip
-    _linearize_together(
-        terms, values, search, residual, jacobian, constraints, constraint_jacobian, squares, weights, costs, norms,
-        gradient, hessian, slopes, contested, scratch, counters,
-    )  # fmt: skip
-
-
-@compiled
-def weigh(
-    terms: TermArrays,
-    weights: Array,
-    residual: Array,
-    jacobian: Array,
-    gradient: Array,
-    hessian: Array,
-) -> None:
+def weigh(terms: TermArrays, out: LinearArrays) -> None:
     """Scale factors whose loss is Python by the square root of their weights; add them to gradient and Hessian."""
-    fields, columns, positions = terms.fields, terms.columns, terms.positions
+    fields, columns, positions, residual, jacobian = (
+        terms.fields, terms.columns, terms.positions, out.residual, out.jacobian,
+    )  # fmt: skip
+    weights, gradient, hessian = out.weights, out.gradient, out.hessian
     for t in range(len(fields)):
         term = fields[t]
         if term[LOSS] >= 0:
@@ -400,17 +355,9 @@ def _scale(root: float, r: Array, J: Array) -> None:
 
 @inlined
 def _accumulate(
-    term: IntArray,
-    i: int,
-    columns: IntArray,
-    positions: IntArray,
-    r: Array,
-    J: Array,
-    residual: Array,
-    jacobian: Array,
-    gradient: Array,
-    hessian: Array,
-) -> None:
+    term: IntArray, i: int, columns: IntArray, positions: IntArray, r: Array, J: Array, residual: Array,
+    jacobian: Array, gradient: Array, hessian: Array,
+) -> None:  # fmt: skip
     """Add J'r and the upper triangle of J'J of one factor, whose r and J stand in ``residual`` and ``jacobian``."""
     rows, width = J.shape
     column = term[COLUMN] + i * width
@@ -461,12 +408,6 @@ def add_constraints(terms: TermArrays, constraint_jacobian: Array, weights: Arra
         if term[KIND] == COST:
             continue
         m, width, row, entry, start = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[POSITION]
-        if term[KIND] == BOUND:
-            for i in range(term[COUNT]):
-                if positions[start + i] >= 0:
-                    slope = constraint_jacobian[entry + i]
-                    hessian[positions[start + i]] += weights[row + i] * slope * slope
-            continue
         for _ in range(term[COUNT]):
             for _ in range(m):
                 w, at = weights[row], start
@@ -520,10 +461,6 @@ def transposed_times(terms: TermArrays, costs: bool, entries: Array, other: Arra
         if (term[KIND] == COST) != costs:
             continue
         m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
-        if term[KIND] == BOUND:
-            for i in range(term[COUNT]):
-                out[columns[column + i]] += other[row + i] * entries[entry + i]
-            continue
         for _ in range(term[COUNT]):
             for _ in range(m):
                 scale = other[row]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from math import sqrt
 from time import perf_counter
-from typing import TypeAlias
 
 import numpy as np
 
@@ -70,8 +69,6 @@ from unifg.problem.table import (
 from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, IntArray
 
-Places: TypeAlias = tuple[IntArray, IntArray, IntArray, Array, IntArray]
-
 
 def lagrangian_hessian(program: CompiledProblem, lin: Linearization, multipliers: Array) -> Array:
     """Hessian of the objective plus multipliers' g, in the order of ``CompiledProblem.normal``.
@@ -109,13 +106,8 @@ def _add(program: CompiledProblem, term: CompiledTerm, lin: Linearization, multi
     began = perf_counter()
     second = term.second_derivatives(lin.values, row_weights(program, term, lin, multipliers))
     program.python_seconds += perf_counter() - began
-    if not second.any():
-        return
-    known = program.once(_known)
-    if term not in known:
-        known[term] = _find(program, term)
-    factor, row, column, times, place = known[term]
-    np.add.at(entries, place, times * second[factor, row, column])
+    if second.any():
+        program.add_pairs(term, second, entries)
 
 
 def row_weights(program: CompiledProblem, term: CompiledTerm, lin: Linearization, multipliers: Array) -> Array:
@@ -142,23 +134,6 @@ def loss_curvature(term: CompiledTerm, lin: Linearization) -> Array:
 def _of_factors(term: CompiledTerm, robust: Array) -> Array:
     """(n,) of an array with one number for every robust factor."""
     return robust[term.place[WEIGHT] : term.place[WEIGHT] + term.count]
-
-
-def _known(_: CompiledProblem) -> dict[CompiledTerm, Places]:
-    """Nothing is known of a program to begin with."""
-    return {}
-
-
-def _find(program: CompiledProblem, term: CompiledTerm) -> Places:
-    """Factor, row and column of second derivatives, how often they count, and where in the normal matrix."""
-    width = sum(term.dims)
-    start, pairs = int(term.place[POSITION]), width * (width + 1) // 2
-    where = program.arrays.positions[start : start + term.count * pairs].reshape(term.count, pairs)
-    row, column = np.tril_indices(width)
-    factor, pair = np.nonzero(where != -1)
-    place = where[factor, pair]
-    doubled = place < -1
-    return factor, row[pair], column[pair], np.where(doubled, 2.0, 1.0), np.where(doubled, -2 - place, place)
 
 
 @compiled

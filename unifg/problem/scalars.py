@@ -92,7 +92,7 @@ def add_scalars(
                 r[0] = 0.0
                 at += width * (width + 1) // 2
                 continue
-            gather_variables(term, i, terms.gather, sizes, terms.parameters, values, scratch)
+            gather_variables(term, i, terms.gather, terms.sizes, terms.parameters, values, scratch)
             p = vector(terms.parameters, term[PARAMETER] + i * term[SPREAD], term[PARAMETERS])
             if term[SECOND] != 0:
                 r[0] = 1.0

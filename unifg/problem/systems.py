@@ -116,8 +116,7 @@ class KktStructure:
     Attributes:
         held: (M,) which rows.
         unknowns: number of them.
-        factorization: of the matrix, in which every pivot of a multiplier is expected to be negative; never used but
-            for its structure.
+        factorization: of the matrix; only its structure is used.
         arrays: all of :class:`KktArrays` but the plan, in its order.
         spare: systems that nobody uses now.
     """
@@ -146,7 +145,7 @@ class KktStructure:
         return KktStructure(
             held.copy(),
             n,
-            Factorization(pattern, np.concatenate([blocks, last + label]), negative=np.arange(n + len(rows)) >= n),
+            Factorization(pattern, np.concatenate([blocks, last + label])),
             (
                 np.array([n, len(rows)]),
                 rows,
@@ -165,7 +164,7 @@ class KktSystem:
     Attributes:
         held: (M,) which rows of the constraints are.
         pattern: upper triangle of the matrix, unknowns first.
-        factorization: of the matrix, in which every pivot of a multiplier is expected to be negative.
+        factorization: of the matrix.
         saddle: the same, for solving without a shift.
         loaded: entries that it was factorised with by :meth:`load`.
     """

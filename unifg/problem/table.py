@@ -26,7 +26,6 @@ from unifg.typing import Array, IntArray
 (
     KIND,  # COST, CONSTRAINT, BOUND or SCALAR
     ADDRESS,  # of the kernel; 0: NumPy has evaluated the term already
-    SEARCH,  # address of the kernel with the search Jacobian
     COUNT,  # factors
     ROWS,  # of one factor
     SLOTS,  # variables of one factor
@@ -57,7 +56,7 @@ from unifg.typing import Array, IntArray
     LOSS,  # which robust loss, or one of the words below
     LOSS_AT,  # where its two parameters stand in TermArrays.parameters
     FIELDS,
-) = range(33)
+) = range(32)
 
 COST, CONSTRAINT, BOUND, SCALAR = range(4)
 PYTHON, HELD = -1, -2  # losses whose formulas are Python; HELD: line searches keep the weights of a linearisation
@@ -121,7 +120,7 @@ class TermTable:
     ) -> None:
         """Lay everything out; numbers come with :meth:`bind`."""
         self._terms = [*terms, *scalars]
-        self._owned: dict[CompiledTerm, tuple[Kernel | None, Kernel | None]] = {}
+        self._owned: dict[CompiledTerm, Kernel | None] = {}
         self._second = False
         self._columns = columns
         self._fields = fields = np.zeros((len(self._terms), FIELDS), dtype=np.int64)
@@ -243,7 +242,7 @@ class TermTable:
         self._owned = {}
         arrays = self.arrays
         self._fields = np.concatenate([arrays.fields, arrays.scalars])
-        self._fields[:, [ADDRESS, SEARCH, SECOND, TABLE, TABLE_SIZE]] = 0
+        self._fields[:, [ADDRESS, SECOND, TABLE, TABLE_SIZE]] = 0
         first = len(arrays.fields)
         self.arrays = arrays._replace(fields=self._fields[:first], scalars=self._fields[first:])
         for row, term in zip(self._fields, self._terms, strict=True):
@@ -255,6 +254,13 @@ class TermTable:
         self._take(term)
         term.place[PARTS] = 0 if term.kernel.linear else len(movable_parts(term.kernel.manifolds))
 
+    def without(self, terms: Sequence[CompiledTerm]) -> TermArrays:
+        """The arrays for a pass in which residuals and Jacobians of some terms are there already."""
+        fields = self.arrays.fields.copy()
+        for term in terms:
+            fields[(fields[:, [KIND, ROW]] == term.place[[KIND, ROW]]).all(axis=1), ADDRESS] = 0
+        return self.arrays._replace(fields=fields)
+
     def give_up(self, term: CompiledTerm) -> None:
         """Leave a term that was traced to its own function; its rows, entries and parameters stay where they are."""
         self._take(term)
@@ -263,15 +269,14 @@ class TermTable:
 
     def _take(self, term: CompiledTerm) -> None:
         """Write where the machine code of a term and its table stand, and only then let go of what stood there."""
-        row, kernel, search = term.place, term.kernel, term.search_kernel
+        row, kernel = term.place, term.kernel
         first = second = table = size = 0
         if kernel is not None:
             wanted = self._second or row[KIND] == SCALAR or not kernel.derived
             first, second = kernel.address, kernel.second_address if wanted else 0
             table, size = kernel.table.ctypes.data, kernel.table.size
-        searching = 0 if search is None else search.address
-        row[[ADDRESS, SECOND, TABLE, TABLE_SIZE, SEARCH]] = first, second, table, size, searching
-        self._owned[term] = kernel, search
+        row[[ADDRESS, SECOND, TABLE, TABLE_SIZE]] = first, second, table, size
+        self._owned[term] = kernel
 
     def require_second(self) -> None:
         """Have second derivatives of derived kernels generated, which not every solver needs."""

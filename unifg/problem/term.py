@@ -29,7 +29,6 @@ from unifg.factors.differences import (
 )
 from unifg.factors.kernel import Kernel, evaluate_rows, side_by_side
 from unifg.factors.per_factor import per_factor
-from unifg.factors.residuals import Residual
 from unifg.factors.whitening import DIAGONAL, FULL, reciprocals, square_roots
 from unifg.lie import Manifold
 from unifg.modeling.probing import blocks_of, size_of, told, tried
@@ -43,7 +42,6 @@ Bound: TypeAlias = Mapping[Data, Array]
 logger = logging.getLogger("unifg")
 _told: set[tuple[str, str]] = set()  # what the log knows: loops state the same graph again and again
 CHANGES = 3  # of what a traced function reads beyond its arguments, before it is left to Python
-_SEARCHED = "evaluated by Python, its derivatives attached: its search Jacobian belongs to another kernel"
 
 
 class Gather:
@@ -133,7 +131,7 @@ class CompiledTerm:
         self._batched = Batched(self.name, term.residual.function)
         self._attached: Batched | None = None
         self.is_bound = isinstance(term, Constraint) and term.is_bound
-        self.kernel, self.search_kernel = (None, None) if isinstance(term, ScalarCost) else _kernels(term.residual)
+        self.kernel = None if isinstance(term, ScalarCost) else term.residual.kernel
         self.place: IntArray = np.zeros(0, dtype=np.int64)
         self._shaping, self.data = frozenset(term.shaping), frozenset(term.data)
         self._blocks: dict[int, tuple[int, int]] = {}
@@ -183,7 +181,7 @@ class CompiledTerm:
         if self.is_bound:
             return "the variable itself"
         if own.kernel is not None:
-            return "a kernel that ships, its derivatives exact" if self.kernel is not None else _SEARCHED
+            return "a kernel that ships, its derivatives exact"
         asked, attached = own.derivatives == "trace", own.jacobian is not None
         why = "it has a search Jacobian" if own.search else ""
         if own.derivatives == "differences":
@@ -596,6 +594,7 @@ class CompiledTerm:
             variables, parameters, _ = kernel.split(self._for_kernel(points), self.count)
         except GraphError as error:
             raise GraphError(f"term '{self.name}': {error}", term=self.name) from None
+        self.kernel = kernel.of_shapes([part.shape[1:] for part in parameters])
         packed = side_by_side(parameters)
         self.parameter_count = packed.shape[1]
         self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
@@ -661,15 +660,6 @@ class CompiledTerm:
             return array
         shape = (-1,) + (1,) * (array.ndim - 1)
         return np.where(self.active.reshape(shape), array, 0.0)
-
-
-def _kernels(residual: Residual) -> tuple[Kernel | None, Kernel | None]:
-    """The kernel and the one to search with; none when they do not belong together, and NumPy evaluates the term."""
-    kernel, search = residual.kernel, residual.search_kernel
-    if kernel is None or residual.search is None:
-        return kernel, None
-    same = search is not None and search.arguments == kernel.arguments and search.table is kernel.table
-    return (kernel, search) if same else (None, None)
 
 
 def resolve(parameter: Parameter, data: Bound) -> Array:

@@ -286,7 +286,9 @@ class Types:
                 parts.append(argument.manifold)
             elif kernel is not None and place < len(expected):
                 axes = expected[place]
-                parts.append(axes if isinstance(axes, int | tuple) else "constant")
+                value = argument.value if isinstance(argument, Data) else argument
+                shape = np.shape(value)[np.ndim(value) - axes :] if isinstance(axes, int) else axes
+                parts.append(shape if isinstance(axes, int | tuple) else "constant")
             elif wrapped.rows:
                 shape = argument.value.shape if isinstance(argument, Data) else np.shape(argument)
                 own = rows[place]

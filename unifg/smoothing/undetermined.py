@@ -1,4 +1,4 @@
-"""Why a pivot of a smoother has vanished: too few factors, or numbers that lose what enough of them say."""
+"""Causes of a vanished pivot of a smoother: too few factors, or numbers that lose what enough of them say."""
 
 from __future__ import annotations
 

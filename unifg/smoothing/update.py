@@ -10,8 +10,9 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.codegen.vectors import Address
-from unifg.elimination.elements import arrange
 from unifg.elimination.ordering import filled
+from unifg.elimination.symbolic import cliques as find_cliques
+from unifg.elimination.symbolic import separators
 from unifg.smoothing.cliques import add_child, add_factor, begin_clique, eliminate_clique, substitute
 from unifg.smoothing.linear import linearize
 from unifg.smoothing.memory import found, grown, length_of_front, more
@@ -78,8 +79,9 @@ def renew(
     inside = _whole_factors(memory, members, update)
     pool, pointer = _elements(memory, orphans, inside)
     weight, given, last = np.empty(n, np.int64), np.empty(n if chronological else 0, np.int64), 0
+    stage, alone = filled(n, 0), np.empty(n, np.bool_)
     for i in range(n):
-        weight[i] = variables[members[i]].dim
+        weight[i], alone[i] = variables[members[i]].dim, chronological
         if variables[members[i]].sequence > variables[members[last]].sequence:
             last = i
     if chronological:
@@ -88,7 +90,9 @@ def renew(
         sort_by_age(memory, given)
         for i in range(n):
             given[i] = variables[given[i]].local
-    order, first, separator, bounds, parent, home = arrange(weight, last, given, pool, pointer)
+    stage[last], alone[last] = 0 if chronological else 1, True
+    order, first, parent, _, begin_at, sizes, held = find_cliques(weight, stage, alone, given, False, pool, pointer)
+    separator, bounds, home = separators(order, begin_at, sizes, held, first, pool, pointer)
     made = len(parent)
     # Sizes, and room for all of it.
     rows, numbers_needed, lists_needed, largest, longest = np.empty(made, np.int64), 0, 0, 0, 0

@@ -6,7 +6,8 @@ point that need not be an optimum. How large is a question of units. With the la
 cost that were seen on the way, unknowns, rows and cost are brought to one scale by taking square roots of the largest
 entries out of both, again and again (Ruiz, RAL-TR-2001-034). The sum of the multipliers of that problem is the same for
 any units, of the order of the number of active rows where all is well, and beyond `LARGEST` what no chain of rows
-explains.
+explains. Between `LARGE` and that it depends on the violation that is left: times its multiplier it is what the cost
+would lose if the row were met exactly. Newton steps leave next to none where a row has a slope.
 
 A solve that stalls may do so at an optimum, with multipliers that its last linear system made of nothing. There they
 are estimated again, from the gradients alone.
@@ -22,6 +23,8 @@ from unifg.problem.linearization import Linearization
 from unifg.typing import Array, IntArray
 
 LARGEST = 1e6
+LARGE = 1e3  # of a single row
+LEFT = 1e-3  # of the cost, times the violation that is left
 SUSPICIOUS = 1e3  # in the graph's own units; below it nobody looks
 PASSES = 12
 DENSE = 1_000_000  # entries of A up to which multipliers are estimated, by dense algebra
@@ -44,10 +47,11 @@ class Slopes:
         """Take note of another point."""
         _raise(jacobian, gradient, self.jacobian, self.gradient)
 
-    def degenerate(self, multipliers: Array, tolerance: float) -> bool:
+    def degenerate(self, lin: Linearization, multipliers: Array, tolerance: float) -> bool:
         """Test whether multipliers are larger than constraints with a slope ever need.
 
         Args:
+            lin: at the answer.
             multipliers: (M,).
             tolerance: of the KKT test; a cost whose gradient never exceeded it has no scale.
         """
@@ -67,7 +71,9 @@ class Slopes:
             scale /= np.sqrt(np.where(of_rows > 0.0, of_rows, 1.0))
             unknowns /= np.sqrt(np.where(of_unknowns > 0.0, of_unknowns, 1.0))
             cost /= np.sqrt(of_cost or 1.0)
-        return bool(cost * float((np.abs(multipliers) / scale).sum()) > LARGEST)
+        sizes = cost * np.abs(multipliers) / scale
+        left = np.abs(multipliers * program.violation(lin.constraints))[sizes > LARGE].sum()
+        return bool(sizes.sum() > LARGEST or left > LEFT * abs(lin.cost))
 
 
 def estimated(program: CompiledProblem, lin: Linearization, tolerance: float) -> Array | None:

@@ -40,7 +40,8 @@ logger = logging.getLogger("unifg")
 Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
-EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new comparisons
+EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new branches
+AT_ONCE, LATER = 4, 128  # verifications of new branches: so many without delay, then one in so many solves
 FEW = 3  # iterations that are asked for as such, one after the other in a control loop
 WITHOUT_SUCCESS = (
     Status.ITERATION_LIMIT,
@@ -415,12 +416,13 @@ class SolveState:
         if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
             self._move(within, self.multipliers)
         returned = self._return_best(status)
-        if status in (Status.STALLED, Status.SINGULAR) and self.optimality.violation <= self.tolerance:
+        earlier = status is Status.ITERATION_LIMIT and returned < self.iterations  # the multipliers of a barrier there
+        if (earlier or status in (Status.STALLED, Status.SINGULAR)) and self.optimality.violation <= self.tolerance:
             self._estimate()
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
-            if self.slopes is not None and self.slopes.degenerate(self.multipliers, self.tolerance):
+            if self.slopes is not None and self.slopes.degenerate(self.lin, self.multipliers, self.tolerance):
                 status = Status.DEGENERATE
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
@@ -516,7 +518,7 @@ class Prepared:
         self._graph = graph or program.graph
         self._edition = self._graph.edition
         self._workspace: Any = None
-        self._solves, self._owed = 0, False
+        self._solves, self._owed, self._of_branches = 0, False, 0
         self._last: ReferenceType[Solution] | None = None
         self._lock = ReentrantLock()
         self._constraints = {
@@ -590,10 +592,15 @@ class Prepared:
         if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
             return solution
         values = solution._lin.values
-        due = slopes or self._solves % EVERY == 0 or program.conditions_changed(values) or self._owed
+        due = slopes or self._solves % EVERY == 0 or self._owed
+        new = not due and program.new_branches(values, False)
+        if new and self._of_branches < AT_ONCE + self._solves // LATER:
+            due = True
+            self._of_branches += 1
         self._owed = due and run.out_of_time  # verified after the next solve that leaves time for it
         if not due or self._owed:
             return solution
+        program.new_branches(values, True)
         mistraced: dict[str, str] = {}
         while found := program.mistraced(values, slopes, self._solves):
             mistraced |= found

@@ -14,9 +14,9 @@ from unifg.factors.autodiff.symbols import TraceError
 from unifg.factors.autodiff.tape import Tape
 
 WAYS = 64
-"""How many ways through a function are followed."""
+"""Ways through a function that are followed, at most."""
 DECISIONS = 200
-"""How many of them one way may take: a loop that ends when a number is small has no end here."""
+"""Decisions of one way, at most: a loop that ends when a number is small has no end here."""
 
 
 def every_way(tape: Tape, run: Callable[[], Sequence[int]]) -> list[int]:

@@ -18,9 +18,9 @@ import numpy as np
 
 from unifg.codegen.fingerprint import is_compiled
 from unifg.factors.autodiff.captured import Captured
-from unifg.factors.autodiff.expression import Expression, generating, traced
+from unifg.factors.autodiff.expression import Expression, generating
 from unifg.factors.autodiff.operations import Op
-from unifg.factors.autodiff.rows import Fixed, Given, argument_of, traced_rows
+from unifg.factors.autodiff.rows import Fixed, Given, argument_of, traced, traced_rows
 from unifg.factors.autodiff.symbols import TraceError
 from unifg.factors.autodiff.tape import Tape
 from unifg.factors.autodiff.trace import Rebound, run

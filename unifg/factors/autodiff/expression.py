@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -12,26 +12,23 @@ from typing import Any
 
 import numpy as np
 
-from unifg.codegen.fingerprint import is_compiled
 from unifg.codegen.jit import folder_of
 from unifg.codegen.native import SOURCES, Native, generation
 from unifg.codegen.objects import Objects
 from unifg.factors.autodiff.calculus import bent, hessian, jacobian
 from unifg.factors.autodiff.emit import residual_code, second_code
-from unifg.factors.autodiff.manifolds import moved
 from unifg.factors.autodiff.operations import Op
-from unifg.factors.autodiff.symbols import Symbol, TraceError, node_of, symbols
 from unifg.factors.autodiff.tape import Tape
-from unifg.factors.autodiff.trace import Rebound, run
-from unifg.factors.kernel import Argument, evaluate_rows
+from unifg.factors.kernel import evaluate_rows
 from unifg.typing import Array, IntArray
 
+WRITERS = ("calculus", "emit", "expression", "loops", "operations", "tape")  # modules that make machine code of a tape
 generating = RLock()  # tracing rebinds names in copies of functions, and what it writes is one tape
 
 
 def _digest() -> str:
     """Of the sources that make machine code of a tape; empty where there are none."""
-    own = [Path(__file__).with_name(f"{name}.py") for name in ("calculus", "emit", "expression", "operations", "tape")]
+    own = [Path(__file__).with_name(f"{name}.py") for name in WRITERS]
     own += map(Path, SOURCES)
     try:
         return hashlib.sha256(b"".join(file.read_bytes() for file in own)).hexdigest()
@@ -153,51 +150,3 @@ class Expression:
     def _second(self) -> bytes:
         tape, nodes = self.tape.at_rest(list(self.curvature.values()))
         return second_code(tape, dict(zip(self.curvature, nodes, strict=True)), self.width)
-
-
-def traced(
-    function: Callable[..., Any],
-    arguments: Sequence[Argument],
-    rows: int = 0,
-    name: str = "",
-) -> Expression:
-    """Run a function once and keep what it computes.
-
-    Args:
-        function: batched NumPy, ``(1, storage)`` arrays of variables and ``(1, ...)`` arrays of parameters to
-            ``(1, m)``; or compiled for one factor.
-        arguments: the manifold of each variable, the shape of each parameter for one factor.
-        rows: m of a compiled function.
-        name: for messages.
-
-    Raises:
-        TraceError: the function does what cannot be traced, or returns another shape.
-    """
-    tape, rebound, given = Tape(), Rebound(), []
-    stored = shared = width = 0
-    single = is_compiled(function)
-    for argument in arguments:
-        if isinstance(argument, tuple):
-            array = symbols(argument)
-            for place in np.ndindex(argument):
-                array[place] = Symbol(tape, tape.leaf(Op.PARAMETER, shared))
-                shared += 1
-            given.append((array.item() if argument == () else array) if single else array[None])
-        elif isinstance(argument, int):
-            raise TraceError("the shape of a parameter is not known")
-        else:
-            point = [Symbol(tape, tape.leaf(Op.VARIABLE, stored + k)) for k in range(argument.storage)]
-            step = [Symbol(tape, tape.leaf(Op.TANGENT, width + k)) for k in range(argument.dim)]
-            array = symbols((argument.storage,))
-            try:
-                array[:] = moved(argument, point, step, rebound.callable)
-            except TraceError:
-                raise
-            except Exception as error:  # whatever a manifold of somebody else makes of symbols
-                raise TraceError(f"a variable lies on {argument.name}: {type(error).__name__}: {error}") from error
-            given.append(array if single else array[None])
-            stored, width = stored + argument.storage, width + argument.dim
-    result = np.asarray(run(function, given, tape, rebound, rows), dtype=object)
-    if not single and (result.ndim != 2 or len(result) != 1):
-        raise TraceError(f"returns an array of shape {result.shape} for one factor, expected (1, m)")
-    return Expression(tape, tuple(node_of(tape, entry) for entry in result.ravel()), width, name or "residual")

@@ -1,4 +1,4 @@
-"""Row structure of a batched function, from traces of batches of several rows.
+"""Traces of functions of one factor, and of batched ones: the row structure from traces of batches of several rows.
 
 A kernel stands for a batched function if every row of the result is the same expression of that row's own arguments.
 Distinct symbols stand for the rows of each argument, so that this is seen in the expressions; no numbers are involved.
@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from unifg.codegen.fingerprint import is_compiled
 from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.manifolds import moved
 from unifg.factors.autodiff.operations import Op
@@ -93,6 +94,36 @@ def lengths_for(given: Sequence[Given]) -> tuple[int, int]:
     return first, second
 
 
+def traced(function: Callable[..., Any], arguments: Sequence[Argument], rows: int = 0, name: str = "") -> Expression:
+    """Run a function once and keep what it computes.
+
+    Args:
+        function: batched NumPy, ``(1, storage)`` arrays of variables and ``(1, ...)`` arrays of parameters to
+            ``(1, m)``; or compiled for one factor.
+        arguments: the manifold of each variable, the shape of each parameter for one factor.
+        rows: m of a compiled function.
+        name: for messages.
+
+    Raises:
+        TraceError: the function does what cannot be traced, or returns another shape.
+    """
+    inputs: list[Given] = []
+    for argument in arguments:
+        if isinstance(argument, int):
+            raise TraceError("the shape of a parameter is not known")
+        inputs.append(Each(argument) if isinstance(argument, tuple) else argument)
+    batch, rebound, single = _Batch(inputs), Rebound(), is_compiled(function)
+    given = batch.arrays(1, rebound)
+    if single:
+        given = [array[0] for array in given]
+    result = np.asarray(run(function, given, batch.tape, rebound, rows), dtype=object)
+    if not single and (result.ndim != 2 or len(result) != 1):
+        raise TraceError(f"returns an array of shape {result.shape} for one factor, expected (1, m)")
+    return Expression(
+        batch.tape, tuple(node_of(batch.tape, e) for e in result.ravel()), batch.width, name or "residual"
+    )
+
+
 def traced_rows(
     function: Callable[..., Any],
     given: Sequence[Given],
@@ -158,7 +189,7 @@ class _Batch:
     ) -> tuple[list[list[int]], bool]:
         """Nodes of the (length, m) result; whether the length was used for more than making arrays."""
         rebound = Rebound()
-        arrays = [self._array(place, length, rebound) for place in range(len(self.inputs))]
+        arrays = self.arrays(length, rebound)
         first = len(arrays) - len(reached)
         for array, numbers in zip(reached, arrays[first:], strict=True):
             rebound.given[id(array)] = numbers
@@ -175,6 +206,10 @@ class _Batch:
         if result.ndim != (1 if scalar else 2) or len(result) != length:
             raise TraceError(f"returns an array of shape {result.shape} for {length} factors")
         return [[node_of(self.tape, entry) for entry in row] for row in result.reshape(length, -1)], used
+
+    def arrays(self, length: int, rebound: Rebound) -> list[Any]:
+        """Arguments of a batch of some length."""
+        return [self._array(place, length, rebound) for place in range(len(self.inputs))]
 
     def _array(self, place: int, length: int, rebound: Rebound) -> Any:
         """The argument of one input."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
 
-from unifg.factors.autodiff.expression import Expression, generating, traced
+from unifg.factors.autodiff.expression import Expression, generating
+from unifg.factors.autodiff.rows import traced
 from unifg.factors.kernel import Kernel
 
 
@@ -15,7 +16,8 @@ from unifg.factors.kernel import Kernel
 class StatedKernel(Kernel):
     """A kernel whose ``function`` is batched NumPy: it is run once on symbols, in the shapes of ``arguments``.
 
-    A second derivative that is given takes the place of the derived one.
+    Where some of these are numbers of axes, it is run for every shape that is used. A second derivative that is given
+    takes the place of the derived one.
     """
 
     function: Callable[..., Any]
@@ -24,6 +26,19 @@ class StatedKernel(Kernel):
     def derived(self) -> bool:
         """They are, unless they are given."""
         return self.second is None
+
+    def of_shapes(self, shapes: Sequence[tuple[int, ...]]) -> Kernel:
+        """The kernel for parameters of these shapes, for one factor."""
+        if not any(isinstance(argument, int) for argument in self.arguments):
+            return self
+        with generating:
+            known: dict[tuple[tuple[int, ...], ...], Kernel] = self.__dict__.setdefault("_shaped", {})
+            found = known.get(tuple(shapes))
+            if found is None:
+                rest = iter(shapes)
+                stated = [a if not isinstance(a, int | tuple) else next(rest) for a in self.arguments]
+                found = known[tuple(shapes)] = replace(self, arguments=tuple(stated), rows=self.size(shapes))
+            return found
 
     @property
     def expression(self) -> Expression:
@@ -48,4 +63,4 @@ class StatedKernel(Kernel):
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what is stated; another process derives it anew."""
-        return {name: value for name, value in super().__getstate__().items() if name != "_expression"}
+        return {name: value for name, value in super().__getstate__().items() if name not in ("_expression", "_shaped")}

@@ -146,14 +146,14 @@ class Symbol:
         raise TraceError("asks whether a number holds that is not known yet; write np.where(condition, a, b) for `if`")
 
     def __float__(self) -> NoReturn:
-        """Nobody knows."""
+        """Refuse: the number is not known yet."""
         raise TraceError(
             "turns a number that is not known yet into a float, as foreign functions and arrays of floats do; write it "
             f"by np.* and np.stack, or {INSTEAD}"
         )
 
     def __int__(self) -> NoReturn:
-        """Nobody knows."""
+        """Refuse: the number is not known yet."""
         raise TraceError("turns a number that is not known yet into an integer")
 
     __index__ = __int__
@@ -163,7 +163,7 @@ class Symbol:
         raise TraceError("makes a complex number; write real and imaginary parts")
 
     def __hash__(self) -> NoReturn:
-        """Nobody knows."""
+        """Refuse: the number is not known yet."""
         raise TraceError("looks up a number that is not known yet in a dictionary or a set; write np.where(...)")
 
     def __round__(self, digits: int = 0) -> Any:
@@ -295,7 +295,7 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         return np.trunc(cast) if kind == np.int64 else cast
 
     def sort(self, *arguments: Any, **options: Any) -> Any:
-        """Nobody knows the order."""
+        """Refuse: the order is not known yet."""
         raise TraceError(f"sorts by numbers that are not known yet; write np.minimum and np.maximum, or {INSTEAD}")
 
     argsort = argmax = argmin = argpartition = partition = searchsorted = nonzero = sort
@@ -594,7 +594,7 @@ UFUNCS: dict[str, Callable[..., Any]] = {
     "bitwise_or": _of_truths("bitwise_or", Op.OR),
     "invert": _of_truths("invert", Op.NOT),
 }
-"""What the ufuncs of NumPy do with single entries, by name."""
+"""Meaning of the ufuncs of NumPy for single entries, by name."""
 
 
 def _not_in_half_precision(name: str, scalar: Callable[..., Any]) -> Callable[..., Any]:
@@ -644,7 +644,8 @@ def _reduced(
             rows.append(np.frompyfunc(scalar, 2, 1)(rows[-1], row))
         return np.moveaxis(np.array(rows, dtype=object), 0, axes[0])
     rest = [k for k in range(array.ndim) if k not in axes]
-    moved = array.transpose([*axes, *rest]).reshape(-1, *(array.shape[k] for k in rest))
+    kept = [array.shape[k] for k in rest]
+    moved = array.transpose([*axes, *rest]).reshape(math.prod(array.shape[k] for k in axes), *kept)
     combine = np.frompyfunc(scalar, 2, 1)
     starts = [] if initial is None or initial is np._NoValue else [initial]
     rows = [np.broadcast_to(np.array(item, dtype=object), moved.shape[1:]) for item in starts] + list(moved)
@@ -662,4 +663,4 @@ def _reduced(
 
 
 FUNCTIONS: dict[Any, Callable[..., Any]] = {}
-"""What functions of NumPy do with arrays of symbols, where NumPy itself would look at entries."""
+"""Replacements of functions of NumPy for arrays of symbols, where NumPy itself would look at entries."""

@@ -36,7 +36,7 @@ NUMPY: dict[Op, Callable[..., Any]] = {
     Op.MAXIMUM: np.maximum, Op.LESS: np.less, Op.LESS_EQUAL: np.less_equal, Op.EQUAL: np.equal,
     Op.AND: np.logical_and, Op.OR: np.logical_or, Op.NOT: np.logical_not,
 }  # fmt: skip
-"""What each operation computes, as NumPy does."""
+"""Function of NumPy that computes each operation."""
 
 _COMMUTES = frozenset({Op.ADD, Op.MULTIPLY, Op.EQUAL, Op.AND, Op.OR})
 

@@ -1,0 +1,105 @@
+"""Elimination of horizons, however their nodes are numbered."""
+
+from __future__ import annotations
+
+from unittest import mock
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+from test_elimination import System, backward_error, full, system
+from unifg.codegen.jit import compiled
+from unifg.elimination import fronts, substitution
+from unifg.elimination.factorization import Factorization
+from unifg.elimination.plan import Plan
+from unifg.elimination.symmetric import Symmetric
+from unifg.typing import Array
+
+
+def horizon(rng: np.random.Generator, length: int, state: int, control: int, multipliers: bool) -> System:
+    """States, then controls, then the multipliers of the dynamics: family by family."""
+    x, u = range(length), range(length, 2 * length - 1)
+    sizes = [state] * length + [control] * (length - 1)
+    edges = [(x[k], u[k]) for k in range(length - 1)]
+    if not multipliers:
+        edges += [(a[k], x[k + 1]) for k in range(length - 1) for a in (x, u)]
+        return system(rng, sizes, edges)
+    m = range(2 * length - 1, 3 * length - 2)
+    edges += [(a, m[k]) for k in range(length - 1) for a in (x[k], u[k], x[k + 1])]
+    return system(rng, sizes + [state] * (length - 1), edges, length - 1)
+
+
+@pytest.mark.parametrize("multipliers", [False, True])
+@pytest.mark.parametrize(("length", "state", "control"), [(50, 3, 2), (2, 3, 2), (20, 9, 4), (7, 1, 1)])
+def test_horizons(rng: np.random.Generator, length: int, state: int, control: int, multipliers: bool) -> None:
+    pattern, data, label, negative = horizon(rng, length, state, control, multipliers)
+    factorization = Factorization(pattern, label)
+    assert factorization.factor(data)
+    right = rng.normal(size=pattern.size)
+    assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-11
+    assert factorization.inertia == (int((~negative).sum()), int(negative.sum()), 0)
+    refined = factorization.refine(data, right)
+    assert backward_error(full(pattern, data), refined, right) < 1e-15
+
+
+def test_several_chains_and_loose_nodes(rng: np.random.Generator) -> None:
+    edges = [(k, k + 1) for k in range(9)] + [(k, k + 1) for k in range(11, 20)]
+    pattern, data, label, _ = system(rng, [2] * 22, edges)
+    factorization = Factorization(pattern, label)
+    assert factorization.factor(data)
+    right = rng.normal(size=pattern.size)
+    assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-14
+
+
+@compiled
+def iterate(plan: Plan, data: Array, added: Array, right: Array, out: Array, times: int) -> int:
+    """A solver's loop that never leaves compiled code."""
+    done = 0
+    for _ in range(times):
+        if substitution.factor_solve(plan, data, added, right, out):
+            done += 1
+    return done
+
+
+def test_kernels_run_inside_compiled_loops(rng: np.random.Generator) -> None:
+    pattern, data, label, negative = horizon(rng, 10, 3, 2, True)
+    factorization = Factorization(pattern, label)
+    right, out, added = rng.normal(size=pattern.size), np.zeros(pattern.size), np.where(negative, -1e-3, 1e-3)
+    assert iterate(factorization.plan, data, added, right, out, 3) == 3
+    assert backward_error(full(pattern, data) + sp.diags(added), out, right) < 1e-12
+    again = np.zeros(pattern.size)
+    assert factorization.factor_solve(data, added, right, again)
+    assert np.array_equal(out, again)
+    assert not factorization.factor_solve(np.zeros(pattern.nnz), None, right, again)
+    assert np.array_equal(out, again)
+
+
+def test_nothing_is_analysed_twice(rng: np.random.Generator) -> None:
+    pattern, data, label, _ = horizon(rng, 5, 3, 2, False)
+    factorization = Factorization(pattern, label)
+    assert factorization.factor(data)
+    with mock.patch("unifg.elimination.factorization.analyse", side_effect=AssertionError):
+        assert factorization.factor(2.0 * data)
+        assert np.allclose(2.0 * factorization.solve(data[: pattern.size]), dense_solution(pattern, data))
+
+
+def dense_solution(pattern: Symmetric, data: Array) -> Array:
+    """Dense solution for the first entries of the data as right-hand side."""
+    return np.asarray(np.linalg.solve(full(pattern, data).toarray(), data[: pattern.size]))
+
+
+def test_free_end_is_noticed_in_a_chain(rng: np.random.Generator) -> None:
+    """Contributions of a front to the next are not taken for the latter's original diagonal."""
+    n = 120
+    weight = rng.uniform(0.1, 10.0, size=n - 1)
+    pattern = Symmetric(n, [(np.arange(n - 1), np.arange(1, n))])
+    data = np.zeros(pattern.nnz)
+    data[pattern.positions(np.arange(n - 1), np.arange(1, n))] = -weight
+    np.add.at(data, pattern.diagonal[:-1], weight)
+    np.add.at(data, pattern.diagonal[1:], weight)
+    factorization = Factorization(pattern)
+    factorization.factor(data + 0.0)
+    singular = not factorization.factor(data)
+    assert singular or abs(factorization.pivots()[-1]) < 1e-13
+    assert fronts.factor(factorization.plan, data, np.full(n, 1e-6))
