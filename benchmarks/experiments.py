@@ -20,11 +20,11 @@ from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.printed import numbers, pairs
 from benchmarks.report import CAMPAIGNS, OUT, table
 from benchmarks.runner import Timing
-from unifg.scenarios.campaigns.account import PAIRED, differences
 from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, replay_command, run_campaign, write_manifest
-from unifg.scenarios.campaigns.performed import OK
+from unifg.scenarios.campaigns.report import PAIRED, differences
 from unifg.scenarios.campaigns.sheet import Sheet, load
 from unifg.scenarios.campaigns.statement import read
+from unifg.scenarios.campaigns.task import OK
 
 RUNS = 30
 LENGTH, DURATION = "path_length_m", "duration_s"

@@ -31,12 +31,12 @@ KEPT = 1e-3  # violation of constraints up to which an iterate is a plan
 
 @dataclass
 class Flight:
-    """Record of one flight.
+    """Record of the ticks of one flight, or of cold starts, which have no motion.
 
     Attributes:
-        times: of the ticks [ms].
-        iterations: of the ticks.
-        statuses: how many ticks ended how.
+        times: of the solves [ms].
+        iterations: of the solves.
+        statuses: numbers of solves by status.
         without: ticks without a plan of their own.
         clearance: at the ticks [m].
         lost: of the barrier from tick to tick beyond its share [m].
@@ -52,6 +52,14 @@ class Flight:
     lost: list[float] = field(default_factory=list)
     slack: list[float] = field(default_factory=list)
     error: list[float] = field(default_factory=list)
+
+    def add(self, case: GuardedFlight, solution: fg.Solution, milliseconds: float) -> None:
+        """Record a solve."""
+        self.times.append(milliseconds)
+        self.iterations.append(solution.iterations)
+        self.statuses[words(solution.status)] += 1
+        if case.kept is not None and case.kept.slack is not None:
+            self.slack.append(float(solution[case.kept.slack].max()))
 
 
 def fly(case: GuardedFlight, solver: fg.Solver, ticks: int) -> Flight:
@@ -70,14 +78,10 @@ def fly(case: GuardedFlight, solver: fg.Solver, ticks: int) -> Flight:
         state = quadrotor.fly(state, plan[case.u][interval], case.tick, VEHICLE, gust(now), substeps=2)
         after = case.clearance(state[None])[0]
         if tick >= 0:
-            seen.times.append(taken)
-            seen.iterations.append(solution.iterations)
-            seen.statuses[words(solution.status)] += 1
+            seen.add(case, solution, taken)
             seen.without += age > 0
             seen.clearance.append(after)
             seen.lost.append(np.exp(-case.alpha * case.tick) * before - after)
-            if case.kept is not None and case.kept.slack is not None:
-                seen.slack.append(float(solution[case.kept.slack].max()))
             seen.error.append(float(np.linalg.norm(state[:3] - figure_eight(np.array([now + case.tick]))[0][0, :3])))
     return seen
 
@@ -114,26 +118,9 @@ def flights(ticks: int) -> dict[tuple[str, str], Callable[[], Flight]]:
     return found
 
 
-@dataclass
-class Starts:
-    """Record of cold starts.
-
-    Attributes:
-        times: [ms].
-        iterations: of each.
-        statuses: how many ended how.
-        slack: the most of each plan [m].
-    """
-
-    times: list[float] = field(default_factory=list)
-    iterations: list[int] = field(default_factory=list)
-    statuses: Counter[str] = field(default_factory=Counter)
-    slack: list[float] = field(default_factory=list)
-
-
-def started(form: keeping.Form, weight: float | None, count: int) -> Starts:
+def started(form: keeping.Form, weight: float | None, count: int) -> Flight:
     """Solve from random states about the reference, some of them inside spheres, from the reference as a guess."""
-    case, rng, seen = GuardedFlight(form, weight=weight), np.random.default_rng(0), Starts()
+    case, rng, seen = GuardedFlight(form, weight=weight), np.random.default_rng(0), Flight()
     run = InteriorPoint(tolerance=TOLERANCE).prepare(case.graph)
     for index in range(-1, count):
         now = float(rng.uniform(0.0, 2.0 * np.pi / PACE))
@@ -143,15 +130,11 @@ def started(form: keeping.Form, weight: float | None, count: int) -> Starts:
         begin = time.thread_time()
         solution = run.solve(guess, data=case.data(states[0], now))
         if index >= 0:  # the first is to warm up
-            seen.times.append(1e3 * (time.thread_time() - begin))
-            seen.iterations.append(solution.iterations)
-            seen.statuses[words(solution.status)] += 1
-            if case.kept is not None and case.kept.slack is not None:
-                seen.slack.append(float(solution[case.kept.slack].max()))
+            seen.add(case, solution, 1e3 * (time.thread_time() - begin))
     return seen
 
 
-def worst(flight: Flight | Starts) -> str:
+def worst(flight: Flight) -> str:
     """Endings of the ticks that did not converge."""
     ends = [f"{count} {name}" for name, count in flight.statuses.most_common() if name != "converged"]
     return ", ".join(ends) or "none"
@@ -181,7 +164,7 @@ COLD: dict[tuple[str, str], tuple[keeping.Form, float | None]] = {
     ("slack, squared", "1e8"): ("slack", 1e8), ("slack, exact", "1e3"): ("exact slack", 1e3),
     ("slack, exact", "1e4"): ("exact slack", None), ("slack, exact", "1e5"): ("exact slack", 1e5),
 }  # fmt: skip
-COLD_COLUMNS: dict[str, Callable[[Starts], str]] = {
+COLD_COLUMNS: dict[str, Callable[[Flight], str]] = {
     "starts": lambda s: str(len(s.times)),
     "not converged": worst,
     "iterations": lambda s: f"{np.mean(s.iterations):.1f}",

@@ -10,12 +10,13 @@ weight 1e-9).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 
 import numpy as np
+import pandas as pd
 
 import unifg as fg
 from benchmarks.comparison import Row
@@ -125,95 +126,6 @@ def solvers(search: int) -> dict[str, fg.Solver]:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Result on one field.
-
-    Attributes:
-        solved: whether the KKT test passed.
-        free: whether no node collides.
-        reached: whether the end of the line was reached.
-        cost: of tracking and effort, without the potential.
-        iterations: of the solver.
-        milliseconds: of the solve, the processor's.
-    """
-
-    solved: bool
-    free: bool
-    reached: bool
-    cost: float
-    iterations: int
-    milliseconds: float
-
-    @property
-    def passed(self) -> bool:
-        """True if a robot could use the answer, optimal or not."""
-        return self.free and self.reached
-
-
-def attempt(method: Method, solver: fg.Solver, seed: int) -> Outcome:
-    """Solve one field cold."""
-    field, stated = method.stated(seed)
-    run = solver.prepare(stated.graph)
-    begin = time.thread_time()
-    solution = run.solve(stated.guess)
-    elapsed = 1e3 * (time.thread_time() - begin)
-    states, (reference, _) = solution[stated.x], field.reference()
-    error = potential(obstacles.disc_clearance)(states[1:], field.discs[:, :2], field.discs[:, 2])
-    pushed = 0.0 if method.hard else 0.5 * float((error**2).sum()) / method.sigma**2
-    given = 0.5 * float(field.stage @ field.error(states[0], reference[0]) ** 2)  # of the first pose, which is fixed
-    return Outcome(
-        solution.converged,
-        max(map(field.penetration, states)) <= CONTACT,
-        float(np.linalg.norm(states[-1, :2] - reference[-1, :2])) < NEAR_END,
-        solution.cost - pushed - given,
-        solution.iterations,
-        elapsed,
-    )
-
-
-Results = dict[tuple[str, str], list[Outcome]]
-
-
-FACTS: dict[str, Callable[[Outcome], bool]] = {
-    "solved": lambda o: o.solved,
-    "free": lambda o: o.free,
-    "reached": lambda o: o.reached,
-    "passed": lambda o: o.passed,
-    "passed and solved": lambda o: o.passed and o.solved,
-}
-
-
-def render(results: Results, fields: int) -> str:
-    """Both tables as Markdown."""
-    lines, moves = [], []
-    for (name, backend), outcomes in results.items():
-        hard, plain = (results[base, backend] for base in ("hard clearance", "potential"))
-        ratios = [o.cost / h.cost for o, h in zip(outcomes, hard, strict=True) if o.passed and h.passed]
-        counts = (sum(map(what, outcomes)) for what in FACTS.values())
-        medians = (np.median([getattr(o, what) for o in outcomes]) for what in ("iterations", "milliseconds"))
-        ratio = f"{np.median(ratios):.2f}" if ratios else "-"
-        lines.append((name, backend, *map(str, counts), ratio, *(f"{value:.0f}" for value in medians)))
-        if name != "potential":
-            changes = (
-                str(moved(plain, outcomes, FACTS[what], before))
-                for what in ("passed", "passed and solved") for before in (False, True)
-            )  # fmt: skip
-            moves.append((f"potential -> {name}", backend, *changes))
-    parts = [
-        table(("method", "solver", *FACTS, "cost", "iterations", "ms"), lines, text=2),
-        table(("change", "solver", "passed: rescued", "broken", "passed and solved: rescued", "broken"), moves, text=2),
-        f"{fields} fields, seeds 0 to {fields - 1}; tolerance {TOLERANCE:g}. "
-        "Iterations and processor times are medians.",
-    ]
-    return "\n\n".join(parts)
-
-
-def moved(plain: list[Outcome], outcomes: list[Outcome], what: Callable[[Outcome], bool], before: bool) -> int:
-    """In how many fields something that was so, or was not, is the other way round."""
-    return sum(what(was) is before and what(now) is not before for was, now in zip(plain, outcomes, strict=True))
-
-
-@dataclass(frozen=True)
 class Cell:
     """A method and a backend on the field of a seed."""
 
@@ -223,19 +135,57 @@ class Cell:
 
 
 def measure(cell: Cell) -> Row:
-    """Solve one field by one method."""
+    """Solve one field cold; the cost is that of tracking and effort, without the potential."""
     method = METHODS[cell.method]
-    return vars(attempt(method, solvers(method.search)[cell.backend], cell.seed))
+    field, stated = method.stated(cell.seed)
+    run = solvers(method.search)[cell.backend].prepare(stated.graph)
+    begin = time.thread_time()
+    solution = run.solve(stated.guess)
+    elapsed = 1e3 * (time.thread_time() - begin)
+    states, (reference, _) = solution[stated.x], field.reference()
+    error = potential(obstacles.disc_clearance)(states[1:], field.discs[:, :2], field.discs[:, 2])
+    pushed = 0.0 if method.hard else 0.5 * float((error**2).sum()) / method.sigma**2
+    given = 0.5 * float(field.stage @ field.error(states[0], reference[0]) ** 2)  # of the first pose, which is fixed
+    return {
+        "solved": solution.converged,
+        "free": bool(max(map(field.penetration, states)) <= CONTACT),
+        "reached": float(np.linalg.norm(states[-1, :2] - reference[-1, :2])) < NEAR_END,
+        "cost": solution.cost - pushed - given,
+        "iterations": solution.iterations,
+        "milliseconds": elapsed,
+    }
+
+
+FACTS = ["solved", "free", "reached", "passed", "passed and solved"]
 
 
 def tables(rows: list[Row]) -> str:
-    """Tables of all rows."""
-    results: Results = {}
-    names = [field.name for field in fields(Outcome)]
-    for row in rows:
-        outcome = Outcome(*(row[name] for name in names))
-        results.setdefault((METHODS[row["method"]].name, row["backend"]), []).append(outcome)
-    return render(results, len({row["seed"] for row in rows}))
+    """Counts of each method, and fields in which a change of method changes the result."""
+    frame = pd.DataFrame(rows)
+    frame["passed"] = frame["free"] & frame["reached"]  # a robot could use the answer, optimal or not
+    frame["passed and solved"] = frame["passed"] & frame["solved"]
+    found = {key: part.set_index("seed") for key, part in frame.groupby(["method", "backend"], sort=False)}
+    lines, moves = [], []
+    for (number, backend), part in found.items():
+        name, hard, plain = METHODS[number].name, found[0, backend], found[1, backend]
+        ratios = (part["cost"] / hard["cost"])[part["passed"] & hard["passed"]]
+        ratio = f"{ratios.median():.2f}" if len(ratios) else "-"
+        medians = (f"{part[what].median():.0f}" for what in ("iterations", "milliseconds"))
+        lines.append((name, backend, *map(str, part[FACTS].sum()), ratio, *medians))
+        if name != "potential":
+            changes = (
+                str(((plain[what] == before) & (part[what] != before)).sum())
+                for what in FACTS[-2:] for before in (False, True)
+            )  # fmt: skip
+            moves.append((f"potential -> {name}", backend, *changes))
+    fields = frame["seed"].nunique()
+    parts = [
+        table(("method", "solver", *FACTS, "cost", "iterations", "ms"), lines, text=2),
+        table(("change", "solver", "passed: rescued", "broken", "passed and solved: rescued", "broken"), moves, text=2),
+        f"{fields} fields, seeds 0 to {fields - 1}; tolerance {TOLERANCE:g}. "
+        "Iterations and processor times are medians.",
+    ]
+    return "\n\n".join(parts)
 
 
 def cells(seeds: Sequence[int]) -> list[Cell]:

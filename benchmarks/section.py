@@ -1,4 +1,4 @@
-"""A section of docs/benchmarks.md: what it measures, what that is to reach, and how it is told."""
+"""A section of the page of elimination: its measurement, its goals and its rendering."""
 
 from __future__ import annotations
 

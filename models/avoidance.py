@@ -175,7 +175,7 @@ def inverse_distance(clearance: Residual, nearest: float = 0.1, weight: float = 
     half = 0.5 * weight
 
     def potential(*arguments: Any) -> Array:
-        r = root.function(*arguments)
+        r = root(*arguments)
         total: Array = half * np.einsum("nm,nm->n", r, r)
         return total
 

@@ -4,8 +4,8 @@ Exit status: 0 if the robot did what it was asked (every goal reached without a 
 its limits), 1 if not, 2 for arguments that cannot be served, 130 after an interrupt (what was done until then is
 written all the same); SIGTERM interrupts, too.
 
-``unifg campaign`` runs many episodes (0 if every one of them succeeded), ``unifg report`` says what came of them,
-``unifg replay`` shows one of them, ``unifg mcap`` writes a drive for other tools. ``unifg doctor`` examines the
+``unifg campaign`` runs many episodes (0 if every one of them succeeded), ``unifg report`` reports on them,
+``unifg replay`` repeats one of them, ``unifg mcap`` writes a drive for other tools. ``unifg doctor`` examines the
 installation, ``unifg bench`` times it. What can be run stands in `unifg.scenarios.commands.catalogue`; only the
 scenario that is named is loaded.
 """
@@ -129,15 +129,15 @@ def _campaign(chosen: argparse.Namespace) -> int:
     for remark in found.remarks:
         print(f"note: {remark}")
     print(found.summary)
-    print(f"{folder}: `{shlex.join(('unifg', 'report', str(folder)))}` says more")
+    print(f"report: {shlex.join(('unifg', 'report', str(folder)))}")
     if found.interrupted:
         return INTERRUPTED
     return SUCCEEDED if found.succeeded else FAILED
 
 
 def _report(chosen: argparse.Namespace) -> int:
-    """Write what a campaign says."""
-    from unifg.scenarios.campaigns.account import write_report
+    """Write the report of a campaign."""
+    from unifg.scenarios.campaigns.report import write_report
 
     for file in write_report(chosen.folder, chosen.against, chosen.any_code):
         print(file)
@@ -346,16 +346,16 @@ COMMANDS = {
         "Compile, once for all programs to come, what the library and its scenarios can reach.",
         {
             "--ship": {"action": "store_true", "help": "write the half compiled kernels that come with unifg anew"},
-            "--check": {"action": "store_true", "help": "say whether these are out of date; compile nothing"},
+            "--check": {"action": "store_true", "help": "list those that are out of date; compile nothing"},
         },
         ("--ship", "--check"),
     ),
     "doctor": Command(
-        _doctor, "whether all is well",
-        "Say whether all is well: versions, caches, threads, every backend on a problem with a known answer.",
+        _doctor, "examine the installation",
+        "Examine the installation: versions, caches, threads, every backend on a problem with a known answer.",
     ),
     "bench": Command(
-        _bench, "how fast it is here",
+        _bench, "measure the speed on this machine",
         "Time what the library does beside a reference, and compare the ratios with a record.",
         {
             "--quick": {"action": "store_true", "help": "fewer rounds: less than a minute"},
@@ -383,7 +383,7 @@ COMMANDS = {
         ("--workers", "--scheduler"),
     ),
     "report": Command(
-        _report, "what a campaign says",
+        _report, "report on a campaign",
         "Write tables and pictures of a campaign, finished or not, as report.html and report.md in its folder.",
         {
             "folder": {"type": Path, "metavar": "DIR", "help": "of the campaign"},
@@ -394,7 +394,7 @@ COMMANDS = {
         },
     ),
     "replay": Command(
-        _replay, "an episode again", "Run one episode of a campaign again, with scene, pictures and metrics.",
+        _replay, "repeat an episode", "Run one episode of a campaign again, with scene, pictures and metrics.",
         {
             "folder": {"type": Path, "metavar": "DIR", "help": "of the campaign"},
             "key": {"metavar": "KEY", "help": "of the episode, as the report names it"},
@@ -403,7 +403,7 @@ COMMANDS = {
         },
     ),
     "mcap": Command(
-        _mcap, "a drive for other tools",
+        _mcap, "export a drive",
         "Write the log of a drive, drive.npz, as messages that Foxglove, PlotJuggler and mcap's tools play.",
         {
             "folder": {"type": Path, "metavar": "DIR", "help": "results of unifg run navigation, or the log itself"},

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
+import numba
 import numpy as np
 
 import unifg as fg
@@ -75,6 +76,21 @@ class Batch:
 
     def _residual(self, function: Any, variables: Sequence[int], arguments: list[Array]) -> Array:
         return self._complete(function, variables)(*arguments)
+
+
+def state(smoother: Any, family: Any, statements: Iterable[Model]) -> None:
+    """State to a smoother what is said of members of one family."""
+    for function, variables, parameters, sigma in statements:
+        smoother.minimize(function, *[family[i] for i in variables], *parameters, sigma=sigma)
+
+
+@numba.njit  # type: ignore[untyped-decorator]
+def seen_once(pose: Array, point: Array, measured: Array, r: Array) -> None:
+    """A point seen from a pose of the plane, in the frame of the pose."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    dx, dy = point[0] - pose[0], point[1] - pose[1]
+    r[0] = c * dx + s * dy - measured[0]
+    r[1] = c * dy - s * dx - measured[1]
 
 
 def drive(group: Any, rng: np.random.Generator, count: int) -> Iterator[list[Model]]:

@@ -169,6 +169,18 @@ def test_least_squares_backends_take_the_twin() -> None:
     assert pushed("squares", (1.5, 0.4, 1.0), GaussNewton()).converged
 
 
+def test_potentials_are_traced_in_graphs() -> None:
+    """As sums of squares and as scalar costs, of clearances that are themselves made of other functions."""
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(3), 4)
+    for k, clearance in enumerate((avoidance.cylinder_clearance, avoidance.sphere_clearance)):
+        centre = CENTRES if k == 0 else np.hstack([CENTRES, np.zeros((len(CENTRES), 1))])
+        graph.minimize(avoidance.inverse_distance_root(clearance), p, centre, RADII, name=f"root {k}")
+        graph.minimize_scalar(avoidance.inverse_distance(clearance), p, centre, RADII, name=f"potential {k}")
+    routes = graph.check({p: np.full((4, 3), 0.7)}).routes
+    assert len(routes) == 4 and all(route.endswith("derivatives exact") for route in routes.values()), routes
+
+
 def test_what_the_potential_needs() -> None:
     with pytest.raises(fg.ModelError, match="positive distance"):
         avoidance.inverse_distance_root(avoidance.cylinder_clearance, 0.0)

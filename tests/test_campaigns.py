@@ -21,12 +21,12 @@ from problems import short_walks
 from unifg.errors import ScenarioError
 from unifg.scenarios import command
 from unifg.scenarios.campaigns import campaign as campaigns
-from unifg.scenarios.campaigns import performed
+from unifg.scenarios.campaigns import task
 from unifg.scenarios.campaigns.campaign import Campaign, run_campaign
 from unifg.scenarios.campaigns.journal import Journal, lines_of
-from unifg.scenarios.campaigns.performed import Order, WrongLibrary, perform
 from unifg.scenarios.campaigns.sources import fingerprint
-from unifg.scenarios.campaigns.statement import Statement, read, spawned, stated
+from unifg.scenarios.campaigns.statement import Episode, Statement, read, spawned, stated
+from unifg.scenarios.campaigns.task import Task, WrongLibrary, run_task
 from unifg.scenarios.episode import silent
 from unifg.scenarios.workers import Workers, finished
 
@@ -293,9 +293,9 @@ def test_a_full_disk_keeps_what_was_there(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- one episode
 
 
-def order(behaviour: str, seed: int = 1, sources: str | None = None, **settings: Any) -> Order:
+def task_of(behaviour: str, seed: int = 1, sources: str | None = None, **settings: Any) -> Task:
     stated = {"behaviour": behaviour, **settings}
-    return Order(WALKS, "key", {}, stated, seed, ".", "now", sources or fingerprint())
+    return Task(WALKS, Episode("key", {}, stated, seed), ".", "now", sources or fingerprint())
 
 
 @pytest.mark.parametrize(
@@ -306,7 +306,7 @@ def order(behaviour: str, seed: int = 1, sources: str | None = None, **settings:
     ],
 )  # fmt: skip
 def test_an_episode_is_a_line_whatever_happens(behaviour: str, outcome: str, error: str | None) -> None:
-    text = perform(order(behaviour))
+    text = run_task(task_of(behaviour))
     assert "\n" not in text and "NaN" not in text
     row = json.loads(text)
     assert (row["outcome"], row.get("error"), row["seed"], row["code"]) == (outcome, error, 1, "now")
@@ -319,7 +319,7 @@ def test_an_episode_is_a_line_whatever_happens(behaviour: str, outcome: str, err
 
 
 def test_settings_that_no_longer_fit_are_an_error() -> None:
-    assert json.loads(perform(order("walk", pace="fast")))["error"].startswith(
+    assert json.loads(run_task(task_of("walk", pace="fast")))["error"].startswith(
         "ScenarioError: problems.short_walks: pace"
     )
 
@@ -333,16 +333,16 @@ def test_a_worker_is_warmed_once_for_each_kind(monkeypatch: pytest.MonkeyPatch) 
         return real(settings, progress)
 
     monkeypatch.setattr(short_walks, "run", counted)
-    monkeypatch.setattr(performed, "_warm", set())
+    monkeypatch.setattr(task, "_warm", set())
     for number, behaviour in enumerate(("walk", "walk", "fail", "walk")):
-        perform(order(behaviour, seed=number, pace=float(number + 1)))
+        run_task(task_of(behaviour, seed=number, pace=float(number + 1)))
     assert [what for what, recorded in calls if not recorded] == ["walk", "fail"]
     assert [what for what, recorded in calls if recorded] == ["walk", "walk", "fail", "walk"]
 
 
 def test_a_worker_with_other_sources_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(WrongLibrary, match="has other sources of unifg"):
-        perform(order("walk", sources="0" * 12))
+        run_task(task_of("walk", sources="0" * 12))
     monkeypatch.setattr(campaigns, "fingerprint", lambda: "0" * 12)
     with pytest.raises(WrongLibrary):
         run(walks(), tmp_path)
@@ -581,7 +581,7 @@ def test_signals_end_a_campaign_with_what_there_is(tmp_path: Path, monkeypatch: 
 
 
 def test_a_report_says_what_the_rows_say(tmp_path: Path) -> None:
-    from unifg.scenarios.campaigns.account import write_report
+    from unifg.scenarios.campaigns.report import write_report
     from unifg.scenarios.campaigns.sheet import load
 
     made = walks(
@@ -608,7 +608,7 @@ def test_a_report_says_what_the_rows_say(tmp_path: Path) -> None:
 
 
 def test_a_report_sets_two_campaigns_side_by_side(tmp_path: Path) -> None:
-    from unifg.scenarios.campaigns.account import write_report
+    from unifg.scenarios.campaigns.report import write_report
 
     for folder, behaviour in (("old", "walk"), ("new", "fail")):
         grid = {"which": [{"name": "it", "behaviour": behaviour}]}
@@ -621,7 +621,7 @@ def test_a_report_sets_two_campaigns_side_by_side(tmp_path: Path) -> None:
 
 
 def test_a_report_of_nothing_yet(tmp_path: Path) -> None:
-    from unifg.scenarios.campaigns.account import write_report
+    from unifg.scenarios.campaigns.report import write_report
 
     with pytest.raises(ScenarioError):
         run(walks(), tmp_path, executor=Watched(broken=True))
@@ -645,8 +645,8 @@ def test_no_campaign_is_a_sentence(tmp_path: Path) -> None:
 
 
 def test_chance_of_differences() -> None:
-    from unifg.scenarios.campaigns.account import _holm
     from unifg.scenarios.campaigns.comparison import by_chance
+    from unifg.scenarios.campaigns.report import _holm
 
     assert by_chance(np.array([1.0, 1.0, 1.0, 1.0])) == 2 / 16  # all signs alike, one way or the other
     assert by_chance(np.array([1.0, -1.0])) == 1.0 and by_chance(np.zeros(3)) == 1.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from test_elimination import full, grid, system
-from test_elimination_horizons import horizon
+from test_elimination_chain import horizon
 from unifg.elimination.factorization import Factorization
 from unifg.errors import UnifgError
 

@@ -19,9 +19,9 @@ from unifg.errors import ScenarioError
 from unifg.files.carmen import read_carmen
 from unifg.scenarios.campaigns.campaign import EPISODES
 from unifg.scenarios.campaigns.journal import Journal, lines_of
-from unifg.scenarios.campaigns.performed import FAILED, OK
 from unifg.scenarios.campaigns.sheet import Combination, Sheet, sheet_of
 from unifg.scenarios.campaigns.statement import read
+from unifg.scenarios.campaigns.task import FAILED, OK
 from unifg.scenarios.navigation import INITIAL_SIGMA
 from unifg.scenarios.planning.polyline import path_length
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from dense import Batch, Model, drive, one_by_one
+from dense import Batch, Model, drive, one_by_one, state
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.smoothing import FixedLag, Incremental
@@ -19,8 +19,8 @@ from unifg.typing import Array, IntArray
 ENDS = ("variable_end", "factor_end", "clique_end", "lists_end", "numbers_end")  # of tables and arenas
 
 
-def within(statement: Model, k: int, lag: int) -> bool:
-    return min(statement[1]) > k - lag
+def within(statements: list[Model], k: int, lag: int) -> list[Model]:
+    return [statement for statement in statements if min(statement[1]) > k - lag]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -30,9 +30,9 @@ def test_linear_problems_lose_nothing(seed: int) -> None:
     smoother = FixedLag(lag, wildfire=0.0)
     x, batch = smoother.variables("x", group), Batch([group])
     for k, statements in enumerate(drive(group, rng, 60)):
-        for function, variables, parameters, sigma in (s for s in statements if within(s, k, lag)):
-            smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
-            batch.minimize(function, variables, parameters, sigma)
+        recent = within(statements, k, lag)
+        state(smoother, x, recent)
+        batch.statements += recent
         start = rng.standard_normal(3)
         smoother.update({x: start})
         batch.add(start)
@@ -53,9 +53,8 @@ def test_nothing_is_lost_at_fixed_points(group: Any, seed: int) -> None:
     whole = Incremental(relinearize=np.inf, wildfire=0.0)
     x, y = smoother.variables("x", group), whole.variables("x", group)
     for k, statements in enumerate(drive(group, rng, 60)):
-        for function, variables, parameters, sigma in (s for s in statements if within(s, k, lag)):
-            smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
-            whole.minimize(function, *[y[i] for i in variables], *parameters, sigma=sigma)
+        state(smoother, x, within(statements, k, lag))
+        state(whole, y, within(statements, k, lag))
         noise = group.exp(0.1 * rng.standard_normal(group.dim))
         start = group.identity() if k == 0 else group.compose(smoother.estimate(x[-1])[0], noise)
         smoother.update({x: start})
@@ -71,9 +70,9 @@ def test_a_loop_beyond_the_first_guess(fixed_points: bool) -> None:
     smoother = FixedLag(lag, relinearize=0.0, wildfire=0.0, fixed_points=fixed_points)
     x, batch = smoother.variables("x", group), Batch([group])
     for k, statements in enumerate(drive(group, rng, 40)):
-        for function, variables, parameters, sigma in (s for s in statements if within(s, k, lag)):
-            smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
-            batch.minimize(function, variables, parameters, sigma)
+        recent = within(statements, k, lag)
+        state(smoother, x, recent)
+        batch.statements += recent
         start = group.identity() if k == 0 else group.compose(smoother.estimate(x[-1])[0], group.random(rng))
         smoother.update({x: start}, iterations=6)
         batch.add(smoother.estimate(x[-1])[0])
@@ -128,8 +127,7 @@ def test_memory_and_tables_stay_as_they_are() -> None:
     x = smoother.variables("x", fg.SE2)
     ends: list[IntArray] = []
     for k, statements in enumerate(drive(fg.SE2, rng, 900)):
-        for function, variables, parameters, sigma in statements:
-            smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
+        state(smoother, x, statements)
         smoother.update({x: np.zeros(3) if k == 0 else smoother.estimate(x[-1])[0]})
         if k in (450, 899):
             counters = smoother._state.counters

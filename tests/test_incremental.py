@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import unifg as fg
-from dense import Batch, drive, one_by_one
+from dense import Batch, drive, one_by_one, seen_once, state
 from unifg.codegen.views import described
 from unifg.elimination.symbolic import cliques as find_cliques
 from unifg.elimination.symbolic import separators as find_separators
@@ -32,9 +32,8 @@ def test_every_update_is_a_batch_step(group: Any, seed: int) -> None:
     x = smoother.variables("x", group)
     batch = Batch([group])
     for k, statements in enumerate(drive(group, rng, 25)):
-        for statement in statements:
-            smoother.minimize(statement[0], *[x[i] for i in statement[1]], *statement[2], sigma=statement[3])
-            batch.minimize(*statement)
+        state(smoother, x, statements)
+        batch.statements += statements
         start = group.identity() if k == 0 else group.compose(smoother.estimate(x[-1])[0], group.random(rng))
         smoother.update({x: start})
         batch.add(start)
@@ -65,9 +64,8 @@ def test_some_points_move_and_others_stay(group: Any, seed: int) -> None:
     batch = Batch([group])
     moved = stayed = 0
     for k, statements in enumerate(drive(group, rng, 50)):
-        for function, variables, parameters, sigma in statements:
-            smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
-            batch.minimize(function, variables, parameters, sigma)
+        state(smoother, x, statements)
+        batch.statements += statements
         noise = group.exp(0.1 * rng.standard_normal(group.dim))
         start = group.identity() if k == 0 else group.compose(smoother.estimate(x[-1])[0], noise)
         effort = smoother.update({x: start})
@@ -88,8 +86,7 @@ def test_wildfire_leaves_small_changes_alone() -> None:
         x = smoother.variables("x", fg.SE2)
         efforts = []
         for statements in drive(fg.SE2, np.random.default_rng(7), 80):
-            for function, variables, parameters, sigma in statements:
-                smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
+            state(smoother, x, statements)
             efforts.append(smoother.update({x: fg.SE2.random(rng) if len(x) == 0 else smoother.estimate(x[-1])[0]}))
         estimates.append(smoother.estimate(x))
         work.append(sum(effort.substituted for effort in efforts))
@@ -104,8 +101,7 @@ def test_the_best_estimate_is_that_of_complete_back_substitution() -> None:
         smoother = Incremental(relinearize=np.inf, wildfire=wildfire)
         x = smoother.variables("x", fg.SE2)
         for k, statements in enumerate(drive(fg.SE2, np.random.default_rng(7), 80)):
-            for function, variables, parameters, sigma in statements:
-                smoother.minimize(function, *[x[i] for i in variables], *parameters, sigma=sigma)
+            state(smoother, x, statements)
             smoother.update({x: np.array([0.3 * k, 0.0, 0.02 * k])})
         found.append((smoother.estimate(x), smoother.estimate(x, best=True)))
         np.testing.assert_array_equal(smoother.estimate(x), found[-1][0])
@@ -117,20 +113,11 @@ def test_the_best_estimate_is_that_of_complete_back_substitution() -> None:
     assert np.abs(rough - full).max() > 1e-6  # or the test has shown nothing
 
 
-@numba.njit  # type: ignore[untyped-decorator]
-def seen_at(pose: Array, point: Array, measured: Array, r: Array) -> None:
-    """A point seen from a pose, in the frame of the pose."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    dx, dy = point[0] - pose[0], point[1] - pose[1]
-    r[0] = c * dx + s * dy - measured[0]
-    r[1] = c * dy - s * dx - measured[1]
-
-
 def test_landmarks_of_another_dimension_and_a_residual_of_the_users_own() -> None:
     """Against SciPy's least squares over plain vectors, with landmarks that appear when they are first seen."""
     rng = np.random.default_rng(3)
     landmarks, poses = rng.uniform(-3, 3, (6, 2)), 12
-    look = fg.residual(seen_at, rows=2)
+    look = fg.residual(seen_once, rows=2)
     smoother = Incremental(relinearize=1e-6, wildfire=0.0)
     x, points = smoother.variables("x", fg.SE2), smoother.variables("l", fg.Rn(2))
     known: list[int] = []

@@ -14,7 +14,7 @@ from own_manifolds import S2, SphereManifold
 from problems.control import Quadrotor, Unicycle
 from problems.known import short_drive
 from unifg.factors.robust import Loss
-from unifg.models import avoidance
+from unifg.models import avoidance, quadrotor
 from unifg.problem.columns import Values
 from unifg.solution.solver import SolveState
 from unifg.solvers import SQP, InteriorPoint
@@ -375,3 +375,32 @@ def test_a_multiplier_near_its_price_is_no_end(force: float, tolerance: float) -
     solution = InteriorPoint(tolerance=tolerance).solve(graph, {x: np.ones((30, 1))})
     assert solution.converged and solution.iterations < 40
     assert -tolerance < solution[x][0, 0] < 1e-3
+
+
+@pytest.mark.parametrize("scalar", [False, True])
+@pytest.mark.parametrize("aside", [0.0, 1e-9, 1e-3])
+def test_orders_of_elimination_lose_no_digits(scalar: bool, aside: float) -> None:
+    """A flight straight at a cylinder, kept off by Ta's potential alone: large curvatures of either sign.
+
+    With the horizon eliminated by minimum degree this took from 17 iterations to the limit.
+    """
+    count, dt = 40, 0.1
+    vehicle = quadrotor.Parameters(mass=1.2, drag=(0.2, 0.2, 0.3), wind=(0.0, 0.5))
+    graph = fg.Graph()
+    x, u = graph.variables("x", quadrotor.STATE, count + 1), graph.variables("u", quadrotor.CONTROL, count)
+    start, target = np.array([0.0, 0.0, 1.0]), np.array([5.0, 0.0, 1.5])
+    tree, trunk = np.array([[2.5, 0.1]]), np.array([0.75])
+    still, hover = np.concatenate([start, quadrotor.hover_attitude(vehicle), np.zeros(3)]), quadrotor.hover(vehicle)
+    graph.fix(x[0], still)
+    graph.minimize(fg.prior, x[1:].p, target, sigma=2.0)
+    graph.minimize(fg.prior, u, hover, sigma=[2.0, 2.0, 2.0, 5.0])
+    graph.constrain(quadrotor.dynamics, x[:-1], u, x[1:], vehicle.packed, dt, lower=0, upper=0)
+    if scalar:
+        graph.minimize_scalar(avoidance.inverse_distance(avoidance.cylinder_clearance), x[1:].p, tree, trunk)
+    else:
+        graph.minimize(avoidance.inverse_distance_root(avoidance.cylinder_clearance), x[1:].p, tree, trunk)
+    straight = np.tile(still, (count + 1, 1))
+    straight[:, :3] = np.linspace(start, target, count + 1)
+    straight[:, 1] += aside * np.sin(np.linspace(0.0, 3.1, count + 1))
+    solution = InteriorPoint().solve(graph, {x: straight, u: np.tile(hover, (count, 1))}, check=True)
+    assert solution.iterations <= 15, solution.report()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from dense import seen_once
 from own_manifolds import Sphere
 from unifg.errors import GraphError
 from unifg.smoothing import FixedLag, Incremental
@@ -49,14 +50,6 @@ def seen_jacobian(pose: Array, point: Array, measured: Any) -> list[Array]:
     by_pose[:, 0, 0] = by_pose[:, 1, 1] = -1.0
     by_pose[:, 0, 2], by_pose[:, 1, 2] = r[:, 1], -r[:, 0]
     return [by_pose, np.stack([np.stack([c, s], axis=1), np.stack([-s, c], axis=1)], axis=1)]
-
-
-@numba.njit  # type: ignore[untyped-decorator]
-def seen_once(pose: Array, point: Array, measured: Array, r: Array) -> None:
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    dx, dy = point[0] - pose[0], point[1] - pose[1]
-    r[0] = c * dx + s * dy - measured[0]
-    r[1] = c * dy - s * dx - measured[1]
 
 
 @numba.njit  # type: ignore[untyped-decorator]

@@ -727,7 +727,7 @@ def _early(x: Array) -> Array:
 
 box = types.ModuleType("box")
 GAINS = Gains()
-Copied = list[Any] | dict[str, Any] | tuple[Any, ...] | types.SimpleNamespace | np.ndarray
+COPIED = (list, dict, tuple, types.SimpleNamespace, np.ndarray)
 
 
 def _again(x: Array, gain: float = 2.0) -> Array:
@@ -765,7 +765,7 @@ def test_what_changes_between_solves_is_noticed(
     monkeypatch.setattr(_again, "__defaults__", (2.0,))
     monkeypatch.setitem(SETTINGS, "gain", 2.0)
     monkeypatch.setitem(globals(), "GAIN", 2.0)
-    given = copy.deepcopy(first) if isinstance(first, Copied) else first
+    given = copy.deepcopy(first) if isinstance(first, COPIED) else first
     graph, x = stated(function, *(() if given is None else (given,)))
     prepared = GaussNewton().prepare(graph)
     np.testing.assert_allclose(prepared.solve({x: np.zeros((N, 3))})[x], 0.5, atol=1e-6)

@@ -173,7 +173,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
 
 
 @dataclass(frozen=True)
-class OutlierReport:
+class Verdict:
     """Fate of a mutant: "killed", "survived", or "unseen" when no test touches its line."""
 
     mutation: Mutation
@@ -247,13 +247,13 @@ class Hunt:
         self.source = self.file.read_text(encoding="utf-8")
         self.times = self.file.stat()
 
-    def judge(self, mutation: Mutation) -> OutlierReport:
+    def judge(self, mutation: Mutation) -> Verdict:
         """Run the tests that touch a mutant's line, then, if they pass, all others."""
         begin = time.monotonic()
         first = self.seen.tests(None if mutation.compiled else self._lines(mutation))
         others = [test for test in self.seen.tests(None) if test not in set(first)]
         if not first:
-            return OutlierReport(mutation, "unseen", 0.0)
+            return Verdict(mutation, "unseen", 0.0)
         self.file.write_text(mutation.applied(self.source), encoding="utf-8")
         try:
             passed = all(
@@ -264,7 +264,7 @@ class Hunt:
         finally:
             self.file.write_text(self.source, encoding="utf-8")
             os.utime(self.file, ns=(self.times.st_atime_ns, self.times.st_mtime_ns))
-        return OutlierReport(mutation, "survived" if passed else "killed", time.monotonic() - begin)
+        return Verdict(mutation, "survived" if passed else "killed", time.monotonic() - begin)
 
     def _lines(self, mutation: Mutation) -> range:
         """A statement over several lines is recorded at some of them."""
@@ -272,7 +272,7 @@ class Hunt:
         return range(mutation.line, last + 1)
 
 
-def hunt(scratch: Path, path: str, share: float, seed: int, skip_compiled: bool, only: str) -> list[OutlierReport]:
+def hunt(scratch: Path, path: str, share: float, seed: int, skip_compiled: bool, only: str) -> list[Verdict]:
     """Judge the mutants of one file, and say what becomes of them."""
     tests = [f"tests/test_{name}.py" for name in TARGETS[path]]
     tests = [test for test in tests if (scratch / test).exists()]

@@ -18,9 +18,9 @@ from typing import Any
 from unifg.atomic_write import write_atomically
 from unifg.errors import ScenarioError
 from unifg.scenarios.campaigns.journal import Journal, lines_of
-from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK, Order, lost, perform
 from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Statement, module_of, read
+from unifg.scenarios.campaigns.task import ERROR, FAILED, LOST, OK, Task, lost, run_task
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.workers import Workers, cluster, died, finished
 
@@ -109,19 +109,19 @@ def run_campaign(
         _remark_changes(found, statement, code, done)
         write_manifest(folder, statement, code)
         found.outcomes = Counter(done.values())
-        orders = _orders(statement, code, done)
+        tasks = _tasks(statement, code, done)
         meter = _Meter(found, progress)
         if len(done) == len(known):
             return found
         with _executor(statement, workers, executor, scheduler) as (at_work, at_once):
             try:
-                for order, future in finished(at_work, perform, orders, at_once, meter.beat):
+                for task, future in finished(at_work, run_task, tasks, at_once, meter.beat):
                     error = future.exception()
                     if isinstance(error, ScenarioError):  # of the workers: every other episode would say the same
                         raise error
                     if error is not None and not died(future):
                         raise ScenarioError(f"an episode cannot be handed to a worker: {error!r}") from error
-                    text = lost(order, f"the worker died, twice: {error}") if error is not None else future.result()
+                    text = lost(task, f"the worker died, twice: {error}") if error is not None else future.result()
                     journal.add(text)
                     found.outcomes[json.loads(text)["outcome"]] += 1
                     found.ran += 1
@@ -233,13 +233,11 @@ def write_manifest(folder: Path, statement: Statement, code: str) -> None:
         raise ScenarioError(f"{path}: cannot be written ({error.strerror})") from None
 
 
-def _orders(statement: Statement, code: str, done: dict[str, str]) -> Iterator[Order]:
+def _tasks(statement: Statement, code: str, done: dict[str, str]) -> Iterator[Task]:
     sources, base = fingerprint(), str(statement.base)
     for episode in statement.episodes():
         if episode.key not in done:
-            yield Order(
-                statement.scenario, episode.key, episode.labels, episode.settings, episode.seed, base, code, sources
-            )
+            yield Task(statement.scenario, episode, base, code, sources)
 
 
 @contextmanager

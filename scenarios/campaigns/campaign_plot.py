@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unifg.scenarios.campaigns.comparison import interval, share
-from unifg.scenarios.campaigns.performed import OK
 from unifg.scenarios.campaigns.sheet import Combination, Sheet
+from unifg.scenarios.campaigns.task import OK
 from unifg.style.colours import INK, css
 from unifg.style.figures import face, new_figure
 

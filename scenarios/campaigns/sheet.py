@@ -14,7 +14,7 @@ import pandas as pd
 
 from unifg.scenarios.campaigns.campaign import EPISODES, manifest_of
 from unifg.scenarios.campaigns.journal import lines_of
-from unifg.scenarios.campaigns.performed import ERROR, FAILED, LOST, OK
+from unifg.scenarios.campaigns.task import ERROR, FAILED, LOST, OK
 from unifg.typing import Array
 
 __all__ = ["OUTCOMES", "Combination", "Sheet", "load", "sheet_of"]

@@ -121,10 +121,10 @@ class _Nowhere(_CacheLocator):  # type: ignore[misc]
         """There is none."""
 
     def get_source_stamp(self) -> None:
-        """Nobody asks."""
+        """Stamp that the index would compare, if it were read."""
 
     def get_disambiguator(self) -> str:
-        """Nobody asks."""
+        """Part of a file name, if there were one."""
         return ""
 
 

@@ -22,7 +22,7 @@ from numba import types
 from numba.core.registry import cpu_target
 
 POINTER = str(ir.DoubleType().as_pointer())
-"""How LLVM's language spells the address of floats."""
+"""Address of floats in LLVM's language."""
 LONG = 20_000  # lines
 SOURCES = (__file__, str(Path(__file__).with_name("calls.py")))
 """Files that say what is generated."""

@@ -43,7 +43,7 @@ def bundle(form: Any, kinds: Sequence[Any]) -> Any:
 
 
 def empty_mailbox() -> IntArray:
-    """Nobody has called."""
+    """Mailbox without a call."""
     return np.zeros(4 * LINE, np.int64)
 
 

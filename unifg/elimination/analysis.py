@@ -7,6 +7,7 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from unifg.elimination.chain import stages
 from unifg.elimination.dissection import separators
 from unifg.elimination.layout import lay_out
 from unifg.elimination.metis import installed, metis_order
@@ -124,6 +125,9 @@ def analyse(indptr: IntArray, indices: IntArray, blocks: IntArray | None, orderi
                 other = make()
                 if (less := predicted_cost(weight, other[0], other[1], other[3])) < cost:
                     kind, tree, cost = name, other, less
+            chain, line, least = stages(pointer, neighbours, weight)
+            if chain and least <= cost:
+                kind, tree = "chain", line
     else:
         raise UnifgError(
             f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural or "

@@ -85,8 +85,8 @@ class Factorization:
             blocks: (n,) non-decreasing label of the node each scalar belongs to; by default scalars that follow each
                 other and have the same neighbours are one node.
             ordering: how to order the nodes, or a permutation of them: the nodes in the order of elimination. "auto"
-                takes the cheaper of minimum degree and, for large graphs, nested dissection (METIS' too, where the
-                extra ``unifg[metis]`` is installed).
+                takes the cheapest of minimum degree, nested dissection (large graphs; METIS' too, where the extra
+                ``unifg[metis]`` is installed) and a chain of stages.
         """
         self._begin(Symbolic(pattern, blocks, ordering))
 

@@ -50,7 +50,7 @@ def cliques(
         of each separator; its nodes in no order, as begin and length in a pool of lists.
     """
     elements = len(pointer) - 1
-    pivots, first, taken, start, length, heavy, lists = _eliminate(weight, stage, given, twins, pool, pointer)
+    pivots, first, absorber, start, length, heavy, lists = _eliminate(weight, stage, given, twins, pool, pointer)
     count, n = len(first) - 1, len(weight)
     rows, into = filled(count, 0), filled(count, 0)
     for k in range(count):
@@ -58,7 +58,7 @@ def cliques(
         for q in range(first[k], first[k + 1]):
             rows[k] += weight[pivots[q]]
     for k in range(count):
-        p, below = taken[elements + k], heavy[elements + k]
+        p, below = absorber[elements + k], heavy[elements + k]
         if p < 0 or alone[pivots[first[p]]]:
             continue
         above = heavy[elements + p]
@@ -129,7 +129,7 @@ def _append(i: int, after: IntArray, gone: IntArray, pivots: IntArray, done: int
 
 @compiled
 def _begin_stage(
-    now: int, stage: IntArray, size: IntArray, taken: IntArray, start: IntArray, length: IntArray, lists: IntArray,
+    now: int, stage: IntArray, size: IntArray, absorber: IntArray, start: IntArray, length: IntArray, lists: IntArray,
     elements: int, own: IntArray, count: IntArray, touching: IntArray, later: IntArray, degree: IntArray,
 ) -> int:  # fmt: skip
     """Find the elements of every node of a stage, and its degree; returns the number of nodes."""
@@ -139,7 +139,7 @@ def _begin_stage(
             count[i], degree[i] = 0, 0
             listed += 1
     for e in range(elements):
-        if taken[e] < 0:
+        if absorber[e] < 0:
             heavy, later[e] = 0, 0
             for k in range(start[e], start[e] + length[e]):
                 heavy += size[lists[k]]
@@ -217,7 +217,7 @@ def _eliminate(
         the K separators: the clique that united it with others or -1, begin and length of its list, its weight; lists.
     """
     n, elements, ordered = len(weight), len(pointer) - 1, len(given) > 0
-    start, length, taken = filled(elements + n, 0), filled(elements + n, 0), filled(elements + n, -1)
+    start, length, absorber = filled(elements + n, 0), filled(elements + n, 0), filled(elements + n, -1)
     outside, seen_by, heavy = filled(elements + n, 0), filled(elements + n, -1), filled(elements + n, 0)
     later, mark, own = filled(elements + n, 0), filled(elements + n, 0), filled(n + 1, 0)
     for e in range(elements):
@@ -242,7 +242,7 @@ def _eliminate(
         while listed == 0:
             now, lowest = now + 1, 0
             listed = _begin_stage(
-                now, stage, size, taken, start, length, lists, elements + made, own, count, touching, later, degree
+                now, stage, size, absorber, start, length, lists, elements + made, own, count, touching, later, degree
             )
             for i in range(n):
                 if stage[i] == now and not ordered:
@@ -268,7 +268,7 @@ def _eliminate(
         seen[p] = made
         for q in range(own[p], own[p] + count[p]):
             e = touching[q]
-            taken[e] = made
+            absorber[e] = made
             for k in range(start[e], start[e] + length[e]):
                 i = lists[k]
                 if gone[i] == 0 and seen[i] != made:
@@ -284,7 +284,7 @@ def _eliminate(
             i = lists[k]
             for q in range(own[i], own[i] + (count[i] if stage[i] == now else 0)):
                 e = touching[q]
-                if taken[e] < 0:
+                if absorber[e] < 0:
                     if seen_by[e] != made:
                         seen_by[e], outside[e] = made, heavy[e] - later[e]
                     outside[e] -= size[i]
@@ -295,14 +295,14 @@ def _eliminate(
                 put, beyond = own[i], 0
                 for q in range(own[i], own[i] + count[i]):
                     e = touching[q]
-                    if taken[e] >= 0:
+                    if absorber[e] >= 0:
                         continue
                     if (
                         not ordered
                         and outside[e] == 0
                         and (later[e] == 0 or _within(start[e], start[e] + length[e], lists, seen, made, gone))
                     ):
-                        taken[e] = made  # a part of the new element
+                        absorber[e] = made  # a part of the new element
                     else:
                         touching[put] = e
                         put += 1
@@ -339,7 +339,7 @@ def _eliminate(
         start[new], length[new], heavy[new] = begin, free - begin, united
         made += 1
         first[made] = done
-    return pivots, first[: made + 1], taken, start, length, heavy, lists
+    return pivots, first[: made + 1], absorber, start, length, heavy, lists
 
 
 @compiled

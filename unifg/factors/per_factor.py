@@ -178,8 +178,8 @@ def _differences(
         for sign, target in (("", "ahead"), ("-", "behind")):
             yield f"            step[d] = {sign}h"
             if kind == OTHER:
-                here, there = (f"vector({array}, {start}, {stored})" for array in ("v", "moved"))
-                yield f"            {movers[start][0]}({here}, vector(step, 0, {dim}), {there})"
+                origin, destination = (f"vector({array}, {start}, {stored})" for array in ("v", "moved"))
+                yield f"            {movers[start][0]}({origin}, vector(step, 0, {dim}), {destination})"
             else:
                 yield f"            move(v, {kind}, {start}, {dim}, step, 0, moved)"
             yield f"            function({call.format('moved')}, {target})"

@@ -30,6 +30,7 @@ from unifg.lie.so3 import (
     coefficients,
     half_log,
     half_turn,
+    require_all,
     rotate,
     write,
     write_matrix,
@@ -59,10 +60,7 @@ def exp(d: Array, out: Array) -> None:
     wx, wy, wz = d[3], d[4], d[5]
     theta, cosine, s = half_turn(wx, wy, wz)
     c = c_value(theta, 2.0 * s * cosine * theta)
-    px, py, pz = turned(2.0 * s * s, c, wx, wy, wz, d[0], d[1], d[2])
-    out[0] = px
-    out[1] = py
-    out[2] = pz
+    out[0], out[1], out[2] = turned(2.0 * s * s, c, wx, wy, wz, d[0], d[1], d[2])
     write(cosine, s * wx, s * wy, s * wz, out, 3)
 
 
@@ -71,10 +69,7 @@ def write_log(w: float, x: float, y: float, z: float, px: float, py: float, pz: 
     """Write the logarithm of the pose with this quaternion and position, ``(Jl(omega)^-1 p, omega)``."""
     factor, half, g = half_log(w, x, y, z)
     wx, wy, wz = factor * x, factor * y, factor * z
-    vx, vy, vz = turned(-0.5, k_value(4.0 * half * half, g), wx, wy, wz, px, py, pz)
-    out[0] = vx
-    out[1] = vy
-    out[2] = vz
+    out[0], out[1], out[2] = turned(-0.5, k_value(4.0 * half * half, g), wx, wy, wz, px, py, pz)
     out[3] = wx
     out[4] = wy
     out[5] = wz
@@ -114,10 +109,7 @@ def between(x: Array, y: Array, out: Array) -> None:
     """``x^-1 y``."""
     w, a, b, c = x[3], -x[4], -x[5], -x[6]
     v, e, f, g = y[3], y[4], y[5], y[6]
-    px, py, pz = rotate(w, a, b, c, y[0] - x[0], y[1] - x[1], y[2] - x[2])
-    out[0] = px
-    out[1] = py
-    out[2] = pz
+    out[0], out[1], out[2] = rotate(w, a, b, c, y[0] - x[0], y[1] - x[1], y[2] - x[2])
     write_product(w, a, b, c, v, e, f, g, out, 3)
 
 
@@ -321,10 +313,10 @@ class SE3Group(CompiledGroup, methods=globals()):
         m = np.asarray(m, dtype=np.float64)
         if m.shape[-2:] != (4, 4):
             raise UnifgError(f"SE3.from_matrix takes (..., 4, 4) matrices; got shape {m.shape}")
-        bad = ~(np.abs(m[..., 3, :] - (0.0, 0.0, 0.0, 1.0)) < 1e-9).all(axis=-1)
-        if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise UnifgError(f"matrix {index or ''} ends with the row {m[index][3].tolist()}: it must be 0, 0, 0, 1")
+        require_all(
+            (np.abs(m[..., 3, :] - (0.0, 0.0, 0.0, 1.0)) < 1e-9).all(axis=-1),
+            lambda index, at: f"matrix {at} ends with the row {m[index][3].tolist()}: it must be 0, 0, 0, 1",
+        )
         return self.from_parts(m[..., :3, 3], SO3.from_matrix(m[..., :3, :3]))
 
     def to_matrix(self, x: ArrayLike, /) -> Array:

@@ -14,7 +14,8 @@ logarithm reads the half angle from ``atan2(|v|, w)``, which is accurate at ever
 from __future__ import annotations
 
 import math
-from typing import Literal, TypeAlias
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -186,10 +187,7 @@ def local(x: Array, y: Array, out: Array) -> None:
 @compiled
 def act(x: Array, p: Array, out: Array) -> None:
     """Rotate a (3,) point."""
-    px, py, pz = rotate(x[0], x[1], x[2], x[3], p[0], p[1], p[2])
-    out[0] = px
-    out[1] = py
-    out[2] = pz
+    out[0], out[1], out[2] = rotate(x[0], x[1], x[2], x[3], p[0], p[1], p[2])
 
 
 @compiled
@@ -313,6 +311,13 @@ _normalise, _from_matrix = over_one(normalise, 4, 4), over_one(from_matrix, 9, 4
 _from_rpy, _to_rpy = over_one(from_rpy, 3, 4), over_one(to_rpy, 4, 3)
 
 
+def require_all(good: BoolArray | np.bool_, message: Callable[[Any, str], str]) -> None:
+    """Raise where something does not hold, with what ``message`` makes of the first index and of its text."""
+    if not good.all():
+        index = tuple(int(i) for i in np.argwhere(~good)[0])
+        raise UnifgError(message(index, f"{index or ''}"))
+
+
 def _reordered(quaternion: ArrayLike, order: Order, by: int) -> Array:
     """(..., 4) with the scalar rolled from last to first (by 1) or back (by -1), if it is last in ``order``."""
     q = np.asarray(quaternion, dtype=np.float64)
@@ -353,12 +358,10 @@ class SO3Group(CompiledGroup, methods=globals()):
         """
         q = _reordered(quaternion, order, 1)
         result = _normalise(q)
-        bad = ~np.isfinite(result).all(axis=-1)
-        if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise UnifgError(
-                f"quaternion {index or ''} {q[index]} names no rotation: give one of non-zero, finite norm"
-            )
+        require_all(
+            np.isfinite(result).all(axis=-1),
+            lambda index, at: f"quaternion {at} {q[index]} names no rotation: give one of non-zero, finite norm",
+        )
         return result
 
     def from_matrix(self, m: ArrayLike, /) -> Array:
@@ -374,19 +377,19 @@ class SO3Group(CompiledGroup, methods=globals()):
         m = np.asarray(m, dtype=np.float64)
         if m.shape[-2:] != (3, 3):
             raise UnifgError(f"SO3.from_matrix takes (..., 3, 3) matrices; got shape {m.shape}")
-        bad = ~np.isfinite(m).all(axis=(-2, -1))
-        if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise UnifgError(f"matrix {index or ''} is not finite, so no rotation is near it: {m[index].tolist()}")
+        require_all(
+            np.isfinite(m).all(axis=(-2, -1)),
+            lambda index, at: f"matrix {at} is not finite, so no rotation is near it: {m[index].tolist()}",
+        )
         u, scale, vt = np.linalg.svd(m)
         sign = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0.0, -1.0, 1.0)
-        bad = ~(scale[..., 1] + sign * scale[..., 2] > AMBIGUOUS * scale[..., 0])
-        if bad.any():
-            index = tuple(int(i) for i in np.argwhere(bad)[0])
-            raise UnifgError(
-                f"matrix {index or ''} has singular values {scale[index].tolist()} and no single nearest rotation: "
-                "it fixes fewer than two directions"
-            )
+        require_all(
+            scale[..., 1] + sign * scale[..., 2] > AMBIGUOUS * scale[..., 0],
+            lambda index, at: (
+                f"matrix {at} has singular values {scale[index].tolist()} and no single nearest rotation: it fixes "
+                "fewer than two directions"
+            ),
+        )
         u[..., :, 2] *= sign[..., None]
         rotation: Array = u @ vt
         return _from_matrix(rotation.reshape(*rotation.shape[:-2], 9))

@@ -7,7 +7,7 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, cached_property
 from itertools import pairwise
 from time import perf_counter
 from typing import Any, NamedTuple, TypeVar, cast
@@ -122,7 +122,6 @@ class CompiledProblem:
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
         for term, rows in zip(self.constraint_terms, self.slices, strict=True):
             self.bound_rows[rows] = term.is_bound
-        self._hessian: tuple[Symmetric, IntArray] | None = None
         self.retraction = Retraction(self.columns, graph.fixes)
         self._read = GuessReader(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
@@ -162,12 +161,12 @@ class CompiledProblem:
     @property
     def hessian(self) -> Symmetric:
         """Pattern of the Gauss-Newton Hessian of the objective alone."""
-        return self._objective()[0]
+        return self._objective[0]
 
     @property
     def objective_places(self) -> IntArray:
         """Positions of the entries of ``hessian`` in ``normal``."""
-        return self._objective()[1]
+        return self._objective[1]
 
     # ---------------------------------------------------------------- data and values
 
@@ -281,12 +280,10 @@ class CompiledProblem:
         step = np.random.default_rng(seed).uniform(-1.0, 1.0, self.size) if slopes else np.ones(self.size)
         direction = np.zeros(self.columns.width)
         direction[self.columns.free] = step
-        moved: dict[float, Values] = {}
 
+        @cache
         def move(length: float) -> Values:
-            if length not in moved:
-                moved[length] = self.retract(values, length * step)
-            return moved[length]
+            return self.retract(values, length * step)
 
         for verification in self.verifications:
             term = verification.term
@@ -577,17 +574,14 @@ class CompiledProblem:
                     second.append(np.maximum(a, b))
         return Symmetric.of_blocks(starts, np.concatenate(first), np.concatenate(second))
 
+    @cached_property
     def _objective(self) -> tuple[Symmetric, IntArray]:
         """Pattern of the objective's Hessian and where its entries stand in ``normal``."""
-        if self._hessian is None:
-            if not self.constraint_terms:
-                self._hessian = self.normal, np.arange(self.normal.nnz)
-            else:
-                variable, starts = self.columns.nodes()
-                pattern = self._pattern(self.cost_terms + self.scalar_terms, variable, starts)
-                columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
-                self._hessian = pattern, self.normal.positions(pattern.indices, columns)
-        return self._hessian
+        if not self.constraint_terms:
+            return self.normal, np.arange(self.normal.nnz)
+        pattern = self._pattern(self.cost_terms + self.scalar_terms, *self.columns.nodes())
+        columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
+        return pattern, self.normal.positions(pattern.indices, columns)
 
 
 def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:

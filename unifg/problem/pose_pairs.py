@@ -42,22 +42,22 @@ def _whitening(dim: int) -> Whiten:
             entry: its offset.
         """
         for a in range(dim):
-            weights, here = first + a * dim, entry + a * width
+            weights, block_row = first + a * dim, entry + a * width
             own = get(whiteners, weights + a)
             total = own * get(residual, row + a)
             for b in range(a + 1, dim):
                 total += get(whiteners, weights + b) * get(residual, row + b)
             put(residual, row + a, total)
             for c in range(0, full, 4):
-                whitened = times(own, load(jacobian, here + c))
+                whitened = times(own, load(jacobian, block_row + c))
                 for b in range(a + 1, dim):
                     whitened = plus(whitened, get(whiteners, weights + b), load(jacobian, entry + b * width + c))
-                store(jacobian, here + c, whitened)
+                store(jacobian, block_row + c, whitened)
             for c in range(full, width):
-                total = own * get(jacobian, here + c)
+                total = own * get(jacobian, block_row + c)
                 for b in range(a + 1, dim):
                     total += get(whiteners, weights + b) * get(jacobian, entry + b * width + c)
-                put(jacobian, here + c, total)
+                put(jacobian, block_row + c, total)
 
     return whiten
 

@@ -135,7 +135,7 @@ class CompiledTerm:
         self.place: IntArray = np.zeros(0, dtype=np.int64)
         self._shaping, self.data = frozenset(term.shaping), frozenset(term.data)
         self._blocks: dict[int, tuple[int, int]] = {}
-        self._taken = tuple(range(len(term.arguments)))
+        self._inputs = tuple(range(len(term.arguments)))
         self.trace: Trace | None = None
         self._each: tuple[int, ...] | None = None  # arguments that were found to have a row for each factor
         self._changes = 0
@@ -186,18 +186,18 @@ class CompiledTerm:
         why = "it has a search Jacobian" if own.search else ""
         if own.derivatives == "differences":
             why = "as it was asked to be"
-        taken = not why and (not attached or asked)
-        if taken or unclear_places(self._arguments, self.term.rows, self.count):
+        traceable = not why and (not attached or asked)
+        if traceable or unclear_places(self._arguments, self.term.rows, self.count):
             found, reason = find(self.batch, own.function, asked)  # also for how arrays as long as the batch are read
             self._each = None if found is None else found.each
             self._bind_batched(self._batched)
-            if taken:
+            if traceable:
                 self.trace, why = found, reason
         if self.trace is None and attached:
-            return "evaluated by Python, its derivatives attached" + (f": {why}" if taken else "")
+            return "evaluated by Python, its derivatives attached" + (f": {why}" if traceable else "")
         if self.trace is None:
-            return self._by_python(why)
-        self.kernel, self._taken = self.trace.kernel, self.trace.taken
+            return self._said("evaluated by Python", why)
+        self.kernel, self._inputs = self.trace.kernel, self.trace.inputs
         self._jacobian = None if isinstance(self.term, ScalarCost) else self._exact
         return self._traced()
 
@@ -229,9 +229,6 @@ class CompiledTerm:
         logger.info("term '%s' was %s: its derivatives are exact", self.name, how)
         return f"{how}, its derivatives exact"
 
-    def _by_python(self, why: str) -> str:
-        return self._said("evaluated by Python", why)
-
     def _said(self, how: str, why: str) -> str:
         if self.term.residual.derivatives != "differences" and (self.name, why) not in _told:
             _told.add((self.name, why))
@@ -260,11 +257,6 @@ class CompiledTerm:
         """Jacobian of a derived kernel, of the arguments of the function it was derived from."""
         assert self.trace is not None
         return self.trace.kernel.jacobian(*self.trace.arguments(arguments))
-
-    def exact_slopes(self, points: list[Array]) -> list[Array]:
-        """One (n, m, d_k) array per variable argument, by the trace."""
-        assert self.trace is not None
-        return self.trace.kernel.jacobian(*self._for_kernel(points))
 
     @property
     def packed(self) -> Array:
@@ -299,7 +291,7 @@ class CompiledTerm:
         """The first active factor whose exact derivatives are not finite though differences are; None for none."""
         assert self.trace is not None
         with np.errstate(all="ignore"):
-            exact = np.concatenate(self.exact_slopes(points), axis=2)
+            exact = np.concatenate(self.trace.kernel.jacobian(*self._for_kernel(points)), axis=2)
             wrong = ~np.isfinite(self._masked(exact)).all(axis=(1, 2))
             if not wrong.any():
                 return None
@@ -352,12 +344,12 @@ class CompiledTerm:
         if self.term.residual.derivatives == "trace":
             raise GraphError(f"term '{self.name}': cannot be traced: {why}", term=self.name)
         self.trace = self.kernel = self._jacobian = None
-        self._taken = tuple(range(len(self.term.arguments)))
+        self._inputs = tuple(range(len(self.term.arguments)))
         if self.term.residual.rows:
             self._call_single()
             self.route = self._said("compiled by Numba", why)
         else:
-            self.route = self._by_python(why)
+            self.route = self._said("evaluated by Python", why)
         self.differenced = True
         self._bind_parameters(self._data)
 
@@ -539,7 +531,7 @@ class CompiledTerm:
         gather: list[IntArray] = []
         keep: list[int] = []
         sizes, width = [], 0
-        for place, expected in zip(self._taken, self.kernel.arguments, strict=False):
+        for place, expected in zip(self._inputs, self.kernel.arguments, strict=False):
             argument = self.term.arguments[place]
             if isinstance(expected, int | tuple):
                 continue
@@ -598,13 +590,13 @@ class CompiledTerm:
         packed = side_by_side(parameters)
         self.parameter_count = packed.shape[1]
         self.parameter_spread = packed.shape[1] if len(packed) > 1 else 0
-        taken = list(zip(self._taken, kernel.arguments, strict=False))  # others are no arguments of the term
-        places = [k for k, expected in taken if not isinstance(expected, int | tuple)]
+        accepted = list(zip(self._inputs, kernel.arguments, strict=False))  # others are no arguments of the term
+        places = [k for k, expected in accepted if not isinstance(expected, int | tuple)]
         given = {slot: v for slot, (k, v) in enumerate(zip(places, variables, strict=True)) if k not in self._places}
         self._constants = given
         self.parameters = np.concatenate([packed.ravel(), *(array.ravel() for array in given.values())])
         self._packed = self.parameters[: packed.size].reshape(packed.shape)
-        slots = [k for k, expected in taken if isinstance(expected, int | tuple)]
+        slots = [k for k, expected in accepted if isinstance(expected, int | tuple)]
         sizes = [prod(part.shape[1:]) for part in parameters]
         starts = np.cumsum([0, *sizes]).tolist()
         self._blocks = {k: (start, size) for k, start, size in zip(slots, starts, sizes, strict=False) if size}

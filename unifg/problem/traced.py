@@ -135,7 +135,7 @@ class Trace:
 
     Attributes:
         kernel: what was derived.
-        taken: places of the arguments that the kernel takes.
+        inputs: places of the arguments that the kernel takes.
         reached: named arrays of the function that the kernel takes after these.
         reach: what else the function reaches, which is compiled in.
         fixed, free: arrays of the user that are compiled in, or are parameters, and what stood in them.
@@ -146,7 +146,7 @@ class Trace:
     """
 
     kernel: DerivedKernel
-    taken: tuple[int, ...]
+    inputs: tuple[int, ...]
     reached: tuple[Array, ...]
     reach: Captured
     fixed: Contents
@@ -159,7 +159,7 @@ class Trace:
     @property
     def layout(self) -> tuple[Any, ...]:
         """Dependencies of the parameters' layout."""
-        return self.taken, self.kernel.arguments, [array.shape for array in self.reached]
+        return self.inputs, self.kernel.arguments, [array.shape for array in self.reached]
 
     @property
     def constant(self) -> bool:
@@ -184,7 +184,7 @@ class Trace:
 
     def arguments(self, filled: Sequence[Any]) -> list[Any]:
         """Arguments of the kernel, of all arguments of the term."""
-        return [*(filled[place] for place in self.taken), *self.reached]
+        return [*(filled[place] for place in self.inputs), *self.reached]
 
     def differs(self, batch: Batch, points: Sequence[Array], theirs: Array | None = None) -> BoolArray:
         """(n,) for which factors it computes something else than the function, which returns ``theirs``."""
@@ -228,16 +228,13 @@ class Trace:
         return bool((times < 2).all())
 
 
-def find(
-    batch: Batch, function: Callable[..., Any], asked: bool, names: Callable[[str], str] = str
-) -> tuple[Trace | None, str]:
+def find(batch: Batch, function: Callable[..., Any], asked: bool) -> tuple[Trace | None, str]:
     """Trace a function, and compare.
 
     Args:
         batch: the term's function and arguments.
         function: to be traced.
         asked: whether the user insists.
-        names: makes the name of the kernel.
 
     Returns:
         The trace, or None and why there is none.
@@ -329,13 +326,13 @@ def _traced(
     kernel = derived(function, given, reach, rows, batch.scalar, name, not asked, reached, lengths)
     if kernel.rows != batch.size:
         raise TraceError(f"it returns {kernel.rows} rows for one factor and {batch.size} for {batch.count}")
-    taken = tuple(k for k, part in enumerate(given) if not isinstance(part, Fixed))
+    inputs = tuple(k for k, part in enumerate(given) if not isinstance(part, Fixed))
     arrays = {k: a for k, a in enumerate(batch.arguments) if isinstance(a, np.ndarray) and not a.dtype.hasobject}
-    fixed = [array for k, array in arrays.items() if k not in taken]
-    free = [*(array for k, array in arrays.items() if k in taken), *(array for array, _ in reached)]
+    fixed = [array for k, array in arrays.items() if k not in inputs]
+    free = [*(array for k, array in arrays.items() if k in inputs), *(array for array, _ in reached)]
     named = tuple(array for array, _ in reached)
     each = tuple(k for k, part in enumerate(given) if isinstance(part, Each))
-    return Trace(kernel, taken, named, reach, _contents(fixed), _contents(free), each, whole, beyond, lists)
+    return Trace(kernel, inputs, named, reach, _contents(fixed), _contents(free), each, whole, beyond, lists)
 
 
 def _reached_by(
@@ -461,17 +458,17 @@ def _moved(manifold: Manifold, point: Array, step: Array) -> Array:
     """Elements about as far from others as the step says, without compiled functions that would have to be loaded."""
     moved = np.array(point)
     for part, leaf in parts_of(manifold):
-        here = moved[:, part.start : part.start + part.storage]
+        stored = moved[:, part.start : part.start + part.storage]
         along = step[:, part.column : part.column + part.dim]
         if part.kind == OTHER:
-            here[:] = leaf.retract(here, along)
+            stored[:] = leaf.retract(stored, along)
         elif part.kind == TURN:
-            here[:, 1:] += 0.5 * along
-            here *= np.where(here[:, :1] < 0.0, -1.0, 1.0) / np.sqrt((here**2).sum(axis=1, keepdims=True))
+            stored[:, 1:] += 0.5 * along
+            stored *= np.where(stored[:, :1] < 0.0, -1.0, 1.0) / np.sqrt((stored**2).sum(axis=1, keepdims=True))
         else:
-            here += along
+            stored += along
             if part.kind == ANGLE:
-                here -= 2.0 * np.pi * np.rint(here / (2.0 * np.pi))
+                stored -= 2.0 * np.pi * np.rint(stored / (2.0 * np.pi))
     return moved
 
 
@@ -485,8 +482,7 @@ def _changed(contents: Contents) -> bool:
 
 def reach_of_value(value: Any) -> Any:
     """Key of a constant; None if there is none."""
-    reach = captured_by(lambda: value)
-    return reach.key
+    return captured_by(lambda: value).key
 
 
 def _unequal(a: Array, b: Array, allowed: Any) -> BoolArray:

@@ -131,13 +131,13 @@ class Types:
         self, key: Key, function: AnyResidual, arguments: tuple[Any, ...], staged: Staged, trace: Trace | None
     ) -> None:
         """Keep what the next factor of its kind needs."""
-        taken = tuple(range(len(arguments))) if trace is None else trace.taken
-        variables = tuple([place for place in taken if isinstance(arguments[place], Selection)])
+        inputs = tuple(range(len(arguments))) if trace is None else trace.inputs
+        variables = tuple([place for place in inputs if isinstance(arguments[place], Selection)])
         if len(variables) != len(staged.families) or (trace is not None and _compiled_in(trace, arguments)):
             return
         parameters, quaternions, at = [], [], 0
         elements = elements_of(complete(function, arguments))
-        for place in taken:
+        for place in inputs:
             if place not in variables:
                 found = quaternions_of(elements[place]) if place in elements else []
                 if found is None:
@@ -317,7 +317,7 @@ def _by_itself(arguments: Sequence[Any]) -> tuple[Any, ...]:
 
 def _compiled_in(trace: Trace, arguments: Sequence[Any]) -> bool:
     """Test whether floats among the arguments are part of a trace and not its parameters."""
-    others = [argument for place, argument in enumerate(arguments) if place not in trace.taken]
+    others = [argument for place, argument in enumerate(arguments) if place not in trace.inputs]
     return any(isinstance(a, Data) or np.asarray(a).dtype.kind == "f" for a in others)
 
 

@@ -26,22 +26,20 @@ def enough(state: State, variable: int) -> bool:
     for kind in np.unique(state.factors["type"][factors]).tolist():
         own = factors[state.factors["type"][factors] == kind]
         slots = int(state.types["slots"][kind])
-        first = state.factors["variables"][own]
-        total = _tie(ties, total, [state.lists[at : at + slots] for at in first.tolist()])
+        total = _tie(ties, total, [state.lists[at : at + slots] for at in state.factors["variables"][own].tolist()])
         rows.append(np.full(len(own), int(state.types["rows"][kind])))
         single.append(np.full(len(own), slots == 1))
     cliques = state.cliques[: int(counters["clique_end"])]
     priors = np.flatnonzero((cliques["prior"] == 1) & (cliques["filled"] == 1))
-    begin, pivots, members = (cliques[name][priors].tolist() for name in ("list", "pivots", "count"))
-    kept = [state.lists[at + gone : at + n] for at, gone, n in zip(begin, pivots, members, strict=True)]
-    total = _tie(ties, total, kept)
+    places = zip(*(cliques[name][priors].tolist() for name in ("list", "pivots", "count")), strict=True)
+    total = _tie(ties, total, [state.lists[at + gone : at + n] for at, gone, n in places])
     rows.append((cliques["size"] - cliques["pivot_rows"])[priors].astype(np.int64))
     single.append(np.ones(len(priors), dtype=bool))  # a prior speaks of where its variables are
     pairs = np.concatenate(ties)
     label = components(count + total, pairs[:, 0] + count, np.ascontiguousarray(pairs[:, 1]))
-    here = label[variable]
-    alive = variables["alive"][:count].astype(bool) & (label[:count] == here)
-    spoken = label[count:] == here
+    component = label[variable]
+    alive = variables["alive"][:count].astype(bool) & (label[:count] == component)
+    spoken = label[count:] == component
     unknowns = int(variables["dim"][:count][alive].sum())
     return bool(np.concatenate(rows)[spoken].sum() >= unknowns and np.concatenate(single)[spoken].any())
 

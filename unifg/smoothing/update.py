@@ -114,11 +114,11 @@ def renew(
     counters.largest, counters.eliminated = largest, n
     # What each clique takes in.
     elements = len(home)
-    taken, following = filled(made, -1), filled(elements, -1)
+    leading, following = filled(made, -1), filled(elements, -1)
     for e in range(elements):
         if home[e] >= 0:
-            following[e] = taken[home[e]]
-            taken[home[e]] = e
+            following[e] = leading[home[e]]
+            leading[home[e]] = e
     place, slot_of, room = np.empty(n, np.int64), filled(made, -1), max(largest, longest) + 8
     relative, runs, x, pivots, signs = (
         np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room), np.empty(room), np.empty(room),
@@ -138,7 +138,7 @@ def renew(
         begin_clique(
             memory, c, members, order, first[k], first[k + 1], separator, bounds[k], bounds[k + 1], rows[k], place,
         )  # fmt: skip
-        e = taken[k]
+        e = leading[k]
         while e >= 0:
             if e < len(orphans):
                 child = orphans[e]

@@ -13,7 +13,7 @@ read from a table) zero. Remainders move with what is divided.
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 
 from unifg.factors.autodiff.operations import GROUPED, STEADY, Op
@@ -33,7 +33,7 @@ def jacobian(tape: Tape, outputs: Sequence[int], width: int) -> dict[tuple[int, 
     swept = (_forwards(tape, outputs, width), _backwards(tape, outputs))
     if len(outputs) == 0:
         return {}
-    lengths = [len(_rest(tape, list(entries.values()))) for entries in swept]
+    lengths = [len(tape.at_rest(list(entries.values()))[0]) for entries in swept]
     return swept[0] if lengths[0] < lengths[1] else swept[1]
 
 
@@ -145,7 +145,7 @@ def _waists(tape: Tape, outputs: Sequence[int]) -> _Waists:
             order.append(i)
             by[i] = {i: tape.one}
         elif op > Op.TANGENT and op not in _FLAT:
-            found = _chosen(tape, i, by) if op == Op.SELECT else _chained(tape, i, by)
+            found = _moving(tape, i, by)
             if len(found) > WAIST:
                 order.append(i)
                 slopes[i], found = found, {i: tape.one}
@@ -159,15 +159,24 @@ def _between(tape: Tape, i: int, slopes: dict[int, int]) -> dict[int, dict[int, 
 
     They are all that the slopes move with: a slope is stated by what the waist takes, and by the waist itself.
     """
-    by = {i: slopes}
-    for j in tape.live(slopes.values(), slopes):
-        if j in slopes:
-            by[j] = {j: tape.one}
-        elif tape.op[j] > Op.TANGENT and tape.op[j] not in _FLAT and j != i:
-            found = _chosen(tape, j, by) if tape.op[j] == Op.SELECT else _chained(tape, j, by)
-            if found:
-                by[j] = found
+    return _swept(tape, tape.live(slopes.values(), slopes), slopes, {i: slopes})
+
+
+def _swept(
+    tape: Tape, nodes: Sequence[int], begin: Container[int], by: dict[int, dict[int, int]]
+) -> dict[int, dict[int, int]]:
+    """Derivatives of nodes by those that ``begin`` holds; ``by`` has what is known."""
+    for i in nodes:
+        if i in begin:
+            by[i] = {i: tape.one}
+        elif tape.op[i] > Op.TANGENT and tape.op[i] not in _FLAT and i not in by and (found := _moving(tape, i, by)):
+            by[i] = found
     return by
+
+
+def _moving(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int]:
+    """Derivatives of a node, from those of its arguments."""
+    return _chosen(tape, i, by) if tape.op[i] == Op.SELECT else _chained(tape, i, by)
 
 
 def _chosen(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int]:
@@ -190,14 +199,7 @@ def _chained(tape: Tape, i: int, by: dict[int, dict[int, int]]) -> dict[int, int
 
 def derivatives_by(tape: Tape, outputs: Sequence[int], leaf: int) -> list[int]:
     """Derivative of every output by one leaf."""
-    by = dict[int, dict[int, int]]()
-    for i in tape.live(outputs):
-        if i == leaf:
-            by[i] = {i: tape.one}
-        elif tape.op[i] > Op.TANGENT and tape.op[i] not in _FLAT:
-            found = _chosen(tape, i, by) if tape.op[i] == Op.SELECT else _chained(tape, i, by)
-            if found:
-                by[i] = found
+    by = _swept(tape, tape.live(outputs), (leaf,), {})
     return [by.get(output, {}).get(leaf, tape.zero) for output in outputs]
 
 
@@ -232,8 +234,9 @@ def _backwards(tape: Tape, outputs: Sequence[int]) -> dict[tuple[int, int], int]
     waists = _waists(tape, outputs)
     found = dict[tuple[int, int], int]()
     for row, slopes in enumerate(waists.outputs):
-        for k, node in _by_tangent(tape, _adjoints(tape, waists, slopes)).items():
-            found[row, k] = node
+        for i, node in _adjoints(tape, waists, slopes).items():
+            if tape.op[i] == Op.TANGENT and node != tape.zero:
+                found[row, tape.a[i]] = node
     return found
 
 
@@ -246,15 +249,6 @@ def _adjoints(tape: Tape, waists: _Waists, slopes: dict[int, int]) -> dict[int, 
         for waist, slope in waists.slopes[i].items():
             adjoint[waist] = tape.add(adjoint.get(waist, tape.zero), tape.scaled(adjoint[i], slope))
     return adjoint
-
-
-def _by_tangent(tape: Tape, adjoint: dict[int, int]) -> dict[int, int]:
-    return {tape.a[i]: node for i, node in adjoint.items() if tape.op[i] == Op.TANGENT and node != tape.zero}
-
-
-def _rest(tape: Tape, outputs: list[int]) -> Tape:
-    """The outputs where all tangent coordinates are zero."""
-    return tape.at_rest(outputs)[0]
 
 
 def _partials(tape: Tape, i: int) -> Partials:
@@ -291,7 +285,7 @@ def _partials(tape: Tape, i: int) -> Partials:
     if op in (Op.MINIMUM, Op.MAXIMUM):  # of equals the first moves
         first = t.apply(Op.LESS_EQUAL, *((a, b) if op == Op.MINIMUM else (b, a)))
         return [(a, t.select(first, one, t.zero)), (b, t.select(first, t.zero, one))]
-    slope = _slope(tape, op, i, a)
+    slope = _SLOPES[op](tape, i, a)
     return [] if slope == t.zero else [(a, slope)]
 
 
@@ -329,44 +323,36 @@ def _squares(t: Tape, a: int) -> bool:
     return t.op[a] == Op.MULTIPLY and t.a[a] == t.b[a]
 
 
-def _slope(t: Tape, op: int, i: int, a: int) -> int:
-    """Derivative of a function of one argument; ``i`` is its value."""
-    one = t.one
-    if op == Op.SQRT:
-        slope = t.divide(t.constant(0.5), i)
-        return t.select(t.apply(Op.EQUAL, i, t.zero), t.zero, slope) if _squares(t, a) else slope
-    if op == Op.SIN:
-        return t.apply(Op.COS, a)
-    if op == Op.COS:
-        return t.negate(t.apply(Op.SIN, a))
-    if op == Op.TAN:
-        return t.add(one, t.multiply(i, i))
-    if op in (Op.ARCSIN, Op.ARCCOS):
-        slope = t.divide(one, t.apply(Op.SQRT, t.multiply(t.subtract(one, a), t.add(one, a))))
-        return slope if op == Op.ARCSIN else t.negate(slope)
-    if op == Op.ARCTAN:
-        return t.divide(one, t.add(one, t.multiply(a, a)))
-    if op == Op.SINH:
-        return t.apply(Op.COSH, a)
-    if op == Op.COSH:
-        return t.apply(Op.SINH, a)
-    if op == Op.TANH:
-        return t.subtract(one, t.multiply(i, i))
-    if op == Op.ARCSINH:
-        return t.divide(one, t.apply(Op.SQRT, t.add(one, t.multiply(a, a))))
-    if op == Op.ARCCOSH:
-        return t.divide(one, t.apply(Op.SQRT, t.multiply(t.subtract(a, one), t.add(a, one))))
-    if op == Op.ARCTANH:
-        return t.divide(one, t.multiply(t.subtract(one, a), t.add(one, a)))
-    if op == Op.ERF:
-        return t.multiply(t.constant(2.0 / math.sqrt(math.pi)), t.apply(Op.EXP, t.negate(t.multiply(a, a))))
-    if op == Op.EXP:
-        return i
-    if op == Op.EXPM1:
-        return t.add(i, one)
-    if op == Op.LOG:
-        return t.divide(one, a)
-    if op == Op.LOG1P:
-        return t.divide(one, t.add(one, a))
-    assert op == Op.ABSOLUTE, Op(op).name
-    return t.apply(Op.SIGN, a)
+def _root_slope(t: Tape, i: int, a: int) -> int:
+    slope = t.divide(t.constant(0.5), i)
+    return t.select(t.apply(Op.EQUAL, i, t.zero), t.zero, slope) if _squares(t, a) else slope
+
+
+def _arcsine_slope(t: Tape, i: int, a: int) -> int:
+    return t.divide(t.one, t.apply(Op.SQRT, t.multiply(t.subtract(t.one, a), t.add(t.one, a))))
+
+
+_SLOPES: dict[int, Callable[[Tape, int, int], int]] = {
+    Op.SQRT: _root_slope,
+    Op.SIN: lambda t, i, a: t.apply(Op.COS, a),
+    Op.COS: lambda t, i, a: t.negate(t.apply(Op.SIN, a)),
+    Op.TAN: lambda t, i, a: t.add(t.one, t.multiply(i, i)),
+    Op.ARCSIN: _arcsine_slope,
+    Op.ARCCOS: lambda t, i, a: t.negate(_arcsine_slope(t, i, a)),
+    Op.ARCTAN: lambda t, i, a: t.divide(t.one, t.add(t.one, t.multiply(a, a))),
+    Op.SINH: lambda t, i, a: t.apply(Op.COSH, a),
+    Op.COSH: lambda t, i, a: t.apply(Op.SINH, a),
+    Op.TANH: lambda t, i, a: t.subtract(t.one, t.multiply(i, i)),
+    Op.ARCSINH: lambda t, i, a: t.divide(t.one, t.apply(Op.SQRT, t.add(t.one, t.multiply(a, a)))),
+    Op.ARCCOSH: lambda t, i, a: t.divide(t.one, t.apply(Op.SQRT, t.multiply(t.subtract(a, t.one), t.add(a, t.one)))),
+    Op.ARCTANH: lambda t, i, a: t.divide(t.one, t.multiply(t.subtract(t.one, a), t.add(t.one, a))),
+    Op.ERF: lambda t, i, a: t.multiply(
+        t.constant(2.0 / math.sqrt(math.pi)), t.apply(Op.EXP, t.negate(t.multiply(a, a)))
+    ),
+    Op.EXP: lambda t, i, a: i,
+    Op.EXPM1: lambda t, i, a: t.add(i, t.one),
+    Op.LOG: lambda t, i, a: t.divide(t.one, a),
+    Op.LOG1P: lambda t, i, a: t.divide(t.one, t.add(t.one, a)),
+    Op.ABSOLUTE: lambda t, i, a: t.apply(Op.SIGN, a),
+}
+"""Derivative of each function of one argument ``a``; ``i`` is its value."""

@@ -11,7 +11,7 @@ import functools
 import hashlib
 import sys
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from enum import Enum
 from types import BuiltinFunctionType, CellType, CodeType, FunctionType, MethodType, ModuleType, SimpleNamespace
 from typing import Any
@@ -35,6 +35,35 @@ _MISSING = object()
 _PLAIN = (bool, int, float, complex, str, bytes, type(None), type(Ellipsis), range)
 
 
+@dataclass
+class _Watched:
+    """Values that a function reaches, as they are when it is looked at."""
+
+    cells: list[tuple[CellType, Any]] = field(default_factory=list)
+    names: list[tuple[Mapping[str, Any], str, Any]] = field(default_factory=list)
+    arrays: list[tuple[Array, bytes]] = field(default_factory=list)
+    functions: list[tuple[FunctionType, tuple[Any, ...]]] = field(default_factory=list)
+    containers: list[tuple[Any, tuple[Any, ...]]] = field(default_factory=list)
+
+    @property
+    def changed(self) -> bool:
+        """True if a name means something else by now, or an array holds other numbers."""
+        for cell, value in self.cells:
+            if _inside(cell) is not value:
+                return True
+        for names, name, value in self.names:
+            if names.get(name, _MISSING) is not value:
+                return True
+        for function, written in self.functions:
+            if any(now is not before for now, before in zip(_written(function), written, strict=True)):
+                return True
+        for container, entries in self.containers:
+            present = entries_of(container)
+            if len(present) != len(entries) or any(now is not kept for now, kept in zip(present, entries, strict=True)):
+                return True
+        return any(array.tobytes() != content for array, content in self.arrays)
+
+
 @dataclass(frozen=True, eq=False)
 class Captured:
     """Captured variables of a function.
@@ -52,16 +81,11 @@ class Captured:
     size: int
     named: tuple[Array, ...]
     attributes: frozenset[str]
-    _cells: tuple[tuple[CellType, Any], ...]
-    _names: tuple[tuple[Mapping[str, Any], str, Any], ...]
-    _arrays: tuple[tuple[Array, bytes], ...]
-    _functions: tuple[tuple[FunctionType, tuple[Any, ...]], ...]
-    _containers: tuple[tuple[Any, tuple[Any, ...]], ...]
-    _elsewhere: bool = False
+    _watched: _Watched | None
 
     def __reduce__(self) -> tuple[Any, ...]:
         """In another process names mean what they mean there: look at everything anew."""
-        return Captured, (None, self.refusal, self.size, (), self.attributes, (), (), (), (), (), True)
+        return Captured, (None, self.refusal, self.size, (), self.attributes, None)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Captured:
         """A copy watches the same names."""
@@ -70,28 +94,12 @@ class Captured:
     @property
     def changed(self) -> bool:
         """True if a name means something else by now, or an array holds other numbers."""
-        if self._elsewhere:
-            return True
-        for cell, value in self._cells:
-            if _inside(cell) is not value:
-                return True
-        for names, name, value in self._names:
-            if names.get(name, _MISSING) is not value:
-                return True
-        for function, written in self._functions:
-            if any(now is not before for now, before in zip(_written(function), written, strict=True)):
-                return True
-        for container, entries in self._containers:
-            present = entries_of(container)
-            if len(present) != len(entries) or any(now is not kept for now, kept in zip(present, entries, strict=True)):
-                return True
-        return any(array.tobytes() != content for array, content in self._arrays)
+        return self._watched is None or self._watched.changed
 
     @property
     def fixed(self) -> bool:
         """True if there is nothing that could change."""
-        watched = self._cells or self._names or self._arrays or self._functions or self._containers
-        return not (watched or self._elsewhere)
+        return self._watched is not None and not any(vars(self._watched).values())
 
 
 def captured_by(
@@ -116,11 +124,7 @@ def captured_by(
         walk.size,
         tuple(walk.named.values()),
         walk.attributes,
-        tuple(walk.cells),
-        tuple(walk.names),
-        tuple(walk.arrays),
-        tuple(walk.functions),
-        tuple(walk.containers),
+        walk.watched,
     )
 
 
@@ -132,11 +136,7 @@ class _Walk:
         self.named: dict[int, Array] = {}
         self.refusal = ""
         self.size = 0
-        self.cells: list[tuple[CellType, Any]] = []
-        self.names: list[tuple[Mapping[str, Any], str, Any]] = []
-        self.arrays: list[tuple[Array, bytes]] = []
-        self.functions: list[tuple[FunctionType, tuple[Any, ...]]] = []
-        self.containers: list[tuple[Any, tuple[Any, ...]]] = []
+        self.watched = _Watched()
         self._seen: dict[int, int] = {}
         self._attributes = set(attributes)
         self._asked = len(attributes)
@@ -227,7 +227,7 @@ class _Walk:
             return "seen", self._seen[id(value)]
         self._seen[id(value)] = len(self._seen)
         entries = entries_of(value)
-        self.containers.append((value, entries))
+        self.watched.containers.append((value, entries))
         return type(value).__name__, tuple(self.named_value(entry, f"an entry of {where}") for entry in entries)
 
     def _instance(self, value: Any, where: str) -> Hashable:
@@ -248,7 +248,7 @@ class _Walk:
                 continue
             for owner in owners:  # also those further up, which super() calls
                 if name in vars(owner):
-                    self.names += [(own, name, _MISSING), (vars(owner), name, vars(owner)[name])]
+                    self.watched.names += [(own, name, _MISSING), (vars(owner), name, vars(owner)[name])]
                     parts.append((owner, name, self._of_class(vars(owner)[name], f"{where}.{name}")))
         return tuple(parts)
 
@@ -268,7 +268,7 @@ class _Walk:
             self.refuse(f"{where} is {_kind(array)}")
             return id(array)
         content = array.tobytes()
-        self.arrays.append((array, content))
+        self.watched.arrays.append((array, content))
         self.size += array.size
         return array.dtype.str, array.shape, hashlib.blake2b(content, digest_size=16).digest()
 
@@ -286,7 +286,7 @@ class _Walk:
     def _named(self, names: dict[str, Any], name: str, prefix: str = "") -> Hashable:
         value = names[name]
         if not (isinstance(value, ModuleType) and _trusted(value.__name__)):
-            self.names.append((names, name, value))
+            self.watched.names.append((names, name, value))
         return name, self.named_value(value, f"'{prefix}{name}'")
 
     def _function(self, function: Any) -> Hashable:
@@ -298,13 +298,13 @@ class _Walk:
         seen = _scanned(code)
         parts: list[Hashable] = [code]
         if own:
-            self.functions.append((python, _written(python)))
+            self.watched.functions.append((python, _written(python)))
             if seen.trouble:
                 self.refuse(f"{seen.trouble}")
             self._attributes |= seen.attributes
         for name, cell in zip(code.co_freevars, python.__closure__ or (), strict=True):
             value = _inside(cell)
-            self.cells.append((cell, value))
+            self.watched.cells.append((cell, value))
             if name == "__class__":  # for super()
                 parts.append(value)
                 continue

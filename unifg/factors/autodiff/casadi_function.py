@@ -66,19 +66,19 @@ def from_casadi(function: Any) -> Residual:
     lines.append("    with np.errstate(all='ignore'):")
     for k in range(scalar.n_instructions()):
         op = names.get(scalar.instruction_id(k), str(scalar.instruction_id(k)))
-        taken, given = scalar.instruction_input(k), scalar.instruction_output(k)
+        operands, given = scalar.instruction_input(k), scalar.instruction_output(k)
         if op == "CONST":
             value = float(scalar.instruction_constant(k))
             lines.append(
                 f"        w{given[0]} = {value!r}" if np.isfinite(value) else f"        w{given[0]} = np.{value}"
             )
         elif op == "INPUT":
-            row, column = places[taken[0]][taken[1]]
-            lines.append(f"        w{given[0]} = x{taken[0]}[:, {row}, {column}]")
+            row, column = places[operands[0]][operands[1]]
+            lines.append(f"        w{given[0]} = x{operands[0]}[:, {row}, {column}]")
         elif op == "OUTPUT":
-            lines.append(f"        r[:, {rows[given[1]]}] = w{taken[0]}")
+            lines.append(f"        r[:, {rows[given[1]]}] = w{operands[0]}")
         elif op in written:
-            lines.append(f"        w{given[0]} = {written[op].format(*(f'w{i}' for i in taken))}")
+            lines.append(f"        w{given[0]} = {written[op].format(*(f'w{i}' for i in operands))}")
         else:
             raise ModelError(f"the CasADi function '{name}' contains the instruction {op}, which is not known here")
     from scipy.special import erf  # not before a function is written: it takes a tenth of a second to load

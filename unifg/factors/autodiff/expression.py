@@ -134,9 +134,9 @@ class Expression:
         inner = op > Op.TANGENT
         digest = hashlib.sha256(op.tobytes())
         for column in (tape.a, tape.b, tape.c):
-            taken: IntArray = np.array(column[:end], dtype=np.int64)[live]
-            taken[inner] = place[taken[inner]]
-            digest.update(taken.tobytes())
+            operands: IntArray = np.array(column[:end], dtype=np.int64)[live]
+            operands[inner] = place[operands[inner]]
+            digest.update(operands.tobytes())
         digest.update(np.array(tape.value[:end], dtype=np.float64)[live].tobytes())
         digest.update(repr((place[list(self.rows)].tolist(), self.width, tape.size)).encode())
         return digest.hexdigest()

@@ -455,26 +455,30 @@ def _by_kind(number: Op, truth: Op) -> Callable[..., Any]:
     return lambda a, b: _apply(truth if is_truth(a) and is_truth(b) else number, a, b)
 
 
+def _all_truths(arguments: tuple[Any, ...]) -> bool:
+    return all(map(is_truth, arguments))
+
+
+def _unless(refused: Callable[[tuple[Any, ...]], bool], why: str, operation: Callable[..., Any]) -> Callable[..., Any]:
+    """An operation that refuses some arguments."""
+
+    def guarded(*arguments: Any) -> Any:
+        if refused(arguments):
+            raise TraceError(why)
+        return operation(*arguments)
+
+    return guarded
+
+
 def _of_truths(name: str, op: Op) -> Callable[..., Any]:
     """An operation on the bits of integers, which is traced for truth values only."""
-
-    def operation(*arguments: Any) -> Any:
-        if not all(map(is_truth, arguments)):
-            raise TraceError(f"calls np.{name} on numbers, which takes their bits; {INSTEAD}")
-        return _apply(op, *arguments)
-
-    return operation
+    why = f"calls np.{name} on numbers, which takes their bits; {INSTEAD}"
+    return _unless(lambda arguments: not _all_truths(arguments), why, _operation(op))
 
 
 def _of_numbers(name: str, op: Op) -> Callable[..., Any]:
     """An operation that NumPy refuses for truth values."""
-
-    def operation(*arguments: Any) -> Any:
-        if all(map(is_truth, arguments)):
-            raise TraceError(f"calls np.{name} on truth values, which NumPy refuses")
-        return _apply(op, *arguments)
-
-    return operation
+    return _unless(_all_truths, f"calls np.{name} on truth values, which NumPy refuses", _operation(op))
 
 
 def _beside_nan(op: Op, truth: Op) -> Callable[..., Any]:
@@ -602,13 +606,8 @@ def _not_in_half_precision(name: str, scalar: Callable[..., Any]) -> Callable[..
     types = getattr(getattr(np, name, None), "types", ())
     if not types or any(kinds[0] in "?b" for kinds in types) or not any(kinds[0] == "e" for kinds in types):
         return scalar
-
-    def operation(*arguments: Any) -> Any:
-        if all(map(is_truth, arguments)):
-            raise TraceError(f"calls np.{name} on truth values, which NumPy does with half precision; convert them")
-        return scalar(*arguments)
-
-    return operation
+    why = f"calls np.{name} on truth values, which NumPy does with half precision; convert them"
+    return _unless(_all_truths, why, scalar)
 
 
 UFUNCS |= {name: _not_in_half_precision(name, scalar) for name, scalar in UFUNCS.items()}

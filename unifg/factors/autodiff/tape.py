@@ -316,9 +316,9 @@ class Tape:
         place = {leaf: self.zero}
         for i in self.live(outputs):
             if self.op[i] > Op.TANGENT:
-                taken = [j if j < 0 else place.get(j, j) for j in (self.a[i], self.b[i], self.c[i])]
-                if taken != [self.a[i], self.b[i], self.c[i]]:
-                    place[i] = self.apply(self.op[i], *taken)
+                operands = [j if j < 0 else place.get(j, j) for j in (self.a[i], self.b[i], self.c[i])]
+                if operands != [self.a[i], self.b[i], self.c[i]]:
+                    place[i] = self.apply(self.op[i], *operands)
         return [place.get(i, i) for i in outputs]
 
     def evaluate(self, outputs: Sequence[int], variables: Sequence[float], parameters: Sequence[float]) -> list[float]:

@@ -161,7 +161,7 @@ class Rebound:
         kernel = residual if isinstance(residual, Kernel) else residual.kernel
         if kernel is None:
             return cast(Callable[..., Any], self.callable(residual.function))
-        called = self.function(kernel.function)
+        called = self.callable(kernel.function)
 
         def batched(*arguments: Any) -> Any:
             return called(*kernel.rows_of(arguments))
@@ -324,8 +324,8 @@ class _Names(dict[str, Any]):
             "enumerate": _along(enumerate),
             "isinstance": _is_instance,
             "len": _length,
-            "max": _greatest,
-            "min": _least,
+            "max": partial(_fold, "maximum", builtins.max),
+            "min": partial(_fold, "minimum", builtins.min),
             "range": _along(range),
             "sum": _sum,
             "type": _type,
@@ -367,15 +367,7 @@ def _wrapped(angle: Any) -> Any:
     return wrap(angle) if isinstance(angle, Symbol | float) else wrapped(np.frompyfunc(wrap, 1, 1)(plain(angle)))
 
 
-def _greatest(*values: Any, **options: Any) -> Any:
-    return _fold("maximum", builtins.max, values, options)
-
-
-def _least(*values: Any, **options: Any) -> Any:
-    return _fold("minimum", builtins.min, values, options)
-
-
-def _fold(name: str, plain: Callable[..., Any], values: tuple[Any, ...], options: dict[str, Any]) -> Any:
+def _fold(name: str, plain: Callable[..., Any], *values: Any, **options: Any) -> Any:
     items = list(values[0]) if len(values) == 1 else list(values)
     if options or not any(isinstance(item, Symbol | Symbols) for item in items):
         return plain(items, **options)
@@ -414,10 +406,7 @@ def _as_array(values: Any, dtype: Any = None, **options: Any) -> Any:
 
 
 def _filled(value: float) -> Callable[..., Any]:
-    def make(shape: Any, dtype: Any = None, order: Any = None) -> Any:
-        return _full(shape, value, dtype)
-
-    return make
+    return lambda shape, dtype=None, order=None: _full(shape, value, dtype)
 
 
 def _full(shape: Any, fill_value: Any, dtype: Any = None, order: Any = None) -> Any:

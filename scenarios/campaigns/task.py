@@ -1,4 +1,4 @@
-"""One episode, where it is run: settings in, a line out, whatever happens in between."""
+"""One episode in a worker: from settings to a line of JSON, whatever happens in between."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ import numpy as np
 
 from unifg.errors import ScenarioError, UnifgError
 from unifg.scenarios.campaigns.sources import fingerprint
-from unifg.scenarios.campaigns.statement import built, module_of
+from unifg.scenarios.campaigns.statement import Episode, built, module_of
 from unifg.scenarios.episode import silent
 
-__all__ = ["ERROR", "FAILED", "LOST", "OK", "Order", "WrongLibrary", "line", "lost", "perform"]
+__all__ = ["ERROR", "FAILED", "LOST", "OK", "Task", "WrongLibrary", "line", "lost", "run_task"]
 
 OK, FAILED, ERROR, LOST = "ok", "failed", "error", "lost"
 WARM_CALLS = 3  # of its progress, until a warming run is stopped
@@ -31,35 +31,29 @@ _warm: set[object] = set()
 
 
 class WrongLibrary(ScenarioError):
-    """A worker runs other sources than the one who asks."""
+    """The sources of a worker differ from those of the campaign."""
 
 
 @dataclass(frozen=True)
-class Order:
-    """An episode to be run.
+class Task:
+    """Everything a worker needs to run an episode.
 
     Attributes:
         scenario: its name.
-        key: of the episode.
-        labels: of the axes.
-        settings: as stated, by path.
-        seed: None where there is none.
+        episode: with settings as stated.
         base: folder that paths are relative to.
-        code: digest of what the scenario depends on, where it is asked for.
+        code: digest of what the scenario depends on, where the campaign was started.
         sources: fingerprint of the library there.
     """
 
     scenario: str
-    key: str
-    labels: Mapping[str, str]
-    settings: Mapping[str, Any]
-    seed: int | None
+    episode: Episode
     base: str
     code: str
     sources: str
 
 
-def perform(order: Order) -> str:
+def run_task(task: Task) -> str:
     """Run an episode.
 
     Returns:
@@ -69,18 +63,18 @@ def perform(order: Order) -> str:
     Raises:
         WrongLibrary: this machine has other sources.
     """
-    if fingerprint() != order.sources:
+    if fingerprint() != task.sources:
         raise WrongLibrary(
-            f"{socket.gethostname()} has other sources of unifg ({fingerprint()}) than the campaign ({order.sources}): "
+            f"{socket.gethostname()} has other sources of unifg ({fingerprint()}) than the campaign ({task.sources}): "
             "install the same everywhere, and leave it alone while a campaign runs"
         )
     with _one_at_a_time:
         began, cpu = time.perf_counter(), time.process_time()
         found: dict[str, Any]
         try:
-            module = module_of(order.scenario)
-            settings = built(order.scenario, order.settings, order.seed, Path(order.base), order.scenario)
-            _warmed(order, module, settings)
+            module = module_of(task.scenario)
+            settings = built(task.scenario, task.episode.settings, task.episode.seed, Path(task.base), task.scenario)
+            _warmed(task, module, settings)
             began, cpu = time.perf_counter(), time.process_time()
             outcome = module.run(settings, silent)
             unclear = list[str]()
@@ -92,23 +86,20 @@ def perform(order: Order) -> str:
             trace = "".join(traceback.format_exception(error))
             found = {"outcome": ERROR, "error": said, "traceback": trace}
     took = {"seconds": time.perf_counter() - began, "cpu_seconds": time.process_time() - cpu}
-    return line(order, found, took)
+    return line(task, found, took)
 
 
-def lost(order: Order, why: str) -> str:
+def lost(task: Task, why: str) -> str:
     """The line of an episode whose workers died."""
-    return line(order, {"outcome": LOST, "error": why}, {})
+    return line(task, {"outcome": LOST, "error": why}, {})
 
 
-def line(order: Order, found: Mapping[str, Any], took: Mapping[str, float]) -> str:
+def line(task: Task, found: Mapping[str, Any], took: Mapping[str, float]) -> str:
     """The line of an episode."""
     row = {
-        "key": order.key,
-        "code": order.code,
-        "scenario": order.scenario,
-        "labels": dict(order.labels),
-        "settings": dict(order.settings),
-        "seed": order.seed,
+        **vars(task.episode),
+        "code": task.code,
+        "scenario": task.scenario,
         **found,
         **{name: round(value, 4) for name, value in took.items()},
         "worker": f"{socket.gethostname()}:{os.getpid()}",
@@ -117,13 +108,13 @@ def line(order: Order, found: Mapping[str, Any], took: Mapping[str, float]) -> s
     return json.dumps(row, allow_nan=False, default=str)
 
 
-def _warmed(order: Order, module: Any, settings: Any) -> None:
+def _warmed(task: Task, module: Any, settings: Any) -> None:
     """Run the first moment of an episode once per worker and kind, so that no recorded one compiles.
 
     Numbers do not change what code is called, words do.
     """
-    words = tuple(sorted((path, v) for path, v in order.settings.items() if isinstance(v, str | bool)))
-    kind = (order.scenario, words)
+    words = tuple(sorted((path, v) for path, v in task.episode.settings.items() if isinstance(v, str | bool)))
+    kind = (task.scenario, words)
     if kind in _warm:
         return
     _warm.add(kind)

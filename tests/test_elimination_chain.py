@@ -1,4 +1,4 @@
-"""Elimination of horizons, however their nodes are numbered."""
+"""Chains are recognised however their nodes are numbered, and run without indices."""
 
 from __future__ import annotations
 
@@ -11,8 +11,10 @@ import scipy.sparse as sp
 from test_elimination import System, backward_error, full, system
 from unifg.codegen.jit import compiled
 from unifg.elimination import fronts, substitution
+from unifg.elimination.chain import stages
 from unifg.elimination.factorization import Factorization
-from unifg.elimination.plan import Plan
+from unifg.elimination.ordering import block_graph
+from unifg.elimination.plan import ADJACENT, DIRECT, Plan
 from unifg.elimination.symmetric import Symmetric
 from unifg.typing import Array
 
@@ -36,11 +38,36 @@ def test_horizons(rng: np.random.Generator, length: int, state: int, control: in
     pattern, data, label, negative = horizon(rng, length, state, control, multipliers)
     factorization = Factorization(pattern, label)
     assert factorization.factor(data)
+    if length > 2:
+        assert factorization.tree.kind == "chain"
+        table = factorization.plan.fronts[:-2]
+        assert table[:, DIRECT].all()
+        assert table[:, ADJACENT].all()
+        assert len(table) >= length // 3 or state == 1
     right = rng.normal(size=pattern.size)
     assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-11
     assert factorization.inertia == (int((~negative).sum()), int(negative.sum()), 0)
     refined = factorization.refine(data, right)
     assert backward_error(full(pattern, data), refined, right) < 1e-15
+
+
+def test_stages_touch_only_the_next(rng: np.random.Generator) -> None:
+    pattern, _, label, _ = horizon(rng, 30, 3, 2, True)
+    weight = np.bincount(label)
+    pointer, neighbours = block_graph(pattern.indptr, pattern.indices, label, len(weight))
+    chain, (order, bounds, parent, passed), _ = stages(pointer, neighbours, weight)
+    assert chain
+    assert sorted(order.tolist()) == list(range(len(weight)))
+    stage = np.empty(len(weight), dtype=int)
+    stage[order] = np.repeat(np.arange(len(parent)), np.diff(bounds))
+    for node in range(len(weight)):
+        beside = neighbours[pointer[node] : pointer[node + 1]]
+        assert np.abs(stage[beside] - stage[node]).max() <= 1
+    for s in range(len(parent) - 1):
+        after = order[bounds[s + 1] : bounds[s + 2]]
+        touched = [k for k in after if (stage[neighbours[pointer[k] : pointer[k + 1]]] == s).any()]
+        assert after[: len(touched)].tolist() == touched
+        assert weight[touched].sum() == passed[s]
 
 
 def test_several_chains_and_loose_nodes(rng: np.random.Generator) -> None:
@@ -50,6 +77,17 @@ def test_several_chains_and_loose_nodes(rng: np.random.Generator) -> None:
     assert factorization.factor(data)
     right = rng.normal(size=pattern.size)
     assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-14
+
+
+def test_wide_graphs_are_no_chains(rng: np.random.Generator) -> None:
+    star = [(0, k) for k in range(1, 40)]
+    loops = [(k, k + 1) for k in range(99)] + [(int(k), int(k) + 40) for k in rng.integers(0, 60, 30)]
+    for nodes, edges in ((40, star), (100, loops)):
+        pattern, data, label, _ = system(rng, [3] * nodes, edges)
+        factorization = Factorization(pattern, label)
+        assert factorization.factor(data)
+        right = rng.normal(size=pattern.size)
+        assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-14
 
 
 @compiled
@@ -100,6 +138,7 @@ def test_free_end_is_noticed_in_a_chain(rng: np.random.Generator) -> None:
     np.add.at(data, pattern.diagonal[1:], weight)
     factorization = Factorization(pattern)
     factorization.factor(data + 0.0)
+    assert factorization.tree.kind == "chain"
     singular = not factorization.factor(data)
     assert singular or abs(factorization.pivots()[-1]) < 1e-13
     assert fronts.factor(factorization.plan, data, np.full(n, 1e-6))

@@ -15,8 +15,8 @@ from unifg.scenarios.campaigns.campaign import replay_command
 from unifg.scenarios.campaigns.campaign_plot import outcomes_picture, values_picture
 from unifg.scenarios.campaigns.comparison import by_chance, digits, interval, share
 from unifg.scenarios.campaigns.document import Document
-from unifg.scenarios.campaigns.performed import OK
 from unifg.scenarios.campaigns.sheet import OUTCOMES, Sheet, load
+from unifg.scenarios.campaigns.task import OK
 from unifg.style.figures import write_figure
 from unifg.typing import Array
 
