@@ -65,7 +65,7 @@ def drives_of(sheet: Sheet, name: str) -> pd.DataFrame:
     found = []
     for combination in sheet.combinations:
         labels = dict(zip(sheet.axes, combination, strict=True))
-        planner = labels.get("planner", f"ours, {labels['coupling']}")
+        planner = labels.get("baseline", f"ours, {labels['coupling']}")
         mine = sheet.of(combination).join(sheet.values)
         found.append(mine.assign(planner=planner, table=ROMAN[name], leg=labels["leg"]))
     measures = [LENGTH, DURATION, CLEARANCE, CONTACTS, TICK]

@@ -31,8 +31,8 @@ from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_pilot import Estimator
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.navigation import INITIAL_SIGMA, Episode, NavigationSettings
+from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
-from unifg.scenarios.rivals.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.typing import Array
 
 SEEDS = range(200, 204)

@@ -242,17 +242,17 @@ class Course:
 
     @property
     def arrived(self) -> bool:
-        """Whether the end is near enough to the target."""
+        """True if the end is near enough to the target."""
         return self.target_distance <= self.settings.arrival
 
     @property
     def clear(self) -> bool:
-        """Whether nothing is touched, neither at nodes nor between them."""
+        """True if nothing is touched, neither at nodes nor between them."""
         return self.clearance_between >= -CONTACT
 
     @property
     def flyable(self) -> bool:
-        """Whether states follow from controls, and limits are kept. Hard clearance is judged by :attr:`clear`."""
+        """True if states follow from controls and limits are kept. Hard clearance is judged by :attr:`clear`."""
         s, x, u = self.settings, self.states, self.controls
         gaps = quadrotor.dynamics(x[:-1], u, x[1:], s.vehicle.packed, s.dt)
         over = max(
@@ -263,17 +263,17 @@ class Course:
 
     @property
     def safe(self) -> bool:
-        """Whether this can be flown to the target without a collision, whatever the solver says of it."""
+        """True if the course can be flown to the target without a collision, converged or not."""
         return self.arrived and self.clear and self.flyable
 
     @property
     def succeeded(self) -> bool:
-        """Whether it is safe and the solver converged."""
+        """True if it is safe and the solver converged."""
         return self.safe and self.solution.converged
 
     @property
     def drift(self) -> float:
-        """How far from the planned end the controls lead by the reference integrator, in one piece [m]."""
+        """Distance from the planned end to where the reference integrator leads in one piece [m]."""
         state, s = self.states[0], self.settings
         for control in self.controls:
             state = quadrotor.fly(state, control, s.dt, s.vehicle)

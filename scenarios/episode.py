@@ -1,4 +1,4 @@
-"""What every episode does alike: rehearse, tick until it is over, tell how far it has come, stop when the user asks."""
+"""Shared loop of all episodes: warm-up run, ticks, progress, interruption by the user."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Progress: TypeAlias = Callable[[float, str], None]
 
 
 def silent(done: float, text: str) -> None:
-    """Tell nobody."""
+    """Ignore the progress."""
 
 
 def run_ticks(limit: int, tick: Callable[[int], tuple[float, str] | None], progress: Progress) -> bool:
@@ -40,7 +40,7 @@ def run_ticks(limit: int, tick: Callable[[int], tuple[float, str] | None], progr
         interrupted = True
     try:
         progress(1.0, "done")
-    except KeyboardInterrupt:  # asked for in the last tick, by somebody who waits for more than this run
+    except KeyboardInterrupt:  # in the last tick, for a sequence of runs
         interrupted = True
     return interrupted
 
@@ -72,5 +72,5 @@ def rehearse(kind: object, twin: Callable[[], Any]) -> None:
         if ticks == GOOD_TICKS + BAD_TICKS:
             raise KeyboardInterrupt
 
-    with watched(None):  # nobody wants to see it
+    with watched(None):  # not shown
         other.run(after)

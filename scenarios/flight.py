@@ -21,7 +21,7 @@ from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.log.columns import Recorder
-from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.log.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.options import count, not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.quadrotor.estimator import EstimatorSettings
@@ -140,19 +140,19 @@ class Flight:
     def __init__(self, settings: FlightSettings, *, rehearsal: bool = False) -> None:
         """Draw the world and wake the pilot, and rehearse unless this is a rehearsal."""
         self.settings = settings
-        self.conditions = found = draw_conditions(settings.seed, settings.mass_error)
+        self.conditions = drawn = draw_conditions(settings.seed, settings.mass_error)
         calm, k = DisturbanceModel(), settings.gusts
         x, y, z = calm.gust
         gusty = replace(calm, gust=(k * x, k * y, k * z))
-        self.world = QuadrotorWorld(found.layout, settings.seed, found.true, settings.movers, disturbance=gusty)
-        error = settings.estimator.state_sigma * found.deviation
+        self.world = QuadrotorWorld(drawn.layout, settings.seed, drawn.true, settings.movers, disturbance=gusty)
+        error = settings.estimator.state_sigma * drawn.deviation
         believed = quadrotor.STATE.retract(self.world.state[None], error[None])[0]
         self.pilot = make_pilot(
-            settings.coupling, settings.solver, found.layout, believed, found.nominal, settings.estimator,
+            settings.coupling, settings.solver, drawn.layout, believed, drawn.nominal, settings.estimator,
             settings.flown,
         )  # fmt: skip
         self.faults = FlightFaults(settings.faults, settings.seed)
-        self.watch = FlightWatch(settings.controller.dt, settings.estimator.parameters_sigma(found.nominal))
+        self.watch = FlightWatch(settings.controller.dt, settings.estimator.parameters_sigma(drawn.nominal))
         self.pilot.pushed = self.watch.pushed
         self._speed = self.pilot.controller.guide.settings
         self._wind = self.world.parameters.wind
@@ -172,11 +172,11 @@ class Flight:
         interrupted = run_ticks(round(settings.time_limit / dt), lambda number: self._tick(recorder), progress)
         return recorder.finish(
             collisions=world.collisions, reached=self._reached, interrupted=interrupted,
-            outcome=self._outcome(interrupted), dropped=dict(self.watch.door.dropped),
+            outcome=self._outcome(interrupted), dropped=dict(self.watch.validator.dropped),
         )  # fmt: skip
 
     def _outcome(self, interrupted: bool) -> str:
-        """What has become of the flight, in words."""
+        """Outcome of the flight in words."""
         cause = self.watch.verdict.cause
         if self._reached or interrupted:
             return "reached" if self._reached else "interrupted"
@@ -246,7 +246,7 @@ class Flight:
             controls=control,
             plans=np.tile(belief.state[:3], (settings.horizon + 1, 1)) if plan is None else plan.states[:, :3],
             pasts=pilot.estimator.window.history.states[:, :3],
-            landmarks=(marks.ids, marks.positions, marks.covariances, marks.radii),
+            landmarks=landmark_rows(marks.ids, marks.positions, marks.covariances, marks.radii),
             parameters=belief.parameters.packed,
             parameters_sigma=belief.parameters_sigma,
             seen=reading.ids,
@@ -263,6 +263,6 @@ class Flight:
         return control
 
     def _arrived(self, state: Array) -> bool:
-        """Whether a state (10,) is at the target and slow."""
+        """Return True for a state (10,) at the target and slow."""
         away = np.linalg.norm(state[:3] - self.world.layout.target)
         return bool(away < REACHED_DISTANCE and np.linalg.norm(state[7:]) < REACHED_SPEED)

@@ -1,16 +1,15 @@
-"""Two manoeuvres nobody programmed: reversing out of a wrong heading, and deflecting around a disc.
+"""Two manoeuvres that are not programmed: reversing out of a wrong heading, and deflecting around a disc.
 
 Each is one control graph solved once, cold, from a guess that the robot cannot drive (Bazzana et al. 2022, section
 VII-B and Fig. 7). In ``behind`` the path to follow leaves behind the robot's back; in ``obstacle`` it leads straight
-through a disc that nobody had foreseen. Every iterate is kept for the picture.
+through an unforeseen disc. Every iterate is kept for the picture.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -24,14 +23,12 @@ from unifg.typing import Array
 __all__ = [
     "CASES",
     "Case",
-    "CaseMetrics",
     "Manoeuvre",
     "ManoeuvreSettings",
     "case_metrics",
     "run_manoeuvre",
     "state_problem",
     "table",
-    "write_metrics",
 ]
 
 AT_REST = 1e-3  # [m/s] and [rad/s]; smaller controls have no sign worth counting
@@ -73,7 +70,7 @@ class ManoeuvreSettings:
 
 @dataclass(frozen=True)
 class Case:
-    """What makes one manoeuvre hard.
+    """Difficulty of one manoeuvre.
 
     Attributes:
         name: on the command line and in file names.
@@ -193,14 +190,14 @@ class Manoeuvre:
 
     @property
     def within_limits(self) -> bool:
-        """Whether speeds and clearance keep their limits at every node."""
+        """True if speeds and clearance keep their limits at every node."""
         s = self.settings
         slow = bool((np.abs(self.controls) <= np.array(s.limits) + ROUNDING).all())
         return slow and bool((self.clearance[1:] >= s.clearance - ROUNDING).all())
 
     @property
     def succeeded(self) -> bool:
-        """Whether the solver converged and every limit is kept."""
+        """True if the solver converged and every limit is kept."""
         return self.solution.converged and self.within_limits
 
     def _clearance(self, states: Array) -> Array:
@@ -235,54 +232,24 @@ def run_manoeuvre(
     return Manoeuvre(case, settings, solver, solution, solution[x], solution[u], iterates)
 
 
-class CaseMetrics(TypedDict):
-    """Numbers of one manoeuvre; only ``solve_ms`` depends on the clock."""
-
-    status: str
-    converged: bool
-    within_limits: bool
-    cost: float
-    iterations: int
-    stationarity: float
-    violation: float
-    complementarity: float
-    cusps: int
-    cusp_times_s: list[float]
-    inflection_times_s: list[float]
-    max_speed_m_s: float
-    max_turn_rate_rad_s: float
-    min_clearance_m: float | None
-    min_clearance_between_nodes_m: float | None
-    end_error_m: float
-    end_error_rad: float
-    solve_ms: float
-
-
-def case_metrics(manoeuvre: Manoeuvre) -> CaseMetrics:
-    """The numbers of one manoeuvre; clearances are None without discs."""
+def case_metrics(manoeuvre: Manoeuvre) -> dict[str, Any]:
+    """Numbers of one manoeuvre; clearances are None without discs; only ``solve_ms`` depends on the clock."""
     m, solution = manoeuvre, manoeuvre.solution
     speed, turning = np.abs(m.controls).max(axis=0).tolist()
     end = m.states[-1] - m.case.reference(m.settings)[-1]
     blocked = bool(m.case.discs)
     return {
-        "status": solution.status.name.lower(),
-        "converged": solution.converged,
+        **metrics.of_solution(solution),
         "within_limits": m.within_limits,
-        "cost": float(solution.cost),
-        "iterations": solution.iterations,
-        "stationarity": float(solution.stationarity),
-        "violation": float(solution.violation),
-        "complementarity": float(solution.complementarity),
         "cusps": len(m.cusps),
-        "cusp_times_s": _rounded(m.time[m.cusps]),
-        "inflection_times_s": _rounded(m.time[m.inflections]),
+        "cusp_times_s": m.time[m.cusps].round(9).tolist(),
+        "inflection_times_s": m.time[m.inflections].round(9).tolist(),
         "max_speed_m_s": speed,
         "max_turn_rate_rad_s": turning,
         "min_clearance_m": float(m.clearance.min()) if blocked else None,
         "min_clearance_between_nodes_m": m.clearance_between if blocked else None,
         "end_error_m": float(np.hypot(end[0], end[1])),
         "end_error_rad": float(abs(fg.wrap_angle(end[2]))),
-        "solve_ms": 1e3 * solution.seconds,
     }
 
 
@@ -293,11 +260,6 @@ def metrics_of(manoeuvres: Sequence[Manoeuvre]) -> dict[str, Any]:
         "solver": manoeuvres[0].solver,
         "cases": {m.case.name: case_metrics(m) for m in manoeuvres},
     }
-
-
-def write_metrics(path: Path, manoeuvres: Sequence[Manoeuvre]) -> Path:
-    """Write them as JSON and return the path."""
-    return metrics.write_metrics(path, metrics_of(manoeuvres), sort_keys=False)
 
 
 def table(manoeuvres: Sequence[Manoeuvre]) -> str:
@@ -337,10 +299,6 @@ def _reversals(values: Array) -> list[int]:
     signed = np.flatnonzero(np.abs(values) > AT_REST)
     changes = np.flatnonzero(np.diff(np.sign(values[signed])) != 0.0)
     return [int(k) for k in signed[changes + 1]]
-
-
-def _rounded(times: Array) -> list[float]:
-    return [round(float(time), 9) for time in times]
 
 
 def _at(times: list[float]) -> str:

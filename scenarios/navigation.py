@@ -26,20 +26,14 @@ from unifg.models.unicycle import step
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.ground.drive_pilot import STOPPED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
 from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.log.columns import Recorder
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.options import count, existing, option, pair, pose, positive
+from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.planning.polyline import path_length
-from unifg.scenarios.rivals.choices import (
-    LOCALISERS,
-    OWN_LOCALISER,
-    OWN_PLANNER,
-    PLANNERS,
-    make_localiser,
-    make_planner,
-)
 from unifg.scenarios.simulation.building import DEMO_GOALS, DEMO_START, building_map
 from unifg.scenarios.simulation.drivetrain import Drivetrain
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
@@ -61,6 +55,8 @@ FREEING = 20  # steps to there
 SLOWEST = 0.25  # [m/s]; a goal that takes longer than this, and a minute, is given up
 HELPLESS = 20.0  # [s] that a robot that may not move waits before it gives up
 REACHED = "reached"
+MPC = "mpc"
+LOCALISERS = ("graph", "amcl")
 LARGEST = Limits(pixels=200_000_000)  # of a map that a user names: 700 m by 700 m at 0.05 m
 
 
@@ -84,8 +80,9 @@ class NavigationSettings:
         lidar: as it is; what the robot believes of it is its own.
         odometry: likewise.
         imperfection: of the robot's map.
-        planner: of the motion along the route: that of this library, or one of others to compare with.
-        localiser: of the estimate: that of this library, or another one to compare with.
+        planner: of the motion along the route: "mpc", the controller of this library, or a class of your own,
+            MODULE:CLASS, as `unifg.scenarios.ground.local_planner` describes it.
+        localiser: of the estimate: "graph", that of this library, or "amcl", a Monte Carlo localiser to compare with.
         faults: what goes wrong; may be repeated.
     """
 
@@ -106,8 +103,8 @@ class NavigationSettings:
     lidar: LidarModel = field(default_factory=LidarModel)
     odometry: OdometryModel = field(default_factory=OdometryModel)
     imperfection: Imperfection = field(default_factory=Imperfection)
-    planner: str = option(OWN_PLANNER, choices=PLANNERS)
-    localiser: str = option(OWN_LOCALISER, choices=LOCALISERS)
+    planner: str = option(MPC, metavar="MODULE:CLASS")
+    localiser: str = option(LOCALISERS[0], choices=LOCALISERS)
     faults: tuple[Fault, ...] = option(
         (), text=one_of(DRIVE_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
     )
@@ -134,12 +131,14 @@ class Episode:
         self.settings = settings
         self.controller = control = replace(settings.controller, accelerations=settings.drivetrain.sheet)
         if settings.coupling != "sequential":
-            for word, chosen, own in (
-                ("planner", settings.planner, OWN_PLANNER),
-                ("localiser", settings.localiser, OWN_LOCALISER),
+            for word, chosen, default in (
+                ("planner", settings.planner, MPC),
+                ("localiser", settings.localiser, LOCALISERS[0]),
             ):
-                if chosen != own:
+                if chosen != default:
                     raise ScenarioError(f"the {word} '{chosen}' stands for itself: its coupling is 'sequential'")
+        if settings.localiser not in LOCALISERS:
+            raise ScenarioError(f"unknown localiser '{settings.localiser}': choose {' or '.join(LOCALISERS)}")
         least, most = settings.obstacle_radius
         if not 0.0 < least <= most < np.inf:
             raise ScenarioError(f"obstacles have radii 0 < least <= greatest, got {least:g} and {most:g} m")
@@ -190,19 +189,19 @@ class Episode:
             rehearse(kind, lambda: Episode(replace(settings, faults=()), rehearsal=True))
 
     def _pilot(self, pose: Array, sigma: Array) -> Pilot[Any]:
-        """Who drives with the map as it was given."""
+        """Make the pilot with the present map of the robot."""
         settings = self.settings
         pilot: Pilot[Any] = make_pilot(
             settings.coupling, self.occupancy, self.distance_map, settings.solver, self.controller, pose, sigma,
             self.world.lidar.beams,
         )  # fmt: skip
         of_planner, of_localiser = self._drawn.spawn(2)
-        planner = make_planner(settings.planner, self.distance_map, self.controller, of_planner)
-        localiser = make_localiser(settings.localiser, self.occupancy, self.distance_map, pose, sigma, of_localiser)
-        if planner is not None:
-            pilot.controller = planner
-        if localiser is not None:
-            pilot.estimator, pilot.pose = localiser, localiser.pose
+        if settings.planner != MPC:
+            context = PlannerContext(self.distance_map, self.controller, of_planner)
+            pilot.controller = load_planner(settings.planner, context)
+        if settings.localiser == "amcl":
+            pilot.estimator = MonteCarlo(self.occupancy, self.distance_map, pose, sigma, of_localiser)
+            pilot.pose = pilot.estimator.pose
         return pilot
 
     def run(self, progress: Progress) -> EpisodeLog:
@@ -221,12 +220,12 @@ class Episode:
             start=self.start,
             dt=s.controller.dt,
             robot_radius=s.controller.robot_radius,
-            solver=s.solver if s.planner == OWN_PLANNER else s.planner,
+            solver=s.solver if s.planner == MPC else s.planner,
             coupling=s.coupling,
             seed=s.seed,
             control_limits=s.controller.limits,
             scan_angles=self.world.lidar.angles,
-            obstacle_moving=self.world.obstacle_states()[:, 3].astype(bool),
+            obstacle_moves=self.world.obstacle_states()[:, 3].astype(bool),
             faults=[str(fault) for fault in s.faults],
         )
         self._outcomes = ["time ran out"] * len(self.goals)
@@ -244,7 +243,7 @@ class Episode:
             collisions=self.world.collisions,
             reached=[outcome == REACHED for outcome in self._outcomes],
             outcomes=self._outcomes,
-            dropped=dict(self.pilot.door.dropped),
+            dropped=dict(self.pilot.validator.dropped),
             interrupted=interrupted,
         )
 
@@ -293,7 +292,7 @@ class Episode:
         return v, omega
 
     def _outcome(self, goal: int) -> str | None:
-        """What has become of a goal; None while the robot is on its way."""
+        """Outcome of a goal; None while the robot is on its way."""
         pilot, dt = self.pilot, self.settings.controller.dt
         helpless = pilot.verdict.rests or pilot.planless_for > dt
         self._helpless = self._helpless + dt if helpless else 0.0
@@ -313,7 +312,7 @@ class Episode:
         return None
 
     def _hopeless(self) -> bool:
-        """Whether the robot has not been allowed to move for so long that it gives up all goals."""
+        """Return True if the robot has not been allowed to move for so long that it gives up all goals."""
         return self._helpless > HELPLESS
 
     def _begin_leg(self, goal: int) -> None:
@@ -400,7 +399,7 @@ class Episode:
         return Route(self.occupancy, self.distance_map, begin, end, s.robot_radius, *self._gaps())
 
     def _arrived(self, goal: int) -> bool:
-        """Whether the robot believes to be there, by an estimate that leaves room for being wrong.
+        """Return True if the robot believes to be there, by an estimate that leaves room for being wrong.
 
         ``SURE`` standard deviations, in the worst direction, fit between where it believes to be and what the truth
         must confirm.
@@ -414,7 +413,7 @@ class Episode:
         return _near(self.pilot.pose, goal_pose, distance, heading)
 
     def _confirmed(self, goal: int) -> bool:
-        """Whether the robot truly is where it believes to have arrived."""
+        """Return True if the robot truly is where it believes to have arrived."""
         return _near(self.world.pose, self.goals[goal], TRUE_DISTANCE, TRUE_HEADING)
 
 

@@ -52,6 +52,7 @@ LOSSES: dict[str, Callable[[float], Loss]] = {
 }
 _JUDGED = {"optimum": 1e-6, "map": 1e-4}  # share of the cost by which maps are told apart: a map ends within 1e-5
 _DEFAULTS = {"huber": 1.345, "cauchy": 2.385, "tukey": 4.685, "dcs": 1.0}
+MOST_SHOWN = 12  # iterates of a picture
 _INLIERS = 0.99  # of right measurements lie within the default threshold of gnc
 OUTLIER_WEIGHT = 0.5
 """A measurement that the robust loss gives less weight than this is called an outlier."""
@@ -59,7 +60,7 @@ OUTLIER_WEIGHT = 0.5
 
 @dataclass(frozen=True)
 class SolveSettings:
-    """What to solve, and how.
+    """Settings of a solve.
 
     Attributes:
         file: pose graph: .g2o or .graph (TORO), also .gz.
@@ -184,7 +185,7 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
         raise ScenarioError(f"{settings.file}: there is no edge in this file, and nothing to solve")
     loss = robust_loss(settings.robust, read.group.dim)
     if settings.certify or settings.staircase:
-        admit(read)  # nobody should wait for a solve to be told
+        admit(read)  # refused before the solve
     if settings.init == "lago" and read.group.dim != 3:
         raise ScenarioError("--init lago is for planar pose graphs; use --init chordal")
     progress(0.05, f"first guess: {settings.init}")
@@ -232,7 +233,7 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     stopped = stopped or solution.status is Status.INTERRUPTED
     with suppress(KeyboardInterrupt):  # there is something to write
         progress(1.0, solution.status.name.lower().replace("_", " "))
-    numbers, steps = solve.snapshots.chosen()
+    numbers, steps = _chosen(solve.iterates)
     chi2 = (in_file if read.placed else np.nan, at_start, float(squared.sum()) + after.seen_chi2())
     judgement = judge(replace(after, edges=after.edges[~outliers]), settings.residual)
     return SolvedGraph(
@@ -246,7 +247,8 @@ class _Solve:
 
     def __init__(self, settings: SolveSettings, loss: Loss | None, clock: Stopwatch, progress: Progress) -> None:
         self.settings, self.loss, self.clock, self.progress = settings, loss, clock, progress
-        self.snapshots, self.before = _Snapshots(), 0
+        self.iterates: dict[int, Array] = {}
+        self.before = 0
 
     def __call__(self, begin: PoseGraph) -> tuple[Solution, PoseGraph, Array, BoolArray]:
         """The solution, the graph at it, (m,) its r' Omega r and which edges the loss takes for outliers."""
@@ -260,7 +262,8 @@ class _Solve:
 
         def tell(row: Iteration) -> None:
             number = self.before + row.number
-            self.snapshots.add(number, None if row.values is None else row.values[x])
+            if row.values is not None:
+                self.iterates[number] = row.values[x]
             stage = f", stage {row.details['stage']}" if "stage" in row.details else ""
             self.progress(0.95 * (1.0 - 0.95 * 0.9**number), f"iteration {number}{stage}, cost {row.cost:.6g}")
 
@@ -276,7 +279,7 @@ class _Solve:
         errors = after.squared_errors(settings.residual)
         weights = np.ones(len(errors)) if loss is None else np.asarray(loss.weight(errors))
         self.before += solution.iterations
-        self.snapshots.add(self.before, after.poses)
+        self.iterates[self.before] = after.poses
         trusted = begin.edges.odometry & (settings.robust_on == "closures")
         return solution, after, errors, (weights < OUTLIER_WEIGHT) & ~trusted
 
@@ -314,24 +317,11 @@ def _threshold(dim: int) -> float:
     return float(np.sqrt(chdtri(dim, 1.0 - _INLIERS)))
 
 
-class _Snapshots:
-    """Iterates for pictures: as few as a dozen of any number, early ones preferred."""
-
-    most = 12
-
-    def __init__(self) -> None:
-        self._kept: dict[int, Array] = {}
-
-    def add(self, number: int, poses: Array | None) -> None:
-        """Keep an iterate."""
-        if poses is not None:
-            self._kept[number] = poses
-
-    def chosen(self) -> tuple[list[int], Array]:
-        """Numbers and poses (k, n, storage); the distances between numbers grow."""
-        numbers = sorted(self._kept)
-        places = np.arange(len(numbers))
-        if len(numbers) > self.most:
-            places = np.unique(np.geomspace(1, len(numbers), self.most).round().astype(np.intp)) - 1
-        kept = [numbers[k] for k in places]
-        return kept, np.stack([self._kept[number] for number in kept])
+def _chosen(kept: dict[int, Array]) -> tuple[list[int], Array]:
+    """Numbers and poses (k, n, storage) of at most a dozen iterates for pictures; early ones are preferred."""
+    numbers = sorted(kept)
+    places = np.arange(len(numbers))
+    if len(numbers) > MOST_SHOWN:
+        places = np.unique(np.geomspace(1, len(numbers), MOST_SHOWN).round().astype(np.intp)) - 1
+    chosen = [numbers[k] for k in places]
+    return chosen, np.stack([kept[number] for number in chosen])

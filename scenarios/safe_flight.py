@@ -70,7 +70,7 @@ def _true_vehicle() -> quadrotor.Parameters:
 
 @dataclass(frozen=True)
 class SafeSettings:
-    """What is to be flown; of several alphas, speeds and controllers all combinations.
+    """Flights to run; of several alphas, speeds and controllers all combinations.
 
     Attributes:
         case: static cylinder, obstacle on an ellipse, cluttered course, figure eight, or a ball thrown at a vehicle
@@ -92,7 +92,7 @@ class SafeSettings:
         patience: by how much the vehicle, at the speed of the path, may be late before time on the path stands still
             [s].
         dt: length of a tick [s].
-        books: vehicle that everybody believes in at first.
+        books: vehicle as believed at first.
         truth: mass and drag of the vehicle.
         true_loops: its loops.
         gains: of the controller by flatness where it predicts; where it does not it has those of a new `Gains`, for
@@ -212,40 +212,30 @@ class SafeFlight:
 
             if controller == "barrier":
                 return plan
-        gains = s.gains if estimating else Gains()
-        flat = FlatnessController(gains, s.books.least, s.books.most)
+        flat = FlatnessController(s.gains if estimating else Gains(), s.books.least, s.books.most)
         ahead = s.books.loops.delay + s.dt if estimating else 0.0
-        numbers_of_filter = replace(s.filter, alpha=barriers[0])
-        if controller == "cascade":
-            track = Track(s.cascade.every)
+        numbers_of_filter, track = replace(s.filter, alpha=barriers[0]), Track(s.cascade.every)
 
-            def filter_below(now: Array, seen: Obstacles) -> Decision:
-                begin, status, steps, places = time.thread_time(), "last plan", 0, now[None, :3]
+        def follow(now: Array, seen: Obstacles) -> Decision:
+            """Follow the path, or the last plan of a cascade, by flatness; its acceleration may be filtered."""
+            begin, status, steps, slack = time.thread_time(), "none", 0, 0.0
+            flown = self.pace.at(np.array([ahead]))
+            if controller == "cascade":
+                status = "last plan"
                 if track.due():
                     above = plan(now, seen)
                     status, steps = above.status, above.iterations
                     if keeper.states is not None:
                         track.lay(lead + keeper.nodes, keeper.states[:, [0, 1, 2, 7, 8, 9]])
-                state, p = self.model.ahead(now, ahead, self._air)[0], self._windy
                 flown = track.at(track.ticks * s.dt + ahead, self.pace.at)
-                acceleration, slack = filtered(flat.wanted(state, flown), state, seen, ahead, numbers_of_filter)
-                control = flat.steer(state, acceleration, flown.jerk[0], p)
-                elapsed = 1e3 * (time.thread_time() - begin)
-                return Decision(control, places, status, steps, slack, p.mass, np.array(p.drag), elapsed)
-
-            return filter_below
-
-        def follow(now: Array, seen: Obstacles) -> Decision:
-            begin, slack = time.thread_time(), 0.0
             state, p = self.model.ahead(now, ahead, self._air)[0], self._windy
-            flown = self.pace.at(np.array([ahead]))
-            if controller == "filter":
-                acceleration, slack = filtered(flat.wanted(state, flown), state, seen, ahead, numbers_of_filter)
-                control = flat.steer(state, acceleration, flown.jerk[0], p)
-            else:
-                control = flat.control(state, flown, p)
+            acceleration = flat.wanted(state, flown)
+            if controller in ("filter", "cascade"):
+                acceleration, slack = filtered(acceleration, state, seen, ahead, numbers_of_filter)
+            control = flat.steer(state, acceleration, flown.jerk[0], p)
             elapsed = 1e3 * (time.thread_time() - begin)
-            return Decision(control, state[None, :3], "none", 0, slack, p.mass, np.array(p.drag), elapsed)
+            places = (now if controller == "cascade" else state)[None, :3]
+            return Decision(control, places, status, steps, slack, p.mass, np.array(p.drag), elapsed)
 
         return follow
 
@@ -256,7 +246,7 @@ class SafeFlight:
 
     @property
     def _windy(self) -> quadrotor.Parameters:
-        """What is believed of the vehicle, with the gust of the moment for a wind."""
+        """Believed parameters, with the gust of the moment for a wind."""
         p, (x, y, z) = self.believed, self._air[3:].tolist()
         return replace(p, wind=(p.wind[0] + x, p.wind[1] + y), updraft=p.updraft + z)
 

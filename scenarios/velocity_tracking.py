@@ -13,7 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -29,13 +29,11 @@ from unifg.typing import Array
 
 __all__ = [
     "Drive",
-    "TrackingMetrics",
     "TrackingSettings",
     "metrics",
     "run_tracking",
     "state_problem",
     "table",
-    "write_metrics",
 ]
 
 ROUNDING = 1e-6  # relative, by which a limit may seem exceeded
@@ -154,7 +152,7 @@ class Drive:
 
     @property
     def within_bounds(self) -> bool:
-        """Whether every force keeps its bounds."""
+        """True if every force keeps its bounds."""
         bounds = self.settings.force_bounds
         if bounds is None:
             return True
@@ -163,7 +161,7 @@ class Drive:
 
     @property
     def succeeded(self) -> bool:
-        """Whether the solver converged and the bounds are kept."""
+        """True if the solver converged and the bounds are kept."""
         return self.solution.converged and self.within_bounds
 
 
@@ -189,33 +187,8 @@ def run_tracking(settings: TrackingSettings | None = None, progress: Callback | 
     return Drive(s, profile, solution, solution[v][:, 0], solution[f][:, 0], solution.dual("dynamics")[:, 0])
 
 
-class TrackingMetrics(TypedDict):
-    """Numbers of one drive; only ``solve_ms`` depends on the clock."""
-
-    scenario: str
-    profile: str
-    length: int
-    drag: str
-    force_bounds_n: list[float] | None
-    solver: str
-    status: str
-    converged: bool
-    within_bounds: bool
-    cost: float
-    iterations: int
-    stationarity: float
-    violation: float
-    complementarity: float
-    rms_error_m_s: float
-    max_error_m_s: float
-    min_force_n: float
-    max_force_n: float
-    forces_at_a_bound: int
-    solve_ms: float
-
-
-def metrics(drive: Drive) -> TrackingMetrics:
-    """The numbers of a drive; ``cost`` is the paper's J, without 1/2."""
+def metrics(drive: Drive) -> dict[str, Any]:
+    """Numbers of a drive; ``cost`` is the paper's J, without 1/2; only ``solve_ms`` depends on the clock."""
     s, solution, bounds = drive.settings, drive.solution, drive.settings.force_bounds
     at_bound = 0
     if bounds is not None:
@@ -227,26 +200,15 @@ def metrics(drive: Drive) -> TrackingMetrics:
         "drag": "linear" if s.linear else "quadratic",
         "force_bounds_n": None if bounds is None else [float(bounds[0]), float(bounds[1])],
         "solver": s.solver,
-        "status": solution.status.name.lower(),
-        "converged": solution.converged,
+        **numbers.of_solution(solution),
         "within_bounds": drive.within_bounds,
         "cost": drive.cost,
-        "iterations": solution.iterations,
-        "stationarity": float(solution.stationarity),
-        "violation": float(solution.violation),
-        "complementarity": float(solution.complementarity),
         "rms_error_m_s": float(np.sqrt(np.mean(drive.error[1:] ** 2))),
         "max_error_m_s": float(np.abs(drive.error[1:]).max()),
         "min_force_n": float(drive.force.min()),
         "max_force_n": float(drive.force.max()),
         "forces_at_a_bound": at_bound,
-        "solve_ms": 1e3 * solution.seconds,
     }
-
-
-def write_metrics(path: Path, drive: Drive) -> Path:
-    """Write the numbers as JSON and return the path."""
-    return numbers.write_metrics(path, metrics(drive), sort_keys=False)
 
 
 def table(drive: Drive) -> str:

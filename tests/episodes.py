@@ -72,6 +72,7 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         control=np.column_stack([np.full(ticks, 0.5), np.full(ticks, 0.2)]),
         horizon=horizon,
         scan=scan,
+        obstacle_moves=np.arange(obstacles) % 3 == 0,
         scan_angles=np.linspace(-np.pi, np.pi, BEAMS, endpoint=False),
         obstacles=places,
         detected=[_seen(places[k], k) for k in range(ticks)],

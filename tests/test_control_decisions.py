@@ -95,7 +95,7 @@ def test_the_way_out_is_rest_unless_somebody_comes_into_it(controller: Controlle
         (tracks((OPEN[0] + 0.9, OPEN[1] + 0.8, 0.2), velocity=(-0.6, 0.0), mover=True), False),
         (coming, True),
     ):
-        way = controller.given(OPEN, reference, others).way_out
+        way = controller.given(OPEN, reference, others).evasive
         assert way.evades == evades
         assert way.states.shape == (s.horizon + 1, 3)
         assert np.all(np.abs(np.diff(way.controls, axis=0, prepend=0.0, append=0.0)) <= s.most + 1e-9)
@@ -123,7 +123,7 @@ def test_nobody_is_evaded_into_a_wall(
     place = np.array(pose[:2]) + distance * towards
     others = tracks((place[0], place[1], 0.2), velocity=tuple(-speed * towards), mover=True)
     controller.loop.applied = np.array([0.6, 0.0])
-    way = controller._way_out(np.array(pose), others)
+    way = controller._evasion_from(np.array(pose), others)
     assert way.evades
     assert controller.field.distance(way.states[1:, :2]).min() - HULL >= OFF_WALLS
     centres = predicted(SETTINGS, np.array(pose), others)
@@ -145,7 +145,7 @@ def test_an_evasion_is_kept_until_another_is_much_better(
         for tick in range(8):
             ahead = 0.01 if tick % 2 else -0.01
             others = tracks((OPEN[0] + ahead, OPEN[1] + 0.8, 0.2), velocity=(0.0, -0.4), mover=True)
-            way = controller._way_out(np.array([OPEN[0], OPEN[1], 0.0]), others)
+            way = controller._evasion_from(np.array([OPEN[0], OPEN[1], 0.0]), others)
             assert way.evades
             found.append(float(np.sign(way.controls[5, 0])))
         return found
@@ -153,8 +153,8 @@ def test_an_evasion_is_kept_until_another_is_much_better(
     assert len(set(senses())) == 1
     before, here = senses()[-1], np.array([OPEN[0], OPEN[1], 0.0])
     across = tracks((OPEN[0] + 0.3 * before, OPEN[1] + 0.8, 0.2), velocity=(0.0, -0.4), mover=True)
-    assert np.sign(controller._way_out(here, across).controls[5, 0]) == -before, "another is much better"
-    assert not controller._way_out(here, tracks()).evades
+    assert np.sign(controller._evasion_from(here, across).controls[5, 0]) == -before, "another is much better"
+    assert not controller._evasion_from(here, tracks()).evades
     monkeypatch.setattr(drive_control, "COMMITTED", 0.0)
     assert set(senses()) == {-1.0, 1.0}, "without that it would turn back and forth"
 
@@ -175,10 +175,10 @@ def test_a_robot_beside_a_standing_disc_may_come_a_little_nearer() -> None:
 RESTING = np.tile(OPEN, (SETTINGS.horizon + 1, 1))
 
 
-def limits_of(others: Tracks, way_out: Array = RESTING, spread: Array | None = None) -> Array:
+def limits_of(others: Tracks, evasive: Array = RESTING, spread: Array | None = None) -> Array:
     """(N,) least distances to one disc, of a robot at a place known to a spread (2, 2)."""
     centres = predicted(SETTINGS, OPEN, others)
-    limits = disc_limits(SETTINGS, OPEN, centres, others, way_out, np.zeros((2, 2)) if spread is None else spread)
+    limits = disc_limits(SETTINGS, OPEN, centres, others, evasive, np.zeros((2, 2)) if spread is None else spread)
     assert limits.shape == (SETTINGS.horizon, 1)
     return limits[:, 0]
 
@@ -441,11 +441,11 @@ def test_after_a_failure_the_guess_is_the_way_out_until_it_is_forgotten(controll
     now = loop.now(OPEN, controller.given(OPEN, ahead(), tracks()))
     run, guess = loop.begin(now)
     assert run is loop.warm
-    assert np.array_equal(guess.values[loop.u], now.given.way_out.controls)
-    assert np.array_equal(guess.values[loop.x.family], now.given.way_out.states)
+    assert np.array_equal(guess.values[loop.u], now.given.evasive.controls)
+    assert np.array_equal(guess.values[loop.x.family], now.given.evasive.states)
     controller.forget()
     run, guess = loop.begin(now)
-    assert run is loop.cold and not np.array_equal(guess.values[loop.u], now.given.way_out.controls)
+    assert run is loop.cold and not np.array_equal(guess.values[loop.u], now.given.evasive.controls)
 
 
 def test_another_backend_is_asked_before_the_robot_brakes(controller: Controller) -> None:

@@ -248,7 +248,7 @@ def test_what_cannot_be_recorded_is_refused() -> None:
         window.move([0.0], time=2.0)
     with pytest.raises(fg.GraphError, match="at least one step"):
         line_window(0)
-    with pytest.raises(fg.GraphError, match="not a point"):
+    with pytest.raises(fg.GraphError, match=r"the start has shape \(1,\), expected \(2,\)"):
         Window(LINE, 3, [], start=[0.0], sigma=1.0)
     with pytest.raises(fg.GraphError, match="positive"):
         line_window(3, replace(LINE, constants=(Constant("bias", fg.Rn(1), [0.0], -1.0),)))

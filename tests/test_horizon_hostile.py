@@ -197,8 +197,8 @@ def test_limits_of_one_number_hold_for_all(limits: Any) -> None:
     ("constants", "message"),
     [
         ({"gian": [[0.1]]}, r"no static 'gian' \(there are: gain\)"),
-        ({"gain": [[0.1], [0.2]]}, r"'gain' must be \(1, 1\)"),
-        ({"gain": [[np.nan]]}, r"'gain' must be \(1, 1\)"),
+        ({"gain": [[0.1], [0.2]]}, r"'gain' has shape \(2, 1\), expected \(1, 1\)"),
+        ({"gain": [[np.nan]]}, "'gain' must be finite numbers"),
     ],
 )
 def test_a_plan_is_given_statics_that_there_are(constants: Any, message: str) -> None:

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -249,14 +250,17 @@ def test_numbers_without_end_are_refused(words: list[str], capsys: pytest.Captur
 def test_sigterm_ends_with_the_results_so_far(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    before, add = signal.getsignal(signal.SIGTERM), pose_graph._Snapshots.add
+    before, begin = signal.getsignal(signal.SIGTERM), pose_graph._Solve.__init__
 
-    def stop(self: pose_graph._Snapshots, number: int, poses: object) -> None:
-        add(self, number, poses)  # type: ignore[arg-type]
-        if number == 1:
-            os.kill(os.getpid(), signal.SIGTERM)
+    def stopping(self: pose_graph._Solve, settings: Any, loss: Any, clock: Any, progress: Any) -> None:
+        def stop(done: float, text: str) -> None:
+            if text.startswith("iteration 1,"):
+                os.kill(os.getpid(), signal.SIGTERM)
+            progress(done, text)
 
-    monkeypatch.setattr(pose_graph._Snapshots, "add", stop)
+        begin(self, settings, loss, clock, stop)
+
+    monkeypatch.setattr(pose_graph._Solve, "__init__", stopping)
     path = put(tmp_path, "g.g2o", PLANAR)
     assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--no-scene"]) == 130
     numbers = json.loads((tmp_path / "out" / "metrics.json").read_text())

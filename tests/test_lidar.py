@@ -11,12 +11,13 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.lie import SE2
+from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.emergency_stop import EmergencyStop, agreed
 from unifg.scenarios.ground.localiser import Localiser, least, scan_covariance
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import consistency, episode_metrics, nees
-from unifg.scenarios.monitoring.validation import Door
+from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.perception.disc_tracker import DiscTracker
 from unifg.scenarios.perception.discs import DiscFinder, Discs
@@ -148,13 +149,13 @@ def test_a_stamp_that_is_no_number_is_refused() -> None:
     angles = LidarModel().angles
     ranges = 3.0 + 0.01 * np.random.default_rng(0).standard_normal(360)
     for stamp in (math.nan, "soon"):
-        door = Door(360)
-        assert door.scan(Scan(angles, ranges, stamp), 1.0) is None  # type: ignore[arg-type]
-        assert door.refused["lidar"] == "its time is not a number"
-    door = Door(360)
-    found = door.scan(Scan(angles, ranges), 1.0)
+        validator = Validator(360)
+        assert validator.scan(Scan(angles, ranges, stamp), 1.0) is None  # type: ignore[arg-type]
+        assert validator.refused["lidar"] == "its time is not a number"
+    validator = Validator(360)
+    found = validator.scan(Scan(angles, ranges), 1.0)
     assert found is not None and found.time == 1.0, "without a stamp it is of now"
-    assert door.scan(Scan(angles, ranges + 0.01), 1.0) is not None
+    assert validator.scan(Scan(angles, ranges + 0.01), 1.0) is not None
 
 
 # ---------------------------------------------------------------- turning while the robot moves
@@ -174,7 +175,8 @@ def test_a_scan_is_deskewed_by_the_wheels(motion: tuple[float, float]) -> None:
     assert scan.turn == 0.1 and still.deskewed(np.array(motion)) is still
 
     def off(one: Scan) -> float:
-        return float(np.abs(floor().distance(SE2.act(pose, one.endpoints()))).mean())
+        ends = lidar.beam_endpoints(one.ranges[one.valid], one.angles[one.valid])
+        return float(np.abs(floor().distance(SE2.act(pose, ends))).mean())
 
     right = scan.deskewed(np.array(motion))
     assert off(right) < off(still) + 0.003 < off(scan)

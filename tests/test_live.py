@@ -269,7 +269,6 @@ def test_a_run_is_watched_tick_by_tick(monkeypatch: pytest.MonkeyPatch) -> None:
     done = episode(ticks=6, obstacles=4)
     names = columns(EpisodeLog)
     known = {name: value for name, value in vars(done).items() if name not in names}
-    known["obstacle_moving"] = done.obstacle_moves
     told: list[str] = []
     scenes: list[Scene] = []
 

@@ -12,8 +12,8 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.lie import wrap_angle
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings, needed
 from unifg.scenarios.perception.readings import Scan
-from unifg.scenarios.rivals.monte_carlo import MonteCarlo, MonteCarloSettings, needed
 from unifg.scenarios.simulation.plane import LidarModel, World
 from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from tools.draw_building import draw_building
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.planning.follow import PathFollower
 from unifg.scenarios.planning.grid import SPACING, path_exists, plan
 from unifg.scenarios.planning.polyline import path_length
-from unifg.scenarios.simulation.building import DEMO_GOALS, DEMO_START, building_map, draw_building
+from unifg.scenarios.simulation.building import DEMO_GOALS, DEMO_START, building_map
 from unifg.typing import Array
 
 RADIUS = 0.17

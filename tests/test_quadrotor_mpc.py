@@ -79,10 +79,10 @@ def test_a_flight_reaches_the_target_and_learns_the_mass() -> None:
     assert error is not None
     assert error < 0.01
     # The cylinders were not known: each appears when it is seen.
-    known = [len(row.ids) for row in log.landmarks]
+    known = [len(row["id"]) for row in log.landmarks]
     assert known[0] < known[-1]
     for ids, row in zip(log.seen, log.landmarks, strict=True):
-        assert set(ids.tolist()) <= set(row.ids.tolist())
+        assert set(ids.tolist()) <= set(row["id"].tolist())
 
 
 @pytest.mark.parametrize("association", ["known", "unknown"])
@@ -354,11 +354,11 @@ def test_what_turns_out_to_move_leaves_the_map() -> None:
     cylinders = flight.world.layout.cylinders[:, :2]
     final, ever = log.landmarks[-1], 0.0
     for row in log.landmarks:
-        own = row.means[row.radii > 0.0]
+        own = row["mean"][row["radius"] > 0.0]
         away = np.hypot(*np.moveaxis(own[:, None] - cylinders, 2, 0)).min(axis=1, initial=np.inf)
         ever = max(ever, float(away.max(initial=0.0)))
     assert ever > 1.0, "at first sight nobody knows"
-    own = final.means[final.radii > 0.0]
+    own = final["mean"][final["radius"] > 0.0]
     assert np.hypot(*np.moveaxis(own[:, None] - cylinders, 2, 0)).min(axis=1).max() < 0.3
 
 

@@ -18,7 +18,7 @@ from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.planning.flat_path import FigureEight, Hover, Line
 from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
 from unifg.scenarios.safety.cbf_mpc import (
-    ON,
+    KEEP,
     PULL,
     SLOWING,
     TRACKING,
@@ -196,8 +196,8 @@ def test_without_a_plan_the_last_is_flown_on_and_then_the_vehicle_brakes() -> No
     start = np.array([-3.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0])
     plans, nothing = keeper(), pillar(50.0, 50.0)
     first = decide(plans, start, 1.0, nothing)
-    controls = plans._plan[1]  # type: ignore[index]
-    warm = plans._warm
+    controls = plans.loop.kept.controls
+    warm = plans.loop.warm
 
     class Violated:
         """An answer that is no plan."""
@@ -219,16 +219,16 @@ def test_without_a_plan_the_last_is_flown_on_and_then_the_vehicle_brakes() -> No
         def solve(self, guess: Any, data: Any) -> Any:
             return Violated(warm.solve(guess, data=data))
 
-    plans._warm = Lost()  # type: ignore[assignment]
-    told = [decide(plans, start, 1.0, nothing) for _ in range(round(ON / 0.01) + 3)]
+    plans.loop.warm = Lost()  # type: ignore[assignment]
+    told = [decide(plans, start, 1.0, nothing) for _ in range(round(KEEP / 0.01) + 3)]
     statuses = [decision.status for decision in told]
-    assert statuses == ["last plan"] * round(ON / 0.01) + ["braking"] * 3
+    assert statuses == ["last plan"] * round(KEEP / 0.01) + ["braking"] * 3
     np.testing.assert_array_equal(told[0].control, controls[1])  # what was meant for this tick
     np.testing.assert_array_equal(told[4].control, controls[1])
     np.testing.assert_array_equal(told[5].control, controls[2])
     assert all(len(decision.plan) == len(first.plan) for decision in told)
     assert told[-1].control[1] < -0.5  # the nose goes up, against the way
-    plans._warm = warm
+    plans.loop.warm = warm
     assert decide(plans, start, 1.0, nothing).status in ("stop_rule", "converged")
 
 
@@ -311,7 +311,7 @@ def test_what_the_plan_comes_near_to_is_looked_at_and_keeps_its_place() -> None:
     assert plans._nearest(moved, all_four, 0.0).tolist() == [2 if k == 2 else 1 for k in before]
     plans = keeper(slots=2)
     decide(plans, start, 1.0, all_four)
-    assert all_four.clearance(plans._plan[0], plans.nodes)[:, 2].min() > 0.0  # type: ignore[index]
+    assert all_four.clearance(plans.loop.kept.states[:, :3], plans.nodes)[:, 2].min() > 0.0
 
 
 def test_the_nearest_are_looked_at_and_falling_ones_fall() -> None:

@@ -6,7 +6,6 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pymunk
 import pytest
 
 from unifg.errors import ScenarioError
@@ -17,13 +16,13 @@ from unifg.scenarios import navigation
 from unifg.scenarios.episode import run_ticks, silent
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.simulation.plane import LidarModel, World
-from unifg.scenarios.simulation.traffic import Person, Traffic, draw_traffic
+from unifg.scenarios.simulation.space import Mover, Space
+from unifg.scenarios.simulation.traffic import Social, Traffic, draw_traffic
 from unifg.typing import Array
 
 PAUSE = 0.005
 QUIET = LidarModel(sigma=0.0, dropout=0.0)
-FAR = pymunk.Body()
-FAR.position = (-50.0, 0.0)
+FAR = Space(np.array([-50.0, 0.0]), 0.17)
 
 
 def hall() -> OccupancyMap:
@@ -37,40 +36,45 @@ def field(occupancy: OccupancyMap) -> DistanceMap:
     return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
 
 
-def world(*people: Person, start: tuple[float, float, float] = (1.0, 2.0, 0.0)) -> World:
+def person(way: Array, radius: float, pace: float, walls: DistanceMap) -> Mover:
+    return Mover(way[0], radius, Social(way, radius, pace, walls))
+
+
+def world(*people: Mover, start: tuple[float, float, float] = (1.0, 2.0, 0.0)) -> World:
     return World(hall(), start, (), np.random.default_rng(0), lidar=QUIET, people=people)
 
 
 def test_a_person_alone_takes_up_its_pace_as_the_forces_say() -> None:
     """dv / dt = (v0 - v) / tau: v = v0 (1 - exp(-t / tau))."""
     way = np.array([[2.0, 2.0], [10.0, 2.0]])
-    person = Person(way, 0.2, 1.2, field(hall()))
+    walker = person(way, 0.2, 1.2, field(hall()))
     for k in range(400):
-        person.advance(FAR, 0.17, False, PAUSE)
-        place, speed = person.body.position, person.body.velocity
+        walker.body.velocity = walker.policy.velocity(walker, FAR, False, PAUSE)
+        place, speed = walker.body.position, walker.body.velocity
         assert speed.x == pytest.approx(1.2 * (1.0 - math.exp(-(k + 1) * PAUSE / 0.5)), abs=0.01)
-        person.body.position = place + PAUSE * speed
-    assert person.body.position.x == pytest.approx(2.0 + 1.2 * (2.0 - 0.5 * (1.0 - math.exp(-4.0))), abs=0.01)
-    assert person.body.position.y == pytest.approx(2.0, abs=0.01)
+        walker.body.position = place + PAUSE * speed
+    assert walker.body.position.x == pytest.approx(2.0 + 1.2 * (2.0 - 0.5 * (1.0 - math.exp(-4.0))), abs=0.01)
+    assert walker.body.position.y == pytest.approx(2.0, abs=0.01)
 
 
 def test_people_are_pushed_off_walls_and_off_each_other() -> None:
     walls = field(hall())
-    person, other = (Person(np.array([[x, 2.0], [11.0, 2.0]]), 0.2, 1.0, walls) for x in (2.0, 2.5))
-    person.others = [(other.body, other.radius)]
+    way = np.array([[2.0, 2.0], [11.0, 2.0]])
+    policy = Social(way, 0.2, 1.0, walls)
+    policy.others = [person(np.array([[2.5, 2.0], [11.0, 2.0]]), 0.2, 1.0, walls)]
     going = np.array([1.0, 0.0])
-    push = person.force(np.array([2.0, 2.0]), going)
+    push = policy.force(np.array([2.0, 2.0]), going)
     assert push == pytest.approx([-25.0 * math.exp((0.4 - 0.5) / 0.08), 0.0], abs=1e-6)
-    person.others = []
+    policy.others = []
     beside = np.array([5.0, 3.95 - 0.3])  # 0.3 m from the wall above
-    wall = person.force(beside, going)
+    wall = policy.force(beside, going)
 
     assert wall[1] < -25.0 * math.exp((0.2 - 0.3) / 0.08), "and back to its way"
 
 
 def test_people_walk_into_a_robot_that_stands_in_their_way() -> None:
     way = np.array([[5.0, 2.02], [0.8, 2.02]])
-    here = world(Person(way, 0.2, 1.0, field(hall())), start=(2.5, 2.0, 0.0))
+    here = world(person(way, 0.2, 1.0, field(hall())), start=(2.5, 2.0, 0.0))
     for _ in range(60):
         here.step(0.0, 0.0)
     assert here.collisions > 0
@@ -82,12 +86,13 @@ PATH = np.column_stack([np.linspace(1.0, 11.0, 201), np.full(201, 2.0), np.zeros
 def test_people_are_drawn_where_there_is_room() -> None:
     walls, chosen = field(hall()), Traffic(people=4)
     drawn = [draw_traffic(chosen, walls, PATH, np.random.default_rng(seed)) for seed in (0, 0, 1)]
-    places = [[tuple(person.body.position) for person in people] for people in drawn]
+    places = [[tuple(mover.body.position) for mover in people] for people in drawn]
     assert places[0] == places[1] != places[2]
-    for person in drawn[0]:
-        assert math.hypot(person.body.position.x - 1.0, person.body.position.y - 2.0) >= 3.0
-        assert walls.distance(person.way).min() >= person.radius and 0.3 <= person.pace <= 1.5
-        assert len(person.others) == 3
+    for mover in drawn[0]:
+        assert math.hypot(mover.body.position.x - 1.0, mover.body.position.y - 2.0) >= 3.0
+        policy = mover.policy
+        assert isinstance(policy, Social) and len(policy.others) == 3
+        assert walls.distance(policy.way).min() >= mover.radius and 0.3 <= policy.pace <= 1.5
     assert draw_traffic(Traffic(), walls, PATH, np.random.default_rng(0)) == []
 
 
@@ -142,6 +147,6 @@ def test_obstacles_may_be_other_than_the_robot_expects() -> None:
 
 def test_a_person_in_the_middle_of_a_short_way_walks_on() -> None:
     """No point of it is far enough to be gone for."""
-    person = Person(np.column_stack([np.linspace(1.0, 1.7, 8), np.full(8, 2.0)]), 0.2, 1.0, field(hall()))
+    policy = Social(np.column_stack([np.linspace(1.0, 1.7, 8), np.full(8, 2.0)]), 0.2, 1.0, field(hall()))
     for place in ((1.35, 2.0), (1.0, 2.0), (1.7, 2.0)):
-        assert np.isfinite(person.force(np.array(place), np.zeros(2))).all()
+        assert np.isfinite(policy.force(np.array(place), np.zeros(2))).all()

@@ -11,6 +11,7 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
+from unifg.models.lidar import beam_endpoints
 from unifg.scenarios.planning.polyline import polyline_distance
 from unifg.scenarios.simulation.plane import LidarModel, OdometryModel, World
 from unifg.scenarios.simulation.rectangles import surface_cells, wall_rectangles
@@ -170,7 +171,7 @@ def test_lidar_measures_the_room(yaw: float) -> None:
         0.4 + yaw,
     )
     scan = World(room(origin=origin), start, lidar=QUIET).scan()
-    points = scan.endpoints()
+    points = beam_endpoints(scan.ranges[scan.valid], scan.angles[scan.valid])
     turn = np.array([[math.cos(0.4), -math.sin(0.4)], [math.sin(0.4), math.cos(0.4)]])
     points = points @ turn.T + inside
     faces = np.stack([points[:, 0] - 0.05, 5.95 - points[:, 0], points[:, 1] - 0.05, 3.95 - points[:, 1]])

@@ -11,7 +11,7 @@ from unifg.scenarios import course as courses
 from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.course import Course
-from unifg.scenarios.log.metrics import table, write_metrics
+from unifg.scenarios.log.metrics import of_solution, table, write_metrics
 from unifg.scenarios.show.course_log import course_log
 from unifg.scenarios.show.course_plot import picture
 from unifg.scenarios.show.course_scene import course_iterate, course_stage
@@ -56,18 +56,12 @@ def course_metrics(course: Course) -> dict[str, Any]:
         "guess": s.chosen_guess,
         "general_cost": s.general,
         "succeeded": c.succeeded,
-        "status": solution.status.name.lower(),
-        "converged": solution.converged,
+        **of_solution(solution),
         "arrived": c.arrived,
         "clear": c.clear,
         "flyable": c.flyable,
-        "cost": float(solution.cost),
         "costs": [float(row.cost) for row in solution.history],
         "violations": [float(row.violation) for row in solution.history],
-        "iterations": solution.iterations,
-        "stationarity": float(solution.stationarity),
-        "violation": float(solution.violation),
-        "complementarity": float(solution.complementarity),
         "target_distance_m": c.target_distance,
         "min_clearance_m": float(c.clearance.min()),
         "min_clearance_between_nodes_m": c.clearance_between,
@@ -79,7 +73,6 @@ def course_metrics(course: Course) -> dict[str, Any]:
         "min_thrust_n": float(c.controls[:, 3].min()),
         "max_thrust_n": float(c.controls[:, 3].max()),
         "max_rate_rad_per_s": float(np.abs(c.controls[:, :3]).max()),
-        "solve_ms": 1e3 * solution.seconds,
     }
 
 

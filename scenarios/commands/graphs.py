@@ -53,7 +53,7 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
     graph = write_g2o(folder / "graph.g2o", solved.after)
     poses = solved.after.poses
     trajectory = write_tum(folder / "trajectory.tum", np.arange(len(poses), dtype=np.float64), poses)
-    numbers = write_metrics(folder / "metrics.json", metrics(solved), sort_keys=False)
+    numbers = write_metrics(folder / "metrics.json", metrics(solved))
     if solved.settings.no_scene:
         return [graph, trajectory, numbers]
     absent = [name for name in ("matplotlib", "meshcat") if find_spec(name) is None]

@@ -8,6 +8,7 @@ from pathlib import Path
 from unifg.scenarios import manoeuvres
 from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
+from unifg.scenarios.log.metrics import write_metrics
 from unifg.scenarios.options import option
 from unifg.scenarios.show.manoeuvre_plot import picture
 from unifg.scenarios.show.manoeuvre_scene import manoeuvre_iterate, manoeuvre_scene, manoeuvre_stage
@@ -52,10 +53,11 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
             break
     progress(1.0, "solved")
 
-    def write(folder: Path) -> list[Path]:
-        numbers = manoeuvres.write_metrics(folder / "metrics.json", solved)
-        scenes = [manoeuvre_scene(m).save(folder / f"{m.case.name}.html") for m in solved]
-        return [*scenes, *(write_figure(folder / f"{m.case.name}.png", picture(m), 105) for m in solved), numbers]
+    numbers = manoeuvres.metrics_of(solved)
 
-    succeeded, numbers = all(m.succeeded for m in solved), manoeuvres.metrics_of(solved)
-    return Outcome(succeeded, interrupted, manoeuvres.table(solved), numbers, write)
+    def write(folder: Path) -> list[Path]:
+        written = write_metrics(folder / "metrics.json", numbers)
+        scenes = [manoeuvre_scene(m).save(folder / f"{m.case.name}.html") for m in solved]
+        return [*scenes, *(write_figure(folder / f"{m.case.name}.png", picture(m), 105) for m in solved), written]
+
+    return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), numbers, write)

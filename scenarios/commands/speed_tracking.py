@@ -7,6 +7,7 @@ from pathlib import Path
 from unifg.scenarios import velocity_tracking
 from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
+from unifg.scenarios.log.metrics import write_metrics
 from unifg.scenarios.show.velocity_plot import picture
 from unifg.scenarios.show.velocity_scene import velocity_scene, velocity_stage
 from unifg.solution.status import Status
@@ -24,12 +25,12 @@ def run(settings: velocity_tracking.TrackingSettings, progress: Progress, announ
         drive = velocity_tracking.run_tracking(settings, progress=synchronized(tell, watch))
     progress(1.0, "solved")
 
+    numbers = velocity_tracking.metrics(drive)
+
     def write(folder: Path) -> list[Path]:
         shown = write_figure(folder / "velocity_tracking.png", picture(drive), 105)
         scene = velocity_scene(drive).save(folder / "scene.html")
-        return [scene, shown, velocity_tracking.write_metrics(folder / "metrics.json", drive)]
+        return [scene, shown, write_metrics(folder / "metrics.json", numbers)]
 
     interrupted = drive.solution.status is Status.INTERRUPTED
-    return Outcome(
-        drive.succeeded, interrupted, velocity_tracking.table(drive), dict(velocity_tracking.metrics(drive)), write
-    )
+    return Outcome(drive.succeeded, interrupted, velocity_tracking.table(drive), numbers, write)

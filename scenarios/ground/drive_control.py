@@ -1,4 +1,4 @@
-"""Where to go? A model-predictive controller as a factor graph (Bazzana et al. 2022, section V).
+"""Model-predictive controller of the ground robot as a factor graph (Bazzana et al. 2022, section V).
 
 Costs: distance to reference poses along the path (eq. 8), control effort, control rate, soft margins to walls and
 discs. Constraints: unicycle dynamics, limits of velocities and of accelerations, rest at the end, hard clearance from
@@ -27,7 +27,7 @@ LEFT_BEHIND = 0.6  # [m] between the ends of plan and reference
 PURSUIT = 0.3  # [m] ahead of the robot, where a guess aims at the reference
 PURSUIT_TIME = 0.2  # [s] in which it would turn there
 ARRIVED = 0.05  # [m] to the end of the reference, where it only turns
-SETTLED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
+ENDED = (fg.Status.CONVERGED, fg.Status.STOP_RULE)
 COMMITTED = 0.1  # [m] more room than the evasion of the last tick has another one to have
 OFF_WALLS = 0.015  # [m] from the hull to walls: less is touching, as far as maps and estimates can tell
 PATIENCE = 5  # ticks of being left behind before the plan starts over from the reference
@@ -60,7 +60,7 @@ class Controller:
             robot(s.dt) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
             cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND, s, COLD_PATIENCE), window=window,
             coupling="sequential" if window is None else "joint", pull=s.pull, limits=s.box, judge=self.judge,
-            starts=InitialGuesses(self.along, self.leaving), believable=settled, patience=PATIENCE,
+            starts=InitialGuesses(self.along, self.leaving), believable=is_believable, patience=PATIENCE,
         )  # fmt: skip
 
     def stations(self) -> Array:
@@ -86,13 +86,13 @@ class Controller:
         return self.loop.estimate
 
     def given(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Drive:
-        """What the terms are given; arguments as of :meth:`plan`."""
+        """Context of the terms; arguments as of :meth:`plan`."""
         cruise = np.zeros((self.settings.horizon, 2))
         cruise[:, 0] = np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
         spread = np.zeros((3, 3)) if covariance is None else covariance
-        return Drive(cruise, reference, tracks, spread, self._way_out(pose, tracks))
+        return Drive(cruise, reference, tracks, spread, self._evasion_from(pose, tracks))
 
-    def _way_out(self, pose: Array, tracks: Tracks) -> EvasiveTrajectory:
+    def _evasion_from(self, pose: Array, tracks: Tracks) -> EvasiveTrajectory:
         """Rest along the path of the last plan; if a mover would come too near there, the best simple way of evading.
 
         Which is the best is judged by the least distance on the way, of discs and of walls alike, beyond what is to be
@@ -118,7 +118,7 @@ class Controller:
         return best
 
     def _worth(self, states: Array, centres: Array, radii: Array) -> tuple[bool, bool, float]:
-        """How good a way out is, the greater the better: whether it touches no wall, nobody, and its least distance."""
+        """Rank of an evasion, the greater the better: clear of walls, clear of discs, least distance."""
         walls, room = self._off_walls(states), self._room(states, centres, radii)
         clear = room + self.settings.disc_clearance >= 0.0
         return walls + self.settings.wall_clearance >= OFF_WALLS, clear, min(room, walls)
@@ -161,7 +161,7 @@ class Controller:
     def judge(
         self, solution: fg.Solution, states: Array, controls: Array, now: Context[Drive], kept: LastPlan
     ) -> Decision:
-        """Drive a plan that keeps the constraints; leave by the way out otherwise.
+        """Drive a plan that keeps the constraints; drive the evasive trajectory otherwise.
 
         Of a solve that ended early this is where it stopped. The cheapest iterate it has passed that keeps the
         constraints was tried: such plans brush past obstacles and creep up to those that stand in the way.
@@ -169,7 +169,7 @@ class Controller:
         if solution.violation <= self.settings.feasible:
             driven = self._within_reach(kept.within(controls), now.last)
             return Decision(driven, states, "solved", behind=is_behind(states, now.given.reference))
-        way = now.given.way_out
+        way = now.given.evasive
         return Decision(way.controls, way.states, "evading" if way.evades else "braking")
 
     def _within_reach(self, controls: Array, last: Array) -> Array:
@@ -180,7 +180,7 @@ class Controller:
 
     def leaving(self, now: Context[Drive]) -> tuple[Array, Array]:
         """Guess the way out, which is feasible: a solver that failed finds the near side of what stopped it."""
-        return now.given.way_out.states, now.given.way_out.controls
+        return now.given.evasive.states, now.given.evasive.controls
 
     def along(self, now: Context[Drive]) -> tuple[Array, Array]:
         """Guess how a simple pursuit would follow the reference, which leads around whatever the route leads around.
@@ -193,27 +193,27 @@ class Controller:
         states, last = np.tile(now.present, (s.horizon + 1, 1)), now.last
         aim = 0
         for k in range(s.horizon):
-            here = states[k]
-            while aim < s.horizon and np.hypot(*(reference[aim] - here)[:2]) < PURSUIT:
+            pose = states[k]
+            while aim < s.horizon and np.hypot(*(reference[aim] - pose)[:2]) < PURSUIT:
                 aim += 1
-            ahead = reference[aim] - here
+            ahead = reference[aim] - pose
             distance = float(np.hypot(*ahead[:2]))
             bearing = np.arctan2(ahead[1], ahead[0]) if distance > ARRIVED else reference[aim, 2]
-            turn = float(wrap_angle(bearing - here[2]))
+            turn = float(wrap_angle(bearing - pose[2]))
             speed = min(speeds[k], distance / s.dt) * max(np.cos(turn), 0.0) ** 2 if distance > ARRIVED else 0.0
             fastest = np.minimum(s.box[1], s.most * (s.horizon - k))
             wanted = np.clip([speed, turn / PURSUIT_TIME], -fastest, fastest)
             controls[k] = np.clip(wanted, last - s.most, last + s.most)
-            states[k + 1] = unicycle.step(here[None], 0.5 * (last + controls[k])[None], s.dt)[0]
+            states[k + 1] = unicycle.step(pose[None], 0.5 * (last + controls[k])[None], s.dt)[0]
             last = controls[k]
         return states, controls
 
 
 def is_behind(states: Array, reference: Array) -> bool:
-    """Whether a plan (N + 1, 3) ends far from its reference: it may be caught in a dead end."""
+    """Return True for a plan (N + 1, 3) that ends far from its reference: it may be caught in a dead end."""
     return bool(np.hypot(*(states[-1] - reference[-1])[:2]) > LEFT_BEHIND)
 
 
-def settled(solution: fg.Solution, choice: Decision) -> bool:
-    """Whether a joint solve says where the robot is: it ended, and its plan is driven."""
-    return choice.source == "solved" and solution.status in SETTLED
+def is_believable(solution: fg.Solution, choice: Decision) -> bool:
+    """Return True if a joint solve says where the robot is: it ended, and its plan is driven."""
+    return choice.source == "solved" and solution.status in ENDED

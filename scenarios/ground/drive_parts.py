@@ -1,4 +1,4 @@
-"""What the driving robot's horizon says, term by term (Bazzana et al. 2022, section V)."""
+"""Terms of the ground robot's horizon (Bazzana et al. 2022, section V)."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ ENDS = "least controls", "greatest controls"
 
 @dataclass(frozen=True)
 class EvasiveTrajectory:
-    """What is driven when no plan is found.
+    """Trajectory that is driven when no plan is found.
 
     It keeps limits and accelerations, ends at rest, and keeps clear as far as anything simple does.
 
     Attributes:
         states: (N + 1, 3) poses from the present on [m, m, rad].
         controls: (N, 2) [m/s, rad/s].
-        evades: whether it is not to come to rest at once, but to get out of somebody's way.
+        evades: True if it evades a mover before it comes to rest.
     """
 
     states: Array
@@ -40,21 +40,21 @@ class EvasiveTrajectory:
 
 @dataclass(frozen=True)
 class Drive:
-    """What the terms are given at a tick.
+    """Context of the terms at a tick.
 
     Attributes:
         wanted: (N, 2) controls that would follow the reference [m/s, rad/s].
         reference: (N + 1, 3) poses along the path, the first beside the robot.
         tracks: discs the robot has seen.
         covariance: (3, 3) of the present pose by the past alone, in its tangent space.
-        way_out: what is driven when no plan is found.
+        evasive: what is driven when no plan is found.
     """
 
     wanted: Array
     reference: Array
     tracks: Tracks
     covariance: Array
-    way_out: EvasiveTrajectory
+    evasive: EvasiveTrajectory
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class Limits:
         graph.constrain(unicycle.rate, u[:-1], u[1:], lower=-s.most, upper=s.most, name="accelerations")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
-        """What can be reached in the first step, and left in one more after the last."""
+        """Controls that are reachable in the first step, and from which rest is reachable after the last."""
         s = self.settings
         least, most = s.box
         low, high = np.tile(least, (s.horizon, 1)), np.tile(most, (s.horizon, 1))
@@ -142,16 +142,16 @@ class Clearance:
         graph.constrain(discs, x[1:], centre, radius, lower=disc_limit, name="discs")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
-        """Where the discs will be, and what the way out keeps."""
+        """Predicted positions of the discs, and the clearance that the evasive trajectory keeps."""
         s, n, m = self.settings, self.settings.horizon, self.settings.discs
         pose, given, chosen = now.present, now.given, nearest(now.given.tracks, now.present, m)
         k, spread = len(chosen), in_world(pose, given.covariance)
         centres, radii, shy = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m)
         limits = np.zeros((n, m))
         centres[:, :k], radii[:k], shy[:k] = predicted(s, pose, chosen), chosen.radius, chosen.mover * s.mover_margin
-        limits[:, :k] = disc_limits(s, pose, centres[:, :k], chosen, given.way_out.states, spread)
+        limits[:, :k] = disc_limits(s, pose, centres[:, :k], chosen, given.evasive.states, spread)
         return {
-            "wall clearance": wall_limits(s, self.field, given.way_out.states, given.reference, spread),
+            "wall clearance": wall_limits(s, self.field, given.evasive.states, given.reference, spread),
             "disc clearance": limits,
             "disc centres": centres,
             "disc radii": radii,
@@ -175,7 +175,7 @@ def along(spread: Array, directions: Array) -> Array:
     return sigma
 
 
-def wall_limits(s: ControllerSettings, field: SmoothField, way_out: Array, reference: Array, spread: Array) -> Array:
+def wall_limits(s: ControllerSettings, field: SmoothField, evasive: Array, reference: Array, spread: Array) -> Array:
     """(N, 1) least distances to walls, as far as the way out keeps them.
 
     They are wider by what the estimate (2, 2) may be off towards the wall that is nearest along the reference. With
@@ -184,16 +184,16 @@ def wall_limits(s: ControllerSettings, field: SmoothField, way_out: Array, refer
     _, slopes = field.distance_and_gradient(reference[1:, :2])
     least = s.robot_radius + s.wall_clearance + s.sigmas * along(spread, slopes)
     if s.avoidance == "barrier":
-        spare = np.maximum(float(field.distance(way_out[:1, :2])[0]) - least, 0.0)
+        spare = np.maximum(float(field.distance(evasive[:1, :2])[0]) - least, 0.0)
         least = least + spare * share(s.approach, s.dt * np.arange(1, s.horizon + 1))
-    limits: Array = np.minimum(least, field.distance(way_out[1:, :2]))[:, None]
+    limits: Array = np.minimum(least, field.distance(evasive[1:, :2]))[:, None]
     return limits
 
 
 def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
     """(N, k, 2) centres along the horizon.
 
-    A mover goes straight on, whoever stands there; it is not trusted to go away, for it may turn round.
+    A mover goes straight on, even through the robot. It is not expected to go away, for it may turn round.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)
     centres: Array = tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
@@ -201,7 +201,7 @@ def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
 
 
 def disc_limits(
-    s: ControllerSettings, pose: Array, centres: Array, tracks: Tracks, way_out: Array, spread: Array
+    s: ControllerSettings, pose: Array, centres: Array, tracks: Tracks, evasive: Array, spread: Array
 ) -> Array:
     """(N, M) least distances to the centres (N, M, 2) of discs less their radii, as far as the way out keeps them.
 
@@ -210,7 +210,7 @@ def disc_limits(
     barrier that may shrink at the rate ``approach`` from now on; with ``avoidance="barrier"`` that holds for each.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)[:, None]
-    kept = np.hypot(*np.moveaxis(way_out[1:, None, :2] - centres, 2, 0)) - tracks.radius
+    kept = np.hypot(*np.moveaxis(evasive[1:, None, :2] - centres, 2, 0)) - tracks.radius
     movers, now = tracks.mover, pose[:2] - tracks.centre
     walk = np.maximum(np.hypot(*tracks.velocity.T), s.mover_speed)
     allowance = np.where(movers, walk * np.minimum(stages, s.mover_surprise), 0.0)

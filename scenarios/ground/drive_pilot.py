@@ -1,4 +1,4 @@
-"""How estimation and control are coupled: two graphs one after the other, or one graph for both."""
+"""Coupling of estimation and control: two graphs one after the other, or one graph for both."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from unifg.scenarios.ground.drive_past import Smoother
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
+from unifg.scenarios.ground.local_planner import PlannerAdapter
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.relocalise import Relocaliser
 from unifg.scenarios.ground.route import Route
-from unifg.scenarios.monitoring.supervisor import Health, OutlierReport, Supervisor
-from unifg.scenarios.monitoring.validation import Door
+from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Supervisor
+from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.perception.disc_tracker import DiscTracker
 from unifg.scenarios.perception.explaining import PointWatch, explained
 from unifg.scenarios.perception.readings import Scan
@@ -43,7 +44,7 @@ logger = logging.getLogger("unifg")
 
 
 class Estimator(Protocol):
-    """What says where the robot is."""
+    """Localiser of the robot."""
 
     @property
     def iterations(self) -> int:
@@ -74,38 +75,7 @@ class Estimator(Protocol):
         ...
 
 
-class Planner(Protocol):
-    """What says where to go."""
-
-    settings: ControllerSettings
-
-    @property
-    def estimate(self) -> Array:
-        """(3,) present pose as it is believed after the last plan [m, m, rad]."""
-        ...
-
-    def stations(self) -> Array:
-        """(N + 1,) how far ahead along the path the reference is [m]."""
-        ...
-
-    def plan(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Plan:
-        """Decide the next control from a pose (3,), poses (N + 1, 3) along the route, discs, and the pose's (3, 3)."""
-        ...
-
-    def rest(self, pose: Array) -> tuple[Array, Array]:
-        """Controls (N, 2) and states (N + 1, 3) of coming to rest, the first of which is taken as applied."""
-        ...
-
-    def driven(self, control: Array) -> None:
-        """Be told that another control (2,) than the first of the plan is applied."""
-        ...
-
-    def forget(self) -> None:
-        """Drop the warm start, as when a new route makes it misleading."""
-        ...
-
-
-PlannerT = TypeVar("PlannerT", bound=Planner)
+PlannerT = TypeVar("PlannerT", bound=Controller | PlannerAdapter)
 
 
 class Pilot(Generic[PlannerT]):
@@ -120,7 +90,7 @@ class Pilot(Generic[PlannerT]):
         pose: (3,) present estimate [m, m, rad]; that of the joint solve, if there is one.
         iterations: of the estimator at the last tick.
         clock: how long the stages of the last tick took: localise, perceive, route, plan.
-        door: what samples have to pass.
+        validator: of samples.
         supervisor: how fast the robot may go.
         share: of the beams of the last scan that the map explains.
         relocated: whether the last tick has found the robot at another place.
@@ -146,7 +116,7 @@ class Pilot(Generic[PlannerT]):
         self.tracks = Tracks.none()
         self.clock = Stopwatch()
         self.pose = estimator.pose
-        self.door, self.supervisor = Door(beams), Supervisor(RAMPS)
+        self.validator, self.supervisor = Validator(beams), Supervisor(RAMPS)
         self.emergency_stop = EmergencyStop(s.robot_radius, float(s.most[0]) / s.dt, s.dt)
         self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
         self.driven = np.zeros(2)
@@ -162,8 +132,8 @@ class Pilot(Generic[PlannerT]):
         return self.estimator.iterations
 
     @property
-    def verdict(self) -> OutlierReport:
-        """What the supervisor said at the last tick."""
+    def verdict(self) -> HealthReport:
+        """Report of the supervisor at the last tick."""
         return self.supervisor.verdict
 
     @property
@@ -174,7 +144,7 @@ class Pilot(Generic[PlannerT]):
     def wake(self, scan: Scan | None, now: float) -> None:
         """Look where the robot stands before anything is decided, as where to go from there; the first tick goes on."""
         try:
-            self._first = self.door.scan(scan, now)
+            self._first = self.validator.scan(scan, now)
             self.estimator.update(self._first, None, self.controller.settings.dt)
         except (UnifgError, ArithmeticError, ValueError):
             return  # the first tick tries again, and says what is wrong
@@ -207,8 +177,8 @@ class Pilot(Generic[PlannerT]):
     def _decide(self, scan: Scan | None, odometry: Array | None, route: Route, now: float, first: bool) -> Plan:
         s = self.controller.settings
         looked = first and self._awake
-        seen = self._first if looked else self.door.scan(scan, now)
-        wheels = None if first else self.door.odometry(odometry, self.driven, s.dt)
+        seen = self._first if looked else self.validator.scan(scan, now)
+        wheels = None if first else self.validator.odometry(odometry, self.driven, s.dt)
         predicted = (
             self.estimator.pose if wheels is None else unicycle.step(self.estimator.pose[None], wheels[None], s.dt)[0]
         )
@@ -229,11 +199,12 @@ class Pilot(Generic[PlannerT]):
         signals.note(
             corrected=found is not None and not self.estimator.refused, share=self.share, predicted=predicted,
             pose=pose, covariance=self.estimator.covariance, wheels=wheels,
-            trusted="wheels" not in self.door.refused, asked=self.driven,
+            trusted="wheels" not in self.validator.refused, asked=self.driven,
             blind=0.0 if seen is None else seen.blind,
         )  # fmt: skip
-        why = self.door.refused.get("lidar", "") or self.estimator.refused
-        verdict = self.supervisor.judge(signals.values(), {"fix": why, "odometry": self.door.refused.get("wheels", "")})
+        refused = self.validator.refused
+        why = {"fix": refused.get("lidar", "") or self.estimator.refused, "odometry": refused.get("wheels", "")}
+        verdict = self.supervisor.judge(signals.values(), why)
         self._find_again(seen)
         if verdict.rests:
             plan = self._rest(pose)
@@ -283,14 +254,14 @@ class Pilot(Generic[PlannerT]):
         self._pause = max(0, self._pause - 1)
         if not search.searching and not self._pause:
             search.begin(scan)
-        found = search.search()
-        if found is None:
+        result = search.search()
+        if result is None:
             return
         self._pause = SEARCH_AGAIN
-        self.search_said = found.cause
-        if found.pose is None:
+        self.search_said = result.cause
+        if result.pose is None:
             return
-        self.estimator.reset(found.pose, FOUND_SIGMA)
+        self.estimator.reset(result.pose, FOUND_SIGMA)
         self.pose, self.relocated = self.estimator.pose, True
         self.tracker, self.points = DiscTracker(self._map), PointWatch()
         self.tracks = Tracks.none()
@@ -301,7 +272,7 @@ class Pilot(Generic[PlannerT]):
 
     def take_over(self, other: Pilot[PlannerT]) -> None:
         """Go on where another pilot, with another map, was."""
-        self.door, self.supervisor, self._signals = other.door, other.supervisor, other._signals
+        self.validator, self.supervisor, self._signals = other.validator, other.supervisor, other._signals
         self.driven, self.share = other.driven, other.share
 
 

@@ -101,7 +101,7 @@ class ControllerSettings:
 
     @property
     def mover_surprise(self) -> float:
-        """How long a disc that has ever moved may go anywhere before the robot can be at rest [s].
+        """Time for which a disc that has ever moved may go anywhere before the robot can be at rest [s].
 
         What it travels in that time is kept off, too: a base that brakes at 1 m/s^2 needs more room than one of 2.5.
         """

@@ -1,4 +1,4 @@
-"""What tells the driving robot's supervisor that something is the matter."""
+"""Health signals of the ground robot."""
 
 from __future__ import annotations
 
@@ -108,26 +108,26 @@ class DriveSignals:
         self._shifts.append((shift, float(wheels[0]) * self._dt))
 
     def planned(self, sound: bool) -> None:
-        """Whether the tick has a plan of its own."""
+        """Record if the tick has a plan of its own."""
         self._plan = 0.0 if sound else self._plan + self._dt
 
     def took(self, seconds: float) -> None:
-        """How long the last tick has taken [s], where that is to count."""
+        """Record the duration of the last tick [s], where that is to count."""
         self._took = seconds
 
     def _misses(self, did: Array) -> float:
-        """By which share velocities (2,) leave out what a wheel was asked for lately."""
+        """Share by which velocities (2,) miss the recent commands of one wheel."""
         sides = np.array([[1.0, 1.0], [-ARM, ARM]])  # speeds of the left and of the right wheel
         told, made = np.array(self._asked) @ sides, did @ sides
         missed = np.maximum(told.min(axis=0) - made, made - told.max(axis=0))
         return float(missed.max(initial=0.0) / max(np.abs(told).max(), CRAWL))
 
     def _distrust(self) -> float:
-        """By which share of it one wheel has missed what it was asked for in each of the last ticks."""
+        """Least of these shares over the last ticks."""
         return min(self._missed) if len(self._missed) == AGREE else 0.0
 
     def values(self) -> dict[str, float]:
-        """By signal."""
+        """Values by signal."""
         shifts = np.array(self._shifts).reshape(-1, 2)
         travelled = float(np.abs(shifts[:, 1]).sum())
         slip = abs(float(shifts[:, 0].sum())) / travelled if travelled > TRAVELLED else 0.0
@@ -146,5 +146,5 @@ class DriveSignals:
 
 
 def forward(one: Array, other: Array) -> float:
-    """How far one pose (3,) has to go ahead, along its heading, to be beside another [m]."""
+    """Distance of a pose (3,) ahead of another, along the heading of the first [m]."""
     return float((other - one)[:2] @ [math.cos(one[2]), math.sin(one[2])])

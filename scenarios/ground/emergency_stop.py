@@ -2,8 +2,8 @@
 
 Neither the map nor the estimate, the tracker nor the plan is asked. A control is reached in a tick and then braked
 along its arc; where the hull would come nearer to the end of a beam than it may, the control is slowed, as far as
-braking goes. Three neighbouring beams have to agree, so noise and single echoes stop nobody. Where most beams ahead
-are lost, the way is not known to be free; a sector that no beam has looked into is occupied from the hull on.
+braking goes. Three neighbouring beams have to agree, so noise and single echoes do not stop the robot. Where most beams
+ahead are lost, the way is not known to be free; a sector that no beam has looked into is occupied from the hull on.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class EmergencyStop:
         return control
 
     def is_free(self, control: Array, scan: Scan, last: float | None = None) -> bool:
-        """Whether a control (2,), reached from a speed ``last`` [m/s] and then braked, touches nothing seen.
+        """Return True if a control (2,), reached from a speed ``last`` [m/s] and then braked, touches nothing seen.
 
         Without ``last`` the control has been reached.
         """

@@ -1,4 +1,4 @@
-"""Where am I? One pose, one odometry prior, 360 beams on the distance map (Bazzana et al. 2022, section IV)."""
+"""Localiser: one pose, one odometry prior, 360 beams on the distance map (Bazzana et al. 2022, section IV)."""
 
 from __future__ import annotations
 

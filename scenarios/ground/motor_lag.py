@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from unifg.errors import ScenarioError
+from unifg.scenarios.simulation.drivetrain import followed
 from unifg.typing import Array
 
 __all__ = ["MotorLag"]
@@ -45,7 +46,6 @@ class MotorLag:
         if np.shape(most) != (2,) or not (np.isfinite(most).all() and np.min(most) >= 0.0):
             raise ScenarioError(f"greatest changes of v and omega must be two finite numbers >= 0, got {most!r}")
         self._dt, self._most = dt, most
-        self._follow = np.array([1.0 if lag == 0.0 else -math.expm1(-dt / lag) for lag in LAGS])[:, None]
         self._velocities = np.zeros((len(LAGS), 2))
         self._evidence = np.zeros(len(LAGS))
 
@@ -54,11 +54,6 @@ class MotorLag:
         """Time constant of the lag that is named [s]; 0 for none."""
         best = int(np.argmax(self._evidence))
         return float(LAGS[best]) if self._evidence[best] > THRESHOLD else 0.0
-
-    @property
-    def evidence(self) -> float:
-        """Of the lag that explains the wheels best, against none."""
-        return float(self._evidence.max())
 
     def note(self, asked: Array, done: Array | None) -> None:
         """Take in a tick.
@@ -69,26 +64,11 @@ class MotorLag:
         """
         if not np.isfinite(asked).all():
             return
-        expected = self._advance(asked)
+        models = [followed(asked, v, lag, self._most, self._dt) for v, lag in zip(self._velocities, LAGS, strict=True)]
+        self._velocities, expected = (np.array(part) for part in zip(*models, strict=True))
         self._evidence *= math.exp(-self._dt / MEMORY)
         if done is None:
             return
         sigma = FLOOR + SCALE * np.abs(expected[0])
         squares = np.minimum(np.square((done - expected) / sigma), OUTLIER).sum(axis=1)
         self._evidence = np.clip(self._evidence + 0.5 * (squares[0] - squares), 0.0, MOST)
-
-    def _advance(self, asked: Array) -> Array:
-        """Mean velocities (models, 2) over a tick."""
-        before = self._velocities
-        wanted = self._follow * (asked - before)
-        change = np.clip(wanted, -self._most, self._most)
-        self._velocities = before + change
-        # At once: a ramp that ends within the tick. With a lag: the exponential where it is not cut.
-        spent = np.divide(np.abs(change), self._most, out=np.zeros_like(change), where=self._most > 0.0)
-        ramp = self._velocities - 0.5 * spent * change
-        mean = np.where(
-            np.abs(wanted) <= self._most,
-            asked - wanted * (LAGS / self._dt)[:, None],
-            0.5 * (before + self._velocities),
-        )
-        return np.concatenate([ramp[:1], mean[1:]])

@@ -1,4 +1,4 @@
-"""Where on the whole map may the robot be? A scan against the distance field from many poses.
+"""Search of the whole map for the pose of the robot: a scan against the distance field from many poses.
 
 Every free place of a coarse grid is tried with every heading of a fan; those whose beams end nearest to surfaces are
 refined by matching on the beams that count, and the best of them is believed if most of its beams end at surfaces and
@@ -38,7 +38,7 @@ CLEARLY = 0.1  # by which the next best place has to fit worse
 
 @dataclass(frozen=True)
 class Found:
-    """What a search has found.
+    """Result of a search.
 
     Attributes:
         pose: (3,) [m, m, rad]; None where it is not known.
@@ -71,7 +71,7 @@ class Relocaliser:
 
     @property
     def searching(self) -> bool:
-        """Whether a search has begun and not ended."""
+        """True while a search goes on."""
         return self._scan is not None
 
     def search(self) -> Found | None:

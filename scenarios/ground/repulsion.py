@@ -42,7 +42,7 @@ class Repulsion:
         graph.minimize(discs, x[1:], centre, reach, sigma=sigma, name="discs")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
-        """Where the discs will be, and how near the robot's centre comes to theirs when they touch."""
+        """Predicted positions of the discs, and distances of the robot's centre from theirs when they touch."""
         s, n, m = self.settings, self.settings.horizon, self.settings.discs
         chosen = nearest(now.given.tracks, now.present, m)
         centres, reach = np.full((n, m, 2), FAR_AWAY), np.zeros(m)

@@ -171,7 +171,7 @@ class Route:
         return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
 
     def _round_about(self, pose: Array, staying: Tracks, place: Array) -> bool:
-        """Whether another way was found on the whole map; if there is none, for long enough, the goal is given up."""
+        """Search another way on the whole map; True if found. After enough failures the goal is given up."""
         self._closed += PATIENCE + 1
         if self._since_anywhere >= ANYWHERE:
             self._since_anywhere = 0
@@ -196,13 +196,13 @@ class Route:
             self.blocked = Blocked(pose[:2].copy(), self._radius + self._wall_gap)
 
     def _stuck(self, end: float) -> bool:
-        """Whether the robot has hardly moved for a while though the goal is not near."""
+        """Return True if the robot has hardly moved for a while though the goal is not near."""
         if len(self._trail) < STUCK_TICKS or end - self._reached < NEAR_GOAL:
             return False
         return bool(np.ptp(np.array(self._trail), axis=0).max() < STUCK_DISTANCE)
 
     def _waits_for_a_mover(self, pose: Array, tracks: Tracks) -> bool:
-        """Whether something that moves just now may keep the robot from going on: it will be elsewhere."""
+        """Return True if something that moves now may be what keeps the robot from going on."""
         speed, offset = np.hypot(*tracks.velocity.T), np.hypot(*(tracks.centre - pose[:2]).T)
         return bool(((speed >= STANDING) & (offset - tracks.radius < WAITING)).any())
 
@@ -223,7 +223,7 @@ class Route:
         self._follow(np.concatenate([way[:-1], onward]))
 
     def _detour(self, pose: Array, rejoin: float, tracks: Tracks, allowance: float, everywhere: bool = False) -> bool:
-        """Whether a way around discs was found: on the map around the path up to ``rejoin`` [m], or on all of it."""
+        """Plan around discs, on the map around the path up to ``rejoin`` [m] or on all of it; True if found."""
         index = min(round(rejoin / SPACING), len(self.path) - 1)
         target = self.path[index]
         corners = np.stack([pose[:2], target[:2], *self.path[self._index() : index + 1, :2]])

@@ -13,7 +13,7 @@ import numpy as np
 from unifg.models import unicycle
 from unifg.typing import Array
 
-EVADING = 1.0  # [s] for which the robot gets out of somebody's way before it brakes
+EVADING = 1.0  # [s] for which the robot evades before it brakes
 TURNS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # turning rates tried, in shares of the greatest
 
 
@@ -30,7 +30,7 @@ def stopped(last: Array, plan: Array, most: Array, count: int) -> Array:
         most: (2,) greatest changes in a step.
         count: of steps.
     """
-    found = np.zeros((count, 2))
+    controls = np.zeros((count, 2))
     (v, omega), (dv, domega) = last.tolist(), most.tolist()
     ahead = [[v, omega], *plan.tolist(), [0.0, 0.0]]
     factor, progress = 1.0, 0.0
@@ -49,8 +49,8 @@ def stopped(last: Array, plan: Array, most: Array, count: int) -> Array:
             v, omega = factor * wanted[0], factor * wanted[1]
         else:
             v, omega = v - min(max(v, -dv), dv), omega - min(max(omega, -domega), domega)
-        found[k] = v, omega
-    return found
+        controls[k] = v, omega
+    return controls
 
 
 def _factors(now: float, wanted: float, most: float) -> tuple[float, float]:

@@ -1,1 +1,1 @@
-"""What a run leaves behind, tick by tick, and the numbers that say how it went."""
+"""Logs of runs, tick by tick, and their metrics."""

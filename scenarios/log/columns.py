@@ -16,6 +16,7 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from unifg.errors import ScenarioError
+from unifg.typing import Array
 
 __all__ = ["Column", "Recorder", "SoFar", "column", "columns", "ragged", "watched", "words"]
 
@@ -24,19 +25,21 @@ L = TypeVar("L")
 
 @dataclass(frozen=True)
 class Column:
-    """How a column is written and kept.
+    """Format of a column.
 
     Attributes:
         unit: of its numbers; "ms" is measured by a clock, "iterations" counts those of a solver.
         entry: what is kept of a value given at a tick, a copy.
         stack: the column, of the entries of all ticks.
-        lasting: whether entries are kept once for as long as they stay the same.
+        lasting: True to keep one entry for as long as it stays the same.
+        ragged: (0, ...) the rows of no tick, of a column of arrays of several lengths; None for other columns.
     """
 
     unit: str
     entry: Callable[[Any], Any]
     stack: Callable[[list[Any]], Any]
     lasting: bool = False
+    ragged: Array | None = None
 
 
 def column(unit: str = "", *shape: int | None, dtype: Any = np.float64) -> Any:
@@ -58,10 +61,9 @@ def ragged(
     unit: str = "",
     *shape: int,
     dtype: Any = np.float64,
-    entry: Callable[[Any], Any] | None = None,
     lasting: bool = False,
 ) -> Any:
-    """Declare a field with an array (n, *shape) per tick, n as it comes, or what ``entry`` makes of a value.
+    """Declare a field with an array (n, *shape) per tick, n as it comes.
 
     A ``lasting`` one seldom changes: ticks in which it is the same share one array.
     """
@@ -69,7 +71,7 @@ def ragged(
     def rows(value: Any) -> Any:
         return np.array(value, dtype=dtype).reshape(-1, *shape)
 
-    return field(metadata={"column": Column(unit, entry or rows, list, lasting)})
+    return field(metadata={"column": Column(unit, rows, list, lasting, rows([]))})
 
 
 def words() -> Any:
@@ -96,7 +98,7 @@ class SoFar:
         return len(next(iter(self._entries.values())))
 
     def follows(self, other: SoFar | None) -> bool:
-        """Whether both look at the same recorder."""
+        """Return True if both look at the same recorder."""
         return other is not None and self._entries is other._entries
 
     def __getattr__(self, name: str) -> Any:
@@ -106,8 +108,8 @@ class SoFar:
                 return place[name]
         if name.startswith("_"):
             raise AttributeError(name)
-        found = getattr(self._log, name)
-        return found.fget(self) if isinstance(found, property) and found.fget is not None else found
+        attribute = getattr(self._log, name)
+        return attribute.fget(self) if isinstance(attribute, property) and attribute.fget is not None else attribute
 
 
 _watch: ContextVar[Callable[[SoFar], None] | None] = ContextVar("watch", default=None)
@@ -115,7 +117,7 @@ _watch: ContextVar[Callable[[SoFar], None] | None] = ContextVar("watch", default
 
 @contextmanager
 def watched(watch: Callable[[SoFar], None] | None) -> Iterator[None]:
-    """Have every tick that is recorded meanwhile, in this thread, looked at; None for by nobody."""
+    """Call ``watch`` after every tick that is recorded meanwhile in this thread; None for no call."""
     token = _watch.set(watch)
     try:
         yield

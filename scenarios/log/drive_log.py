@@ -1,23 +1,22 @@
-"""What one drive leaves behind."""
+"""Log of a drive."""
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
-from unifg.errors import FileFormatError
 from unifg.files.ros_map import OccupancyMap
 from unifg.scenarios.log.columns import column, ragged, words
-from unifg.scenarios.log.stored import load_columns, save_columns
+from unifg.scenarios.log.stored import StoredLog
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["EpisodeLog"]
 
 
 @dataclass(kw_only=True)
-class EpisodeLog:
+class EpisodeLog(StoredLog):
     """One episode of T ticks with a horizon of N steps, K true obstacles and G goals.
 
     Columns share the leading axis T. Row k holds what was true, estimated and decided at ``time[k]``;
@@ -36,7 +35,7 @@ class EpisodeLog:
         scan_angles: (B,) beam angles in the body frame [rad].
         collisions: distinct contact events of the episode.
         reached: one flag per goal.
-        obstacle_moving: (K,) True for obstacles that move by design; None derives it from their positions.
+        obstacle_moves: (K,) True for obstacles that move.
         control_limits: greatest abs(v) [m/s] and abs(omega) [rad/s].
         scenario: name of the scenario.
         interrupted: the user stopped the episode before its end.
@@ -44,6 +43,8 @@ class EpisodeLog:
         dropped: samples that were not let in, by what was wrong with them.
         faults: what was made to go wrong.
     """
+
+    KIND: ClassVar[str] = "unifg drive log 2"
 
     occupancy: OccupancyMap
     path: Array
@@ -57,7 +58,7 @@ class EpisodeLog:
     scan_angles: Array
     collisions: int
     reached: list[bool]
-    obstacle_moving: BoolArray | None = None
+    obstacle_moves: BoolArray
     control_limits: tuple[float, float] = (1.0, 1.0)
     scenario: str = "navigation"
     interrupted: bool = False
@@ -94,7 +95,7 @@ class EpisodeLog:
     route_ms: Array = column("ms")
     """Repair of the global route, most often nothing."""
     compiled: IntArray = column("functions", dtype=np.intp)
-    """What was compiled, or read from the disk, in the tick: none, once the robot has been woken."""
+    """Functions compiled, or read from the disk, in the tick: none, once the robot has been woken."""
     localisation_iterations: IntArray = column("iterations", dtype=np.intp)
     plan_iterations: IntArray = column("iterations", dtype=np.intp)
     status: list[str] = words()
@@ -108,7 +109,7 @@ class EpisodeLog:
     goal_index: IntArray = column(dtype=np.intp)
     """Goal being approached."""
     emergency: BoolArray = column(dtype=np.bool_)
-    """True where the robot braked or got out of the way because nobody found a plan."""
+    """True where the robot braked or got out of the way because there was no plan."""
     rescued: BoolArray = column(dtype=np.bool_)
     """True where the plan is that of the second backend, asked because the first had none."""
     health: list[str] = words()
@@ -141,55 +142,7 @@ class EpisodeLog:
         return not self.interrupted and bool(self.reached) and all(self.reached) and self.collisions == 0
 
     @property
-    def obstacle_moves(self) -> BoolArray:
-        """(K,) True for the obstacles that move, by design or as seen over the episode."""
-        if self.obstacle_moving is not None:
-            return self.obstacle_moving
-        if self.ticks == 0:
-            return np.zeros(self.obstacles.shape[1], dtype=bool)
-        places = self.obstacles[:, :, :2]
-        travel = np.abs(places - places[:1]).max(axis=(0, 2), initial=0.0)
-        moved: BoolArray = np.asarray(travel > 1e-6)
-        return moved
-
-    @property
     def obstacles_first(self) -> Array:
         """(K, 3) the obstacles at the beginning."""
         first: Array = self.obstacles[0]
         return first
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one ``.npz`` file; see :mod:`unifg.scenarios.log.stored`."""
-        occupancy = self.occupancy
-        known = {name: getattr(self, name) for name in _KNOWN} | {
-            "map_occupied": occupancy.occupied,
-            "map_free": occupancy.free,
-            "map_resolution": occupancy.resolution,
-            "map_origin": list(occupancy.origin),
-            "map_name": occupancy.name,
-        }
-        save_columns(path, self, _KIND, known)
-
-    @staticmethod
-    def load(path: str | os.PathLike[str]) -> EpisodeLog:
-        """Read a file written by :meth:`save`.
-
-        Raises:
-            FileFormatError: if the file is no log of a drive.
-        """
-        found, known = load_columns(path, EpisodeLog, _KIND)
-        try:
-            parts = (known.pop(f"map_{name}") for name in ("occupied", "free", "resolution", "origin", "name"))
-            occupied, free, resolution, origin, name = parts
-            occupancy = OccupancyMap(occupied, free, resolution, tuple(origin), name)
-            known["control_limits"] = tuple(known["control_limits"])
-            return EpisodeLog(occupancy=occupancy, **known, **found)
-        except (KeyError, TypeError, ValueError) as error:
-            raise FileFormatError(f"{os.fspath(path)} is no {_KIND}: {error}") from error
-
-
-_KIND = "unifg drive log 1"
-_KNOWN = (
-    "path", "goals", "start", "dt", "robot_radius", "solver", "coupling", "seed", "scan_angles", "collisions",
-    "reached", "obstacle_moving", "control_limits", "scenario", "interrupted", "outcomes", "dropped", "faults",
-)  # fmt: skip

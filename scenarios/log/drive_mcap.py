@@ -223,10 +223,10 @@ def _schema(name: str, log: EpisodeLog) -> dict[str, Any]:
     """JSON schema of a message."""
     if name == _TICK:
         units = {key: column.unit for key, column in columns(log).items()}
-        found = _object(**{key: {"description": units[key]} for key in _plain(log)})
+        schema = _object(**{key: {"description": units[key]} for key in _plain(log)})
     else:
-        found = _SCHEMAS[name]
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": name, **found}
+        schema = _SCHEMAS[name]
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": name, **schema}
 
 
 _NUMBER, _INTEGER, _STRING, _BOOLEAN = ({"type": kind} for kind in ("number", "integer", "string", "boolean"))

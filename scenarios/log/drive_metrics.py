@@ -25,8 +25,8 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
 
     Returns:
         The metrics, of plain Python numbers; the key says the unit. ``path_length_m`` is the way the robot really
-        drove, ``planned_length_m`` that of the planned path; ``solver_failures`` counts ticks for which nobody had a
-        plan, so that the robot braked (``emergency_ticks``, the same ticks), ``rescued_ticks`` those for which the
+        drove, ``planned_length_m`` that of the planned path; ``solver_failures`` counts ticks without a
+        plan, in which the robot braked (``emergency_ticks``, the same ticks), ``rescued_ticks`` those for which the
         second backend had one and the first had not, and ``plan_status`` counts the status words of all ticks.
         ``odometry_error_m`` is the error of dead reckoning. ``outcomes`` says what became of every goal, ``health``
         and ``causes`` count ticks by what the supervisor made of them, ``dropped_samples`` what was not let in, and
@@ -85,7 +85,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
 
 
 def consistency(log: EpisodeLog) -> dict[str, float]:
-    """How well the covariances fit the errors: the mean NEES, and that of one tick drawn by the seed.
+    """Consistency of the covariances: the mean NEES, and that of one tick drawn by the seed.
 
     Errors of neighbouring ticks are correlated, so only one tick of a drive is an independent draw of chi-squared with
     three degrees of freedom.

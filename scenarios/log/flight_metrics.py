@@ -85,7 +85,7 @@ def flight_metrics(log: FlightLog) -> dict[str, Any]:
         "mass_error_relative": float(mass[-1]) if active[0] else None,
         "mass_error_relative_5s": float(mass[early]) if active[0] and long_enough else None,
         "mass_known_s": _settled(log, mass) if active[0] else None,
-        "landmarks": len(log.landmarks[-1].ids),
+        "landmarks": len(log.landmarks[-1]),
         "landmark_error_m": norms(landmark_errors(log)) if len(landmark_errors(log)) else None,
         "statuses": dict(sorted(Counter(log.statuses).items())),
         "outcome": log.outcome,
@@ -99,7 +99,7 @@ def flight_metrics(log: FlightLog) -> dict[str, Any]:
 
 
 def has_estimate(log: FlightLog) -> bool:
-    """Whether somebody estimated the state: a flight along a given plan has neither sigmas nor windows."""
+    """Return True if the state was estimated: a flight along a given plan has neither sigmas nor windows."""
     return bool((log.believed_sigma > 0.0).any()) or any(len(past) for past in log.pasts)
 
 
@@ -119,7 +119,7 @@ def landmark_errors(log: FlightLog) -> Array:
 
     Landmarks farther than 1 m from all of them are left out: they stand for something that moves, or for nothing.
     """
-    means = log.landmarks[-1].means
+    means = log.landmarks[-1]["mean"]
     things = _things(log.layout)
     if not len(means) or not len(things):
         return np.zeros((0, 2))

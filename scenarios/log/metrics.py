@@ -16,6 +16,7 @@ import numpy as np
 
 from unifg.atomic_write import write_atomically
 from unifg.scenarios.log.columns import columns
+from unifg.solution.solution import Solution
 from unifg.typing import Array, IntArray
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "errors",
     "health",
     "iterations",
+    "of_solution",
     "spread",
     "statistics",
     "strict",
@@ -62,7 +64,7 @@ def iterations(values: IntArray) -> dict[str, float]:
 
 
 def collision_words(count: int) -> str:
-    """How many collisions there were, for people."""
+    """Number of collisions in words."""
     return "no collision" if count == 0 else f"{count} collision{'s' if count > 1 else ''}"
 
 
@@ -71,19 +73,32 @@ def without_timings(metrics: Mapping[str, object]) -> dict[str, object]:
     return {key: value for key, value in metrics.items() if not key.endswith("_ms")}
 
 
-def write_metrics(path: str | Path, metrics: Mapping[str, object], *, sort_keys: bool = True) -> Path:
-    """Write metrics as JSON; a number that is not finite becomes null.
+def of_solution(solution: Solution) -> dict[str, Any]:
+    """Status, cost, KKT numbers and time of a solve."""
+    return {
+        "status": solution.status.name.lower(),
+        "converged": solution.converged,
+        "cost": float(solution.cost),
+        "iterations": solution.iterations,
+        "stationarity": float(solution.stationarity),
+        "violation": float(solution.violation),
+        "complementarity": float(solution.complementarity),
+        "solve_ms": 1e3 * solution.seconds,
+    }
+
+
+def write_metrics(path: str | Path, metrics: Mapping[str, object]) -> Path:
+    """Write metrics as JSON with sorted keys; a number that is not finite becomes null.
 
     Args:
         path: file to write; an existing one is replaced.
         metrics: numbers, words, and lists and mappings of them.
-        sort_keys: False keeps the order given.
 
     Returns:
         The path written.
     """
     path = Path(path)
-    text = json.dumps(strict(metrics), indent=2, sort_keys=sort_keys, allow_nan=False)
+    text = json.dumps(strict(metrics), indent=2, sort_keys=True, allow_nan=False)
     write_atomically(path, text + "\n")
     return path
 
@@ -107,7 +122,7 @@ def table(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def health(m: Mapping[str, Any]) -> str:
-    """How well a robot was, and what was the matter longest."""
+    """Health of a run in words, with the causes that lasted longest."""
     ticks = [f"{count} ticks {state}" for state, count in m["health"].items() if count and state != "ok"]
     if not ticks:
         return "ok throughout"

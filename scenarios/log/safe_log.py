@@ -1,4 +1,4 @@
-"""What a flight past things that must not be touched leaves behind, tick by tick."""
+"""Log of a flight among obstacles, tick by tick."""
 
 from __future__ import annotations
 
@@ -87,22 +87,22 @@ class SafeLog:
 
     @property
     def arrived(self) -> bool:
-        """Whether it was where it was to be."""
+        """True if the flight ended where it was to end."""
         return self.end is None or (self.ticks > 0 and bool(np.linalg.norm(self.states[-1, :3] - self.end) < 0.3))
 
     @property
     def touched(self) -> bool:
-        """Whether the hull met anything."""
+        """True if the hull met anything."""
         return bool((self.clearance < 0.0).any())
 
     @property
     def violated(self) -> bool:
-        """Whether the margin was not kept."""
+        """True if the margin was not kept."""
         return bool((self.boundary < -TOUCH).any())
 
     @property
     def succeeded(self) -> bool:
-        """Whether it kept its distance and arrived."""
+        """True if it kept its distance and arrived."""
         return self.arrived and not self.violated
 
 

@@ -1,1 +1,1 @@
-"""What a robot may rely on just now: samples looked at before they come in, and how fast it may go with the rest."""
+"""Health monitoring: validation of samples, and the speed that the rest allows."""

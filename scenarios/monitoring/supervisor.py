@@ -1,4 +1,4 @@
-"""How fast may the robot go with what it knows, and what is the matter? Signals become a share of its speed.
+"""Supervisor: health signals become a share of the robot's speed.
 
 Every signal grows with trouble. Up to one value all is well; from there the share of the speed falls, and at another
 one it is at its least, most often rest. From a third one on the robot does not know where it is. The worst signal
@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
-__all__ = ["Health", "OutlierReport", "Ramp", "Supervisor"]
+__all__ = ["Health", "HealthReport", "Ramp", "Supervisor"]
 
 RISE = 0.1  # of the speed that comes back in a tick
 STEADY = 5  # ticks in a row in which nothing says that it is lost, after which a robot that was is not
@@ -20,7 +20,7 @@ PERSISTENT = 2  # bad ticks in a row that make one lost
 
 
 class Health(Enum):
-    """How much of itself a robot can rely on."""
+    """State of a robot's sensors and estimates."""
 
     OK = "ok"
     DEGRADED = "degraded"
@@ -29,7 +29,7 @@ class Health(Enum):
 
 @dataclass(frozen=True)
 class Ramp:
-    """What a signal says about speed.
+    """Speed by the value of one signal.
 
     Attributes:
         words: the cause, for people.
@@ -54,8 +54,8 @@ class Ramp:
 
 
 @dataclass(frozen=True)
-class OutlierReport:
-    """What holds until the next tick.
+class HealthReport:
+    """Report that holds until the next tick.
 
     Attributes:
         health: in a word.
@@ -69,7 +69,7 @@ class OutlierReport:
 
     @property
     def rests(self) -> bool:
-        """Whether the robot has to come to rest."""
+        """True if the robot has to come to rest."""
         return self.share <= 0.0
 
 
@@ -84,11 +84,11 @@ class Supervisor:
     def __init__(self, ramps: Mapping[str, Ramp]) -> None:
         """Begin with confidence."""
         self.ramps = dict(ramps)
-        self.verdict = OutlierReport(Health.OK, 1.0, "")
+        self.verdict = HealthReport(Health.OK, 1.0, "")
         self._bad = 0
         self._good = STEADY
 
-    def judge(self, signals: Mapping[str, float], notes: Mapping[str, str] | None = None) -> OutlierReport:
+    def judge(self, signals: Mapping[str, float], notes: Mapping[str, str] | None = None) -> HealthReport:
         """Weigh the signals of a tick.
 
         Args:
@@ -107,13 +107,13 @@ class Supervisor:
         is_lost = self._bad >= PERSISTENT or (before.health is Health.LOST and self._good < STEADY)
         if is_lost:
             named = self._cause(worst if allowed < 1.0 else "", notes) or before.cause
-            self.verdict = OutlierReport(Health.LOST, 0.0, named)
+            self.verdict = HealthReport(Health.LOST, 0.0, named)
         elif allowed < 1.0:
-            self.verdict = OutlierReport(Health.DEGRADED, min(allowed, before.share + RISE), self._cause(worst, notes))
+            self.verdict = HealthReport(Health.DEGRADED, min(allowed, before.share + RISE), self._cause(worst, notes))
         else:
             share = min(1.0, before.share + RISE)
             returning = share < 1.0
-            self.verdict = OutlierReport(
+            self.verdict = HealthReport(
                 Health.DEGRADED if returning else Health.OK, share, before.cause if returning else ""
             )
         return self.verdict
@@ -122,7 +122,7 @@ class Supervisor:
         """Note a tick that came to no end."""
         self._good = 0
         health = Health.LOST if self.verdict.health is Health.LOST else Health.DEGRADED
-        self.verdict = OutlierReport(health, 0.0, f"the tick failed: {why}")
+        self.verdict = HealthReport(health, 0.0, f"the tick failed: {why}")
 
     def _cause(self, name: str, notes: Mapping[str, str] | None) -> str:
         if not name:

@@ -1,4 +1,4 @@
-"""What may come in: every sample is looked at before anything is worked out from it.
+"""Validation of sensor samples.
 
 A sample is let in if it can be one of the sensor that it comes from: there, of the right size, finite, of the right
 sign, new, not too old. Others are dropped and counted by what is wrong with them; nothing is raised, whatever arrives.
@@ -15,35 +15,35 @@ import numpy as np
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.typing import Array, BoolArray
 
-__all__ = ["Door", "DoorSettings"]
+__all__ = ["ValidationSettings", "Validator"]
 
 EARLY = 1e-6  # [s] by which a stamp may lie ahead of the clock
 
 
 @dataclass(frozen=True)
-class DoorSettings:
-    """What a sample of a sensor can be.
+class ValidationSettings:
+    """Limits of valid samples.
 
     Attributes:
-        nearest: a beam that comes back from nearer has met nothing [m].
-        farthest: beams longer than this say nothing about the map [m].
-        fewest: beams between these that a scan must have.
-        oldest: a scan older than this says where the robot was, not where it is [s].
+        min_range: a beam that comes back from nearer has met nothing [m].
+        max_range: beams longer than this say nothing about the map [m].
+        min_beams: beams between these that a scan must have.
+        max_age: a scan older than this says where the robot was, not where it is [s].
         moved: distance [m] and turn [rad] after which a scan that repeats the last one, bit by bit, is none.
-        fastest: greatest |v| [m/s] and |omega| [rad/s] that wheels can report.
-        heaviest: greatest specific force [m/s^2] and body rate [rad/s] that a reading can hold.
+        max_speed: greatest |v| [m/s] and |omega| [rad/s] that wheels can report.
+        max_specific_force: greatest specific force [m/s^2] and body rate [rad/s] that a reading can hold.
     """
 
-    nearest: float = 0.01
-    farthest: float = 10.0
-    fewest: int = 20
-    oldest: float = 0.15
+    min_range: float = 0.01
+    max_range: float = 10.0
+    min_beams: int = 20
+    max_age: float = 0.15
     moved: tuple[float, float] = (0.005, 0.005)
-    fastest: tuple[float, float] = (5.0, 10.0)
-    heaviest: tuple[float, float] = (500.0, 50.0)
+    max_speed: tuple[float, float] = (5.0, 10.0)
+    max_specific_force: tuple[float, float] = (500.0, 50.0)
 
 
-class Door:
+class Validator:
     """Looks at samples.
 
     Attributes:
@@ -52,9 +52,9 @@ class Door:
         refused: what was wrong with the last sample of each sensor; no entry where it was let in.
     """
 
-    def __init__(self, beams: int = 0, settings: DoorSettings | None = None) -> None:
+    def __init__(self, beams: int = 0) -> None:
         """Expect scans of so many beams."""
-        self.settings = settings or DoorSettings()
+        self.settings = ValidationSettings()
         self.dropped: Counter[str] = Counter()
         self.refused: dict[str, str] = {}
         self._beams = beams
@@ -86,24 +86,24 @@ class Door:
             return None, "its time is not a number"
         if stamp > now + EARLY:
             return None, "from the future"
-        if now - stamp > self.settings.oldest + EARLY:
+        if now - stamp > self.settings.max_age + EARLY:
             return None, "too old"
         if scan.time is not None and stamp <= self._time:
             return None, "not newer than the last"
         if self._repeats(ranges):
             return None, "the last one once more"
         s = self.settings
-        measured = np.isfinite(ranges) & (ranges >= s.nearest) & (ranges <= s.farthest)
-        if measured.sum() < s.fewest:
-            return None, _emptiness(ranges, s.nearest)
+        measured = np.isfinite(ranges) & (ranges >= s.min_range) & (ranges <= s.max_range)
+        if measured.sum() < s.min_beams:
+            return None, _emptiness(ranges, s.min_range)
         self._last, self._since[:] = ranges.copy(), 0.0
         self._time = stamp
         turn = _number(scan.turn)
-        turn = turn if 0.0 <= turn <= s.oldest else 0.0
-        return Scan(angles, np.where(ranges >= s.nearest, ranges, np.nan), stamp, turn), ""
+        turn = turn if 0.0 <= turn <= s.max_age else 0.0
+        return Scan(angles, np.where(ranges >= s.min_range, ranges, np.nan), stamp, turn), ""
 
     def _repeats(self, ranges: Array) -> bool:
-        """Whether noise has not changed a single beam though the robot has moved."""
+        """Return True if noise has not changed a single beam though the robot has moved."""
         if self._last is None or not (self._since > self.settings.moved).any():
             return False
         return np.array_equal(ranges, self._last, equal_nan=True)
@@ -125,7 +125,7 @@ class Door:
             wrong = "not two numbers"
         elif not np.isfinite(found).all():
             wrong = "not finite"
-        elif (np.abs(found) > self.settings.fastest).any():
+        elif (np.abs(found) > self.settings.max_speed).any():
             wrong = "faster than any wheel"
         self._note("wheels", wrong)
         velocities = applied if wrong or found is None else found
@@ -146,7 +146,7 @@ class Door:
         """
         sightings, wrong = _sightings(reading)
         self._note("detector", wrong)
-        force, rates = self.settings.heaviest
+        force, rates = self.settings.max_specific_force
         inertial = reading is not None and _bounded(reading.rates, 3, rates) and _bounded(reading.force, 3, force)
         self._note("inertial unit", "" if inertial else "not three numbers that can be")
         if reading is None:
@@ -192,19 +192,15 @@ def _sightings(reading: Reading | None) -> tuple[Reading, str]:
     )
     if good.all():
         return reading, ""
-    kept = replace(
-        reading, ids=ids[good], bearings=bearings[good], ranges=ranges[good], radii=radii[good], kinds=kinds[good],
-        moving=moving[good],
-    )  # fmt: skip
-    return kept, "sightings that cannot be"
+    return reading.only(good), "sightings that cannot be"
 
 
-def _emptiness(ranges: Array, nearest: float) -> str:
+def _emptiness(ranges: Array, min_range: float) -> str:
     """Why a scan holds next to nothing."""
     kinds = {
         "no beam came back (not numbers)": np.isnan(ranges).sum(),
         "no beam came back (out of range)": (ranges > 0.0).sum(),
-        "beams shorter than can be": (ranges < nearest).sum(),
+        "beams shorter than can be": (ranges < min_range).sum(),
     }
     return max(kinds, key=lambda kind: kinds[kind])
 
@@ -220,11 +216,11 @@ def _numbers(value: object, shape: tuple[int, ...]) -> Array | None:
 
 def _number(value: object) -> float:
     """A number; NaN for what is none."""
-    found = _numbers(value, ())
-    return math.nan if found is None else float(found)
+    number = _numbers(value, ())
+    return math.nan if number is None else float(number)
 
 
 def _bounded(value: object, count: int, most: float) -> bool:
-    """Whether these are so many finite numbers, none beyond a bound."""
-    found = _numbers(value, (count,))
-    return found is not None and bool((np.abs(found) <= most).all())
+    """Return True for so many finite numbers, none beyond a bound."""
+    numbers = _numbers(value, (count,))
+    return numbers is not None and bool((np.abs(numbers) <= most).all())

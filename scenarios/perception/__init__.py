@@ -1,1 +1,1 @@
-"""What measurements say about things that no map shows."""
+"""Perception of obstacles and landmarks that no map shows."""

@@ -1,4 +1,4 @@
-"""What landmarks should look like from an uncertain state, and where sightings put what was seen."""
+"""Association: expected sightings of landmarks from an uncertain state, and positions of sightings."""
 
 from __future__ import annotations
 

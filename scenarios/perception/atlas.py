@@ -1,4 +1,4 @@
-"""What the landmarks' slots hold: names, kinds and radii, and what had to leave its slot."""
+"""Slots of landmarks: names, kinds and radii, and the landmarks that had to leave their slot."""
 
 from __future__ import annotations
 
@@ -91,10 +91,10 @@ class Atlas:
             covariance: (2 K, 2 K) [m^2].
         """
         slots = np.flatnonzero(self.used)
-        own = 2 * slots[:, None] + np.arange(2)
+        columns = 2 * slots[:, None] + np.arange(2)
         rows = [
             (int(self._first[s]), int(self.names[s]), positions[s], block, float(self.radii[s]), int(self.kinds[s]))
-            for s, block in zip(slots.tolist(), covariance[own[:, :, None], own[:, None, :]], strict=True)
+            for s, block in zip(slots.tolist(), covariance[columns[:, :, None], columns[:, None, :]], strict=True)
         ]
         # A landmark that was given up and seen again stands in a slot: its old entry does not count.
         known = {row[1] for row in rows}

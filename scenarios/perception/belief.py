@@ -1,4 +1,4 @@
-"""What the estimator knows and the planner may use: the present state, the parameters and the landmarks seen so far."""
+"""Belief that the estimator gives the planner: present state, parameters, landmarks seen so far."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""What a lidar tells of obstacles that are not on the map: discs tracked over scans.
+"""Discs that are not on the map, tracked over lidar scans.
 
 `unifg.scenarios.perception.discs` finds discs in one scan; here they become tracks. Each track runs two small Kalman
 filters side by side, one of a disc that stands still and one of a disc at constant velocity (Bar-Shalom, Li,
 Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, chapter 6). A track is still until
 its velocity is beyond doubt, and again once it was seen in one place for long: a disc half hidden behind another
-seems to move while the robot passes, and nobody should wait for it ever after. Things out of view are remembered
+seems to move while the robot passes, and the robot should not wait for it ever after. Things out of view are remembered
 while they stand still, and forgotten soon once they move.
 """
 
@@ -78,14 +78,13 @@ class DiscTracker:
     per track serves both axes, and all tracks are filtered together.
     """
 
-    def __init__(self, distance_map: DistanceMap, *, finder: DiscFinder | None = None) -> None:
+    def __init__(self, distance_map: DistanceMap) -> None:
         """Start without tracks.
 
         Args:
             distance_map: distance to the surfaces of the map the robot was given.
-            finder: how discs are found in a scan; None for the usual settings.
         """
-        self.finder = finder or DiscFinder(distance_map)
+        self.finder = DiscFinder(distance_map)
         self._next_identity = 0
         self._rows = _Filters.of(Discs.none(), np.zeros(0, dtype=np.intp))
 
@@ -186,7 +185,7 @@ class DiscTracker:
         rows.unseen[track] = 0.0
         rows.clear[track] = 0
         self._judge_motion(track, variance)
-        self._settle(track, dt)
+        self._count_rest(track, dt)
 
     def _judge_motion(self, track: IntArray, variance: Array) -> None:
         """Decide which tracks move: velocity beyond doubt to begin, plainly slow to end."""
@@ -201,19 +200,19 @@ class DiscTracker:
         rows.anchor[moved] = rows.mean[moved, 0]
         rows.anchor_variance[moved] = variance[moving]
 
-    def _settle(self, track: IntArray, dt: float) -> None:
+    def _count_rest(self, track: IntArray, dt: float) -> None:
         """Take for standing what has not left its place for long."""
         rows = self._rows
         left = np.linalg.norm(rows.mean[track, 0] - rows.home[track], axis=1) > _HOME
         rows.home[track[left]] = rows.mean[track[left], 0]
         rows.stayed[track] = np.where(left, 0.0, rows.stayed[track] + dt)
-        settled = track[rows.has_moved[track] & (rows.stayed[track] > _SETTLED)]
-        rows.has_moved[settled] = rows.moving[settled] = False
-        rows.mean[settled, 1] = 0.0
-        rows.covariance[settled, 0, 1] = rows.covariance[settled, 1, 0] = 0.0
-        rows.covariance[settled, 1, 1] = _FIRST_SPEED**2
-        rows.anchor[settled] = rows.mean[settled, 0]
-        rows.anchor_variance[settled] = rows.covariance[settled, 0, 0]
+        resting = track[rows.has_moved[track] & (rows.stayed[track] > _SETTLED)]
+        rows.has_moved[resting] = rows.moving[resting] = False
+        rows.mean[resting, 1] = 0.0
+        rows.covariance[resting, 0, 1] = rows.covariance[resting, 1, 0] = 0.0
+        rows.covariance[resting, 1, 1] = _FIRST_SPEED**2
+        rows.anchor[resting] = rows.mean[resting, 0]
+        rows.anchor_variance[resting] = rows.covariance[resting, 0, 0]
 
     def _review(self, missed: BoolArray, scan: Scan, pose: Array, dt: float) -> None:
         """Age the tracks that were not seen; drop those seen through, gone or found by chance."""

@@ -1,4 +1,4 @@
-"""Which beams does the map explain? Those that end near one of its surfaces; the others have met something new.
+"""Beams that the map explains, because they end near a surface; the others have met something new.
 
 The share of those that are explained tells whether the robot is where it believes to be. The others are places that a
 plan has to keep clear of, whatever shape they belong to.

@@ -1,4 +1,4 @@
-"""What moves, and where does it go? A straight line through the last detections of each disc.
+"""Tracks of moving discs: a straight line through the last detections of each.
 
 A sensor that names what it sees says what moves, too. Of one that does not every cylinder is followed, and moves once a
 line through its last places is steeper than their scatter explains.
@@ -21,7 +21,7 @@ __all__ = ["LineTracker", "TrackerSettings"]
 
 @dataclass(frozen=True)
 class TrackerSettings:
-    """How detections become tracks.
+    """Settings of the tracks.
 
     Attributes:
         memory: age of the oldest detection that counts [s].
@@ -63,9 +63,9 @@ class _Track:
 class LineTracker:
     """Tracks of what moves, in the frame of the belief."""
 
-    def __init__(self, settings: TrackerSettings | None = None, association: str = "known") -> None:
+    def __init__(self, association: str = "known") -> None:
         """Begin without tracks; ``association`` "known" trusts the readings' names and flags, "unknown" finds out."""
-        self.settings = settings or TrackerSettings()
+        self.settings = TrackerSettings()
         self._known = association == "known"
         self._tracks: list[_Track] = []
         self._count = 0
@@ -87,7 +87,7 @@ class LineTracker:
         return replace(reading, ids=names, moving=moving)
 
     def update(self, reading: Reading, state: Array) -> Tracks:
-        """Where the moving discs are now, and how they move.
+        """Tracks of the discs that move, now.
 
         Args:
             reading: as it was :meth:`told`.
@@ -112,15 +112,15 @@ class LineTracker:
 
     def _follow(self, reading: Reading, state: Array, rows: IntArray) -> list[_Track]:
         """The tracks of some detections (r,), each taken in."""
-        now, free, found = reading.time, list(self._tracks), []
+        now, free, followed = reading.time, list(self._tracks), []
         for row, place in zip(rows.tolist(), places(state, reading.bearings[rows], reading.ranges[rows]), strict=True):
             track = self._match(int(reading.ids[row]), place, now, free)
             track.times.append(now)
             track.places.append(place)
             track.radii.append(float(reading.radii[row]))
             self._fit(track, now)
-            found.append(track)
-        return found
+            followed.append(track)
+        return followed
 
     def _match(self, name: int, place: Array, now: float, free: list[_Track]) -> _Track:
         """The track a detection belongs to, taken from those that are free; otherwise a new one."""
@@ -157,11 +157,11 @@ class LineTracker:
 
 def _line(times: list[float], places: list[Array]) -> tuple[float, Array, Array, float]:
     """Mean time [s] and place (2,) [m], velocity (2,) by least squares, and its standard deviation per axis [m/s]."""
-    moments, found = np.array(times), np.array(places)
-    middle, mean = moments.mean(), found.mean(axis=0)
+    moments, positions = np.array(times), np.array(places)
+    middle, mean = moments.mean(), positions.mean(axis=0)
     away = moments - middle
     weight = float(away @ away)
-    velocity = away @ (found - mean) / weight
-    left = found - mean - away[:, None] * velocity
+    velocity = away @ (positions - mean) / weight
+    left = positions - mean - away[:, None] * velocity
     scatter = float(np.sqrt(np.square(left).sum() / (2 * len(moments) - 4)))
     return float(middle), mean, velocity, scatter / float(np.sqrt(weight))

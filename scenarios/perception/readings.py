@@ -1,9 +1,10 @@
-"""What the sensors return: one turn of the lidar, and one reading of the quadrotor's sensors."""
+"""Measurements: one turn of the lidar, and one reading of the quadrotor's sensors."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -77,10 +78,10 @@ class Scan:
         count = len(self.angles)
         since = self.turn * (np.arange(count) - (count - 1)) / count
         motion = since[:, None] * np.array([velocity[0], 0.0, velocity[1]])
-        there = SE2.exp(motion)
+        poses = SE2.exp(motion)
         ranges = np.where(self.valid, self.ranges, 1.0)
-        points = SE2.act(there, ranges[:, None] * np.column_stack([np.cos(self.angles), np.sin(self.angles)]))
-        bearing = np.where(self.valid, np.arctan2(points[:, 1], points[:, 0]), self.angles + there[:, 2])
+        points = SE2.act(poses, ranges[:, None] * np.column_stack([np.cos(self.angles), np.sin(self.angles)]))
+        bearing = np.where(self.valid, np.arctan2(points[:, 1], points[:, 0]), self.angles + poses[:, 2])
         # Nearly the old directions, and rising as they did: not wrapped anew.
         angles = self.angles + wrap_angle(bearing - self.angles)
         return replace(self, angles=angles, ranges=np.where(self.valid, np.hypot(*points.T), self.ranges), turn=0.0)
@@ -90,12 +91,6 @@ class Scan:
         """(B,) True for beams that came back."""
         returned: BoolArray = np.isfinite(self.ranges)
         return returned
-
-    def endpoints(self) -> Array:
-        """(n, 2) body-frame points [m] of the n beams that came back, in beam order."""
-        keep = self.valid
-        angles, ranges = self.angles[keep], self.ranges[keep]
-        return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=1)
 
 
 @dataclass(frozen=True)
@@ -127,3 +122,9 @@ class Reading:
     tilt: Array
     rates: Array
     force: Array
+
+    def only(self, rows: IntArray | BoolArray) -> Reading:
+        """The reading with some of its sightings, by indices or flags (K,)."""
+        names = ("ids", "bearings", "ranges", "radii", "kinds", "moving")
+        chosen: dict[str, Any] = {name: np.asarray(getattr(self, name))[rows] for name in names}
+        return replace(self, **chosen)

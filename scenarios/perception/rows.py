@@ -15,7 +15,7 @@ class Rows:
     """Base of classes whose fields are arrays of one length."""
 
     def __len__(self) -> int:
-        """How many."""
+        """Number of rows."""
         return len(self._columns()[0])
 
     def at(self, index: IntArray | BoolArray) -> Self:

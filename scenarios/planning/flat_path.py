@@ -28,7 +28,7 @@ class Flown(NamedTuple):
 
 
 class FlatPath(Protocol):
-    """Where to be when."""
+    """Positions over time."""
 
     def at(self, times: Array) -> Flown:
         """The path at times (n,) [s], before and after which it goes on as it is stated."""

@@ -10,6 +10,8 @@ from unifg.errors import ScenarioError
 from unifg.scenarios.planning.polyline import arc_lengths, at_stations
 from unifg.typing import Array, ArrayLike
 
+WINDOW = 2.0  # ahead of the last arc length, where the robot is looked for [m]; so short, a path may cross itself
+
 
 class PathFollower:
     """The point of a path nearest to a robot that only moves forward, and the poses ahead of it.
@@ -19,18 +21,15 @@ class PathFollower:
         length: [m].
     """
 
-    def __init__(self, path: ArrayLike, *, window: float = 2.0) -> None:
+    def __init__(self, path: ArrayLike) -> None:
         """Measure the path.
 
         Args:
             path: (P, 3) poses [m, m, rad], P >= 2.
-            window: how far ahead of the last arc length the robot is looked for [m]; short enough, a path may
-                cross itself.
         """
         self.path: Array = np.array(path, dtype=np.float64)
         if self.path.ndim != 2 or self.path.shape[1] != 3 or len(self.path) < 2:
             raise ScenarioError(f"path of shape {self.path.shape}: at least two poses (P, 3) are needed")
-        self.window = window
         self._arc = arc_lengths(self.path[:, :2])
         self.length = float(self._arc[-1])
         # The goal's heading belongs to the goal alone: on the way there the heading stays that of the path.
@@ -45,7 +44,7 @@ class PathFollower:
         """
         begin = min(max(start_arclength, 0.0), self.length)
         first = min(int(np.searchsorted(self._arc, begin, side="right")) - 1, len(self._arc) - 2)
-        last = min(int(np.searchsorted(self._arc, begin + self.window)), len(self._arc) - 1)
+        last = min(int(np.searchsorted(self._arc, begin + WINDOW)), len(self._arc) - 1)
         tail, head = self.path[first:last, :2], self.path[first + 1 : last + 1, :2]
         span = head - tail
         length = self._arc[first + 1 : last + 1] - self._arc[first:last]

@@ -48,7 +48,7 @@ class _Clearance:
             )
         self.occupancy = occupancy
         self.field = distance_map
-        # Compiled for one layout: a part of a map, or what somebody else has locked, would be compiled for anew.
+        # Compiled for one layout: a part of a map, or a read-only array, would be compiled for anew.
         self.discs: Array = _plain(np.asarray([] if discs is None else discs, dtype=np.float64).reshape(-1, 3))
         self.known: BoolArray = _plain(occupancy.free)
         self.grid: Array = distance_map.values
@@ -92,7 +92,7 @@ class _Clearance:
         return distance, gradient
 
     def free(self, points: Array) -> BoolArray:
-        """Whether points (..., 2) lie in cells of the map that are known to be free."""
+        """Flags of points (..., 2) that lie in cells of the map known to be free."""
         cells = np.floor(self.occupancy.world_to_grid(points)).astype(np.intp)
         height, width = self.occupancy.shape
         row, column = cells[..., 1], cells[..., 0]
@@ -140,7 +140,6 @@ def plan(
     goal: ArrayLike,
     *,
     robot_radius: float,
-    clearance_preferred: float | None = None,
     clearance_least: float | None = None,
     extra_discs: ArrayLike | None = None,
 ) -> Array:
@@ -152,9 +151,8 @@ def plan(
         start: (3,) or (2,) [m, m, rad]; the heading is not used.
         goal: (3,) [m, m, rad].
         robot_radius: radius of the robot's disc [m].
-        clearance_preferred: distance from the robot's centre to walls that is tried first [m], by default the
-            radius plus 0.15 m; where no such way exists it is lowered step by step.
-        clearance_least: the lowest that is tried [m], by default the radius.
+        clearance_least: lowest distance from the robot's centre to walls that is tried [m], by default the radius.
+            The radius plus 0.15 m is tried first; where no such way exists it is lowered step by step.
         extra_discs: (K, 3) x, y, radius [m] of obstacles that are not on the map.
 
     Returns:
@@ -174,7 +172,7 @@ def plan(
     for name, pose in (("start", start_pose), ("goal", goal_pose)):
         _check_standing(clearance, name, pose, robot_radius)
     least = robot_radius if clearance_least is None else max(clearance_least, robot_radius)
-    preferred = max(robot_radius + _COMFORT if clearance_preferred is None else clearance_preferred, least)
+    preferred = max(robot_radius + _COMFORT, least)
 
     if least > robot_radius:
         clearance.restrict(least)
@@ -200,7 +198,7 @@ def plan(
     for stride in (1, 5):
         points = _shorten(clearance, resample(points, SPACING), float(level), robot_radius, stride)
     points = _smooth(clearance, resample(points, SPACING), preferred)
-    return headed(_settle(clearance, resample(points, SPACING), float(level)), float(goal_pose[2]))
+    return headed(_off_corners(clearance, resample(points, SPACING), float(level)), float(goal_pose[2]))
 
 
 def smoothed(values: Array) -> Array:
@@ -219,7 +217,7 @@ def path_exists(
     clearance: float,
     discs: ArrayLike | None = None,
 ) -> bool:
-    """Whether start and goal are joined by free space with this clearance to walls and discs.
+    """Return True if free space with this clearance to walls and discs joins start and goal.
 
     Args:
         occupancy: the map.
@@ -323,7 +321,7 @@ def _search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -
     spent[begin] = 0.0
     keys[0], places[0], size = 0.0, begin, 1
     while size > 0:
-        here = places[0]
+        current = places[0]
         size -= 1
         key, place, at = keys[size], places[size], 0
         while True:  # the last one sinks from the top of the heap
@@ -336,31 +334,31 @@ def _search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -
                 break
             keys[at], places[at], at = keys[child], places[child], child
         keys[at], places[at] = key, place
-        if done[here]:
+        if done[current]:
             continue
-        done[here] = True
-        if here == goal:
+        done[current] = True
+        if current == goal:
             break
-        row, column = here // width, here % width
+        row, column = current // width, current % width
         for k in range(9):
             i, j = row + k // 3 - 1, column + k % 3 - 1
             if i < 0 or i >= height or j < 0 or j >= width or not cells[i, j]:
                 continue
-            there = i * width + j
-            if done[there] or not (cells[row, j] and cells[i, column]):
+            neighbour = i * width + j
+            if done[neighbour] or not (cells[row, j] and cells[i, column]):
                 continue
             length = math.sqrt(2.0) if i != row and j != column else 1.0
-            total = spent[here] + 0.5 * length * (cost[row, column] + cost[i, j])
-            if total >= spent[there] or size + 1 >= len(keys):
+            total = spent[current] + 0.5 * length * (cost[row, column] + cost[i, j])
+            if total >= spent[neighbour] or size + 1 >= len(keys):
                 continue
-            spent[there], before[there] = total, here
+            spent[neighbour], before[neighbour] = total, current
             away, aside = abs(i - source[0]), abs(j - source[1])
             key = total + max(away, aside) + (math.sqrt(2.0) - 1.0) * min(away, aside)
             at, size = size, size + 1
             while at > 0 and keys[(at - 1) // 2] > key:
                 keys[at], places[at] = keys[(at - 1) // 2], places[(at - 1) // 2]
                 at = (at - 1) // 2
-            keys[at], places[at] = key, there
+            keys[at], places[at] = key, neighbour
     return before
 
 
@@ -403,19 +401,19 @@ def _straightened(
     stride: int,
     robot_radius: float,
 ) -> IntArray:
-    """Which of points (n, 2) are left: from each the farthest that a good line leads to."""
+    """Indices of the points (n, 2) that are left: from each the farthest that a good line leads to."""
     last = len(points) - 1
     kept, count, anchor = np.zeros(last + 1, dtype=np.int64), 1, 0
     while anchor < last:
-        found = anchor + 1  # the path itself
+        farthest = anchor + 1  # the path itself
         for k in range(_LOOKAHEAD, 0, -1):
             end = min(anchor + stride * k, last)
             if k > 1 and end == min(anchor + stride * (k - 1), last):
                 continue
             if _good_line(table, free, discs, points, spent, floor, anchor, end, robot_radius):
-                found = end
+                farthest = end
                 break
-        anchor = found
+        anchor = farthest
         kept[count] = anchor
         count += 1
     return kept[:count]
@@ -433,7 +431,7 @@ def _good_line(
     end: int,
     robot_radius: float,
 ) -> bool:
-    """Whether a straight line keeps the clearance of its ends, stays on free cells, and costs no more."""
+    """Return True if a straight line keeps the clearance of its ends, stays on free cells, and costs no more."""
     across, along = points[end, 0] - points[begin, 0], points[end, 1] - points[begin, 1]
     length, allowed, total = math.hypot(across, along), min(floor[begin], floor[end]) - 1e-9, 0.0
     pieces = max(1, 2 * math.ceil(length * math.hypot(table[0], table[3])))  # half a cell each
@@ -488,7 +486,7 @@ def _diffuse(table: Array, free: BoolArray, discs: Array, points: Array, preferr
                 known[i, 0], known[i, 1], known[i, 2] = trial, trial_x, trial_y
 
 
-def _settle(clearance: _Clearance, points: Array, level: float) -> Array:
+def _off_corners(clearance: _Clearance, points: Array, level: float) -> Array:
     """Undo the millimetres by which the chords of the last resampling cut a corner below the inflation."""
     points = points.copy()
     for _ in range(4):

@@ -1,4 +1,4 @@
-"""Whether a way exists between obstacles on the ground plane, decided exactly rather than on a grid.
+"""Clearance of the widest way between obstacles on the ground plane, exactly rather than on a grid.
 
 A way of clearance c exists if start and target lie in the same component of the plane without the obstacles grown by
 c. Grown discs and segments are convex, so their pairwise overlaps are connected and, by the nerve theorem, closed

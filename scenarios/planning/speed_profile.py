@@ -96,8 +96,8 @@ def read_profile(path: Path, limits: Limits = LIMITS) -> Profile:
     head = [word.strip() for word in lines[0]] if lines else []
     speed = _column(name, head, lines, SPEED_COLUMNS, (0.0, FASTEST))
     if speed is None:
-        there = ", ".join(head)[:200]
-        raise FileFormatError(f"{name}, line 1: no column '{SPEED_COLUMNS[0]}' of speeds (there are: {there})")
+        columns = ", ".join(head)[:200]
+        raise FileFormatError(f"{name}, line 1: no column '{SPEED_COLUMNS[0]}' of speeds (there are: {columns})")
     if len(speed) < 2:
         raise FileFormatError(f"{name}: holds {len(speed)} speeds; a drive needs 2 at least")
     time = _column(name, head, lines, TIME_COLUMNS, (-1e12, 1e12))
@@ -118,24 +118,24 @@ def _column(
     file: str, head: list[str], lines: list[list[str]], names: tuple[str, ...], within: tuple[float, float]
 ) -> Array | None:
     """The one of the named columns that is there, with numbers within a range."""
-    found = [k for k, name in enumerate(head) if name in names]
-    if not found:
+    matching = [k for k, name in enumerate(head) if name in names]
+    if not matching:
         return None
-    if len(found) > 1:
-        both = " and ".join(f"'{head[k]}'" for k in found[:2])
+    if len(matching) > 1:
+        both = " and ".join(f"'{head[k]}'" for k in matching[:2])
         raise FileFormatError(f"{file}, line 1: the columns {both} both hold the same: leave one out")
     numbers = []
     for number, line in enumerate(lines[1:], start=2):
         if not any(word.strip() for word in line):
             continue
         try:
-            value = float(line[found[0]])
+            value = float(line[matching[0]])
         except (IndexError, ValueError):
             value = math.nan
         if not math.isfinite(value):
-            raise FileFormatError(f"{file}, line {number}: no finite number in column '{head[found[0]]}'")
+            raise FileFormatError(f"{file}, line {number}: no finite number in column '{head[matching[0]]}'")
         if not within[0] <= value <= within[1]:
-            text = f"{value:g} in column '{head[found[0]]}' is not between {within[0]:g} and {within[1]:g}"
+            text = f"{value:g} in column '{head[matching[0]]}' is not between {within[0]:g} and {within[1]:g}"
             raise FileFormatError(f"{file}, line {number}: {text}")
         numbers.append(value)
     return np.array(numbers, dtype=np.float64)

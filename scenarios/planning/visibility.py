@@ -94,11 +94,11 @@ class Ways:
         return np.array(places)
 
     def passes(self, way: Array, slack: float) -> bool:
-        """Whether a way (P, 2), whose first point may be anywhere, keeps the clearance but for ``slack`` [m]."""
+        """Return True if a way (P, 2), whose first point may be anywhere, keeps the clearance but for ``slack`` [m]."""
         return bool(self._see(way[:-1], way[1:], way[0], slack).all())
 
     def _see(self, first: Array, second: Array, start: Array | None = None, slack: float = TOUCH) -> BoolArray:
-        """Whether segments (n, 2) to (n, 2) keep clear, from each body as far as ``start`` does itself."""
+        """Flags of segments (n, 2) to (n, 2) that keep clear, from each body as far as ``start`` does itself."""
         reach, beside = self._reach, np.full(len(self._walls), self.clearance)
         if start is not None:
             reach = np.minimum(reach, np.hypot(*(self._centres - start).T))

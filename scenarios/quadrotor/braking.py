@@ -52,7 +52,7 @@ def brake(
 
 
 def stopping_path(position: Array, velocity: Array, times: Array) -> Array:
-    """Where a vehicle is that goes on for the delay and then brakes in the ground plane, (N, 2) [m] at times [s]."""
+    """Positions (N, 2) [m] at times [s] of a vehicle that goes on for the delay and then brakes in the ground plane."""
     speed = float(np.hypot(*velocity[:2]))
     braked = np.clip(times - DELAY, 0.0, speed / DECELERATION)
     travelled = speed * (np.minimum(times, DELAY) + braked) - 0.5 * DECELERATION * braked**2

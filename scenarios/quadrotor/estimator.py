@@ -1,4 +1,4 @@
-"""Where is the vehicle, how heavy is it, where are the obstacles? A sliding window, solved anew at each tick.
+"""Estimator of the quadrotor's state, parameters and landmarks: a sliding window, solved anew at each tick.
 
 :class:`Estimator` knows the dynamics: controls, process noise and the unknown parameters tie the states to each other.
 With :class:`DeadReckoning` in their place it has the same sensors and does not.
@@ -44,7 +44,7 @@ TOLERANCE = 1e-3  # of the KKT test, and of the dynamics in their own units
 
 @dataclass(frozen=True)
 class EstimatorSettings:
-    """What is believed before the first reading, and how the window is solved.
+    """Initial belief, and settings of the window.
 
     Attributes:
         window: sizes, noise and sensors.
@@ -92,7 +92,7 @@ class EstimatorSettings:
 
 @dataclass(frozen=True)
 class Dynamics:
-    """How the vehicle moves from one reading to the next: by the controller's dynamics.
+    """Motion from one reading to the next by the controller's dynamics.
 
     Attributes:
         nominal: parameters believed at the start.
@@ -113,11 +113,11 @@ class Dynamics:
         return control, reading.rates - control[:3]
 
     def pushed(self, push: Array) -> Array:
-        """What a push (2,) that was felt is to the model, beside its own forces [m/s^2]."""
+        """Effect of a measured push (2,) on the model, beside its own forces [m/s^2]."""
         return push
 
     def believed(self, parameters: Array) -> quadrotor.Parameters:
-        """What is believed where the window holds ``parameters`` (7,)."""
+        """Belief of a window that holds ``parameters`` (7,)."""
         return flyable(parameters)
 
 
@@ -288,7 +288,7 @@ class Estimator:
         return self.belief()
 
     def belief(self) -> Belief:
-        """What is known now."""
+        """Belief of now."""
         window = self.window
         spread = self.covariance[FIRST_LANDMARK:, FIRST_LANDMARK:]
         return Belief(
@@ -337,8 +337,8 @@ class Estimator:
         columns = FIRST_LANDMARK + 2 * used
         forecast, innovation = expected(self.window.present, self.covariance, self.landmarks[used], columns, noise)
         possible = reading.kinds[own][:, None] == atlas.kinds[used][None]
-        found = nearest(sightings, forecast, innovation, possible, self.settings.gates)
-        return np.where(found >= 0, used[np.maximum(found, 0)], found)
+        pairs = nearest(sightings, forecast, innovation, possible, self.settings.gates)
+        return np.where(pairs >= 0, used[np.maximum(pairs, 0)], pairs)
 
     def _slot(self) -> int | None:
         """A free slot, if need be that of the landmark not seen for longest; None when the window sees them all."""

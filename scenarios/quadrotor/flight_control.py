@@ -1,4 +1,4 @@
-"""How to fly there? The model-predictive controller of the quadrotor as a factor graph (Ta et al. 2014, V-B).
+"""Model-predictive controller of the quadrotor as a factor graph (Ta et al. 2014, V-B).
 
 Costs: a reference through what is known, level attitude, effort about hover, change of control. Constraints: the
 dynamics with the believed mass, drag and wind, limits of control and attitude, clearance from cylinders, moving discs
@@ -7,7 +7,7 @@ and walls. With ``avoidance="potential"`` the costs are Ta's own, |p - l_g|^2 an
 
 from __future__ import annotations
 
-from typing import Literal, Protocol, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -20,9 +20,6 @@ from unifg.horizon import (
     LastPlan,
     Plan,
     RecedingHorizon,
-    Robot,
-    Term,
-    Window,
 )
 from unifg.models import quadrotor
 from unifg.scenarios.perception.belief import Belief
@@ -43,51 +40,13 @@ from unifg.scenarios.quadrotor.flight_settings import ControllerSettings, backen
 from unifg.scenarios.quadrotor.guide import Guide, Reference
 from unifg.scenarios.quadrotor.slots import Obstacles, Slots
 from unifg.solvers import names
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array
 
 LEFT_BEHIND = 1.0  # [m] between the ends of plan and reference
 PATIENCE = 10  # ticks of being left behind before the plan starts over from the reference
 KEPT = 8  # ticks for which an old plan may be flown
 
 Source: TypeAlias = Literal["solved", "violating", "kept", "braking"]
-
-
-class FlightPast(Protocol):
-    """How a flight is tied to the past: state, parameters and map that are given, or estimated in the same graph.
-
-    Attributes:
-        robot: who flies.
-        window: of the past, in one graph with it; None where its belief is given.
-        pull: see :class:`unifg.horizon.coupling.JointPresent`.
-    """
-
-    robot: Robot
-    window: Window | None
-    pull: float
-
-    def motion(self) -> list[Term]:
-        """How the vehicle moves."""
-        ...
-
-    def apart(self, squares: bool | None) -> list[Term]:
-        """Keep clear of what is a variable: hard, or for Ta's potential as sums of squares or not."""
-        ...
-
-    def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
-        """Obstacles without those that are variables; which (M,) these are, and the variables."""
-        ...
-
-    def carry(self, multipliers: dict[str, Array], now: Context[Flown]) -> dict[str, Array]:
-        """What of the shifted multipliers still holds."""
-        ...
-
-    def moving_with(self, solution: fg.Solution, now: Context[Flown]) -> quadrotor.Parameters:
-        """Parameters with which a solution moves."""
-        ...
-
-    def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
-        """What is believed after a solve for which a belief was given."""
-        ...
 
 
 class Controller:
@@ -109,7 +68,7 @@ class Controller:
         solver: str = "ipm",
         settings: ControllerSettings | None = None,
         bounds: Array | None = None,
-        past: FlightPast | None = None,
+        past: GivenFlight | None = None,
     ) -> None:
         """State the graph and prepare the backend.
 
@@ -128,7 +87,7 @@ class Controller:
         self.settings = s = settings or ControllerSettings()
         if s.avoidance not in ("clearance", "potential"):
             raise fg.ScenarioError(f"unknown avoidance '{s.avoidance}': choose clearance or potential")
-        self.past: FlightPast = past or GivenFlight(s)
+        self.past: GivenFlight = past or GivenFlight(s)
         self.walls = np.asarray(walls, dtype=np.float64)
         target = np.asarray(target, dtype=np.float64)
         self.guide = Guide(target, self.walls, s.guide, bounds)
@@ -164,7 +123,7 @@ class Controller:
         return plan
 
     def given(self, belief: Belief, movers: Tracks) -> Flown:
-        """What the terms are given."""
+        """Context of the terms."""
         s = self.settings
         reference = self.guide.reference(belief.state, belief.landmarks, s.horizon + 1, s.dt)
         obstacles = self.slots.fill(belief.state, reference.positions, belief.landmarks, movers)
@@ -201,8 +160,8 @@ class Controller:
             return Decision(kept.within(controls), states, "solved", behind=is_behind(states, given.reference))
         choices: dict[Source, tuple[Array, Array]] = {}
         if kept.age <= KEPT and kept.age < s.horizon:
-            rest = np.tile(given.hover, (kept.age, 1))
-            old = np.concatenate([kept.within(kept.left()), rest])
+            left = kept.within(kept.left())
+            old = np.concatenate([left, np.tile(given.hover, (s.horizon - len(left), 1))])
             choices["kept"] = old, quadrotor.rollout(belief.state, old, s.dt, belief.parameters)
         choices["braking"] = brake(belief.state, belief.parameters, s.horizon, s.dt, kept.least, kept.most)
         if sound:
@@ -222,7 +181,7 @@ class Controller:
 
 
 def moves(controls: Array, states: Array, dt: float, parameters: quadrotor.Parameters, tolerance: float) -> bool:
-    """Whether states (N + 1, 10) follow from controls (N, 4), each row of the dynamics to a tolerance."""
+    """Return True if states (N + 1, 10) follow from controls (N, 4), each row of the dynamics to a tolerance."""
     if not (np.isfinite(controls).all() and np.isfinite(states).all()):
         return False
     defects = quadrotor.dynamics(states[:-1], controls, states[1:], parameters.packed, dt)
@@ -230,7 +189,7 @@ def moves(controls: Array, states: Array, dt: float, parameters: quadrotor.Param
 
 
 def is_behind(states: Array, reference: Reference) -> bool:
-    """Whether a plan (N + 1, 10) ends far from its reference: it may be caught behind something."""
+    """Return True for a plan (N + 1, 10) that ends far from its reference: it may be caught behind something."""
     return bool(np.hypot(*(states[-1, :2] - reference.positions[-1, :2])) > LEFT_BEHIND)
 
 

@@ -27,11 +27,11 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import Context, RecedingHorizon, Term, Window
+from unifg.horizon import Context, RecedingHorizon, Term
 from unifg.models import avoidance, quadrotor
 from unifg.scenarios.perception.belief import Belief
 from unifg.scenarios.quadrotor.estimator import Estimator, flyable
-from unifg.scenarios.quadrotor.flight_parts import Flown, repel
+from unifg.scenarios.quadrotor.flight_parts import Flown, GivenFlight, repel
 from unifg.scenarios.quadrotor.flight_past import packed, parameters_in
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
 from unifg.scenarios.quadrotor.slots import FAR_AWAY, Obstacles
@@ -43,7 +43,7 @@ BELIEVABLE = 1e-4  # largest violation of an estimate; a plan may have more, but
 
 @dataclass(frozen=True)
 class JointSettings:
-    """How far the future may lean on the past.
+    """Bounds on the pull of the future on the past.
 
     Attributes:
         pull: how far the plan may move state, parameters and landmarks, in standard deviations of what the past
@@ -110,18 +110,18 @@ class KeepClear:
             repel(graph, s, self.squares, kept, *pairs, name="landmarks", active=near)
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """Which of them are obstacles now, how wide they are, and how far to keep off."""
+        """Flags of the landmarks that are obstacles now, their radii, and the clearances to keep."""
         s, given, count = self.settings, now.given, len(now.constants["landmarks"])
         hulls, limits = np.zeros((2, s.horizon, count))
         counting = np.zeros((s.horizon, count), dtype=bool)
         counting[:, given.marks] = True
         hulls[:, given.marks] = given.obstacles.radii[given.held] + (0.0 if self.squares is None else s.vehicle_radius)
         limits[:, given.marks] = given.obstacles.limits[:, given.held]
-        found = {"radii of landmarks": hulls.ravel(), "landmarks to keep clear of": counting.ravel()}
-        return found | ({"clearances of landmarks": limits.reshape(-1, 1)} if self.squares is None else {})
+        values = {"radii of landmarks": hulls.ravel(), "landmarks to keep clear of": counting.ravel()}
+        return values | ({"clearances of landmarks": limits.reshape(-1, 1)} if self.squares is None else {})
 
 
-class SharedFlight:
+class SharedFlight(GivenFlight):
     """A flight whose first state, parameters and map are estimated in the same solve.
 
     Attributes:
@@ -141,14 +141,13 @@ class SharedFlight:
             settings: weights and limits of the future.
             joint: how far it may lean on the past.
         """
-        self.estimator, self.robot = estimator, estimator.window.robot
-        self.window: Window | None = estimator.window
-        self.settings, self.pull = settings, joint.pull
+        super().__init__(settings, estimator.window.robot, estimator.window, joint.pull)
+        self.estimator = estimator
         self.latest = estimator.belief()
         self.names = estimator.atlas.names.copy()
 
     def motion(self) -> list[Term]:
-        """How the vehicle moves."""
+        """Terms of the motion."""
         return [SharedMotion(self.settings, "drag" in self.estimator.own.estimated)]
 
     def apart(self, squares: bool | None) -> list[Term]:
@@ -181,7 +180,7 @@ class SharedFlight:
         return flyable(packed({static.name: solution[families[static.name]] for static in self.robot.constants}))
 
     def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
-        """What the joint solve says, with the covariances of the past; what was given where it says nothing."""
+        """Belief by the joint solve, with the covariances of the past; the given one where it says nothing."""
         atlas = self.estimator.atlas
         self.names = atlas.names.copy()
         self.latest = given
@@ -202,5 +201,5 @@ class SharedFlight:
 
 
 def believable(solution: fg.Solution, choice: object) -> bool:
-    """Whether a solve says something about the past, whatever came of its plan; not if its violation is no number."""
+    """Return True for a solve that says something about the past, whatever came of its plan."""
     return solution.violation <= BELIEVABLE

@@ -1,4 +1,4 @@
-"""What the quadrotor's horizon says, term by term (Ta et al. 2014, section V)."""
+"""Terms of the quadrotor's horizon (Ta et al. 2014, section V)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SLOWING = 0.3  # [s] in which a speed above the limit is to fade
 
 @dataclass(frozen=True)
 class Flown:
-    """What the terms are given at a tick.
+    """Context of the terms at a tick.
 
     Attributes:
         belief: state, parameters and landmarks.
@@ -60,41 +60,45 @@ class GivenMotion:
         graph.constrain(quadrotor.dynamics, *motion, lower=0, upper=0, name="dynamics")
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """What is believed."""
+        """Parameters as believed."""
         return {"parameters": now.given.belief.parameters.packed}
 
 
 class GivenFlight:
-    """A flight that is given its state, parameters and map.
+    """Coupling of a flight to its past: state, parameters and map are given, or estimated by a subclass.
 
     Attributes:
-        robot: who flies.
-        window: of the past; None.
-        pull: of no consequence.
+        settings: weights and limits.
+        robot: of the horizon.
+        window: of the past, in one graph with the horizon; None where its belief is given.
+        pull: see :class:`unifg.horizon.coupling.JointPresent`.
     """
 
-    window: Window | None = None
-    pull = np.inf
-
-    def __init__(self, settings: ControllerSettings) -> None:
-        """Take the sampling time from the settings."""
-        self.robot = Robot(quadrotor.STATE, quadrotor.CONTROL)
-        self.settings = settings
+    def __init__(
+        self,
+        settings: ControllerSettings,
+        robot: Robot | None = None,
+        window: Window | None = None,
+        pull: float = np.inf,
+    ) -> None:
+        """Keep what is given."""
+        self.robot = robot or Robot(quadrotor.STATE, quadrotor.CONTROL)
+        self.settings, self.window, self.pull = settings, window, pull
 
     def motion(self) -> list[Term]:
-        """How the vehicle moves."""
+        """Terms of the motion."""
         return [GivenMotion(self.settings)]
 
     def apart(self, squares: bool | None) -> list[Term]:
-        """Nothing else is kept clear of."""
+        """Terms that keep clear of variables: hard, or for Ta's potential as sums of squares or not."""
         return []
 
     def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
-        """All obstacles are data."""
+        """Obstacles without those that are variables; which (M,) these are, and the variables."""
         return obstacles, np.zeros(len(obstacles.names), dtype=bool), []
 
     def carry(self, multipliers: dict[str, Array], now: Context[Flown]) -> dict[str, Array]:
-        """Multipliers as they are."""
+        """Shifted multipliers that still hold."""
         return multipliers
 
     def moving_with(self, solution: fg.Solution, now: Context[Flown]) -> quadrotor.Parameters:
@@ -102,13 +106,13 @@ class GivenFlight:
         return now.given.belief.parameters
 
     def believed(self, given: Belief, loop: RecedingHorizon) -> Belief:
-        """What was given."""
+        """Belief after a solve for which a belief was given."""
         return given
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What the vehicle can do and where it may be."""
+    """Limits of controls, heights and attitude."""
 
     settings: ControllerSettings
 
@@ -148,7 +152,7 @@ class Leaning:
         graph.minimize(landmarks.tilt, x.R[1:], upright, sigma=sigma, name="level")
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """Where up is at hover."""
+        """Vertical axis in the body at hover."""
         return {"upright": SO3.act(SO3.inverse(level(now.given.belief)), UP)}
 
 
@@ -210,7 +214,7 @@ class Clearance:
             graph.constrain(avoidance.segment_clearance, *segments, lower=beside, name="walls")
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """What fills the slots."""
+        """Contents of the slots."""
         others = now.given.others
         found: dict[str, ArrayLike] = {"centres": others.centres, "radii": others.radii, "clearances": others.limits}
         return found | ({"wall clearances": others.wall_limits} if len(self.walls) else {})
@@ -250,7 +254,7 @@ class Potential:
             repel(graph, s, self.squares, avoidance.segment_clearance, *hulls, name="walls")
 
     def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """What fills the slots, and a speed that the vehicle can come down to."""
+        """Contents of the slots, and a speed that the vehicle can come down to."""
         s, others = self.settings, now.given.others
         times, most = s.dt * np.arange(1.0, s.horizon + 1), s.guide.speed
         excess = np.maximum(np.abs(now.present[7:10]) - most, 0.0) + SPARE

@@ -145,7 +145,7 @@ class Motion:
         graph.constrain(quadrotor.disturbed_dynamics, *motion, lower=0.0, upper=0.0, name="dynamics")
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """How long the steps took, what pushed, and what the gyro saw."""
+        """Lengths of the steps, pushes, and rates of the gyroscope."""
         pushed = np.zeros((len(now.past.times) - 1, 6))
         pushed[:, 3:5] = now.past.recorded("push")[0][1:]
         found: dict[str, ArrayLike] = {"durations": np.diff(now.past.times), "pushed": pushed}
@@ -156,7 +156,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """What was felt between neighbours; it ties their velocities to each other, whatever moves the vehicle."""
+    """Specific force between neighbours; it ties their velocities to each other, whatever moves the vehicle."""
 
     sigma: float
 
@@ -175,7 +175,7 @@ class Accelerometer:
         graph.minimize(FORCE, *sides, sigma=self.sigma, active=felt, name="accelerometer")
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """What was felt in steps that took time."""
+        """Specific force in steps that took time."""
         durations = np.diff(now.past.times)
         felt = durations > 0.0
         per_second = 1.0 / np.where(felt, durations, 1.0)
@@ -204,7 +204,7 @@ class Sightings:
         graph.minimize(landmarks.bearing_range, *pairs, sigma=sigma, active=seen, name="sightings")
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """Measurements of a drive."""
+        """Sightings."""
         rows = now.past.recorded("sightings")[0].reshape(-1, 3)
         seen = rows[:, 2] > 0.0
         return {"sightings": np.where(seen[:, None], rows[:, :2], 1.0), "seen": seen}
@@ -230,7 +230,7 @@ class Survey:
         graph.minimize(fg.prior, graph.families["landmarks"], places, sigma=self._sigma, active=known, name="survey")
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """What the map has."""
+        """Corners on the map."""
         return {"survey": self.places, "surveyed": self.known}
 
 

@@ -1,4 +1,4 @@
-"""How estimation and control are coupled: two graphs that share nothing, two that share a belief, or one graph."""
+"""Coupling of estimation and control: two graphs that share nothing, two that share a belief, or one graph."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tells the quadrotor's supervisor that something is the matter, and what is flown instead of a plan then.
+"""Health signals of the quadrotor, and the control in place of a plan.
 
 A vehicle that may not go on hovers, by what it still measures; one that cannot go on for long lands where it is.
 """
@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from unifg.scenarios.monitoring.supervisor import Health, OutlierReport, Ramp, Supervisor
-from unifg.scenarios.monitoring.validation import Door
+from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Ramp, Supervisor
+from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.perception.belief import Belief
 from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.quadrotor.braking import braking_control
@@ -46,7 +46,7 @@ class FlightWatch:
     """Looks at readings, judges, and flies where nothing is planned.
 
     Attributes:
-        door: what readings have to pass.
+        validator: of readings.
         supervisor: how fast the vehicle may fly.
         felt: what no model holds.
         lands: whether it is to land.
@@ -57,9 +57,9 @@ class FlightWatch:
 
         Args:
             dt: duration of a tick [s].
-            sigma: (7,) standard deviations of parameters that nobody estimates; see :class:`Unmodelled`.
+            sigma: (7,) standard deviations of parameters that are not estimated; see :class:`Unmodelled`.
         """
-        self.door, self.supervisor, self.felt = Door(), Supervisor(RAMPS), Unmodelled(sigma)
+        self.validator, self.supervisor, self.felt = Validator(), Supervisor(RAMPS), Unmodelled(sigma)
         self.lands = False
         self._dt = dt
         self._sight = self._plan = self._inertial = self._resting = 0.0
@@ -68,7 +68,7 @@ class FlightWatch:
         self._first = True
 
     @property
-    def verdict(self) -> OutlierReport:
+    def verdict(self) -> HealthReport:
         """The last one."""
         return self.supervisor.verdict
 
@@ -81,7 +81,7 @@ class FlightWatch:
             applied: (4,) control since the last tick; None at the first one.
             belief: after the last tick.
         """
-        seen = self.door.reading(reading, now, np.zeros(4) if applied is None else applied)
+        seen = self.validator.reading(reading, now, np.zeros(4) if applied is None else applied)
         if applied is not None:
             self.felt.note(seen.force, float(applied[3]), belief)
         return seen
@@ -100,14 +100,14 @@ class FlightWatch:
         self._strangers.append(0 if self._first else len(names - self._known))
         self._known |= names
         self._first = False
-        self._inertial = self._inertial + self._dt if "inertial unit" in self.door.refused else 0.0
+        self._inertial = self._inertial + self._dt if "inertial unit" in self.validator.refused else 0.0
         spread = float(np.linalg.eigvalsh(belief.covariance[:3, :3])[-1]) if _finite(belief) else math.inf
         signals = {
             "sight": self._sight, "spread": math.sqrt(max(spread, 0.0)), "plan": self._plan,
             "strangers": float(sum(self._strangers)), "inertial": self._inertial,
             "push": float(np.hypot(*self.felt.push)), "thrust": abs(self.felt.missing),
         }  # fmt: skip
-        verdict = self.supervisor.judge(signals, {"sight": self.door.refused.get("detector", "")})
+        verdict = self.supervisor.judge(signals, {"sight": self.validator.refused.get("detector", "")})
         waits = verdict.rests or self._plan > RAMPS["plan"].ends
         self._resting = self._resting + self._dt if waits else 0.0
         self.lands = self._resting > (BLIND_HOVER if verdict.health is Health.LOST else HOVER) or (
@@ -115,14 +115,14 @@ class FlightWatch:
         )
 
     def planned(self, sound: bool) -> None:
-        """Whether the tick has a plan of its own."""
+        """Record if the tick has a plan of its own."""
         self._plan = 0.0 if sound else self._plan + self._dt
 
     def hover(self, belief: Belief, least: Array, most: Array) -> Array:
         """The control (4,) of a vehicle that brakes and hovers, or lands."""
         sink = 0.0
         if self.lands:
-            measured = "altimeter" not in self.door.refused
+            measured = "altimeter" not in self.validator.refused
             sink = float(np.clip(belief.state[2] / SLOWING, *SINK)) if measured else BLIND_SINK
         return braking_control(belief.state, self.pushed(belief).parameters, least, most, sink)
 

@@ -1,4 +1,4 @@
-"""Which way? The reference of the controller: a shortest way through what is known, at a speed that bends allow.
+"""Reference of the controller: a shortest way through what is known, at a speed that bends allow.
 
 Space that has not been seen counts as free. The widest clearance that leaves a way is used. A way is kept as long as
 it passes and no other is much shorter, so that small corrections of the map do not send the vehicle to and fro.
@@ -26,7 +26,7 @@ SMOOTHING = 5  # points of a smoothing window
 
 @dataclass(frozen=True)
 class GuideSettings:
-    """How the reference is made.
+    """Settings of the reference.
 
     Attributes:
         speed: cruise [m/s].
@@ -45,7 +45,7 @@ class GuideSettings:
 
 @dataclass(frozen=True)
 class Reference:
-    """Where to be at the nodes of the horizon.
+    """Positions and velocities at the nodes of the horizon.
 
     Attributes:
         positions: (N + 1, 3) [m].
@@ -102,15 +102,15 @@ class Guide:
             return
         if not same or self._ways is None:
             self._discs = discs
-            found = self._widest(position)
+            another = self._widest(position)
         else:
-            found = self._ways.way(position) if self._ways is not None else None
+            another = self._ways.way(position) if self._ways is not None else None
         self.plans += 1
         kept = None if self._way is None else _onwards(self._way, position)
-        if found is None or self._ways is None:
+        if another is None or self._ways is None:
             self._way = None
-        elif kept is None or not self._ways.passes(kept, GIVE) or path_length(found) < path_length(kept) - SHORTER:
-            self._way = smoothed(found)
+        elif kept is None or not self._ways.passes(kept, GIVE) or path_length(another) < path_length(kept) - SHORTER:
+            self._way = smoothed(another)
 
     def _widest(self, position: Array) -> Array | None:
         """The shortest way at the first clearance that leaves one."""
@@ -126,13 +126,13 @@ class Guide:
         s = self.settings
         arc = arc_lengths(way)
         piece, share, _ = nearest_piece(way, state[:2])
-        here = float(arc[piece] + share * (arc[piece + 1] - arc[piece]))
+        begin = float(arc[piece] + share * (arc[piece + 1] - arc[piece]))
         tangent = np.gradient(way, arc, axis=0) if len(way) > 1 else np.zeros((1, 2))
         tangent /= np.maximum(np.hypot(*tangent.T), 1e-9)[:, None]
-        along = at_stations(tangent, arc, np.array([here]))[0]
+        along = at_stations(tangent, arc, np.array([begin]))[0]
         now = max(float(along @ state[7:9]), SLOWEST)
-        stations = here + np.linspace(0.0, arc[-1] - here, max(2, 2 + int((arc[-1] - here) / SPACING)))
-        squared = np.minimum(self._allowed(way, arc, stations), now**2 + 2.0 * s.acceleration * (stations - here))
+        stations = begin + np.linspace(0.0, arc[-1] - begin, max(2, 2 + int((arc[-1] - begin) / SPACING)))
+        squared = np.minimum(self._allowed(way, arc, stations), now**2 + 2.0 * s.acceleration * (stations - begin))
         speed = np.sqrt(np.maximum(squared, 0.0))
         # Each piece is flown with constant acceleration.
         lengths = np.diff(stations)
@@ -182,6 +182,6 @@ def smoothed(way: Array) -> Array:
 
 
 def _onwards(way: Array, position: Array) -> Array:
-    """What is left of a way, from ``position`` on."""
+    """Rest of a way, from ``position`` on."""
     at, _, _ = nearest_piece(way, position)
     return np.concatenate([position[None], way[at + 1 :]])

@@ -1,4 +1,4 @@
-"""Which obstacles the horizon must keep clear of, in slots that keep their obstacle from tick to tick, and how far.
+"""Obstacles of the horizon, in slots that keep their obstacle from tick to tick, and their clearances.
 
 A graph has a fixed number of slots. An obstacle keeps its slot as long as it is chosen, so that multipliers of the
 tick before still belong to it. Unused slots wait far away.
@@ -24,7 +24,7 @@ DODGE = 5.0  # [m/s^2] with which a vehicle can get out of the way
 
 @dataclass(frozen=True)
 class Obstacles:
-    """What fills the slots at one tick; C slots of cylinders, then those of movers, M in all.
+    """Contents of the slots at one tick; C slots of cylinders, then those of movers, M in all.
 
     Attributes:
         names: (M,) landmark ids, -1 for what is none.

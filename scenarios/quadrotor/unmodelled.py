@@ -40,7 +40,7 @@ class Unmodelled:
         """Begin with nothing felt.
 
         Args:
-            sigma: (7,) standard deviations of parameters that nobody estimates, in the order of
+            sigma: (7,) standard deviations of parameters that are not estimated, in the order of
                 ``quadrotor.Parameters.packed``.
         """
         self._sigma = sigma
@@ -73,10 +73,10 @@ class Unmodelled:
         along, asked = np.mean([row[1] for row in self._window], axis=0).tolist()
         known = belief.parameters_sigma
         sigma = np.where(known > 0.0, known, self._sigma)
-        usual = SENSOR**2 / WINDOW + LASTING**2
+        variance = SENSOR**2 / WINDOW + LASTING**2
         drag = sigma[1:4] * np.abs(relative) / p.mass
-        across = np.sqrt(usual + sigma[4:6] ** 2 + max(drag[:2]) ** 2)
-        upright = np.sqrt(usual + (asked * sigma[0] / p.mass) ** 2 + drag[2] ** 2)
+        across = np.sqrt(variance + sigma[4:6] ** 2 + max(drag[:2]) ** 2)
+        upright = np.sqrt(variance + (asked * sigma[0] / p.mass) ** 2 + drag[2] ** 2)
         pushed, weak = float(np.hypot(*(sideways / across))), abs(along) / float(upright)
         self.score = max(pushed, weak)
         if self.score <= LIMIT:

@@ -20,7 +20,7 @@ __all__ = ["CascadeSettings", "Track"]
 
 @dataclass(frozen=True)
 class CascadeSettings:
-    """How plan and filter share the work.
+    """Division of the work between plan and filter.
 
     Attributes:
         every: ticks from one plan to the next.
@@ -46,7 +46,7 @@ class Track:
     _nodes: Array | None = None
 
     def due(self) -> bool:
-        """Whether a plan is to be made in this tick; called once in each."""
+        """Return True if a plan is to be made in this tick; called once in each."""
         self.ticks += 1
         return self._nodes is None or self.ticks >= self.every
 
@@ -55,12 +55,12 @@ class Track:
         self._times, self._nodes, self.ticks = times, nodes, 0
 
     def at(self, later: float, path: Callable[[Array], Flown]) -> Flown:
-        """What is to be flown ``later`` than the plan was made [s]; beyond its end, or without one, the path itself."""
+        """Reference ``later`` than the plan was made [s]; beyond its end, or without one, the path itself."""
         if self._times is None or self._nodes is None or later >= self._times[-1]:
             return path(np.array([later]))
         k = max(int(np.searchsorted(self._times, later, side="right")) - 1, 0)
         span, gone = self._times[k + 1] - self._times[k], later - self._times[k]
         (p, v), ahead = self._nodes[k].reshape(2, 3), self._nodes[k + 1, 3:]
         push = (ahead - v) / span
-        found = p + gone * v + 0.5 * gone * gone * push, v + gone * push, push, np.zeros(3)
-        return Flown(*(part[None] for part in found))
+        parts = p + gone * v + 0.5 * gone * gone * push, v + gone * push, push, np.zeros(3)
+        return Flown(*(part[None] for part in parts))

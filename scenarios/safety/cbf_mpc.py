@@ -19,12 +19,15 @@ constraints violated has found no plan; then the last one is flown on, for a whi
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 import unifg as fg
+from unifg import horizon
+from unifg.horizon import Context, ControlCost, InitialGuesses, LastPlan, RecedingHorizon, Robot, Term
 from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
@@ -33,7 +36,7 @@ from unifg.scenarios.safety.flatness import FlatnessController, Gains, flat_flig
 from unifg.scenarios.safety.weighing import Weighing
 from unifg.scenarios.simulation.body_rate import Airframe
 from unifg.solvers.names import backend
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 __all__ = ["TRACKING", "CbfMpc", "Decision", "KeeperSettings", "Obstacles", "Terminal"]
 
@@ -41,15 +44,15 @@ Reading: TypeAlias = Literal["decay", "published"]
 Terminal: TypeAlias = Literal["none", "rest"]
 
 FAR = 1e3  # where obstacles are that are not there [m]
-PRICE = 1e5  # of violation: multipliers of squared slacks that are used grow with them
+PENALTY = 1e5  # of violation: multipliers of squared slacks that are used grow with them
 SLOWING = 3.0  # deceleration of a vehicle that is faster than it may be [m/s^2]
 SPEEDING = 1e4  # weight of the squared slack of the speed [s^2/m^2]
-KEPT = 1e-3  # violation of constraints up to which an answer is a plan
+FEASIBLE = 1e-3  # violation of constraints up to which an answer is a plan
 TRIES = 3  # ticks in a row without a plan until the search begins anew
-ON = 0.2  # how long the last plan is flown on [s]
+KEEP = 0.2  # how long the last plan is flown on [s]
 INSIDE = 1e-3  # deeper than this within the distance to be kept is too near [m]
 PULL = 0.02, 0.05  # how far a plan may move mass, relative, and drag [kg/s] from where the past alone puts them
-FIERCE = 6.0  # greatest acceleration along each axis of the world in braking [m/s^2]
+BRAKING = 6.0  # greatest acceleration along each axis of the world in braking [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -120,7 +123,7 @@ what noise and gusts leave.
 
 @dataclass(frozen=True)
 class Obstacles:
-    """What is seen of M obstacles at one time.
+    """Sightings of M obstacles at one time.
 
     Attributes:
         position, velocity: (M, 3) [m, m/s].
@@ -258,13 +261,14 @@ def slower(v: Array, limit: Array) -> Array:
 
 
 class CbfMpc:
-    """Plans anew at each tick.
+    """Plans anew at each tick, on a `RecedingHorizon` whose first step is a tick and whose others are longer.
 
     Attributes:
         settings: the numbers.
         airframe: as it is believed.
-        nodes: when the nodes of a plan are, from its begin [s].
-        states: (N + 1, 17) of the last plan; None before there is one.
+        nodes: times of the nodes of a plan, from its begin [s].
+        loop: the prepared graph.
+        kept: barriers of the graph.
     """
 
     def __init__(
@@ -275,120 +279,46 @@ class CbfMpc:
         weighing: Weighing | None = None,
         solver: str = "ipm",
     ) -> None:
-        """State the graph.
+        """Prepare the graph.
 
         Args:
             settings: the numbers.
             airframe: as it is believed; its mass and drag where they are not estimated. Loops of an infinite gain are
                 none.
             dt: length of a tick [s].
-            weighing: the past that says what the vehicle weighs, a part of the same graph; None to believe.
+            weighing: the past that estimates mass and drag, a part of the same graph; None for given ones.
             solver: one of `unifg.solvers.names.CONSTRAINED`.
         """
         self.settings, self.airframe = settings, airframe
         s = settings
-        self._weighing, self._dt = weighing, dt
-        n = s.horizon
-        steps = np.full(n, s.step)
+        self._weighing = weighing
         with np.errstate(over="ignore"):
-            steps = np.minimum(steps, dt * s.growth ** np.arange(n))
+            steps = np.minimum(np.full(s.horizon, s.step), dt * s.growth ** np.arange(s.horizon))
         self.nodes = np.concatenate([[0.0], np.cumsum(steps)])
-        graph = fg.Graph()
-        self.x = x = graph.variables("state", quadrotor_loops.STATE, n + 1)
-        self.u = u = graph.variables("control", quadrotor.CONTROL, n)
-        self.mass, self.drag = graph.variables("mass", quadrotor.MASS, 1), graph.variables("drag", quadrotor.DRAG, 1)
-        self._start = graph.data("start", quadrotor_loops.STATE.identity())
-        graph.fix(x[0], self._start)
-        self._by_the_past: tuple[fg.Data, ...] = ()
-        if weighing is None:
-            graph.fix(self.mass, [airframe.parameters.mass], name="given mass")
-            graph.fix(self.drag, airframe.parameters.drag, name="given drag")
-        else:
-            weighing.state(graph, self.mass, self.drag)
-            mass, drag = self._believed_numbers()
-            self._by_the_past = graph.data("mass by the past", mass), graph.data("drag by the past", drag)
-            mass_pull = PULL[0] * airframe.parameters.mass
-            for what, past, pull in zip((self.mass, self.drag), self._by_the_past, (mass_pull, PULL[1]), strict=True):
-                graph.constrain(fg.prior, what, past, lower=-pull, upper=pull, name=f"pull of {what.name}")
-        ahead, share = x[1:], (steps / s.step)[:, None]
-        weights = {"p": s.position, "R": s.attitude, "v": s.velocity}
-        self._wanted = {}
-        for part, weight in weights.items():
-            rest = getattr(ahead, part)
-            self._wanted[part] = data = graph.data(
-                f"wanted {part}", np.tile(rest.manifold.identity(), (n, 1)), each=True
-            )
-            sigma = np.broadcast_to((weight * share) ** -0.5, (n, 3))
-            graph.minimize(fg.prior, rest, data, sigma=sigma, name=f"path {part}")
-        self._effort = graph.data("wanted controls", np.zeros((n, 4)), each=True)
-        self._last = graph.data("last control", np.zeros(4))
-        self._gust = graph.data("gust", np.zeros((n, 3)), each=True)
+        share = (steps / s.step)[:, None]
+        self._barriers = Barriers(s, airframe, self.nodes, steps)
+        self._speed = SpeedLimit(s, self.nodes)
         effort, change = (
             np.array([a, a, a, b]) ** -0.5 for a, b in ((s.rate, s.thrust), (s.rate_change, s.thrust_change))
         )
-        graph.minimize(fg.prior, u, self._effort, sigma=effort * share**-0.5, name="effort")
-        graph.minimize(fg.prior, u[0], self._last, sigma=change, name="first change")
-        graph.minimize(fg.difference, u[:-1], u[1:], sigma=change, name="change")
-        loops = airframe.loops
-        held = quadrotor_loops.held(loops.gain, loops.lag, steps)
-        motion = x[:-1], u, self.mass, self.drag, self._gust, ahead, steps, held
-        graph.constrain(quadrotor_loops.defect, *motion, lower=0.0, upper=0.0, name="dynamics")
-        graph.bound(u, lower=airframe.least, upper=airframe.most, name="limits")
-        self._allowed = graph.data("allowed speed", np.full(n, s.speed), each=True)
-        self._speed = keep(graph, slower, ahead.v, self._allowed, obstacles=["speed"], weight=SPEEDING, name="speed")
-        if s.terminal == "rest":
-            graph.bound(x[-1].v, lower=0.0, upper=0.0, name="rest")
-        self.kept: list[Kept] = []
-        if s.slots:
-            self._state_barriers(graph, steps)
-        self.graph = graph
+        terms: list[Term] = [
+            MassAndDrag(weighing, airframe), Path(s, share),
+            ControlCost(effort * share**-0.5, change, wanted=lambda now: now.given.controls),
+            Motion(airframe, steps), self._speed,
+        ]  # fmt: skip
+        terms += [self._barriers] if s.slots else []
         early = {"step_tolerance": np.inf} if solver == "ipm" and not s.settled else {}
-        dear = {"penalty": PRICE} if solver == "ipm" else {}
-        self._cold = backend(solver, tolerance=s.tolerance, **dear, **early).prepare(graph)
-        hurried = backend(
-            solver, tolerance=s.tolerance, time_limit=s.budget, max_iterations=s.iterations, **dear, **early
-        )
-        self._warm = hurried.prepare(graph)
-        self._guess: fg.Guess | None = None
-        self._applied = quadrotor.hover(airframe.parameters)
-        self.states: Array | None = None
-        self._plan: tuple[Array, Array] | None = None  # places and controls of the last plan
-        self._age = 0  # of it [ticks]
+        numbers = {"tolerance": s.tolerance, **({"penalty": PENALTY} if solver == "ipm" else {}), **early}
+        self.loop = RecedingHorizon(
+            Robot(quadrotor_loops.STATE, quadrotor.CONTROL), s.horizon, terms, times=self.nodes,
+            solver=backend(solver, time_limit=s.budget, max_iterations=s.iterations, **numbers),
+            cold=backend(solver, **numbers), limits=(airframe.least, airframe.most), judge=self.judge,
+            starts=InitialGuesses(cold=self._along, after_failure=self._braking),
+        )  # fmt: skip
+        self.loop.applied = quadrotor.hover(airframe.parameters)
+        self._planned, self._refused = False, 0
         self._looked_at: list[int] = []
         self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
-
-    def _state_barriers(self, graph: fg.Graph, steps: Array) -> None:
-        s, x, m = self.settings, self.x, self.settings.slots
-        self._since = graph.data("since", self.nodes[:-1], each=True)
-        blank = np.zeros((m, 3))
-        things = {
-            "centre": np.full((m, 3), FAR),
-            "velocity": blank,
-            "fall": blank,
-            "keep": np.ones(m),
-            "flat": blank + 1.0,
-            "doubt": blank,
-        }
-        self._seen = {name: graph.data(name, value) for name, value in things.items()}
-        seen = tuple(self._seen.values())
-        if s.reading == "published":
-            h: Barrier = inverse_clearance
-            lost = _of_states(h)
-            held = velocity_extended(h, expected, s.gamma) if s.gamma > 0.0 else lost
-            asked = condition(held, s.alpha, quadrotor_loops.STATE, _flow(self.airframe), as_published=True, lost=lost)
-            self.kept = [
-                keep(graph, asked, x[:-1], self.u, self._since, *seen, obstacles=m, form="hinge", weight=s.hinge)
-            ]
-            return
-        ends = x[:-1].p, x[1:].p, self._since, steps, *seen
-        self.kept = [keep(graph, decay(clearance, s.alpha), *ends, obstacles=m, form=s.form, weight=s.slack)]
-        if s.gamma > 0.0:
-            held = velocity_extended(clearance, expected, s.gamma)
-            states = x[:-1], x[1:], self._since, steps, *seen
-            name = "velocity barrier"
-            self.kept.append(
-                keep(graph, decay(held, s.alpha), *states, obstacles=m, form=s.form, weight=s.slack, name=name)
-            )
 
     def decide(self, start: Array, flown: Flown, obstacles: Obstacles, later: float, gust: Array) -> Decision:
         """Plan.
@@ -401,59 +331,47 @@ class CbfMpc:
             gust: (N, 3) acceleration by the air that is expected in each step [m/s^2].
         """
         begin = time.thread_time()
-        s = self.settings
         states, controls = flat_flight(flown, self.believed)
-        data: dict[fg.Data, Array] = {
-            self._start: start, self._last: self._applied, self._effort: controls[:-1], self._gust: gust,
-        }  # fmt: skip
-        data[self._allowed] = np.maximum(s.speed, np.linalg.norm(start[7:10]) - SLOWING * self.nodes[1:])
-        for name, place in (("p", slice(0, 3)), ("R", slice(3, 7)), ("v", slice(7, 10))):
-            data[self._wanted[name]] = states[1:, place]
-        if self._weighing is not None:
-            data |= self._weighing.data() | dict(zip(self._by_the_past, self._believed_numbers(), strict=True))
-        if s.slots:
-            near = obstacles.these(self._nearest(start, obstacles, later), s.slots)
-            flat = np.ones((s.slots, 3))
-            flat[near.upright, 2] = 0.0
-            fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * near.falls[:, None]
-            given = near.position, near.velocity, fall, near.keep, flat, near.doubts
-            data |= {self._since: later + self.nodes[:-1], **dict(zip(self._seen.values(), given, strict=True))}
-        first, guess = self._plan is None, self._guess
-        if guess is None:
-            if not first:
-                states, controls = flat_flight(_braked(start, self.nodes), self.believed)
-            guess = self._begun(start, states, controls)
-        solution = (self._cold if first else self._warm).solve(guess, data=data)
-        numbers = solution[self.x], solution[self.u]
-        found = all(np.isfinite(part).all() for part in numbers) and solution.violation < KEPT
-        status, slack = solution.status.name.lower(), 0.0
-        if found:
-            self.states = numbers[0]
-            self._plan, self._age, self._guess = (
-                (numbers[0][:, :3], numbers[1]),
-                0,
-                solution.shifted(self.x, self.u, by=0),
-            )
-            slack = max((use.amount for kept in self.kept for use in kept.used(solution)), default=0.0)
-            if len(obstacles.keep) and obstacles.clearance(self._plan[0], later + self.nodes).min() < -INSIDE:
+        near = obstacles
+        if self.settings.slots:
+            near = obstacles.these(self._nearest(start, obstacles, later), self.settings.slots)
+        plan = self.loop.plan(start, Guarded(states, controls[:-1], near, later, gust))
+        solution = self.loop.solution
+        assert solution is not None
+        status, slack, p = plan.source, 0.0, self.believed
+        mass, drag = p.mass, np.array(p.drag)
+        if not plan.emergency:
+            status, mass, drag = plan.status.name.lower(), float(solution["mass"][0, 0]), solution["drag"][0]
+            slack = max((use.amount for kept in self._barriers.kept for use in kept.used(solution)), default=0.0)
+            places = plan.states[:, :3]
+            if len(obstacles.keep) and obstacles.clearance(places, later + self.nodes).min() < -INSIDE:
                 status = "too near"
-        else:
-            self._age += 1
-            # Nearer than before, or never: what was begun is ended in the next tick, and after a few begun anew.
-            on = self._guess is not None and all(np.isfinite(part).all() for part in numbers) and self._age % TRIES
-            self._guess = solution.shifted(self.x, self.u, by=0) if on else None
-        control, plan = self._flown(start)
-        if not found:
-            status = "braking" if self._plan is None or self._age * self._dt > ON else "last plan"
-        self._applied = control
         spent = 1e3 * (time.thread_time() - begin)
-        p = self.believed if not found else None
-        mass, drag = (p.mass, np.array(p.drag)) if p else (float(solution[self.mass][0, 0]), solution[self.drag][0])
-        return Decision(control, plan, status, solution.iterations, slack, mass, drag, spent)
+        return Decision(plan.control, plan.states[:, :3], status, plan.iterations, slack, mass, drag, spent)
+
+    def judge(
+        self, solution: fg.Solution, states: Array, controls: Array, now: Context[Guarded], kept: LastPlan
+    ) -> horizon.Decision:
+        """Fly a plan that keeps the constraints; else the last one for a while; else brake."""
+        finite = bool(np.isfinite(states).all() and np.isfinite(controls).all())
+        if finite and solution.violation < FEASIBLE:
+            self._planned, self._refused = True, 0
+            return horizon.Decision(kept.within(controls), states, "solved")
+        # A solve that was begun goes on in the next tick; after a few ticks it begins anew.
+        self._refused += 1
+        resumed = finite and self.loop.guess is not None and self._refused % TRIES > 0
+        left = kept.within(kept.left())
+        if self._planned and kept.age <= KEEP + 1e-9 and len(left):
+            rest = np.tile(left[-1], (len(controls) - len(left), 1))
+            return horizon.Decision(np.concatenate([left, rest]), kept.states, "last plan", resumed=resumed)
+        level = np.clip(-np.array(Gains().velocity)[[0, 0, 1]] * now.present[7:10], -BRAKING, BRAKING)
+        control = self._brakes.steer(now.present[:10], level, np.zeros(3), self.believed)
+        still = np.tile(now.present, (len(states), 1))
+        return horizon.Decision(np.tile(control, (len(controls), 1)), still, "braking", resumed=resumed)
 
     def _nearest(self, start: Array, obstacles: Obstacles, later: float) -> IntArray:
-        """Which obstacles are looked at; one that was looked at before keeps its place, and so its multipliers."""
-        ways = [_braked(start, self.nodes).position, *([] if self._plan is None else [self._plan[0]])]
+        """Obstacles that are nearest to the plan or to braking; one that was chosen before keeps its place."""
+        ways = [_braked(start, self.nodes).position, *([self.loop.kept.states[:, :3]] if self._planned else [])]
         near = np.min([obstacles.clearance(way, later + self.nodes).min(axis=0) for way in ways], axis=0)
         wanted = np.argsort(near, kind="stable")[: self.settings.slots]
         fresh = [k for k in wanted.tolist() if k not in self._looked_at]
@@ -461,47 +379,218 @@ class CbfMpc:
         self._looked_at = kept + fresh
         return np.array(self._looked_at, dtype=np.intp)
 
-    def _flown(self, start: Array) -> tuple[Array, Array]:
-        """Control and places of the last plan at its age; of braking where it is too old."""
-        age = self._age * self._dt
-        if self._plan is None or age > ON:
-            level = np.clip(-np.array(Gains().velocity)[[0, 0, 1]] * start[7:10], -FIERCE, FIERCE)
-            return self._brakes.steer(start[:10], level, np.zeros(3), self.believed), np.tile(
-                start[:3], (len(self.nodes), 1)
-            )
-        step = int(np.searchsorted(self.nodes, age + 0.5 * self._dt)) - 1
-        return np.clip(self._plan[1][step], self.airframe.least, self.airframe.most), self._plan[0]
+    def _along(self, now: Context[Guarded]) -> tuple[Array, Array]:
+        """Guess a flight on the path from the second node on."""
+        return _with_loops(now.present, now.given.states, now.given.controls)
 
-    def _begun(self, start: Array, states: Array, controls: Array) -> fg.Guess:
-        """A first guess: as if the vehicle flew like that (n, 10), (n, 4) from its second node on."""
-        looped = np.concatenate([states, controls[:, :3], np.zeros((len(states), 3)), controls[:, 3:]], axis=1)
-        looped[0] = start
-        values = {self.x: looped, self.u: controls[:-1], **self._parameters(), **self._speed.guess()}
-        for kept in self.kept:
-            values |= kept.guess()
-        return fg.Guess(values)
+    def _braking(self, now: Context[Guarded]) -> tuple[Array, Array]:
+        """Guess a flight that slows down to rest."""
+        states, controls = flat_flight(_braked(now.present, self.nodes), self.believed)
+        return _with_loops(now.present, states, controls[:-1])
+
+    @property
+    def states(self) -> Array | None:
+        """(N + 1, 17) of the last plan; None before there is one."""
+        return self.loop.kept.states if self._planned else None
 
     @property
     def believed(self) -> quadrotor.Parameters:
-        """Mass and drag as the past says."""
+        """Mass and drag by the past alone."""
         return self.airframe.parameters if self._weighing is None else self._weighing.believed
 
-    def _believed_numbers(self) -> tuple[Array, Array]:
+
+@dataclass(frozen=True)
+class Guarded:
+    """Input of the terms at a tick.
+
+    Attributes:
+        states: (N + 1, 10) of a flight on the path.
+        controls: (N, 4) of it.
+        obstacles: in the slots, as they were seen.
+        later: how much later the plan begins than they were [s].
+        gust: (N, 3) acceleration by the air that is expected in each step [m/s^2].
+    """
+
+    states: Array
+    controls: Array
+    obstacles: Obstacles
+    later: float
+    gust: Array
+
+
+@dataclass(frozen=True)
+class MassAndDrag:
+    """Mass and drag as unknowns: given, or estimated by the past in the same graph."""
+
+    weighing: Weighing | None
+    airframe: Airframe
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the unknowns; how far a plan may move them from where the past alone puts them is bounded."""
+        p = self.airframe.parameters
+        mass, drag = graph.variables("mass", quadrotor.MASS, 1), graph.variables("drag", quadrotor.DRAG, 1)
+        if self.weighing is None:
+            graph.fix(mass, [p.mass], name="given mass")
+            graph.fix(drag, p.drag, name="given drag")
+            return
+        self.weighing.state(graph, mass, drag)
+        for what, believed, pull in zip((mass, drag), self._believed, (PULL[0] * p.mass, PULL[1]), strict=True):
+            past = graph.data(f"{what.name} by the past", believed)
+            graph.constrain(fg.prior, what, past, lower=-pull, upper=pull, name=f"pull of {what.name}")
+
+    @property
+    def _believed(self) -> tuple[Array, Array]:
         """(1,) mass and (3,) drag by the past alone."""
-        p = self.believed
+        p = self.airframe.parameters if self.weighing is None else self.weighing.believed
         return np.array([p.mass]), np.array(p.drag)
 
-    def _parameters(self) -> dict[fg.Family, Array]:
-        if self._weighing is None:
+    def data(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
+        """Data of the past."""
+        if self.weighing is None:
             return {}
-        mass, drag = self._believed_numbers()
-        return {self.mass: mass[None], self.drag: drag[None]}
+        mass, drag = self._believed
+        return {**self.weighing.data(), "mass by the past": mass, "drag by the past": drag}
+
+    def guess(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
+        """Mass and drag by the past alone."""
+        return {name: value[None] for name, value in zip(("mass", "drag"), self._believed, strict=True)}
+
+
+@dataclass(frozen=True)
+class Path:
+    """Costs of leaving the path in position, attitude and velocity; ``share`` (N, 1) of steps in the longest."""
+
+    settings: KeeperSettings
+    share: Array
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the costs."""
+        s, ahead, n = self.settings, x[1:], len(self.share)
+        for part, weight in {"p": s.position, "R": s.attitude, "v": s.velocity}.items():
+            rest = getattr(ahead, part)
+            data = graph.data(f"wanted {part}", np.tile(rest.manifold.identity(), (n, 1)), each=True)
+            sigma = np.broadcast_to((weight * self.share) ** -0.5, (n, 3))
+            graph.minimize(fg.prior, rest, data, sigma=sigma, name=f"path {part}")
+
+    def data(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
+        """The path."""
+        states = now.given.states[1:]
+        return {"wanted p": states[:, :3], "wanted R": states[:, 3:7], "wanted v": states[:, 7:]}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Dynamics with the loops of the airframe in steps (N,) [s], and limits of the controls."""
+
+    airframe: Airframe
+    steps: Array
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the constraints."""
+        loops, families = self.airframe.loops, graph.families
+        held = quadrotor_loops.held(loops.gain, loops.lag, self.steps)
+        gust = graph.data("gust", np.zeros((len(self.steps), 3)), each=True)
+        motion = x[:-1], u, families["mass"], families["drag"], gust, x[1:], self.steps, held
+        graph.constrain(quadrotor_loops.defect, *motion, lower=0.0, upper=0.0, name="dynamics")
+        graph.bound(u, lower=self.airframe.least, upper=self.airframe.most, name="limits")
+
+    def data(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
+        """The gust."""
+        return {"gust": now.given.gust}
+
+
+class Held:
+    """Base of terms with slack.
+
+    Attributes:
+        kept: barriers of the graph.
+    """
+
+    kept: list[Kept]
+
+    def guess(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
+        """No slack."""
+        return {family.name: value for kept in self.kept for family, value in kept.guess().items()}
+
+
+class SpeedLimit(Held):
+    """Limit of the speed, with a slack, and rest at the end where it is wanted."""
+
+    def __init__(self, settings: KeeperSettings, nodes: Array) -> None:
+        """Take the numbers."""
+        self.settings, self.nodes, self.kept = settings, nodes, []
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the constraints."""
+        s = self.settings
+        allowed = graph.data("allowed speed", np.full(s.horizon, s.speed), each=True)
+        names, weight = ["speed"], SPEEDING
+        self.kept = [keep(graph, slower, x[1:].v, allowed, obstacles=names, weight=weight, name="speed")]
+        if s.terminal == "rest":
+            graph.bound(x[-1].v, lower=0.0, upper=0.0, name="rest")
+
+    def data(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
+        """A speed that a vehicle can come down to."""
+        fast = np.linalg.norm(now.present[7:10])
+        return {"allowed speed": np.maximum(self.settings.speed, fast - SLOWING * self.nodes[1:])}
+
+
+class Barriers(Held):
+    """Clearance from the obstacles in the slots."""
+
+    def __init__(self, settings: KeeperSettings, airframe: Airframe, nodes: Array, steps: Array) -> None:
+        """Take the numbers."""
+        self.settings, self.airframe, self.nodes, self.steps, self.kept = settings, airframe, nodes, steps, []
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        """Add the barriers."""
+        s, m, steps = self.settings, self.settings.slots, self.steps
+        since = graph.data("since", self.nodes[:-1], each=True)
+        blank = np.zeros((m, 3))
+        far = np.full((m, 3), FAR)
+        things = {"centre": far, "velocity": blank, "fall": blank, "keep": np.ones(m), "flat": blank + 1.0}
+        seen = [graph.data(name, value) for name, value in {**things, "doubt": blank}.items()]
+        if s.reading == "published":
+            h: Barrier = inverse_clearance
+            lost = _of_states(h)
+            held = velocity_extended(h, expected, s.gamma) if s.gamma > 0.0 else lost
+            asked = condition(held, s.alpha, quadrotor_loops.STATE, _flow(self.airframe), as_published=True, lost=lost)
+            self.kept = [keep(graph, asked, x[:-1], u, since, *seen, obstacles=m, form="hinge", weight=s.hinge)]
+            return
+        ends = x[:-1].p, x[1:].p, since, steps, *seen
+        self.kept = [keep(graph, decay(clearance, s.alpha), *ends, obstacles=m, form=s.form, weight=s.slack)]
+        if s.gamma > 0.0:
+            held = velocity_extended(clearance, expected, s.gamma)
+            states = x[:-1], x[1:], since, steps, *seen
+            name = "velocity barrier"
+            self.kept.append(
+                keep(graph, decay(held, s.alpha), *states, obstacles=m, form=s.form, weight=s.slack, name=name)
+            )
+
+    def data(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
+        """Contents of the slots."""
+        near = now.given.obstacles
+        flat = np.ones((self.settings.slots, 3))
+        flat[near.upright, 2] = 0.0
+        fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * near.falls[:, None]
+        return {
+            "since": now.given.later + self.nodes[:-1], "centre": near.position, "velocity": near.velocity,
+            "fall": fall, "keep": near.keep, "flat": flat, "doubt": near.doubts,
+        }  # fmt: skip
+
+
+def _with_loops(start: Array, states: Array, controls: Array) -> tuple[Array, Array]:
+    """States (N + 1, 17) with loops at rest, from ``start`` (17,) on, of states (N + 1, 10) and controls (N, 4)."""
+    told = np.concatenate([controls, controls[-1:]])
+    looped = np.concatenate([states, told[:, :3], np.zeros((len(states), 3)), told[:, 3:]], axis=1)
+    looped[0] = start
+    return looped, controls
 
 
 def _braked(start: Array, times: Array) -> Flown:
     """The way of a vehicle that slows down evenly to rest."""
     place, velocity = start[:3], start[7:10]
-    rest = max(float(np.linalg.norm(velocity)) / FIERCE, 1e-3)
+    rest = max(float(np.linalg.norm(velocity)) / BRAKING, 1e-3)
     t = np.minimum(times, rest)[:, None]
     slowing = np.where(times[:, None] < rest, -velocity / rest, 0.0)
     return Flown(place + velocity * (t - 0.5 * t * t / rest), velocity * (1.0 - t / rest), slowing, 0.0 * slowing)

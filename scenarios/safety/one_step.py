@@ -71,12 +71,12 @@ def filtered(
     least = -(bend + (s.alpha + s.beta) * rate + s.alpha * s.beta * (distance - near.off(np.array([later]))[0]))
     weights = np.concatenate([np.ones(3), np.full(count, s.price)])
     box = np.array([s.level, s.level, s.vertical])
-    found = qpsolvers.solve_qp(
+    answer = qpsolvers.solve_qp(
         P=scipy.sparse.diags(weights, format="csc"), q=np.concatenate([-wanted, np.zeros(count)]),
         G=scipy.sparse.csc_matrix(-np.hstack([normal, np.eye(count)])), h=-least,
         lb=np.concatenate([-box, np.zeros(count)]), ub=np.concatenate([box, np.full(count, np.inf)]), solver="piqp",
     )  # fmt: skip
-    if found is None or not np.isfinite(found).all():
+    if answer is None or not np.isfinite(answer).all():
         return np.clip(wanted, -box, box), float("inf")
-    acceleration: Array = found[:3]
-    return acceleration, float(found[3:].max(initial=0.0))
+    acceleration: Array = answer[:3]
+    return acceleration, float(answer[3:].max(initial=0.0))

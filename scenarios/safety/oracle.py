@@ -1,4 +1,4 @@
-"""Whether a safe control exists, for one who knows no more than a controller does.
+"""Existence of a safe control, for a controller that knows no more than its measurements.
 
 The vehicle and an obstacle are a double integrator of their relative position r. The vehicle gives accelerations up to
 A in any direction, less what a wrong mass takes away, and only after a delay; the obstacle is where it is and as fast
@@ -34,7 +34,7 @@ Answer: TypeAlias = Literal["yes", "no", "unknown"]
 
 @dataclass(frozen=True)
 class Authority:
-    """What vehicle and obstacle can do.
+    """Accelerations of vehicle and obstacle.
 
     Attributes:
         vehicle: greatest acceleration in any direction [m/s^2].
@@ -85,7 +85,7 @@ def escape(
 
 
 def exists(away: Array, speed: Array, keep: float, authority: Authority, pull: Array | None = None) -> Answer:
-    """Whether a safe control exists; arguments as those of :func:`escape`."""
+    """Existence of a safe control; arguments as those of :func:`escape`."""
     certain, best = escape(away, speed, keep, authority, pull)
     return "yes" if certain >= 0.0 else "no" if best < 0.0 else "unknown"
 
@@ -114,7 +114,7 @@ class Threat:
 
 
 def exists_among(threats: Sequence[Threat], authority: Authority) -> Answer:
-    """Whether one acceleration that is held escapes all obstacles, or one of them cannot be escaped.
+    """Existence of one held acceleration that escapes all obstacles, or of one that cannot be escaped.
 
     Args:
         threats: the obstacles.
@@ -127,14 +127,14 @@ def exists_among(threats: Sequence[Threat], authority: Authority) -> Answer:
     ways = np.concatenate([level, _directions(3)])
     certain, lost = np.full(len(ways), np.inf), False
     for threat in threats:
-        there = times <= threat.until
+        present = times <= threat.until
         flat = np.array([1.0, 1.0, 0.0 if threat.upright else 1.0])
-        straight = threat.away + times[there, None] * threat.speed
+        straight = threat.away + times[present, None] * threat.speed
         if threat.pull is not None:
-            straight = straight - 0.5 * times[there, None] ** 2 * threat.pull
-        straight, moved = straight * flat, a.usable * ways[:, None, :] * late[None, there, None] * flat
-        lost |= bool((np.linalg.norm(straight, axis=1) + a.usable * late[there] < threat.keep).any())
-        far = np.linalg.norm(straight + moved, axis=2) - 0.5 * threat.bend * times[there] ** 2 - threat.keep
+            straight = straight - 0.5 * times[present, None] ** 2 * threat.pull
+        straight, moved = straight * flat, a.usable * ways[:, None, :] * late[None, present, None] * flat
+        lost |= bool((np.linalg.norm(straight, axis=1) + a.usable * late[present] < threat.keep).any())
+        far = np.linalg.norm(straight + moved, axis=2) - 0.5 * threat.bend * times[present] ** 2 - threat.keep
         certain = np.minimum(certain, far.min(axis=1))
     return "no" if lost else "yes" if certain.max() >= 0.0 else "unknown"
 

@@ -1,4 +1,4 @@
-"""Where obstacles are and how fast, from looks that are not exact; and how far that is to be believed.
+"""Positions and velocities of obstacles from noisy sightings, and their uncertainty.
 
 The last looks at M obstacles are factors on place and velocity of now, one graph for all of them: what goes straight
 on, or falls, was at c + s v + s^2/2 a when it was seen at the time s. Noise is the same along every axis, so place and
@@ -124,10 +124,10 @@ class Sightings:
             self._unsure: np.full((1, 3), max(unsure, SUREST)),
         }  # fmt: skip
         guess = {self.place: places, self.speed: np.zeros_like(places), self.own: np.zeros((1, 3))}
-        found = self._run.solve(guess, data=data)
+        solution = self._run.solve(guess, data=data)
         # All are looked at alike, and along all axes; distances are of place less own place.
-        joint = found.covariance(self.place[0], self.speed[0], self.own[0])[::3, ::3] * s.k**2
+        joint = solution.covariance(self.place[0], self.speed[0], self.own[0])[::3, ::3] * s.k**2
         apart = np.array([[1.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
         spread = apart @ joint @ apart.T
         doubt = np.tile([spread[0, 0], 2.0 * spread[0, 1], spread[1, 1]], (len(places), 1))
-        return Obstacles(found[self.place], found[self.speed], like.keep, like.upright, like.falls, doubt)
+        return Obstacles(solution[self.place], solution[self.speed], like.keep, like.upright, like.falls, doubt)

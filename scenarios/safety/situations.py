@@ -25,7 +25,7 @@ _TAG = 71  # keeps these numbers apart from those of others with the same seed
 
 @dataclass(frozen=True)
 class Situation:
-    """What a flight is about.
+    """Path, obstacles and end of a flight.
 
     Attributes:
         kind: its name.

@@ -77,10 +77,10 @@ def around(line: Line, obstacles: Obstacles, settings: SplineSettings) -> Spline
     points, along = wanted.copy(), (np.array(line.end) - np.array(line.start)) / line.length
     anchors: list[tuple[int, Array, Array]] = []
     for _ in range(s.rounds):
-        found = _anchors(points, obstacles, along, anchors)
-        if not found:
+        fresh = _anchors(points, obstacles, along, anchors)
+        if not fresh:
             break
-        anchors += found
+        anchors += fresh
         points = _optimised(points, wanted, anchors, s)
     return SplinePath(points, s.knot)
 
@@ -132,7 +132,7 @@ def _optimised(points: Array, wanted: Array, anchors: list[tuple[int, Array, Arr
         np.add.at(gradient, index, -s.near * slope[:, None] * sides)
         return float(value), gradient[free].ravel()
 
-    found = minimize(cost, points[free].ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 500})
+    result = minimize(cost, points[free].ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 500})
     best = points.copy()
-    best[free] = found.x.reshape(-1, 3)
+    best[free] = result.x.reshape(-1, 3)
     return best

@@ -1,4 +1,4 @@
-"""Where the vehicle is and how the air pushes it, from all that was seen: the past of a flight as one Gaussian.
+"""State filter of the vehicle and of the gust: the past of a flight as one Gaussian.
 
 A step of the past is a factor between two states, a look is a factor on one of them, and the gust, an acceleration that
 fades with a known time, goes along. What lies more than one step back is summed up in the mean and the covariance of
@@ -29,7 +29,7 @@ P, R, V, G = (slice(k, k + 3) for k in range(0, 12, 3))
 
 @dataclass(frozen=True)
 class FilterStatistics:
-    """What is believed of sensors and air.
+    """Statistics of sensors and air as believed.
 
     Attributes:
         seen: standard deviations of position, attitude and velocity as they are seen [m, rad, m/s].
@@ -77,9 +77,9 @@ class StateFilter:
         s = self.covariance
         missed = quadrotor.STATE.local(self.state[None], seen[None])[0]
         gain = np.linalg.solve(s[:9, :9] + np.diag(self._noise), s[:9]).T
-        found = gain @ missed
-        self.state = quadrotor.STATE.retract(self.state[None], found[None, :9])[0]
-        self.gust = self.gust + found[9:]
+        correction = gain @ missed
+        self.state = quadrotor.STATE.retract(self.state[None], correction[None, :9])[0]
+        self.gust = self.gust + correction[9:]
         s = s - gain @ s[:9]
         self.covariance = 0.5 * (s + s.T)
         return self.state

@@ -1,11 +1,11 @@
-"""What the vehicle weighs and how much the air holds it, from how its velocity has changed (FactorMPC, reference 29).
+"""Mass and drag from the change of the velocity (FactorMPC, reference 29).
 
 Over a stretch of the past, thrust and attitude are known from what was told and seen. The mean of v' is
 
     (v_1 - v_0) / t = (1/m) (mean of T R e3 - mean of R diag(R' v) drag) - g e3
 
 one residual of mass and drag for each stretch, whose standard deviation is that of two velocities. These terms stand
-in the graph of whoever plans, or alone.
+in the graph of the plan, or alone.
 """
 
 from __future__ import annotations
@@ -74,34 +74,27 @@ class Weighing:
         self._at = 0
         self._begun: Array | None = None
         self._sums = np.zeros((3, 4))
-        self._given: list[tuple[fg.Data, fg.Data, fg.Data, fg.Data]] = []
         graph = fg.Graph()
         self._mass, self._drag = graph.variables("mass", quadrotor.MASS, 1), graph.variables("drag", quadrotor.DRAG, 1)
-        self.state(graph, self._mass, self._drag)
+        self._handles = self.state(graph, self._mass, self._drag)
         self._alone = GaussNewton(tolerance=1e-8).prepare(graph)
 
-    def state(self, graph: fg.Graph, mass: fg.Family, drag: fg.Family) -> None:
-        """Add what the past says of mass and drag to a graph."""
+    def state(self, graph: fg.Graph, mass: fg.Family, drag: fg.Family) -> dict[str, fg.Data]:
+        """Add the costs of mass and drag by the past to a graph; returns its data by name."""
         s, n = self.settings, self.settings.count
-        given = (
-            graph.data("push", self._push, each=True), graph.data("hold", self._hold, each=True),
-            graph.data("gained", self._gained, each=True), graph.data("weighed", self._known, each=True),
-        )  # fmt: skip
+        handles = {name: graph.data(name, value, each=True) for name, value in self.data().items()}
+        *motion, known = handles.values()
         sigma = 2.0**0.5 * s.velocity_sigma / s.stretch
         every = np.zeros(n, dtype=np.intp)
-        graph.minimize(balance, mass[every], drag[every], *given[:3], sigma=sigma, active=given[3], name="weighing")
+        graph.minimize(balance, mass[every], drag[every], *motion, sigma=sigma, active=known, name="weighing")
         nominal = self._nominal
         graph.minimize(fg.prior, mass, [nominal.mass], sigma=s.mass_sigma * nominal.mass, name="mass before")
         graph.minimize(fg.prior, drag, np.array(nominal.drag), sigma=s.drag_sigma, name="drag before")
-        self._given.append(given)
+        return handles
 
-    def data(self) -> dict[fg.Data, Array]:
-        """Of all graphs the terms stand in."""
-        return {
-            data: value
-            for given in self._given[1:]
-            for data, value in zip(given, (self._push, self._hold, self._gained, self._known), strict=True)
-        }
+    def data(self) -> dict[str, Array]:
+        """Values of the data by name."""
+        return {"push": self._push, "hold": self._hold, "gained": self._gained, "weighed": self._known}
 
     def see(self, state: Array, thrust: float) -> None:
         """Remember a tick.
@@ -133,8 +126,8 @@ class Weighing:
 
     def _weigh(self) -> None:
         p = self.believed
-        given = dict(zip(self._given[0], (self._push, self._hold, self._gained, self._known), strict=True))
-        found = self._alone.solve({self._mass: [[p.mass]], self._drag: [p.drag]}, data=given)
-        mass = max(float(found[self._mass][0, 0]), self.settings.least)
-        drag = np.maximum(found[self._drag][0], 0.0).tolist()
+        given = {self._handles[name]: value for name, value in self.data().items()}
+        solution = self._alone.solve({self._mass: [[p.mass]], self._drag: [p.drag]}, data=given)
+        mass = max(float(solution[self._mass][0, 0]), self.settings.least)
+        drag = np.maximum(solution[self._drag][0], 0.0).tolist()
         self.believed = quadrotor.Parameters(mass, (drag[0], drag[1], drag[2]), p.wind, p.updraft)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.scenarios.course import Course
-from unifg.scenarios.log.flight_log import FlightLog, LandmarkRow
+from unifg.scenarios.log.flight_log import LANDMARK, FlightLog
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 
 __all__ = ["course_log"]
@@ -14,7 +14,7 @@ _FRAMES_PER_STEP = 4
 
 
 def course_log(course: Course) -> FlightLog:
-    """The flight as planned, in the form scenes and plots of flights read; nobody estimates anything in it."""
+    """The flight as planned, in the form scenes and plots of flights read; nothing is estimated in it."""
     c, s = course, course.settings
     settings: dict[str, object] = {
         "scenario": "quadrotor-obstacles", "solver": f"{s.solver}, {s.chosen_hessian} Hessian",
@@ -43,7 +43,7 @@ def course_log(course: Course) -> FlightLog:
         controls=c.controls[nodes],
         plans=np.array(plans),
         pasts=[np.zeros((0, 3))] * count,
-        landmarks=[LandmarkRow.of([], [], [], [])] * count,
+        landmarks=[np.zeros(0, dtype=LANDMARK)] * count,
         parameters=np.tile(s.vehicle.packed, (count, 1)),
         parameters_sigma=np.zeros((count, 7)),
         seen=[np.zeros(0, dtype=np.intp)] * count,

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from unifg.scenarios.course import CourseSettings
+from unifg.scenarios.show.parts import layout
 from unifg.solution.history import Iteration
 from unifg.view import Frame, Scene
 
@@ -14,15 +13,12 @@ _HEIGHT = 2.0  # up to which obstacles are drawn; they have no top [m]
 
 
 def course_stage(settings: CourseSettings) -> Scene:
-    """What stands there, start and target."""
-    layout = settings.layout()
-    scene = Scene(f"unifg: {layout.name or 'a course'}, as it is solved", counts="iteration")
-    scene.discs("cylinders", layout.cylinders, height=_HEIGHT, colour="fixed")
-    foot = np.concatenate([layout.walls, np.zeros((*layout.walls.shape[:2], 1))], axis=2)
-    edges = np.concatenate([foot, foot + np.array([0.0, 0.0, _HEIGHT])])
-    scene.lines("walls", edges, width=0.05, colour="wall")
-    scene.points("target", layout.target[None], pixels=12.0, colour="goal")
-    scene.points("start", layout.start[None], pixels=12.0, colour="start")
+    """Obstacles, start and target."""
+    placed = settings.layout()
+    scene = Scene(f"unifg: {placed.name or 'a course'}, as it is solved", counts="iteration")
+    scene.ground = False
+    layout(scene, placed, _HEIGHT)
+    scene.discs("cylinders", placed.cylinders, height=_HEIGHT, colour="fixed")
     return scene
 
 

@@ -11,7 +11,7 @@ from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.log.metrics import collision_words
 from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import INK, css
-from unifg.style.figures import dashes, discs, ground, headline, new_axes, new_figure, word
+from unifg.style.figures import discs, ground, headline, new_axes, new_figure, word
 from unifg.typing import Array
 from unifg.view.shapes import known_corners
 
@@ -92,29 +92,30 @@ def plot_map(log: EpisodeLog, ax: Axes | None = None, *, legend: bool = True) ->
 
 def plot_localisation(log: EpisodeLog, ax: Axes | None = None) -> Axes:
     """Distance between estimate and truth over time [cm], with dead reckoning where it fits into the picture."""
-    ax = new_axes(ax)
-    error, _ = pose_errors(log.estimate, log.true_pose)
-    odometry, _ = pose_errors(log.dead_reckoning, log.true_pose)
-    ax.plot(log.time, 100.0 * error, color=css("estimate"), lw=1.2, label="estimate (lidar)")
-    ax.plot(log.time, 100.0 * odometry, color=css("odometry"), lw=1.2, ls=":", label="wheel odometry alone")
-    ax.set_ylim(0.0, 100.0 * max(1.3 * float(error.max()), 3.0 * float(error.mean()), 0.01))
+    error, odometry = (pose_errors(poses, log.true_pose)[0] for poses in (log.estimate, log.dead_reckoning))
+    curves = (
+        (100.0 * error, {"color": css("estimate"), "label": "estimate (lidar)"}),
+        (100.0 * odometry, {"color": css("odometry"), "ls": ":", "label": "wheel odometry alone"}),
+    )
+    top = 100.0 * max(1.3 * float(error.max()), 3.0 * float(error.mean()), 0.01)
+    title = f"Localisation error, {100.0 * error.mean():.1f} cm on average"
+    ax = over_time(log, ax, title, "error [cm]", curves, bounds=(0.0, top))
     if odometry.max() > error.max():
         ax.annotate(
             f"odometry ends {odometry[-1]:.2f} m off",
             xy=(0.995, 0.93), xycoords="axes fraction", ha="right", va="top", fontsize=8, color="#5b6472",
         )  # fmt: skip
-    return over_time(log, ax, f"Localisation error, {100.0 * error.mean():.1f} cm on average", "error [cm]")
+    return ax
 
 
 def plot_controls(log: EpisodeLog, ax: tuple[Axes, Axes] | None = None) -> tuple[Axes, Axes]:
     """Forward and turning speed over time against their limits, in two axes."""
     both = (new_axes(None), new_axes(None)) if ax is None else ax
     names = (("v [m/s]", "Forward speed and its limits"), ("$\\omega$ [rad/s]", "Turning speed and its limits"))
+    style = {"color": css("robot"), "lw": 1.1, "drawstyle": "steps-post"}
     for axes, values, limit, (label, title) in zip(both, log.control.T, log.control_limits, names, strict=True):
-        dashes(axes, (-limit, limit))
-        axes.step(log.time, values, where="post", color=css("robot"), lw=1.1)
-        axes.set_ylim(-1.18 * limit, 1.18 * limit)
-        over_time(log, axes, title, label)
+        bounds, curve = (-1.18 * limit, 1.18 * limit), (values, style)
+        over_time(log, axes, title, label, [curve], levels=(-limit, limit), bounds=bounds)
     shade_trouble(both[0], log.dt, log.health, log.cause, "Forward speed")
     if float(log.control[:, 0].min()) >= 0.0:  # it never reversed: show the half that was used
         both[0].set_ylim(-0.08 * log.control_limits[0], 1.18 * log.control_limits[0])

@@ -15,6 +15,8 @@ from unifg.lie import SE2
 from unifg.scenarios.log.drive_log import EpisodeLog
 from unifg.scenarios.log.drive_metrics import episode_metrics
 from unifg.scenarios.log.metrics import collision_words, health
+from unifg.scenarios.show.numbers import Number, declare, in_words, metres, show
+from unifg.scenarios.show.parts import pillar
 from unifg.typing import Array, IntArray
 from unifg.view import Frame, Part, Scene, shapes
 
@@ -27,6 +29,57 @@ _BODY = 0.3  # height of the robot [m]
 _NODES = 16  # of the predicted way
 _ABOVE = (0.0, -math.cos(1.1), math.sin(1.1))  # where the camera stands
 _SIGMAS, _ENLARGED = 3.0, 10.0  # of the ellipse of the estimate: centimetres in a building
+
+
+def _error(log: Any, k: int) -> float:
+    """Localisation error [cm]."""
+    return 100.0 * float(np.hypot(*(log.estimate[k] - log.true_pose[k])[:2]))
+
+
+def _deviations(log: Any, k: int) -> str:
+    """Believed standard deviations along the axes of the ellipse."""
+    greatest, least = 100.0 * np.sqrt(np.linalg.eigvalsh(log.covariance[k][:2, :2])[[1, 0]])
+    return f"{greatest:.1f} and {least:.1f} cm"
+
+
+def _spent(log: Any, k: int) -> str:
+    """Times of the estimate and of the plan."""
+    return f"{log.localise_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + " (compiled)" * bool(log.compiled[k])
+
+
+def _whole(log: Any, k: int) -> str:
+    """Time of a tick."""
+    return f"{log.perceive_ms[k] + log.route_ms[k] + log.localise_ms[k] + log.plan_ms[k]:.1f} ms"
+
+
+NUMBERS = (
+    Number("speed", lambda log, k: f"{log.control[k][0]:.2f} m/s"),
+    Number("turn", lambda log, k: f"{log.control[k][1]:.2f} rad/s"),
+    Number("goal", lambda log, k: f"{log.goal_index[k] + 1} of {len(log.goals)}"),
+    Number("localise + plan", None, lambda log, k: log.solve_ms[k], plot={"unit": "ms", "log": True}),
+    Number(
+        "localisation error", lambda log, k: f"{_error(log, k):.1f} cm", _error,
+        plot={"unit": "cm", "colour": "estimate"},
+    ),
+    Number("believed \u03c3", _deviations),
+    Number(
+        "health", lambda log, k: in_words(log.health[k], log.cause[k]), alarm=lambda log, k: log.health[k] != "ok"
+    ),
+    Number("fault", lambda log, k: (log.fault[k] or "none now") if any(log.faults) else ""),
+    Number(
+        "clearance", lambda log, k: metres(log.clearance[k]), lambda log, k: log.clearance[k],
+        plot={"unit": "m", "limit": 0.0, "colour": "horizon"},
+    ),
+    Number("contacts", lambda log, k: str(int(log.contacts[k])), alarm=lambda log, k: log.contacts[k] > 0),
+    Number("localise, plan", _spent, alarm=lambda log, k: log.compiled[k] > 0),
+    Number("whole tick", _whole),
+    Number(
+        "plan", lambda log, k: log.status[k].replace("_", " ") + ": stored one driven" * bool(log.emergency[k]),
+        alarm=lambda log, k: log.emergency[k],
+    ),
+    Number("iterations of it", lambda log, k: str(int(log.plan_iterations[k]))),
+)  # fmt: skip
+"""Lines and curves of a drive."""
 
 
 def drive_scene(log: EpisodeLog) -> Scene:
@@ -58,7 +111,7 @@ def drive_scene(log: EpisodeLog) -> Scene:
 
 
 def drive_stage(log: Any) -> Scene:
-    """What stays throughout a drive, and the bodies that move in it.
+    """Static parts of a drive's scene, and the bodies that move in it.
 
     Args:
         log: an `EpisodeLog`, or one in the making: what is known before the first tick is asked of it.
@@ -87,14 +140,12 @@ def drive_stage(log: Any) -> Scene:
     scene.label("odometry alone", follows="odometry", minor=True)
     scene.view("overview", "Whole building", _ABOVE)
     scene.view("follow", "Follow robot", _ABOVE, follows="robot", distance=30.0)
-    scene.plot("localise + plan", unit="ms", log=True)
-    scene.plot("localisation error", unit="cm", colour="estimate")
-    scene.plot("clearance", unit="m", limit=0.0, colour="horizon")
+    declare(scene, NUMBERS)
     return scene
 
 
 def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
-    """What a tick of a drive shows.
+    """Draw a tick of a drive.
 
     Args:
         frame: to be drawn on.
@@ -123,7 +174,7 @@ def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
     for index in np.flatnonzero(log.obstacle_moves).tolist():
         frame.place(f"obstacle {index}", [*log.obstacles[tick][index][:2], 0.0])
     _touch(frame, log, tick)
-    _say(frame, log, tick)
+    show(frame, log, tick, NUMBERS)
 
 
 def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
@@ -203,9 +254,8 @@ def _obstacles(scene: Scene, log: Any) -> None:
     first: str | None = None
     for index in np.flatnonzero(moves).tolist():
         name, radius = f"obstacle {index}", float(places[index, 2])
-        mesh = shapes.copies(shapes.column(), np.zeros((1, 3)), np.diag([radius, radius, _WALL])[None])
         words = "obstacle that moves" if first is None else ""
-        scene.body(name, [Part("body", mesh, "moving")], colour="moving", legend=words, like=first)
+        scene.body(name, [pillar(radius, _WALL, "moving")], colour="moving", legend=words, like=first)
         first = first or name
 
 
@@ -215,31 +265,3 @@ def _touch(frame: Frame, log: Any, tick: int) -> None:
     if begun:
         rows = [[*log.true_pose[k][:2], 0.5 * log.robot_radius] for k in begun]
         frame.discs("contact", rows, height=2.0 * _WALL)
-
-
-def _say(frame: Frame, log: Any, tick: int) -> None:
-    """Numbers of the moment."""
-    error = float(np.hypot(*(log.estimate[tick] - log.true_pose[tick])[:2]))
-    clearance, stored = float(log.clearance[tick]), bool(log.emergency[tick])
-    spent = f"{log.localise_ms[tick]:.1f} ms, {log.plan_ms[tick]:.1f} ms"
-    whole = log.perceive_ms[tick] + log.route_ms[tick] + log.localise_ms[tick] + log.plan_ms[tick]
-    deviations = 100.0 * np.sqrt(np.linalg.eigvalsh(log.covariance[tick][:2, :2])[[1, 0]])
-    status = log.status[tick].replace("_", " ")
-    frame.readout("speed", f"{log.control[tick][0]:.2f} m/s")
-    frame.readout("turn", f"{log.control[tick][1]:.2f} rad/s")
-    frame.readout("goal", f"{log.goal_index[tick] + 1} of {len(log.goals)}")
-    frame.readout("localisation error", f"{100 * error:.1f} cm")
-    frame.readout("believed \u03c3", f"{deviations[0]:.1f} and {deviations[1]:.1f} cm")
-    well = log.health[tick] == "ok"
-    frame.readout("health", log.health[tick] + (f": {log.cause[tick]}" if log.cause[tick] else ""), alarm=not well)
-    if any(log.faults):
-        frame.readout("fault", log.fault[tick] or "none now")
-    frame.readout("clearance", f"{clearance:.2f} m" if np.isfinite(clearance) else "\u2013")
-    frame.readout("contacts", str(int(log.contacts[tick])), alarm=bool(log.contacts[tick]))
-    frame.readout("localise, plan", spent + " (compiled)" * bool(log.compiled[tick]), alarm=bool(log.compiled[tick]))
-    frame.readout("whole tick", f"{whole:.1f} ms")
-    frame.readout("plan", status + ": stored one driven" * stored, alarm=stored)
-    frame.readout("iterations of it", str(int(log.plan_iterations[tick])))
-    frame.value("localise + plan", float(log.solve_ms[tick]))
-    frame.value("localisation error", 100.0 * error)
-    frame.value("clearance", clearance)

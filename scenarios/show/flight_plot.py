@@ -18,10 +18,10 @@ from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
 from unifg.scenarios.log.metrics import collision_words
 from unifg.scenarios.show.flight_scene import SIGMAS, first_sights, sensor_reach
-from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times, shade_trouble
+from unifg.scenarios.show.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.style.colours import GREY, INK, css
-from unifg.style.figures import dashes, discs, ground, headline, key_of, new_axes, new_figure
+from unifg.style.figures import discs, ground, headline, key_of, new_axes, new_figure
 from unifg.typing import Array, IntArray
 from unifg.view.shapes import ellipse_axes
 
@@ -88,7 +88,7 @@ def estimates(log: FlightLog) -> Figure:
         ViewError: the flight has no tick or no estimate.
     """
     if log.ticks and not has_estimate(log):
-        raise ViewError("nobody estimated in this flight: it has neither sigmas nor windows")
+        raise ViewError("this flight has no estimate: it has neither sigmas nor windows")
     parameters = np.flatnonzero(estimated_parameters(log)).tolist()
     rows = math.ceil(len(parameters) / _COLUMNS) + len(_STATES) // _COLUMNS
     with new_figure((15.0, 2.05 * rows + 0.9), log.ticks) as figure:
@@ -144,7 +144,7 @@ def moments(log: FlightLog, count: int = 6) -> IntArray:
 
 
 def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bool = True) -> Axes:
-    """What stood there, was believed and meant at one tick, from above.
+    """Obstacles, belief and plan at one tick, from above.
 
     Args:
         log: the flight.
@@ -205,7 +205,7 @@ def _landmarks(log: FlightLog, tick: int, ax: Axes) -> None:
 
     row = log.landmarks[tick]
     style = {"facecolor": (*to_rgb(css("estimate")), 0.45), "edgecolor": css("estimate"), "lw": 0.8, "zorder": 6}
-    for index, (mean, covariance) in enumerate(zip(row.means.tolist(), row.covariances, strict=True)):
+    for index, (mean, covariance) in enumerate(zip(row["mean"].tolist(), row["covariance"], strict=True)):
         long, short, direction = ellipse_axes(covariance, SIGMAS)
         ellipse = Ellipse(mean, 2.0 * long, 2.0 * short, angle=math.degrees(direction), **style)
         ellipse.set_label(None if index else "landmark as believed, 2\u03c3")
@@ -220,19 +220,14 @@ def plot_parameter(log: FlightLog, name: str, ax: Axes | None = None) -> Axes:
         name: one of `unifg.scenarios.log.flight_metrics.PARAMETERS`.
         ax: axes to draw into; None for new ones.
     """
-    ax, index = new_axes(ax), PARAMETERS.index(name)
+    index = PARAMETERS.index(name)
     values, sigmas = log.parameters[:, index], log.parameters_sigma[:, index]
     true = float(log.parameters_true[index])
-    inside = _band(log, ax, values, sigmas, true, "estimate")
-    ax.lines[-1].set_label("truth (errors: zero)")
     ends = f"ends {100.0 * (values[-1] / true - 1.0):+.1f} %" if index == 0 else f"ends {values[-1] - true:+.3f}"
     # A first guess that knows nothing would flatten the rest.
     settled = slice(min(10, log.ticks - 1), None)
-    low = min(true, float((values - 2.5 * sigmas)[settled].min()), float(values.min()))
-    high = max(true, float((values + 2.5 * sigmas)[settled].max()), float(values.max()))
-    margin = 0.08 * max(high - low, 1e-9)
-    ax.set_ylim(low - margin, high + margin)
-    return over_time(log, ax, f"{_NAMES[index]}, {ends}; {inside:.0f} % within 2\u03c3", f"[{_UNITS[index]}]")
+    bounds = padded(true, values, (values - 2.5 * sigmas)[settled], (values + 2.5 * sigmas)[settled])
+    return _band(log, ax, f"{_NAMES[index]}, {ends}", f"[{_UNITS[index]}]", values, sigmas, true, bounds)
 
 
 def plot_state_error(log: FlightLog, component: int, ax: Axes | None = None) -> Axes:
@@ -243,24 +238,36 @@ def plot_state_error(log: FlightLog, component: int, ax: Axes | None = None) -> 
         component: 0-2 position, 3-5 attitude, 6-8 velocity.
         ax: axes to draw into; None for new ones.
     """
-    ax, scale = new_axes(ax), _SCALES[component // 3]
+    scale = _SCALES[component // 3]
     error = scale * state_errors(log)[:, component]
-    inside = _band(log, ax, error, scale * log.believed_sigma[:, component], 0.0, "robot", around=0.0)
     name, unit = _STATES[component].split(" [")
-    rms = math.sqrt(float(np.mean(error**2)))
-    return over_time(log, ax, f"{name}, {rms:.1f} {unit[:-1]} rms; {inside:.0f} % within 2\u03c3", f"[{unit}")
+    title = f"{name}, {math.sqrt(float(np.mean(error**2))):.1f} {unit[:-1]} rms"
+    return _band(log, ax, title, f"[{unit}", error, scale * log.believed_sigma[:, component])
 
 
 def _band(
-    log: FlightLog, ax: Axes, values: Array, sigmas: Array, true: float, colour: str, around: float | None = None
-) -> float:
-    """Values, the truth, and a band of two sigmas around the values or a level; percent of values within."""
-    middle = values if around is None else np.full_like(values, around)
+    log: FlightLog,
+    ax: Axes | None,
+    title: str,
+    unit: str,
+    values: Array,
+    sigmas: Array,
+    true: float | None = None,
+    bounds: tuple[float, float] | None = None,
+) -> Axes:
+    """Values, the truth, and a band of two sigmas around the values, or around zero for errors, which have no truth."""
+    ax, zero = new_axes(ax), np.zeros_like(values)
+    middle, truth, name, colour = zero, 0.0, "error", "robot"
+    if true is not None:
+        middle, truth, name, colour = values, true, "estimate", "estimate"
     band: dict[str, Any] = {"color": css(colour), "alpha": 0.17, "lw": 0, "label": "\u00b1 2\u03c3"}
     ax.fill_between(log.time, middle - 2.0 * sigmas, middle + 2.0 * sigmas, **band)
-    ax.plot(log.time, values, color=css(colour), lw=1.4, label="estimate" if around is None else "error")
-    ax.axhline(true, color=INK, lw=1.0, ls="--")
-    return 100.0 * float(np.mean(np.abs(values - true) <= 2.0 * sigmas))
+    curves = (
+        (values, {"color": css(colour), "lw": 1.4, "label": name}),
+        (zero + truth, {"color": INK, "lw": 1.0, "ls": "--", "label": "truth (errors: zero)"}),
+    )
+    inside = 100.0 * float(np.mean(np.abs(values - truth) <= 2.0 * sigmas))
+    return over_time(log, ax, f"{title}; {inside:.0f} % within 2\u03c3", unit, curves, bounds=bounds)
 
 
 def plot_control(log: FlightLog, index: int, ax: Axes | None = None) -> Axes:
@@ -271,35 +278,27 @@ def plot_control(log: FlightLog, index: int, ax: Axes | None = None) -> Axes:
         index: 0-2 body rates, 3 thrust.
         ax: axes to draw into; None for new ones.
     """
-    ax = new_axes(ax)
     values, limits = log.controls[:, index], _limits(log, index)
-    ax.step(log.time, values, where="post", color=css("robot"), lw=1.2)
-    dashes(ax, limits, 1.1)
-    low, high = min([float(values.min()), *limits]), max([float(values.max()), *limits])
-    margin = 0.08 * max(high - low, 0.1)
-    ax.set_ylim(low - margin, high + margin)
-    title = _CONTROLS[index] + (" and its limits" if limits else "")
-    return over_time(log, ax, title, "[N]" if index == 3 else "[rad/s]")
+    title, unit = _CONTROLS[index] + (" and its limits" if limits else ""), "[N]" if index == 3 else "[rad/s]"
+    curve = values, {"color": css("robot"), "drawstyle": "steps-post"}
+    return over_time(log, ax, title, unit, [curve], levels=limits, bounds=padded(values, limits, least=0.1))
 
 
 def plot_speed(log: FlightLog, ax: Axes | None = None) -> Axes:
     """True speed over time [m/s]."""
-    ax = new_axes(ax)
     speed = np.linalg.norm(log.truth[:, 7:], axis=1)
-    ax.plot(log.time, speed, color=css("robot"), lw=1.4)
-    ax.set_ylim(0.0, 1.12 * max(float(speed.max()), 0.1))
-    over_time(log, ax, f"Speed, at most {speed.max():.2f} m/s", "[m/s]")
-    shade_trouble(ax, log.dt, log.health, log.causes, f"Speed, at most {speed.max():.2f} m/s")
+    title, top = f"Speed, at most {speed.max():.2f} m/s", 1.12 * max(float(speed.max()), 0.1)
+    ax = over_time(log, ax, title, "[m/s]", [(speed, {"color": css("robot"), "lw": 1.4})], bounds=(0.0, top))
+    shade_trouble(ax, log.dt, log.health, log.causes, title)
     return ax
 
 
 def plot_height(log: FlightLog, ax: Axes | None = None) -> Axes:
     """True height over time, with that of the target [m]."""
-    ax = new_axes(ax)
-    ax.plot(log.time, log.truth[:, 2], color=css("robot"), lw=1.4)
-    ax.axhline(float(log.layout.target[2]), color=css("goal"), lw=1.4, ls="--")
-    ax.set_ylim(0.0, 1.15 * max(float(log.truth[:, 2].max()), float(log.layout.target[2]), 0.1))
-    return over_time(log, ax, "Height, and that of the target", "[m]")
+    height, target = log.truth[:, 2], np.full(log.ticks, log.layout.target[2])
+    curves = (height, {"color": css("robot"), "lw": 1.4}), (target, {"color": css("goal"), "lw": 1.4, "ls": "--"})
+    top = 1.15 * max(float(height.max()), float(target[0]), 0.1)
+    return over_time(log, ax, "Height, and that of the target", "[m]", curves, bounds=(0.0, top))
 
 
 def _limits(log: FlightLog, index: int) -> list[float]:
@@ -311,7 +310,7 @@ def _limits(log: FlightLog, index: int) -> list[float]:
 
 
 def _title(log: FlightLog, what: str) -> str:
-    """What a figure shows and of which flight."""
+    """Title of a figure: its content and the flight."""
     settings = log.settings
     words = [what, str(settings.get("scenario", "")), log.layout.name]
     if settings.get("solver"):

@@ -1,7 +1,7 @@
 """A flight as a scene: what stood there, what was believed of it, and where the vehicle flew and meant to fly.
 
-The same few functions show a whole log, and a flight while it goes on: they read one tick of it. A flight that nobody
-estimated, such as a plan flown as it is, has no sigmas, windows, landmarks or sightings; it is shown without them, and
+The same few functions show a whole log, and a flight while it goes on: they read one tick of it. A flight without an
+estimate, such as a plan flown as it is, has no sigmas, windows, landmarks or sightings; it is shown without them, and
 with all cylinders solid from the start.
 """
 
@@ -16,6 +16,8 @@ from unifg.errors import ViewError
 from unifg.scenarios.log.flight_log import FlightLog
 from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.log.metrics import collision_words, health
+from unifg.scenarios.show.numbers import Number, declare, in_words, metres, show
+from unifg.scenarios.show.parts import layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
@@ -27,8 +29,62 @@ SIGMAS = 2.0
 """Half axes of ellipses in standard deviations."""
 
 _HEIGHT = 2.0  # of walls, cylinders and movers [m]; there they have no top
-_FLOOR = -0.02  # drawn a little lower than it is, clear of what stands on it [m]
 _NODES = 16  # of a way that changes from frame to frame
+
+
+def _error(log: Any, k: int) -> float:
+    """Position error [cm]."""
+    return 100.0 * float(np.linalg.norm(log.believed[k][:3] - log.truth[k][:3]))
+
+
+def _mass(log: Any, k: int) -> str:
+    """Mass as believed, where it is estimated."""
+    mass, sigma = log.parameters[k][0], log.parameters_sigma[k][0]
+    return f"{mass:.3f} \u00b1 {sigma:.3f} kg" if sigma > 0.0 else ""
+
+
+def _spent(log: Any, k: int) -> float:
+    """Time of a tick [ms]; NaN where no clock ran."""
+    return float(log.estimate_ms[k] + log.plan_ms[k]) or math.nan
+
+
+def _times(log: Any, k: int) -> str:
+    """Times of estimate and plan, where a clock ran."""
+    spent = f"{log.estimate_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + " (compiled)" * bool(log.compiled[k])
+    return "" if math.isnan(_spent(log, k)) else spent
+
+
+NUMBERS_OF_A_PLAN = (
+    Number("speed", lambda log, k: f"{np.linalg.norm(log.truth[k][7:]):.2f} m/s"),
+    Number("height", lambda log, k: f"{log.truth[k][2]:.2f} m"),
+    Number(
+        "health", lambda log, k: in_words(log.health[k], log.causes[k]), alarm=lambda log, k: log.health[k] != "ok"
+    ),
+    Number("fault", lambda log, k: (log.fault[k] or "none now") if log.settings.get("faults") else ""),
+    Number(
+        "clearance", lambda log, k: metres(log.clearance[k]), lambda log, k: log.clearance[k],
+        plot={"unit": "m", "limit": 0.0, "colour": "horizon"},
+    ),
+    Number("thrust", lambda log, k: f"{log.controls[k][3]:.1f} N"),
+    Number("landmarks", lambda log, k: str(len(log.landmarks[k]) or "")),
+    Number(
+        "plan", lambda log, k: log.statuses[k].lower() + ": stored one flown" * bool(log.emergency[k]),
+        alarm=lambda log, k: log.emergency[k],
+    ),
+)  # fmt: skip
+"""Lines and curves of a flight that nothing estimates."""
+
+NUMBERS = (
+    *NUMBERS_OF_A_PLAN,
+    Number("estimate + plan", None, _spent, plot={"unit": "ms", "log": True}),
+    Number(
+        "position error", lambda log, k: f"{_error(log, k):.1f} cm", _error, plot={"unit": "cm", "colour": "estimate"}
+    ),
+    Number("mass \u00b1 \u03c3", _mass),
+    Number("true mass", lambda log, k: f"{log.parameters_true[0]:.3f} kg" if _mass(log, k) else ""),
+    Number("estimate, plan", _times, alarm=lambda log, k: log.compiled[k] > 0),
+)  # fmt: skip
+"""Lines and curves of a flight."""
 
 
 def flight_scene(log: FlightLog) -> Scene:
@@ -80,12 +136,12 @@ def sensor_reach(log: FlightLog) -> float | None:
 
 
 def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Scene:
-    """What stays throughout a flight, and the bodies that move in it.
+    """Static parts of a flight's scene, and the bodies that move in it.
 
     Args:
         log: a `FlightLog`, or one in the making: what is known before the first tick is asked of it.
         sensed: whether there is a sensor.
-        estimated: whether somebody estimates.
+        estimated: True for a flight with an estimate.
     """
     name = str(log.settings.get("scenario", "quadrotor"))
     scene = Scene(f"unifg: {name}" + (f", {log.layout.name}" if log.layout.name else ""), dt=log.dt)
@@ -98,21 +154,16 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
     scene.facts["solver"] = solver
     _layers(scene, sensed, estimated)
     _bodies(scene, float(log.settings.get("sensor_range", SensorModel().range_max)) if sensed else None)
-    _ground(scene, log)
-    _ends(scene, log)
+    layout(scene, log.layout, _HEIGHT)
     scene.label("start", log.layout.start[:2])
     scene.label("target", log.layout.target)
-    scene.label("drone", follows="drone", above=True)
     _views(scene, log)
-    if estimated:
-        scene.plot("estimate + plan", unit="ms", log=True)
-        scene.plot("position error", unit="cm", colour="estimate")
-    scene.plot("clearance", unit="m", limit=0.0, colour="horizon")
+    declare(scene, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
     return scene
 
 
 def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
-    """What a tick of a flight shows.
+    """Draw a tick of a flight.
 
     Args:
         scene: begun by `flight_stage`.
@@ -135,7 +186,9 @@ def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
         if name not in scene.bodies:
             words = "cylinder that moves" if index == 0 else ""
             like = "mover 0" if index else None
-            scene.body(name, _pillar(radius, "moving"), colour="moving", legend=words, like=like)
+            rim = shapes.ring(np.zeros(2), radius - 0.03, 0.03, _HEIGHT + 0.01, corners=32)
+            parts = [pillar(radius, _HEIGHT, "moving"), Part("rim", rim, "start", False)]
+            scene.body(name, parts, colour="moving", legend=words, like=like)
         frame.place(name, [x, y, 0.0])
     for name, way in (("past", log.pasts[tick]), ("horizon", log.plans[tick])):
         points = shapes.thin(way, _NODES) if len(way) > 1 and np.isfinite(way).all() else way[:0]
@@ -144,7 +197,7 @@ def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
             if name == "horizon":
                 below = shapes.ribbon(points, 0.06, 0.018)
                 frame.mesh("below", below, opacity=0.35)
-    _say(frame, log, tick, estimated)
+    show(frame, log, tick, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
 
 
 def _layers(scene: Scene, sensed: bool, estimated: bool) -> None:
@@ -162,45 +215,12 @@ def _layers(scene: Scene, sensed: bool, estimated: bool) -> None:
 
 def _bodies(scene: Scene, reach: float | None) -> None:
     """The vehicle, its shadow with a plumb line, and the circle the sensor reaches."""
-    scene.body("drone", "quadrotor", size=VEHICLE_RADIUS, colour="robot", legend="")
-    plumb = shapes.tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), 0.012)
-    disc = shapes.ring(np.zeros(2), 0.0, VEHICLE_RADIUS, 0.016, corners=24)
-    shadow = [Part("disc", disc, "start", False, 0.4), Part("plumb", plumb, "start", False, 0.5)]
-    scene.body("shadow", shadow, colour="start", legend="")
+    vehicle(scene, VEHICLE_RADIUS, plumb=True)
     if reach is not None:
         ring = shapes.ring(np.zeros(2), reach - 0.07, 0.07, 0.014, corners=96)
         scene.body(
             "sensor", [Part("ring", ring, "scan", False)], colour="scan", swatch="ring", legend="reach of the sensor"
         )
-
-
-def _ground(scene: Scene, log: Any) -> None:
-    """The floor, with lines every metre to judge distances by, and the walls."""
-    (left, low), (right, high) = log.layout.size
-    floor = np.array([[[left, low, _FLOOR], [right, low, _FLOOR], [right, high, _FLOOR], [left, high, _FLOOR]]])
-    scene.mesh("floor", shapes.quads(floor), colour="floor", legend="")
-    across = [[[x, low], [x, high]] for x in np.arange(math.ceil(left), right + 1e-9)]
-    along = [[[left, y], [right, y]] for y in np.arange(math.ceil(low), high + 1e-9)]
-    lines = [shapes.ribbon(np.array(line), 0.02, 0.0) for line in across + along]
-    scene.mesh("metres", shapes.merge(lines), colour="metres", legend="")
-    sheets, frames = [], []
-    for wall in log.layout.walls:
-        foot, top = (np.column_stack([wall, np.full(2, z)]) for z in (0.0, _HEIGHT))
-        sheets.append(shapes.quads(np.concatenate([foot, top[::-1]])[None]))
-        frames += [shapes.tube(line, 0.03, 4) for line in (foot, top)]
-        frames += [shapes.tube(np.stack([foot[k], top[k]]), 0.03, 4) for k in range(2)]
-    if sheets:
-        scene.mesh("walls", shapes.merge(sheets), colour="wall", opacity=0.22, legend="")
-        scene.mesh("wall frames", shapes.merge(frames), colour="wall", lit=True, legend="")
-
-
-def _ends(scene: Scene, log: Any) -> None:
-    start, target = log.layout.start, log.layout.target
-    scene.mesh("start", shapes.ring(start[:2], 0.18, 0.07, 0.012, corners=32), colour="start", legend="")
-    rings = [shapes.ring(target[:2], r, 0.07, 0.012, corners=40) for r in (0.12, 0.4)]
-    ball = shapes.copies(shapes.sphere(), target[None], 0.16 * np.eye(3)[None])
-    scene.mesh("target", shapes.merge([*rings, ball]), colour="goal", swatch="disc", legend="target")
-    scene.discs("pole", [[target[0], target[1], 0.025]], height=float(target[2]), colour="pole", legend="")
 
 
 def _cylinders(frame: Frame, log: Any, tick: int, sensed: bool) -> None:
@@ -217,18 +237,9 @@ def _cylinders(frame: Frame, log: Any, tick: int, sensed: bool) -> None:
         frame.discs("unseen", rows[~known], height=_HEIGHT, opacity=0.22)
 
 
-def _pillar(radius: float, colour: str) -> list[Part]:
-    column = shapes.copies(shapes.column(), np.zeros((1, 3)), np.diag([radius, radius, _HEIGHT])[None])
-    rim = shapes.ring(np.zeros(2), radius - 0.03, 0.03, _HEIGHT + 0.01, corners=32)
-    return [Part("body", column, colour), Part("rim", rim, "start", False)]
-
-
 def _landmarks(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     """Of every name: an ellipse on top of the cylinder it stands for, and the cylinder's outline as believed."""
-    row = log.landmarks[tick]
-    for name, mean, covariance, radius in zip(
-        row.ids.tolist(), row.means, row.covariances, row.radii.tolist(), strict=True
-    ):
+    for name, mean, covariance, radius in log.landmarks[tick]:
         ellipse, outline = f"landmark {name}", f"outline {name}"
         if ellipse not in scene.bodies:
             others = [body for body in scene.bodies if body.startswith("landmark ")]
@@ -241,39 +252,6 @@ def _landmarks(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
         frame.ellipse(ellipse, mean, covariance, sigmas=SIGMAS, z=_HEIGHT + 0.02 if radius > 0.0 else 0.03)
         if outline in scene.bodies:
             frame.place(outline, [*mean, 0.0])
-
-
-def _say(frame: Frame, log: Any, tick: int, estimated: bool) -> None:
-    """Numbers of the moment."""
-    truth, clearance = log.truth[tick], float(log.clearance[tick])
-    frame.readout("speed", f"{np.linalg.norm(truth[7:]):.2f} m/s")
-    frame.readout("height", f"{truth[2]:.2f} m")
-    if log.health[tick]:
-        state, cause = log.health[tick], log.causes[tick]
-        frame.readout("health", state + (f": {cause}" if cause else ""), alarm=state != "ok")
-    if log.settings.get("faults"):
-        frame.readout("fault", log.fault[tick] or "none now")
-    frame.readout("clearance", f"{clearance:.2f} m" if np.isfinite(clearance) else "\u2013")
-    frame.readout("thrust", f"{log.controls[tick][3]:.1f} N")
-    frame.value("clearance", clearance)
-    if estimated:
-        error = 100.0 * float(np.linalg.norm(log.believed[tick][:3] - truth[:3]))
-        frame.readout("position error", f"{error:.1f} cm")
-        frame.value("position error", error)
-    mass, sigma = log.parameters[tick][0], log.parameters_sigma[tick][0]
-    if sigma > 0.0:
-        frame.readout("mass \u00b1 \u03c3", f"{mass:.3f} \u00b1 {sigma:.3f} kg")
-        frame.readout("true mass", f"{log.parameters_true[0]:.3f} kg")
-    if len(log.landmarks[tick].ids):
-        frame.readout("landmarks", str(len(log.landmarks[tick].ids)))
-    spent = float(log.estimate_ms[tick] + log.plan_ms[tick])
-    if spent > 0.0:
-        new = bool(log.compiled[tick])
-        words = f"{log.estimate_ms[tick]:.1f} ms, {log.plan_ms[tick]:.1f} ms" + " (compiled)" * new
-        frame.readout("estimate, plan", words, alarm=new)
-        frame.value("estimate + plan", spent)
-    stored = bool(log.emergency[tick])
-    frame.readout("plan", log.statuses[tick].lower() + ": stored one flown" * stored, alarm=stored)
 
 
 def _views(scene: Scene, log: Any) -> None:

@@ -56,7 +56,7 @@ def graph_scene(solved: SolvedGraph) -> Scene:
 
 
 def shown_steps(solved: SolvedGraph) -> list[int]:
-    """Which of ``solved.steps`` are drawn: all, or of a large graph the first and the last."""
+    """Indices of ``solved.steps`` that are drawn: all, or of a large graph the first and the last."""
     last = len(solved.steps) - 1
     return list(range(last + 1)) if len(solved.after.edges) * (last + 1) <= _MOST else sorted({0, last})
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.scenarios.manoeuvres import Manoeuvre
-from unifg.scenarios.show.panels import plot_convergence, shade_distance
+from unifg.scenarios.show.panels import forbid, plot_convergence, shade_distance
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import discs, face, ground, headline, new_figure, word
 from unifg.typing import Array
@@ -84,9 +84,8 @@ def plot_control(manoeuvre: Manoeuvre, column: int, ax: Axes) -> Axes:
     """One control of the optimum over time against its limits; column 0 is v, column 1 is omega."""
     m = manoeuvre
     limit = m.settings.limits[column]
-    ax.axhspan(limit, 1.3 * limit, color=GREY, alpha=0.22, lw=0)
-    ax.axhspan(-1.3 * limit, -limit, color=GREY, alpha=0.22, lw=0)
     ax.axhline(0.0, color=GREY, lw=0.8)
+    forbid(ax, (-limit, limit), (-1.3 * limit, 1.3 * limit), m.time[-1])
     held = np.append(m.controls[:, column], m.controls[-1, column])
     ax.step(m.time, held, where="post", color=_LAST, lw=1.8)
     for k in m.cusps:
@@ -99,8 +98,6 @@ def plot_control(manoeuvre: Manoeuvre, column: int, ax: Axes) -> Axes:
         ax.axvline(m.time[k], color=INK, lw=1.0, ls=":")
     ax.set_ylim(-1.3 * limit, 1.3 * limit)
     ax.set_xlim(0.0, m.time[-1])
-    for place in (1.15 * limit, -1.15 * limit):
-        ax.text(0.98 * m.time[-1], place, "not allowed", ha="right", va="center", fontsize=8, color="#4b5563")
     title, label = (("Forward speed v", "v [m/s]"), ("Turning speed $\\omega$", "$\\omega$ [rad/s]"))[column]
     return face(ax, title, label, "time [s]")
 

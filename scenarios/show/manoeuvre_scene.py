@@ -25,7 +25,7 @@ def manoeuvre_scene(manoeuvre: Manoeuvre) -> Scene:
     scene.points("cusps", cusps, pixels=9.0, colour="ink", legend="cusp: it passes from backward to forward")
     if m.case.discs:
         discs = np.array(m.case.discs)
-        scene.discs("discs", discs, colour="fixed", legend="disc that nobody had foreseen")
+        scene.discs("discs", discs, colour="fixed", legend="unforeseen disc")
     scene.body("robot", "disc", size=s.robot_radius, colour="robot")
     scene.body("wanted", "arrow", size=1.5 * s.robot_radius, colour="goal", legend="where the path would have it now")
     scene.label("robot", follows="robot", above=True)
@@ -65,11 +65,11 @@ def manoeuvre_scene(manoeuvre: Manoeuvre) -> Scene:
 
 
 def manoeuvre_stage(case: Case) -> Scene:
-    """What is asked of the robot, for a scene of the iterates of a solve."""
+    """Static parts of a manoeuvre's scene, for the iterates of a solve."""
     scene = Scene(f"unifg: manoeuvre '{case.name}', as it is solved", counts="iteration")
     scene.way("path", case.reference(ManoeuvreSettings())[:, :2], colour="goal", legend="path it is asked to follow")
     if case.discs:
-        scene.discs("discs", np.array(case.discs), colour="fixed", legend="disc that nobody had foreseen")
+        scene.discs("discs", np.array(case.discs), colour="fixed", legend="unforeseen disc")
     scene.layer("plan", "line", "horizon", "plan of this iterate")
     scene.layer("poses", "arrow", "horizon", "", like="plan")
     return scene

@@ -1,61 +1,86 @@
-"""Panels and marks that several pictures share; a panel draws into the axes it is given, or new ones, and returns them.
-
-Panels over time take any log with time, clearance and marks on ticks that had to do with a stored plan.
-"""
+"""Panels and marks that several pictures share; a panel draws into the given axes, or new ones, and returns them."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from unifg.solution.history import Iteration
 from unifg.style.colours import GREY, css
 from unifg.style.figures import dashes, face, new_axes
-from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.typing import Array, ArrayLike
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
+    "forbid",
     "over_time",
+    "padded",
     "plot_clearance",
     "plot_convergence",
     "plot_times",
+    "shade",
     "shade_distance",
     "shade_trouble",
 ]
 
 
-class Timed(Protocol):
-    """What panels over time need of a log."""
+def over_time(
+    log: Any,
+    ax: Axes | None,
+    title: str,
+    y: str,
+    curves: Iterable[tuple[Array, Mapping[str, Any]]] = (),
+    *,
+    levels: Iterable[float] = (),
+    bounds: tuple[float, float] | None = None,
+) -> Axes:
+    """Draw curves over the time of a run, shaded where a stored plan was followed.
 
-    @property
-    def ticks(self) -> int:
-        """Number of ticks."""
-        ...
-
-    @property
-    def time(self) -> Array:
-        """(T,) [s]."""
-        ...
-
-    dt: float
-    clearance: Array
-    emergency: BoolArray
-    compiled: IntArray
-
-
-def over_time(log: Timed, ax: Axes, title: str, y: str) -> Axes:
-    """The face of a panel over the time of a run, shaded where a stored plan was followed."""
+    Args:
+        log: with ticks, time, dt, and an emergency flag for each tick.
+        ax: axes to draw into; None for new ones.
+        title: of the panel.
+        y: label of the axis.
+        curves: values (T,) of every tick, and the style of the line.
+        levels: of dashed lines.
+        bounds: lower and upper end of the axis; None for those that matplotlib finds.
+    """
+    ax = new_axes(ax)
+    dashes(ax, levels)
+    for values, style in curves:
+        ax.plot(log.time, values, **{"lw": 1.2, **style})
     ax.set_xlim(0.0, log.ticks * log.dt)
-    steps = np.diff(np.concatenate([[0], log.emergency.astype(np.int8), [0]]))
-    for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
-        ax.axvspan(begin * log.dt, end * log.dt, color="#000000", alpha=0.12, lw=0)
+    ax.set_ylim(*(bounds or ax.get_ylim()))
+    shade(ax, log.emergency, log.dt, "#000000", 0.12)
     return face(ax, title, y)
+
+
+def padded(*values: ArrayLike, share: float = 0.08, least: float = 1e-9) -> tuple[float, float]:
+    """Ends of an axis around all values, with a margin of a share of their range, or of ``least``."""
+    every = np.concatenate([np.ravel(part) for part in values])
+    low, high = float(every.min()), float(every.max())
+    margin = share * max(high - low, least)
+    return low - margin, high + margin
+
+
+def shade(ax: Axes, flags: Array, dt: float, colour: str, alpha: float) -> None:
+    """Shade the ticks of ``dt`` [s] that are flagged."""
+    steps = np.diff(np.concatenate([[0], np.asarray(flags).astype(np.int8), [0]]))
+    for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
+        ax.axvspan(begin * dt, end * dt, color=colour, alpha=alpha, lw=0)
+
+
+def forbid(ax: Axes, limits: tuple[float, float], ends: tuple[float, float], at: float) -> None:
+    """Shade values beyond limits, up to the ends of the axis, and write so at the time ``at`` [s]."""
+    for limit, end in zip(limits, ends, strict=True):
+        ax.axhspan(min(limit, end), max(limit, end), color=GREY, alpha=0.22, lw=0)
+        ax.text(at, 0.5 * (limit + end), "not allowed ", ha="right", va="center", fontsize=8, color="#4b5563")
 
 
 def shade_trouble(ax: Axes, dt: float, health: Sequence[str], causes: Sequence[str], what: str) -> None:
@@ -68,34 +93,30 @@ def shade_trouble(ax: Axes, dt: float, health: Sequence[str], causes: Sequence[s
         causes: why it was not well, "" where it was.
         what: is drawn, for the title.
     """
-    states = np.array(health)
     for state, colour in (("degraded", "moving"), ("lost", "robot")):
-        steps = np.diff(np.concatenate([[0], (states == state).astype(np.int8), [0]]))
-        for begin, end in zip(np.flatnonzero(steps == 1), np.flatnonzero(steps == -1), strict=True):
-            ax.axvspan(begin * dt, end * dt, color=css(colour), alpha=0.18, lw=0)
+        shade(ax, np.array(health) == state, dt, css(colour), 0.18)
     named = Counter(cause for cause in causes if cause)
     if named:
-        found = " and ".join(state for state in ("degraded", "lost") if state in health)
-        ax.set_title(fill(f"{what}; {found}: {named.most_common(1)[0][0]}", 72), fontsize=8)
+        states = " and ".join(state for state in ("degraded", "lost") if state in health)
+        ax.set_title(fill(f"{what}; {states}: {named.most_common(1)[0][0]}", 72), fontsize=8)
 
 
-def plot_clearance(log: Timed, ax: Axes | None = None) -> Axes:
+def plot_clearance(log: Any, ax: Axes | None = None) -> Axes:
     """Distance from the hull to the nearest thing over time [m]."""
-    ax = new_axes(ax)
-    ax.fill_between(log.time, log.clearance, color=css("horizon"), alpha=0.18, lw=0)
-    ax.plot(log.time, log.clearance, color=css("horizon"), lw=1.2)
-    ax.axhline(0.0, color=css("moving"), lw=1.2)
     lowest = int(np.argmin(log.clearance))
     least = float(log.clearance[lowest])
-    ax.plot(log.time[lowest], least, "v", color=css("horizon"), ms=6)
     finite = log.clearance[np.isfinite(log.clearance)]
     top = 1.15 * max(float(finite.max()), 0.05) if finite.size else 1.0
-    ax.set_ylim(min(0.0, 1.1 * least if np.isfinite(least) else 0.0) - 0.03 * top, top)
+    bounds = min(0.0, 1.1 * least if np.isfinite(least) else 0.0) - 0.03 * top, top
     title = f"Clearance between hull and nearest thing, at least {max(0.0, least):.2f} m"
-    return over_time(log, ax, title, "clearance [m]")
+    ax = over_time(log, ax, title, "clearance [m]", [(log.clearance, {"color": css("horizon")})], bounds=bounds)
+    ax.fill_between(log.time, log.clearance, color=css("horizon"), alpha=0.18, lw=0)
+    ax.axhline(0.0, color=css("moving"), lw=1.2)
+    ax.plot(log.time[lowest], least, "v", color=css("horizon"), ms=6)
+    return ax
 
 
-def plot_times(log: Timed, total: Array, parts: Mapping[str, tuple[Array, str]], ax: Axes | None = None) -> Axes:
+def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], ax: Axes | None = None) -> Axes:
     """Time spent in each tick, in all and on each part [ms], on a logarithmic axis.
 
     Ticks in which something was compiled, or read from the disk, are marked: their time is not that of the others.

@@ -1,4 +1,4 @@
-"""Which factors a solve still fights with: the residual of every factor at every iteration, as one picture.
+"""Residual of every factor at every iteration of a solve, as one picture.
 
 One panel per term, factors upwards, iterations to the right, the residual norm as a colour. FactorMPC (Yang et al.
 2025) monitors its factors in this way. :class:`ResidualMonitor` draws while the solver goes on,

@@ -79,7 +79,7 @@ def plot_above(logs: Sequence[SafeLog], ax: Axes) -> Axes:
 
 
 def plot_speed(logs: Sequence[SafeLog], ax: Axes) -> Axes:
-    """How fast, and how fast the path is."""
+    """Speed of the vehicle and of the path."""
     paths: list[Array] = []
     for log, colour in _coloured(logs):
         wanted = np.linalg.norm(log.wanted[:, 3:], axis=1)

@@ -10,16 +10,49 @@ import numpy as np
 
 from unifg.errors import ViewError
 from unifg.scenarios.log.safe_log import SafeLog
+from unifg.scenarios.show.numbers import Number, declare, show
+from unifg.scenarios.show.parts import floor, pillar, vehicle
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
 __all__ = ["safe_frame", "safe_scene", "safe_stage"]
 
 _HEIGHT = 3.0  # of cylinders, which have no end [m]
-_FLOOR = -0.02
 _STILL = 1e-9  # [m]
 _NODES = 16  # of a plan
 _BESIDE = 1.0  # around the flight [m]
+
+
+def _near(log: Any, k: int) -> float:
+    """Distance to the nearest surface beyond the margin [m]."""
+    return float(log.near[k].min()) - float(log.hull) - float(log.margin)
+
+
+def _away(log: Any, k: int) -> float:
+    """Distance from the path [cm]."""
+    return 100.0 * float(np.linalg.norm(log.states[k][:3] - log.wanted[k][:3]))
+
+
+NUMBERS = (
+    Number("speed", lambda log, k: f"{np.linalg.norm(log.states[k][7:]):.2f} m/s"),
+    Number("from the path", lambda log, k: f"{_away(log, k):.1f} cm", _away, plot={"unit": "cm", "colour": "estimate"}),
+    Number("mass believed", lambda log, k: f"{log.mass[k]:.3f} kg"),
+    Number(
+        "decided in", lambda log, k: f"{log.decide_ms[k]:.1f} ms", lambda log, k: log.decide_ms[k],
+        plot={"unit": "ms", "log": True},
+    ),
+)  # fmt: skip
+"""Lines and curves of every flight."""
+
+NEARNESS = Number(
+    "boundary distance", lambda log, k: f"{_near(log, k):.3f} m", _near, lambda log, k: _near(log, k) < 0.0,
+    {"unit": "m", "limit": 0.0, "colour": "horizon"},
+)  # fmt: skip
+"""Line and curve of a flight among obstacles."""
+
+
+def _numbers(log: Any) -> tuple[Number, ...]:
+    return (NEARNESS, *NUMBERS) if len(log.radii) else NUMBERS
 
 
 def safe_scene(log: SafeLog) -> Scene:
@@ -34,7 +67,7 @@ def safe_scene(log: SafeLog) -> Scene:
     low, high = _extent(log)
     corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (low[0], high[0]) for y in (low[1], high[1])]
     scene.around, scene.ground = np.array(corners), False
-    _floor(scene, low, high)
+    floor(scene, low, high)
     if not _rests(log.wanted[:, :3]):
         scene.way("path", shapes.thin(log.wanted[:, :3], 200))
     for tick in range(log.ticks):
@@ -55,18 +88,12 @@ def safe_stage(log: Any, still: Sequence[bool] = ()) -> Scene:
     scene.layer("flown", "line", "trail", "way flown", width=0.05)
     scene.layer("path", "line", "plan", "path to follow", width=0.024)
     scene.layer("plan", "line", "horizon", "plan", width=0.07)
-    scene.body("drone", "quadrotor", size=log.hull, colour="robot", legend="")
-    shadow = shapes.ring(np.zeros(2), 0.0, log.hull, 0.016, corners=24)
-    scene.body("shadow", [Part("disc", shadow, "start", False, 0.4)], legend="")
+    vehicle(scene, log.hull)
     _bodies(scene, log, list(still) or [False] * len(log.radii))
-    scene.label("drone", follows="drone", above=True)
     scene.view("overview", "Overview", [-0.55, -0.75, 0.8], 24.0)
     scene.view("follow", "Follow drone", [-1.0, -0.45, 0.7], 30.0, follows="drone", distance=9.0)
     scene.view("top", "From above", [0.0, -0.001, 1.0], 10.0)
-    if len(log.radii):
-        scene.plot("boundary distance", unit="m", limit=0.0, colour="horizon")
-    scene.plot("from the path", unit="cm", colour="estimate")
-    scene.plot("decided in", unit="ms", log=True)
+    declare(scene, _numbers(log))
     return scene
 
 
@@ -76,28 +103,16 @@ def _extent(log: SafeLog) -> tuple[Array, Array]:
     return ways.min(axis=0) - _BESIDE, ways.max(axis=0) + _BESIDE
 
 
-def _floor(scene: Scene, low: Array, high: Array) -> None:
-    """With lines every metre to judge distances by."""
-    (left, near), (right, far) = low.tolist(), high.tolist()
-    corners = np.array([[[left, near, _FLOOR], [right, near, _FLOOR], [right, far, _FLOOR], [left, far, _FLOOR]]])
-    scene.mesh("floor", shapes.quads(corners), colour="floor", legend="")
-    across = [[[x, near], [x, far]] for x in np.arange(math.ceil(left), right)]
-    along = [[[left, y], [right, y]] for y in np.arange(math.ceil(near), far)]
-    lines = shapes.merge([shapes.ribbon(np.array(w), 0.02, 0.0) for w in across + along])
-    scene.mesh("metres", lines, colour="metres", legend="")
-
-
 def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
-    """What is to be kept clear of, with its margin on the ground."""
+    """Obstacles, with the margin on the ground."""
     first: dict[str, str] = {}
     for index, (radius, upright) in enumerate(zip(log.radii.tolist(), log.upright.tolist(), strict=True)):
         colour = "fixed" if still[index] else "moving"
         name, words = f"body {index}", {"fixed": "at rest", "moving": "moves"}[colour]
         like = first.get(colour)
         if upright:
-            column = shapes.copies(shapes.column(), np.zeros((1, 3)), np.diag([radius, radius, _HEIGHT])[None])
             edge = shapes.ring(np.zeros(2), radius + log.hull + log.margin - 0.02, 0.02, 0.014, corners=48)
-            parts = [Part("body", column, colour), Part("margin", edge, "moving", False)]
+            parts = [pillar(radius, _HEIGHT, colour), Part("margin", edge, "moving", False)]
             scene.body(name, parts, colour=colour, legend=words, like=like)
         else:
             scene.body(name, "ball", size=radius, colour=colour, legend=words, like=like)
@@ -105,7 +120,7 @@ def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
 
 
 def safe_frame(frame: Frame, log: Any, tick: int) -> None:
-    """What a tick of a `SafeLog`, or of one in the making, shows."""
+    """Draw a tick of a `SafeLog`, or of one in the making."""
     state, plan = log.states[tick], log.plans[tick]
     frame.place("drone", state[:7])
     frame.place("shadow", [state[0], state[1], 0.0])
@@ -115,26 +130,16 @@ def safe_frame(frame: Frame, log: Any, tick: int) -> None:
     frame.trail("flown", state[:3])
     if len(plan) > 1 and np.isfinite(plan).all() and not _rests(plan):
         frame.way("plan", shapes.thin(plan, _NODES))
-    error = 100.0 * float(np.linalg.norm(state[:3] - log.wanted[tick][:3]))
-    frame.readout("speed", f"{np.linalg.norm(state[7:]):.2f} m/s")
-    if len(log.radii):
-        near = float(log.near[tick].min()) - log.hull - log.margin
-        frame.readout("boundary distance", f"{near:.3f} m", alarm=near < 0.0)
-        frame.value("boundary distance", near)
-    frame.readout("from the path", f"{error:.1f} cm")
-    frame.value("from the path", error)
-    frame.readout("mass believed", f"{log.mass[tick]:.3f} kg")
-    frame.readout("decided in", f"{log.decide_ms[tick]:.1f} ms")
-    frame.value("decided in", float(log.decide_ms[tick]))
+    show(frame, log, tick, _numbers(log))
 
 
 def _rests(points: Array) -> bool:
-    """Whether places (n, 3) are all the same."""
+    """Return True if places (n, 3) are all the same."""
     return bool(np.ptp(points, axis=0).max() < _STILL)
 
 
 def _words(scene: Scene, log: SafeLog) -> None:
-    """How it ended."""
+    """Outcome and facts of the flight."""
     words = "kept its distance" if not log.violated else "came TOO NEAR" if not log.touched else "TOUCHED something"
     arrived = "" if log.end is None else ", arrived" if log.arrived else ", did NOT arrive"
     stopped = ", interrupted by the user" if log.interrupted else ""

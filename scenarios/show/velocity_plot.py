@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.scenarios.show.panels import plot_convergence
+from unifg.scenarios.show.panels import forbid, padded, plot_convergence
 from unifg.scenarios.velocity_tracking import Drive, metrics
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import face, headline, new_figure
@@ -47,7 +47,7 @@ def plot_speed(drive: Drive, ax: Axes) -> Axes:
 
 
 def plot_error(drive: Drive, ax: Axes) -> Axes:
-    """What the vehicle is faster than the profile."""
+    """Deviation of the speed from the profile."""
     ax.axhline(0.0, color=GREY, lw=0.8)
     ax.plot(drive.time, drive.error, color=_MISSED, lw=1.1)
     return face(ax, "Deviation from the profile", "v - v_ref [m/s]")
@@ -58,18 +58,14 @@ def plot_force(drive: Drive, ax: Axes) -> Axes:
     bounds, force = drive.settings.force_bounds, drive.force
     low, high = float(min(force.min(), 0.0)), float(max(force.max(), 0.0))
     ax.axhline(0.0, color=GREY, lw=0.8)
+    low, high = padded(low, high, bounds or (), share=0.14)
     if bounds is not None:
-        low, high = min(low, bounds[0]), max(high, bounds[1])
-    room = 0.14 * (high - low)
-    if bounds is not None:
-        for limit, end in ((bounds[0], low - room), (bounds[1], high + room)):
-            ax.axhspan(min(limit, end), max(limit, end), color=GREY, alpha=0.22, lw=0)
-            ax.text(drive.time[-1], 0.5 * (limit + end), "not allowed ", ha="right", va="center", fontsize=8)
+        forbid(ax, bounds, (low, high), drive.time[-1])
     ax.step(drive.time, np.append(force, force[-1]), where="post", color=_DRIVEN, lw=1.3, label="force of the vehicle")
     car = drive.settings.vehicle.linearised() if drive.settings.linear else drive.settings.vehicle
     resistance = car.resistance(drive.speed, drive.profile.slope)
     ax.plot(drive.time, resistance, color=INK, lw=1.0, ls=(0, (4, 2)), label="resistance of air and road")
-    ax.set_ylim(low - room, high + room)
+    ax.set_ylim(low, high)
     face(ax, "Drive and brake force", "force [N]")
     _key(ax)
     return ax
@@ -86,7 +82,7 @@ def plot_numbers(drive: Drive, ax: Axes) -> Axes:
     styles = {name: {"color": c, "marker": mark, "ms": 4, "ls": line} for name, (c, mark, line) in shown.items()}
 
     def values(name: str) -> list[float]:
-        """What is exactly zero, as complementarity with zero multipliers, has no place on a logarithmic axis."""
+        """Values of a row; exact zeros, which have no place on a logarithmic axis, are NaN."""
         return [value if (value := getattr(row, name)) > 0.0 else np.nan for row in history]
 
     plot_convergence(ax, history, styles, drive.settings.tolerance, values)

@@ -158,7 +158,7 @@ class QuadrotorWorld:
         space, body = self._space, self._space.vehicle
         wanted = pymunk.Vec2d(float(flown[0]), float(flown[1]))
         body.velocity = space.without_contacts((wanted - body.position) / pause)
-        space.step(pause)  # movers wait for nobody: their path is the same in every flight
+        space.step(pause)  # movers do not wait: their path is the same in every flight
         if body.position.get_distance(wanted) > _ARRIVED:
             flown[:2] = body.position
         flown[7:9] = space.without_contacts(pymunk.Vec2d(float(flown[7]), float(flown[8])))

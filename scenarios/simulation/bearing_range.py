@@ -1,4 +1,4 @@
-"""What the vehicle measures: bearing and range of cylinders and corners, height, tilt, body rates, specific force."""
+"""Sensors of the vehicle: bearing and range of cylinders and corners, height, tilt, body rates, specific force."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class Sensor:
         )
 
     def _visible(self, index: int, state: Array, things: Array) -> bool:
-        """Whether a ray to the axis, or one to either flank, meets this thing first."""
+        """Return True if a ray to the axis, or one to either flank, meets this thing first."""
         x, y, radius = things[index].tolist()
         origin = (float(state[0]), float(state[1]))
         dx, dy = x - origin[0], y - origin[1]

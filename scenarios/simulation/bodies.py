@@ -22,7 +22,7 @@ __all__ = ["Bodies", "Body", "Ellipse", "Motion", "Shuttle", "Still", "Thrown"]
 
 
 class Motion(Protocol):
-    """Where something is when."""
+    """Motion over time."""
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Positions (n, 3) [m] and velocities (n, 3) [m/s] at times (n,) [s]."""
@@ -30,7 +30,7 @@ class Motion(Protocol):
 
     @property
     def falls(self) -> bool:
-        """Whether gravity bends its way, which one who predicts it knows."""
+        """True if gravity bends the way, which a predictor knows."""
         ...
 
 
@@ -90,7 +90,7 @@ class Ellipse:
 
     @property
     def greatest_acceleration(self) -> float:
-        """Where the curve bends most [m/s^2]."""
+        """Acceleration where the curve bends most [m/s^2]."""
         return self.speed**2 * max(self.axes) / min(self.axes) ** 2
 
 
@@ -117,9 +117,9 @@ class Shuttle:
         if not length > 0.0:
             raise ScenarioError(f"a shuttle needs two places, got {self}")
         share = (self.phase + self.speed * times / (2.0 * length)) % 1.0
-        there = 1.0 - np.abs(2.0 * share - 1.0)
+        share_along = 1.0 - np.abs(2.0 * share - 1.0)
         sense = np.where(share < 0.5, 1.0, -1.0)
-        return np.array(self.start) + there[:, None] * span, sense[:, None] * span * (self.speed / length)
+        return np.array(self.start) + share_along[:, None] * span, sense[:, None] * span * (self.speed / length)
 
 
 @dataclass(frozen=True)
@@ -206,7 +206,7 @@ class Bodies:
             raise ScenarioError(f"obstacles need radii above zero, got {self.radii.tolist()}")
 
     def __len__(self) -> int:
-        """How many."""
+        """Number of bodies."""
         return len(self.bodies)
 
     def at(self, times: Array) -> tuple[Array, Array]:

@@ -30,7 +30,7 @@ SUBSTEP = 1e-3
 
 @dataclass(frozen=True)
 class Loops:
-    """How the vehicle follows what it is told.
+    """Response of the vehicle to its commands.
 
     Attributes:
         gain: of the loop of the rates [1/s].
@@ -58,7 +58,7 @@ class Loops:
 
     @property
     def delay(self) -> float:
-        """What the loops amount to, seen from slow commands: link and slope of the rate loop's phase [s]."""
+        """Delay of the loops for slow commands: link and slope of the rate loop's phase [s]."""
         return self.link + 1.0 / self.gain
 
 
@@ -110,7 +110,7 @@ def _advance(x: Array, loop: Array, told: Array, noise: Array, rho: Array, step:
 
 
 class BodyRatePlant:
-    """One vehicle in the air, or somebody's model of it.
+    """One vehicle in the air, or a model of it.
 
     Attributes:
         airframe: what flies.
@@ -143,7 +143,7 @@ class BodyRatePlant:
 
     @property
     def late(self) -> float:
-        """How long after a tick its command begins to act [s]."""
+        """Delay from a tick until its command begins to act [s]."""
         return len(self._pipe) * SUBSTEP
 
     def tick(self, command: ArrayLike, noise: ArrayLike | None = None) -> Array:
@@ -164,7 +164,7 @@ class BodyRatePlant:
         return self._fly(rows, np.zeros(6) if noise is None else np.asarray(noise, dtype=np.float64))
 
     def ahead(self, state: Array, duration: float, noise: ArrayLike | None = None) -> tuple[Array, Array]:
-        """Where the vehicle, were it in ``state`` now, would be after what is pending has acted for a while.
+        """Prediction from ``state`` after what is pending has acted for a while.
 
         Args:
             state: (10,) as it is seen.
@@ -180,9 +180,9 @@ class BodyRatePlant:
         self.state = state.copy()
         if rows:
             self._fly(np.array(rows), np.zeros(6) if noise is None else np.asarray(noise, dtype=np.float64))
-        found = self.state, self.loops
+        predicted = self.state, self.loops
         self.state, self.loops, self.time = kept
-        return found
+        return predicted
 
     def _fly(self, told: Array, noise: Array) -> Array:
         path = np.empty((len(told) + 1, 3))

@@ -1,4 +1,4 @@
-"""What one flight through the corridor meets, and what is believed before it starts: drawn by seed.
+"""Conditions of one flight through the corridor, true and believed, drawn by seed.
 
 Streams of their own for truth and belief, besides those of the layout and of the world's noise: flights of one seed
 meet the same cylinders, mass, drag, wind, disturbances and sensor noise, however they are estimated and controlled.

@@ -1,4 +1,4 @@
-"""What shakes the vehicle and is not in anybody's model: rate noise, acceleration noise and gusts."""
+"""Disturbances of the vehicle that no model knows: rate noise, acceleration noise and gusts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a base makes of its commands: how soon, how briskly, and how much of it the floor takes.
+"""Response of a base to its commands: latency, lag, accelerations, slip and drift.
 
 A command acts after the latency. The motors follow it with a lag of first order, dv/dt = (command - v) / lag, but they
 change the wheels' velocities no faster than their accelerations allow, divided by what the base carries besides itself.
@@ -18,7 +18,7 @@ from unifg.errors import ScenarioError
 from unifg.scenarios.options import not_negative, option, positive, share
 from unifg.typing import Array
 
-__all__ = ["Drivetrain", "Wheels"]
+__all__ = ["Drivetrain", "Wheels", "followed"]
 
 
 @dataclass(frozen=True)
@@ -100,15 +100,28 @@ class Wheels:
         while self._coming and self._coming[0][0] <= self._now + 0.5 * dt:
             self._told = self._coming.popleft()[1]
         self._now += dt
-        lag, before = self._drivetrain.lag, self.velocity
-        follow = 1.0 if lag == 0.0 else -math.expm1(-dt / lag)
-        wanted = follow * (self._told - before)
-        change = np.clip(wanted, -self._most * dt, self._most * dt)
-        self.velocity = before + change
-        if lag == 0.0:  # a ramp that ends within the interval, or a step
-            spent = np.abs(change) / (self._most * dt)
-            mean = self.velocity - 0.5 * spent * change
-        else:  # the exponential where it is not cut
-            easy = np.abs(wanted) <= self._most * dt
-            mean = np.where(easy, self._told - wanted * lag / dt, 0.5 * (before + self.velocity))
+        self.velocity, mean = followed(self._told, self.velocity, self._drivetrain.lag, self._most * dt, dt)
         return float(mean[0]), float(mean[1])
+
+
+def followed(told: Array, before: Array, lag: float, most: Array, dt: float) -> tuple[Array, Array]:
+    """Velocities that follow a command with a lag of first order and limited accelerations.
+
+    Args:
+        told: (2,) command [m/s, rad/s].
+        before: (2,) velocities now.
+        lag: time constant [s].
+        most: (2,) greatest changes within the interval.
+        dt: its duration [s].
+
+    Returns:
+        (2,) velocities at the end, and (2,) means.
+    """
+    wanted = (1.0 if lag == 0.0 else -math.expm1(-dt / lag)) * (told - before)
+    change = np.clip(wanted, -most, most)
+    after = before + change
+    if lag == 0.0:  # a ramp that ends within the interval, or a step
+        spent = np.divide(np.abs(change), most, out=np.zeros_like(change), where=most > 0.0)
+        return after, after - 0.5 * spent * change
+    # The exponential where it is not cut.
+    return after, np.where(np.abs(wanted) <= most, told - wanted * lag / dt, 0.5 * (before + after))

@@ -1,4 +1,4 @@
-"""What can go wrong, and when: faults that are put between a simulated world and the robot in it.
+"""Injected faults between a simulated world and the robot in it.
 
 A fault is stated as ``KIND@SECONDS[:DURATION]``; without a duration it stays. Faults of sensors change what arrives,
 those of actuators what is done, and the robot is told of none.
@@ -19,7 +19,7 @@ from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.typing import Array
 
-__all__ = ["DRIVE_FAULTS", "FLIGHT_FAULTS", "DriveFaults", "Fault", "FlightFaults", "elsewhere", "one_of"]
+__all__ = ["DRIVE_FAULTS", "FLIGHT_FAULTS", "DriveFaults", "Fault", "FlightFaults", "one_of"]
 
 DRIVE_FAULTS = (
     "lidar-nan", "lidar-inf", "lidar-max", "lidar-negative", "lidar-frozen", "lidar-dropped", "lidar-delayed",
@@ -63,7 +63,7 @@ class Fault:
         return f"{self.kind}@{self.begin:g}" + (f":{self.duration:g}" if math.isfinite(self.duration) else "")
 
     def holds(self, time: float) -> bool:
-        """Whether it does at a time [s]."""
+        """Return True if it is active at a time [s]."""
         return self.begin - 1e-9 <= time < self.begin + self.duration - 1e-9
 
 
@@ -95,7 +95,7 @@ class _Faults:
         self._rng = np.random.default_rng([55, seed])
 
     def hold(self, kind: str, time: float) -> bool:
-        """Whether a fault of this kind holds at a time [s]."""
+        """Return True if a fault of this kind is active at a time [s]."""
         return any(fault.kind == kind and fault.holds(time) for fault in self._faults)
 
     def names(self, time: float) -> str:
@@ -104,7 +104,7 @@ class _Faults:
 
 
 class DriveFaults(_Faults):
-    """What goes wrong in a drive."""
+    """Faults of a drive."""
 
     def __init__(self, faults: Sequence[Fault], seed: int) -> None:
         """Begin before the first tick."""
@@ -115,7 +115,7 @@ class DriveFaults(_Faults):
         self._carried = False
 
     def scan(self, scan: Scan, now: float) -> Scan | None:
-        """What arrives of a scan."""
+        """Scan that arrives."""
         self._scans.append(scan)
         if not self.hold("lidar-frozen", now):
             self._frozen = scan
@@ -137,13 +137,13 @@ class DriveFaults(_Faults):
         return replace(scan, ranges=-scan.ranges) if self.hold("lidar-negative", now) else scan
 
     def odometry(self, measured: Array, now: float) -> Array:
-        """What arrives of the wheels' velocities (2,) [m/s, rad/s]."""
+        """Velocities (2,) of the wheels that arrive [m/s, rad/s]."""
         if self.hold("odometry-nan", now):
             return np.full(2, math.nan)
         return measured * [SPIN, 1.0] if self.hold("odometry-slip", now) else measured
 
     def control(self, asked: Array, now: float, dt: float) -> Array:
-        """What the motors make of the velocities (2,) asked for [m/s, rad/s] over ``dt`` [s]."""
+        """Velocities (2,) that the motors make of those asked for [m/s, rad/s] over ``dt`` [s]."""
         done = asked
         if self.hold("actuator-lag", now):
             done = self._driven + (1.0 - math.exp(-dt / LAG)) * (asked - self._driven)
@@ -154,33 +154,28 @@ class DriveFaults(_Faults):
         return done
 
     def carries(self, now: float) -> bool:
-        """Whether the robot is to be carried away now; it is once."""
+        """Return True, once, when the robot is to be carried away."""
         due = self.hold("kidnapped", now) and not self._carried
         self._carried |= due
         return due
 
-    def elsewhere(self, distance_map: DistanceMap, cells: Array, here: Array) -> Array:
-        """A free pose (3,) away from ``here``; see :func:`elsewhere`."""
-        return elsewhere(distance_map, cells, here, self._rng)
-
-
-def elsewhere(distance_map: DistanceMap, places: Array, here: Array, rng: np.random.Generator) -> Array:
-    """A pose (3,) drawn from places (n, 2) [m] that are far from walls and from ``here`` (3,), with any heading."""
-    room = distance_map.distance(places) > ROOM
-    far = np.hypot(*(places - here[:2]).T) > CARRIED
-    chosen = places[room & far]
-    chosen = chosen if len(chosen) else places[room]
-    place = chosen[int(rng.integers(len(chosen)))] if len(chosen) else here[:2]
-    return np.array([*place, rng.uniform(-np.pi, np.pi)])
+    def elsewhere(self, distance_map: DistanceMap, places: Array, pose: Array) -> Array:
+        """Draw a pose (3,) from places (n, 2) [m] far from walls and from ``pose`` (3,), with any heading."""
+        room = distance_map.distance(places) > ROOM
+        far = np.hypot(*(places - pose[:2]).T) > CARRIED
+        chosen = places[room & far]
+        chosen = chosen if len(chosen) else places[room]
+        place = chosen[int(self._rng.integers(len(chosen)))] if len(chosen) else pose[:2]
+        return np.array([*place, self._rng.uniform(-np.pi, np.pi)])
 
 
 class FlightFaults(_Faults):
-    """What goes wrong in a flight."""
+    """Faults of a flight."""
 
     def reading(self, reading: Reading, now: float) -> Reading:
-        """What arrives of a reading."""
+        """Reading that arrives."""
         if self.hold("detector-lost", now):
-            return _only(reading, np.zeros(0, dtype=np.intp))
+            return reading.only(np.zeros(0, dtype=np.intp))
         return self._haunted(reading) if self.hold("detector-false", now) else reading
 
     def _haunted(self, reading: Reading) -> Reading:
@@ -197,15 +192,9 @@ class FlightFaults(_Faults):
         )
 
     def control(self, asked: Array, now: float) -> Array:
-        """What the motors make of body rates and thrust (4,)."""
+        """Body rates and thrust (4,) that the motors make of those asked for."""
         return asked * [1.0, 1.0, 1.0, THRUST] if self.hold("thrust-loss", now) else asked
 
     def wind(self, now: float) -> tuple[float, float]:
-        """What a gust adds to the wind [m/s^2]."""
+        """Wind that a gust adds [m/s^2]."""
         return (0.0, GUST) if self.hold("gust", now) else (0.0, 0.0)
-
-
-def _only(reading: Reading, rows: Array) -> Reading:
-    """A reading with some of its sightings."""
-    names = ("ids", "bearings", "ranges", "radii", "kinds", "moving")
-    return replace(reading, **{name: getattr(reading, name)[rows] for name in names})

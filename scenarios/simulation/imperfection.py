@@ -1,4 +1,4 @@
-"""How a building differs from its map: walls drawn a little off, and furniture that has been moved.
+"""Differences between a building and its map: walls drawn a little off, and furniture that has been moved.
 
 The robot's map shows the furniture where it once stood; the world is the map warped, with the furniture where it stands
 now. Everything is drawn by seed, and redrawn until the robot can get through in both.
@@ -30,7 +30,7 @@ DRAWS = 200  # of one piece
 
 @dataclass(frozen=True)
 class Imperfection:
-    """How wrong the robot's map is.
+    """Errors of the robot's map.
 
     Attributes:
         map_error: standard deviation by which walls stand elsewhere than on the map, smoothly from place to place [m].
@@ -93,7 +93,7 @@ def _warped(occupancy: OccupancyMap, sigma: float, rng: np.random.Generator) -> 
 def _furnished(
     given: OccupancyMap, true: OccupancyMap, ends: Array, rng: np.random.Generator
 ) -> tuple[OccupancyMap | None, OccupancyMap | None]:
-    """Both maps with one more piece, drawn at random; None where it would stand in something or before somebody."""
+    """Both maps with one more piece, drawn at random; None where there is no room for it."""
     rows, columns = np.nonzero(given.free)
     cell = rng.integers(len(rows))
     size, turn, far = rng.uniform(*SIZES, 2), rng.uniform(0.0, 2.0 * np.pi), rng.uniform(*MOVED)
@@ -120,6 +120,6 @@ def _standing(occupancy: OccupancyMap, corner: Array, size: Array, ends: Array) 
 
 
 def _passable(occupancy: OccupancyMap, ends: Array) -> bool:
-    """Whether the start is joined to every goal."""
+    """Return True if the start is joined to every goal."""
     field = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
     return all(path_exists(occupancy, field, ends[0], end, WAY) for end in ends[1:])

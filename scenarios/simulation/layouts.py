@@ -1,4 +1,4 @@
-"""Where things stand: the corridor and the obstacle course of Ta, Kobilarov and Dellaert (ICUAS 2014), section V.
+"""Layouts: the corridor and the obstacle course of Ta, Kobilarov and Dellaert (ICUAS 2014), section V.
 
 A layout depends on its seed alone. The seeds of the studies are fixed here, apart from those open to tuning.
 """

@@ -1,4 +1,4 @@
-"""Where discs that no map shows are: drawn by seed, on a building's map or in a corridor.
+"""Placement of discs that no map shows: drawn by seed, on a building's map or in a corridor.
 
 In a building they matter: they stand on and beside the planned path. They are drawn at random and redrawn until a disc
 of radius 0.25 m can still get from the start to every goal, so that an episode is hard but never impossible. Every
@@ -35,7 +35,7 @@ _FRACTIONS = (0.25, 0.5, 0.75)  # places between the ends at which a way must re
 
 @dataclass(frozen=True)
 class PlacementRules:
-    """Where unforeseen obstacles may be.
+    """Rules for the positions of unforeseen obstacles.
 
     Attributes:
         radius: smallest and greatest radius [m].
@@ -62,7 +62,7 @@ class PlacementRules:
 
 @dataclass(frozen=True)
 class _Site:
-    """What every draw is held against."""
+    """Map, path and rules that every draw must fit."""
 
     occupancy: OccupancyMap
     distance_map: DistanceMap
@@ -81,7 +81,7 @@ class _Site:
         return np.where(known, self.distance_map.distance(points), -1.0)
 
     def passable(self, discs: Array) -> bool:
-        """Whether the start is still joined to every goal around discs (K, 3) x, y, radius [m]."""
+        """Return True if the start is still joined to every goal around discs (K, 3) x, y, radius [m]."""
         clearance = self.rules.way_clearance
         return all(path_exists(self.occupancy, self.distance_map, self.start, g, clearance, discs) for g in self.goals)
 
@@ -184,7 +184,7 @@ def _draw(site: _Site, moves: bool, rng: np.random.Generator) -> Obstacle | None
 
 
 def _keeps_distance(site: _Site, placed: list[Obstacle], obstacle: Obstacle) -> bool:
-    """Whether the obstacle, all along its sweep, is far enough from start, goals and the other obstacles."""
+    """Return True if the obstacle, all along its sweep, is far enough from start, goals and the other obstacles."""
     sweep = obstacle.positions(np.linspace(0.0, 1.0, 41))
     rules = site.rules
     if np.linalg.norm(sweep - site.start, axis=1).min() < rules.start_distance:
@@ -196,7 +196,7 @@ def _keeps_distance(site: _Site, placed: list[Obstacle], obstacle: Obstacle) -> 
 
 
 def _leaves_way(site: _Site, obstacles: list[Obstacle]) -> bool:
-    """Whether the start is joined to every goal wherever the movers may be."""
+    """Return True if the start is joined to every goal wherever the movers may be."""
     fixed = [(*o.centre, o.radius) for o in obstacles if not o.moving]
     movers = [o for o in obstacles if o.moving]
 

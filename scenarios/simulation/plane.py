@@ -24,8 +24,7 @@ from unifg.scenarios.options import not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.simulation.rectangles import wall_rectangles
-from unifg.scenarios.simulation.space import OTHERS, Obstacle, Space
-from unifg.scenarios.simulation.traffic import Person
+from unifg.scenarios.simulation.space import OTHERS, Mover, Obstacle, Space
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["ROBOT_RADIUS", "LidarModel", "OdometryModel", "World"]
@@ -109,7 +108,7 @@ class World:
         odometry: OdometryModel | None = None,
         drivetrain: Drivetrain | None = None,
         yields: bool = True,
-        people: Sequence[Person] = (),
+        people: Sequence[Mover] = (),
     ) -> None:
         """Build the walls, place the obstacles and the robot.
 
@@ -150,9 +149,8 @@ class World:
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
             self._space.add_disc(obstacle, index)
-        self._people = tuple(people)
-        for index, person in enumerate(self._people, start=len(self.obstacles)):
-            self._space.add_thing(person, index)
+        for index, person in enumerate(people, start=len(self.obstacles)):
+            self._space.add_mover(person, index)
         self._robot = self._space.vehicle
         self._trail: list[tuple[float, tuple[float, float, float]]] = [
             (self.time, (*self._robot.position, self._robot.angle))
@@ -286,12 +284,12 @@ class World:
         lidar = self.lidar
         early, where, mixed, between = self._lidar_rng.random((4, lidar.beams))
         met = np.minimum(ranges, lidar.range_max)
-        found = np.where(
+        mixed_ranges = np.where(
             (np.abs(met - np.roll(met, 1)) > EDGE) & (mixed < lidar.mixed),
             met + between * (np.roll(met, 1) - met),
             ranges,
         )
-        return np.where(early < lidar.clutter, where * np.minimum(found, lidar.range_max), found)
+        return np.where(early < lidar.clutter, where * np.minimum(mixed_ranges, lidar.range_max), mixed_ranges)
 
     def odometry(self) -> tuple[float, float]:
         """Mean body velocities (v [m/s], omega [rad/s]) over the last step, as the wheels report them.
@@ -331,5 +329,4 @@ class World:
 
     def obstacle_states(self) -> Array:
         """(K, 4) x, y, radius [m] of obstacles and people, and 1 for those that move, else 0."""
-        people = [(*person.body.position, person.radius, 1.0) for person in self._people]
-        return np.concatenate([self._space.discs(), np.array(people).reshape(-1, 4)])
+        return self._space.discs()

@@ -17,7 +17,7 @@ import pymunk
 from unifg.errors import ScenarioError
 from unifg.typing import Array
 
-__all__ = ["OTHERS", "YIELD_GAP", "Obstacle", "Space", "Thing"]
+__all__ = ["OTHERS", "YIELD_GAP", "Mover", "Obstacle", "Policy", "Space", "ToAndFro"]
 
 YIELD_GAP = 0.1
 """Gap a mover keeps between its hull and that of a resting robot [m]."""
@@ -60,22 +60,30 @@ class Obstacle:
         return positions
 
 
-class Thing(Protocol):
-    """Something that moves by itself."""
+class Policy(Protocol):
+    """Motion of a mover."""
 
-    @property
-    def body(self) -> pymunk.Body:
-        """Kinematic."""
+    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+        """Velocity for the next substep of ``dt`` [s]; ``resting``: the vehicle stands still [m/s]."""
         ...
 
-    @property
-    def shape(self) -> pymunk.Shape:
-        """Of the body."""
-        ...
 
-    def advance(self, robot: pymunk.Body, robot_radius: float, resting: bool, dt: float) -> None:
-        """Choose the velocity of the next substep, knowing where the robot is and whether it is at rest."""
-        ...
+class Mover:
+    """A kinematic disc.
+
+    Attributes:
+        body: kinematic; its position and velocity.
+        radius: [m].
+        policy: of its motion.
+        shape: of the body.
+    """
+
+    def __init__(self, place: Array, radius: float, policy: Policy) -> None:
+        """Stand at ``place`` (2,) [m]."""
+        self.body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        self.body.position = (float(place[0]), float(place[1]))
+        self.radius, self.policy = radius, policy
+        self.shape = pymunk.Circle(self.body, radius)
 
 
 class Space:
@@ -85,7 +93,6 @@ class Space:
         engine: pymunk's space.
         vehicle: body of the vehicle; a wall stops it, it does not turn it.
         radius: of the vehicle's disc [m].
-        obstacles: discs that are not on the map.
         time: since the start [s].
         collisions: contact events so far; contacts with one owner less than 0.5 s apart are one.
     """
@@ -100,12 +107,10 @@ class Space:
         self.vehicle.angle = float(place[2]) if len(place) > 2 else 0.0
         self.radius = radius
         self._yields = yields
-        self.obstacles: list[Obstacle] = []
         self.time = 0.0
         self.collisions = 0
         self._owner: dict[pymunk.Shape, int] = {}
-        self._movers: dict[int, _Mover] = {}  # by place in obstacles
-        self._things: list[Thing] = []
+        self._discs: list[tuple[Array, float, Mover | None]] = []
         self._touching: dict[int, int] = {}
         self._separated: dict[int, float] = {}
 
@@ -122,21 +127,17 @@ class Space:
     def add_disc(self, obstacle: Obstacle, owner: int) -> pymunk.Shape:
         """Add a disc, on a body of its own if it moves."""
         if obstacle.end is not None and obstacle.moving:
-            mover = _Mover(obstacle, obstacle.end)
-            self._movers[len(self.obstacles)] = mover
-            self.engine.add(mover.body)
-            shape = pymunk.Circle(mover.body, obstacle.radius)
-        else:
-            offset = (float(obstacle.centre[0]), float(obstacle.centre[1]))
-            shape = pymunk.Circle(self.engine.static_body, obstacle.radius, offset)
-        self.obstacles.append(obstacle)
-        return self.add(shape, owner)
+            policy = ToAndFro(obstacle, obstacle.end, self._yields)
+            return self.add_mover(Mover(obstacle.centre, obstacle.radius, policy), owner)
+        self._discs.append((obstacle.centre, obstacle.radius, None))
+        offset = (float(obstacle.centre[0]), float(obstacle.centre[1]))
+        return self.add(pymunk.Circle(self.engine.static_body, obstacle.radius, offset), owner)
 
-    def add_thing(self, thing: Thing, owner: int) -> None:
-        """Add something that moves by itself, whoever stands there."""
-        self._things.append(thing)
-        self.engine.add(thing.body)
-        self.add(thing.shape, owner)
+    def add_mover(self, mover: Mover, owner: int) -> pymunk.Shape:
+        """Add a disc that moves by a policy."""
+        self._discs.append((np.zeros(2), mover.radius, mover))
+        self.engine.add(mover.body)
+        return self.add(mover.shape, owner)
 
     def add_vehicle(self) -> None:
         """Let the vehicle in, after everything else."""
@@ -147,12 +148,11 @@ class Space:
         self.engine.on_collision(_VEHICLE_TYPE, _THING_TYPE, begin=self._on_begin, separate=self._on_separate)
 
     def discs(self) -> Array:
-        """(K, 4) x, y, radius [m] of the obstacles now, and 1 for those that move by design, else 0."""
-        states = np.zeros((len(self.obstacles), 4))
-        for index, obstacle in enumerate(self.obstacles):
-            mover = self._movers.get(index)
-            centre = obstacle.centre if mover is None else mover.body.position
-            states[index] = centre[0], centre[1], obstacle.radius, mover is not None
+        """(K, 4) x, y, radius [m] of the discs now, in the order they were added, and 1 for movers, else 0."""
+        states = np.zeros((len(self._discs), 4))
+        for index, (centre, radius, mover) in enumerate(self._discs):
+            place = centre if mover is None else mover.body.position
+            states[index] = place[0], place[1], radius, mover is not None
         return states
 
     # -------------------------------------------------------------------- time
@@ -172,10 +172,9 @@ class Space:
 
     def step(self, pause: float, resting: bool = False) -> None:
         """Move everything for a substep [s]; movers that yield wait for a vehicle that is ``resting``."""
-        for mover in self._movers.values():
-            mover.advance(self.vehicle, self.radius, resting and self._yields, pause)
-        for thing in self._things:
-            thing.advance(self.vehicle, self.radius, resting, pause)
+        for _, _, mover in self._discs:
+            if mover is not None:
+                mover.body.velocity = mover.policy.velocity(mover, self, resting, pause)
         self.engine.step(pause)
 
     def without_contacts(self, velocity: pymunk.Vec2d, relative: bool = True) -> pymunk.Vec2d:
@@ -199,7 +198,7 @@ class Space:
     # ---------------------------------------------------------------- contacts
 
     def touches(self, owner: int) -> bool:
-        """Whether the vehicle is in contact with an owner's things."""
+        """Return True if the vehicle is in contact with an owner's things."""
         return self._touching.get(owner, 0) > 0
 
     def begin(self, owner: int, counts: bool = True) -> None:
@@ -224,42 +223,28 @@ class Space:
         return self._owner[first] if first in self._owner else self._owner[second]
 
 
-class _Mover:
-    """A kinematic disc going to and fro along its segment."""
+class ToAndFro:
+    """To and fro along the segment of an obstacle at constant speed; waits where it would crowd a robot at rest."""
 
-    def __init__(self, obstacle: Obstacle, end: Array) -> None:
-        """Stand at the obstacle's centre, about to leave for ``end`` (2,) [m]."""
+    def __init__(self, obstacle: Obstacle, end: Array, yields: bool) -> None:
+        """Begin at the obstacle's centre, about to leave for ``end`` (2,) [m]; ``yields``: wait for robots at rest."""
         self.origin = pymunk.Vec2d(*map(float, obstacle.centre))
         span = pymunk.Vec2d(*map(float, end)) - self.origin
-        self.length = span.length
-        self.direction = span.normalized()
-        self.radius = obstacle.radius
-        self.speed = obstacle.speed
-        self.along = 0.0
-        self.sense = 1.0
-        self.body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        self.body.position = self.origin
+        self.length, self.direction, self.speed = span.length, span.normalized(), obstacle.speed
+        self.along, self.sense, self.yields = 0.0, 1.0, yields
 
-    def advance(self, robot: pymunk.Body, robot_radius: float, resting: bool, dt: float) -> None:
-        """Choose the velocity of the next substep; wait when it would crowd a robot at rest.
-
-        Args:
-            robot: the robot's body.
-            robot_radius: [m].
-            resting: True while the robot stands still; turning on the spot is standing still.
-            dt: duration of the substep [s].
-        """
+    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+        """Velocity to the next place on the segment, so that nothing drifts."""
         along, sense = self.along + self.sense * self.speed * dt, self.sense
         if along > self.length:
             along, sense = max(2.0 * self.length - along, 0.0), -1.0
         elif along < 0.0:
             along, sense = min(-along, self.length), 1.0
-        target = self.origin + along * self.direction
-        if resting:
-            hulls = robot_radius + self.radius
-            gap = target.get_distance(robot.position) - hulls
-            if gap < YIELD_GAP and gap < self.body.position.get_distance(robot.position) - hulls:
-                self.body.velocity = (0.0, 0.0)
-                return
+        target, robot = self.origin + along * self.direction, space.vehicle.position
+        if resting and self.yields:
+            hulls = space.radius + mover.radius
+            gap = target.get_distance(robot) - hulls
+            if gap < YIELD_GAP and gap < mover.body.position.get_distance(robot) - hulls:
+                return 0.0, 0.0
         self.along, self.sense = along, sense
-        self.body.velocity = (target - self.body.position) / dt  # lands on the segment: no drift
+        return (target - mover.body.position) / dt

@@ -12,22 +12,22 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import pymunk
 
 from unifg.errors import ScenarioError
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.options import count, option, positive
 from unifg.scenarios.planning.polyline import arc_lengths, at_stations
+from unifg.scenarios.simulation.space import Mover, Space
 from unifg.typing import Array
 
-__all__ = ["Person", "Traffic", "draw_traffic"]
+__all__ = ["Social", "Traffic", "draw_traffic"]
 
 RELAXATION = 0.5  # [s], of a person's velocity to the one that is wanted
 PUSH, REACH = 25.0, 0.08  # of a person: acceleration at a touch [m/s^2], length over which it falls to 1/e [m]
 HASTE = 1.3  # fastest walk, in shares of the pace that is wanted
 MOST = 200  # people
 CARROT = 0.5  # [m] ahead on their way that people go for
-FROM_START = 3.0  # [m] from the start, where nobody is at the beginning
+FROM_START = 3.0  # [m] from the start, without people at the beginning
 PERSON = (0.18, 0.25)  # radius [m]
 WALK = (3.0, 10.0)  # shortest and longest way of a person [m]
 STEP = 0.1  # [m] between places that are tried
@@ -60,38 +60,33 @@ class Traffic:
             raise ScenarioError(f"the number of people must be from 0 to {MOST}, got {self.people}")
 
 
-class Person:
-    """A disc that walks to and fro along a way.
+class Social:
+    """Policy of a person: walk to and fro along a way by social forces.
 
     Attributes:
-        body: kinematic; where it is, and its velocity.
-        others: bodies and radii that it keeps off, by social forces.
+        others: movers that it keeps off.
     """
 
     def __init__(self, way: Array, radius: float, pace: float, walls: DistanceMap) -> None:
-        """Stand at the beginning of a way.
+        """Begin at the beginning of a way.
 
         Args:
             way: (P, 2) [m].
             radius: [m].
-            pace: at which it wants to walk [m/s].
+            pace: at which the person wants to walk [m/s].
             walls: distance to them.
         """
         self.way, self.radius, self.pace = way, radius, pace
-        self.body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        self.body.position = (float(way[0, 0]), float(way[0, 1]))
-        self.shape = pymunk.Circle(self.body, radius)
-        self.others: list[tuple[pymunk.Body, float]] = []
+        self.others: list[Mover] = []
         self._walls, self._arc = walls, arc_lengths(way)
         self._along, self._sense = 0.0, 1.0
 
-    def advance(self, robot: pymunk.Body, robot_radius: float, resting: bool, dt: float) -> None:
-        """Choose the velocity of the next ``dt`` [s]."""
-        place, velocity = np.array(self.body.position), np.array(self.body.velocity)
-        velocity = velocity + dt * self.force(place, velocity)
-        speed = float(np.hypot(*velocity))
-        velocity *= min(1.0, HASTE * self.pace / max(speed, 1e-12))
-        self.body.velocity = (float(velocity[0]), float(velocity[1]))
+    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+        """Velocity after ``dt`` [s] of the forces, at most a hasty walk."""
+        velocity = np.array(mover.body.velocity)
+        velocity = velocity + dt * self.force(np.array(mover.body.position), velocity)
+        velocity *= min(1.0, HASTE * self.pace / max(float(np.hypot(*velocity)), 1e-12))
+        return float(velocity[0]), float(velocity[1])
 
     def force(self, place: Array, velocity: Array) -> Array:
         """(2,) acceleration at a place (2,) and velocity (2,), between what is wanted and what is kept off [m/s^2]."""
@@ -103,10 +98,10 @@ class Person:
             self._go_on(STEP)
             carrot = at_stations(self.way, self._arc, np.array([self._along]))[0] - place
         made: Array = (self.pace * carrot / max(float(np.hypot(*carrot)), 1e-6) - velocity) / RELAXATION
-        for body, radius in self.others:
-            away = place - np.array(body.position)
+        for other in self.others:
+            away = place - np.array(other.body.position)
             distance = max(float(np.hypot(*away)), 1e-6)
-            made += PUSH * math.exp((self.radius + radius - distance) / REACH) * away / distance
+            made += PUSH * math.exp((self.radius + other.radius - distance) / REACH) * away / distance
         off_walls, slope = self._walls.distance_and_gradient(place)
         made += PUSH * math.exp(min((self.radius - float(off_walls)) / REACH, 1.0)) * slope
         return made
@@ -120,7 +115,7 @@ class Person:
         self._along = along
 
 
-def draw_traffic(traffic: Traffic, walls: DistanceMap, path: Array, rng: np.random.Generator) -> list[Person]:
+def draw_traffic(traffic: Traffic, walls: DistanceMap, path: Array, rng: np.random.Generator) -> list[Mover]:
     """Draw the people on or beside a planned path.
 
     Args:
@@ -134,9 +129,10 @@ def draw_traffic(traffic: Traffic, walls: DistanceMap, path: Array, rng: np.rand
     """
     (of_people,) = rng.spawn(1)
     people = [_person(traffic, walls, path[:, :2], of_people) for _ in range(traffic.people)]
-    for person in people:
-        person.others = [(other.body, other.radius) for other in people if other is not person]
-    return people
+    movers = [Mover(person.way[0], person.radius, person) for person in people]
+    for person, own in zip(people, movers, strict=True):
+        person.others = [other for other in movers if other is not own]
+    return movers
 
 
 def _stretch(points: Array, rng: np.random.Generator) -> Array:
@@ -150,7 +146,7 @@ def _stretch(points: Array, rng: np.random.Generator) -> Array:
     return at_stations(points, arc, stations)
 
 
-def _person(traffic: Traffic, walls: DistanceMap, points: Array, rng: np.random.Generator) -> Person:
+def _person(traffic: Traffic, walls: DistanceMap, points: Array, rng: np.random.Generator) -> Social:
     for _ in range(DRAWS):
         way, (size, pace, aside) = _stretch(points, rng), rng.random(3)
         radius = PERSON[0] + size * (PERSON[1] - PERSON[0])
@@ -160,5 +156,5 @@ def _person(traffic: Traffic, walls: DistanceMap, points: Array, rng: np.random.
         far = np.hypot(*(way[0] - points[0])) >= FROM_START
         if far and arc_lengths(way)[-1] > CARROT and walls.distance(way).min() >= radius + 0.02:
             speed = traffic.slowest + pace * (traffic.fastest - traffic.slowest)
-            return Person(way, radius, float(speed), walls)
+            return Social(way, radius, float(speed), walls)
     raise ScenarioError("there is no place for so many people along the path; ask for fewer, or for goals farther away")

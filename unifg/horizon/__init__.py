@@ -1,11 +1,12 @@
 """Past and future of a robot: a window of what was measured, a horizon of what to do, one graph or two.
 
-from unifg.horizon import Loop, Measurement, Robot, Window
+from unifg.horizon import Dynamics, Measurement, RecedingHorizon, Robot, Window
 
 robot = Robot(STATE, CONTROL, predict=step)
 past = [Dynamics(motion, h, sigma=noise), Measurement("position", position, (2,), 0.3)]
 window = Window(robot, 10, past, start=x0, sigma=0.5)
-loop = Loop(robot, 25, [Dynamics(motion, h), Parking()], solver=InteriorPoint(), window=window, coupling="joint")
+terms = [Dynamics(motion, h), Parking()]
+loop = RecedingHorizon(robot, 25, terms, solver=InteriorPoint(), window=window, coupling="joint")
 plan = loop.tick(measured={"position": z})
 """
 

@@ -57,31 +57,40 @@ class LastPlan:
     Attributes:
         controls: (N, m), within their limits.
         states: (N + 1, storage).
-        age: ticks since then; N when nothing is left of it.
+        times: (N + 1,) of the nodes from the begin of a plan [s]; 0, 1, ..., N in ticks where the horizon has none.
+        age: time since then, in the unit of ``times``; that of the last node when nothing is left of it.
         least, most: limits (m,) of the controls.
         excess: by how much the plan exceeded them.
     """
 
-    def __init__(self, steps: int, robot: Robot, limits: tuple[Array, Array]) -> None:
+    def __init__(self, times: Array, robot: Robot, limits: tuple[Array, Array]) -> None:
         """Begin with nothing."""
         self.least, self.most = limits
-        self.controls = np.zeros((steps, robot.control.storage))
-        self.states = np.tile(robot.state.identity(), (steps + 1, 1))
+        self.times = times
+        self.controls = np.zeros((len(times) - 1, robot.control.storage))
+        self.states = np.tile(robot.state.identity(), (len(times), 1))
         self.clear()
+
+    @property
+    def lengths(self) -> Array:
+        """(N,) lengths of the steps, in the unit of ``times``."""
+        return np.diff(self.times)
 
     def clear(self) -> None:
         """Let nothing be left."""
         self.controls[:] = 0.0
-        self.age, self.excess = len(self.controls), 0.0
+        self.age, self.excess = float(self.times[-1]), 0.0
 
     def store(self, controls: Array, states: Array) -> None:
         """Keep a new plan (N, m), (N + 1, storage)."""
         self.excess = float(np.maximum(controls - self.most, self.least - controls).max(initial=0.0))
-        self.controls, self.states, self.age = controls.copy(), states.copy(), 0
+        self.controls, self.states, self.age = controls.copy(), states.copy(), 0.0
 
     def left(self) -> Array:
-        """(k, m) controls that are left of the plan."""
-        rest: Array = self.controls[self.age :]
+        """(k, m) controls that are left of the plan, for the first k steps from now on."""
+        begins = self.age + self.times[:-1] + 1e-9 * self.times[1]  # so much late that rounding chooses no earlier step
+        acting = np.searchsorted(self.times, begins[begins < self.times[-1]], side="right") - 1
+        rest: Array = self.controls[acting]
         return rest
 
     def within(self, controls: Array) -> Array:
@@ -100,7 +109,8 @@ class Decision:
         source: "solved" for the solver's answer, which is then kept; what else it is otherwise.
         after: states (N + 1, storage) and controls (N, m) where the next solve begins after another source than
             "solved"; None for anew.
-        behind: whether a plan that was accepted ends far from where it should.
+        behind: True if a plan that was accepted ends far from where it should.
+        resumed: True if the next solve goes on from a refused one, multipliers included, instead of ``after``.
     """
 
     controls: Array
@@ -108,6 +118,7 @@ class Decision:
     source: str
     after: tuple[Array, Array] | None = None
     behind: bool = False
+    resumed: bool = False
 
 
 class AcceptancePolicy(Protocol):
@@ -135,13 +146,14 @@ class LastPlanThenBrake:
     Attributes:
         robot: who moves.
         feasible: greatest violation of a plan that may be applied.
-        keep: ticks for which an old plan may be applied.
+        keep: greatest age of an old plan that may be applied, in seconds, or in ticks of a horizon without node times;
+            None for 8 ticks.
         brake: ``brake(now)`` gives controls (N, m), or (m,) for all steps, that bring the robot to rest; None: zero.
     """
 
     robot: Robot
     feasible: float = 1e-3
-    keep: int = 8
+    keep: float | None = None
     brake: Callable[[Context[Any]], Array] | None = None
 
     def __call__(
@@ -159,8 +171,10 @@ class LastPlanThenBrake:
         if self.brake is not None:
             braking = kept.within(np.broadcast_to(np.asarray(self.brake(now), dtype=np.float64), kept.controls.shape))
         left = kept.within(kept.left())
-        if kept.age <= self.keep and len(left):
+        tick = float(kept.times[1])
+        keep = 8 * tick if self.keep is None else self.keep
+        if kept.age <= keep + 1e-9 * tick and len(left):
             controls, source = np.concatenate([left, braking[: count - len(left)]]), "kept"
         else:
             controls, source = braking, "braking"
-        return Decision(controls, self.robot.rollout(now.present, controls), source)
+        return Decision(controls, self.robot.rollout(now.present, controls, kept.lengths), source)

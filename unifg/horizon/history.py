@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.horizon.robot import Robot
+from unifg.horizon.robot import Robot, numbers
 from unifg.typing import Array, ArrayLike, BoolArray
 
 
@@ -148,14 +148,7 @@ class History:
         """
         if name not in self._values:
             raise GraphError(f"nothing measures '{name}' (there are: {', '.join(self._values) or 'none'})")
-        expected = self._values[name].shape[1:]
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GraphError(f"measurement '{name}' must be {expected} numbers, got {value!r}") from error
-        if array.shape != expected:
-            raise GraphError(f"measurement '{name}' has shape {array.shape}, expected {expected}")
-        return array
+        return numbers(value, self._values[name].shape[1:], f"measurement '{name}'", finite=False)
 
     def recorded(self, name: str) -> tuple[Array, BoolArray]:
         """(L + 1, ...) what was measured at the nodes, and (L + 1,) whether it was."""
@@ -168,10 +161,4 @@ def instant(time: float) -> float:
     Raises:
         GraphError: when it is none.
     """
-    try:
-        found = float(time)
-    except (TypeError, ValueError) as error:
-        raise GraphError(f"a time must be a finite number of seconds, got {time!r}") from error
-    if not np.isfinite(found):
-        raise GraphError(f"a time must be a finite number of seconds, got {found}")
-    return found
+    return float(numbers(time, (), "a time [s]"))

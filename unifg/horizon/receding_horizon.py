@@ -15,8 +15,8 @@ from unifg.errors import BackendError, GraphError
 from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
-from unifg.horizon.robot import Robot
-from unifg.horizon.terms import Context, Term, handles_of, looked_at, reset_all, values_of
+from unifg.horizon.robot import Robot, numbers
+from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.window import Window
 from unifg.locks import ReentrantLock
 from unifg.modeling.variables import Data
@@ -56,12 +56,13 @@ class RecedingHorizon:
     Attributes:
         robot: who moves.
         steps: N of the future.
+        times: (N + 1,) of its nodes from the present on [s]; 0, 1, ..., N in ticks where none were given.
         coupling: of estimation and control.
         window: of the past; None where the present is given to :meth:`plan`.
         tie: what ties the horizon to the past.
         x, u: nodes (N + 1) of the future, and the family of controls (N).
         warm, cold: the prepared backend for solves with and without a warm start.
-        second: another one, asked when the plan of the first is refused; None for nobody.
+        second: another one, asked when the plan of the first is refused; None for none.
         guess: where the next solve begins; None for anew.
         failed: whether the last plan was refused.
         kept: the last plan that was accepted.
@@ -85,6 +86,7 @@ class RecedingHorizon:
         steps: int,
         terms: Sequence[Term],
         *,
+        times: ArrayLike | None = None,
         solver: Solver,
         cold: Solver | None = None,
         second: Solver | None = None,
@@ -106,11 +108,13 @@ class RecedingHorizon:
         Args:
             robot: who moves.
             steps: N of the future.
-            terms: what is said of the nodes and controls of the future.
+            terms: of the nodes and controls of the future.
+            times: (N + 1,) of the nodes from the present on [s], from zero and of any spacing, the first step being as
+                long as a tick. Warm starts, kept plans and rollouts go by them. None: every step is a tick.
             solver: for a solve with a warm start.
             cold: for one without, which may iterate longer; None for the same.
             second: asked in the same tick when the plan of the first is refused, from where solves begin after a
-                failure; None for nobody.
+                failure; None for none.
             window: of the past.
             coupling: "separate", "sequential" or "joint".
             pull: see :class:`unifg.horizon.coupling.JointPresent`.
@@ -130,7 +134,8 @@ class RecedingHorizon:
 
         Raises:
             GraphError: for an unknown coupling, a joint one without a window, sizes and limits that do not fit, a term
-                that cannot be stated, or a delay of a joint coupling or of a robot without a model.
+                that cannot be stated, times that do not grow or begin with another step than a tick, or a delay of a
+                joint coupling or of a robot without a model.
         """
         if coupling not in COUPLINGS:
             raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
@@ -146,6 +151,8 @@ class RecedingHorizon:
                 "'joint', where the future begins at the present"
             )
         self._lock = ReentrantLock()
+        self.times = _node_times(times, steps, robot)
+        self._even = bool(np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0))
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
         between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
@@ -156,13 +163,13 @@ class RecedingHorizon:
         for term in self._terms:
             term.state(graph, self.x, self.u)
         weigh(graph.terms[before:], control_weight)
-        self._handles = handles_of(graph)
+        self._handles, self._families = handles_of(graph), dict(graph.families)
         backends = solver, cold or solver, second or solver
         timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in backends]
         self._limits = [own.time_limit for own in timed]
         self.warm, self.cold = (own.prepare(graph) for own in timed[:2])
         self.second = None if second is None else timed[2].prepare(graph)
-        self.kept = LastPlan(steps, robot, between)
+        self.kept = LastPlan(self.times, robot, between)
         self.judge: AcceptancePolicy = judge or LastPlanThenBrake(robot)
         self.starts: InitialGuesses = starts or InitialGuesses()
         self._believable = believable or _close
@@ -237,7 +244,7 @@ class RecedingHorizon:
         return self._plan(window.now(given, last), begin)
 
     def plan(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Plan:
-        """Plan from a present state (storage,) that somebody else has estimated.
+        """Plan from a present state (storage,) that is estimated elsewhere.
 
         Args:
             present: state.
@@ -299,10 +306,7 @@ class RecedingHorizon:
         """A value (count, storage) of a static."""
         if name not in known:
             raise GraphError(f"the robot has no static '{name}' (there are: {', '.join(known) or 'none'})", family=name)
-        found, shape = np.asarray(value, dtype=np.float64), known[name].shape
-        if found.shape != shape or not np.isfinite(found).all():
-            raise GraphError(f"static '{name}' must be {shape} finite numbers, got {found}", family=name)
-        return found
+        return numbers(value, known[name].shape, f"static '{name}'", family=name)
 
     def data(self, now: Context[Any]) -> dict[Data, ArrayLike]:
         """Data of the whole graph."""
@@ -345,13 +349,8 @@ class RecedingHorizon:
             return first, False
         if np.isfinite(left):
             other.solver.time_limit = min(self._limits[2], left)
-        start = self.starts.after_failure or self.starts.cold
-        states, controls = (
-            (np.tile(now.present, (self.steps + 1, 1)), np.zeros((self.steps, self.robot.control.storage)))
-            if start is None
-            else start(now)
-        )
-        found = other.solve(self.tie.begin(self.guess_of(states, controls, now), now), data=data)
+        start = self.starts.after_failure or self.starts.cold or self._stay
+        found = other.solve(self.tie.begin(self.guess_of(*start(now), now), now), data=data)
         if self._refuses(found, now):
             return first, False
         self.rescues += 1
@@ -366,7 +365,7 @@ class RecedingHorizon:
             late: whether the deadline has passed, so that the plan serves the next tick only.
         """
         states, controls = solution[self.x], solution[self.u]
-        self.kept.age += 1
+        self.kept.age += float(self.times[1])
         choice = self.judge(solution, states, controls, now, self.kept)
         if late and choice.source == "solved":
             instead = LastPlanThenBrake(self.robot, brake=getattr(self.judge, "brake", None)).instead(now, self.kept)
@@ -376,7 +375,10 @@ class RecedingHorizon:
             self._accept(solution, states, controls, choice)
         else:
             self.failed = True
-            self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
+            if choice.resumed:
+                self.guess = self.shifted(solution)
+            else:
+                self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
         self.sources[choice.source] += 1
         return choice
 
@@ -393,23 +395,51 @@ class RecedingHorizon:
             return self.warm, self.guess if carry is None else carry(self.guess, now)
         if self.failed and self.starts.after_failure is not None:
             return self.warm, self.guess_of(*self.starts.after_failure(now), now)
-        if self.starts.cold is not None:
-            return self.cold, self.guess_of(*self.starts.cold(now), now)
-        rest = np.zeros((self.steps, self.robot.control.storage))
-        return self.cold, self.guess_of(np.tile(now.present, (self.steps + 1, 1)), rest, now)
+        return self.cold, self.guess_of(*(self.starts.cold or self._stay)(now), now)
+
+    def _stay(self, now: Context[Any]) -> tuple[Array, Array]:
+        """States and controls of staying with the control zero."""
+        return np.tile(now.present, (self.steps + 1, 1)), np.zeros((self.steps, self.robot.control.storage))
 
     def guess_of(self, states: Array, controls: Array, now: Context[Any]) -> Guess:
         """A guess for the graph, from states (N + 1, storage) and controls (N, m) of the future."""
         x = self.x.family
         nodes = np.tile(now.present, (len(x), 1))
         nodes[len(x) - self.steps - 1 :] = states
-        return Guess({x: nodes, self.u: np.asarray(controls, dtype=np.float64)})
+        values = {x: nodes, self.u: np.asarray(controls, dtype=np.float64)}
+        for term in self._terms:
+            if isinstance(term, Guessing):
+                for name, value in term.guess(now).items():
+                    values[self._families[name]] = np.asarray(value, dtype=np.float64)
+        return Guess(values)
 
     def _accept(self, solution: Solution, states: Array, controls: Array, choice: Decision) -> None:
         """Keep a plan, and begin the next solve from it."""
         self.kept.store(controls, states)
         self.failed = False
-        self.guess = None if self.stays_behind(choice.behind) else solution.shifted(*self.tie.along, self.u)
+        self.guess = None if self.stays_behind(choice.behind) else self.shifted(solution)
+
+    def shifted(self, solution: Solution) -> Guess:
+        """A solution moved on by a tick, for the next solve.
+
+        Between nodes states are interpolated on their manifold; beyond the last one it repeats. Multipliers move by
+        whole steps: by those that a tick is nearest to, on average over the horizon.
+        """
+        along = *self.tie.along, self.u
+        if self._even:
+            return solution.shifted(*along)
+        joint = len(self.x.family) > self.steps + 1
+        whole = 1 if joint else round(self.steps * self.times[1] / self.times[-1])
+        moved, states, controls = solution.shifted(*along, by=whole), solution[self.x], solution[self.u]
+        later = np.minimum(self.times + self.times[1], self.times[-1])
+        step = np.minimum(np.searchsorted(self.times, later + 1e-9 * self.times[1], side="right") - 1, self.steps - 1)
+        share = (later - self.times[step]) / np.diff(self.times)[step]
+        space = self.robot.state
+        ahead = space.retract(states[step], share[:, None] * space.local(states[step], states[step + 1]))
+        nodes = moved.values[self.x.family].copy()
+        nodes[len(nodes) - self.steps - 1 :] = ahead
+        values = {**moved.values, self.x.family: nodes, self.u: controls[step[:-1]]}
+        return replace(moved, values=values)
 
     def _believe(self, solution: Solution, choice: Decision, now: Context[Any]) -> None:
         said = self.tie.believed(solution) if self._believable(solution, choice) else None
@@ -462,6 +492,21 @@ class RecedingHorizon:
         self.solution = None
         self.estimate = self.robot.state.identity() if self.window is None else self.window.present
         self.constants, self.believed = {static.name: static.values for static in self.robot.constants}, False
+
+
+def _node_times(times: ArrayLike | None, steps: int, robot: Robot) -> Array:
+    """(N + 1,) times of the nodes."""
+    if times is None:
+        return np.arange(steps + 1.0) * (robot.tick or 1.0)
+    nodes = np.array(times, dtype=np.float64)
+    growing = nodes.shape == (steps + 1,) and nodes[0] == 0.0 and (np.diff(nodes) > 0.0).all() and nodes[-1] < np.inf
+    if not growing:
+        raise GraphError(f"the times must be {steps + 1} growing numbers from 0 on, one for each node; got {times}")
+    if robot.predict is not None and robot.tick is None:
+        raise GraphError("node times need the robot's tick: its predict(x, u, seconds) is given the length of a step")
+    if robot.tick is not None and not np.isclose(robot.tick, nodes[1], rtol=1e-9, atol=0.0):
+        raise GraphError(f"the first step must be as long as a tick of the robot ({robot.tick} s), got {nodes[1]} s")
+    return nodes
 
 
 def _looked_at(limits: tuple[ArrayLike, ArrayLike], size: int) -> tuple[Array, Array]:

@@ -87,25 +87,34 @@ class Robot:
         constants: unknowns that past and future share.
         steps: manifolds by name of unknowns that belong to each step of the past, as process noise; terms of the past
             find the families, one member per step, as ``graph.families[name]``.
-        predict: ``predict(x, u)`` where a state (storage,) is after one step with a control (m,); a first guess of the
-            next node, and what kept plans and braking lead to. None: it stays where it is.
+        predict: ``predict(x, u)`` gives the state (storage,) after one step with a control (m,): the first guess of the
+            next node, and the states that kept plans and braking lead to. None: it stays where it is.
+        tick: length of a tick [s]; with it ``predict(x, u, seconds)`` is given the length of a step, as horizons with
+            node times of any spacing need. None: all steps are of one length, which ``predict`` has.
     """
 
     state: Manifold
     control: Manifold
     constants: tuple[Constant, ...] = ()
     steps: Mapping[str, Manifold] = field(default_factory=dict)
-    predict: Callable[[Array, Array], Array] | None = None
+    predict: Callable[..., Array] | None = None
+    tick: float | None = None
 
-    def predicted(self, state: Array, control: Array) -> Array:
-        """(storage,) where one step leads.
+    def predicted(self, state: Array, control: Array, seconds: float | None = None) -> Array:
+        """(storage,) state after a step with a control (m,).
+
+        Args:
+            state: (storage,) before it.
+            control: (m,) that acts.
+            seconds: length of the step of a robot with a tick; None for a tick.
 
         Raises:
             GraphError: when ``predict`` gives something else.
         """
         if self.predict is None:
             return state.copy()
-        found = np.asarray(self.predict(state, control), dtype=np.float64)
+        length = () if self.tick is None else (self.tick if seconds is None else seconds,)
+        found = np.asarray(self.predict(state, control, *length), dtype=np.float64)
         if found.size != self.state.storage:
             raise GraphError(f"predict must give a state ({self.state.storage},), found {found.shape}")
         return found.reshape(self.state.storage)
@@ -116,14 +125,7 @@ class Robot:
         Raises:
             GraphError: when it is none.
         """
-        size = self.control.storage
-        try:
-            applied = np.asarray(control, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GraphError(f"the control that was applied must be ({size},) finite: {control!r}") from error
-        if applied.shape != (size,) or not np.isfinite(applied).all():
-            raise GraphError(f"the control that was applied must be ({size},) finite: {applied}")
-        return applied
+        return numbers(control, (self.control.storage,), "the control that was applied")
 
     def point(self, state: ArrayLike, what: str) -> Array:
         """A point (storage,) of the robot's manifold.
@@ -131,20 +133,34 @@ class Robot:
         Raises:
             GraphError: when it is none.
         """
-        try:
-            found = np.array(state, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise GraphError(f"{what} {state!r} is not a point of {self.state.name}") from error
-        if found.shape != (self.state.storage,) or not np.all(self.state.is_valid(found)):
-            raise GraphError(f"{what} {found} is not a point of {self.state.name}")
-        return found
+        point = numbers(state, (self.state.storage,), what).copy()
+        if not np.all(self.state.is_valid(point)):
+            raise GraphError(f"{what} {point} is not a point of {self.state.name}")
+        return point
 
-    def rollout(self, state: Array, controls: Array) -> Array:
-        """(k + 1, storage) states that controls (k, m) lead to from a state (storage,)."""
+    def rollout(self, state: Array, controls: Array, lengths: Array | None = None) -> Array:
+        """(k + 1, storage) states that controls (k, m) lead to, in steps of ``lengths`` (k,) [s]; None for ticks."""
         states = [np.asarray(state, dtype=np.float64)]
-        for control in controls:
-            states.append(self.predicted(states[-1], control))
+        for k, control in enumerate(controls):
+            states.append(self.predicted(states[-1], control, None if lengths is None else float(lengths[k])))
         return np.array(states)
+
+
+def numbers(value: ArrayLike, shape: tuple[int, ...], what: str, *, finite: bool = True, family: str = "") -> Array:
+    """An array of that shape.
+
+    Raises:
+        GraphError: when the value is none, or holds numbers that are not finite where they should be.
+    """
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise GraphError(f"{what} must be {shape} numbers, got {value!r}", family=family) from error
+    if array.shape != shape:
+        raise GraphError(f"{what} has shape {array.shape}, expected {shape}", family=family)
+    if finite and not np.isfinite(array).all():
+        raise GraphError(f"{what} must be finite numbers, got {value!r}", family=family)
+    return array
 
 
 def information_of(sigma: Array) -> Array:

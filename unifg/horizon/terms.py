@@ -93,6 +93,15 @@ class Resetting(Protocol):
         ...
 
 
+@runtime_checkable
+class Guessing(Protocol):
+    """A term of the future with unknowns of its own, as slacks."""
+
+    def guess(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        """Values (count, storage) for a first guess, by the names of the families."""
+        ...
+
+
 @dataclass(frozen=True)
 class Measurement:
     """A measurement of the state at nodes of the past, those at which it was made.
@@ -148,14 +157,14 @@ class Dynamics:
 
     Attributes:
         residual: ``residual(x, u, x_next, h)`` or, with constants, ``residual(x, u, s_1, ..., x_next, h)``: (n, m).
-        step: h [s], for all steps.
+        step: h [s], for all steps or (N,) for each.
         sigma: (m,) standard deviations of the process noise; None where the model holds exactly.
         constants: names of families of one member that the residual takes, too.
         name: of the term, and with "past" added where the controls are those that were applied.
     """
 
     residual: AnyResidual
-    step: float
+    step: ArrayLike
     sigma: ArrayLike | None = None
     constants: tuple[str, ...] = ()
     name: str = "dynamics"

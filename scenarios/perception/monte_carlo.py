@@ -78,7 +78,7 @@ class MonteCarloSettings:
 
 
 def needed(cells: int, settings: MonteCarloSettings) -> int:
-    """How many particles a posterior on so many cells takes (Fox 2003, eq. 7)."""
+    """Number of particles for a posterior on so many cells (Fox 2003, eq. 7)."""
     least, most = settings.particles
     if cells <= 1:
         return most

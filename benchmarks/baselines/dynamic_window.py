@@ -1,7 +1,7 @@
 """The dynamic window approach (Fox, Burgard, Thrun, IEEE Robotics and Automation Magazine 4 (1997)).
 
 Velocities within reach in the next tick are tried, each held for a while. Those from which the robot could not stop
-before it hits something are not admissible (eq. 14); the cheapest of the others is driven. The paper weighs heading to
+before it hits something are not admissible (eq. 14); the cheapest of the others is driven. The paper weights heading to
 the goal, clearance and speed; costs here are those its present-day implementation adds so that it follows a path round
 corners: critics and weights are the defaults of ``nav2_dwb_controller`` (BaseObstacle, PathDist, PathAlign, GoalDist,
 GoalAlign, RotateToGoal), distances in metres, with goal distances measured along the path.
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
-from unifg.scenarios.rivals.sampled_drives import driven, nearest_on
+from benchmarks.baselines.shared import GoalTurn, rollouts, to_reference
+from unifg.scenarios.ground.local_planner import PlannerContext, Situation
 from unifg.typing import Array, BoolArray
 
 __all__ = ["DynamicWindow", "WindowSettings"]
@@ -55,30 +55,45 @@ class WindowSettings:
     decay: float = 3.0
 
 
-class DynamicWindow(LocalPlanner[WindowSettings]):
-    """Tries velocities."""
+class DynamicWindow:
+    """Cheapest of many velocities.
 
-    usual = WindowSettings
+    Attributes:
+        settings: limits of the robot.
+        numbers: of the planner.
+        iterations: velocities tried at the last tick.
+    """
 
-    def wish(self, now: Situation) -> Wish | None:
+    def __init__(self, context: PlannerContext, numbers: WindowSettings | None = None) -> None:
+        """Construct for a map; without ``numbers`` with the published ones."""
+        self.settings, self.numbers = context.settings, numbers or WindowSettings()
+        self.iterations, self._at_goal = 1, GoalTurn()
+
+    def control(self, now: Situation) -> Array | None:
         """The cheapest admissible velocity; a turn at the goal."""
-        turn = self.turned_to_goal(now)
+        turn = self._at_goal.control(now)
         if turn is not None:
             return turn
         tried = self.window(now)
-        steps = round(self.own.horizon / self.own.step)
-        states = driven(now.pose, np.tile(tried[:, None], (1, steps, 1)), self.own.step)
-        times = self.own.step * np.arange(1.0, steps + 1)
+        steps = round(self.numbers.horizon / self.numbers.step)
+        states = rollouts(now.pose, np.tile(tried[:, None], (1, steps, 1)), self.numbers.step)
+        times = self.numbers.step * np.arange(1.0, steps + 1)
         clearance = now.clearance(states[:, 1:, :2], times)
         admissible = self.admissible(tried, now.hits(clearance, times))
         if not admissible.any():
             return None
         cost = np.where(admissible, self.cost(now, states, clearance), np.inf)
-        return Wish(tried[np.argmin(cost)][None], len(tried))
+        self.iterations = len(tried)
+        best: Array = tried[np.argmin(cost)][None]
+        return best
+
+    def forget(self) -> None:
+        """Leave the turn at a goal."""
+        self._at_goal.forget()
 
     def window(self, now: Situation) -> Array:
         """(M, 2) velocities that the robot can have after this tick (eq. 13)."""
-        s, own = self.settings, self.own
+        s, own = now.settings, self.numbers
         change, (least, most) = s.most, s.box
         least = np.array([-own.backwards, least[1]])
         low = np.minimum(np.maximum(now.applied - change, least), now.applied + change)
@@ -90,9 +105,9 @@ class DynamicWindow(LocalPlanner[WindowSettings]):
         return grid
 
     def admissible(self, tried: Array, hit: BoolArray) -> BoolArray:
-        """(M,) whether the robot could stop before the first place (M, K) where it hits something (eq. 14)."""
+        """(M,) True if the robot can stop before the first place (M, K) where it hits something (eq. 14)."""
         first = np.where(hit.any(axis=1), hit.argmax(axis=1), hit.shape[1])
-        time = self.own.step * first  # of driving freely
+        time = self.numbers.step * first  # of driving freely
         free = ~hit.any(axis=1)
         stop = np.abs(tried) / np.array(self.settings.accelerations)  # braking takes so long, and half the way
         admissible: BoolArray = free | (0.5 * stop.max(axis=1) + self.settings.dt <= time)
@@ -100,10 +115,10 @@ class DynamicWindow(LocalPlanner[WindowSettings]):
 
     def cost(self, now: Situation, states: Array, clearance: Array) -> Array:
         """(M,) cost of drives (M, K + 1, 3) with clearances (M, K)."""
-        own, end = self.own, states[:, -1]
+        own, end = self.numbers, states[:, -1]
         nose = end[:, :2] + own.ahead * np.stack([np.cos(end[:, 2]), np.sin(end[:, 2])], axis=1)
-        away, left = nearest_on(now, end[:, :2])
-        nose_away, nose_left = nearest_on(now, nose)
+        away, left = to_reference(now, end[:, :2])
+        nose_away, nose_left = to_reference(now, nose)
         aligned = float(now.along()[-1] > own.aligned_beyond)
         near = clearance.min(axis=1)
         occupied = np.where(near < own.inflation, FULL * np.exp(-own.decay * np.maximum(near, 0.0)), 0.0)

@@ -5,7 +5,7 @@ what is too much: short intervals (eq. 13), speeds and accelerations within limi
 neighbouring poses (eq. 11), distance from things (eq. 6). Between rounds of Levenberg-Marquardt the band is resized, so
 that its intervals stay near one length, and things are looked for where the robot then would be. Weights, rounds and
 margins of numbers are the defaults of ``teb_local_planner`` 0.9; the distance kept from things is the margin of the
-model-predictive controller here, as the planner's own of 0.5 m closes every door.
+model-predictive controller here, as the planner's of 0.5 m closes every door.
 
 Differences from that package: an interval is the exponential of an unknown, so that it stays positive; of the sides on
 which the band could pass something, only that of the route is tried, which is repaired beforehand.
@@ -20,10 +20,10 @@ import numpy as np
 import unifg as fg
 from unifg.lie import wrap_angle
 from unifg.models import obstacles
-from unifg.models.distance_map import DistanceMap, SmoothField
+from unifg.models.distance_map import SmoothField
 from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.local_planner import PlannerContext, Situation
 from unifg.scenarios.perception.tracks import nearest
-from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
 from unifg.solvers import LevenbergMarquardt
 from unifg.typing import Array
 
@@ -82,7 +82,7 @@ def velocities(x: Array, y: Array, log_time: Array) -> Array:
 
 
 def beyond(values: Array, least: Array, most: Array) -> Array:
-    """How far values are outside their limits."""
+    """Excess of values over their limits."""
     return np.maximum(values - most, 0.0) + np.maximum(least - values, 0.0)
 
 
@@ -138,7 +138,7 @@ class Band:
         own: BandSettings,
         count: int,
     ) -> None:
-        """State and prepare it."""
+        """Build and prepare the graph."""
         self.count = count
         s, m = settings, settings.discs
         graph = fg.Graph()
@@ -197,49 +197,48 @@ class Band:
         return solution[self._x], np.exp(solution[self._t][:, 0]), solution.iterations
 
 
-class ElasticBand(LocalPlanner[BandSettings]):
-    """Plans by a band along the reference.
+class ElasticBand:
+    """Band along the reference.
 
     Attributes:
+        settings: limits of the robot.
+        numbers: of the planner.
         poses, times: the last band, (n + 1, 3) and (n,); empty without one.
+        iterations: of the solver at the last tick.
     """
 
-    usual = BandSettings
-
-    def __init__(
-        self, distance_map: DistanceMap, settings: ControllerSettings, own: BandSettings | None = None
-    ) -> None:
-        """Stand still; graphs are prepared for bands of every length."""
-        super().__init__(distance_map, settings, own)
-        field = SmoothField(distance_map)
-        least, most = self.own.poses
-        self._bands = {n: Band(field, settings, self.own, n) for n in range(least - 1, most)}
+    def __init__(self, context: PlannerContext, numbers: BandSettings | None = None) -> None:
+        """Prepare graphs for bands of every length; without ``numbers`` with the published ones."""
+        self.settings, self.numbers = context.settings, numbers or BandSettings()
+        self.iterations = 0
+        field = SmoothField(context.distance_map)
+        least, most = self.numbers.poses
+        self._bands = {n: Band(field, self.settings, self.numbers, n) for n in range(least - 1, most)}
         self.forget()
 
     def forget(self) -> None:
         """Drop the band."""
-        super().forget()
         self.poses, self.times = np.zeros((0, 3)), np.zeros(0)
 
-    def wish(self, now: Situation) -> Wish | None:
+    def control(self, now: Situation) -> Array | None:
         """The beginning of the band, if it is free."""
         poses, times = self.begin(now)
-        effort = 0
-        for _ in range(self.own.rounds):
+        self.iterations = 0
+        for _ in range(self.numbers.rounds):
             poses, times = self.resized(poses, times)
             poses, times, took = self._bands[len(times)].solve(poses, times, now, self.settings.discs)
-            effort += took
+            self.iterations += took
         if not (np.isfinite(poses).all() and np.isfinite(times).all() and self.free(now, poses, times)):
             self.forget()
             return None
         self.poses, self.times = poses, times
         speeds = velocities(poses[:-1], poses[1:], np.log(times)[:, None])
         counts = np.minimum(np.maximum(np.round(times / self.settings.dt), 1.0), self.settings.horizon).astype(int)
-        return Wish(self.saturated(np.repeat(speeds, counts, axis=0)), effort)
+        return self.saturated(np.repeat(speeds, counts, axis=0))
 
     def saturated(self, speeds: Array) -> Array:
         """Speeds (K, 2) slowed together, so that the curvature stays, where one of them is beyond its limit."""
-        own, most = self.own, np.array(self.settings.limits)
+        own, most = self.numbers, np.array(self.settings.limits)
         limits = np.where(speeds[:, :1] < 0.0, [[own.backwards, most[1]]], most[None])
         share = np.minimum(1.0, (limits / np.maximum(np.abs(speeds), 1e-9)).min(axis=1))
         slowed: Array = speeds * share[:, None]
@@ -248,7 +247,7 @@ class ElasticBand(LocalPlanner[BandSettings]):
     def begin(self, now: Situation) -> tuple[Array, Array]:
         """The last band from where the robot is now to where the reference ends, or a new one along it."""
         end = now.reference[-1]
-        if len(self.times) and np.hypot(*(self.poses[-1] - end)[:2]) < self.own.reach:
+        if len(self.times) and np.hypot(*(self.poses[-1] - end)[:2]) < self.numbers.reach:
             poses, times = self.poses.copy(), self.times.copy()
             passed = np.hypot(*(poses[: min(10, len(poses) - 2), :2] - now.pose[:2]).T).argmin()
             poses, times = poses[passed:], times[passed:]
@@ -262,7 +261,7 @@ class ElasticBand(LocalPlanner[BandSettings]):
         s, arc = self.settings, now.along()
         kept = np.concatenate([[True], np.diff(arc) > 1e-6])
         way = now.reference[kept]
-        step = max(1, round(self.own.interval[0] / s.dt))
+        step = max(1, round(self.numbers.interval[0] / s.dt))
         poses = np.concatenate([now.pose[None], way[step::step], now.reference[-1:]])
         if np.hypot(*(poses[-1] - poses[-2])[:2]) < 1e-3 and len(poses) > 2:
             poses = np.delete(poses, -2, axis=0)
@@ -276,7 +275,7 @@ class ElasticBand(LocalPlanner[BandSettings]):
 
     def resized(self, poses: Array, times: Array) -> tuple[Array, Array]:
         """Split intervals that are too long, and join those that are too short."""
-        (wanted, spare), (least, most) = self.own.interval, self.own.poses
+        (wanted, spare), (least, most) = self.numbers.interval, self.numbers.poses
         k = 0
         while k < len(times):
             if times[k] > wanted + spare and len(poses) < most:
@@ -299,8 +298,8 @@ class ElasticBand(LocalPlanner[BandSettings]):
         return poses, times
 
     def free(self, now: Situation, poses: Array, times: Array) -> bool:
-        """Whether the first poses of a band keep clear of everything, and what lies between them."""
-        count = min(self.own.checked, len(times))
+        """Return True if the first poses of a band, and what lies between them, are clear of everything."""
+        count = min(self.numbers.checked, len(times))
         share = np.linspace(0.25, 1.0, 4)[:, None]
         places = poses[:count, None, :2] + share * (poses[1 : count + 1, None, :2] - poses[:count, None, :2])
         begins = np.concatenate([[0.0], np.cumsum(times)])[:count, None]

@@ -13,11 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.baselines.shared import rollouts, to_reference
 from unifg.lie import wrap_angle
-from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
-from unifg.scenarios.rivals.sampled_drives import driven, nearest_on
+from unifg.scenarios.ground.local_planner import PlannerContext, Situation
 from unifg.typing import Array
 
 __all__ = ["PathIntegral", "PathIntegralSettings"]
@@ -73,34 +71,30 @@ class PathIntegralSettings:
     turn_within: float = 0.5
 
 
-class PathIntegral(LocalPlanner[PathIntegralSettings]):
-    """Averages noisy drives.
+class PathIntegral:
+    """Weighted mean of noisy drives.
 
     Attributes:
-        mean: (N, 2) the last plan, moved on by a tick [m/s, rad/s].
+        settings: limits of the robot.
+        numbers: of the planner.
+        mean: (N, 2) the last plan, shifted by a tick [m/s, rad/s].
+        iterations: number of drives.
     """
 
-    usual = PathIntegralSettings
+    def __init__(self, context: PlannerContext, numbers: PathIntegralSettings | None = None) -> None:
+        """Construct for a map; without ``numbers`` with the published ones; all noise comes from ``context.rng``."""
+        self.settings, self._rng = context.settings, context.rng
+        self.numbers = numbers or PathIntegralSettings()
+        self.iterations = self.numbers.drives
+        self.mean: Array = np.zeros((self.settings.horizon, 2))
 
-    def __init__(
-        self,
-        distance_map: DistanceMap,
-        settings: ControllerSettings,
-        rng: np.random.Generator,
-        own: PathIntegralSettings | None = None,
-    ) -> None:
-        """Stand still; all noise comes from ``rng``."""
-        super().__init__(distance_map, settings, own)
-        self._rng = rng
-        self.mean: Array = np.zeros((settings.horizon, 2))
-
-    def wish(self, now: Situation) -> Wish | None:
+    def control(self, now: Situation) -> Array | None:
         """The mean of the drives, unless all of them hit something."""
-        own, s = self.own, self.settings
+        own, s = self.numbers, self.settings
         noise = self._rng.standard_normal((own.drives, s.horizon, 2)) * own.sigma
         wanted = self.mean + noise
         wanted[..., 0] = np.maximum(wanted[..., 0], -own.backwards)
-        controls = self.reachable(wanted)
+        controls = now.reachable(wanted)
         price = self.price(now, controls)
         # What the noise itself costs (the cross term of eq. 27), of what could be driven of it.
         price += own.gamma * (self.mean / np.square(own.sigma) * (controls - self.mean)).sum(axis=(1, 2))
@@ -110,12 +104,12 @@ class PathIntegral(LocalPlanner[PathIntegralSettings]):
         weight = np.exp(-(price - price.min()) / own.temperature)
         plan: Array = np.einsum("m,mki->ki", weight / weight.sum(), controls)
         self.mean = np.concatenate([plan[1:], plan[-1:]])
-        return Wish(plan, own.drives)
+        return plan
 
     def price(self, now: Situation, controls: Array) -> Array:
         """(M,) price of drives under controls (M, N, 2)."""
-        own, dt = self.own, self.settings.dt
-        states = driven(now.pose, controls, dt)[:, 1:]
+        own, dt = self.numbers, self.settings.dt
+        states = rollouts(now.pose, controls, dt)[:, 1:]
         count, horizon = controls.shape[:2]
         times = dt * np.arange(1.0, horizon + 1)
         clearance = now.clearance(states[..., :2], times)
@@ -137,7 +131,7 @@ class PathIntegral(LocalPlanner[PathIntegralSettings]):
         price += own.follow * distance
         if (now.clearance(now.reference[:, :2], 0.0) < 0.0).mean() <= own.occupied:
             sparse = states[:, own.every - 1 :: own.every, :2]
-            away, _ = nearest_on(now, sparse.reshape(-1, 2))
+            away, _ = to_reference(now, sparse.reshape(-1, 2))
             price += own.align * away.reshape(count, -1).mean(axis=1)
         way = target[:2] - now.pose[:2]
         if abs(float(wrap_angle(np.arctan2(way[1], way[0]) - now.pose[2]))) > own.angle_beyond:
@@ -146,5 +140,4 @@ class PathIntegral(LocalPlanner[PathIntegralSettings]):
 
     def forget(self) -> None:
         """Drop the last plan."""
-        super().forget()
         self.mean = np.zeros_like(self.mean)

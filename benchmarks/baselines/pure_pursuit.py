@@ -3,7 +3,7 @@
 An arc leads from the robot to a carrot on the path, farther ahead the faster the robot is. Its speed is lowered where
 the arc is sharp, where walls or discs are near, and before the goal; before anything that the arc would hit the robot
 stops. Numbers are the defaults of the authors' plugin for Nav2, ``nav2_regulated_pure_pursuit_controller``, but for the
-speed, which is that of everybody here.
+speed, which is the reference speed of the run.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.baselines.shared import GoalTurn, turn_on_spot
 from unifg.models import unicycle
-from unifg.scenarios.rivals.local_planner import LocalPlanner, Situation, Wish
+from unifg.scenarios.ground.local_planner import PlannerContext, Situation
 from unifg.typing import Array
 
 __all__ = ["PurePursuit", "PursuitSettings"]
@@ -46,14 +47,23 @@ class PursuitSettings:
     foresight: float = 1.0
 
 
-class PurePursuit(LocalPlanner[PursuitSettings]):
-    """Follows a carrot."""
+class PurePursuit:
+    """Arcs to a carrot on the path.
 
-    usual = PursuitSettings
+    Attributes:
+        settings: limits of the robot.
+        numbers: of the planner.
+        iterations: one.
+    """
 
-    def wish(self, now: Situation) -> Wish | None:
+    def __init__(self, context: PlannerContext, numbers: PursuitSettings | None = None) -> None:
+        """Construct for a map; without ``numbers`` with the published ones."""
+        self.settings, self.numbers = context.settings, numbers or PursuitSettings()
+        self.iterations, self._at_goal = 1, GoalTurn()
+
+    def control(self, now: Situation) -> Array | None:
         """An arc to the carrot, a turn towards it, or a stop."""
-        turn = self.turned_to_goal(now)
+        turn = self._at_goal.control(now)
         if turn is not None:
             return turn
         carrot = self.carrot(now)
@@ -61,16 +71,20 @@ class PurePursuit(LocalPlanner[PursuitSettings]):
         distance = float(np.hypot(*offset))
         bearing = np.arctan2(offset[1], offset[0]) - now.pose[2]
         ahead, aside = distance * np.cos(bearing), distance * np.sin(bearing)
-        if abs(np.arctan2(aside, ahead)) > self.own.turn_beyond:
-            return self.turn(float(np.arctan2(aside, ahead)))
+        if abs(np.arctan2(aside, ahead)) > self.numbers.turn_beyond:
+            return turn_on_spot(float(np.arctan2(aside, ahead)), now.settings)
         curvature = 2.0 * aside / max(distance, 1e-6) ** 2
         speed = self.speed(now, curvature)
         control = np.array([[speed, np.clip(speed * curvature, *(side[1] for side in self.settings.box))]])
-        return Wish(control) if self.free(now, control[0], distance) else None
+        return control if self.free(now, control[0], distance) else None
+
+    def forget(self) -> None:
+        """Leave the turn at a goal."""
+        self._at_goal.forget()
 
     def carrot(self, now: Situation) -> Array:
         """(3,) pose of the path at the present look-ahead distance from the robot, its end if that is nearer."""
-        reach = float(np.clip(abs(now.applied[0]) * self.own.lookahead_time, *self.own.lookahead))
+        reach = float(np.clip(abs(now.applied[0]) * self.numbers.lookahead_time, *self.numbers.lookahead))
         gap = np.hypot(*(now.reference[:, :2] - now.pose[:2]).T)
         beyond = np.flatnonzero(gap >= reach)
         if not len(beyond):
@@ -84,7 +98,7 @@ class PurePursuit(LocalPlanner[PursuitSettings]):
 
     def speed(self, now: Situation, curvature: float) -> float:
         """The speed wanted, regulated by curvature (eq. 4), by what is near (eq. 5), and by the goal [m/s]."""
-        own, wanted = self.own, self.settings.speed
+        own, wanted = self.numbers, now.settings.speed
         bend = 1.0 / (own.turning_radius * max(abs(curvature), 1e-9))
         room = float(now.clearance(now.pose[None, :2], 0.0)[0]) + self.settings.robot_radius
         regulated = max(wanted * min(1.0, bend, max(room, 0.0) / own.proximity), own.slowest)
@@ -94,9 +108,9 @@ class PurePursuit(LocalPlanner[PursuitSettings]):
         return float(min(regulated, max(wanted * left / own.approach, own.approach_speed)))
 
     def free(self, now: Situation, control: Array, distance: float) -> bool:
-        """Whether the arc can be driven as long as it has to be foreseen, or to the carrot if that is nearer."""
+        """Return True if the arc is free for the foresight, or to the carrot if that is nearer."""
         dt = 0.5 * self.settings.dt
-        steps = int(np.ceil(min(self.own.foresight, distance / max(float(control[0]), 1e-6)) / dt))
+        steps = int(np.ceil(min(self.numbers.foresight, distance / max(float(control[0]), 1e-6)) / dt))
         states = unicycle.rollout(now.pose, np.tile(control, (max(steps, 1), 1)), dt)
         times = dt * np.arange(1.0, len(states))
         return not now.hits(now.clearance(states[1:, :2], times), times).any()

@@ -1,0 +1,1 @@
+"""Published local planners, written from their papers, to compare with."""

@@ -1,0 +1,63 @@
+"""Parts of scenes that several kinds of flights share: the floor, the vehicle, upright cylinders."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from unifg.scenarios.simulation.layouts import Layout
+from unifg.typing import Array
+from unifg.view import Part, Scene, shapes
+
+__all__ = ["floor", "layout", "pillar", "vehicle"]
+
+_FLOOR = -0.02  # height of the floor, clear of what stands on it [m]
+
+
+def floor(scene: Scene, low: Array, high: Array) -> None:
+    """Floor between two corners (2,), with lines every metre to judge distances by."""
+    (left, near), (right, far) = low.tolist(), high.tolist()
+    corners = np.array([[[left, near, _FLOOR], [right, near, _FLOOR], [right, far, _FLOOR], [left, far, _FLOOR]]])
+    scene.mesh("floor", shapes.quads(corners), colour="floor", legend="")
+    across = [[[x, near], [x, far]] for x in np.arange(math.ceil(left), right + 1e-9)]
+    along = [[[left, y], [right, y]] for y in np.arange(math.ceil(near), far + 1e-9)]
+    lines = [shapes.ribbon(np.array(line), 0.02, 0.0) for line in across + along]
+    scene.mesh("metres", shapes.merge(lines), colour="metres", legend="")
+
+
+def layout(scene: Scene, placed: Layout, height: float) -> None:
+    """Floor, walls of a height [m], start and target of a layout."""
+    floor(scene, *placed.size)
+    sheets, frames = [], []
+    for wall in placed.walls:
+        foot, top = (np.column_stack([wall, np.full(2, z)]) for z in (0.0, height))
+        sheets.append(shapes.quads(np.concatenate([foot, top[::-1]])[None]))
+        frames += [shapes.tube(line, 0.03, 4) for line in (foot, top)]
+        frames += [shapes.tube(np.stack([foot[k], top[k]]), 0.03, 4) for k in range(2)]
+    if sheets:
+        scene.mesh("walls", shapes.merge(sheets), colour="wall", opacity=0.22, legend="")
+        scene.mesh("wall frames", shapes.merge(frames), colour="wall", lit=True, legend="")
+    start, target = placed.start, placed.target
+    scene.mesh("start", shapes.ring(start[:2], 0.18, 0.07, 0.012, corners=32), colour="start", legend="")
+    rings = [shapes.ring(target[:2], r, 0.07, 0.012, corners=40) for r in (0.12, 0.4)]
+    ball = shapes.copies(shapes.sphere(), target[None], 0.16 * np.eye(3)[None])
+    scene.mesh("target", shapes.merge([*rings, ball]), colour="goal", swatch="disc", legend="target")
+    scene.discs("pole", [[target[0], target[1], 0.025]], height=float(target[2]), colour="pole", legend="")
+
+
+def vehicle(scene: Scene, radius: float, plumb: bool = False) -> None:
+    """Quadrotor of that radius [m] and its shadow, perhaps with a plumb line."""
+    scene.body("drone", "quadrotor", size=radius, colour="robot", legend="")
+    parts = [Part("disc", shapes.ring(np.zeros(2), 0.0, radius, 0.016, corners=24), "start", False, 0.4)]
+    if plumb:
+        line = shapes.tube(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), 0.012)
+        parts.append(Part("plumb", line, "start", False, 0.5))
+    scene.body("shadow", parts, colour="start", legend="")
+    scene.label("drone", follows="drone", above=True)
+
+
+def pillar(radius: float, height: float, colour: str) -> Part:
+    """Upright cylinder [m]."""
+    column = shapes.copies(shapes.column(), np.zeros((1, 3)), np.diag([radius, radius, height])[None])
+    return Part("body", column, colour)

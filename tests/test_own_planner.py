@@ -1,0 +1,139 @@
+"""A planner of the user drives in the controller's place, from a module outside the package."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from episodes import room
+from unifg.errors import ScenarioError
+from unifg.files.ros_map import save_map
+from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.command import main
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
+from unifg.scenarios.navigation import Episode, NavigationSettings
+from unifg.scenarios.perception.tracks import Tracks
+
+MODULE = '''
+import numpy as np
+
+class Straight:
+    def __init__(self, context):
+        self.gain, self.limits = 2.0, context.settings.limits
+
+    def control(self, now):
+        ahead = now.reference[3, :2] - now.pose[:2]
+        turn = self.gain * (np.arctan2(ahead[1], ahead[0]) - now.pose[2])
+        return [min(1.0, 2.0 * np.hypot(*ahead)), turn]
+
+class Careful(Straight):
+    iterations, forgotten = 7, 0
+
+    def control(self, now):
+        return None
+
+    def forget(self):
+        self.forgotten += 1
+
+class Wrong(Straight):
+    def control(self, now):
+        return [1.0, 2.0, 3.0]
+
+class Mute:
+    pass
+
+class Eager:
+    def __init__(self):
+        pass
+
+    def control(self, now):
+        return [0.0, 0.0]
+
+number = 3
+'''
+
+
+@pytest.fixture
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A working directory with a module of planners."""
+    (tmp_path / "my_planners.py").write_text(MODULE)
+    (tmp_path / "broken_planners.py").write_text("import no_such_package\n")
+    save_map(tmp_path / "room.yaml", room())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield tmp_path
+    sys.modules.pop("my_planners", None)
+
+
+def context() -> PlannerContext:
+    occupancy = room()
+    distances = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    return PlannerContext(distances, ControllerSettings(accelerations=(1.0, 2.0)), np.random.default_rng(0))
+
+
+def ahead() -> np.ndarray:
+    way = 0.1 * np.arange(ControllerSettings().horizon + 1.0)
+    return np.column_stack([way, np.zeros_like(way), np.zeros_like(way)])
+
+
+def test_a_planner_of_the_working_directory_drives(own: Path) -> None:
+    words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=0.8,0,0", "--obstacles", "0"]
+    assert main([*words, "--planner", "my_planners:Straight", "--out", "out"]) == 0
+    metrics = json.loads((own / "out" / "metrics.json").read_text())
+    assert metrics["solver"] == "my_planners:Straight" and metrics["goals_reached"] == 1
+    assert metrics["plan_iterations"]["max"] == 1
+
+
+def test_what_it_wants_is_brought_within_the_limits(own: Path) -> None:
+    plan = load_planner("my_planners:Straight", context()).plan(np.zeros(3), ahead(), Tracks.none())
+    assert plan.source == "solved" and plan.control[0] == pytest.approx(0.1)  # 1 m/s^2 for 0.1 s
+    assert plan.controls.shape == (30, 2) and plan.states.shape == (31, 3)
+
+
+def test_without_a_way_the_robot_brakes_and_a_new_route_is_announced(own: Path) -> None:
+    adapter = load_planner("my_planners:Careful", context())
+    adapter.driven(np.array([0.25, 0.0]))
+    plan = adapter.plan(np.zeros(3), ahead(), Tracks.none())
+    assert plan.emergency and plan.iterations == 0
+    assert np.allclose(plan.controls[:4, 0], [0.15, 0.05, 0.0, 0.0])
+    adapter.forget()
+    assert getattr(adapter.planner, "forgotten") == 1  # noqa: B009  # the class is not known here
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("teb", "unknown planner 'teb': give 'mpc' or MODULE:CLASS, for example benchmarks.baselines.elastic_band"),
+        ("my_planners:", "unknown planner"),
+        ("no_such_module:Straight", "cannot import no_such_module from .*: No module named 'no_such_module'"),
+        ("broken_planners:Straight", "cannot import broken_planners from .*: No module named 'no_such_package'"),
+        ("my_planners:Best", "my_planners has no class Best"),
+        ("my_planners:number", "my_planners has no class number"),
+        ("my_planners:Mute", r"Mute has no method control\(situation\)"),
+        ("my_planners:Eager", r"Eager\(context\) failed: .* takes 1 positional argument"),
+    ],
+)
+def test_a_planner_that_cannot_be_used_is_refused(name: str, why: str, own: Path) -> None:
+    with pytest.raises(ScenarioError, match=why):
+        load_planner(name, context())
+
+
+def test_an_answer_of_another_shape_is_refused(own: Path) -> None:
+    adapter = load_planner("my_planners:Wrong", context())
+    with pytest.raises(ScenarioError, match=r"returned \[1.0, 2.0, 3.0\]: give finite controls"):
+        adapter.plan(np.zeros(3), ahead(), Tracks.none())
+
+
+def test_planner_and_localiser_of_others_have_no_joint_graph() -> None:
+    with pytest.raises(ScenarioError, match="planner 'x:Y' stands for itself: its coupling is 'sequential'"):
+        Episode(NavigationSettings(planner="x:Y", coupling="joint"))
+    with pytest.raises(ScenarioError, match="localiser 'amcl' stands for itself"):
+        Episode(NavigationSettings(localiser="amcl", coupling="joint"))
+    with pytest.raises(ScenarioError, match="unknown localiser 'best': choose graph or amcl"):
+        Episode(NavigationSettings(localiser="best"))
