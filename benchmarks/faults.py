@@ -18,9 +18,9 @@ from benchmarks.comparison import Row
 from benchmarks.report import table
 from benchmarks.runner import Study
 from unifg.scenarios.flight import FlightSettings, run_flight
-from unifg.scenarios.log.drive_metrics import episode_metrics
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import flight_metrics
+from unifg.scenarios.logs.drive_metrics import episode_metrics
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import flight_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.scenarios.quadrotor.braking import braking_control
 from unifg.scenarios.simulation.air import QuadrotorWorld

@@ -19,7 +19,7 @@ from benchmarks.report import shared, table
 from benchmarks.runner import Study
 from unifg.scenarios.ground.drive_pilot import COUPLINGS
 from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.typing import Array
 

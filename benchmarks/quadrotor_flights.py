@@ -16,8 +16,8 @@ from benchmarks.comparison import Row
 from benchmarks.quadrotor_tables import HEADLINE, render
 from benchmarks.runner import Study
 from unifg.scenarios.flight import FlightSettings, run_flight
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import flight_metrics
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import flight_metrics
 from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS
 from unifg.scenarios.quadrotor.flight_settings import Avoidance
 from unifg.scenarios.simulation.layouts import CORRIDOR_SEEDS

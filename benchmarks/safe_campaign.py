@@ -16,7 +16,7 @@ from benchmarks.comparison import Row, difference, where
 from benchmarks.report import table
 from benchmarks.runner import Study
 from unifg.models.quadrotor import GRAVITY
-from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
+from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.safe_flight import Controller, Knowledge, SafeFlight, SafeSettings, flights
 from unifg.scenarios.safety.oracle import Answer, Authority, Threat, exists_among
 from unifg.scenarios.safety.situations import Kind

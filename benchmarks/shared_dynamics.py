@@ -22,8 +22,8 @@ from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.episode import silent
 from unifg.scenarios.flight import Flight, FlightSettings
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import flight_metrics
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import flight_metrics
 from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.quadrotor.estimator import STILL, DeadReckoning, Dynamics, Estimator, EstimatorSettings

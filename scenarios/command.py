@@ -155,8 +155,8 @@ def _replay(chosen: argparse.Namespace) -> int:
 
 def _mcap(chosen: argparse.Namespace) -> int:
     """Write a drive's log for other tools."""
-    from unifg.scenarios.log.drive_log import EpisodeLog
-    from unifg.scenarios.log.drive_mcap import write_mcap
+    from unifg.scenarios.logs.drive_log import EpisodeLog
+    from unifg.scenarios.logs.drive_mcap import write_mcap
 
     stored: Path = chosen.folder / "drive.npz" if chosen.folder.is_dir() else chosen.folder
     out: Path = chosen.out or stored.with_suffix(".mcap")

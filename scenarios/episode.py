@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, TypeAlias
 
-from unifg.scenarios.log.columns import watched
+from unifg.scenarios.logs.columns import watched
 
 __all__ = ["Progress", "rehearse", "run_ticks", "silent"]
 

@@ -20,8 +20,8 @@ from unifg.errors import ScenarioError, UnifgError
 from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
-from unifg.scenarios.log.columns import Recorder
-from unifg.scenarios.log.flight_log import FlightLog, landmark_rows
+from unifg.scenarios.logs.columns import Recorder
+from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.options import count, not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.quadrotor.estimator import EstimatorSettings

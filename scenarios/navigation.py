@@ -28,8 +28,8 @@ from unifg.scenarios.ground.drive_pilot import STOPPED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
 from unifg.scenarios.ground.route import Blocked, Route
-from unifg.scenarios.log.columns import Recorder
-from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.logs.columns import Recorder
+from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.options import count, existing, option, pair, pose, positive
 from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan

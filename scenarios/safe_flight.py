@@ -19,8 +19,8 @@ import numpy as np
 import unifg as fg
 from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, run_ticks, silent
-from unifg.scenarios.log.columns import Recorder
-from unifg.scenarios.log.safe_log import SafeLog
+from unifg.scenarios.logs.columns import Recorder
+from unifg.scenarios.logs.safe_log import SafeLog
 from unifg.scenarios.options import count, not_negative, option, positive
 from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.safety.cascade import CascadeSettings, Track

@@ -20,7 +20,7 @@ import numpy as np
 import unifg as fg
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
-from unifg.scenarios.log import metrics as numbers
+from unifg.scenarios.logs import metrics as numbers
 from unifg.scenarios.options import count, existing, option, pair, positive
 from unifg.scenarios.planning.speed_profile import Profile, drive_cycle, read_profile
 from unifg.solution.solver import Callback

@@ -6,7 +6,7 @@ import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import wrap_angle
-from unifg.scenarios.log.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.typing import Array
 
 RESOLUTION = 0.1

@@ -13,8 +13,8 @@ from unifg.errors import FileFormatError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.scenarios import navigation
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.scenarios.perception.explaining import PointWatch, explained, thinned
 from unifg.scenarios.perception.readings import Scan

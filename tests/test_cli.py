@@ -26,8 +26,8 @@ from unifg.scenarios import navigation as navigation_scenario
 from unifg.scenarios.commands import drives
 from unifg.scenarios.episode import run_ticks
 from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.metrics import write_metrics
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.metrics import write_metrics
 from unifg.scenarios.navigation import NavigationSettings
 from unifg.scenarios.options import add_options, option, pose, positive, settings_of
 

@@ -12,7 +12,7 @@ from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_past import WINDOW, Registration, Smoother
 from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.log.drive_metrics import episode_metrics
+from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
 from unifg.scenarios.simulation.building import building_map
 from unifg.solvers import GaussNewton

@@ -15,8 +15,8 @@ from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.emergency_stop import EmergencyStop, agreed
 from unifg.scenarios.ground.localiser import Localiser, least, scan_covariance
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import consistency, episode_metrics, nees
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_metrics import consistency, episode_metrics, nees
 from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.perception.disc_tracker import DiscTracker

@@ -262,9 +262,9 @@ def test_a_run_is_watched_tick_by_tick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every tick that is recorded is a frame; the log in the making answers as the log does."""
     from episodes import episode
     from unifg.scenarios.commands.watching import watching_ticks
-    from unifg.scenarios.log.columns import Recorder, columns, watched
-    from unifg.scenarios.log.drive_log import EpisodeLog
-    from unifg.scenarios.show.drive_scene import drive_frame, drive_stage
+    from unifg.scenarios.logs.columns import Recorder, columns, watched
+    from unifg.scenarios.logs.drive_log import EpisodeLog
+    from unifg.scenarios.scenes.drive_scene import drive_frame, drive_stage
 
     done = episode(ticks=6, obstacles=4)
     names = columns(EpisodeLog)

@@ -25,8 +25,8 @@ from unifg.scenarios.manoeuvres import (
     state_problem,
     table,
 )
-from unifg.scenarios.show import manoeuvre_plot as manoeuvre_plots
-from unifg.scenarios.show.manoeuvre_scene import manoeuvre_scene
+from unifg.scenarios.scenes import manoeuvre_plot as manoeuvre_plots
+from unifg.scenarios.scenes.manoeuvre_scene import manoeuvre_scene
 from unifg.solvers import SQP, names
 from unifg.style.colours import css
 

@@ -14,9 +14,9 @@ import pytest
 
 from episodes import episode
 from unifg.scenarios.command import main
-from unifg.scenarios.log.columns import columns
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_mcap import write_mcap
+from unifg.scenarios.logs.columns import columns
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_mcap import write_mcap
 
 Recorded = dict[str, list[tuple[int, dict[str, Any]]]]
 

@@ -9,9 +9,9 @@ import pytest
 
 from episodes import DT, episode
 from unifg.errors import ScenarioError
-from unifg.scenarios.log.columns import Recorder, column, columns, ragged, words
-from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
-from unifg.scenarios.log.metrics import statistics, table, without_timings, write_metrics
+from unifg.scenarios.logs.columns import Recorder, column, columns, ragged, words
+from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
+from unifg.scenarios.logs.metrics import statistics, table, without_timings, write_metrics
 from unifg.scenarios.planning.polyline import path_length
 from unifg.typing import Array, IntArray
 

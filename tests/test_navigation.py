@@ -16,8 +16,8 @@ from unifg.files.ros_map import OccupancyMap, load_map, save_map
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.route import Route
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks

@@ -15,7 +15,7 @@ from benchmarks import quadrotor_flights, quadrotor_tables
 from benchmarks.comparison import against, paired, share
 from benchmarks.quadrotor_flights import STUDIES, Job, cells
 from unifg.scenarios.flight import FlightSettings, run_flight
-from unifg.scenarios.log.flight_log import FlightLog
+from unifg.scenarios.logs.flight_log import FlightLog
 
 Row = dict[str, Any]
 

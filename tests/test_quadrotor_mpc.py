@@ -21,8 +21,8 @@ from unifg.scenarios.commands import flights as results
 from unifg.scenarios.commands.catalogue import SCENARIOS
 from unifg.scenarios.episode import Progress
 from unifg.scenarios.flight import Flight, FlightSettings, run_flight
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import flight_metrics, state_errors
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import flight_metrics, state_errors
 from unifg.scenarios.options import add_options, settings_of
 from unifg.scenarios.perception.line_tracker import LineTracker
 from unifg.scenarios.perception.readings import Reading

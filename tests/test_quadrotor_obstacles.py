@@ -27,8 +27,8 @@ from unifg.scenarios.course import (
     run_course,
     state_problem,
 )
-from unifg.scenarios.show.course_log import course_log
-from unifg.scenarios.show.course_plot import chosen_iterates, picture, plot_above
+from unifg.scenarios.scenes.course_log import course_log
+from unifg.scenarios.scenes.course_plot import chosen_iterates, picture, plot_above
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.layouts import Layout, obstacle_course
 

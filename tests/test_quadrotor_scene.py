@@ -15,11 +15,11 @@ from unifg.errors import ScenarioError, ViewError
 from unifg.lie import SO3
 from unifg.scenarios.commands import flights as results
 from unifg.scenarios.commands.flights import summary, write_results
-from unifg.scenarios.log.columns import Recorder
-from unifg.scenarios.log.flight_log import FlightLog, landmark_rows
-from unifg.scenarios.log.flight_metrics import flight_metrics, landmark_errors
-from unifg.scenarios.show.flight_plot import control, estimates, moments, overview, plot_moment
-from unifg.scenarios.show.flight_scene import first_sights, flight_scene
+from unifg.scenarios.logs.columns import Recorder
+from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
+from unifg.scenarios.logs.flight_metrics import flight_metrics, landmark_errors
+from unifg.scenarios.scenes.flight_plot import control, estimates, moments, overview, plot_moment
+from unifg.scenarios.scenes.flight_scene import first_sights, flight_scene
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.style.colours import css
 from unifg.style.figures import write_figure

@@ -12,8 +12,8 @@ import pytest
 from unifg.errors import FileFormatError, ScenarioError
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.scenarios.log.columns import Recorder
-from unifg.scenarios.log.flight_log import FlightLog, landmark_rows
+from unifg.scenarios.logs.columns import Recorder
+from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS, QuadrotorWorld
 from unifg.scenarios.simulation.bearing_range import SensorModel

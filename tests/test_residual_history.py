@@ -12,7 +12,7 @@ import pytest
 
 import unifg as fg
 from problems.known import short_drive
-from unifg.scenarios.show.residual_plot import ResidualMonitor, residual_picture
+from unifg.scenarios.scenes.residual_plot import ResidualMonitor, residual_picture
 from unifg.solution.history import factor_norms
 from unifg.solvers import (
     KKT,

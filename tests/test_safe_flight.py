@@ -14,7 +14,7 @@ from unifg.errors import ScenarioError
 from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.scenarios import command
-from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
+from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.planning.flat_path import FigureEight, Hover, Line
 from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
 from unifg.scenarios.safety.cbf_mpc import (

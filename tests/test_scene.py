@@ -16,11 +16,11 @@ from matplotlib.axes import Axes
 from episodes import HORIZON, episode, room
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from unifg.errors import ViewError
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.show import drive_plot
-from unifg.scenarios.show.drive_plot import overview, plot_controls, plot_localisation, plot_map
-from unifg.scenarios.show.drive_scene import drive_scene, scan_points
-from unifg.scenarios.show.panels import plot_clearance, plot_times
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.scenes import drive_plot
+from unifg.scenarios.scenes.drive_plot import overview, plot_controls, plot_localisation, plot_map
+from unifg.scenarios.scenes.drive_scene import drive_scene, scan_points
+from unifg.scenarios.scenes.panels import plot_clearance, plot_times
 from unifg.style.figures import write_figure
 from unifg.view.recorder import Recorder, viewer_script
 from unifg.view.shapes import cover, extrude, flat, known_corners, ribbon
@@ -78,7 +78,7 @@ def test_names_from_outside_cannot_become_markup(log: EpisodeLog) -> None:
 def test_same_log_same_bytes_in_two_processes(page: str, tmp_path: Path, log: EpisodeLog) -> None:
     assert drive_scene(log).save(tmp_path / "scene.html").read_bytes() == page.encode()
     code = (
-        "import hashlib; from episodes import episode; from unifg.scenarios.show.drive_scene import drive_scene;"
+        "import hashlib; from episodes import episode; from unifg.scenarios.scenes.drive_scene import drive_scene;"
         "print(hashlib.sha256(drive_scene(episode(ticks=12, obstacles=4)).html().encode()).hexdigest())"
     )
     here = Path(__file__).parent
@@ -366,7 +366,7 @@ def test_plotted_error_is_the_error(log: EpisodeLog) -> None:
 
 def test_the_headline_says_once_and_shortly_why_goals_were_missed(monkeypatch: pytest.MonkeyPatch) -> None:
     numbers = {"goals_reached": 0, "goals": 2, "path_length_m": 3.1, "duration_s": 23.1}
-    monkeypatch.setattr("unifg.scenarios.show.drive_plot.episode_metrics", lambda _: numbers)
+    monkeypatch.setattr("unifg.scenarios.scenes.drive_plot.episode_metrics", lambda _: numbers)
     log: Any = SimpleNamespace(
         scenario="navigation", occupancy=SimpleNamespace(name="hall"), collisions=0, interrupted=False,
         outcomes=["lost: no beam came back"] * 2, solver="ipm", coupling="sequential", seed=0,

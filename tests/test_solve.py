@@ -289,7 +289,7 @@ def test_an_interrupt_keeps_what_there_is(city: Path) -> None:
 
 
 def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
-    from unifg.scenarios.show.graph_scene import graph_scene, shown_steps
+    from unifg.scenarios.scenes.graph_scene import graph_scene, shown_steps
     from unifg.view.shapes import strips
 
     solved = solve_file(SolveSettings(city))

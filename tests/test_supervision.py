@@ -20,10 +20,10 @@ from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
 from unifg.scenarios.ground.motor_lag import MotorLag
 from unifg.scenarios.ground.relocalise import PORTION, Found, Relocaliser
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import episode_metrics
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import flight_metrics
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_metrics import episode_metrics
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import flight_metrics
 from unifg.scenarios.monitoring.supervisor import RISE, STEADY, Health, Ramp, Supervisor
 from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.navigation import Episode, NavigationSettings, askew
@@ -32,8 +32,8 @@ from unifg.scenarios.perception.line_tracker import LineTracker
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.scenarios.quadrotor.flight_watch import FlightWatch
 from unifg.scenarios.quadrotor.unmodelled import Unmodelled
-from unifg.scenarios.show.flight_plot import control
-from unifg.scenarios.show.flight_scene import flight_scene
+from unifg.scenarios.scenes.flight_plot import control
+from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.scenarios.simulation.air import QuadrotorWorld
 from unifg.scenarios.simulation.building import building_map
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels

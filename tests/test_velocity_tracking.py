@@ -18,8 +18,8 @@ from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios import command, velocity_tracking
 from unifg.scenarios.planning.speed_profile import drive_cycle, read_profile
-from unifg.scenarios.show import velocity_plot as velocity_tracking_plots
-from unifg.scenarios.show.velocity_scene import velocity_scene
+from unifg.scenarios.scenes import velocity_plot as velocity_tracking_plots
+from unifg.scenarios.scenes.velocity_scene import velocity_scene
 from unifg.scenarios.velocity_tracking import (
     Drive,
     TrackingSettings,

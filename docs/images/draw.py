@@ -27,7 +27,7 @@ from fences import fences  # noqa: E402
 from unifg.lie import SE2  # noqa: E402
 from unifg.models.lidar import in_world  # noqa: E402
 from unifg.pose_graphs import manhattan  # noqa: E402
-from unifg.scenarios.log.drive_log import EpisodeLog  # noqa: E402
+from unifg.scenarios.logs.drive_log import EpisodeLog  # noqa: E402
 from unifg.scenarios.navigation import NavigationSettings, run_navigation  # noqa: E402
 from unifg.solvers import GaussNewton  # noqa: E402
 from unifg.style.colours import css  # noqa: E402

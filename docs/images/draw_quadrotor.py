@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 from draw import COST, HARD, beside, factor, frame, variable
 
 from unifg.scenarios.flight import FlightSettings, run_flight
-from unifg.scenarios.show.flight_plot import overview
+from unifg.scenarios.scenes.flight_plot import overview
 from unifg.style.colours import css
 from unifg.style.figures import write_figure
 

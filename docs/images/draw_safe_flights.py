@@ -4,7 +4,7 @@ from pathlib import Path
 
 from unifg.scenarios.safe_flight import SafeSettings, run_safe_flights
 from unifg.scenarios.safety.situations import Kind
-from unifg.scenarios.show.safe_plot import picture
+from unifg.scenarios.scenes.safe_plot import picture
 from unifg.style.figures import write_figure
 
 CASES: tuple[Kind, ...] = ("static", "ellipse", "cluttered", "figure8", "ball")

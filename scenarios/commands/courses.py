@@ -11,11 +11,11 @@ from unifg.scenarios import course as courses
 from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.course import Course
-from unifg.scenarios.log.metrics import of_solution, table, write_metrics
-from unifg.scenarios.show.course_log import course_log
-from unifg.scenarios.show.course_plot import picture
-from unifg.scenarios.show.course_scene import course_iterate, course_stage
-from unifg.scenarios.show.flight_scene import flight_scene
+from unifg.scenarios.logs.metrics import of_solution, table, write_metrics
+from unifg.scenarios.scenes.course_log import course_log
+from unifg.scenarios.scenes.course_plot import picture
+from unifg.scenarios.scenes.course_scene import course_iterate, course_stage
+from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.solution.status import Status
 from unifg.style.figures import write_figure
 

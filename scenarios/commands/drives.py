@@ -8,11 +8,11 @@ from unifg.files.tum import write_tum
 from unifg.scenarios import navigation
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.commands.watching import Announce, watching_ticks
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import episode_metrics
-from unifg.scenarios.log.metrics import health, table, write_metrics
-from unifg.scenarios.show.drive_plot import overview
-from unifg.scenarios.show.drive_scene import drive_frame, drive_scene, drive_stage
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_metrics import episode_metrics
+from unifg.scenarios.logs.metrics import health, table, write_metrics
+from unifg.scenarios.scenes.drive_plot import overview
+from unifg.scenarios.scenes.drive_scene import drive_frame, drive_scene, drive_stage
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run", "summary", "write_results"]

@@ -8,11 +8,11 @@ from pathlib import Path
 from unifg.scenarios import flight
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.commands.watching import Announce, watching_ticks
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
-from unifg.scenarios.log.metrics import health, table, write_metrics
-from unifg.scenarios.show.flight_plot import control, estimates, overview
-from unifg.scenarios.show.flight_scene import flight_frame, flight_scene, flight_stage
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
+from unifg.scenarios.logs.metrics import health, table, write_metrics
+from unifg.scenarios.scenes.flight_plot import control, estimates, overview
+from unifg.scenarios.scenes.flight_scene import flight_frame, flight_scene, flight_stage
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run", "summary", "write_results"]

@@ -15,7 +15,7 @@ from unifg.files.tum import write_tum
 from unifg.pose_graphs.certificate import Certificate
 from unifg.scenarios import pose_graph
 from unifg.scenarios.commands.outcome import Outcome, Progress
-from unifg.scenarios.log.metrics import table, write_metrics
+from unifg.scenarios.logs.metrics import table, write_metrics
 from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.solution.fit import FAR
 
@@ -60,8 +60,8 @@ def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
     if absent:  # numbers need nothing but the library
         logger.warning("no picture and no scene: they need %s: pip install 'unifg[view]'", absent[0])
         return [graph, trajectory, numbers]
-    from unifg.scenarios.show.graph_plot import picture
-    from unifg.scenarios.show.graph_scene import graph_scene
+    from unifg.scenarios.scenes.graph_plot import picture
+    from unifg.scenarios.scenes.graph_scene import graph_scene
     from unifg.style.figures import write_figure
 
     shown = write_figure(folder / "graph.png", picture(solved), 130)

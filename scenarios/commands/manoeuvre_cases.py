@@ -8,10 +8,10 @@ from pathlib import Path
 from unifg.scenarios import manoeuvres
 from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
-from unifg.scenarios.log.metrics import write_metrics
+from unifg.scenarios.logs.metrics import write_metrics
 from unifg.scenarios.options import option
-from unifg.scenarios.show.manoeuvre_plot import picture
-from unifg.scenarios.show.manoeuvre_scene import manoeuvre_iterate, manoeuvre_scene, manoeuvre_stage
+from unifg.scenarios.scenes.manoeuvre_plot import picture
+from unifg.scenarios.scenes.manoeuvre_scene import manoeuvre_iterate, manoeuvre_scene, manoeuvre_stage
 from unifg.solution.status import Status
 from unifg.style.figures import write_figure
 

@@ -9,10 +9,10 @@ from typing import Any
 from unifg.scenarios import safe_flight
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.commands.watching import Announce, watching_ticks
-from unifg.scenarios.log.metrics import write_metrics
-from unifg.scenarios.log.safe_log import SafeLog, safe_metrics
-from unifg.scenarios.show.safe_plot import picture
-from unifg.scenarios.show.safe_scene import safe_frame, safe_scene, safe_stage
+from unifg.scenarios.logs.metrics import write_metrics
+from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
+from unifg.scenarios.scenes.safe_plot import picture
+from unifg.scenarios.scenes.safe_scene import safe_frame, safe_scene, safe_stage
 from unifg.style.figures import write_figure
 
 __all__ = ["SETTINGS", "run", "safe_numbers", "summary", "write_results"]

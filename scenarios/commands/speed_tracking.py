@@ -7,9 +7,9 @@ from pathlib import Path
 from unifg.scenarios import velocity_tracking
 from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
 from unifg.scenarios.commands.watching import Announce, watching_iterates
-from unifg.scenarios.log.metrics import write_metrics
-from unifg.scenarios.show.velocity_plot import picture
-from unifg.scenarios.show.velocity_scene import velocity_scene, velocity_stage
+from unifg.scenarios.logs.metrics import write_metrics
+from unifg.scenarios.scenes.velocity_plot import picture
+from unifg.scenarios.scenes.velocity_scene import velocity_scene, velocity_stage
 from unifg.solution.status import Status
 from unifg.style.figures import write_figure
 

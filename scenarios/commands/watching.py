@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeAlias
 
-from unifg.scenarios.log.columns import SoFar, watched
+from unifg.scenarios.logs.columns import SoFar, watched
 from unifg.solution.history import Iteration
 from unifg.view import Frame, Live, Scene
 

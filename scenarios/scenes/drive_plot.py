@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import episode_metrics, pose_errors
-from unifg.scenarios.log.metrics import collision_words
-from unifg.scenarios.show.panels import over_time, plot_clearance, plot_times, shade_trouble
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
+from unifg.scenarios.logs.metrics import collision_words
+from unifg.scenarios.scenes.panels import over_time, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import INK, css
 from unifg.style.figures import discs, ground, headline, new_axes, new_figure, word
 from unifg.typing import Array

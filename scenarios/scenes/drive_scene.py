@@ -12,11 +12,11 @@ import numpy as np
 
 from unifg.errors import ViewError
 from unifg.lie import SE2
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.drive_metrics import episode_metrics
-from unifg.scenarios.log.metrics import collision_words, health
-from unifg.scenarios.show.numbers import Number, declare, in_words, metres, show
-from unifg.scenarios.show.parts import pillar
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_metrics import episode_metrics
+from unifg.scenarios.logs.metrics import collision_words, health
+from unifg.scenarios.scenes.numbers import Number, declare, in_words, metres, show
+from unifg.scenarios.scenes.parts import pillar
 from unifg.typing import Array, IntArray
 from unifg.view import Frame, Part, Scene, shapes
 

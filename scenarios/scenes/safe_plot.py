@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.scenarios.log.safe_log import SafeLog
+from unifg.scenarios.logs.safe_log import SafeLog
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import discs, face, ground, headline, new_figure
 from unifg.typing import Array

@@ -9,8 +9,8 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.lie import SE2, wrap_angle
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.metrics import spread, statistics, timing
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.metrics import spread, statistics, timing
 from unifg.scenarios.planning.polyline import path_length
 from unifg.typing import Array
 

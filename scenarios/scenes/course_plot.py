@@ -12,7 +12,7 @@ import numpy as np
 
 from unifg.lie import SO3
 from unifg.scenarios.course import Course
-from unifg.scenarios.show.panels import shade_distance
+from unifg.scenarios.scenes.panels import shade_distance
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import discs, face, ground, headline, key_of, new_figure, word

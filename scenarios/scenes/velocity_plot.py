@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from unifg.scenarios.show.panels import forbid, padded, plot_convergence
+from unifg.scenarios.scenes.panels import forbid, padded, plot_convergence
 from unifg.scenarios.velocity_tracking import Drive, metrics
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import face, headline, new_figure

@@ -9,9 +9,9 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.metrics import errors as norms
-from unifg.scenarios.log.metrics import statistics, timing
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.metrics import errors as norms
+from unifg.scenarios.logs.metrics import statistics, timing
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array, BoolArray
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from unifg.atomic_write import replacing
 from unifg.errors import FileFormatError, UnifgError
-from unifg.scenarios.log.columns import columns
+from unifg.scenarios.logs.columns import columns
 
 __all__ = ["StoredLog"]
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.scenarios.manoeuvres import Manoeuvre
-from unifg.scenarios.show.panels import forbid, plot_convergence, shade_distance
+from unifg.scenarios.scenes.panels import forbid, plot_convergence, shade_distance
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import discs, face, ground, headline, new_figure, word
 from unifg.typing import Array

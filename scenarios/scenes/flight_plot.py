@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
-from unifg.scenarios.log.metrics import collision_words
-from unifg.scenarios.show.flight_scene import SIGMAS, first_sights, sensor_reach
-from unifg.scenarios.show.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
+from unifg.scenarios.logs.metrics import collision_words
+from unifg.scenarios.scenes.flight_scene import SIGMAS, first_sights, sensor_reach
+from unifg.scenarios.scenes.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import discs, ground, headline, key_of, new_axes, new_figure
@@ -217,7 +217,7 @@ def plot_parameter(log: FlightLog, name: str, ax: Axes | None = None) -> Axes:
 
     Args:
         log: the flight.
-        name: one of `unifg.scenarios.log.flight_metrics.PARAMETERS`.
+        name: one of `unifg.scenarios.logs.flight_metrics.PARAMETERS`.
         ax: axes to draw into; None for new ones.
     """
     index = PARAMETERS.index(name)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.scenarios.log.safe_log import SafeLog
-from unifg.scenarios.show.numbers import Number, declare, show
-from unifg.scenarios.show.parts import floor, pillar, vehicle
+from unifg.scenarios.logs.safe_log import SafeLog
+from unifg.scenarios.scenes.numbers import Number, declare, show
+from unifg.scenarios.scenes.parts import floor, pillar, vehicle
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from unifg.scenarios.log.columns import column, words
-from unifg.scenarios.log.metrics import errors, iterations, timing
+from unifg.scenarios.logs.columns import column, words
+from unifg.scenarios.logs.metrics import errors, iterations, timing
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["SafeLog", "safe_metrics"]

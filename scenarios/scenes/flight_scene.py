@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.scenarios.log.flight_log import FlightLog
-from unifg.scenarios.log.flight_metrics import flight_metrics, has_estimate
-from unifg.scenarios.log.metrics import collision_words, health
-from unifg.scenarios.show.numbers import Number, declare, in_words, metres, show
-from unifg.scenarios.show.parts import layout, pillar, vehicle
+from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
+from unifg.scenarios.logs.metrics import collision_words, health
+from unifg.scenarios.scenes.numbers import Number, declare, in_words, metres, show
+from unifg.scenarios.scenes.parts import layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array

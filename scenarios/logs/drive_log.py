@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
-from unifg.scenarios.log.columns import column, ragged, words
-from unifg.scenarios.log.stored import StoredLog
+from unifg.scenarios.logs.columns import column, ragged, words
+from unifg.scenarios.logs.stored import StoredLog
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["EpisodeLog"]

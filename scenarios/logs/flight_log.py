@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from unifg.scenarios.log.columns import column, ragged, words
-from unifg.scenarios.log.stored import StoredLog
+from unifg.scenarios.logs.columns import column, ragged, words
+from unifg.scenarios.logs.stored import StoredLog
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 

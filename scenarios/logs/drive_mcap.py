@@ -19,9 +19,9 @@ import numpy as np
 
 from unifg.atomic_write import replacing
 from unifg.files.ros_map import OccupancyMap
-from unifg.scenarios.log.columns import columns
-from unifg.scenarios.log.drive_log import EpisodeLog
-from unifg.scenarios.log.metrics import strict
+from unifg.scenarios.logs.columns import columns
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.metrics import strict
 from unifg.typing import Array
 
 __all__ = ["write_mcap"]

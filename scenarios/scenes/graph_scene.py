@@ -8,7 +8,7 @@ import numpy as np
 
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.show.graph_plot import segments
+from unifg.scenarios.scenes.graph_plot import segments
 from unifg.typing import Array
 from unifg.view import Scene
 from unifg.view.canvas import Canvas

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from unifg.atomic_write import write_atomically
-from unifg.scenarios.log.columns import columns
+from unifg.scenarios.logs.columns import columns
 from unifg.solution.solution import Solution
 from unifg.typing import Array, IntArray
 

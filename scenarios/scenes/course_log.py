@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.scenarios.course import Course
-from unifg.scenarios.log.flight_log import LANDMARK, FlightLog
+from unifg.scenarios.logs.flight_log import LANDMARK, FlightLog
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 
 __all__ = ["course_log"]

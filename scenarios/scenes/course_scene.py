@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from unifg.scenarios.course import CourseSettings
-from unifg.scenarios.show.parts import layout
+from unifg.scenarios.scenes.parts import layout
 from unifg.solution.history import Iteration
 from unifg.view import Frame, Scene
 
