@@ -20,7 +20,7 @@ from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.perception.tracks import Tracks
 
-MODULE = '''
+MODULE = """
 import numpy as np
 
 class Straight:
@@ -56,7 +56,7 @@ class Eager:
         return [0.0, 0.0]
 
 number = 3
-'''
+"""
 
 
 @pytest.fixture

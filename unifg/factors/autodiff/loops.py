@@ -139,7 +139,7 @@ class Sum(NamedTuple):
 
 
 class Repeats:
-    """What is repeated on a tape: long sums, and on demand rows.
+    """Repeated parts of a tape: long sums, and on demand rows.
 
     Attributes:
         templates: one for each level of sums that depend on each other, and number of copies.
