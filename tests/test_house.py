@@ -263,13 +263,13 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 26_991, "scenarios": 10_851, "benchmarks": 3_964, "tests": 31_477,
+    "unifg solvers models": 26_991, "scenarios": 10_852, "benchmarks": 3_964, "tests": 31_477,
     "docs examples": 1_633, "unifg/factors": 3_732, "unifg/problem": 2_578, "models": 2_207,
     "unifg/elimination": 2_085, "solvers": 3_961, "unifg/solution": 1_777, "unifg/smoothing": 1_751,
     "unifg/lie": 1_579, "unifg/view": 1_411, "unifg/files": 1_204, "unifg/pose_graphs": 1_125,
     "unifg/horizon": 1_070, "unifg/modeling": 981, "unifg/codegen": 829, "unifg/plots": 424,
     "scenarios/scenes": 1_510, "scenarios/simulation": 1_229, "scenarios/campaigns": 943,
-    "scenarios/quadrotor": 1_089, "scenarios/ground": 1_167, "scenarios/safety": 789, "scenarios/commands": 585,
+    "scenarios/quadrotor": 1_089, "scenarios/ground": 1_167, "scenarios/safety": 789, "scenarios/commands": 586,
     "scenarios/logs": 492, "scenarios/perception": 757, "scenarios/planning": 628,
 }  # fmt: skip
 # Nodes of syntax a statement: budgets are not met by denser code.

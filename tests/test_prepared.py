@@ -111,7 +111,7 @@ def progress(done, text):
     if ticks == 5:  # something comes from the front
         heading = np.array([np.cos(pilot.pose[2]), np.sin(pilot.pose[2])])
         near = pilot.pose[:2] + 0.7 * heading
-        turns.append(pilot.controller._way_out(pilot.pose, discs(near, tuple(-0.6 * heading), True)).evades)
+        turns.append(pilot.controller._evasion_from(pilot.pose, discs(near, tuple(-0.6 * heading), True)).evades)
     if ticks == 7:  # something is right before the hull
         near = replace(run.world.scan(), ranges=np.full(len(run.world.scan().ranges), 0.2))
         turns.append(bool(pilot.emergency_stop.control(pilot.driven, pilot.driven, near)[0] < pilot.driven[0]))

@@ -100,5 +100,5 @@ def _nested(kind: type, flat: dict[str, Any]) -> dict[str, Any]:
         elif name in flat:
             found[name] = tuple(flat[name]) if get_origin(hint) is tuple else flat[name]
     if unknown := sorted(key for key in flat if key.partition(".")[0] not in found):
-        raise ValueError(f"no fields of a {kind.__name__}: {', '.join(unknown)}")
+        raise UnifgError(f"no fields of a {kind.__name__}: {', '.join(unknown)}")
     return found
