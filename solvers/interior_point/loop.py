@@ -11,7 +11,6 @@ import numpy as np
 
 from unifg.codegen.function_pointers import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
 from unifg.codegen.jit import compiled
-from unifg.codegen.work_queue import bundle
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
 from unifg.problem import evaluation
@@ -98,8 +97,13 @@ def renew(address: int) -> None:
     terms, values, weights = parts(address, "terms values weights")
     fill(gradient, 0.0)
     fill(hessian, 0.0)
-    out = LinearArrays(residual, jacobian, constraints, constraint_jacobian, squares, weights, norms, gradient, hessian)
-    scalars[0].cost = number(links[0].linearize, (terms, values, out, scratch))
+    scalars[0].cost = number(
+        links[0].linearize,
+        (
+            terms, values, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms, gradient,
+            hessian, scratch,
+        ),
+    )  # fmt: skip
     if len(heights):
         fill(concavity, 0.0)
         arrays = terms, values, heights, gradient, hessian, concavity, scratch
@@ -183,11 +187,11 @@ def addresses() -> Records:
     kinds = {**dict(zip(Problem._fields, problem, strict=True)), **dict(zip(Work._fields, work, strict=True))}
     values, residual, constraints, vector = (kinds[name] for name in ("values", "residual", "constraints", "step"))
     terms, scratch = kinds["terms"], kinds["scratch"]
-    linearized = bundle(LinearArrays, [kinds[name] for name in LinearArrays._fields])
+    linearized = [kinds[name] for name in LinearArrays._fields]
     links = np.zeros(1, LINKS)
     links[0]["factor"] = link(factor, TRUTH, kinds["plan"], kinds["data"], vector)
     links[0]["solve"] = link(solve, NOTHING, kinds["plan"], vector, vector)
-    links[0]["linearize"] = link(evaluation.linearize, NUMBER, terms, values, linearized, scratch)
+    links[0]["linearize"] = link(evaluation.linearize, NUMBER, terms, values, *linearized, scratch)
     links[0]["evaluate"] = link(
         evaluation.evaluate,
         NUMBER,

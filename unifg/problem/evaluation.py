@@ -249,23 +249,22 @@ def linearize_share(
 
 
 @compiled
-def linearize(terms: TermArrays, values: Array, out: LinearArrays, scratch: Array) -> float:
+def linearize(
+    terms: TermArrays, values: Array, residual: Array, jacobian: Array, constraints: Array, constraint_jacobian: Array,
+    squares: Array, weights: Array, norms: Array, gradient: Array, hessian: Array, scratch: Array,
+) -> float:  # fmt: skip
     """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
 
-    Factors whose loss is Python stop after whitening, see :func:`weigh`.
-
-    Args:
-        terms: of the program.
-        values: stored ones.
-        out: receives the results; gradient and Hessian are added to.
-        scratch: a factor's variables, then J with all its columns for terms that keep only some.
+    Factors whose loss is Python stop after whitening, see :func:`weigh`. Arrays from ``residual`` to ``hessian`` are
+    those of :class:`LinearArrays`, which as a record would count references to each of them; ``scratch`` holds a
+    factor's variables, then J with all its columns for terms that keep only some.
 
     Returns:
         The cost of all factors but those whose loss is Python.
     """
     return linearize_share(
-        terms, values, out.residual, out.jacobian, out.constraints, out.constraint_jacobian, out.squares, out.weights,
-        out.norms, out.gradient, out.hessian, scratch, 0, 1,
+        terms, values, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms, gradient, hessian,
+        scratch, 0, 1,
     )  # fmt: skip
 
 
