@@ -502,9 +502,9 @@ class Prepared:
     graphs that were stated twice do not.
 
     Answers are verified by evaluating traced functions as written. Values: in solves 1, 2, 4, ..., in every 100th, and
-    after solves in which a comparison of a trace comes out otherwise. Derivatives: in solves 1, 2, 4, ... A term whose
-    trace differs is left to Python, and the solve is repeated from there. Where the time limit has passed, the next
-    answer is verified instead.
+    after solves in which comparisons of a trace come out as at no verified answer: four times at once, then once in
+    128 solves. Derivatives: in solves 1, 2, 4, ... A term whose trace differs is left to Python, and the solve is
+    repeated from there. Where the time limit has passed, the next answer is verified instead.
 
     Attributes:
         solver: the backend and its options.
