@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from test_horizon import Goal
 from unifg.horizon import (
     Context,
     ControlCost,
@@ -43,18 +43,6 @@ def motion(x: Array, u: Array, y: Array, h: Array) -> Array:
 
 CART = Robot(fg.Rn(2), fg.Rn(1), predict=flows, tick=TICK)
 STEADY = Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: flows(x, u, TICK))
-
-
-class Goal:
-    """Come to rest at what is given."""
-
-    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
-        goal = graph.data("goal", np.zeros(2))
-        graph.minimize(fg.prior, x[1:], goal, sigma=[0.2, 0.5], name="goal")
-        graph.bound(u, lower=-1.0, upper=1.0, name="limits")
-
-    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        return {"goal": now.given}
 
 
 @dataclass

@@ -166,9 +166,7 @@ def test_search_by_numpy_beside_a_kernel() -> None:
     program = graph.compile()
     assert program.fully_compiled
     steered, true = (program.linearize({x: poses()}, search=flag).jacobian for flag in (True, False))
-    count = len(true) // 2
-    np.testing.assert_allclose(steered[:count], 2.0 * true[:count], rtol=1e-12)
-    np.testing.assert_allclose(steered[count:], true[count:], rtol=1e-12)
+    np.testing.assert_allclose(steered, true * np.repeat([2.0, 1.0], len(true) // 2), rtol=1e-12)
 
 
 def test_data_reaches_the_kernels() -> None:

@@ -119,11 +119,28 @@ def test_copies_lie_at_equal_strides() -> None:
     shifted = [*good[:7], tape.multiply(x, tape.leaf(Op.PARAMETER, 23))]
     assert loops.Template(tape, 8).add(shifted) is None
     assert loops.Repeats(tape, shifted).rows(shifted) == [range(7)]
-    other = [*good[:7], tape.multiply(tape.leaf(Op.VARIABLE, 1), tape.leaf(Op.PARAMETER, 22))]
-    assert loops.Template(tape, 8).add(other) is None
+    another = tape.multiply(tape.leaf(Op.VARIABLE, 1), tape.leaf(Op.PARAMETER, 22))
+    assert loops.Template(tape, 8).add([*good[:7], another]) is None
     assert loops.Template(tape, 8).add([*good[:7], tape.add(x, tape.leaf(Op.PARAMETER, 22))]) is None
-    few = good[: loops.FEWEST - 1]
-    assert loops.Repeats(tape, few).rows(few) == []
+    assert loops.Repeats(tape, good).rows(good[: loops.FEWEST - 1]) == []
+
+
+def test_copies_are_compared_once() -> None:
+    """Sixty squares of squares, of which one begins elsewhere: either factor of each would be compared again."""
+    tape = Tape()
+    towers = parameters(tape, [*range(7), 9])
+    for _ in range(60):
+        towers = [tape.multiply(tower, tower) for tower in towers]
+    template = loops.Template(tape, 8)
+    assert template.add(towers[:7]) is not None and template.add(towers) is None
+    x = tape.leaf(Op.VARIABLE, 0)  # a sum whose first term is the second one's in the last copy, by the order of nodes
+    early = tape.apply(Op.SIN, tape.leaf(Op.PARAMETER, 107))
+    sums = [
+        tape.add(tape.multiply(x, tape.leaf(Op.PARAMETER, k)), tape.apply(Op.SIN, tape.leaf(Op.PARAMETER, 100 + k)))
+        for k in range(8)
+    ]
+    assert tape.a[sums[7]] == early != tape.a[sums[6]] == tape.multiply(x, tape.leaf(Op.PARAMETER, 6))
+    assert loops.Repeats(tape, sums).rows(sums) == [range(8)]
 
 
 def test_what_ends_depend_on_is_not_live() -> None:

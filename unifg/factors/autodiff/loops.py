@@ -103,10 +103,13 @@ class Template:
         self.slots.append(slot)
         return len(self.slots) - 1
 
-    def _matches(self, slot: int, node: int, k: int, seen: dict[int, int]) -> bool:
-        """Test whether a node is the k-th copy of a slot."""
-        if slot in seen:
-            return seen[slot] == node
+    def _matches(self, slot: int, node: int, k: int, known: dict[tuple[int, int], bool]) -> bool:
+        """Test whether a node is the k-th copy of a slot; what is known is not compared again."""
+        if (slot, node) not in known:
+            known[slot, node] = self._compared(slot, node, k, known)
+        return known[slot, node]
+
+    def _compared(self, slot: int, node: int, k: int, known: dict[tuple[int, int], bool]) -> bool:
         tape, (op, a, b, c) = self._tape, self.slots[slot]
         if op == INVARIANT:
             return node == a
@@ -116,11 +119,10 @@ class Template:
             return tape.a[node] == a + k * b
         given = tape.a[node], tape.b[node], tape.c[node]
         orders = [given, (given[1], given[0], given[2])] if op in _COMMUTES else [given]
-        for order in orders:
-            if all(s < 0 or self._matches(s, i, k, seen) for s, i in zip((a, b, c), order, strict=True)):
-                seen[slot] = node
-                return True
-        return False
+        return any(
+            all(s < 0 or self._matches(s, i, k, known) for s, i in zip((a, b, c), order, strict=True))
+            for order in orders
+        )
 
 
 class Sum(NamedTuple):
