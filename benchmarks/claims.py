@@ -84,6 +84,7 @@ def summary(cases: list[Case], names: Iterable[str]) -> str:
 
     columns: dict[str, Callable[[Mine], str]] = {
         "converged": lambda mine: f"{len(solved(mine))} / {len(mine)}",
+        "degenerate": lambda mine: str(sum(a.status == "DEGENERATE" for _, a in mine)),
         "false": lambda mine: str(sum(a.claim == "false" for _, a in solved(mine))),
         "largest exact KKT number": worst,
         "infeasible: true / saddle / false": dead,

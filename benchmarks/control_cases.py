@@ -17,6 +17,7 @@ from benchmarks.cold import PEERS, Outcome, Results, Rules
 from benchmarks.report import table
 from benchmarks.runner import Timing
 from problems.control import blocked, problems
+from unifg.solution.status import Status
 from unifg.solvers.names import backends
 
 RULES = Rules(tolerance=1e-4, same=1e-4, slow=300.0, peers=PEERS)
@@ -28,6 +29,7 @@ def render(results: Results, rounds: int) -> str:
     """The cold solves as Markdown."""
     counted: dict[str, Callable[[Outcome], bool]] = {
         "converged": lambda outcome: outcome.status == "converged",
+        "degenerate": lambda outcome: outcome.status == "degenerate",
         "listed optimum or lower": lambda outcome: outcome.verdict(RULES).startswith(("listed", "lower")),
     }
     notes = (
@@ -51,17 +53,18 @@ def starts(count: int) -> str:
             for name, run in runs.items():
                 solution = run.solve({stated.x: states, stated.u: controls})
                 cost = solution.cost / problem.optima[0] if solution.converged else np.nan
-                rows.append((name, problem.title, solution.converged, solution.iterations, cost))
-    frame = pd.DataFrame(rows, columns=["solver", "case", "converged", "iterations", "cost"])
+                rows.append((name, problem.title, solution.status, solution.iterations, cost))
+    frame = pd.DataFrame(rows, columns=["solver", "case", "status", "iterations", "cost"])
     lines = [
         (
-            name, case, f"{found['converged'].sum()} / {count}",
+            name, case,
+            *(f"{(found['status'] == status).sum()} / {count}" for status in (Status.CONVERGED, Status.DEGENERATE)),
             f"{found['iterations'].median():.0f}, {found['iterations'].max()}",
             f"{found['cost'].min():.3f} to {found['cost'].max():.3f}",
         )
         for (name, case), found in frame.groupby(["solver", "case"], sort=False)
     ]  # fmt: skip
-    head = ("solver", "case", "converged", "iterations, median and most", "cost / listed optimum")
+    head = ("solver", "case", "converged", "degenerate", "iterations, median and most", "cost / listed optimum")
     notes = (
         f"{count} guesses for each case: the cold guess with every state moved by a normal tangent step (unicycle "
         f"0.3 m, 0.5 rad; quadrotor 0.3 m, 0.3 rad, 0.5 m/s) and every control by 0.3, or 0.5 rad/s and 1 m/s^2. "

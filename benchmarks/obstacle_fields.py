@@ -25,6 +25,7 @@ from benchmarks.runner import Study
 from problems.control import Stated, Unicycle
 from unifg.models import obstacles
 from unifg.models.potential import Sense, potential
+from unifg.solution.status import Status
 from unifg.solvers.names import backends
 from unifg.typing import Array
 
@@ -148,6 +149,7 @@ def measure(cell: Cell) -> Row:
     given = 0.5 * float(field.stage @ field.error(states[0], reference[0]) ** 2)  # of the first pose, which is fixed
     return {
         "solved": solution.converged,
+        "degenerate": solution.status is Status.DEGENERATE,
         "free": bool(max(map(field.penetration, states)) <= CONTACT),
         "reached": float(np.linalg.norm(states[-1, :2] - reference[-1, :2])) < NEAR_END,
         "cost": solution.cost - pushed - given,
@@ -156,7 +158,7 @@ def measure(cell: Cell) -> Row:
     }
 
 
-FACTS = ["solved", "free", "reached", "passed", "passed and solved"]
+FACTS = ["solved", "degenerate", "free", "reached", "passed", "passed and solved"]
 
 
 def tables(rows: list[Row]) -> str:

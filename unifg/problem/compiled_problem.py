@@ -26,6 +26,7 @@ from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
 from unifg.problem.binding import Binding
+from unifg.problem.branches import Branches
 from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
 from unifg.problem.evaluation import LinearArrays
@@ -130,7 +131,7 @@ class CompiledProblem:
         self.buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
         self._watched: list[CompiledTerm] = []
         self.verifications: list[Verification] = []
-        self._watching, self._watchers = False, list[Verification]()
+        self._watching, self._branches = False, Branches(self.table, (), self.scratch)
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
@@ -285,12 +286,15 @@ class CompiledProblem:
         def move(length: float) -> Values:
             return self.retract(values, length * step)
 
-        for verification in self.verifications:
-            term = verification.term
-            if why := verification.difference(values, direction, move, slopes):
-                term.leave(why)
-                self._give_up(term)
-                found[term.name] = why
+        with np.errstate(all="ignore"):
+            differences = [
+                verification.difference(values, direction, move, slopes) for verification in self.verifications
+            ]
+        for verification, why in zip(self.verifications, differences, strict=True):
+            if why:
+                verification.term.leave(why)
+                self._give_up(verification.term)
+                found[verification.term.name] = why
         if found:
             self.renew_verifications()
         return found
@@ -302,7 +306,7 @@ class CompiledProblem:
 
     def new_branches(self, values: Values, verified: bool) -> bool:
         """Test whether comparisons in watched traces come out as at no verified answer; ``verified``: this is one."""
-        return any([watcher.new_branches(values, verified) for watcher in self._watchers])
+        return self._branches.new(values, verified)
 
     def renew_verifications(self) -> None:
         """Keep what verifies the present traces."""
@@ -310,7 +314,8 @@ class CompiledProblem:
         self.verifications = [
             kept.get((term, term.trace.kernel)) or Verification(term) for term in self.terms if term.trace is not None
         ]
-        self._watchers = [known for known in self.verifications if self._watching and known.watch()]
+        if self._watching:
+            self._branches = Branches(self.table, [known.term for known in self.verifications], self.scratch)
 
     def _give_up(self, term: CompiledTerm) -> None:
         """Leave a term that was traced to Python."""

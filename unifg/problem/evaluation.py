@@ -104,7 +104,7 @@ def gather_variables(
 
 
 @inlined
-def _run(
+def run_kernel(
     term: IntArray, where: int, i: int, gather: IntArray, sizes: IntArray, parameters: Array, values: Array,
     scratch: Array, r: Array, J: Array,
 ) -> None:  # fmt: skip
@@ -157,7 +157,9 @@ def evaluate(
             if term[ACTIVE] >= 0 and active[term[ACTIVE] + i] == 0:
                 r[:] = 0.0
             elif term[ADDRESS] != 0:
-                _run(term, term[ADDRESS], i, gather, sizes, parameters, values, scratch, r, matrix(scratch, 0, 0, 0))
+                run_kernel(
+                    term, term[ADDRESS], i, gather, sizes, parameters, values, scratch, r, matrix(scratch, 0, 0, 0)
+                )
             if kind == COST:
                 whiten(term[WHITEN], whiteners, term[WHITENER], i, r, matrix(scratch, 0, 0, 0))
                 squared = 0.0
@@ -210,10 +212,10 @@ def linearize_share(
                 J[:] = 0.0
             elif where != 0:
                 if term[KEEP] < 0:
-                    _run(term, where, i, gather, sizes, parameters, values, scratch, r, J)
+                    run_kernel(term, where, i, gather, sizes, parameters, values, scratch, r, J)
                 else:
                     full = matrix(scratch, term[STORAGE], m, term[KERNEL_WIDTH])
-                    _run(term, where, i, gather, sizes, parameters, values, scratch, r, full)
+                    run_kernel(term, where, i, gather, sizes, parameters, values, scratch, r, full)
                     for a in range(m):
                         for d in range(width):
                             J[a, d] = full[a, sizes[term[KEEP] + d]]

@@ -103,6 +103,7 @@ class TermTable:
 
     Attributes:
         arrays: for the compiled loops.
+        fields: (T + S, FIELDS) one row per term, those of costs that are no squares last.
         residuals, weights: number of rows of all costs, number of robust factors.
         scalars: number of factors of costs that are no squares.
         constraints: number of constraint rows.
@@ -123,7 +124,7 @@ class TermTable:
         self._owned: dict[CompiledTerm, Kernel | None] = {}
         self._second = False
         self._columns = columns
-        self._fields = fields = np.zeros((len(self._terms), FIELDS), dtype=np.int64)
+        self.fields = fields = np.zeros((len(self._terms), FIELDS), dtype=np.int64)
         gather, sizes, tangent = [], [], []
         parts: list[tuple[int, ...]] = []
         starts = {"gather": 0, "sizes": 0, "tangent": 0, "positions": 0, "parameters": 0, "whiteners": 0, "active": 0}
@@ -220,7 +221,7 @@ class TermTable:
 
     def pairs_at(self, positions: IntArray) -> bool:
         """Test whether terms whose loops are of fixed size could have them at other places, too."""
-        rows = zip(self._fields, self._terms, strict=True)
+        rows = zip(self.fields, self._terms, strict=True)
         return all(self._paired(row, term, positions) == row[PAIRED] for row, term in rows if row[PAIRED])
 
     def _paired(self, row: IntArray, term: CompiledTerm, positions: IntArray) -> int:
@@ -241,11 +242,11 @@ class TermTable:
         self.__dict__.update(state)
         self._owned = {}
         arrays = self.arrays
-        self._fields = np.concatenate([arrays.fields, arrays.scalars])
-        self._fields[:, [ADDRESS, SECOND, TABLE, TABLE_SIZE]] = 0
+        self.fields = np.concatenate([arrays.fields, arrays.scalars])
+        self.fields[:, [ADDRESS, SECOND, TABLE, TABLE_SIZE]] = 0
         first = len(arrays.fields)
-        self.arrays = arrays._replace(fields=self._fields[:first], scalars=self._fields[first:])
-        for row, term in zip(self._fields, self._terms, strict=True):
+        self.arrays = arrays._replace(fields=self.fields[:first], scalars=self.fields[first:])
+        for row, term in zip(self.fields, self._terms, strict=True):
             term.place = row
 
     def renew(self, term: CompiledTerm) -> None:
@@ -253,6 +254,10 @@ class TermTable:
         assert term.kernel is not None
         self._take(term)
         term.place[PARTS] = 0 if term.kernel.linear else len(movable_parts(term.kernel.manifolds))
+
+    def row_of(self, term: CompiledTerm) -> int:
+        """Number of the row of a term in ``fields``."""
+        return self._terms.index(term)
 
     def without(self, terms: Sequence[CompiledTerm]) -> TermArrays:
         """The arrays for a pass in which residuals and Jacobians of some terms are there already."""
@@ -290,7 +295,7 @@ class TermTable:
         """Copy limits and everything that some terms have bound; their parameters live here from then on."""
         arrays = self.arrays
         arrays.lower[:], arrays.upper[:] = lower, upper
-        for row, term, start in zip(self._fields, self._terms, self._active_starts, strict=False):
+        for row, term, start in zip(self.fields, self._terms, self._active_starts, strict=False):
             if term not in rebound:
                 continue
             parameters = arrays.parameters[row[PARAMETER] : row[PARAMETER] + term.parameters.size]

@@ -10,9 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
 from unifg.factors.autodiff.derived import NO_SLOPES
 from unifg.factors.kernel import evaluate_rows
@@ -27,8 +25,6 @@ ALIKE = 1e-9  # relative difference of values at which nothing else is looked at
 MARGIN = 4.0  # times the disagreement of two steps
 RELATIVE = 1e-6  # of a slope
 ROUNDINGS = 64.0
-REMEMBERED = 4096  # outcomes of a factor's comparisons, of each term
-PROBES = 64  # of the table of outcomes
 
 Move = Callable[[float], Values]
 """Values after a step of some length along a fixed direction."""
@@ -50,21 +46,6 @@ class Verification:
         self._places: IntArray = np.concatenate(places, axis=1)
         self._columns: IntArray = np.concatenate(term.columns, axis=1)
         self._rows, self._slopes = np.empty((term.count, term.size)), np.empty((0, 0, 0))
-        self._watch, self._conditions, self._seen = 0, 0, np.zeros(REMEMBERED, dtype=np.uint64)
-
-    def watch(self) -> bool:
-        """Compile the comparisons in the trace, for :meth:`new_branches` in a loop; True if there are any."""
-        if not self._watch and (chosen := self.kernel.expression.conditions) is not None:
-            self._watch = chosen.residual().address
-            self._conditions = len(chosen.rows)
-        return self._watch != 0
-
-    def new_branches(self, values: Values, verified: bool) -> bool:
-        """Test whether the comparisons of a factor come out as those of no factor did at a verified answer."""
-        term, table = self.term, self.kernel.table
-        return _new_outcomes(
-            self._watch, values.flat, self._places, term.packed, table, self._conditions, self._seen, verified
-        )
 
     def difference(self, values: Values, direction: Array, move: Move, slopes: bool) -> str:
         """Reason for which the trace is not the function at these values; empty where it is.
@@ -84,19 +65,16 @@ class Verification:
             points = term.points(values)
             theirs = batch.original(points)
             self._evaluate(self.kernel.address, values, self._rows, NO_SLOPES)
-            with np.errstate(all="ignore"):
-                if not (np.abs(self._rows - theirs) <= ALIKE * np.abs(theirs)).all():
-                    wrong = self._active(trace.differs(batch, points, theirs))
-                    if wrong.any():
-                        beside = term.points(move(BESIDE))
-                        wrong &= trace.differs(batch, beside, batch.original(beside))
-                    if wrong.any():
-                        return (
-                            f"at factor {int(np.argmax(wrong))} of an answer, what was traced is not what it computes"
-                        )
-                if not slopes or batch.single is not None:  # of one factor, the slopes are those of the source
-                    return ""
-                wrong = self._wrong_slopes(batch, values, theirs, direction, move)
+            if not (np.abs(self._rows - theirs) <= ALIKE * np.abs(theirs)).all():
+                wrong = self._active(trace.differs(batch, points, theirs))
+                if wrong.any():
+                    beside = term.points(move(BESIDE))
+                    wrong &= trace.differs(batch, beside, batch.original(beside))
+                if wrong.any():
+                    return f"at factor {int(np.argmax(wrong))} of an answer, what was traced is not what it computes"
+            if not slopes or batch.single is not None:  # of one factor, the slopes are those of the source
+                return ""
+            wrong = self._wrong_slopes(batch, values, theirs, direction, move)
         except GraphError:
             raise
         except Exception as error:
@@ -138,40 +116,3 @@ class Verification:
 
     def _active(self, wrong: BoolArray) -> BoolArray:
         return wrong if self.term.active is None else wrong & self.term.active
-
-
-@compiled
-def _new_outcomes(
-    where: int,
-    flat: Array,
-    places: IntArray,
-    parameters: Array,
-    table: Array,
-    conditions: int,
-    seen: NDArray[np.uint64],
-    enter: bool,
-) -> bool:
-    """Test whether a factor's comparisons come out as a hash table has not seen; they may be entered into it."""
-    variables, outcomes, no_slopes = np.empty(places.shape), np.empty((len(places), conditions)), np.empty((0, 0, 0))
-    for i in range(places.shape[0]):
-        for j in range(places.shape[1]):
-            variables[i, j] = flat[places[i, j]]
-    evaluate_rows(where, variables, parameters, table, outcomes, no_slopes)
-    new = False
-    for i in range(outcomes.shape[0]):
-        key = np.uint64(14695981039346656037)  # FNV-1a
-        for j in range(outcomes.shape[1]):
-            bit = np.uint64(2) if outcomes[i, j] > 0.5 else np.uint64(1)
-            key = (key ^ bit) * np.uint64(1099511628211)
-        key |= np.uint64(1)  # zero is an empty place
-        place = np.int64(key >> np.uint64(32)) % len(seen)
-        for _ in range(PROBES):
-            if seen[place] == key:
-                break
-            if seen[place] == np.uint64(0):
-                if enter:
-                    seen[place] = key
-                new = True
-                break
-            place = (place + 1) % len(seen)
-    return new

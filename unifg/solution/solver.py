@@ -41,7 +41,7 @@ Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
 EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new branches
-AT_ONCE, LATER = 4, 128  # verifications of new branches: so many without delay, then one in so many solves
+AT_ONCE, LATER = 4, 256  # verifications of new branches: so many without delay, then one in so many solves
 FEW = 3  # iterations that are asked for as such, one after the other in a control loop
 WITHOUT_SUCCESS = (
     Status.ITERATION_LIMIT,
@@ -503,7 +503,7 @@ class Prepared:
 
     Answers are verified by evaluating traced functions as written. Values: in solves 1, 2, 4, ..., in every 100th, and
     after solves in which comparisons of a trace come out as at no verified answer: four times at once, then once in
-    128 solves. Derivatives: in solves 1, 2, 4, ... A term whose trace differs is left to Python, and the solve is
+    256 solves. Derivatives: in solves 1, 2, 4, ... A term whose trace differs is left to Python, and the solve is
     repeated from there. Where the time limit has passed, the next answer is verified instead.
 
     Attributes:
@@ -593,8 +593,7 @@ class Prepared:
             return solution
         values = solution._lin.values
         due = slopes or self._solves % EVERY == 0 or self._owed
-        new = not due and program.new_branches(values, False)
-        if new and self._of_branches < AT_ONCE + self._solves // LATER:
+        if not due and self._of_branches < AT_ONCE + self._solves // LATER and program.new_branches(values, False):
             due = True
             self._of_branches += 1
         self._owed = due and run.out_of_time  # verified after the next solve that leaves time for it
