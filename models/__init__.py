@@ -22,12 +22,7 @@ __all__ = [
     "odometry",
     "potential",
     "preintegration",
-    "profile",
     "quadrotor",
-    "quadrotor_dynamics",
-    "quadrotor_loops",
-    "quadrotor_second",
-    "rigid",
     "rkmk",
     "space_landmarks",
     "spline",
@@ -37,7 +32,6 @@ __all__ = [
     "trajectory",
     "uncertainty",
     "unicycle",
-    "universal",
     "vehicle",
 ]
 

@@ -27,14 +27,7 @@ from unifg.lie import Rn
 from unifg.models.profile import plain
 from unifg.typing import Array
 
-__all__ = [
-    "cylinder_clearance",
-    "inverse_distance",
-    "inverse_distance_root",
-    "landmark_clearance",
-    "segment_clearance",
-    "sphere_clearance",
-]
+__all__ = ["cylinder_clearance", "inverse_distance", "inverse_distance_root", "sphere_clearance"]
 
 
 NEAR = 1e-9  # distance below which there is no direction; gradient and curvature are zero

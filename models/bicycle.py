@@ -22,6 +22,8 @@ from unifg.models import rkmk
 from unifg.models.rkmk import Field
 from unifg.typing import Array
 
+__all__ = ["STATE", "Bicycle", "dynamics", "field"]
+
 STATE = Product(pose=SE2, speed=Rn(1))
 CONTROL = Rn(2)
 

@@ -20,6 +20,8 @@ from unifg.models import rkmk
 from unifg.models.rkmk import Field
 from unifg.typing import Array
 
+__all__ = ["STATE", "CartPole", "dynamics", "field"]
+
 STATE = Product(cart=Rn(1), pole=SO2, rates=Rn(2))
 """Storage (q, theta, q', theta') [m, rad, m/s, rad/s]."""
 FORCE = Rn(1)

@@ -22,6 +22,8 @@ from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
 from unifg.typing import Array, ArrayLike, BoolArray
 
+__all__ = ["DistanceMap", "SmoothField"]
+
 HEADER = 8  # numbers in front of the cells of a table
 RING = 2  # cells repeated around the grid
 PIECE, BESIDE = 2048, 512  # cells to a side that are measured at once, and beyond them

@@ -35,6 +35,8 @@ from unifg.models.rigid import motion_parts
 from unifg.models.stamped import Present, by_handle, state_whole
 from unifg.typing import Array, ArrayLike
 
+__all__ = ["InertialMeasurements", "motion", "specific_force"]
+
 STILL = 1e-6  # standard deviation of each row, and of biases, over a step of no duration
 
 

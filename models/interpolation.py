@@ -25,6 +25,8 @@ from unifg.errors import ModelError
 from unifg.lie import SE23, SO3, LieGroup, Manifold, Product, Rn
 from unifg.typing import Array
 
+__all__ = ["cubic", "geodesic"]
+
 Interpolation: TypeAlias = Callable[[Array, Array, Array, Array], Array]
 """``between(x, y, s, h)``: (n, storage) states at the fractions s (n,) of steps of h (n,) [s] from x to y."""
 

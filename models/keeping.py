@@ -24,7 +24,7 @@ from unifg.modeling.terms import prepare_arguments
 from unifg.modeling.variables import Family
 from unifg.typing import Array
 
-__all__ = ["Form", "Kept", "Use", "aligned", "grid", "hinge", "keep"]
+__all__ = ["aligned", "grid", "hinge", "keep"]
 
 Form: TypeAlias = Literal["hinge", "hard", "slack", "exact slack"]
 WEIGHT = 1e6  # of the squared slack: a multiplier of 1000 /m moves the boundary by a millimetre

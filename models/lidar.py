@@ -20,6 +20,8 @@ from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap, bilinear
 from unifg.typing import Array, BoolArray
 
+__all__ = ["endpoint", "endpoint_loss", "in_world"]
+
 DISCARD_BEYOND = 0.3  # [m] to the nearest surface
 DROP_BEYOND = 10.0  # [m] range
 NEAR_WEIGHT = 0.25

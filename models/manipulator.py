@@ -21,6 +21,8 @@ from unifg.models import rkmk
 from unifg.models.rkmk import Field
 from unifg.typing import Array
 
+__all__ = ["STATE", "Arm", "dynamics", "field"]
+
 STATE = Product(shoulder=SO2, elbow=SO2, rates=Rn(2))
 """Storage (q_1, q_2, q_1', q_2') [rad, rad, rad/s, rad/s]."""
 TORQUES = Rn(2)

@@ -14,6 +14,8 @@ import numpy as np
 from unifg.lie import wrap_angle
 from unifg.typing import Array, BoolArray, IntArray
 
+__all__ = ["NEW", "Gates", "nearest"]
+
 NEW = -1
 """Seen for the first time."""
 

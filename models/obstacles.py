@@ -17,6 +17,8 @@ from unifg.models.distance_map import SmoothField, smooth
 from unifg.models.profile import of_distance
 from unifg.typing import Array
 
+__all__ = ["disc_clearance", "shortfall", "wall_distance"]
+
 disc_clearance = residual(
     StatedKernel(to_balls, (SE2, 2, 1), partial(count, "disc clearance", 2, "pose"), name="disc clearance"),
     about="""``disc_clearance(x, centre, radius)``: |p - c| - r [m], one column per disc, (n, M).

@@ -11,6 +11,8 @@ from unifg.lie import SE2
 from unifg.models import unicycle
 from unifg.typing import Array, ArrayLike
 
+__all__ = ["OdometryNoise", "driven", "held", "predict"]
+
 
 @dataclass(frozen=True)
 class OdometryNoise:

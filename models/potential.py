@@ -33,6 +33,8 @@ from unifg.factors.residuals import Residual
 from unifg.models.profile import of_distance
 from unifg.typing import Array
 
+__all__ = ["potential"]
+
 SCALE = 0.075  # [m], the paper's k
 NEAR = 0.05  # [m], its mu
 FAR = 0.8  # [m], its rho

@@ -32,6 +32,8 @@ from unifg.lie import SE23, SO3, Product, Rn, se3, se23, so3
 from unifg.lie.series import c_slope, c_value
 from unifg.typing import Array, ArrayLike
 
+__all__ = ["BIAS", "ImuNoise", "Preintegrated", "at_rest", "predict", "preintegrate"]
+
 BIAS = Product(gyro=Rn(3), accelerometer=Rn(3))
 """What the sensors show too much of: rates [rad/s] and specific forces [m/s^2], in the axes of the body."""
 GRAVITY = (0.0, 0.0, -9.81)

@@ -20,8 +20,6 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual, residual
 from unifg.typing import Array
 
-__all__ = ["of_distance"]
-
 Profile: TypeAlias = Callable[[float, Array], tuple[float, float]]
 
 

@@ -36,9 +36,7 @@ __all__ = [
     "DRAG",
     "GRAVITY",
     "MASS",
-    "NOISE",
     "STATE",
-    "UPDRAFT",
     "WIND",
     "Parameters",
     "disturbed_dynamics",
@@ -48,7 +46,6 @@ __all__ = [
     "hover",
     "hover_attitude",
     "rollout",
-    "step",
 ]
 
 STATE = Product(p=Rn(3), R=SO3, v=Rn(3))

@@ -23,8 +23,6 @@ from unifg.lie import SO3, Product, Rn
 from unifg.models import quadrotor
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["STATE", "defect", "field", "held"]
-
 STATE = Product(p=Rn(3), R=SO3, v=Rn(3), rate=Rn(3), spin=Rn(3), thrust=Rn(1))
 """Storage 17 numbers, of which the first ten are those of :data:`unifg.models.quadrotor.STATE`; tangent 16."""
 

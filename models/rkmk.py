@@ -47,6 +47,8 @@ from unifg.lie.functions import functions_of
 from unifg.models.tableau import METHODS, Tableau
 from unifg.typing import Array, ArrayLike
 
+__all__ = ["advance", "integrator", "rollout", "trapezoid", "unicycle_field"]
+
 Field: TypeAlias = Callable[..., Array]
 Rows: TypeAlias = Sequence[Sequence[float]]
 Form: TypeAlias = Literal["full", "simplified"]

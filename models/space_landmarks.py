@@ -27,6 +27,8 @@ from unifg.lie import SE3, SO3, Manifold, Rn
 from unifg.models.rigid import pose_parts
 from unifg.typing import Array, ArrayLike
 
+__all__ = ["bearing_3d", "bearing_range_3d", "observe_3d"]
+
 ACROSS = 1e-12  # sine below which a direction straight behind is taken to be off along the first axis
 
 

@@ -28,6 +28,8 @@ from unifg.factors.autodiff.lookup import Lookup
 from unifg.models.distance_map import DistanceMap
 from unifg.typing import Array, ArrayLike
 
+__all__ = ["SplineCurve", "SplineField"]
+
 BEYOND = 3  # steps outside the grid after which nothing changes
 RING = 16  # cells of a map repeated around it: what a kink at its border stirs up has died away there
 PAD = BEYOND  # coefficients repeated on each side

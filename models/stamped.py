@@ -23,6 +23,8 @@ from unifg.modeling.variables import Data, Family, Variable, as_selection
 from unifg.models.interpolation import Interpolation, geodesic
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
+__all__ = ["Counts", "StampedMeasurements"]
+
 CLOSE = 1e-6  # of a step: how far from a node a stamp still falls on it
 
 

@@ -22,6 +22,8 @@ import numpy as np
 from unifg.errors import ModelError
 from unifg.typing import Array
 
+__all__ = ["Tableau"]
+
 
 @dataclass(frozen=True)
 class Tableau:

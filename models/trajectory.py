@@ -36,6 +36,8 @@ from unifg.lie import LieGroup
 from unifg.modeling.variables import Family
 from unifg.typing import Array, ArrayLike, IntArray
 
+__all__ = ["CubicTrajectory"]
+
 Function: TypeAlias = Callable[[Array, Array, Array, Array, Array], Array]
 ORDER = 4  # control poses that hold a moment
 NUDGE = 1e-3  # of the differences that brackets are rounded from

@@ -31,6 +31,8 @@ import numpy as np
 from unifg.lie import SE2
 from unifg.typing import Array
 
+__all__ = ["confident_clearance", "packed", "pose_recursion", "unpacked", "updated"]
+
 NEAR = 1e-3  # [m]: distances and deviations are rounded off below it, where they have no slope
 
 

@@ -19,6 +19,8 @@ from unifg.lie.so2 import wrap
 from unifg.modeling.factors import difference
 from unifg.typing import Array, ArrayLike
 
+__all__ = ["dynamics", "rate", "rollout", "step", "tracking"]
+
 state = SE2
 """Manifold of the state."""
 

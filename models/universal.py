@@ -28,8 +28,6 @@ from unifg.lie import SO3, Rn
 from unifg.models import quadrotor
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["CONTROL", "consistency", "covariance", "dynamics", "excess", "field", "hover", "increments", "step"]
-
 CONTROL = Rn(6)
 """Rates [rad/s], 3, and accelerations without gravity [m/s^2], 3, along the axes of the body."""
 

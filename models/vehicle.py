@@ -19,6 +19,8 @@ from unifg.factors.residuals import Residual, residual
 from unifg.lie import Rn
 from unifg.typing import Array, ArrayLike
 
+__all__ = ["Vehicle", "dynamics"]
+
 SPEED = Rn(1)
 FORCE = Rn(1)
 

@@ -18,7 +18,7 @@ NOTEBOOKS = sorted((CHECKOUT / "docs" / "notebooks").glob("*.ipynb"))
 ROOMS = ("unifg", "unifg.solvers", "unifg.horizon", "unifg.smoothing", "unifg.pose_graphs", "unifg.view", "unifg.lie")
 """Their names are public where they are listed."""
 SHELVES = ("unifg.models", "unifg.files")
-"""Their modules are."""
+"""The modules that they list are."""
 ALONE = ("unifg.errors", "unifg.solution.status", "unifg.solution.solver", "unifg.solvers.names")
 MOVED = {
     "](../../README.md": "](../readme.md",
@@ -64,7 +64,7 @@ def _told(notebook: Path) -> str:
 @cache
 def public() -> dict[str, list[str]]:
     """Public names by module."""
-    shelved = [f"{shelf}.{path.stem}" for shelf in SHELVES for path in sorted(folder(shelf).glob("[!_]*.py"))]
+    shelved = [f"{shelf}.{module}" for shelf in SHELVES for module in names_of(shelf)]
     found = {module: names_of(module) for module in (*ROOMS, *shelved, *ALONE)}
     return {module: names for module, names in found.items() if names}
 
