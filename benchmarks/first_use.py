@@ -16,6 +16,7 @@ import tempfile
 from pathlib import Path
 
 from benchmarks.report import table
+from unifg.codegen.cache_folder import VARIABLE
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 BACKENDS = {
@@ -44,7 +45,7 @@ print(json.dumps([time.process_time() - begin, len(tally.compiled), len(tally.ge
 
 def measured(makes: list[str], way: str, cache: str) -> tuple[float, int, int]:
     """Processor time [s] of the solves of a fresh process, and how many functions it compiled and generated."""
-    environment = {**os.environ, "NUMBA_CACHE_DIR": cache, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    environment = {**os.environ, VARIABLE: cache, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", CHILD, json.dumps(makes), way],
         cwd=CHECKOUT, env=environment, capture_output=True, text=True, check=True,

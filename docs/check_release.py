@@ -157,7 +157,7 @@ class Failed(SystemExit):
 def run(*command: str | Path, cwd: Path, **environment: str) -> str:
     """Run a command, without what leads Python elsewhere; what it said, if it fails."""
     kept = {
-        k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "NUMBA_CACHE_DIR")
+        k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "UNIFG_CACHE_DIR")
     }
     done = subprocess.run(
         [str(part) for part in command],

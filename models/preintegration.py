@@ -255,7 +255,7 @@ def _integrate(
 ) -> None:  # fmt: skip
     """All intervals; what is written begins as the identity, zeros and infinity."""
     Y, back, G, A = np.empty(10), np.empty(10), np.empty((9, 6)), np.empty((9, 9))
-    w, a = np.empty(3), np.empty(3)
+    w, a, carried = np.empty(3), np.empty(3), np.empty((9, 9))
     first = 0
     for n in range(len(times) - 1):
         if len(stamps) == 0 or stamps[0] > times[n] + CLOSE * (times[n + 1] - times[n]):
@@ -280,11 +280,26 @@ def _integrate(
             for i in range(9):
                 for j in range(3):
                     A[i, 3 + j] += h * A[i, j]
-            by_bias[n] = A @ by_bias[n] - G
-            covariance[n] = A @ covariance[n] @ A.T
+            _products(A, by_bias[n], carried)
+            for i in range(9):
+                for j in range(6):
+                    by_bias[n, i, j] = carried[i, j] - G[i, j]
+            _products(A, covariance[n], carried)
+            _products(A, carried.T, covariance[n])
             _add_noise(G, density, h, covariance[n])
             now, k = until, k + 1
         held[n] = longest
+
+
+@compiled
+def _products(A: Array, B: Array, out: Array) -> None:
+    """Write A B into the first columns of ``out``."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            total = 0.0
+            for k in range(A.shape[1]):
+                total += A[i, k] * B[k, j]
+            out[i, j] = total
 
 
 @compiled

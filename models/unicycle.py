@@ -12,6 +12,7 @@ import numpy as np
 
 from unifg.codegen.calls import call_residual, vector
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import copy_to
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import residual
 from unifg.lie import SE2, Rn, wrap_angle
@@ -60,7 +61,8 @@ def _advance_all(where: int, x: Array, u: Array, dt: Array, out: Array) -> None:
     """Advance row by row, in order: ``out`` may be ``x`` one row further on; ``where`` is the code of ``moving``."""
     v, moves, nothing = np.empty(5), np.empty(3), np.empty((0, 0))
     for i in range(len(out)):
-        v[:3], v[3:] = x[i], u[i]
+        copy_to(x[i], v[:3])
+        copy_to(u[i], v[3:])
         call_residual(where, v, vector(dt, i, 1), moves, moves, nothing)
         out[i, 0], out[i, 1] = x[i, 0] + moves[0], x[i, 1] + moves[1]
         out[i, 2] = wrap(x[i, 2] + moves[2])

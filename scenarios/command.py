@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import re
 import shlex
+import shutil
 import signal
 import sys
 import time
@@ -28,6 +29,7 @@ from typing import Any
 
 from unifg import __version__
 from unifg.codegen import precompiled
+from unifg.codegen.cache_folder import place
 from unifg.errors import UnifgError
 from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
@@ -192,6 +194,15 @@ def _warm_up(chosen: argparse.Namespace) -> int:
     return SUCCEEDED
 
 
+def _cache(chosen: argparse.Namespace) -> int:
+    """Name the folder of what is compiled, or delete it."""
+    folder = place()
+    if chosen.clear:
+        shutil.rmtree(folder, ignore_errors=True)
+    print(folder)
+    return SUCCEEDED
+
+
 def _doctor(chosen: argparse.Namespace) -> int:
     """Examine the installation."""
     from unifg.scenarios.commands import doctor
@@ -349,6 +360,15 @@ COMMANDS = {
             "--check": {"action": "store_true", "help": "list those that are out of date; compile nothing"},
         },
         ("--ship", "--check"),
+    ),
+    "cache": Command(
+        _cache, "name or delete what is kept of compiled functions",
+        "Name the folder that keeps compiled functions from one process to the next.",
+        {
+            "--where": {"action": "store_true", "help": "print the folder (the default)"},
+            "--clear": {"action": "store_true", "help": "delete it: what is needed is generated or compiled anew"},
+        },
+        ("--where", "--clear"),
     ),
     "doctor": Command(
         _doctor, "examine the installation",

@@ -14,6 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import copy_to, dot
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import NEGATIVE, Plan
 from unifg.elimination.substitution import solve
@@ -196,13 +197,13 @@ def minimize(
     add_constraints(terms, constraint_jacobian, weights, settled)
     for row in range(len(weights)):
         weights[row] = penalty[row] if not equality[row] and after[row] != 0.0 else 0.0
-    value = 0.5 * float(np.dot(residual, residual)) + barrier(constraints, lower, upper, multipliers, penalty)
+    value = 0.5 * float(dot(residual, residual)) + barrier(constraints, lower, upper, multipliers, penalty)
     start = value
     for newton in range(NEWTON_STEPS):
         full[:] = 0.0
         transposed_times(terms, True, jacobian, residual, full)
         transposed_times(terms, False, constraint_jacobian, after, full)
-        curvature[:] = settled
+        copy_to(settled, curvature)
         add_constraints(terms, constraint_jacobian, weights, curvature)
         if newton == 0:
             _damping(curvature, indptr, damping, added)
@@ -213,7 +214,7 @@ def minimize(
         solve(plan, gradient, move)
         times(terms, True, jacobian, move, residual_move)
         times(terms, False, constraint_jacobian, move, constraint_move)
-        slope, length = -np.dot(gradient, move), 1.0
+        slope, length = -dot(gradient, move), 1.0
         if not np.isfinite(slope):
             return np.nan
         if curved:
@@ -226,17 +227,20 @@ def minimize(
                 residual_here[row] = residual[row] + length * residual_move[row]
             for row in range(len(constraints)):
                 constraints_here[row] = constraints[row] + length * constraint_move[row]
-            value_here = 0.5 * float(np.dot(residual_here, residual_here))
+            value_here = 0.5 * float(dot(residual_here, residual_here))
             value_here += barrier(constraints_here, lower, upper, multipliers, penalty)
             for k in range(len(step)):
                 value_here += 0.5 * added[k] * here[k] * here[k]
             if curved:
-                bow_here = bow + length * (np.dot(bent, move) + 0.5 * length * np.dot(bent_move, move))
+                bow_here = bow + length * (dot(bent, move) + 0.5 * length * dot(bent_move, move))
                 value_here += bow_here
             if value_here <= value + ARMIJO * length * slope + ROUNDING * abs(value) or length < SHORTEST:
                 break
             length *= 0.5
-        step[:], residual[:], constraints[:], value = here, residual_here, constraints_here, value_here
+        copy_to(here, step)
+        copy_to(residual_here, residual)
+        copy_to(constraints_here, constraints)
+        value = value_here
         bent += length * bent_move
         bow = bow_here
         update(constraints, lower, upper, multipliers, penalty, after)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import importlib.util
-import pickle
+import os
 import subprocess
 import sys
 import time
@@ -17,29 +17,19 @@ import numba
 import numpy as np
 import pytest
 
-from unifg.codegen import jit
+from unifg.codegen import cache_folder, jit
+from unifg.codegen.artifact import Artifact
 from unifg.codegen.jit import compiled
 from unifg.codegen.objects import read_sealed, write_sealed
 
 SOURCE = "def twice(x):\n    return 2.0 * x\n"
 
 
-class Moved:
-    """Stands for a type that an older version knew under another name."""
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """As pickled by a module that is no more."""
-        return _gone, ()
-
-
-def _gone() -> None:
-    raise ModuleNotFoundError("No module named 'unifg.where_it_was'")
-
-
 @pytest.fixture
 def twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], float]:
-    """A function in a file of its own, whose cache lies beside it."""
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    """A function in a file of its own, with a cache of its own."""
+    monkeypatch.setenv(cache_folder.VARIABLE, str(tmp_path / "cache"))
+    monkeypatch.setattr(jit, "cache_folder", cache_folder.cache_folder.__wrapped__)
     path = tmp_path / "doubling.py"
     path.write_text(SOURCE, encoding="utf-8")
     spec = importlib.util.spec_from_file_location("doubling", path)
@@ -84,14 +74,19 @@ def test_a_damaged_file_is_named_and_written_anew(
     assert after(3.0) == 6.0 and read_from_cache(after), "written anew"
 
 
-def test_code_that_names_what_has_moved_begins_anew(
-    twice: Callable[[float], float], tmp_path: Path, caplog: pytest.LogCaptureFixture
+@pytest.mark.parametrize("change", [{"result": "no such type"}, {"arguments": None}, {"symbol": "elsewhere"}])
+def test_code_whose_header_says_something_else_begins_anew(
+    twice: Callable[[float], float], tmp_path: Path, change: dict[str, Any], caplog: pytest.LogCaptureFixture
 ) -> None:
     first = compiled(twice)
     assert first(3.0) == 6.0
     (file,) = tmp_path.rglob("*.code")
-    made = first._cache._made()  # type: ignore[attr-defined]
-    write_sealed(file, made + pickle.dumps(Moved()))
+    made = first._cache._made((numba.float64,))  # type: ignore[attr-defined]
+    content = read_sealed(file)
+    assert content is not None and content.startswith(made)
+    artifact = Artifact.unpacked(content[len(made) :])
+    header = {name: value for name, value in (artifact.header | change).items() if value is not None}
+    write_sealed(file, made + artifact._replace(header=header).packed())
     again = compiled(twice)
     assert again(3.0) == 6.0 and not read_from_cache(again) and str(file) in caplog.text
     assert read_from_cache(again) or compiled(twice)(3.0) == 6.0
@@ -138,7 +133,7 @@ def test_a_full_disk_costs_the_cache_and_a_warning(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(jit, "write_sealed", full)
-    monkeypatch.setattr(jit, "_said", Event())
+    monkeypatch.setattr(cache_folder, "_said", Event())
     assert compiled(twice)(3.0) == 6.0 and compiled(twice)(3) == 6.0
     assert [record.message.count("No space left") for record in caplog.records if "kept" in record.message] == [1]
     assert not list(tmp_path.rglob("*.code"))
@@ -148,26 +143,42 @@ NOWHERE = """
 import logging, os, sys
 os.environ.pop("HOME", None)
 logging.basicConfig(level=logging.WARNING, format="%(message)s")
-from numba.core import caching
-def refuse(self):
-    raise PermissionError("read-only")
-caching._CacheLocator.ensure_cache_path = refuse
 import unifg as fg
+from unifg.codegen.cache_folder import cache_folder
 group = fg.SO2.compose([[0.5]], [[0.25]])
 assert group[0, 0] == 0.75
-graph = fg.Graph()
-assert fg.codegen.jit.folder_of(fg.factors.kernel.evaluate_rows) is None
+assert cache_folder() is None
 function = fg.compiled(eval("lambda x: 2.0 * x"))
 assert function(3.0) == 6.0
 """
 
 
 def test_without_a_folder_to_write_to_everything_works_after_one_warning(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("no folder", encoding="utf-8")
     ended = subprocess.run(
-        [sys.executable, "-c", NOWHERE], capture_output=True, text=True, cwd=Path(__file__).parent.parent, timeout=120
-    )
+        [sys.executable, "-c", NOWHERE], capture_output=True, text=True, cwd=Path(__file__).parent.parent, timeout=120,
+        env={**os.environ, cache_folder.VARIABLE: str(tmp_path / "file" / "below")},
+    )  # fmt: skip
     assert ended.returncode == 0, ended.stderr
-    assert ended.stderr.count("\n") == 1 and "NUMBA_CACHE_DIR" in ended.stderr
+    assert ended.stderr.count("\n") == 1 and cache_folder.VARIABLE in ended.stderr
+
+
+def test_a_folder_that_others_may_write_to_or_own_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv(cache_folder.VARIABLE, str(tmp_path))
+    monkeypatch.setattr(cache_folder, "_said", Event())
+    found = cache_folder.cache_folder.__wrapped__
+    folder = found()
+    assert folder is not None and folder.parent == tmp_path and folder.stat().st_mode & 0o777 == 0o700
+    folder.chmod(0o722)
+    assert found() is None and found() is None and caplog.text.count("others may write") == 1
+    folder.chmod(0o700)
+    monkeypatch.setattr(os, "getuid", lambda: -1)
+    assert found() is None
+    monkeypatch.undo()
+    monkeypatch.setenv(cache_folder.VARIABLE, "")
+    assert cache_folder.place().parent.name == "unifg" and tmp_path not in cache_folder.place().parents
 
 
 HAMMER = """
@@ -190,7 +201,8 @@ for k in range(4):
 def test_processes_compile_at_once_and_one_is_killed(tmp_path: Path) -> None:
     (tmp_path / "doubling.py").write_text(SOURCE, encoding="utf-8")
     command = [sys.executable, "-c", HAMMER, str(tmp_path / "doubling.py")]
-    runs = [subprocess.Popen(command, cwd=Path(__file__).parent.parent) for _ in range(2)]
+    place = {**os.environ, cache_folder.VARIABLE: str(tmp_path / "cache")}
+    runs = [subprocess.Popen(command, cwd=Path(__file__).parent.parent, env=place) for _ in range(2)]
     turns = tmp_path / "turns"
     while runs[0].poll() is None and not (turns.exists() and turns.stat().st_size > 1):
         time.sleep(0.01)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import gc
 import importlib.util
 import logging
+import lzma
+import re
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
@@ -13,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from unifg.codegen import compile_counter, precompiled
+from unifg.codegen import compile_counter, jit, precompiled
 from unifg.codegen.compile_counter import Tally, counting
 from unifg.codegen.jit import compiled, in_order
 
@@ -40,8 +42,10 @@ def module(path: Path, source: str) -> Any:
 
 
 @pytest.fixture(autouse=True)
-def forgotten() -> Iterator[None]:
-    """The module is nobody else's."""
+def forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The module is nobody else's, and so is the cache."""
+    (tmp_path / "kept").mkdir()
+    monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path / "kept")
     yield
     sys.modules.pop("doubling", None)
 
@@ -92,7 +96,7 @@ def test_what_has_changed_is_compiled(archive: Path, tmp_path: Path, source: str
     assert "doubling.twice" in first_use(tmp_path, source, how).compiled
 
 
-@pytest.mark.parametrize("name", ["python", "numba", "llvmlite", "platform", "instructions"])
+@pytest.mark.parametrize("name", ["llvm", "platform", "surroundings"])
 def test_an_archive_for_others_is_left_alone(
     archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
@@ -113,17 +117,58 @@ def test_an_archive_that_cannot_be_read_is_none(
     assert (f"{archive} is damaged" in caplog.text) == (content is not None)
 
 
-def test_members_that_are_damaged_are_none(archive: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    whole = archive.read_bytes()
+def rewritten(archive: Path, **changes: bytes) -> None:
+    """Replace parts of an archive."""
     with zipfile.ZipFile(archive) as file:
-        members = [info for info in file.infolist() if info.filename != precompiled.ABOUT]
-    damaged = bytearray(whole)
-    for info in members:
-        first = info.header_offset + 30 + len(info.filename)
-        damaged[first + 20 : first + info.compress_size] = bytes(info.compress_size - 20)
-    archive.write_bytes(damaged)
+        parts = {name: file.read(name) for name in file.namelist()} | changes
+    with zipfile.ZipFile(archive, "w") as file:
+        for name, data in parts.items():
+            file.writestr(name, data)
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "cut off": lambda code: code[:-40],
+    "other numbers": lambda code: lzma.compress(lzma.decompress(code).replace(b"2.000000e+00", b"3.000000e+00")),
+    "empty": lambda code: b"",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_members_that_are_damaged_are_none(
+    archive: Path, tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with zipfile.ZipFile(archive) as file:
+        rewritten(archive, **{precompiled.CODE: DAMAGES[damage](file.read(precompiled.CODE))})
     assert "doubling.twice" in first_use(tmp_path).compiled
     assert caplog.text.count(f"{archive} is damaged") == 1
+
+
+def test_nothing_of_python_is_archived() -> None:
+    """Every member that ships expects LLVM's, Numba's and C's functions alone, and holds neither objects nor errors."""
+    shipped = precompiled.Archive(precompiled.ARCHIVE)
+    assert shipped.usable
+    for key in shipped.about["members"]:
+        found = shipped.find(key)
+        assert found is not None
+        wrong = [symbol for symbol in precompiled.undefined(found[1]) if not precompiled.OUTSIDE.match(symbol)]
+        assert wrong == [], found[0]["symbol"]
+        assert not re.search(r"pickle|builtins\\94|inttoptr \(i64 \d{6,}", found[1]), found[0]["symbol"]
+
+
+def test_an_error_of_archived_code_is_raised_here(archive: Path, tmp_path: Path) -> None:
+    source = """from unifg.codegen.jit import compiled
+import numpy as np
+def twice(n):
+    return np.empty(n)[0]
+"""
+    with precompiled.recording() as recorder, pytest.raises(ValueError, match="negative"):
+        compiled(module(tmp_path / "there" / "doubling.py", source).twice)(-1)
+    recorder.write(archive)
+    precompiled.archive.cache_clear()
+    function = compiled(module(tmp_path / "here" / "doubling.py", source).twice)
+    with counting() as counted, pytest.raises(ValueError, match="arrays of other sizes"):
+        function(-1)
+    assert (counted.compiled, counted.generated) == ([], ["doubling.twice"])
 
 
 @pytest.mark.parametrize(
@@ -155,10 +200,9 @@ def test_an_archive_names_the_functions_that_have_changed_since(archive: Path, t
 
 def test_members_are_numbered_beyond_those_of_a_process(archive: Path) -> None:
     """Two functions of one name and of the same types would otherwise be one to the linker."""
-    with zipfile.ZipFile(archive) as file:
-        members = [name for name in file.namelist() if name != precompiled.ABOUT]
-        assert len(members) == 2
-        assert all(f"v{precompiled.FIRST_NUMBER}"[:4].encode() in file.read(name) for name in members)
+    members = precompiled.Archive(archive).about["members"]
+    assert len(members) == 2
+    assert all(f"v{precompiled.FIRST_NUMBER}"[:4] in member["header"]["symbol"] for member in members.values())
 
 
 def test_a_compilation_is_announced_once_and_disturbs_nothing(
@@ -170,7 +214,7 @@ def test_a_compilation_is_announced_once_and_disturbs_nothing(
         first_use(tmp_path)
         first_use(tmp_path, SOURCE.replace("+ 0.0", "+ -0.0"))
     (said,) = [record.message for record in caplog.records if record.levelno == logging.WARNING]
-    assert "doubling.twice" in said and str(tmp_path / "here") in said
+    assert "doubling.twice" in said and str(tmp_path / "kept") in said
     assert gc.get_threshold() == before
 
     @compiled

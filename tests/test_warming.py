@@ -18,7 +18,8 @@ from unifg.scenarios.commands.warm import missing
 @pytest.fixture
 def done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List of the jobs done, each of which leaves one file in a cache of its own."""
-    monkeypatch.setattr(precompile, "folder_of", lambda function: tmp_path / "cache")
+    (tmp_path / "cache").mkdir()
+    monkeypatch.setattr(precompile, "cache_folder", lambda: tmp_path / "cache")
     return []
 
 
@@ -49,8 +50,11 @@ def test_what_is_there_is_left_alone(done: list[str], tmp_path: Path, monkeypatc
     assert warmed(done, kept) and len(done) == 8
 
 
-def test_a_cache_that_cannot_be_written_is_no_error(done: list[str], tmp_path: Path) -> None:
-    (tmp_path / "cache").write_text("a file where the folder should be", encoding="utf-8")
+def test_a_cache_that_cannot_be_written_is_no_error(
+    done: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("a file where the folder should be", encoding="utf-8")
+    monkeypatch.setattr(precompile, "cache_folder", lambda: tmp_path / "file")
     assert warmed(done, tmp_path / "kept.nbi") and warmed(done, tmp_path / "kept.nbi")
 
 

@@ -19,13 +19,14 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from unifg.atomic_write import write_atomically
+from unifg.codegen.cache_folder import cache_folder
 from unifg.codegen.compile_counter import Tally, counting
-from unifg.codegen.jit import folder_of, processor
+from unifg.codegen.jit import processor
 from unifg.codegen.precompiled import versions
 from unifg.codegen.threads import cores, threads, use_threads
 from unifg.errors import UnifgError
 from unifg.factors.autodiff.stated import StatedKernel
-from unifg.factors.kernel import Kernel, evaluate_rows
+from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import DCS, Cauchy, GemanMcClure, Huber, TruncatedLeastSquares, Tukey
 from unifg.lie import SE2, SE3, SE23, SO2, SO3, Product, Rn
@@ -63,7 +64,7 @@ def perform(name: str, works: Callable[[], list[Job]], progress: Progress | None
     Returns:
         What was compiled, generated and read.
     """
-    folder, present = folder_of(evaluate_rows), _present()
+    folder, present = cache_folder(), _present()
     mark = None if folder is None else folder / f"warm-{name}.json"
     if mark is not None and not anew and _holds(mark, present):
         return Tally()

@@ -19,12 +19,10 @@ from pathlib import Path
 import numpy as np
 
 import unifg as fg
-from unifg import models, scenarios, solvers
 from unifg.codegen import precompiled
-from unifg.codegen.jit import folder_of
+from unifg.codegen.cache_folder import VARIABLE, cache_folder
 from unifg.codegen.objects import read_sealed
 from unifg.codegen.threads import cores
-from unifg.elimination import fronts
 from unifg.errors import UnifgError
 from unifg.scenarios.commands import performance
 from unifg.scenarios.commands.outcome import Progress
@@ -101,43 +99,31 @@ def _version(package: str) -> str | None:
 
 
 def _caches() -> Iterator[Finding]:
-    folder = folder_of(fronts.factor)
+    folder = cache_folder()
     if folder is None:
         yield Finding(
             "caches",
-            "no folder for compiled functions can be written: every process compiles anew; name one in NUMBA_CACHE_DIR",
+            f"no folder for compiled functions can be written: every process compiles anew; name one in {VARIABLE}",
             good=False,
         )
     else:
-        yield from _cache(_roots(folder))
+        yield from _cache(folder)
     if precompiled.archive().usable:
         changed = precompiled.outdated()
         behind = f"; {len(changed)} functions have changed since and are compiled instead" if changed else ""
-        yield Finding(
-            "caches", f"kernels that come half compiled fit this Python and Numba{behind}", not changed or None
-        )
+        yield Finding("caches", f"kernels that come half compiled fit this LLVM and Numba{behind}", not changed or None)
     else:
         yield Finding(
-            "caches", "the kernels that come half compiled are of another Python, Numba or platform: a first use "
+            "caches", "the kernels that come half compiled are of another LLVM, Numba or platform: a first use "
             "compiles, which takes minutes once (`unifg warmup`)", good=None,
         )  # fmt: skip
 
 
-def _roots(folder: Path) -> list[Path]:
-    """Below what the cache lies, when it keeps the functions of one file in a folder: the sources, or one place."""
-    rooms = [Path(next(iter(room.__path__))).resolve() for room in (fg, models, scenarios, solvers)]
-    if any(folder.is_relative_to(room) for room in rooms):
-        return rooms
-    return [Path(os.environ["NUMBA_CACHE_DIR"]) if "NUMBA_CACHE_DIR" in os.environ else folder.parent]
-
-
-def _cache(roots: list[Path]) -> Iterator[Finding]:
-    """Files of compiled functions below folders."""
-    files = sorted({file.resolve() for root in roots for file in root.rglob("*.code")})
-    writable = all(os.access(root if root.exists() else root.parent, os.W_OK) for root in roots)
+def _cache(folder: Path) -> Iterator[Finding]:
+    """Files of compiled functions in a folder."""
+    files = sorted(folder.glob("*.code"))
     size = sum(file.stat().st_size for file in files)
-    text = f"{len(files)} compiled functions, {size / 1e6:.0f} MB below {roots[0]}"
-    yield Finding("caches", f"{text}, {'writable' if writable else 'which cannot be written'}", writable)
+    yield Finding("caches", f"{len(files)} compiled functions, {size / 1e6:.0f} MB in {folder}")
     began, read, damaged = time.monotonic(), 0, list[Path]()
     for file in files:
         if time.monotonic() - began > SECONDS:

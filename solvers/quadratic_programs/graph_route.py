@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import copy_to
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
 from unifg.problem.compiled_problem import CompiledProblem
@@ -188,7 +189,7 @@ def minimize_quadratic(
         weights[:] = 0.0
         for k in range(sides):
             weights[side_row[k]] += y[k] / s[k]
-        matrix[:] = hessian
+        copy_to(hessian, matrix)
         add_constraints(terms, jacobian, weights, matrix)
         fill(kkt, matrix, jacobian, data)
         if not factor(kkt.plan, data, shift):

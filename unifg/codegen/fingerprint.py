@@ -1,30 +1,47 @@
-"""Digests of compiled functions: equal for functions that compute the same, whatever file and line they stand in.
+"""Digests of compiled functions: equal for functions that compute the same, whatever file, line and Python they have.
 
-A digest covers the bytecode of a function and of everything compiled that it calls or closes over, and the constants
-that are compiled in. Comments, docstrings, line numbers and other functions of a file do not change it.
+A digest covers the syntax of a function and of everything that it reaches: compiled functions that it calls or closes
+over, what generates the instructions of its primitives, compile flags, and the constants that are compiled in.
+Comments, docstrings, annotations, line numbers, names of modules and other functions of a file do not change it.
 """
 
 from __future__ import annotations
 
-import dis
+import ast
 import hashlib
+import json
+import os
+import zipfile
 from collections.abc import Iterator
-from functools import cache, lru_cache
-from importlib.util import find_spec
-from inspect import CO_NEWLOCALS, CO_OPTIMIZED
+from functools import cache
+from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-GENERATORS = ("calls", "function_pointers", "jit", "vectors", "views", "work_queue")
-"""Modules of this package that say what is generated for primitives and types of their own."""
-_FUNCTION = CO_OPTIMIZED | CO_NEWLOCALS
+SHIPPED, SHAPES = Path(__file__).with_name("kernels.zip"), "shapes.json"
 _CONSTANTS = (int, float, complex, str, tuple, np.ndarray, np.generic)
-_LOADS = {number for name, number in dis.opmap.items() if "CONST" in name}
 _FOREIGN = ("numpy", "math", "numba", "llvmlite")
-_FLAGS = 0xFFFF  # those of later versions say whether there is a docstring
+_GENERATORS = "unifg.codegen."  # functions of these modules are looked at though they are not compiled
+_IGNORED = {"type_params", "type_comment", "kind", "ctx", "annotation", "returns", "decorator_list"}
+
+
+class Shape(NamedTuple):
+    """Syntax of a function.
+
+    Attributes:
+        digest: of it.
+        names: that it mentions, sorted.
+    """
+
+    digest: str
+    names: tuple[str, ...]
+
+
+parsed: dict[str, dict[str, Shape]] = {}
+"""Syntax of all files that were looked at, by their digests."""
 
 
 def is_compiled(function: object) -> bool:
@@ -38,68 +55,109 @@ def source_of(function: Any) -> FunctionType:
 
 
 def fingerprint(function: Any) -> str:
-    """Digest of a function, compiled or not, and of every compiled function it calls or closes over."""
+    """Digest of a function, compiled or not, and of everything that it reaches."""
     digest = hashlib.sha256()
     for part in sorted(_parts(function, set())):
         digest.update(part.encode())
     return digest.hexdigest()
 
 
+def shape_of(code: CodeType) -> Shape:
+    """Syntax of the function with this code; its bytecode where there is no source."""
+    found = shapes(code.co_filename).get(f"{code.co_name}:{code.co_firstlineno}")
+    if found is not None:
+        return found
+    parts = (code.co_code.hex(), *(c if not isinstance(c, CodeType) else shape_of(c).digest for c in code.co_consts))
+    return Shape(hashlib.sha256(repr(parts).encode()).hexdigest(), tuple(sorted(_names(code))))
+
+
+def shapes(path: str) -> dict[str, Shape]:
+    """Syntax of all functions of a file by their names and first lines; of none where it cannot be read."""
+    try:
+        status = os.stat(path)
+        return _shapes(path, status.st_mtime_ns, status.st_size)
+    except (OSError, SyntaxError, ValueError, TypeError):
+        return {}
+
+
 @cache
-def generators() -> str:
-    """Digest of the modules that generate instructions."""
-    digest = hashlib.sha256()
-    for name in GENERATORS:
-        spec: Any = find_spec(f"{__package__}.{name}")
-        digest.update(code_digest(spec.loader.get_code(spec.name)).encode())
-    return digest.hexdigest()
+def _shapes(path: str, date: int, size: int) -> dict[str, Shape]:
+    """Syntax of a file as it was at a date."""
+    with open(path, "rb") as file:
+        content = file.read()
+    digest = hashlib.sha256(content).hexdigest()
+    found = archived().get(digest)
+    parsed[digest] = _parsed(content) if found is None else {name: Shape(*shape) for name, shape in found.items()}
+    return parsed[digest]
 
 
-@lru_cache(maxsize=4096)
-def code_digest(code: CodeType) -> str:
-    """Digest of bytecode without positions and docstrings."""
-    constants = list(code.co_consts)
-    if code.co_flags & _FUNCTION == _FUNCTION:
-        if constants and isinstance(constants[0], str) and not _loads_first(code):
-            constants[0] = None
-    elif "__doc__" in code.co_names:
-        constants[constants.index(next(c for c in constants if isinstance(c, str) and c != code.co_qualname))] = None
-    parts = (
-        code.co_code.hex(), code.co_exceptiontable.hex(), code.co_flags & _FLAGS, code.co_names, code.co_varnames,
-        code.co_freevars, code.co_cellvars, code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount,
-        *(code_digest(c) if isinstance(c, CodeType) else _constant(c) for c in constants),
-    )  # fmt: skip
-    return hashlib.sha256(repr(parts).encode()).hexdigest()
+@cache
+def archived() -> dict[str, Any]:
+    """Syntax of files as they come with the library, by their digests: what has not been edited is not parsed."""
+    try:
+        with zipfile.ZipFile(SHIPPED) as file:
+            return dict(json.loads(file.read(SHAPES)))
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile):
+        return {}
 
 
-def _loads_first(code: CodeType) -> bool:
-    """Test whether an instruction loads the first constant, which then is more than a docstring."""
-    return any(k in _LOADS and place == 0 for k, place in zip(code.co_code[::2], code.co_code[1::2], strict=True))
+def _parsed(content: bytes) -> dict[str, Shape]:
+    """Syntax of the functions of a source."""
+    found = {}
+    for node in ast.walk(ast.parse(content)):
+        if isinstance(node, ast.FunctionDef):
+            first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+            names = {inner.id for inner in ast.walk(node) if isinstance(inner, ast.Name)}
+            names |= {inner.attr for inner in ast.walk(node) if isinstance(inner, ast.Attribute)}
+            digest = hashlib.sha256(_spelled(node).encode()).hexdigest()
+            found[f"{node.name}:{first}"] = Shape(digest, tuple(sorted(names)))
+    return found
+
+
+def _spelled(node: Any) -> str:
+    """Syntax in full, without what differs between versions of Python and what computes nothing."""
+    if isinstance(node, list):
+        return f"[{', '.join(map(_spelled, node))}]"
+    if not isinstance(node, ast.AST):
+        return repr(node)
+    fields = {name: value for name, value in ast.iter_fields(node) if name not in _IGNORED and value not in (None, [])}
+    if isinstance(node, ast.FunctionDef) and ast.get_docstring(node, clean=False) is not None:
+        fields["body"] = node.body[1:]
+    return f"{type(node).__name__}({', '.join(f'{name}={_spelled(value)}' for name, value in fields.items())})"
 
 
 def _parts(function: Any, seen: set[int]) -> Iterator[str]:
-    """Digests of code, compile flags and constants of a function and its callees."""
+    """Digests of syntax, compile flags and constants of a function and of what it reaches."""
     python = source_of(function)
     if id(python) in seen:
         return
     seen.add(id(python))
+    shape = shape_of(python.__code__)
     flags = sorted(f"{name} {_constant(value)}" for name, value in getattr(function, "targetoptions", {}).items())
-    yield f"{python.__qualname__} {code_digest(python.__code__)} {_constant(python.__defaults__)} {flags}"
-    for name, found in _reached(python):
-        if is_compiled(found):
-            yield from _parts(found, seen)
+    yield f"{python.__name__} {shape.digest} {_constant(python.__defaults__)} {flags}"
+    for name, found in _reached(python, shape.names):
+        inner = found if is_compiled(found) else getattr(found, "__wrapped__", found)  # primitives wrap generators
+        if is_compiled(inner) or _generates(inner):
+            yield from _parts(inner, seen)
         elif isinstance(found, _CONSTANTS) or name in python.__code__.co_freevars:
             yield f"{name} = {_constant(found)}"
 
 
-def _reached(function: FunctionType) -> Iterator[tuple[str, Any]]:
+def _generates(found: Any) -> bool:
+    """Test for a function that helps to write instructions."""
+    return isinstance(found, FunctionType) and found.__module__.startswith(_GENERATORS)
+
+
+def _reached(function: FunctionType, names: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
     """Names that a function refers to, and what they stand for: in its closure, its module and modules it names."""
-    yield from zip(function.__code__.co_freevars, (c.cell_contents for c in function.__closure__ or ()), strict=True)
-    names, known = set(_names(function.__code__)), function.__globals__
-    for name in sorted(names & known.keys()):
-        yield name, known[name]
-        if isinstance(known[name], ModuleType) and known[name].__name__.partition(".")[0] not in _FOREIGN:
-            yield from ((f"{name}.{n}", vars(known[name])[n]) for n in sorted(names & vars(known[name]).keys()))
+    code, known = function.__code__, function.__globals__
+    yield from zip(code.co_freevars, (c.cell_contents for c in function.__closure__ or ()), strict=True)
+    own = {*code.co_freevars, *code.co_varnames, *code.co_cellvars}
+    for name in names:
+        if name in known and name not in own:
+            yield name, known[name]
+            if isinstance(known[name], ModuleType) and known[name].__name__.partition(".")[0] not in _FOREIGN:
+                yield from ((f"{name}.{n}", vars(known[name])[n]) for n in names if n in vars(known[name]))
 
 
 def _names(code: CodeType) -> Iterator[str]:

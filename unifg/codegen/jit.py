@@ -19,26 +19,24 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
-import pickle
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from threading import Event
-from typing import Any, ClassVar, TypeVar, cast
+from types import FunctionType
+from typing import Any, TypeVar, cast
 
 import llvmlite
 import numba
 from numba import types
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
-from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 
 from unifg.codegen import precompiled
+from unifg.codegen.artifact import Artifact, finished, header_of, rebuilt
+from unifg.codegen.cache_folder import cache_folder, say_not_kept
 from unifg.codegen.compile_counter import tally
-from unifg.codegen.fingerprint import fingerprint, generators
+from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.objects import read_sealed, write_sealed
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -46,8 +44,6 @@ F = TypeVar("F", bound=Callable[..., Any])
 logger = logging.getLogger("unifg")
 
 LIBERTIES = {"contract", "reassoc", "nsz", "arcp"}
-_HOME = os.path.expanduser("~") != "~"
-_said = Event()
 
 
 def compiled(function: F) -> F:
@@ -92,71 +88,23 @@ def written(function: str, lines: Sequence[str], names: dict[str, Any], what: st
     return cast(Callable[..., None], dispatcher)
 
 
-def folder_of(function: Any) -> Path | None:
-    """Cache folder of a compiled function; None where nothing can be written."""
-    path = function._cache.cache_path
-    return None if path is None else Path(path)
-
-
 def processor() -> str:
     """Processor that code is generated for."""
     return repr(cpu_target.target_context.codegen().magic_tuple())
 
 
-class _Nowhere(_CacheLocator):  # type: ignore[misc]
-    """For functions whose code is kept in no file."""
-
-    def __init__(self, file: str) -> None:
-        """Of a file, or of what is none, as an interpreter's prompt."""
-        self._py_file = file
-
-    @classmethod
-    def from_function(cls, function: Any, file: str) -> _Nowhere:
-        """Take any function; say so where it might have been otherwise."""
-        if os.path.exists(file):
-            _say_unwritable()
-        return cls(file)
-
-    def get_cache_path(self) -> None:
-        """There is none."""
-
-    def get_source_stamp(self) -> None:
-        """Stamp that the index would compare, if it were read."""
-
-    def get_disambiguator(self) -> str:
-        """Part of a file name, if there were one."""
-        return ""
-
-
-def _say_unwritable(where: str = "no folder for compiled functions can be written") -> None:
-    """Once in a process."""
-    if not _said.is_set():
-        _said.set()
-        logger.warning(
-            "%s: what is compiled is not kept, and every process compiles anew; name a folder in NUMBA_CACHE_DIR", where
-        )
-
-
-class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
-    """Folders of the cache, as Numba finds them, or none."""
-
-    _locator_classes: ClassVar[list[Any]] = [
-        # without a home, "~" would be a folder of the working directory
-        *(c for c in CompileResultCacheImpl._locator_classes if _HOME or "UserWide" not in c.__name__),
-        _Nowhere,
-    ]
-
-
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """A cache that asks for the stamp of the function and of everything it calls, and that comes half filled."""
-
-    _impl_class = _Implementation
+class _Cache:
+    """Compiled functions that Numba asks for: in files found by fingerprints, and in the archive of the library."""
 
     def __init__(self, function: Any) -> None:
-        """Find the place of the files."""
-        self._name, self._py_func, self._impl = repr(function), function, self._impl_class(function)
-        self._cache_path = self._impl.locator.get_cache_path()
-        self.enable()
+        """Touch nothing."""
+        self._py_func: FunctionType = function
+
+    @property
+    def cache_path(self) -> str | None:
+        """Folder of the files, for messages."""
+        folder = cache_folder()
+        return None if folder is None else str(folder)
 
     def load_overload(self, signature: Any, target: Any) -> Any:
         if precompiled.recorder is not None:
@@ -171,8 +119,11 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             return found
         if (half := precompiled.archive().find(self._shipping_key(signature))) is None:
             return None
-        found = self._impl.rebuild(target, half)
-        self._keep(path, half)
+        header, text = half
+        arguments = normalize_signature(signature)[0]
+        made = finished(target, header, text, self._py_func, arguments, header["called"])
+        found = rebuilt(target, made, self._py_func, arguments)
+        self._keep(path, arguments, made)
         tally.generated.append(name)
         return found
 
@@ -187,53 +138,56 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             target.refresh()
 
     def save_overload(self, signature: Any, result: Any) -> None:
-        result = result._replace(type_annotation="")  # half of what would be written, and nobody reads it
-        if self._impl.check_cachable(result):
-            self._keep(self._file(signature, result.codegen), self._impl.reduce(result))
+        if not result.library.has_dynamic_globals and (header := header_of(result)) is not None:
+            _, _, (code, linkable) = result.library.serialize_using_object_code()
+            path, arguments = self._file(signature, result.codegen), normalize_signature(signature)[0]
+            self._keep(path, arguments, Artifact(header, code, linkable))
         if precompiled.recorder is not None:
-            precompiled.recorder.keep(self._shipping_key(signature), self._py_func, result, self._impl.reduce(result))
+            precompiled.recorder.keep(self._shipping_key(signature), self._py_func, result)
 
     def flush(self) -> None:
         """Do nothing: code is found by its fingerprint, so there is nothing to begin anew."""
 
     def _read(self, path: Path, signature: Any, target: Any) -> Any:
         """Read the code of the function as it is now; None if a file is of another or cannot be read."""
-        if (content := read_sealed(path)) is None or not content.startswith(made := self._made()):
+        arguments = normalize_signature(signature)[0]
+        if (content := read_sealed(path)) is None or not content.startswith(made := self._made(arguments)):
             return None
         try:
-            found = self._impl.rebuild(target, pickle.loads(content[len(made) :]))
-        except Exception as error:  # unpickling what names classes that have moved may raise anything
+            artifact = Artifact.unpacked(content[len(made) :])
+            return rebuilt(target, artifact, self._py_func, arguments)
+        except (ValueError, KeyError, TypeError, RuntimeError) as error:
             logger.warning("%s cannot be read and is written anew: %s: %s", path, type(error).__name__, error)
             return None
-        return found if found.signature.args == normalize_signature(signature)[0] else None
 
-    def _keep(self, path: Path | None, reduced: tuple[Any, ...]) -> None:
+    def _keep(self, path: Path | None, arguments: tuple[Any, ...], artifact: Artifact) -> None:
         """Write what Numba keeps of a function, if that is possible."""
         if path is None:
             return
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_sealed(path, self._made() + dumps(reduced))
+            write_sealed(path, self._made(arguments) + artifact.packed())
         except OSError as error:  # a full disk
-            _say_unwritable(f"{path.parent}: {error.strerror}")
+            say_not_kept(f"{path.parent}: {error.strerror}")
             return
         tally.files.append(str(path))
 
     def _file(self, signature: Any, codegen: Any) -> Path | None:
         """One for each signature and processor; of functions made by another function, one for each that is made."""
-        if self._cache_path is None:
+        folder, function = cache_folder(), self._py_func
+        if folder is None:
             return None
-        function = self._py_func
         name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}".replace("<", "").replace(">", "")
         made = fingerprint(function) if "<" in function.__qualname__ else ""
         arguments = normalize_signature(signature)[0]
-        parts = (sys.version_info[:2], function.__module__, *map(spelled, arguments), codegen.magic_tuple(), made)
+        place = function.__module__, function.__code__.co_filename
+        parts = (sys.version_info[:2], *place, *map(spelled, arguments), codegen.magic_tuple(), made)
         digest = hashlib.sha256(repr((*parts, *self._variant())).encode()).hexdigest()[:20]
-        return Path(self._cache_path, f"{name}.{digest}.code")
+        return folder / f"{name}.{digest}.code"
 
-    def _made(self) -> bytes:
-        """Digest of versions, the function and its callees."""
-        stated = f"{numba.__version__} {llvmlite.__version__} {generators()} {fingerprint(self._py_func)}"
+    def _made(self, arguments: tuple[Any, ...]) -> bytes:
+        """Digest of versions, the types of the arguments, the function and its callees."""
+        kinds = " ".join(map(spelled, arguments))
+        stated = f"{numba.__version__} {llvmlite.__version__} {kinds} {fingerprint(self._py_func)}"
         return hashlib.sha256(stated.encode()).digest()
 
     def _variant(self) -> tuple[str, ...]:
@@ -244,8 +198,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         """Key of the function in an archive that is made elsewhere: no date and no processor."""
         function = self._py_func
         arguments, _ = normalize_signature(signature)  # a dispatcher, too, tells functions by their arguments alone
-        parts = (function.__module__, function.__qualname__, *map(spelled, arguments), *self._variant())
-        return hashlib.sha256(repr((*parts, fingerprint(function))).encode()).hexdigest()
+        parts = (*map(spelled, arguments), *self._variant(), fingerprint(function))
+        return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
 class _CacheInOrder(_Cache):

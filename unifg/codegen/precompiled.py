@@ -1,57 +1,78 @@
 """Kernels that come with the library half compiled: LLVM's code after all optimisation, before that of a processor.
 
-Nine tenths of a first compilation are the same on every machine: types are inferred, code is written down, linked and
-optimised. An archive beside this file keeps what comes of it, one member per function and signature, so that a first
-use generates code for the processor at hand and nothing else. What it made is then in the cache on disk like any other.
+Nine tenths of a first compilation are the same on every machine and for every Python: types are inferred, code is
+written down, linked and optimised. An archive beside this file keeps what comes of it, one member per function and
+signature, so that a first use generates code for the processor at hand and nothing else. What it made is then in the
+cache on disk like any other.
 
-A member is found by the fingerprint of a function and by its types; the archive as a whole by the versions of Python,
-Numba and llvmlite, by what generates instructions, and by the platform. So code that has changed is never found and is
-compiled instead: an archive that is out of date costs time, and nothing else. Comments, docstrings and other functions
-of a file change nothing.
-``unifg warmup --ship`` writes it anew; :func:`outdated` says what has changed since.
+A member is found by the fingerprint of a function and by its types; the archive as a whole is for a version of LLVM, a
+platform, and what Numba's compiled code expects of its surroundings. So code that has changed is never found and is
+compiled instead: an archive that is out of date costs time, and nothing else. Members are text that LLVM reads, without
+anything of Python: they are checked against digests, and say nothing about what runs but machine code.
+``unifg warmup --ship`` writes the archive anew; :func:`outdated` says what has changed since.
 """
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
 import logging
-import pickle
-import sys
+import lzma
+import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
-from importlib import metadata
+from functools import cache, lru_cache
 from pathlib import Path
 from types import FunctionType
 from typing import Any
 
 from llvmlite import binding as llvm
+from numba import _helperlib, types
 from numba.core.bytecode import FunctionIdentity
 from numba.core.registry import cpu_target
-from numba.core.serialize import dumps
+from numba.core.runtime import _nrt_python
 
 from unifg.atomic_write import replacing
-from unifg.codegen.fingerprint import fingerprint, generators
+from unifg.codegen.artifact import header_of
+from unifg.codegen.errors import PREFIX, without_errors
+from unifg.codegen.fingerprint import SHAPES, SHIPPED, fingerprint, parsed
 
 logger = logging.getLogger("unifg")
 
-ARCHIVE = Path(__file__).with_name("kernels.zip")
-ABOUT = "about.json"
+ARCHIVE = SHIPPED
+ABOUT, CODE = "about.json", "code.xz"
 FIRST_NUMBER = 10**9  # of functions in the archive: Numba numbers those of a process from one, and names hold numbers
-LINKED_MANY_TIMES = "linkonce_odr"
+WRAPPER = "_ZN7cpython"  # prefix of what Python calls
+OUTSIDE = re.compile(
+    rf"llvm\.|NRT_|numba_|{PREFIX}|(a?(sin|cos|tan)h?|atan2|exp2?|expm1|log(10|1p|2)?|sqrt|cbrt|pow|hypot|fmod|floor|ceil|"
+    r"rint|erfc?|mem(set|cpy|move))$"
+)
+"""Symbols that members may expect from outside: of LLVM, of Numba's own library, and of C's for mathematics."""
 
 
 def versions() -> dict[str, str]:
-    """Versions that code generated here depends on, besides the functions."""
+    """Circumstances that code in the archive depends on, besides the functions."""
     return {
-        "python": f"{sys.version_info.major}.{sys.version_info.minor}",
-        "numba": metadata.version("numba"),
-        "llvmlite": metadata.version("llvmlite"),
+        "llvm": ".".join(map(str, llvm.llvm_version_info)),
         "platform": str(llvm.get_process_triple()),
-        "instructions": generators(),
+        "surroundings": surroundings(),
     }
+
+
+@cache
+def surroundings() -> str:
+    """Digest of what Numba's compiled code expects: layout of arrays, calling convention, functions of its library."""
+    context = cpu_target.target_context
+    kinds = (
+        types.Array(types.float64, 2, "C"), types.Optional(types.float64), types.Tuple((types.int64, types.boolean)),
+        types.none, types.float64,
+    )  # fmt: skip
+    stated = [str(context.get_value_type(kind)) for kind in kinds]
+    stated += [str(context.call_conv.get_function_type(kind, kinds)) for kind in kinds]
+    stated += [*sorted(vars(_helperlib)["c_helpers"]), *sorted(_nrt_python.c_helpers)]
+    return hashlib.sha256(repr(stated).encode()).hexdigest()
 
 
 class Archive:
@@ -64,10 +85,11 @@ class Archive:
     def __init__(self, path: Path) -> None:
         """Look at what the file is for."""
         self.usable, self._path = False, path
+        self._code: bytes | None = None
         try:
             self._file = zipfile.ZipFile(path)
             self.about = json.loads(self._file.read(ABOUT))
-            kind, _ = self.about["versions"], self.about["functions"]
+            kind, _, self._members = (self.about[part] for part in ("versions", "functions", "members"))
         except FileNotFoundError:  # it is an archive that one may do without
             return
         except Exception as error:  # what is damaged may say anything
@@ -78,13 +100,18 @@ class Archive:
         if different:
             logger.info("the kernels that come with unifg are of another kind (%s)", ", ".join(different))
 
-    def find(self, key: str) -> Any:
-        """Entry of Numba's cache for a function, with code for this processor; None where there is nothing."""
-        if not self.usable or key not in self._file.NameToInfo:
+    def find(self, key: str) -> tuple[dict[str, Any], str] | None:
+        """Header and code, in LLVM's language, of a function; None where there is nothing."""
+        if not self.usable or key not in self._members:
             return None
         try:
-            (name, bitcode), *others = pickle.loads(self._file.read(key))  # checked against its sum as it is read
-            return (name, "object", _generated(bitcode)), *others
+            if self._code is None:
+                self._code = lzma.decompress(self._file.read(CODE))
+            member = self._members[key]
+            code = self._code[member["first"] : member["end"]]
+            if hashlib.sha256(code).hexdigest() != member["sha256"]:
+                raise ValueError(f"member {key[:12]} is not what its digest says")
+            return member["header"], code.decode()
         except Exception as error:
             self.usable = False
             self._say_damaged(error)
@@ -123,43 +150,85 @@ def _present(name: str) -> str:
     return fingerprint(found)
 
 
-def _generated(bitcode: bytes) -> tuple[bytes, bytes]:
-    """Object code for this processor, and what other functions link: the two that Numba's cache keeps."""
-    module = llvm.parse_bitcode(bitcode)
-    code = cpu_target.target_context.codegen()._tm.emit_object(module)
-    for function in module.functions:
-        if not function.is_declaration and function.linkage == llvm.Linkage.external:
-            function.linkage = LINKED_MANY_TIMES
-    return code, module.as_bitcode()
+def undefined(text: str) -> Iterable[str]:
+    """Names of functions and variables that code expects from outside."""
+    module = llvm.parse_assembly(text)
+    yield from (function.name for function in module.functions if function.is_declaration)
+    yield from (variable.name for variable in module.global_variables if variable.is_declaration)
 
 
 class Recorder:
     """Keeps what is compiled while an archive is made.
 
     Attributes:
-        members: of the archive to be, by their keys.
+        members: of the archive to be, headers and code by their keys.
         functions: fingerprints of what was compiled, by module and name; without those that functions make.
+        left_out: reasons by the names of functions that are not archived.
     """
 
     def __init__(self) -> None:
         """Nothing has been compiled."""
-        self.members: dict[str, bytes] = {}
+        self.members: dict[str, tuple[dict[str, Any], str]] = {}
         self.functions: dict[str, str] = {}
+        self.left_out: dict[str, str] = {}
+        self._codegen = cpu_target.target_context.codegen()
+        self._optimised: dict[str, str] = {}
 
-    def keep(self, key: str, function: FunctionType, result: Any, reduced: tuple[Any, ...]) -> None:
-        """Add a function: its key, what Numba made of it, and what the cache keeps of that."""
-        library = result.library
-        self.members[key] = dumps(((library.name, library._final_module.as_bitcode()), *reduced[1:]))
+    def watch(self, module: Any) -> Any:
+        """Take down optimised code before it is generated for a processor, which changes it."""
+        self._optimised[module.name] = str(module)
+        return type(self._codegen)._add_module(self._codegen, module)
+
+    def keep(self, key: str, function: FunctionType, result: Any) -> None:
+        """Add a function: its key, and what Numba made of it."""
         name = f"{function.__module__}:{function.__qualname__}"
+        header = header_of(result)
+        try:
+            text = without_errors(self._alone(self._optimised[result.library._final_module.name]))
+            wrong = [symbol for symbol in undefined(text) if not OUTSIDE.match(symbol)]
+        except KeyError as error:
+            self.left_out[name] = str(error)
+            return
+        if header is None or wrong:
+            self.left_out[name] = f"expects {', '.join(wrong)}" if wrong else "its result is of no plain type"
+            return
+        called = any(symbol.startswith(WRAPPER) for symbol in self._names)
+        self.members[key] = {**header, "called": called}, text
         if digest := _present(name):
             self.functions[name] = digest
 
+    def _alone(self, text: str) -> str:
+        """Code without what Python calls, which each version of it wants otherwise."""
+        module = llvm.parse_assembly(text)
+        self._names = [function.name for function in module.functions]
+        for function in module.functions:
+            if function.name.startswith((WRAPPER, "cfunc.")) and not function.is_declaration:
+                function.linkage = llvm.Linkage.internal
+        builder = llvm.create_pass_builder(self._codegen._tm, llvm.create_pipeline_tuning_options())
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_global_dead_code_eliminate_pass()
+        passes.run(module, builder)
+        return str(module)
+
     def write(self, path: Path) -> None:
-        """Write the archive."""
-        about = {"versions": versions(), "functions": dict(sorted(self.functions.items()))}
-        with replacing(path) as own, zipfile.ZipFile(own, "w", zipfile.ZIP_LZMA) as file:
-            for name, data in {ABOUT: json.dumps(about, indent=1).encode(), **self.members}.items():
-                file.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_LZMA)
+        """Write the archive, and log what is left out of it."""
+        for name, reason in self.left_out.items():
+            logger.warning("%s is not archived: %s", name, reason)
+        code, members = bytearray(), {}
+        for key, (header, text) in sorted(self.members.items(), key=lambda member: member[1][0]["symbol"]):
+            first = len(code)
+            code += text.encode()
+            digest = hashlib.sha256(code[first:]).hexdigest()
+            members[key] = {"header": header, "first": first, "end": len(code), "sha256": digest}
+        about = {"versions": versions(), "functions": dict(sorted(self.functions.items())), "members": members}
+        content = {
+            ABOUT: json.dumps(about, indent=1).encode(),
+            SHAPES: json.dumps(parsed).encode(),
+            CODE: lzma.compress(bytes(code), preset=9),
+        }
+        with replacing(path) as own, zipfile.ZipFile(own, "w") as file:
+            for name, data in content.items():
+                file.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_STORED if name == CODE else zipfile.ZIP_DEFLATED)
 
 
 recorder: Recorder | None = None
@@ -172,8 +241,11 @@ def recording() -> Iterator[Recorder]:
     numbers = FunctionIdentity._unique_ids
     FunctionIdentity._unique_ids = iter(range(FIRST_NUMBER, 2 * FIRST_NUMBER))
     recorder = Recorder()
+    codegen = recorder._codegen
+    codegen._add_module = recorder.watch
     try:
         yield recorder
     finally:
+        del codegen._add_module
         recorder = None
         FunctionIdentity._unique_ids = numbers

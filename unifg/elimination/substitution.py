@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import copy_to
 from unifg.codegen.vectors import Address, address, blend, get, load, minus, plus_products, put, splat, store, total
 from unifg.elimination.fronts import factor
 from unifg.elimination.plan import ADJACENT, FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, SCALARS, STRIDE, Plan
@@ -261,14 +262,16 @@ def refine(
                 combined = residual(indptr, indices, data, other, right, scale, first, step, bulk)
                 if combined < relative:
                     relative = combined
-                    trial[:], after[:] = other, step
+                    copy_to(other, trial)
+                    copy_to(step, after)
         idle = idle + 1 if relative > 0.5 * best else 0
         if relative < best:
             best = relative
-            out[:] = trial
+            copy_to(trial, out)
         if best <= tolerance or idle == PATIENCE:
             break
-        x[:], rest[:] = trial, after
+        copy_to(trial, x)
+        copy_to(after, rest)
     return best
 
 
@@ -276,7 +279,8 @@ def refine(
 def _remember(place: int, step: Array, effect: Array, moves: Array, effects: Array) -> None:
     """Keep a correction and its effect on the scaled residual, without what the others kept do, and of length one."""
     move, own = moves[place], effects[place]
-    move[:], own[:] = step, effect
+    copy_to(step, move)
+    copy_to(effect, own)
     for j in range(len(moves)):
         if j != place:
             share = 0.0
@@ -297,7 +301,7 @@ def _remember(place: int, step: Array, effect: Array, moves: Array, effects: Arr
 @compiled
 def _least(x: Array, rest: Array, scale: Array, moves: Array, effects: Array, out: Array) -> None:
     """``out`` = x and the combination of corrections after which the scaled residual ``rest`` is least."""
-    out[:] = x
+    copy_to(x, out)
     for j in range(len(moves)):
         share = 0.0
         for i in range(len(x)):

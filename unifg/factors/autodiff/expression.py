@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from unifg.codegen.jit import folder_of
+from unifg.codegen.cache_folder import cache_folder
 from unifg.codegen.native import SOURCES, Native, generation
 from unifg.codegen.objects import Objects
 from unifg.factors.autodiff.calculus import bent, hessian, jacobian
 from unifg.factors.autodiff.emit import residual_code, second_code
 from unifg.factors.autodiff.operations import Op
 from unifg.factors.autodiff.tape import Tape
-from unifg.factors.kernel import evaluate_rows
 from unifg.typing import Array, IntArray
 
 WRITERS = ("calculus", "emit", "expression", "loops", "operations", "tape")  # modules that make machine code of a tape
@@ -42,7 +41,7 @@ _WRITERS = _digest()  # as they are when they are loaded: they may be edited whi
 @cache
 def _objects() -> Objects:
     """Beside what Numba keeps."""
-    folder = folder_of(evaluate_rows)
+    folder = cache_folder()
     return Objects(None if folder is None else folder / "derived")
 
 
