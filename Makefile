@@ -97,7 +97,7 @@ release-kernels: $(VENV)/ready
 release-check: release-build release-kernels
 
 kernels: $(VENV)/ready
-	$(ONE_THREAD) $(BIN)/unifg warmup --ship
+	NUMBA_CPU_NAME=generic UNIFG_CACHE_DIR=$(CURDIR)/out/kernels $(ONE_THREAD) $(BIN)/unifg warmup --ship
 
 performance: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg bench --quick --strict

@@ -15,11 +15,12 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.codegen import objects
+from unifg.codegen import native, objects
 from unifg.codegen.native import Native
 from unifg.codegen.objects import SWITCH, Objects
 from unifg.errors import GraphError
@@ -410,3 +411,13 @@ def test_processes_write_at_once(tmp_path: Path) -> None:
     runs = [subprocess.Popen([sys.executable, "-c", HAMMER, file, str(tmp_path)]) for _ in range(3)]
     assert [run.wait(timeout=60) for run in runs] == [0, 0, 0]
     assert all("." not in path.name for path in tmp_path.iterdir())
+
+
+def test_the_processor_that_numba_is_told_is_that_of_derived_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cluster of several processors shares one home: code is kept apart by what it was generated for."""
+    monkeypatch.setattr(native, "_processor", native._processor.__wrapped__)
+    here, kept = native._processor(), native.generation.__wrapped__()
+    monkeypatch.setattr(numba.config, "CPU_NAME", "generic")
+    monkeypatch.setattr(numba.config, "CPU_FEATURES", "")
+    assert native._processor() == (here[0], "generic", "") != here
+    assert native.generation.__wrapped__() != kept

@@ -127,9 +127,13 @@ def _frame(arguments: tuple[Any, ...]) -> tuple[str, str, str]:
 
 @cache
 def _processor() -> tuple[str, str, str]:
-    """Target of generated code: triple, name and features."""
-    features = binding.get_host_cpu_features().flatten()
-    return binding.get_default_triple(), binding.get_host_cpu_name(), features
+    """Target of generated code: triple, name and features, those that Numba is told by its variables if any."""
+    name, features = numba.config.CPU_NAME, numba.config.CPU_FEATURES
+    return (
+        binding.get_default_triple(),
+        binding.get_host_cpu_name() if name is None else name,
+        binding.get_host_cpu_features().flatten() if features is None else features,
+    )
 
 
 @cache
