@@ -15,6 +15,7 @@
 #   make release-check    the same, and fail for kernels that are out of date
 #   make kernels  compile everything anew into unifg/codegen/kernels.zip, which spares a first use most of it (minutes)
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/ground/drive_past.py')
+#   make first-use  time README's first example in a new environment of every Python that is found (minutes)
 #   make examples run all scripts of examples/ and draw the pictures of docs/guide/examples.md again
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make docs     build the site with the reference of all public names into out/site, every link checked
@@ -36,7 +37,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: docs kernels performance notebooks help demo test test-all fuzz test-lowest processes lint style types mypy pyright bench results sample release-build release-kernels release-check mutants fences clean offsets examples
+.PHONY: first-use docs kernels performance notebooks help demo test test-all fuzz test-lowest processes lint style types mypy pyright bench results sample release-build release-kernels release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -84,6 +85,9 @@ bench: $(VENV)/ready-bench
 results: $(VENV)/ready-bench
 	@test -n "$(PAGE)" || { $(BIN)/python -m benchmarks; echo "Choose: make results PAGE=name"; exit 2; }
 	$(BIN)/python -m benchmarks $(PAGE)
+
+first-use: $(VENV)/ready
+	$(BIN)/python -m benchmarks first-use --fresh
 
 sample: $(VENV)/ready
 	@$(ONE_THREAD) $(BIN)/python -m benchmarks.collection

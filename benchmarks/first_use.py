@@ -1,84 +1,86 @@
-"""Cost of a first use: README's worked problem in fresh processes whose cache is empty.
+"""Cost of a first use: README's first example in new environments of every Python, with an empty cache.
 
-``python -m benchmarks.first_use`` prints a row for each backend, and one for all of them one after another in one
-process: processor time with the half compiled kernels that come with the library, from the sources alone, and from a
-cache that has everything.
+Pythons are found by their names on the path (``python3.11`` and later) and in the variable ``PYTHONS``, paths with
+colons in between. Each gets an environment of its own, into which this checkout is installed.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
+import resource
+import shutil
 import subprocess
-import sys
 import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.report import table
+from benchmarks.comparison import Row
+from benchmarks.report import CHECKOUT, table
+from benchmarks.runner import Study
 from unifg.codegen.cache_folder import VARIABLE
 
-CHECKOUT = Path(__file__).resolve().parent.parent
-BACKENDS = {
-    "InteriorPoint": "InteriorPoint()",
-    "AugmentedLagrangian": "AugmentedLagrangian()",
-    "SQP": "SQP()",
-    'SQP(qp="graph")': 'SQP(qp="graph")',
-    'SQP(hessian="exact")': 'SQP(hessian="exact")',
-}
-CHILD = """
-import json, sys, time
-from pathlib import Path
-from unifg.codegen import precompiled
-from unifg.codegen.compile_counter import tally
-if sys.argv[2] == "sources":
-    precompiled.ARCHIVE = Path("none")
-from unifg.solvers import InteriorPoint
-text = Path("README.md").read_text(encoding="utf-8").split("```python")[2].split("for solver in")[0]
-exec(text)
-begin = time.process_time()
-for make in json.loads(sys.argv[1]):
-    eval(make).solve(graph, guess, check=True)
-print(json.dumps([time.process_time() - begin, len(tally.compiled), len(tally.generated)]))
-"""
+SOURCES = "from pathlib import Path\nfrom unifg.codegen import precompiled\nprecompiled.ARCHIVE = Path('none')\n"
+IMPORTS = {"numpy, numba": "import numpy, numba", "unifg": "import unifg as fg; fg.Graph, fg.solve, fg.SE2"}
+DEMO = "from unifg.scenarios.command import main; main(['warmup']); main('run navigation --obstacles 3'.split())"
+REPEATS = 3  # of imports, the least of which counts
+COLUMNS = ("first", "second", "from sources", "import numpy, numba", "import unifg", "demo")
 
 
-def measured(makes: list[str], way: str, cache: str) -> tuple[float, int, int]:
-    """Processor time [s] of the solves of a fresh process, and how many functions it compiled and generated."""
-    environment = {**os.environ, VARIABLE: cache, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", CHILD, json.dumps(makes), way],
-        cwd=CHECKOUT, env=environment, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    seconds, compiled, generated = json.loads(done.stdout.splitlines()[-1])
-    return float(seconds), int(compiled), int(generated)
+@dataclass(frozen=True)
+class Cell:
+    """A Python.
+
+    Attributes:
+        python: path of the interpreter.
+    """
+
+    python: str
 
 
-def rows(names: list[str]) -> list[list[str]]:
-    """One for each backend, and one for all."""
-    found = []
-    for name in [*names, "all of them"]:
-        makes = [BACKENDS[key] for key in names] if name == "all of them" else [BACKENDS[name]]
-        cells = [name]
-        for way in ("shipped", "sources"):
-            with tempfile.TemporaryDirectory() as cache:
-                seconds, compiled, generated = measured(makes, way, cache)
-                cells.append(f"{seconds:.1f} s, {generated if way == 'shipped' else compiled} functions")
-                if way == "shipped" and compiled:
-                    cells[-1] += f", {compiled} compiled"
-                again = measured(makes, way, cache)[0]
-        found.append([*cells, f"{again:.2f} s"])
-    return found
+def cells(seeds: Sequence[int]) -> Iterator[Cell]:
+    """The Pythons of this machine."""
+    named = filter(None, os.environ.get("PYTHONS", "").split(":"))
+    on_path = filter(None, (shutil.which(f"python3.{minor}") for minor in range(11, 20)))
+    yield from map(Cell, dict.fromkeys([*named, *on_path]))
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", choices=BACKENDS, help="one backend instead of all")
-    chosen = parser.parse_args().only
-    head = ["backend", "first use, with what is shipped", "first use, from the sources", "from the cache"]
-    print(table(head, rows([chosen] if chosen else list(BACKENDS))))
+def measure(cell: Cell) -> Row:
+    """Processor times [s] in a new environment."""
+    example = (CHECKOUT / "README.md").read_text(encoding="utf-8").split("```python")[1].split("```")[0]
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        subprocess.run([cell.python, "-m", "venv", place / "env"], check=True)
+        python = str(place / "env" / "bin" / "python")
+        install = ["-m", "pip", "--quiet", "--disable-pip-version-check", "install", f"{CHECKOUT}[scenarios]"]
+        subprocess.run([python, *install], check=True)
+        found = {"first": spent(python, example, place / "cache"), "second": spent(python, example, place / "cache")}
+        found["from sources"] = spent(python, SOURCES + example, place / "sources")
+        for name, code in IMPORTS.items():
+            found[f"import {name}"] = min(spent(python, code, place / "cache") for _ in range(REPEATS))
+        found["demo"] = spent(python, DEMO, place / "demo")
+        version = subprocess.run(
+            [python, "-c", "import platform; print(platform.python_version())"],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+    return {"version": version.stdout.strip(), **found}
 
 
-if __name__ == "__main__":
-    main()
+def spent(python: str, code: str, cache: Path) -> float:
+    """Processor time of a process [s], without that of compiling bytecode."""
+    environment = {**os.environ, VARIABLE: str(cache), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    subprocess.run([python, "-c", code], cwd=cache.parent, env=environment, capture_output=True, check=True)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def tables(rows: list[Row]) -> str:
+    """A line for each Python."""
+    head = ("Python", *(f"{column} [s]" for column in COLUMNS))
+    return table(head, [(row["version"], *(f"{row[column]:.2f}" for column in COLUMNS)) for row in rows], text=1)
+
+
+STUDY = Study(cells, measure, tables)

@@ -103,6 +103,7 @@ PAGES: dict[str, dict[str, float]] = {
     "pose-graphs": {"elimination": 0.1, "incremental": 0.1, "wrong_closures": 4.0},
     "navigation": {"navigation": 0.1, "localisation": 0.15},
     "reliability": {"faults": 0.3},
+    "first-use": {"first_use": 0.2},
 }  # fmt: skip
 """Pages of docs/results: the studies of each, and about how many hours they take on two cores."""
 
