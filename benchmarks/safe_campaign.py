@@ -17,9 +17,9 @@ from benchmarks.report import table
 from benchmarks.runner import Study
 from unifg.models.quadrotor import GRAVITY
 from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
+from unifg.scenarios.quadrotor.oracle import Answer, Authority, Threat, exists_among
+from unifg.scenarios.quadrotor.situations import Kind
 from unifg.scenarios.safe_flight import Controller, Knowledge, SafeFlight, SafeSettings, flights
-from unifg.scenarios.safety.oracle import Answer, Authority, Threat, exists_among
-from unifg.scenarios.safety.situations import Kind
 from unifg.scenarios.simulation.bodies import Ellipse, Thrown
 
 VEHICLE = 5.0  # horizontal acceleration at a tilt of 27 degrees [m/s^2]

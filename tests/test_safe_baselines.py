@@ -9,11 +9,11 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.scenarios.planning.flat_path import Line
+from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
+from unifg.scenarios.quadrotor.one_step import FilterSettings, filtered
+from unifg.scenarios.quadrotor.oracle import Authority, Threat, escape, exists, exists_among
+from unifg.scenarios.quadrotor.spline_planner import SplineSettings, around
 from unifg.scenarios.safe_flight import SafeSettings, flights
-from unifg.scenarios.safety.cbf_mpc import Obstacles
-from unifg.scenarios.safety.one_step import FilterSettings, filtered
-from unifg.scenarios.safety.oracle import Authority, Threat, escape, exists, exists_among
-from unifg.scenarios.safety.spline_planner import SplineSettings, around
 
 LINE = Line((-4.0, 0.0, 1.5), (4.0, 0.0, 1.5), 2.0, 1.5)
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

@@ -25,7 +25,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import quadrotor
-from unifg.scenarios.safety.cbf_mpc import Obstacles
+from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 

@@ -32,8 +32,8 @@ from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
 from unifg.scenarios.planning.flat_path import Flown
-from unifg.scenarios.safety.flatness import FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.weighing import Weighing
+from unifg.scenarios.quadrotor.flatness import FlatnessController, Gains, flat_flight
+from unifg.scenarios.quadrotor.weighing import Weighing
 from unifg.scenarios.simulation.body_rate import Airframe
 from unifg.solvers.names import backend
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
