@@ -252,11 +252,10 @@ class SafeFlight:
 
     def _spline(self) -> SplinePath:
         """A path around what stands in the way, planned before the flight."""
-        line, bodies = self.situation.path, self.situation.bodies
-        place, velocity = (part[0] for part in bodies.at(np.zeros(1)))
+        line = self.situation.path
         if not isinstance(line, Line) or self.situation.kind != "static":
             raise fg.ScenarioError(f"splines are planned past things at rest, not in the case {self.situation.kind!r}")
-        return around(line, Obstacles(place, velocity, self._keep, bodies.upright, bodies.falls), self.settings.spline)
+        return around(line, self._bodies(0.0), self.settings.spline)
 
     @property
     def believed(self) -> quadrotor.Parameters:
@@ -283,13 +282,8 @@ class SafeFlight:
         """Obstacles as they are."""
         bodies = self.situation.bodies
         place, velocity = (part[0] for part in bodies.at(np.array([now])))
-        return Obstacles(place, velocity, self._keep, bodies.upright, bodies.falls)
-
-    @property
-    def _keep(self) -> Array:
-        """(M,) distance of the centre to be kept from each body [m]."""
-        found: Array = self.situation.bodies.radii + self.settings.books.radius + self.settings.margin
-        return found
+        keep = bodies.radii + self.settings.books.radius + self.settings.margin
+        return Obstacles(place, velocity, keep, bodies.upright, bodies.falls)
 
     def run(self, progress: Progress = silent) -> SafeLog:
         """Fly to the end, or until the user stops it."""

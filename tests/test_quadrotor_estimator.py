@@ -17,7 +17,7 @@ from unifg.models.matching import DOUBTFUL, NEW, Gates, nearest
 from unifg.scenarios.perception.belief import Belief, Landmarks
 from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.quadrotor.arrival import arrival, seen_from_the_vehicle
-from unifg.scenarios.quadrotor.estimator import DeadReckoningEstimator, Estimator, EstimatorSettings
+from unifg.scenarios.quadrotor.estimator import DeadReckoning, Dynamics, Estimator, EstimatorSettings
 from unifg.scenarios.quadrotor.flight_past import WindowSettings
 from unifg.scenarios.simulation.air import QuadrotorWorld
 from unifg.scenarios.simulation.layouts import Layout
@@ -69,12 +69,13 @@ def flight(seed: int, ticks: int = 101, movers: int = 0) -> Log:
     return log
 
 
-def begin(seed: int, kind: type[Estimator] = Estimator, settings: EstimatorSettings | None = None) -> Estimator:
+def begin(seed: int, model: type[Dynamics] = Dynamics, settings: EstimatorSettings | None = None) -> Estimator:
     """An estimator with a wrong start and a mass that is 5 % off."""
     settings = settings or EstimatorSettings()
     off = settings.state_sigma * np.random.default_rng([7, seed]).normal(size=9)
     start = quadrotor.STATE.retract(flight(seed)[0][2], off)
-    return kind(start, quadrotor.Parameters(1.05 if seed % 2 else 0.95, (0.2, 0.2, 0.2)), settings)
+    nominal = quadrotor.Parameters(1.05 if seed % 2 else 0.95, (0.2, 0.2, 0.2))
+    return Estimator(start, nominal, settings, model=model(nominal))
 
 
 def beliefs(estimator: Estimator, log: Log) -> list[Belief]:
@@ -216,7 +217,7 @@ def test_the_mass_is_known_soon() -> None:
 
 def test_without_dynamics_nothing_is_learnt() -> None:
     log = flight(2)
-    estimator = begin(2, DeadReckoningEstimator)
+    estimator = begin(2, DeadReckoning)
     found = beliefs(estimator, log)
     assert found[-1].parameters == estimator.model.nominal
     assert np.abs(found[-1].parameters_sigma).max() == 0.0
@@ -227,7 +228,7 @@ def test_without_dynamics_nothing_is_learnt() -> None:
         return float(np.sqrt(np.mean(square)))
 
     assert rms(informed) < 0.6 * rms(found) < 0.3
-    felt = begin(2, DeadReckoningEstimator, EstimatorSettings(window=WindowSettings(force_sigma=0.15)))
+    felt = begin(2, DeadReckoning, EstimatorSettings(window=WindowSettings(force_sigma=0.15)))
     assert rms(beliefs(felt, log)) < 0.5 * rms(found)  # what is felt takes the place of dynamics
 
 

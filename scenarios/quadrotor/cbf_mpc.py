@@ -33,6 +33,7 @@ from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, 
 from unifg.models.keeping import Form, Kept, keep
 from unifg.scenarios.planning.flat_path import Flown
 from unifg.scenarios.quadrotor.flatness import FlatnessController, Gains, flat_flight
+from unifg.scenarios.quadrotor.slots import reassigned
 from unifg.scenarios.quadrotor.weighing import Weighing
 from unifg.scenarios.simulation.body_rate import Airframe
 from unifg.solvers.names import backend
@@ -317,7 +318,7 @@ class CbfMpc:
         )  # fmt: skip
         self.loop.applied = quadrotor.hover(airframe.parameters)
         self._planned, self._refused = False, 0
-        self._looked_at: list[int] = []
+        self._looked_at = [-1] * s.slots
         self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
 
     def decide(self, start: Array, flown: Flown, obstacles: Obstacles, later: float, gust: Array) -> Decision:
@@ -374,10 +375,8 @@ class CbfMpc:
         ways = [_braked(start, self.nodes).position, *([self.loop.kept.states[:, :3]] if self._planned else [])]
         near = np.min([obstacles.clearance(way, later + self.nodes).min(axis=0) for way in ways], axis=0)
         wanted = np.argsort(near, kind="stable")[: self.settings.slots]
-        fresh = [k for k in wanted.tolist() if k not in self._looked_at]
-        kept = [k if k in wanted else fresh.pop(0) for k in self._looked_at]
-        self._looked_at = kept + fresh
-        return np.array(self._looked_at, dtype=np.intp)
+        self._looked_at = reassigned(self._looked_at, wanted.tolist())
+        return np.array([k for k in self._looked_at if k >= 0], dtype=np.intp)
 
     def _along(self, now: Context[Guarded]) -> tuple[Array, Array]:
         """Guess a flight on the path from the second node on."""

@@ -96,14 +96,20 @@ class Slots:
 
     def _assign(self, known: Landmarks, positions: Array) -> IntArray:
         """Row of ``known`` in every slot of cylinders, -1 for none: those nearest to where the vehicle is to be."""
-        s = self._settings
         gaps = np.hypot(*np.moveaxis(known.positions - positions[:, None, :2], 2, 0)) - known.radii
-        chosen = np.argsort(gaps.min(axis=0), kind="stable")[: s.cylinders]
-        rows = np.full(s.cylinders, -1, dtype=np.intp)
+        chosen = np.argsort(gaps.min(axis=0), kind="stable")[: self._settings.cylinders]
         row_of = {int(known.ids[row]): int(row) for row in chosen}
-        for slot, name in enumerate(self._names.tolist()):
-            rows[slot] = row_of.pop(name, -1)
-        for row in row_of.values():
-            rows[int(np.argmin(rows))] = row
-        self._names = np.where(rows >= 0, known.ids[rows] if len(known) else -1, -1)
-        return rows
+        names = reassigned(self._names.tolist(), list(row_of))
+        self._names = np.array(names, dtype=np.intp)
+        return np.array([row_of.get(name, -1) for name in names], dtype=np.intp)
+
+
+def reassigned(held: list[int], wanted: list[int]) -> list[int]:
+    """Contents of the slots: what is wanted and was ``held`` keeps its slot, the rest fills the others in order.
+
+    Args:
+        held: what each slot has held; -1 for nothing.
+        wanted: what the slots are to hold, at most as much as there are slots.
+    """
+    fresh = [name for name in wanted if name not in held]
+    return [name if name in wanted else fresh.pop(0) if fresh else -1 for name in held]
