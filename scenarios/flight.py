@@ -250,7 +250,7 @@ class Flight:
             parameters=belief.parameters.packed,
             parameters_sigma=belief.parameters_sigma,
             seen=reading.ids,
-            movers=world.mover_states(),
+            movers=world.discs()[:, :3],
             **pilot.clock.milliseconds,
             compiled=new.everything,
             statuses="failed" if plan is None else plan.status.name.lower().replace("_", " "),

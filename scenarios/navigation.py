@@ -225,7 +225,7 @@ class Episode:
             seed=s.seed,
             control_limits=s.controller.limits,
             scan_angles=self.world.lidar.angles,
-            obstacle_moves=self.world.obstacle_states()[:, 3].astype(bool),
+            obstacle_moves=self.world.discs()[:, 3].astype(bool),
             faults=[str(fault) for fault in s.faults],
         )
         self._outcomes = ["time ran out"] * len(self.goals)
@@ -373,7 +373,7 @@ class Episode:
             contacts=world.collisions,
             horizon=plan.states,
             scan=scan.ranges,
-            obstacles=world.obstacle_states()[:, :3],
+            obstacles=world.discs()[:, :3],
             detected=np.column_stack([pilot.tracks.centre, pilot.tracks.radius]),
             solve_ms=took["localise_ms"] + took["plan_ms"],
             **took,

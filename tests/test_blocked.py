@@ -79,7 +79,7 @@ def test_the_time_for_a_goal_is_that_of_the_longest_way_so_far(tmp_path: Path) -
     asked = [(direct, 10.0), (detour, 90.0), (short, 120.0), (short, 160.0), (short, 180.0)]
     found = []
     for path, now in asked:
-        leg.path, drive.world._space.time = path, now
+        leg.path, drive.world.time = path, now
         found.append(drive._outcome(0))
     assert found == [None, None, None, None, "timed out"]  # 27 m in 108 s, and a minute
     drive._begin_leg(0)

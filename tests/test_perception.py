@@ -148,7 +148,7 @@ def test_velocity_of_a_mover(heading: float) -> None:
         noise = np.array([0.01, 0.01, 0.004])
         tracks = watch(world, DiscTracker(field(occupancy)), 11, noise, np.random.default_rng(50 + seed))
         assert len(tracks) == 1
-        assert np.linalg.norm(tracks.centre[0] - world.obstacle_states()[0, :2]) < 0.08
+        assert np.linalg.norm(tracks.centre[0] - world.discs()[0, :2]) < 0.08
         errors.append(np.linalg.norm(tracks.velocity[0] - 0.3 * direction))
     assert np.mean(errors) < 0.06
     assert max(errors) < 0.1
@@ -166,7 +166,7 @@ def test_mover_that_turns_round_is_followed() -> None:
         tracks = watch(world, tracker, 1, np.array([0.01, 0.01, 0.003]), rng)
         identities |= set(tracks.identity.tolist())
         if len(tracks):
-            away.append(float(np.linalg.norm(tracks.centre[0] - world.obstacle_states()[0, :2])))
+            away.append(float(np.linalg.norm(tracks.centre[0] - world.discs()[0, :2])))
     assert len(identities) == 1
     assert max(away[10:]) < 0.15
     assert np.mean(away) < 0.06
@@ -199,14 +199,14 @@ def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
     still = np.zeros(3)
     waited = 0
     for _ in range(80):
-        before = world.obstacle_states()[0, :2]
+        before = world.discs()[0, :2]
         watch(world, tracker, 1, still, rng)
-        waited += bool(np.allclose(world.obstacle_states()[0, :2], before))
+        waited += bool(np.allclose(world.discs()[0, :2], before))
     assert waited > 20
     away = []
     for _ in range(12):
         tracks = tracker.update(world.scan(), world.pose, 0.1)
-        away.append(float(np.linalg.norm(tracks.centre[0] - world.obstacle_states()[0, :2])))
+        away.append(float(np.linalg.norm(tracks.centre[0] - world.discs()[0, :2])))
         world.step(-1.0, 0.0)  # no longer at rest: the mover goes on
     assert max(away) < 0.05
 
@@ -222,7 +222,7 @@ def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
     assert tracker.tracks().mover.tolist() == [True]
     tracks = watch(world, tracker, round(10.0 * waits), np.zeros(3), rng)
     assert tracks.mover.tolist() == [waits < 10.0] and not tracks.velocity.any()
-    x, y = world.obstacle_states()[0, :2]
+    x, y = world.discs()[0, :2]
     assert np.hypot(*(tracks.centre[0] - [x, y])) < 0.04
     world.carry(np.array([2.0, 6.5, 0.0]))
     again = [watch(world, tracker, 1, np.zeros(3), rng) for _ in range(12)]

@@ -151,18 +151,18 @@ def test_bad_steps_and_starts_in_things_are_refused() -> None:
 def test_movers_keep_to_their_segments_whatever_the_vehicle_does() -> None:
     layout = corridor(11)
     first, second = (QuadrotorWorld(layout, 5, movers=4, disturbance=CALM) for _ in range(2))
-    assert first.mover_states().shape == (4, 3)
+    assert first.discs()[:, :3].shape == (4, 3)
     travelled = np.zeros(4)
     for tick in range(200):
-        before = first.mover_states()
+        before = first.discs()[:, :3]
         first.step(HOVER)
         second.step([0.0, 0.1, 0.0, 11.0] if tick < 5 else HOVER)
-        np.testing.assert_allclose(first.mover_states(), second.mover_states(), atol=1e-9)
-        travelled += np.linalg.norm((first.mover_states() - before)[:, :2], axis=1)
-        assert (layout.distance(first.mover_states()[:, :2]) >= first.mover_states()[:, 2] + 0.1 - 1e-9).all()
+        np.testing.assert_allclose(first.discs()[:, :3], second.discs()[:, :3], atol=1e-9)
+        travelled += np.linalg.norm((first.discs()[:, :3] - before)[:, :2], axis=1)
+        assert (layout.distance(first.discs()[:, :2]) >= first.discs()[:, 2] + 0.1 - 1e-9).all()
     for mover, distance in zip(first.movers, travelled, strict=True):
         assert distance == pytest.approx(mover.speed * 10.0, rel=0.02)
-    assert not np.array_equal(QuadrotorWorld(layout, 6, movers=4).mover_states(), before)
+    assert not np.array_equal(QuadrotorWorld(layout, 6, movers=4).discs()[:, :3], before)
 
 
 def test_a_mover_hits_and_pushes_a_hovering_vehicle() -> None:
@@ -353,7 +353,7 @@ def flown(ticks: int) -> FlightLog:
             landmarks=landmark_rows(
                 reading.ids, world.things()[reading.ids, :2], np.tile(np.eye(2), (count, 1, 1)), reading.radii
             ),
-            parameters=PARAMETERS.packed, parameters_sigma=np.zeros(7), seen=reading.ids, movers=world.mover_states(),
+            parameters=PARAMETERS.packed, parameters_sigma=np.zeros(7), seen=reading.ids, movers=world.discs()[:, :3],
             estimate_ms=1.0, plan_ms=2.0, compiled=0, statuses="converged", clearance=world.clearance(),
             emergency=tick == 1, health="ok", causes="", fault="gust" if tick == 1 else "",
         )  # fmt: skip

@@ -208,7 +208,7 @@ def test_a_ball_is_held_passes_its_target_and_comes_to_rest() -> None:
     np.testing.assert_allclose(place[[0, 1, 2]], [(4.0, 1.0, 1.2), (4.0, 1.0, 1.2), (0.0, 0.0, 1.5)], atol=1e-12)
     np.testing.assert_array_equal(velocity[[0, 1, 3]], 0.0)
     assert place[3, 2] == pytest.approx(ball.floor)
-    assert ball.falls and not Still((0.0, 0.0, 0.0)).falls
+    assert Bodies([Body(0.1, ball), Body(0.1, Still((0.0, 0.0, 0.0)))]).falls.tolist() == [True, False]
 
 
 def test_near_is_measured_along_the_whole_way() -> None:

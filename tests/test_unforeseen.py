@@ -174,7 +174,7 @@ def test_movers_keep_off_walls_in_the_world() -> None:
     states = []
     for _ in range(200):
         world.step(0.0, 0.0)
-        states.append(world.obstacle_states())
+        states.append(world.discs())
     track = np.array(states)
     moving = track[0, :, 3] == 1.0
     assert moving.tolist() == [False, False, True, False, False, True]

@@ -117,7 +117,7 @@ def test_fixed_obstacle_is_a_collision_and_does_not_yield() -> None:
         world.step(0.8, 0.0)
     assert world.collisions == 1
     assert world.pose[0] == pytest.approx(3.0 - 0.37, abs=0.01)
-    np.testing.assert_allclose(world.obstacle_states(), [[3.0, 2.0, 0.2, 0.0]])
+    np.testing.assert_allclose(world.discs(), [[3.0, 2.0, 0.2, 0.0]])
 
 
 def test_clearance_to_walls_and_in_the_open() -> None:
@@ -134,10 +134,10 @@ def test_mover_keeps_its_pace_on_its_segment() -> None:
     xs = []
     for _ in range(110):
         world.step(0.0, 0.0)
-        xs.append(world.obstacle_states()[0, 0])
+        xs.append(world.discs()[0, 0])
     expected = 3.0 + np.abs((0.3 * 0.1 * np.arange(1, 111) + 1.5) % 3.0 - 1.5)
     np.testing.assert_allclose(xs, expected, atol=1e-6)
-    assert world.obstacle_states()[0, 3] == 1.0
+    assert world.discs()[0, 3] == 1.0
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.6])
@@ -151,12 +151,12 @@ def test_mover_waits_for_a_robot_at_rest(turning: float) -> None:
     assert min(gaps) >= 0.1 - 1e-6
     assert gaps[-1] == pytest.approx(0.1, abs=0.005)
     assert world.collisions == 0
-    waiting = world.obstacle_states()[0, 0]
+    waiting = world.discs()[0, 0]
     while abs(math.remainder(world.pose[2] - math.pi / 2, 2 * math.pi)) > 0.05:
         world.step(0.0, 0.5)
     for _ in range(15):
         world.step(1.0, 0.0)
-    assert world.obstacle_states()[0, 0] < waiting - 0.2
+    assert world.discs()[0, 0] < waiting - 0.2
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])

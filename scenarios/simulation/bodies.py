@@ -28,18 +28,12 @@ class Motion(Protocol):
         """Positions (n, 3) [m] and velocities (n, 3) [m/s] at times (n,) [s]."""
         ...
 
-    @property
-    def falls(self) -> bool:
-        """True if gravity bends the way, which a predictor knows."""
-        ...
-
 
 @dataclass(frozen=True)
 class Still:
     """A thing at rest at ``place`` [m]."""
 
     place: tuple[float, float, float]
-    falls: bool = False
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """The place."""
@@ -63,7 +57,6 @@ class Ellipse:
     speed: float
     phase: float = 0.0
     clockwise: bool = False
-    falls: bool = False
     _arc: tuple[Array, Array] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -108,7 +101,6 @@ class Shuttle:
     end: tuple[float, float, float]
     speed: float
     phase: float = 0.0
-    falls: bool = False
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Positions and velocities."""
@@ -137,11 +129,6 @@ class Thrown:
     velocity: tuple[float, float, float]
     release: float
     floor: float = 0.1
-
-    @property
-    def falls(self) -> bool:
-        """Gravity bends its way."""
-        return True
 
     @property
     def flight(self) -> float:
@@ -201,7 +188,7 @@ class Bodies:
         self.bodies = tuple(bodies)
         self.radii = np.array([body.radius for body in self.bodies], dtype=np.float64)
         self.upright: BoolArray = np.array([body.upright for body in self.bodies], dtype=bool)
-        self.falls: BoolArray = np.array([body.motion.falls for body in self.bodies], dtype=bool)
+        self.falls: BoolArray = np.array([isinstance(body.motion, Thrown) for body in self.bodies], dtype=bool)
         if not (self.radii > 0.0).all():
             raise ScenarioError(f"obstacles need radii above zero, got {self.radii.tolist()}")
 
