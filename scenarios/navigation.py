@@ -318,7 +318,7 @@ class Episode:
     def _begin_leg(self, goal: int) -> None:
         """Plan to a goal from where the robot believes to be; without a way it is given up at the next tick."""
         self._begun, self._allowed = self.world.time, 0.0
-        self.pilot.forget()
+        self.pilot.controller.forget()
         try:
             self.legs[goal] = self._route(self._freed(self.pilot.pose), self.goals[goal])
         except ScenarioError:
@@ -378,7 +378,7 @@ class Episode:
             solve_ms=took["localise_ms"] + took["plan_ms"],
             **took,
             compiled=compiled,
-            localisation_iterations=pilot.iterations,
+            localisation_iterations=pilot.estimator.iterations,
             plan_iterations=plan.iterations,
             status=STOPPED if plan.source == STOPPED else plan.status.name.lower(),
             bound_violation=plan.excess,

@@ -127,11 +127,6 @@ class Pilot(Generic[PlannerT]):
         self._first: Scan | None = None
 
     @property
-    def iterations(self) -> int:
-        """Iterations of the last estimate."""
-        return self.estimator.iterations
-
-    @property
     def verdict(self) -> HealthReport:
         """Report of the supervisor at the last tick."""
         return self.supervisor.verdict
@@ -265,10 +260,6 @@ class Pilot(Generic[PlannerT]):
         self.pose, self.relocated = self.estimator.pose, True
         self.tracker, self.points = DiscTracker(self._map), PointWatch()
         self.tracks = Tracks.none()
-
-    def forget(self) -> None:
-        """Drop the warm start of the horizon."""
-        self.controller.forget()
 
     def take_over(self, other: Pilot[PlannerT]) -> None:
         """Go on where another pilot, with another map, was."""

@@ -25,6 +25,7 @@ from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.polyline import arc_lengths
 from unifg.typing import Array, ArrayLike, BoolArray
 
 __all__ = ["LocalPlanner", "PlannerAdapter", "PlannerContext", "Situation", "load_planner"]
@@ -106,8 +107,7 @@ class Situation:
 
     def along(self) -> Array:
         """(N + 1,) arc lengths of the reference [m]."""
-        steps = np.hypot(*np.diff(self.reference[:, :2], axis=0).T)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        return arc_lengths(self.reference[:, :2])
 
 
 class LocalPlanner(Protocol):

@@ -16,6 +16,7 @@ from unifg.codegen.jit import compiled
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap, bilinear
+from unifg.scenarios.perception.explaining import FARTHEST
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array
 
@@ -117,8 +118,7 @@ class Relocaliser:
 
 def fit(distance_map: DistanceMap, scan: Scan, pose: Array) -> float:
     """Share of the beams that end at a surface and have passed none, seen from a pose (3,)."""
-    with np.errstate(invalid="ignore"):
-        beams = scan.ranges <= 10.0
+    beams = scan.within(FARTHEST)
     ranges, bearing = scan.ranges[beams], scan.angles[beams] + pose[2]
     ray = ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     ends = np.abs(distance_map.distance(pose[:2] + ray)) <= END
@@ -128,8 +128,7 @@ def fit(distance_map: DistanceMap, scan: Scan, pose: Array) -> float:
 
 def refine(distance_map: DistanceMap, scan: Scan, pose: Array) -> Array:
     """Gauss-Newton on the beams that end near a surface, whose reach shrinks as the match improves, (3,)."""
-    with np.errstate(invalid="ignore"):
-        beams = scan.ranges <= 10.0
+    beams = scan.within(FARTHEST)
     ranges, angles = scan.ranges[beams], scan.angles[beams]
     for step in range(STEPS):
         bearing = angles + pose[2]
@@ -146,8 +145,7 @@ def refine(distance_map: DistanceMap, scan: Scan, pose: Array) -> Array:
 
 def _tips(scan: Scan) -> Array:
     """(H, n, 2) ends of beams spread over the turn, for every heading of the fan, seen from the robot [m]."""
-    with np.errstate(invalid="ignore"):
-        beams = np.flatnonzero(scan.ranges <= 10.0)
+    beams = scan.within(FARTHEST)
     chosen = beams[np.linspace(0, len(beams) - 1, min(BEAMS, len(beams))).round().astype(np.intp)]
     angles, ranges = FAN[:, None] + scan.angles[chosen], scan.ranges[chosen]
     return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=2)

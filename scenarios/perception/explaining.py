@@ -55,8 +55,7 @@ class Explained:
 
 def explained(distance_map: DistanceMap, scan: Scan, pose: Array) -> Explained:
     """Hold a scan, taken at a pose (3,) [m, m, rad], against the map."""
-    with np.errstate(invalid="ignore"):
-        beams = np.flatnonzero(scan.ranges <= FARTHEST)
+    beams = scan.within(FARTHEST)
     ranges, bearing = scan.ranges[beams], scan.angles[beams] + pose[2]
     points = pose[:2] + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     give = THRESHOLD + GROWTH * ranges

@@ -24,7 +24,6 @@ from unifg.models import quadrotor
 from unifg.typing import Array
 
 STORED, TANGENT = 17, 16  # of state and parameters; landmarks follow
-WIND, WIND_TANGENT = 14, 13
 
 
 @compiled
@@ -43,7 +42,10 @@ def _heading(x: Array, R: Array) -> tuple[float, float, float, float]:
 
 @compiled
 def _arrival(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """Difference of state, parameters and landmarks from those of the reference, both seen from their vehicles."""
+    """Difference of state, parameters and landmarks from those of the reference, both seen from their vehicles.
+
+    Behind the reference an offset follows that is taken away.
+    """
     derive = len(J) > 0
     if derive:
         J[:] = 0.0
@@ -86,6 +88,8 @@ def _arrival(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
             J[row + 1, 4], J[row + 1, 5] = -x * along, -x * across
             if k > 1:
                 J[row, 0], J[row, 1], J[row + 1, 0], J[row + 1, 1] = -c, -s, s, -c
+    for i in range(len(r)):
+        r[i] -= p[len(v) + i]
 
 
 @cache
@@ -94,57 +98,30 @@ def arrival(landmarks: int) -> Residual:
 
     Rows are differences of position (3), heading, the first two entries of R' e3, velocity (3), mass, drag (3), wind
     (2), updraft and landmarks (2 each); velocity, wind and landmarks as seen from the vehicle's place and heading.
-    reference: (17 + 2 K,), states, parameters and landmarks in the world side by side. For vehicles that lean by less
-    than a right angle.
+    reference: (33 + 4 K,), states, parameters and landmarks in the world side by side, and an offset of the rows. For
+    vehicles that lean by less than a right angle.
     """
     marks = [fg.Rn(2)] * landmarks
     parts = (quadrotor.STATE, quadrotor.MASS, quadrotor.DRAG, quadrotor.WIND, quadrotor.UPDRAFT, *marks)
-    kernel = Kernel(_arrival, (*parts, (STORED + 2 * landmarks,)), TANGENT + 2 * landmarks, name="arrival")
+    rows = TANGENT + 2 * landmarks
+    kernel = Kernel(_arrival, (*parts, (STORED + 2 * landmarks + rows,)), rows, name="arrival")
     return fg.residual(kernel)
 
 
-def seen_from_the_vehicle(here: Array, reference: Array, information: Array) -> tuple[Array, Array]:
+def seen_from_the_vehicle(here: Array, step: Array, information: Array) -> tuple[Array, Array]:
     """Express a joint prior, frozen at ``here``, in the coordinates of :func:`arrival`.
 
     Args:
         here: (S,) where it was linearised: state, parameters and landmarks.
-        reference: (S,) its lowest point.
+        step: (D,) from there to its lowest point, a right perturbation.
         information: (D, D) over right perturbations.
 
     Returns:
-        Reference (S,) in the world, and information (D, D) of the rows of :func:`arrival`.
+        Reference (S + D,), and information (D, D) of the rows of :func:`arrival`.
     """
-    here, reference = np.ascontiguousarray(here), np.ascontiguousarray(reference)
-    size = len(here) - 1
-    step = np.concatenate([quadrotor.STATE.local(here[:10], reference[:10]), reference[10:] - here[10:]])
-    change, J = np.empty(size), np.empty((size, size))
-    _arrival(here, here, np.zeros(0), change, J)
+    reference = np.concatenate([here, np.zeros_like(step)])
+    J = np.empty((len(step), len(step)))
+    _arrival(reference[: len(here)], reference, np.zeros(0), np.empty(len(step)), J)
     inverse = np.linalg.inv(J)
     information = inverse.T @ information @ inverse
-    return _moved(here, J @ step), 0.5 * (information + information.T)
-
-
-def _moved(here: Array, change: Array) -> Array:
-    """The point whose difference from ``here`` is ``change``."""
-    moved = here.copy()
-    moved[:3] += change[:3]
-    moved[9:] += change[8:]
-    R = np.empty((3, 3))
-    c0, s0, _, _ = _heading(here, R)
-    turn = math.atan2(s0, c0) + change[3]
-    c, s = math.cos(turn), math.sin(turn)
-    moved[3:7] = _attitude(c, s, R[2, 0] + change[4], R[2, 1] + change[5])
-    for at in (7, WIND, *range(STORED, len(here), 2)):
-        origin = (here[:2], moved[:2]) if at >= STORED else (0.0, 0.0)
-        x, y = here[at : at + 2] - origin[0]
-        x, y = c0 * x + s0 * y + change[at - 1], c0 * y - s0 * x + change[at]
-        moved[at : at + 2] = origin[1] + np.array([c * x - s * y, s * x + c * y])
-    return moved
-
-
-def _attitude(c: float, s: float, x: float, y: float) -> Array:
-    """The quaternion with heading (c, s) whose R' e3 begins with (x, y) and points up."""
-    z = math.sqrt(max(1.0 - x * x - y * y, 0.0))
-    h = math.sqrt(1.0 - x * x)
-    level = np.array([[h, -x * y / h, -x * z / h], [0.0, z / h, -y / h], [x, y, z]])
-    return fg.SO3.from_matrix(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ level)
+    return np.concatenate([here, J @ step]), 0.5 * (information + information.T)

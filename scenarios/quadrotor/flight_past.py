@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from unifg.codegen.jit import compiled
-from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual
 from unifg.horizon import Constant, Context, Measurement, Robot, Term, Window
 from unifg.models import landmarks, quadrotor
@@ -87,18 +85,10 @@ class WindowSettings:
 FORCE = specific_force(quadrotor.STATE)
 
 
-@compiled
-def _turned(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """Noise of the rates less what the gyro saw beyond those commanded."""
-    for i in range(3):
-        r[i] = v[i] - p[i]
-        if len(J):
-            for k in range(6):
-                J[i, k] = 1.0 if i == k else 0.0
-
-
-gyro = fg.residual(Kernel(_turned, (quadrotor.NOISE, (3,)), 3, name="gyro", linear=True))
-"""``gyro(w, beyond)``: noise of the rates less ``beyond`` (3,), measured less commanded rates [rad/s]."""
+def gyro(noise: Array, beyond: Array) -> Array:
+    """(n, 3) noise (n, 6) of the rates less ``beyond`` (n, 3), measured less commanded rates [rad/s]."""
+    found: Array = noise[:, :3] - beyond
+    return found
 
 
 class SeenFromTheVehicle:
@@ -113,12 +103,12 @@ class SeenFromTheVehicle:
         return arrival(self._slots)
 
     def more(self, dim: int) -> int:
-        """Nothing: the reference is the lowest point."""
-        return 0
+        """The offset of the lowest point."""
+        return dim
 
     def express(self, here: Array, step: Array, lowest: Array, information: Array) -> tuple[Array, Array]:
         """As seen from the vehicle."""
-        return seen_from_the_vehicle(here, lowest, information)
+        return seen_from_the_vehicle(here, step, information)
 
 
 @dataclass(frozen=True)
