@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from episodes import room
+from maps import field
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.command import main
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
@@ -72,9 +72,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def context() -> PlannerContext:
-    occupancy = room()
-    distances = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
-    return PlannerContext(distances, ControllerSettings(accelerations=(1.0, 2.0)), np.random.default_rng(0))
+    return PlannerContext(field(room()), ControllerSettings(accelerations=(1.0, 2.0)), np.random.default_rng(0))
 
 
 def ahead() -> np.ndarray:

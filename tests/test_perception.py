@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maps import field, walled
 from unifg.files.ros_map import OccupancyMap, load_map
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.perception.disc_tracker import DiscTracker
 from unifg.scenarios.perception.discs import DiscFinder
 from unifg.scenarios.perception.readings import Scan
@@ -23,19 +23,9 @@ from unifg.typing import Array, ArrayLike
 DT = 0.1
 
 
-def hall(width: float = 10.0, height: float = 8.0, pillar: bool = False) -> OccupancyMap:
-    """A hall with walls, and perhaps a mapped pillar of 0.5 m in its middle."""
-    occupied = np.zeros((round(height / 0.05), round(width / 0.05)), dtype=bool)
-    occupied[[0, -1], :] = True
-    occupied[:, [0, -1]] = True
-    if pillar:
-        occupied[75:85, 95:105] = True
-    return OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall")
-
-
-def field(occupancy: OccupancyMap) -> DistanceMap:
-    """Distance map of an occupancy map."""
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+def hall(pillar: bool = False) -> OccupancyMap:
+    """A hall of 10 m by 8 m, and perhaps a mapped pillar of 0.5 m in its middle."""
+    return walled(10.0, 8.0, blocks=[np.s_[75:85, 95:105]] if pillar else [])
 
 
 def disc(x: float, y: float, radius: float = 0.2) -> Obstacle:
@@ -123,9 +113,7 @@ def test_mapped_things_are_not_obstacles() -> None:
 
 def test_wide_things_become_several_discs() -> None:
     """An unmapped wall of two metres is covered by discs along its whole face."""
-    occupied = hall().occupied.copy()
-    occupied[60:100, 100:104] = True
-    solid = OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall")
+    solid = walled(10.0, 8.0, blocks=[np.s_[60:100, 100:104]])
     world = World(solid, (3.0, 4.0, 0.0), rng=np.random.default_rng(0))
     tracks = watch(world, DiscTracker(field(hall())), 5, np.zeros(3), np.random.default_rng(0))
     face = np.stack([np.full(41, 5.0), np.linspace(3.0, 5.0, 41)], axis=1)

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import maps
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
@@ -35,7 +35,6 @@ from unifg.scenarios.quadrotor.unmodelled import Unmodelled
 from unifg.scenarios.scenes.flight_plot import control
 from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.scenarios.simulation.air import QuadrotorWorld
-from unifg.scenarios.simulation.building import building_map
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault, one_of
 from unifg.scenarios.simulation.layouts import corridor
@@ -317,12 +316,6 @@ def test_single_beams_stop_nobody_and_lost_ones_do() -> None:
 # ------------------------------------------------------------------- found again
 
 
-@functools.cache
-def building() -> tuple[Any, DistanceMap]:
-    occupancy = building_map()
-    return occupancy, DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
-
-
 def searched(search: Relocaliser, sample: Scan) -> tuple[Found, int]:
     """Result of a search, and the number of its portions."""
     search.begin(sample)
@@ -335,7 +328,7 @@ def searched(search: Relocaliser, sample: Scan) -> tuple[Found, int]:
 
 @pytest.mark.parametrize("place", [(3.0, 25.2, 2.0), (21.0, 9.6, -2.0)], ids=str)
 def test_a_robot_put_down_anywhere_is_found(place: tuple[float, float, float]) -> None:
-    occupancy, field = building()
+    occupancy, field = maps.building()
     search = Relocaliser(occupancy, field, 0.17)
     found, ticks = searched(search, World(occupancy, place).scan())
     assert found.pose is not None and found.share > 0.9 and found.cause == ""
@@ -345,7 +338,7 @@ def test_a_robot_put_down_anywhere_is_found(place: tuple[float, float, float]) -
 
 
 def test_a_scan_of_another_building_is_found_nowhere() -> None:
-    occupancy, field = building()
+    occupancy, field = maps.building()
     other = askew(occupancy, np.array([10.8, 17.0, 0.0]))
     where = World(other, (10.8, 17.0, 0.0))
     found, _ = searched(Relocaliser(occupancy, field, 0.17), where.scan())
@@ -353,10 +346,10 @@ def test_a_scan_of_another_building_is_found_nowhere() -> None:
 
 
 def test_a_map_put_askew_leaves_the_robot_in_the_open() -> None:
-    occupancy, field = building()
+    occupancy, field = maps.building()
     here = np.array([10.8, 17.0, 0.3])
     other = askew(occupancy, here)
-    turned = DistanceMap.from_occupancy(other.occupied, other.resolution, other.origin)
+    turned = maps.field(other)
     assert turned.distance(here[None, :2])[0] == pytest.approx(field.distance(here[None, :2])[0], abs=0.03)
 
 
@@ -378,15 +371,8 @@ SHORT = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),), o
 @functools.cache
 def faulty(fault: str, coupling: str = "sequential", ticks: int = 50) -> EpisodeLog:
     """Some seconds with a fault from second 1."""
-    count = 0
-
-    def stop(done: float, text: str) -> None:
-        nonlocal count
-        count += 1
-        if count == ticks:
-            raise KeyboardInterrupt
-
-    return Episode(replace(SHORT, coupling=coupling, faults=(one_of(DRIVE_FAULTS)(fault),))).run(stop)
+    settings = replace(SHORT, coupling=coupling, faults=(one_of(DRIVE_FAULTS)(fault),))
+    return Episode(settings).run(maps.stop_after(ticks))
 
 
 @pytest.mark.parametrize("kind", ["lidar-max", "lidar-frozen", "lidar-delayed", "beams-missing"])
@@ -450,15 +436,7 @@ def test_other_faults_are_named_too(fault: str, cause: str) -> None:
 def test_a_tick_that_fails_stops_the_robot_and_not_the_record(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(SHORT)
     monkeypatch.setattr(episode.pilot.tracker, "update", lambda *_: np.linalg.inv(np.zeros((2, 2))))
-    count = 0
-
-    def stop(done: float, text: str) -> None:
-        nonlocal count
-        count += 1
-        if count == 10:
-            raise KeyboardInterrupt
-
-    log = episode.run(stop)
+    log = episode.run(maps.stop_after(10))
     assert log.ticks == 10 and not log.control.any()
     assert log.cause[-1] == "the tick failed: Singular matrix" and log.health[-1] == "degraded"
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+import maps
+from maps import walled
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.planning.grid import plan
 from unifg.scenarios.planning.polyline import polyline_distance
 from unifg.scenarios.simulation.placement import PlacementRules, place_obstacles
@@ -26,20 +27,16 @@ GOALS = np.array([[9.0, 6.0, 0.0], [18.5, 1.5, 0.0]])
 
 def floor(door: float = 1.4) -> OccupancyMap:
     """20 m x 8 m, two inner walls with one door each."""
-    occupied = np.zeros((160, 400), dtype=bool)
-    occupied[[0, -1], :] = True
-    occupied[:, [0, -1]] = True
     half = round(0.5 * door / 0.05)
-    for column, middle in ((120, 100), (260, 60)):
-        occupied[:, column : column + 3] = True
-        occupied[middle - half : middle + half, column : column + 3] = False
-    return OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="floor")
+    beside = [
+        (rows, slice(column, column + 3))
+        for column, middle in ((120, 100), (260, 60))
+        for rows in (slice(0, middle - half), slice(middle + half, 160))
+    ]
+    return walled(20.0, 8.0, name="floor", blocks=beside)
 
 
-@functools.lru_cache(maxsize=4)
-def field(occupancy: OccupancyMap) -> DistanceMap:
-    """Distance map of an occupancy map."""
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+field = functools.lru_cache(maxsize=4)(maps.field)
 
 
 def route(occupancy: OccupancyMap, start: Array, goals: Array) -> Array:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maps import walled
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.lidar import beam_endpoints
@@ -24,11 +25,7 @@ EXACT = OdometryModel(scale_sigma=0.0, noise_sigma=0.0)
 
 def room(width: float = 6.0, height: float = 4.0, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyMap:
     """A room with walls one cell thick; its inside begins one cell (0.05 m) from the origin."""
-    rows, columns = round(height / 0.05), round(width / 0.05)
-    occupied = np.zeros((rows, columns), dtype=bool)
-    occupied[[0, -1], :] = True
-    occupied[:, [0, -1]] = True
-    return OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=origin, name="room")
+    return walled(width, height, origin=origin, name="room")
 
 
 def quiet_world(start: tuple[float, float, float], *obstacles: Obstacle, seed: int = 0) -> World:

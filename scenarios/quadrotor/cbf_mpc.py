@@ -20,14 +20,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 import unifg as fg
 from unifg import horizon
-from unifg.horizon import Context, ControlCost, InitialGuesses, LastPlan, RecedingHorizon, Robot, Term
+from unifg.horizon import (
+    Context,
+    ControlCost,
+    InitialGuesses,
+    LastPlan,
+    LastPlanThenBrake,
+    RecedingHorizon,
+    Robot,
+    Term,
+)
 from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
@@ -310,16 +319,17 @@ class CbfMpc:
         terms += [self._barriers] if s.slots else []
         early = {"step_tolerance": np.inf} if solver == "ipm" and not s.settled else {}
         numbers = {"tolerance": s.tolerance, **({"penalty": PENALTY} if solver == "ipm" else {}), **early}
+        robot = Robot(quadrotor_loops.STATE, quadrotor.CONTROL)
+        self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
+        self._policy, self._refused = LastPlanThenBrake(robot, FEASIBLE, KEEP, self._brake), 0
         self.loop = RecedingHorizon(
-            Robot(quadrotor_loops.STATE, quadrotor.CONTROL), s.horizon, terms, times=self.nodes,
+            robot, s.horizon, terms, times=self.nodes,
             solver=backend(solver, time_limit=s.budget, max_iterations=s.iterations, **numbers),
             cold=backend(solver, **numbers), limits=(airframe.least, airframe.most), judge=self.judge,
             starts=InitialGuesses(cold=self._along, after_failure=self._braking),
         )  # fmt: skip
         self.loop.applied = quadrotor.hover(airframe.parameters)
-        self._planned, self._refused = False, 0
         self._looked_at = [-1] * s.slots
-        self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
 
     def decide(self, start: Array, flown: Flown, obstacles: Obstacles, later: float, gust: Array) -> Decision:
         """Plan.
@@ -339,40 +349,36 @@ class CbfMpc:
         plan = self.loop.plan(start, Guarded(states, controls[:-1], near, later, gust))
         solution = self.loop.solution
         assert solution is not None
-        status, slack, p = plan.source, 0.0, self.believed
-        mass, drag = p.mass, np.array(p.drag)
+        status, slack, p = "last plan" if plan.source == "kept" else plan.source, 0.0, self.believed
+        mass, drag, places = p.mass, np.array(p.drag), plan.states[:, :3]
+        if plan.source == "kept":
+            places = self.loop.kept.states[:, :3]
         if not plan.emergency:
             status, mass, drag = plan.status.name.lower(), float(solution["mass"][0, 0]), solution["drag"][0]
             slack = max((use.amount for kept in self._barriers.kept for use in kept.used(solution)), default=0.0)
-            places = plan.states[:, :3]
             if len(obstacles.keep) and obstacles.clearance(places, later + self.nodes).min() < -INSIDE:
                 status = "too near"
         spent = 1e3 * (time.thread_time() - begin)
-        return Decision(plan.control, plan.states[:, :3], status, plan.iterations, slack, mass, drag, spent)
+        return Decision(plan.control, places, status, plan.iterations, slack, mass, drag, spent)
 
     def judge(
         self, solution: fg.Solution, states: Array, controls: Array, now: Context[Guarded], kept: LastPlan
     ) -> horizon.Decision:
         """Fly a plan that keeps the constraints; else the last one for a while; else brake."""
-        finite = bool(np.isfinite(states).all() and np.isfinite(controls).all())
-        if finite and solution.violation < FEASIBLE:
-            self._planned, self._refused = True, 0
-            return horizon.Decision(kept.within(controls), states, "solved")
+        decision = self._policy(solution, states, controls, now, kept)
         # A solve that was begun goes on in the next tick; after a few ticks it begins anew.
-        self._refused += 1
-        resumed = finite and self.loop.guess is not None and self._refused % TRIES > 0
-        left = kept.within(kept.left())
-        if self._planned and kept.age <= KEEP + 1e-9 and len(left):
-            rest = np.tile(left[-1], (len(controls) - len(left), 1))
-            return horizon.Decision(np.concatenate([left, rest]), kept.states, "last plan", resumed=resumed)
+        self._refused = 0 if decision.source == "solved" else self._refused + 1
+        begun = np.isfinite(states).all() and np.isfinite(controls).all() and self.loop.guess is not None
+        return replace(decision, resumed=bool(begun) and self._refused % TRIES > 0)
+
+    def _brake(self, now: Context[Guarded]) -> Array:
+        """(4,) control that takes the velocity away."""
         level = np.clip(-np.array(Gains().velocity)[[0, 0, 1]] * now.present[7:10], -BRAKING, BRAKING)
-        control = self._brakes.steer(now.present[:10], level, np.zeros(3), self.believed)
-        still = np.tile(now.present, (len(states), 1))
-        return horizon.Decision(np.tile(control, (len(controls), 1)), still, "braking", resumed=resumed)
+        return self._brakes.steer(now.present[:10], level, np.zeros(3), self.believed)
 
     def _nearest(self, start: Array, obstacles: Obstacles, later: float) -> IntArray:
         """Obstacles that are nearest to the plan or to braking; one that was chosen before keeps its place."""
-        ways = [_braked(start, self.nodes).position, *([self.loop.kept.states[:, :3]] if self._planned else [])]
+        ways = [_braked(start, self.nodes).position, *([] if self.states is None else [self.states[:, :3]])]
         near = np.min([obstacles.clearance(way, later + self.nodes).min(axis=0) for way in ways], axis=0)
         wanted = np.argsort(near, kind="stable")[: self.settings.slots]
         self._looked_at = reassigned(self._looked_at, wanted.tolist())
@@ -390,7 +396,7 @@ class CbfMpc:
     @property
     def states(self) -> Array | None:
         """(N + 1, 17) of the last plan; None before there is one."""
-        return self.loop.kept.states if self._planned else None
+        return self.loop.kept.states if "solved" in self.loop.sources else None
 
     @property
     def believed(self) -> quadrotor.Parameters:
