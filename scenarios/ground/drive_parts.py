@@ -186,8 +186,7 @@ def wall_limits(s: ControllerSettings, field: SmoothField, evasive: Array, refer
     if s.avoidance == "barrier":
         spare = np.maximum(float(field.distance(evasive[:1, :2])[0]) - least, 0.0)
         least = least + spare * share(s.approach, s.dt * np.arange(1, s.horizon + 1))
-    limits: Array = np.minimum(least, field.distance(evasive[1:, :2]))[:, None]
-    return limits
+    return np.minimum(least, field.distance(evasive[1:, :2]))[:, None]
 
 
 def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
@@ -196,8 +195,7 @@ def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
     A mover goes straight on, even through the robot. It is not expected to go away, for it may turn round.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)
-    centres: Array = tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
-    return centres
+    return tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
 
 
 def disc_limits(

@@ -49,30 +49,24 @@ class Estimator(Protocol):
     @property
     def iterations(self) -> int:
         """Of the last update."""
-        ...
 
     @property
     def pose(self) -> Array:
         """(3,) present estimate [m, m, rad]."""
-        ...
 
     @property
     def covariance(self) -> Array:
         """(3, 3) of it, in the tangent space."""
-        ...
 
     @property
     def refused(self) -> str:
         """Why the last scan has not corrected the estimate, "" where it has."""
-        ...
 
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
         """Take in a scan, None for none, and the odometry (2,) since the last one, None on the first."""
-        ...
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
-        ...
 
 
 PlannerT = TypeVar("PlannerT", bound=Controller | PlannerAdapter)

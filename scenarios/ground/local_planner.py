@@ -86,14 +86,12 @@ class Situation:
         for centre, velocity, radius in zip(self.tracks.centre, self.tracks.velocity, self.tracks.radius, strict=True):
             offset = points - (centre + when * velocity)
             np.minimum(distance, np.hypot(offset[..., 0], offset[..., 1]) - radius - s.disc_clearance, out=distance)
-        left: Array = distance - s.robot_radius - self.doubt
-        return left
+        return distance - s.robot_radius - self.doubt
 
     def hits(self, clearance: Array, times: Array | float) -> BoolArray:
         """Flags of a drive of such clearances (...,) at those times: True for a hit that a robot at rest avoids."""
         rest = self.clearance(np.broadcast_to(self.pose[:2], (*np.shape(times), 2)), times)
-        struck: BoolArray = clearance < np.minimum(rest, 0.0) - TOLERANCE
-        return struck
+        return clearance < np.minimum(rest, 0.0) - TOLERANCE
 
     def reachable(self, wanted: Array) -> Array:
         """Controls (..., K, 2) nearest to those wanted within the limits of speed and acceleration from now on."""
@@ -115,7 +113,6 @@ class LocalPlanner(Protocol):
 
     def control(self, now: Situation) -> ArrayLike | None:
         """Velocity (2,) or velocities (K, 2) from now on, the last of which holds on [m/s, rad/s]; None for no way."""
-        ...
 
 
 class PlannerAdapter:

@@ -125,8 +125,7 @@ def thinned(points: Array, apart: float) -> Array:
     if not len(points):
         return points
     _, first = np.unique(np.floor(points / apart).astype(np.int64), axis=0, return_index=True)
-    kept: Array = points[np.sort(first)]
-    return kept
+    return points[np.sort(first)]
 
 
 def _near(points: Array, others: Array, reach: float) -> BoolArray:

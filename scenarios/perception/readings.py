@@ -93,8 +93,7 @@ class Scan:
     @property
     def valid(self) -> BoolArray:
         """(B,) True for beams that came back."""
-        returned: BoolArray = np.isfinite(self.ranges)
-        return returned
+        return np.isfinite(self.ranges)
 
 
 @dataclass(frozen=True)

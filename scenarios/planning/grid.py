@@ -376,8 +376,7 @@ def _shorten(clearance: _Clearance, points: Array, level: float, robot_radius: f
     kept = _straightened(
         clearance.field.table, clearance.known, clearance.discs, points, spent, floor, stride, robot_radius
     )
-    shorter: Array = points[kept]
-    return shorter
+    return points[kept]
 
 
 @compiled

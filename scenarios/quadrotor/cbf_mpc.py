@@ -166,8 +166,7 @@ class Obstacles:
         """(n, M, 3) where they are expected ``later`` (n,) [s]: at constant velocity, or falling."""
         t = later[:, None, None]
         down = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * self.falls[:, None]
-        found: Array = self.position + self.velocity * t + 0.5 * down * t * t
-        return found
+        return self.position + self.velocity * t + 0.5 * down * t * t
 
     def clearance(self, places: Array, later: Array) -> Array:
         """(n, M) distances of places (n, 3) from where they are expected ``later`` (n,), beyond what is to be kept."""
@@ -259,8 +258,7 @@ def inverse_clearance(
     p: Array, t: Array, centre: Array, velocity: Array, fall: Array, keep: Array, *rest: Any
 ) -> Array:
     """(n, M) ``1/keep - 1/distance`` of the same [1/m] (eq. 15)."""
-    found: Array = 1.0 / keep - 1.0 / (keep + clearance(p, t, centre, velocity, fall, keep, *rest))
-    return found
+    return 1.0 / keep - 1.0 / (keep + clearance(p, t, centre, velocity, fall, keep, *rest))
 
 
 def slower(v: Array, limit: Array) -> Array:

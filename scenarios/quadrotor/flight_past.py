@@ -87,8 +87,7 @@ FORCE = specific_force(quadrotor.STATE)
 
 def gyro(noise: Array, beyond: Array) -> Array:
     """(n, 3) noise (n, 6) of the rates less ``beyond`` (n, 3), measured less commanded rates [rad/s]."""
-    found: Array = noise[:, :3] - beyond
-    return found
+    return noise[:, :3] - beyond
 
 
 class SeenFromTheVehicle:

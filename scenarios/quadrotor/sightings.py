@@ -65,8 +65,7 @@ def missed(centre: Array, velocity: Array, own: Array, since: Array, fall: Array
         seen: (n, 3) where it was seen [m].
         beside: 1 where looks are from the vehicle, 0 where they say a place in the world.
     """
-    found: Array = centre + since * velocity + 0.5 * since * since * fall - seen - beside * own
-    return found
+    return centre + since * velocity + 0.5 * since * since * fall - seen - beside * own
 
 
 class Sightings:

@@ -26,7 +26,6 @@ class Motion(Protocol):
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Positions (n, 3) [m] and velocities (n, 3) [m/s] at times (n,) [s]."""
-        ...
 
 
 @dataclass(frozen=True)

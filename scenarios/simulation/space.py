@@ -56,8 +56,7 @@ class Obstacle:
     def positions(self, fractions: Array) -> Array:
         """(n, 2) centres at fractions (n,) of the segment [m]; the same place for a fixed obstacle."""
         end = self.centre if self.end is None else self.end
-        positions: Array = self.centre + fractions[:, None] * (end - self.centre)
-        return positions
+        return self.centre + fractions[:, None] * (end - self.centre)
 
 
 class Policy(Protocol):
@@ -65,7 +64,6 @@ class Policy(Protocol):
 
     def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
         """Velocity for the next substep of ``dt`` [s]; ``resting``: the vehicle stands still [m/s]."""
-        ...
 
 
 class Mover:
