@@ -128,10 +128,14 @@ def test_an_answer_of_another_shape_is_refused(own: Path) -> None:
         adapter.plan(np.zeros(3), ahead(), Tracks.none())
 
 
-def test_planner_and_localiser_of_others_have_no_joint_graph() -> None:
-    with pytest.raises(ScenarioError, match="planner 'x:Y' stands for itself: its coupling is 'sequential'"):
-        Episode(NavigationSettings(planner="x:Y", coupling="joint"))
-    with pytest.raises(ScenarioError, match="localiser 'amcl' stands for itself"):
-        Episode(NavigationSettings(localiser="amcl", coupling="joint"))
-    with pytest.raises(ScenarioError, match="unknown localiser 'best': choose graph or amcl"):
-        Episode(NavigationSettings(localiser="best"))
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"planner": "x:Y", "coupling": "joint"}, "planner 'x:Y' stands for itself: its coupling is 'sequential'"),
+        ({"localiser": "amcl", "coupling": "joint"}, "localiser 'amcl' stands for itself"),
+        ({"localiser": "best"}, "unknown localiser 'best': choose graph or amcl"),
+    ],
+)
+def test_planner_and_localiser_of_others_have_no_joint_graph(wrong: dict[str, str], words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        Episode(NavigationSettings(**wrong))  # type: ignore[arg-type]

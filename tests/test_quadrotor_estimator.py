@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -326,15 +327,18 @@ def test_what_moves_is_left_out() -> None:
     assert len(last.landmarks) > 2
 
 
-def test_settings_are_checked() -> None:
-    with pytest.raises(fg.ScenarioError, match="at least two past states"):
-        WindowSettings(length=1)
-    with pytest.raises(fg.ScenarioError, match="at least one slot"):
-        WindowSettings(landmarks=0)
-    with pytest.raises(fg.ScenarioError, match="'weight' is no parameter"):
-        WindowSettings(estimated=("weight",))
-    with pytest.raises(fg.ScenarioError, match="choose known or unknown"):
-        EstimatorSettings(association="guessed")
+@pytest.mark.parametrize(
+    ("settings", "wrong", "words"),
+    [
+        (WindowSettings, {"length": 1}, "at least two past states"),
+        (WindowSettings, {"landmarks": 0}, "at least one slot"),
+        (WindowSettings, {"estimated": ("weight",)}, "'weight' is no parameter"),
+        (EstimatorSettings, {"association": "guessed"}, "choose known or unknown"),
+    ],
+)
+def test_settings_are_checked(settings: Any, wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises(fg.ScenarioError, match=words):
+        settings(**wrong)
 
 
 def test_an_empty_map() -> None:

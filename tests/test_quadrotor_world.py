@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,6 @@ from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.scenarios.simulation.layouts import Layout, corridor
 from unifg.scenarios.simulation.space import Obstacle
-from unifg.typing import Array
 
 CALM = DisturbanceModel.calm()
 PARAMETERS = quadrotor.Parameters(mass=1.2, drag=(0.2, 0.3, 0.4), wind=(0.3, -0.2), updraft=0.1)
@@ -128,21 +128,20 @@ def test_clearance_is_the_nearest_of_everything() -> None:
 
 
 @pytest.mark.parametrize(
-    "start", [np.zeros(3), np.full(10, np.nan), [0, 0, 1, 2, 0, 0, 0, 0, 0, 0], [0, 0, -0.1, *LEVEL, 0, 0, 0]]
+    ("start", "control", "dt", "words"),
+    [
+        (np.zeros(3), HOVER, 0.05, "start"),
+        (np.full(10, np.nan), HOVER, 0.05, "start"),
+        ([0, 0, 1, 2, 0, 0, 0, 0, 0, 0], HOVER, 0.05, "start"),
+        ([0, 0, -0.1, *LEVEL, 0, 0, 0], HOVER, 0.05, "start"),
+        ([4.5, 0, 1, *LEVEL, 0, 0, 0], HOVER, 0.05, "cannot start at"),
+        (None, [0.0, 0.0, math.nan, 9.81], 0.05, "four finite"),
+        (None, HOVER, 0.0, "duration"),
+    ],
 )
-def test_bad_starts_are_refused(start: Array) -> None:
-    with pytest.raises(ScenarioError, match="start"):
-        QuadrotorWorld(field(), 0, start=start)
-
-
-def test_bad_steps_and_starts_in_things_are_refused() -> None:
-    with pytest.raises(ScenarioError, match="cannot start at"):
-        QuadrotorWorld(field([(0.5, 0.0, 0.3)]), 0)
-    world = QuadrotorWorld(field(), 0)
-    with pytest.raises(ScenarioError, match="four finite"):
-        world.step([0.0, 0.0, math.nan, 9.81])
-    with pytest.raises(ScenarioError, match="duration"):
-        world.step(HOVER, 0.0)
+def test_bad_starts_and_steps_are_refused(start: Any, control: Any, dt: float, words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        QuadrotorWorld(field([(5.0, 0.0, 0.3)]), 0, start=start).step(control, dt)
 
 
 # ----------------------------------------------------------------------- movers

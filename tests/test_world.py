@@ -236,17 +236,19 @@ def test_same_seed_same_bits_and_streams_stay_apart() -> None:
     assert np.abs(first[1] - other_seed[1]).max() > 0.005
 
 
-def test_bad_input_is_refused() -> None:
-    """Standing in a wall, a start that is no pose, commands that are no numbers."""
-    with pytest.raises(ScenarioError, match="would overlap a wall or an obstacle"):
-        quiet_world((0.1, 2.0, 0.0))
-    with pytest.raises(ScenarioError, match="three finite numbers"):
-        World(room(), (1.0, math.nan, 0.0))
-    world = quiet_world((3.0, 2.0, 0.0))
-    with pytest.raises(ScenarioError, match="not finite"):
-        world.step(math.nan, 0.0)
-    with pytest.raises(ScenarioError, match="must be positive"):
-        world.step(0.1, 0.0, dt=0.0)
+@pytest.mark.parametrize(
+    ("start", "command", "dt", "words"),
+    [
+        ((0.1, 2.0, 0.0), 0.0, 0.1, "would overlap a wall or an obstacle"),
+        ((1.0, math.nan, 0.0), 0.0, 0.1, "three finite numbers"),
+        ((3.0, 2.0, 0.0), math.nan, 0.1, "not finite"),
+        ((3.0, 2.0, 0.0), 0.1, 0.0, "must be positive"),
+    ],
+)
+def test_bad_input_is_refused(start: tuple[float, float, float], command: float, dt: float, words: str) -> None:
+    """Standing in a wall, a start that is no pose, commands and durations that are no numbers."""
+    with pytest.raises(ScenarioError, match=words):
+        quiet_world(start).step(command, 0.0, dt)
 
 
 @pytest.mark.data
