@@ -16,6 +16,7 @@ from unifg.codegen.jit import compiled
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap, bilinear
+from unifg.scenarios.monitoring.validation import first_true
 from unifg.scenarios.perception.explaining import FARTHEST
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array
@@ -105,15 +106,14 @@ class Relocaliser:
             refined = refine(self._map, scan, pose)
             if not any(_same(refined, other) for _, other in kept):
                 kept.append((fit(self._map, scan, refined), refined))
-        if not kept:
-            return Found(None, 0.0, "no place on the map")
         kept.sort(key=lambda row: -row[0])
-        share, best = kept[0]
-        if share < BELIEVED:
-            return Found(None, share, "no place on the map fits the scan")
-        if len(kept) > 1 and kept[1][0] > share - CLEARLY:
-            return Found(None, share, "several places on the map look alike")
-        return Found(best, share, "")
+        share, best = kept[0] if kept else (0.0, None)
+        cause = first_true(
+            (best is None, "no place on the map"),
+            (share < BELIEVED, "no place on the map fits the scan"),
+            (any(rival > share - CLEARLY for rival, _ in kept[1:]), "several places on the map look alike"),
+        )
+        return Found(None if cause else best, share, cause)
 
 
 def fit(distance_map: DistanceMap, scan: Scan, pose: Array) -> float:

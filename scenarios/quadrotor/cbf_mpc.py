@@ -41,6 +41,7 @@ from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
 from unifg.scenarios.planning.flat_path import Flown
+from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.scenarios.quadrotor.flatness import FlatnessController, Gains, flat_flight
 from unifg.scenarios.quadrotor.slots import reassigned
 from unifg.scenarios.quadrotor.weighing import Weighing
@@ -276,7 +277,6 @@ class CbfMpc:
         airframe: as it is believed.
         nodes: times of the nodes of a plan, from its begin [s].
         loop: the prepared graph.
-        kept: barriers of the graph.
     """
 
     def __init__(
@@ -310,7 +310,7 @@ class CbfMpc:
             np.array([a, a, a, b]) ** -0.5 for a, b in ((s.rate, s.thrust), (s.rate_change, s.thrust_change))
         )
         terms: list[Term] = [
-            MassAndDrag(weighing, airframe), Path(s, share),
+            MassAndDrag(weighing, airframe), *along_path(s, share),
             ControlCost(effort * share**-0.5, change, wanted=lambda now: now.given.controls),
             Motion(airframe, steps), self._speed,
         ]  # fmt: skip
@@ -459,26 +459,16 @@ class MassAndDrag:
         return {name: value[None] for name, value in zip(("mass", "drag"), self._believed, strict=True)}
 
 
-@dataclass(frozen=True)
-class Path:
+def along_path(settings: KeeperSettings, share: Array) -> list[Term]:
     """Costs of leaving the path in position, attitude and velocity; ``share`` (N, 1) of steps in the longest."""
 
-    settings: KeeperSettings
-    share: Array
+    def cost(part: str, weight: float) -> Term:
+        columns = quadrotor.STATE.component(part).storage
+        sigma = np.broadcast_to((weight * share) ** -0.5, (len(share), 3))
+        return ReferenceCost(f"path {part}", sigma, lambda now: now.given.states[1:, columns], part)
 
-    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
-        """Add the costs."""
-        s, ahead, n = self.settings, x[1:], len(self.share)
-        for part, weight in {"p": s.position, "R": s.attitude, "v": s.velocity}.items():
-            rest = getattr(ahead, part)
-            data = graph.data(f"wanted {part}", np.tile(rest.manifold.identity(), (n, 1)), each=True)
-            sigma = np.broadcast_to((weight * self.share) ** -0.5, (n, 3))
-            graph.minimize(fg.prior, rest, data, sigma=sigma, name=f"path {part}")
-
-    def data(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
-        """The path."""
-        states = now.given.states[1:]
-        return {"wanted p": states[:, :3], "wanted R": states[:, 3:7], "wanted v": states[:, 7:]}
+    weights = {"p": settings.position, "R": settings.attitude, "v": settings.velocity}
+    return [cost(part, weight) for part, weight in weights.items()]
 
 
 @dataclass(frozen=True)

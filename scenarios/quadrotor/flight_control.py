@@ -21,20 +21,21 @@ from unifg.horizon import (
     Plan,
     RecedingHorizon,
 )
-from unifg.models import quadrotor
+from unifg.models import landmarks, quadrotor
 from unifg.scenarios.perception.belief import Belief
 from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.scenarios.quadrotor.braking import brake
 from unifg.scenarios.quadrotor.flight_joint import believable
 from unifg.scenarios.quadrotor.flight_parts import (
     Clearance,
     Flown,
-    Following,
     GivenFlight,
-    Leaning,
     Limits,
     Potential,
+    following,
     level,
+    upright,
 )
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings, backend
 from unifg.scenarios.quadrotor.guide import Guide, Reference
@@ -93,12 +94,13 @@ class Controller:
         self.guide = Guide(target, self.walls, s.guide, bounds)
         self.slots = Slots(s, self.walls)
         effort = ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.hover)
-        terms = [*self.past.motion(), Limits(s), Leaning(s), effort]
+        lean = ReferenceCost("level", s.weighted(s.level_sigma), upright, "R", residual=landmarks.tilt, size=3)
+        terms = [*self.past.motion(), Limits(s), lean, effort]
         if s.avoidance == "potential":
             squares = not s.general_costs or not names.entry(solver).made_by.scalar_costs
             terms += [Potential(s, self.walls, target, squares), *self.past.apart(squares)]
         else:
-            terms += [Following(s), Clearance(s, self.walls), *self.past.apart(None)]
+            terms += [*following(s), Clearance(s, self.walls), *self.past.apart(None)]
         window = self.past.window
         self.loop = RecedingHorizon(
             self.past.robot, s.horizon, terms, solver=backend(solver, s), cold=backend(solver, s, cold=True),

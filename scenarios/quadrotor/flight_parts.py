@@ -14,6 +14,7 @@ from unifg.horizon import Context, RecedingHorizon, Robot, Term, Window
 from unifg.lie import SO3
 from unifg.models import avoidance, landmarks, quadrotor
 from unifg.scenarios.perception.belief import Belief
+from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.scenarios.quadrotor.braking import stopping_height
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
 from unifg.scenarios.quadrotor.guide import Reference
@@ -139,21 +140,9 @@ class Limits:
         return {"low": least, "high": most}
 
 
-@dataclass(frozen=True)
-class Leaning:
-    """Cost of leaning otherwise than at hover."""
-
-    settings: ControllerSettings
-
-    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
-        """Add the cost."""
-        upright = graph.data("upright", UP)
-        sigma = self.settings.weighted(self.settings.level_sigma)
-        graph.minimize(landmarks.tilt, x.R[1:], upright, sigma=sigma, name="level")
-
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """Vertical axis in the body at hover."""
-        return {"upright": SO3.act(SO3.inverse(level(now.given.belief)), UP)}
+def upright(now: Context[Flown]) -> Array:
+    """(3,) vertical axis in the body at hover."""
+    return SO3.act(SO3.inverse(level(now.given.belief)), UP)
 
 
 def level(belief: Belief) -> Array:
@@ -163,34 +152,17 @@ def level(belief: Belief) -> Array:
     return SO3.compose(quadrotor.hover_attitude(belief.parameters), heading)
 
 
-@dataclass(frozen=True)
-class Following:
+def following(settings: ControllerSettings) -> list[Term]:
     """Costs of leaving the reference in position and velocity, others at its end."""
-
-    settings: ControllerSettings
-
-    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
-        """Add the costs."""
-        s = self.settings
-        n, last = s.horizon, np.sqrt(s.terminal_weight)
-        positions = graph.data("reference positions", np.zeros((n - 1, 3)), each=True)
-        velocities = graph.data("reference velocities", np.zeros((n - 1, 3)), each=True)
-        end, leaving = graph.data("end of reference", np.zeros(3)), graph.data("velocity at the end", np.zeros(3))
-        position, velocity = s.weighted(s.position_sigma), s.weighted(s.velocity_sigma)
-        graph.minimize(fg.prior, x.p[1:-1], positions, sigma=position, name="way")
-        graph.minimize(fg.prior, x.v[1:-1], velocities, sigma=velocity, name="pace")
-        graph.minimize(fg.prior, x.p[-1], end, sigma=position / last, name="end of way")
-        graph.minimize(fg.prior, x.v[-1], leaving, sigma=velocity / last, name="final pace")
-
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """The reference."""
-        places, speeds = now.given.reference.positions, now.given.reference.velocities
-        return {
-            "reference positions": places[1:-1],
-            "reference velocities": speeds[1:-1],
-            "end of reference": places[-1],
-            "velocity at the end": speeds[-1],
-        }
+    s, between, end = settings, (1, -1), (-1, None)
+    last = np.sqrt(s.terminal_weight)
+    position, velocity = s.weighted(s.position_sigma), s.weighted(s.velocity_sigma)
+    return [
+        ReferenceCost("way", position, lambda now: now.given.reference.positions[1:-1], "p", between),
+        ReferenceCost("pace", velocity, lambda now: now.given.reference.velocities[1:-1], "v", between),
+        ReferenceCost("end of way", position / last, lambda now: now.given.reference.positions[-1], "p", end),
+        ReferenceCost("final pace", velocity / last, lambda now: now.given.reference.velocities[-1], "v", end),
+    ]
 
 
 @dataclass(frozen=True)
