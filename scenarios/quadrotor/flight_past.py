@@ -172,7 +172,7 @@ class Accelerometer:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class LandmarkSightings:
     """Bearings and ranges of the landmarks' slots."""
 
     settings: WindowSettings
@@ -193,7 +193,7 @@ class Sightings:
         graph.minimize(landmarks.bearing_range, *pairs, sigma=sigma, active=seen, name="sightings")
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """Sightings."""
+        """LandmarkSightings."""
         rows = now.past.recorded("sightings")[0].reshape(-1, 3)
         seen = rows[:, 2] > 0.0
         return {"sightings": np.where(seen[:, None], rows[:, :2], 1.0), "seen": seen}
@@ -254,7 +254,7 @@ def window(
     terms: list[Term] = [
         survey,
         Motion(settings),
-        Sightings(settings),
+        LandmarkSightings(settings),
         Measurement("height", landmarks.height, (), settings.height_sigma, component="p"),
         Measurement("tilt", landmarks.tilt, (3,), settings.tilt_sigma, component="R"),
     ]

@@ -23,7 +23,7 @@ DODGE = 5.0  # [m/s^2] with which a vehicle can get out of the way
 
 
 @dataclass(frozen=True)
-class Obstacles:
+class SlotObstacles:
     """Contents of the slots at one tick; C slots of cylinders, then those of movers, M in all.
 
     Attributes:
@@ -65,7 +65,7 @@ class Slots:
         self._walls = walls
         self._names = np.full(settings.cylinders, -1, dtype=np.intp)
 
-    def fill(self, state: Array, positions: Array, landmarks: Landmarks, movers: Tracks) -> Obstacles:
+    def fill(self, state: Array, positions: Array, landmarks: Landmarks, movers: Tracks) -> SlotObstacles:
         """Fill the slots for a vehicle in a state (10,) that is to go along positions (N + 1, 3) [m]."""
         s = self._settings
         n, m = s.horizon, s.cylinders + s.movers
@@ -92,7 +92,7 @@ class Slots:
         least = s.vehicle_radius + s.margin
         names = np.concatenate([self._names, np.full(s.movers, -1, dtype=np.intp)])
         changed = np.concatenate([self._names != before, np.ones(s.movers, dtype=bool)])
-        return Obstacles(names, centres, radii, np.minimum(least + wider, kept), changed, np.minimum(least, beside))
+        return SlotObstacles(names, centres, radii, np.minimum(least + wider, kept), changed, np.minimum(least, beside))
 
     def _assign(self, known: Landmarks, positions: Array) -> IntArray:
         """Row of ``known`` in every slot of cylinders, -1 for none: those nearest to where the vehicle is to be."""
