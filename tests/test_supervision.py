@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import functools
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -453,21 +454,21 @@ def believed(spread: float = 1e-4) -> Belief:
     return Belief(state, spread * np.eye(9), quadrotor.Parameters(), np.zeros(7), Landmarks.none())
 
 
-def looked(watch: FlightWatch, reading: Reading | None, now: float, applied: Array | None, belief: Belief) -> None:
-    """One tick of a vehicle that takes the sensor's names for its own."""
-    watch.judge(watch.admit(reading, now, applied, belief), belief)
+def looked(watch: FlightWatch, readings: Iterable[Reading | None], belief: Belief, begin: int = 0) -> None:
+    """Ticks of a vehicle that hovers and takes the sensor's names for its own."""
+    for tick, seen in enumerate(readings, start=begin):
+        watch.judge(watch.admit(seen, 0.05 * tick, HOVERED, belief), belief)
 
 
 def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> None:
-    watch, dt, applied = FlightWatch(0.05, SPREAD), 0.05, np.array([0.0, 0.0, 0.0, 9.81])
-    for tick in range(10):
-        looked(watch, reading(), tick * dt, applied, believed())
+    watch, dt = FlightWatch(0.05, SPREAD), 0.05
+    looked(watch, [reading()] * 10, believed())
     assert watch.verdict.cause == ""
     blind = reading(ids=np.zeros(0, int), bearings=np.zeros(0), ranges=np.zeros(0), radii=np.zeros(0),
                     kinds=np.zeros(0, int), moving=np.zeros(0, bool))  # fmt: skip
     rested = landed = 0.0
     for tick in range(1, 200):
-        looked(watch, blind, 0.5 + tick * dt, applied, believed())
+        looked(watch, [blind], believed(), 10 + tick)
         rested = rested or (tick * dt if watch.verdict.rests else 0.0)
         landed = landed or (tick * dt if watch.lands else 0.0)
     assert rested == pytest.approx(0.2) and watch.verdict.health is Health.LOST
@@ -489,21 +490,18 @@ def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> 
 )
 def test_readings_say_what_is_the_matter(changed: dict[str, Any], cause: str) -> None:
     watch = FlightWatch(0.05, SPREAD)
-    for tick in range(20):
-        looked(watch, reading(**(changed if tick else {})), 0.05 * tick, HOVERED, believed())
+    looked(watch, [reading(), *[reading(**changed)] * 19], believed())
     assert watch.verdict.cause == cause
 
 
 def test_a_detector_that_sees_ghosts_is_not_followed() -> None:
     watch = FlightWatch(0.05, SPREAD)
-    for tick in range(8):
-        looked(watch, reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick), 0.05 * tick, HOVERED, believed())
+    looked(watch, [reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick) for tick in range(8)], believed())
     assert watch.verdict.rests and watch.verdict.cause == "the detector sees what was not there before"
     lost = FlightWatch(0.05, SPREAD)
-    for tick in range(3):
-        looked(lost, reading(), 0.05 * tick, HOVERED, believed(4.0))
+    looked(lost, [reading()] * 3, believed(4.0))
     assert lost.verdict.health is Health.LOST and "decimetres" in lost.verdict.cause
-    looked(lost, None, 0.2, None, believed(math.nan))
+    looked(lost, [None], believed(math.nan), 4)
     assert lost.verdict.rests and lost.validator.dropped["detector: nothing came"] == 1
 
 
@@ -566,9 +564,7 @@ def test_what_pushes_is_flown_against_at_once() -> None:
     belief = replace(believed(), parameters_sigma=np.full(7, 0.01))
     still = replace(belief, state=np.concatenate([belief.state[:7], np.zeros(3)]))
     assert watch.pushed(still) is still
-    for tick in range(4):
-        pushed = reading(force=np.array([0.0, 4.0 if tick else 0.0, 9.81]))
-        looked(watch, pushed, 0.05 * tick, np.array([0.0, 0.0, 0.0, 9.81]), still)
+    looked(watch, [reading(), *[reading(force=np.array([0.0, 4.0, 9.81]))] * 3], still)
     assert watch.verdict.cause == "a gust pushes" and watch.verdict.share < 1.0
     assert watch.pushed(still).parameters.wind == pytest.approx((0.0, 4.0), abs=0.01)
     assert watch.hover(still, least, most)[0] > 1.0, "it leans against it"
@@ -578,11 +574,9 @@ def test_a_landing_is_broken_off_when_all_is_well_again_but_not_near_the_floor()
     for height, lands in ((1.5, False), (0.4, True)):
         watch, here = FlightWatch(0.05, SPREAD), believed()
         here.state[2] = height
-        for tick in range(60):
-            looked(watch, None, 0.05 * tick, HOVERED, here)
+        looked(watch, [None] * 60, here)
         assert watch.lands
-        for tick in range(60, 80):
-            looked(watch, reading(), 0.05 * tick, HOVERED, here)
+        looked(watch, [reading()] * 20, here, 60)
         assert watch.verdict.health is not Health.LOST and watch.lands is lands
 
 
