@@ -130,8 +130,6 @@ def thinned(points: Array, apart: float) -> Array:
 
 def _near(points: Array, others: Array, reach: float) -> BoolArray:
     """(n,) whether one of others (k, 2) is within reach of points (n, 2)."""
-    if not len(points) or not len(others):
-        return np.zeros(len(points), dtype=bool)
     gaps = np.hypot(*np.moveaxis(points[:, None] - others[None], 2, 0))
-    near: BoolArray = gaps.min(axis=1) <= reach
+    near: BoolArray = gaps.min(axis=1, initial=np.inf) <= reach
     return near
