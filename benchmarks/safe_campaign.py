@@ -86,7 +86,8 @@ def threats(flight: SafeFlight, log: SafeLog, tick: int) -> list[Threat]:
         found.append(
             Threat(
                 log.states[tick, :3] - place, log.states[tick, 7:] - velocity, body.radius + log.hull + log.margin,
-                body.upright, motion.greatest_acceleration if isinstance(motion, Ellipse) else 0.0,
+                body.upright,
+                motion.speed**2 * max(motion.axes) / min(motion.axes) ** 2 if isinstance(motion, Ellipse) else 0.0,
                 np.array([0.0, 0.0, -GRAVITY * ball]), until,
             )
         )  # fmt: skip

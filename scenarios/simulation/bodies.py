@@ -80,11 +80,6 @@ class Ellipse:
         place = np.column_stack([a * np.cos(turn), b * np.sin(turn), level]) + np.array(self.centre)
         return place, np.column_stack([across, level])
 
-    @property
-    def greatest_acceleration(self) -> float:
-        """Acceleration where the curve bends most [m/s^2]."""
-        return self.speed**2 * max(self.axes) / min(self.axes) ** 2
-
 
 @dataclass(frozen=True)
 class Shuttle:

@@ -51,11 +51,6 @@ class Loops:
         if not (self.gain > 0.0 and self.lag > 0.0 and self.link >= 0.0):
             raise ScenarioError(f"loops need a gain and a lag above zero and a link of no negative delay, got {self}")
 
-    def step(self) -> Array:
-        """(8,) how one millisecond changes the loops, as :func:`unifg.models.quadrotor_loops.held` has it."""
-        found: Array = held(self.gain, self.lag, SUBSTEP)[0]
-        return found
-
     @property
     def delay(self) -> float:
         """Delay of the loops for slow commands: link and slope of the rate loop's phase [s]."""
@@ -138,13 +133,8 @@ class BodyRatePlant:
                 raise ScenarioError(f"a {what} of {length:g} s is no whole number of milliseconds")
         hover = quadrotor.hover(airframe.parameters)
         self.loops = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, hover[3]])
-        self._step = airframe.loops.step()
+        self._step: Array = held(airframe.loops.gain, airframe.loops.lag, SUBSTEP)[0]
         self._pipe: deque[Array] = deque([hover] * (self._rows + late))
-
-    @property
-    def late(self) -> float:
-        """Delay from a tick until its command begins to act [s]."""
-        return len(self._pipe) * SUBSTEP
 
     def tick(self, command: ArrayLike, noise: ArrayLike | None = None) -> Array:
         """Fly one tick; what is decided now acts after those decided before.
