@@ -19,10 +19,10 @@ import numpy as np
 from benchmarks.comparison import digits, interval
 from benchmarks.report import table
 from benchmarks.runner import Timing
+from unifg.scenarios.quadrotor.cascade import CascadeSettings
+from unifg.scenarios.quadrotor.cbf_mpc import KeeperSettings
+from unifg.scenarios.quadrotor.situations import Kind, Situation, situation
 from unifg.scenarios.safe_flight import SafeSettings, flights
-from unifg.scenarios.safety.cascade import CascadeSettings
-from unifg.scenarios.safety.cbf_mpc import KeeperSettings
-from unifg.scenarios.safety.situations import Kind, Situation, situation
 
 GAMMAS = (0.0, 0.1, 0.3, 1.0, 1.3)
 MEETS = 0.3  # boundary distance of the path itself, below which a phase counts [m]

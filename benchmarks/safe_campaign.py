@@ -17,9 +17,9 @@ from benchmarks.report import table
 from benchmarks.runner import Study
 from unifg.models.quadrotor import GRAVITY
 from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
+from unifg.scenarios.quadrotor.oracle import Answer, Authority, Threat, exists
+from unifg.scenarios.quadrotor.situations import Kind
 from unifg.scenarios.safe_flight import Controller, Knowledge, SafeFlight, SafeSettings, flights
-from unifg.scenarios.safety.oracle import Answer, Authority, Threat, exists_among
-from unifg.scenarios.safety.situations import Kind
 from unifg.scenarios.simulation.bodies import Ellipse, Thrown
 
 VEHICLE = 5.0  # horizontal acceleration at a tilt of 27 degrees [m/s^2]
@@ -86,8 +86,9 @@ def threats(flight: SafeFlight, log: SafeLog, tick: int) -> list[Threat]:
         found.append(
             Threat(
                 log.states[tick, :3] - place, log.states[tick, 7:] - velocity, body.radius + log.hull + log.margin,
-                body.upright, motion.greatest_acceleration if isinstance(motion, Ellipse) else 0.0,
-                np.array([0.0, 0.0, -GRAVITY]) if ball else None, until,
+                body.upright,
+                motion.speed**2 * max(motion.axes) / min(motion.axes) ** 2 if isinstance(motion, Ellipse) else 0.0,
+                np.array([0.0, 0.0, -GRAVITY * ball]), until,
             )
         )  # fmt: skip
     return found
@@ -104,11 +105,11 @@ def judged(flight: SafeFlight, log: SafeLog) -> Row:
     loops = flight.settings.books.loops
     authority = Authority(VEHICLE, 0.1, loops.delay + flight.settings.dt + TILT)
     first = first_sight(flight, log)
-    answer: Answer = exists_among(threats(flight, log, first), authority)
+    answer: Answer = exists(threats(flight, log, first), authority)
     if not log.violated:
         return {"oracle": answer}
     lost = int(np.argmax(log.boundary < -1e-3))
-    asked = [exists_among(threats(flight, log, k), authority) for k in range(first, lost, EVERY)]
+    asked = [exists(threats(flight, log, k), authority) for k in range(first, lost, EVERY)]
     return {
         "oracle": answer,
         "charged": "yes" in asked or answer == "yes",

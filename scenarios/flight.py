@@ -197,9 +197,7 @@ class Flight:
         world.parameters = replace(world.parameters, wind=(self._wind[0] + gust_x, self._wind[1] + gust_y))
         world.step(self.faults.control(self._control, now), self.settings.controller.dt)
         self._landed = self.watch.lands and world.grounded
-        if self._landed:
-            return None
-        if world.collisions >= COLLISIONS:
+        if self._landed or world.collisions >= COLLISIONS:
             return None
         target, start = world.layout.target, world.layout.start
         left = float(np.linalg.norm(target - world.state[:3]))
@@ -250,7 +248,7 @@ class Flight:
             parameters=belief.parameters.packed,
             parameters_sigma=belief.parameters_sigma,
             seen=reading.ids,
-            movers=world.mover_states(),
+            movers=world.discs()[:, :3],
             **pilot.clock.milliseconds,
             compiled=new.everything,
             statuses="failed" if plan is None else plan.status.name.lower().replace("_", " "),

@@ -225,7 +225,7 @@ class Episode:
             seed=s.seed,
             control_limits=s.controller.limits,
             scan_angles=self.world.lidar.angles,
-            obstacle_moves=self.world.obstacle_states()[:, 3].astype(bool),
+            obstacle_moves=self.world.discs()[:, 3].astype(bool),
             faults=[str(fault) for fault in s.faults],
         )
         self._outcomes = ["time ran out"] * len(self.goals)
@@ -318,7 +318,7 @@ class Episode:
     def _begin_leg(self, goal: int) -> None:
         """Plan to a goal from where the robot believes to be; without a way it is given up at the next tick."""
         self._begun, self._allowed = self.world.time, 0.0
-        self.pilot.forget()
+        self.pilot.controller.forget()
         try:
             self.legs[goal] = self._route(self._freed(self.pilot.pose), self.goals[goal])
         except ScenarioError:
@@ -373,12 +373,12 @@ class Episode:
             contacts=world.collisions,
             horizon=plan.states,
             scan=scan.ranges,
-            obstacles=world.obstacle_states()[:, :3],
+            obstacles=world.discs()[:, :3],
             detected=np.column_stack([pilot.tracks.centre, pilot.tracks.radius]),
             solve_ms=took["localise_ms"] + took["plan_ms"],
             **took,
             compiled=compiled,
-            localisation_iterations=pilot.iterations,
+            localisation_iterations=pilot.estimator.iterations,
             plan_iterations=plan.iterations,
             status=STOPPED if plan.source == STOPPED else plan.status.name.lower(),
             bound_violation=plan.excess,

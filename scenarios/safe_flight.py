@@ -23,16 +23,16 @@ from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.safe_log import SafeLog
 from unifg.scenarios.options import count, not_negative, option, positive
 from unifg.scenarios.planning.flat_path import Line
-from unifg.scenarios.safety.cascade import CascadeSettings, Track
-from unifg.scenarios.safety.cbf_mpc import TRACKING, CbfMpc, Decision, KeeperSettings, Obstacles, Reading, Terminal
-from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.one_step import FilterSettings, filtered
-from unifg.scenarios.safety.pace import Pace
-from unifg.scenarios.safety.sightings import Sightings, SightingSettings
-from unifg.scenarios.safety.situations import Kind, Situation, situation
-from unifg.scenarios.safety.spline_planner import SplinePath, SplineSettings, around
-from unifg.scenarios.safety.state_filter import FilterStatistics, StateFilter
-from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
+from unifg.scenarios.quadrotor.cascade import CascadeSettings, Track
+from unifg.scenarios.quadrotor.cbf_mpc import TRACKING, CbfMpc, Decision, KeeperSettings, Obstacles, Reading, Terminal
+from unifg.scenarios.quadrotor.flatness import TUNED, FlatnessController, Gains, flat_flight
+from unifg.scenarios.quadrotor.one_step import FilterSettings, filtered
+from unifg.scenarios.quadrotor.pace import Pace
+from unifg.scenarios.quadrotor.sightings import Sightings, SightingSettings
+from unifg.scenarios.quadrotor.situations import Kind, Situation, situation
+from unifg.scenarios.quadrotor.spline_planner import SplinePath, SplineSettings, around
+from unifg.scenarios.quadrotor.state_filter import FilterStatistics, StateFilter
+from unifg.scenarios.quadrotor.weighing import Weighing, WeighingSettings
 from unifg.scenarios.simulation.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.typing import Array
@@ -252,11 +252,10 @@ class SafeFlight:
 
     def _spline(self) -> SplinePath:
         """A path around what stands in the way, planned before the flight."""
-        line, bodies = self.situation.path, self.situation.bodies
-        place, velocity = (part[0] for part in bodies.at(np.zeros(1)))
+        line = self.situation.path
         if not isinstance(line, Line) or self.situation.kind != "static":
             raise fg.ScenarioError(f"splines are planned past things at rest, not in the case {self.situation.kind!r}")
-        return around(line, Obstacles(place, velocity, self._keep, bodies.upright, bodies.falls), self.settings.spline)
+        return around(line, self._bodies(0.0), self.settings.spline)
 
     @property
     def believed(self) -> quadrotor.Parameters:
@@ -283,13 +282,8 @@ class SafeFlight:
         """Obstacles as they are."""
         bodies = self.situation.bodies
         place, velocity = (part[0] for part in bodies.at(np.array([now])))
-        return Obstacles(place, velocity, self._keep, bodies.upright, bodies.falls)
-
-    @property
-    def _keep(self) -> Array:
-        """(M,) distance of the centre to be kept from each body [m]."""
-        found: Array = self.situation.bodies.radii + self.settings.books.radius + self.settings.margin
-        return found
+        keep = bodies.radii + self.settings.books.radius + self.settings.margin
+        return Obstacles(place, velocity, keep, bodies.upright, bodies.falls)
 
     def run(self, progress: Progress = silent) -> SafeLog:
         """Fly to the end, or until the user stops it."""

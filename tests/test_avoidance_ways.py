@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from episodes import room
+from maps import field
 from unifg.errors import ScenarioError
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.scenarios.ground.drive_control import Controller
@@ -23,8 +24,7 @@ NONE = np.zeros((2, 2))
 
 @pytest.fixture(scope="module")
 def flat() -> DistanceMap:
-    occupancy = room()
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    return field(room())
 
 
 def standing(x: float, y: float, radius: float) -> Tracks:

@@ -16,6 +16,7 @@ from benchmarks.baselines.path_integral import PathIntegral, PathIntegralSetting
 from benchmarks.baselines.pure_pursuit import PurePursuit
 from benchmarks.baselines.shared import rollouts, to_reference
 from episodes import room
+from maps import field, walled
 from unifg.files.ros_map import save_map
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
@@ -37,10 +38,7 @@ START = np.array([2.0, 2.0, 0.0])
 @functools.cache
 def hall() -> DistanceMap:
     """An empty hall of 8 m by 4 m."""
-    occupied = np.zeros((84, 164), dtype=bool)
-    occupied[:2] = occupied[-2:] = True
-    occupied[:, :2] = occupied[:, -2:] = True
-    return DistanceMap.from_occupancy(occupied, 0.05, (-0.1, -0.1, 0.0))
+    return field(walled(8.2, 4.2, 2, (-0.1, -0.1, 0.0)))
 
 
 def context(accelerations: tuple[float, float] = SLOW, seed: int = 0) -> PlannerContext:

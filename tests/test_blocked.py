@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from episodes import episode
+from maps import field, walled
 from unifg.errors import FileFormatError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
-from unifg.models.distance_map import DistanceMap, SmoothField
+from unifg.models.distance_map import SmoothField
 from unifg.scenarios import navigation
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
@@ -24,24 +25,12 @@ from unifg.scenarios.simulation.plane import World
 from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
-CELL = 0.05
-
 
 def corridor(door: int = 0, length: float = 12.0) -> OccupancyMap:
     """A corridor of 2 m along x, its walls at y = 0 and y = 2, with a wall at x = 6 and a door of so many cells."""
-    occupied = np.zeros((44, round(length / CELL)), dtype=bool)
-    occupied[:2] = occupied[-2:] = True
-    occupied[:, :2] = occupied[:, -2:] = True
-    if door:
-        first = 22 - door // 2
-        occupied[:, 118:122] = True
-        occupied[first : first + door, 118:122] = False
-    return OccupancyMap(occupied, ~occupied, CELL, (0.0, -0.1, 0.0), "corridor")
-
-
-def field(occupancy: OccupancyMap) -> DistanceMap:
-    """Distance map of an occupancy map."""
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    first, across = 22 - door // 2, slice(118, 122)
+    blocks = [(slice(0, first), across), (slice(first + door, 44), across)] if door else []
+    return walled(length, 2.2, 2, (0.0, -0.1, 0.0), "corridor", blocks)
 
 
 FOUR = [Obstacle(np.array([6.0, y]), 0.25) for y in (0.25, 0.75, 1.25, 1.75)]
@@ -79,7 +68,7 @@ def test_the_time_for_a_goal_is_that_of_the_longest_way_so_far(tmp_path: Path) -
     asked = [(direct, 10.0), (detour, 90.0), (short, 120.0), (short, 160.0), (short, 180.0)]
     found = []
     for path, now in asked:
-        leg.path, drive.world._space.time = path, now
+        leg.path, drive.world.time = path, now
         found.append(drive._outcome(0))
     assert found == [None, None, None, None, "timed out"]  # 27 m in 108 s, and a minute
     drive._begin_leg(0)

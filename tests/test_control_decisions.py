@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import maps
 import unifg as fg
 from episodes import room
 from unifg.models.distance_map import DistanceMap, SmoothField
@@ -32,8 +33,7 @@ OPEN = np.array([1.5, 1.0, 0.0])  # far from walls and pillar
 
 @pytest.fixture(scope="module")
 def field() -> DistanceMap:
-    occupancy = room()
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    return maps.field(room())
 
 
 @pytest.fixture

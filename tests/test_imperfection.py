@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import maps
 from episodes import room
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.planning.grid import path_exists
 from unifg.scenarios.simulation.building import building_map
 from unifg.scenarios.simulation.imperfection import MOVED, Imperfection, imperfect
@@ -80,7 +80,7 @@ def test_nothing_is_spoiled_unless_asked_for_and_nothing_shifts_the_noise() -> N
 
 def moved_by(given: OccupancyMap, true: OccupancyMap) -> Array:
     """Distances [m] from the walls of the robot's map to those that are true."""
-    field = DistanceMap.from_occupancy(true.occupied, true.resolution, true.origin)
+    field = maps.field(true)
     rows, columns = np.nonzero(given.occupied)
     middles = np.column_stack([columns, rows]).astype(np.float64) + 0.5
     inside: Array = field.distance(given.grid_to_world(middles))
@@ -106,7 +106,7 @@ def test_furniture_has_been_moved_and_leaves_a_way() -> None:
         added = occupancy.occupied & ~building.occupied
         assert added.sum() * building.resolution**2 > 5 * 0.3**2 * 0.8
         assert (added & ~other.occupied).any()
-        field = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+        field = maps.field(occupancy)
         assert all(path_exists(occupancy, field, START, goal, 0.3) for goal in GOALS)
         assert field.distance(np.vstack([START[None, :2], GOALS[:, :2]])).min() > 0.3
     assert moved_by(given, true).max() < MOVED[1] + 0.05

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import maps
 import unifg as fg
 from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
@@ -14,7 +15,6 @@ from unifg.scenarios.ground.drive_past import WINDOW, Registration, Smoother
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
-from unifg.scenarios.simulation.building import building_map
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
@@ -23,8 +23,7 @@ HERE, THERE = (13.9, 20.0, -1.6), (15.0, 14.0, 0.0)
 
 @pytest.fixture(scope="module")
 def field() -> DistanceMap:
-    occupancy = building_map()
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    return maps.building()[1]
 
 
 def chain(count: int, rng: np.random.Generator) -> tuple[fg.Graph, fg.Family, Array]:
@@ -74,17 +73,9 @@ def settled(field: DistanceMap, weight: float, ticks: int = 12) -> tuple[Episode
         controller=replace(ControllerSettings(), control_weight=weight),
     )
     episode = Episode(settings)
-    seen = 0
-
-    def stop(done: float, text: str) -> None:
-        nonlocal seen
-        seen += 1
-        if seen == ticks:
-            raise KeyboardInterrupt
-
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(episode, "_arrived", lambda goal: False)
-        episode.run(stop)
+        episode.run(maps.stop_after(ticks))
     smoother = episode.pilot.estimator
     assert isinstance(smoother, Smoother)
     return episode, smoother
@@ -176,19 +167,9 @@ def test_joint_episode_reaches_its_goal(solver: str) -> None:
 
 
 def test_same_seed_same_joint_drive() -> None:
-    def drive() -> Array:
-        seen = 0
-
-        def stop(done: float, text: str) -> None:
-            nonlocal seen
-            seen += 1
-            if seen == 25:
-                raise KeyboardInterrupt
-
-        settings = NavigationSettings(start=HERE, goals=(THERE,), coupling="joint", obstacles=1, seed=5)
-        return Episode(settings).run(stop).true_pose
-
-    np.testing.assert_array_equal(drive(), drive())
+    settings = NavigationSettings(start=HERE, goals=(THERE,), coupling="joint", obstacles=1, seed=5)
+    one, two = (Episode(settings).run(maps.stop_after(25)).true_pose for _ in range(2))
+    np.testing.assert_array_equal(one, two)
 
 
 def test_unknown_coupling_is_refused() -> None:

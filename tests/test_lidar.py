@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from maps import building, field, stop_after
 from unifg.errors import ScenarioError
 from unifg.lie import SE2
 from unifg.models import lidar
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.emergency_stop import EmergencyStop, agreed
 from unifg.scenarios.ground.localiser import Localiser, least, scan_covariance
-from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import consistency, episode_metrics, nees
 from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.perception.disc_tracker import DiscTracker
 from unifg.scenarios.perception.discs import DiscFinder, Discs
 from unifg.scenarios.perception.readings import Scan
-from unifg.scenarios.simulation.building import building_map
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, one_of
 from unifg.scenarios.simulation.imperfection import Imperfection, imperfect
 from unifg.scenarios.simulation.plane import LidarModel, World
@@ -35,24 +32,6 @@ SHORT = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),), o
 HALF = LidarModel(beams=181, field=math.pi)
 
 
-@functools.cache
-def floor() -> DistanceMap:
-    occupancy = building_map()
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
-
-
-def drive(settings: NavigationSettings, ticks: int) -> EpisodeLog:
-    count = 0
-
-    def stop(done: float, text: str) -> None:
-        nonlocal count
-        count += 1
-        if count == ticks:
-            raise KeyboardInterrupt
-
-    return Episode(settings).run(stop)
-
-
 # ---------------------------------------------------------------- the field of view
 
 
@@ -63,9 +42,9 @@ def test_beams_fill_the_field_of_view() -> None:
     scan = Scan(angles, np.ones(181))
     assert scan.spacing == pytest.approx(math.pi / 180) and not scan.closed
     assert Scan(LidarModel().angles, np.ones(360)).closed
-    for field in (0.0, 7.0, math.nan):
+    for view in (0.0, 7.0, math.nan):
         with pytest.raises(ScenarioError, match="field of view"):
-            LidarModel(field=field)
+            LidarModel(field=view)
 
 
 def test_what_no_beam_looks_into_is_unseen() -> None:
@@ -114,8 +93,8 @@ def test_a_disc_is_placed_by_a_lidar_of_any_field(lidar: LidarModel) -> None:
     place = (21.0, 9.6, -2.0)
     centre = SE2.act(np.array(place), np.array([1.2, 0.1]))
     disc = Obstacle(centre, 0.2)
-    world = World(building_map(), place, [disc], np.random.default_rng(3), lidar=replace(lidar, dropout=0.0))
-    found = DiscFinder(floor()).find(world.scan(), world.pose)
+    world = World(building()[0], place, [disc], np.random.default_rng(3), lidar=replace(lidar, dropout=0.0))
+    found = DiscFinder(building()[1]).find(world.scan(), world.pose)
     near = np.hypot(*(found.centre - centre).T)
     assert near.min() < 0.04 and found.radius[near.argmin()] == pytest.approx(0.2, abs=0.04)
 
@@ -123,14 +102,14 @@ def test_a_disc_is_placed_by_a_lidar_of_any_field(lidar: LidarModel) -> None:
 def test_a_track_is_seen_through_by_beams_as_wide_as_they_stand() -> None:
     """Beside the middle beam, which passes, others are stopped before; 31 beams of a full turn would be coarser."""
     scan = Scan(np.linspace(-0.5 * np.pi, 0.5 * np.pi, 31), np.where(np.arange(31) == 15, 5.0, 1.0))
-    tracker = DiscTracker(floor())
+    tracker = DiscTracker(building()[1])
     seen = Discs(np.array([[3.0, 0.0]]), np.array([0.2]), np.array([0.02]), np.array([3.0]))
     tracker._rows = type(tracker._rows).of(seen, np.zeros(1, dtype=np.intp))
     assert tracker._seen_through(np.ones(1, dtype=bool), scan, np.zeros(3)).all()
 
 
 def test_a_lidar_that_sees_half_a_turn_drives_into_nothing() -> None:
-    log = drive(replace(SHORT, lidar=HALF, obstacles=3, seed=4), 150)
+    log = Episode(replace(SHORT, lidar=HALF, obstacles=3, seed=4)).run(stop_after(150))
     assert log.collisions == 0 and np.hypot(*(log.true_pose[-1] - log.true_pose[0])[:2]) > 3.0
     assert log.control[:, 0].min() >= 0.0, "it does not reverse into what it does not see"
 
@@ -139,7 +118,7 @@ def test_a_lidar_that_sees_half_a_turn_drives_into_nothing() -> None:
 
 
 def test_a_blind_sector_ahead_stops_the_robot_and_is_named() -> None:
-    log = drive(replace(SHORT, faults=(one_of(DRIVE_FAULTS)("lidar-blind@1"),)), 40)
+    log = Episode(replace(SHORT, faults=(one_of(DRIVE_FAULTS)("lidar-blind@1"),))).run(stop_after(40))
     assert log.control[5, 0] > 0.3 and not log.control[25:, 0].any() and log.collisions == 0
     assert set(log.health[15:]) == {"degraded"}
     assert log.cause[-1] == "the lidar sees nothing in a sector"
@@ -165,7 +144,7 @@ def test_a_stamp_that_is_no_number_is_refused() -> None:
 def test_a_scan_is_deskewed_by_the_wheels(motion: tuple[float, float]) -> None:
     def taken(turn: float) -> tuple[Scan, Array]:
         lidar = LidarModel(sigma=0.0, dropout=0.0, turn=turn)
-        world = World(building_map(), (21.0, 9.6, -2.0), rng=np.random.default_rng(1), lidar=lidar)
+        world = World(building()[0], (21.0, 9.6, -2.0), rng=np.random.default_rng(1), lidar=lidar)
         for _ in range(2):
             world.step(*motion)
         return world.scan(), world.pose
@@ -176,7 +155,7 @@ def test_a_scan_is_deskewed_by_the_wheels(motion: tuple[float, float]) -> None:
 
     def off(one: Scan) -> float:
         ends = lidar.beam_endpoints(one.ranges[one.valid], one.angles[one.valid])
-        return float(np.abs(floor().distance(SE2.act(pose, ends))).mean())
+        return float(np.abs(building()[1].distance(SE2.act(pose, ends))).mean())
 
     right = scan.deskewed(np.array(motion))
     assert off(right) < off(still) + 0.003 < off(scan)
@@ -191,9 +170,9 @@ def test_a_turning_lidar_leaves_no_bias() -> None:
     errors = []
     for turn in (0.0, 0.1):
         world = World(
-            building_map(), (21.0, 9.6, -2.0), rng=np.random.default_rng(1), lidar=LidarModel(turn=turn, sigma=0.005)
+            building()[0], (21.0, 9.6, -2.0), rng=np.random.default_rng(1), lidar=LidarModel(turn=turn, sigma=0.005)
         )
-        localiser = Localiser(floor(), world.pose, np.array([0.05, 0.05, 0.02]), 360)
+        localiser = Localiser(building()[1], world.pose, np.array([0.05, 0.05, 0.02]), 360)
         localiser.update(world.scan(), None, 0.1)
         for _ in range(20):
             world.step(0.3, 0.9)
@@ -206,14 +185,13 @@ def test_a_turning_lidar_leaves_no_bias() -> None:
 
 
 def test_the_covariance_follows_what_the_map_leaves_unexplained() -> None:
-    building = building_map()
+    occupancy = building()[0]
     ends = np.array([[21.0, 9.6, -2.0]])
     sizes = []
     for error in (0.0, 0.03):
-        given, true = imperfect(building, Imperfection(map_error=error), ends[0], ends, np.random.default_rng(5))
-        field = DistanceMap.from_occupancy(given.occupied, given.resolution, given.origin)
+        given, true = imperfect(occupancy, Imperfection(map_error=error), ends[0], ends, np.random.default_rng(5))
         world = World(true, ends[0], rng=np.random.default_rng(1))
-        localiser = Localiser(field, world.pose, np.array([0.05, 0.05, 0.02]), 360)
+        localiser = Localiser(field(given), world.pose, np.array([0.05, 0.05, 0.02]), 360)
         for _ in range(3):
             localiser.update(world.scan(), np.zeros(2), 0.1)
         sizes.append(np.sqrt(np.diag(localiser.covariance)))
@@ -224,12 +202,12 @@ def test_the_covariance_follows_what_the_map_leaves_unexplained() -> None:
 def test_correlated_residuals_count_for_less_than_independent_ones(rng: np.random.Generator) -> None:
     angles = LidarModel().angles
     pose = np.array([21.0, 9.6, -2.0])
-    world = World(building_map(), pose, rng=np.random.default_rng(1), lidar=LidarModel(sigma=0.0, dropout=0.0))
+    world = World(building()[0], pose, rng=np.random.default_rng(1), lidar=LidarModel(sigma=0.0, dropout=0.0))
     clean = world.scan().ranges
     white = rng.standard_normal(360)
     waves = np.convolve(np.tile(white, 3), np.hanning(41), mode="same")[360:720]
     alike = [clean + 0.03 * noise / noise.std() for noise in (white, waves)]
-    independent, correlated = (scan_covariance(floor(), Scan(angles, ranges), pose) for ranges in alike)
+    independent, correlated = (scan_covariance(building()[1], Scan(angles, ranges), pose) for ranges in alike)
     assert np.linalg.eigvalsh(correlated)[0] > 4.0 * np.linalg.eigvalsh(independent)[0]
 
 
@@ -242,8 +220,8 @@ def test_the_lesser_of_two_covariances_is_taken_in_every_direction(rng: np.rando
 
 
 def test_a_scan_again_and_again_makes_no_surer() -> None:
-    world = World(building_map(), (21.0, 9.6, -2.0), rng=np.random.default_rng(1))
-    localiser = Localiser(floor(), world.pose, np.array([0.05, 0.05, 0.02]), 360)
+    world = World(building()[0], (21.0, 9.6, -2.0), rng=np.random.default_rng(1))
+    localiser = Localiser(building()[1], world.pose, np.array([0.05, 0.05, 0.02]), 360)
     localiser.correct(world.scan())
     first = np.linalg.eigvalsh(localiser.covariance)
     for _ in range(30):
@@ -254,13 +232,15 @@ def test_a_scan_again_and_again_makes_no_surer() -> None:
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
 def test_errors_are_as_large_as_their_covariances(coupling: str) -> None:
     lidar = LidarModel(turn=0.1)
-    log = drive(replace(SHORT, coupling=coupling, lidar=lidar, imperfection=Imperfection(map_error=0.03), seed=3), 60)
+    log = Episode(
+        replace(SHORT, coupling=coupling, lidar=lidar, imperfection=Imperfection(map_error=0.03), seed=3)
+    ).run(stop_after(60))
     values = nees(log.estimate, log.true_pose, log.covariance)
     assert 0.2 < values[5:].mean() < 8.0
 
 
 def test_the_metrics_hold_means_and_one_draw_of_nees() -> None:
-    log = drive(SHORT, 12)
+    log = Episode(SHORT).run(stop_after(12))
     values = nees(log.estimate, log.true_pose, log.covariance)
     error = SE2.local(log.estimate[4], log.true_pose[4])
     assert values[4] == pytest.approx(error @ np.linalg.solve(log.covariance[4], error))

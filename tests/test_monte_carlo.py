@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from maps import field, walled
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import wrap_angle
 from unifg.models import unicycle
@@ -26,12 +27,8 @@ OWN = MonteCarloSettings(beams=40)
 @functools.cache
 def flat() -> tuple[OccupancyMap, DistanceMap]:
     """A room of 6 m by 4 m that looks like itself from no other side."""
-    occupied = np.zeros((84, 124), dtype=bool)
-    occupied[:2] = occupied[-2:] = True
-    occupied[:, :2] = occupied[:, -2:] = True
-    occupied[60:, 30:36] = occupied[10:20, 90:110] = True
-    occupancy = OccupancyMap(occupied, ~occupied, 0.05, (-0.1, -0.1, 0.0), "flat")
-    return occupancy, DistanceMap.from_occupancy(occupied, 0.05, occupancy.origin)
+    occupancy = walled(6.2, 4.2, 2, (-0.1, -0.1, 0.0), "flat", [np.s_[60:, 30:36], np.s_[10:20, 90:110]])
+    return occupancy, field(occupancy)
 
 
 def localiser(own: MonteCarloSettings = OWN, pose: Array = START, seed: int = 0) -> MonteCarlo:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,18 +10,16 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from maps import building, field, stop_after
 from unifg.errors import BackendError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.route import Route
-from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.polyline import path_length, polyline_distance
-from unifg.scenarios.simulation.building import building_map
 from unifg.scenarios.simulation.plane import World
 from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
@@ -33,25 +30,6 @@ SOLVERS = ("ipm", "sqp", "alm")
 # Seven metres of the long corridor, and eight metres out of an office's door and around the corner.
 CORRIDOR = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),))
 CORNER = NavigationSettings(start=(10.8, 17.0, -1.57), goals=((16.5, 14.0, 0.0),))
-
-
-def stop_after(ticks: int, settings: NavigationSettings) -> EpisodeLog:
-    """An episode that the user interrupts after so many ticks."""
-    return drive(Episode(settings), ticks)
-
-
-def drive(episode: Episode, ticks: int) -> EpisodeLog:
-    """Run an episode for so many ticks at most."""
-    count = 0
-
-    def interrupt(done: float, text: str) -> None:
-        nonlocal count
-        count += done < 1.0
-        if count >= ticks:
-            count = -(10**6)
-            raise KeyboardInterrupt
-
-    return episode.run(interrupt)
 
 
 # ------------------------------------------------------------------- arriving
@@ -114,7 +92,7 @@ def test_turtlebot_world(shared_data: Path, solver: str) -> None:
 @pytest.mark.parametrize("solver", SOLVERS)
 def test_same_seed_same_drive(solver: str) -> None:
     settings = replace(CORRIDOR, solver=solver, obstacles=2, seed=5)
-    one, two = stop_after(40, settings), stop_after(40, settings)
+    one, two = (Episode(settings).run(stop_after(40)) for _ in range(2))
     assert one.ticks == two.ticks == 40
     clocked = {"solve_ms", "localise_ms", "plan_ms", "perceive_ms", "route_ms"}
     for name, value in vars(one).items():
@@ -130,14 +108,15 @@ def test_same_seed_same_drive(solver: str) -> None:
 
 
 def test_other_seed_other_drive() -> None:
-    one, two = (stop_after(10, replace(CORRIDOR, obstacles=2, seed=seed)) for seed in (5, 6))
+    settings = [replace(CORRIDOR, obstacles=2, seed=seed) for seed in (5, 6)]
+    one, two = (Episode(s).run(stop_after(10)) for s in settings)
     assert not np.array_equal(one.true_pose, two.true_pose)
     assert not np.array_equal(one.scan, two.scan, equal_nan=True)
     assert not np.array_equal(one.obstacles, two.obstacles)
 
 
 def test_interrupted_episode_is_a_shorter_one() -> None:
-    log = stop_after(7, CORRIDOR)
+    log = Episode(CORRIDOR).run(stop_after(7))
     assert log.ticks == 7
     assert log.interrupted and not log.succeeded
 
@@ -188,7 +167,7 @@ def test_failed_solves_brake_to_rest_along_the_stored_plan(
     episode = Episode(replace(CORNER, solver=solver, seed=3))
     horizon = episode.settings.controller.horizon
     replace_solver(monkeypatch, episode, Failing(episode.pilot.controller.loop.warm, good))
-    log = drive(episode, good + horizon + 10)
+    log = episode.run(stop_after(good + horizon + 10))
     assert np.array_equal(log.emergency, np.arange(log.ticks) >= good)
     assert set(log.status[good:]) == {"locally_infeasible"}
 
@@ -236,7 +215,7 @@ def test_a_rescued_tick_is_no_emergency_and_is_counted(monkeypatch: pytest.Monke
     failing = Failing(loop.warm, 10)
     monkeypatch.setattr(loop, "warm", failing)
     monkeypatch.setattr(loop, "cold", failing)
-    log = drive(episode, 30)
+    log = episode.run(stop_after(30))
     assert not log.emergency.any() and log.collisions == 0
     assert np.array_equal(log.rescued, np.arange(30) >= 10)
     assert episode_metrics(log)["rescued_ticks"] == loop.rescues == 20
@@ -276,14 +255,14 @@ def test_a_plan_is_driven_where_it_stopped_if_it_keeps_the_constraints(share: fl
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
 def test_a_drive_has_nothing_to_warn_of(coupling: str, caplog: pytest.LogCaptureFixture) -> None:
-    drive(Episode(replace(CORNER, coupling=coupling)), 5)
+    Episode(replace(CORNER, coupling=coupling)).run(stop_after(5))
     assert [record.message for record in caplog.records if "unifg compiles" not in record.message] == []
 
 
 def test_failure_on_the_first_tick_stands_still(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(CORRIDOR)
     replace_solver(monkeypatch, episode, Failing(episode.pilot.controller.loop.warm, 0))
-    log = drive(episode, 5)
+    log = episode.run(stop_after(5))
     assert log.emergency.all()
     assert np.all(log.control == 0.0)
     assert np.array_equal(log.true_pose, np.broadcast_to(log.true_pose[0], log.true_pose.shape))
@@ -322,22 +301,15 @@ def test_a_map_of_ones_own_needs_start_and_goal(tmp_path: Path) -> None:
 # ----------------------------------------------------------------- localiser
 
 
-@functools.cache
-def building() -> tuple[OccupancyMap, DistanceMap]:
-    """The shipped floor and its distance map."""
-    occupancy = building_map()
-    return occupancy, DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
-
-
 SIGMA = np.array([0.1, 0.1, 0.05])
 
 
 @pytest.mark.parametrize("place", [(3.0, 25.2, 0.0), (21.0, 9.6, -2.0), (10.8, 17.0, 1.0), (36.0, 18.0, 3.0)], ids=str)
 @pytest.mark.parametrize("off", [(0.1, 0.0, 0.05), (-0.07, 0.07, -0.05), (0.0, -0.1, 0.05)], ids=str)
 def test_localiser_converges(place: tuple[float, float, float], off: tuple[float, float, float]) -> None:
-    occupancy, field = building()
+    occupancy, distances = building()
     world = World(occupancy, place, rng=np.random.default_rng(1))
-    localiser = Localiser(field, world.pose + np.array(off), SIGMA, world.lidar.beams)
+    localiser = Localiser(distances, world.pose + np.array(off), SIGMA, world.lidar.beams)
     for _ in range(3):
         localiser.correct(world.scan())
     position, heading = pose_errors(localiser.pose[None], world.pose[None])
@@ -350,11 +322,11 @@ def test_localiser_converges(place: tuple[float, float, float], off: tuple[float
 
 def test_a_disc_beside_a_wall_does_not_pull_the_estimate_along_a_corridor() -> None:
     """Little says how far along a corridor the robot is: beams that end on a disc, near a wall, must not decide it."""
-    occupancy, field = building()
+    occupancy, distances = building()
     place = np.array([15.0, 14.2, -0.3])
     shelf = [Obstacle(np.array([15.0 + x, 13.45]), 0.2) for x in (0.6, 1.1, 1.6)]
     world = World(occupancy, place, shelf, np.random.default_rng(1))
-    localiser = Localiser(field, place.copy(), SIGMA, world.lidar.beams)
+    localiser = Localiser(distances, place.copy(), SIGMA, world.lidar.beams)
     iterations = []
     for _ in range(10):
         localiser.correct(world.scan())
@@ -364,8 +336,8 @@ def test_a_disc_beside_a_wall_does_not_pull_the_estimate_along_a_corridor() -> N
 
 
 def test_localiser_keeps_the_prediction_without_a_scan() -> None:
-    _, field = building()
-    localiser = Localiser(field, np.array([3.0, 25.2, 0.0]), SIGMA, 360)
+    _, distances = building()
+    localiser = Localiser(distances, np.array([3.0, 25.2, 0.0]), SIGMA, 360)
     localiser.predict(np.array([0.5, 0.0]), 0.1)
     predicted, uncertain = localiser.pose.copy(), localiser.covariance.copy()
     assert np.allclose(predicted, [3.05, 25.2, 0.0])
@@ -379,10 +351,10 @@ def test_localiser_keeps_the_prediction_without_a_scan() -> None:
 @pytest.mark.data
 def test_department_map_is_planned_end_to_end(shared_data: Path) -> None:
     occupancy = load_map(shared_data / "maps" / "dis-B1-2011-09-27.yaml")
-    field = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    distances = field(occupancy)
     start, goal = np.array([2.3, 30.0, -1.57]), np.array([10.0, 1.7, 0.0])
-    route = Route(occupancy, field, start, goal, RADIUS)
-    assert field.distance(route.path[:, :2]).min() > RADIUS
+    route = Route(occupancy, distances, start, goal, RADIUS)
+    assert distances.distance(route.path[:, :2]).min() > RADIUS
     assert 30.0 < path_length(route.path) < 45.0
 
 
@@ -439,7 +411,7 @@ def test_the_first_leg_begins_where_the_robot_believes_to_be(coupling: str) -> N
         inner(scan, odometry, dt)
 
     episode.pilot.estimator.update = counted  # type: ignore[method-assign]
-    log = drive(episode, 2)
+    log = episode.run(stop_after(2))
     assert [u is None for u in updates] == [True, False]
     first = log.route[0][0, :2]
     assert not np.array_equal(first, episode.start[:2])

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from episodes import room
+from maps import field
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.command import main
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
@@ -72,9 +72,7 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def context() -> PlannerContext:
-    occupancy = room()
-    distances = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
-    return PlannerContext(distances, ControllerSettings(accelerations=(1.0, 2.0)), np.random.default_rng(0))
+    return PlannerContext(field(room()), ControllerSettings(accelerations=(1.0, 2.0)), np.random.default_rng(0))
 
 
 def ahead() -> np.ndarray:
@@ -130,10 +128,14 @@ def test_an_answer_of_another_shape_is_refused(own: Path) -> None:
         adapter.plan(np.zeros(3), ahead(), Tracks.none())
 
 
-def test_planner_and_localiser_of_others_have_no_joint_graph() -> None:
-    with pytest.raises(ScenarioError, match="planner 'x:Y' stands for itself: its coupling is 'sequential'"):
-        Episode(NavigationSettings(planner="x:Y", coupling="joint"))
-    with pytest.raises(ScenarioError, match="localiser 'amcl' stands for itself"):
-        Episode(NavigationSettings(localiser="amcl", coupling="joint"))
-    with pytest.raises(ScenarioError, match="unknown localiser 'best': choose graph or amcl"):
-        Episode(NavigationSettings(localiser="best"))
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"planner": "x:Y", "coupling": "joint"}, "planner 'x:Y' stands for itself: its coupling is 'sequential'"),
+        ({"localiser": "amcl", "coupling": "joint"}, "localiser 'amcl' stands for itself"),
+        ({"localiser": "best"}, "unknown localiser 'best': choose graph or amcl"),
+    ],
+)
+def test_planner_and_localiser_of_others_have_no_joint_graph(wrong: dict[str, str], words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        Episode(NavigationSettings(**wrong))  # type: ignore[arg-type]

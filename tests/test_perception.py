@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maps import field, walled
 from unifg.files.ros_map import OccupancyMap, load_map
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.perception.disc_tracker import DiscTracker
 from unifg.scenarios.perception.discs import DiscFinder
 from unifg.scenarios.perception.readings import Scan
@@ -23,19 +23,9 @@ from unifg.typing import Array, ArrayLike
 DT = 0.1
 
 
-def hall(width: float = 10.0, height: float = 8.0, pillar: bool = False) -> OccupancyMap:
-    """A hall with walls, and perhaps a mapped pillar of 0.5 m in its middle."""
-    occupied = np.zeros((round(height / 0.05), round(width / 0.05)), dtype=bool)
-    occupied[[0, -1], :] = True
-    occupied[:, [0, -1]] = True
-    if pillar:
-        occupied[75:85, 95:105] = True
-    return OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall")
-
-
-def field(occupancy: OccupancyMap) -> DistanceMap:
-    """Distance map of an occupancy map."""
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+def hall(pillar: bool = False) -> OccupancyMap:
+    """A hall of 10 m by 8 m, and perhaps a mapped pillar of 0.5 m in its middle."""
+    return walled(10.0, 8.0, blocks=[np.s_[75:85, 95:105]] if pillar else [])
 
 
 def disc(x: float, y: float, radius: float = 0.2) -> Obstacle:
@@ -123,9 +113,7 @@ def test_mapped_things_are_not_obstacles() -> None:
 
 def test_wide_things_become_several_discs() -> None:
     """An unmapped wall of two metres is covered by discs along its whole face."""
-    occupied = hall().occupied.copy()
-    occupied[60:100, 100:104] = True
-    solid = OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="hall")
+    solid = walled(10.0, 8.0, blocks=[np.s_[60:100, 100:104]])
     world = World(solid, (3.0, 4.0, 0.0), rng=np.random.default_rng(0))
     tracks = watch(world, DiscTracker(field(hall())), 5, np.zeros(3), np.random.default_rng(0))
     face = np.stack([np.full(41, 5.0), np.linspace(3.0, 5.0, 41)], axis=1)
@@ -148,7 +136,7 @@ def test_velocity_of_a_mover(heading: float) -> None:
         noise = np.array([0.01, 0.01, 0.004])
         tracks = watch(world, DiscTracker(field(occupancy)), 11, noise, np.random.default_rng(50 + seed))
         assert len(tracks) == 1
-        assert np.linalg.norm(tracks.centre[0] - world.obstacle_states()[0, :2]) < 0.08
+        assert np.linalg.norm(tracks.centre[0] - world.discs()[0, :2]) < 0.08
         errors.append(np.linalg.norm(tracks.velocity[0] - 0.3 * direction))
     assert np.mean(errors) < 0.06
     assert max(errors) < 0.1
@@ -166,7 +154,7 @@ def test_mover_that_turns_round_is_followed() -> None:
         tracks = watch(world, tracker, 1, np.array([0.01, 0.01, 0.003]), rng)
         identities |= set(tracks.identity.tolist())
         if len(tracks):
-            away.append(float(np.linalg.norm(tracks.centre[0] - world.obstacle_states()[0, :2])))
+            away.append(float(np.linalg.norm(tracks.centre[0] - world.discs()[0, :2])))
     assert len(identities) == 1
     assert max(away[10:]) < 0.15
     assert np.mean(away) < 0.06
@@ -199,14 +187,14 @@ def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
     still = np.zeros(3)
     waited = 0
     for _ in range(80):
-        before = world.obstacle_states()[0, :2]
+        before = world.discs()[0, :2]
         watch(world, tracker, 1, still, rng)
-        waited += bool(np.allclose(world.obstacle_states()[0, :2], before))
+        waited += bool(np.allclose(world.discs()[0, :2], before))
     assert waited > 20
     away = []
     for _ in range(12):
         tracks = tracker.update(world.scan(), world.pose, 0.1)
-        away.append(float(np.linalg.norm(tracks.centre[0] - world.obstacle_states()[0, :2])))
+        away.append(float(np.linalg.norm(tracks.centre[0] - world.discs()[0, :2])))
         world.step(-1.0, 0.0)  # no longer at rest: the mover goes on
     assert max(away) < 0.05
 
@@ -222,7 +210,7 @@ def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
     assert tracker.tracks().mover.tolist() == [True]
     tracks = watch(world, tracker, round(10.0 * waits), np.zeros(3), rng)
     assert tracks.mover.tolist() == [waits < 10.0] and not tracks.velocity.any()
-    x, y = world.obstacle_states()[0, :2]
+    x, y = world.discs()[0, :2]
     assert np.hypot(*(tracks.centre[0] - [x, y])) < 0.04
     world.carry(np.array([2.0, 6.5, 0.0]))
     again = [watch(world, tracker, 1, np.zeros(3), rng) for _ in range(12)]

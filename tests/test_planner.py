@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+import maps
 from tools.draw_building import draw_building
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
@@ -21,10 +22,6 @@ from unifg.scenarios.simulation.building import DEMO_GOALS, DEMO_START, building
 from unifg.typing import Array
 
 RADIUS = 0.17
-
-
-def field_of(occupancy: OccupancyMap) -> DistanceMap:
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
 
 
 def room(gap_cells: int = 8, yaw: float = 0.0) -> OccupancyMap:
@@ -60,7 +57,7 @@ def check_path(path: Array, start: Array, goal: Array, field: DistanceMap, clear
 @pytest.mark.parametrize("gap", [8, 9, 12, 30])
 def test_a_gap_is_passed_with_the_room_it_offers(gap: int) -> None:
     occupancy = room(gap)
-    field = field_of(occupancy)
+    field = maps.field(occupancy)
     start, goal = np.array([1.0, 1.0, 0.0]), np.array([5.0, 1.0, 2.5])
     path = plan(occupancy, field, start, goal, robot_radius=RADIUS)
     check_path(path, start, goal, field, min(0.32, 0.05 * (gap - 1) / 2.0) - 1e-3)
@@ -69,7 +66,7 @@ def test_a_gap_is_passed_with_the_room_it_offers(gap: int) -> None:
 
 def test_a_gap_narrower_than_the_robot_is_no_way() -> None:
     occupancy = room(6)
-    field = field_of(occupancy)
+    field = maps.field(occupancy)
     assert not path_exists(occupancy, field, (1, 1), (5, 1), RADIUS)
     with pytest.raises(ScenarioError, match=r"no way from \(1\.00, 1\.00\) to \(5\.00, 1\.00\).*choose another goal"):
         plan(occupancy, field, (1, 1, 0), (5, 1, 0), robot_radius=RADIUS)
@@ -79,7 +76,7 @@ def test_the_middle_of_a_corridor_is_preferred() -> None:
     occupied = np.ones((50, 400), dtype=bool)
     occupied[5:45, 5:395] = False
     occupancy = OccupancyMap(occupied, ~occupied, 0.05, (0.0, 0.0, 0.0))
-    path = plan(occupancy, field_of(occupancy), (1.0, 0.6, 0.0), (19.0, 1.8, 0.0), robot_radius=RADIUS)
+    path = plan(occupancy, maps.field(occupancy), (1.0, 0.6, 0.0), (19.0, 1.8, 0.0), robot_radius=RADIUS)
     middle = path[(path[:, 0] > 4.0) & (path[:, 0] < 16.0)]
     assert np.abs(middle[:, 1] - 1.25).max() < 0.3
     assert path_length(path) < 18.3
@@ -90,7 +87,7 @@ def test_an_oblique_line_over_open_floor_is_straight() -> None:
     occupancy = OccupancyMap(occupied, ~occupied, 0.05, (0.0, 0.0, 0.3))
     ends = occupancy.grid_to_world(np.array([[20.3, 31.7], [170.2, 90.1]]))
     start, goal = np.append(ends[0], 1.0), np.append(ends[1], -1.0)
-    path = plan(occupancy, field_of(occupancy), start, goal, robot_radius=RADIUS)
+    path = plan(occupancy, maps.field(occupancy), start, goal, robot_radius=RADIUS)
     assert path_length(path) < 1.001 * float(np.hypot(*(ends[1] - ends[0])))
     assert turn(path).max() < 0.3
 
@@ -99,21 +96,21 @@ def test_the_path_of_a_turned_map_is_the_turned_path() -> None:
     plain, turned = room(), room(yaw=0.9)
     ends = plain.world_to_grid(np.array([[1.0, 1.0], [5.0, 1.0]]))
     start, goal = turned.grid_to_world(ends)
-    path = plan(plain, field_of(plain), (1, 1, 0), (5, 1, 0), robot_radius=RADIUS)
-    other = plan(turned, field_of(turned), (*start, 0), (*goal, 0), robot_radius=RADIUS)
+    path = plan(plain, maps.field(plain), (1, 1, 0), (5, 1, 0), robot_radius=RADIUS)
+    other = plan(turned, maps.field(turned), (*start, 0), (*goal, 0), robot_radius=RADIUS)
     assert abs(path_length(path) - path_length(other)) < 0.05  # rounding decides between equal grid paths
-    assert field_of(turned).distance(other[:, :2]).min() >= 0.17
+    assert maps.field(turned).distance(other[:, :2]).min() >= 0.17
 
 
 def test_discs_are_avoided_and_can_close_the_way() -> None:
     occupancy = room(30)
-    field = field_of(occupancy)
+    field = maps.field(occupancy)
     disc = np.array([[2.0, 3.0, 0.25]])
     start, goal = np.array([1.0, 3.0, 0.0]), np.array([5.0, 3.2, 0.0])
     path = plan(occupancy, field, start, goal, robot_radius=RADIUS, extra_discs=disc)
     apart = np.hypot(*(path[:, :2] - disc[0, :2]).T) - 0.25
     assert 0.31 <= apart.min() < 0.7
-    assert np.allclose(field.values, field_of(occupancy).values)  # the map itself is left alone
+    assert np.allclose(field.values, maps.field(occupancy).values)  # the map itself is left alone
     assert path_exists(occupancy, field, start, goal, 0.25, disc)
     assert not path_exists(occupancy, field, start, goal, 0.25, [[3.0, 3.25, 0.4]])
     assert path_exists(occupancy, field, start, goal, 0.25, [[3.0, 2.7, 0.2]])
@@ -126,8 +123,8 @@ def test_unknown_cells_are_not_driven_through() -> None:
     free = occupancy.free.copy()
     free[60:90, 68:72] = False
     closed = OccupancyMap(occupancy.occupied, free, 0.05, occupancy.origin, "closed")
-    assert path_exists(occupancy, field_of(occupancy), (1, 1), (5, 1), 0.25)
-    assert not path_exists(closed, field_of(closed), (1, 1), (5, 1), 0.25)
+    assert path_exists(occupancy, maps.field(occupancy), (1, 1), (5, 1), 0.25)
+    assert not path_exists(closed, maps.field(closed), (1, 1), (5, 1), 0.25)
 
 
 @pytest.mark.parametrize(
@@ -146,7 +143,7 @@ def test_places_where_no_robot_can_stand_are_refused(
 ) -> None:
     occupancy = room()
     with pytest.raises(ScenarioError, match=words):
-        plan(occupancy, field_of(occupancy), start, goal, robot_radius=RADIUS)
+        plan(occupancy, maps.field(occupancy), start, goal, robot_radius=RADIUS)
 
 
 def test_a_distance_map_of_another_map_is_refused() -> None:
@@ -158,7 +155,7 @@ def test_a_distance_map_of_another_map_is_refused() -> None:
 @pytest.mark.parametrize("apart", [0.0, 0.01, 0.3])
 def test_a_goal_at_hand_still_gives_two_poses(apart: float) -> None:
     occupancy = room()
-    path = plan(occupancy, field_of(occupancy), (1.012, 1.033, 0), (1.012 + apart, 1.033, 2.0), robot_radius=RADIUS)
+    path = plan(occupancy, maps.field(occupancy), (1.012, 1.033, 0), (1.012 + apart, 1.033, 2.0), robot_radius=RADIUS)
     assert len(path) >= 2
     assert np.allclose(path[-1], (1.012 + apart, 1.033, 2.0))
     assert path_length(path) < apart + 0.05
@@ -242,7 +239,7 @@ def test_the_shipped_building_is_what_the_generator_draws(building: OccupancyMap
 
 
 def test_every_room_of_the_building_can_be_reached(building: OccupancyMap) -> None:
-    open_cells = building.free & (field_of(building).values >= 0.25)
+    open_cells = building.free & (maps.field(building).values >= 0.25)
     labels, _ = ndimage.label(open_cells)
     sizes = np.bincount(labels.ravel())[1:]
     # What is left over are nooks behind furniture of less than half a square metre.
@@ -258,7 +255,7 @@ def test_the_building_looks_different_when_mirrored_or_turned(building: Occupanc
 
 
 def test_the_demonstration_route(building: OccupancyMap) -> None:
-    field = field_of(building)
+    field = maps.field(building)
     start, total = np.array(DEMO_START), 0.0
     for goal in np.array(DEMO_GOALS):
         path = plan(building, field, start, goal, robot_radius=RADIUS)
@@ -282,7 +279,7 @@ def test_real_maps(
     shared_data: Path, name: str, stops: list[tuple[float, float, float]], longest: float, clearance: float
 ) -> None:
     occupancy = load_map(shared_data / "maps" / f"{name}.yaml")
-    field = field_of(occupancy)
+    field = maps.field(occupancy)
     total = 0.0
     for start, goal in pairwise(stops):
         path = plan(occupancy, field, start, goal, robot_radius=RADIUS)

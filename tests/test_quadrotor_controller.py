@@ -22,7 +22,7 @@ from unifg.scenarios.quadrotor.flight_parts import GivenFlight
 from unifg.scenarios.quadrotor.flight_past import MANIFOLDS
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
 from unifg.scenarios.quadrotor.guide import Guide, GuideSettings
-from unifg.scenarios.quadrotor.slots import FAR_AWAY, Obstacles, Slots
+from unifg.scenarios.quadrotor.slots import FAR_AWAY, SlotObstacles, Slots
 from unifg.solvers.names import CONSTRAINED
 from unifg.typing import Array
 
@@ -207,7 +207,7 @@ def test_terms_of_the_estimate_can_be_replaced() -> None:
         def apart(self, squares: bool | None) -> list[Term]:
             return [Places()]
 
-        def split(self, obstacles: Obstacles) -> tuple[Obstacles, Any, list[int]]:
+        def split(self, obstacles: SlotObstacles) -> tuple[SlotObstacles, Any, list[int]]:
             nowhere = replace(obstacles, centres=np.full_like(obstacles.centres, FAR_AWAY))
             return nowhere, np.ones(len(obstacles.names), dtype=bool), []
 

@@ -15,7 +15,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.quadrotor.flight_control import KEPT, LEFT_BEHIND, PATIENCE, Controller, is_behind
-from unifg.scenarios.quadrotor.flight_parts import Flown
+from unifg.scenarios.quadrotor.flight_parts import FlightInput
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
 from unifg.scenarios.quadrotor.guide import Reference
 from unifg.scenarios.quadrotor.slots import Slots
@@ -139,7 +139,7 @@ def test_the_control_that_is_flown_is_what_the_next_one_changes_from() -> None:
     hover = quadrotor.hover(here.parameters)
     lasts, inner = [], controller.loop.data
 
-    def data(now: Context[Flown]) -> Any:
+    def data(now: Context[FlightInput]) -> Any:
         lasts.append(now.last)
         return inner(now)
 

@@ -36,15 +36,22 @@ SEED = 1000  # of those open to tuning
 FREE = JointSettings(np.inf)
 
 
+def flown(flight: Flight, ticks: int) -> Iterator[Plan]:
+    """Plans of a flight, tick by tick, each flown when the next is asked for."""
+    control: Array | None = None
+    for _ in range(ticks):
+        plan = flight.pilot.tick(flight.world.sense(), control)
+        control = plan.controls[0]
+        yield plan
+        flight.world.step(control, flight.settings.controller.dt)
+
+
 class Past:
     """A window filled by a flight, up to a tick that has not been planned yet."""
 
     def __init__(self, ticks: int, settings: FlightSettings) -> None:
         flight = Flight(settings)
-        control: Array | None = None
-        for _ in range(ticks):
-            control = flight.pilot.tick(flight.world.sense(), control).controls[0]
-            flight.world.step(control, settings.controller.dt)
+        control = [plan.controls[0] for plan in flown(flight, ticks)][-1]
         self.layout: Layout = flight.conditions.layout
         self.estimator: Estimator = flight.pilot.estimator
         self.belief: Belief = self.estimator.update(flight.world.sense(), control)
@@ -224,14 +231,10 @@ def test_no_wish_makes_drag_negative() -> None:
     found, state = flight.conditions, flight.pilot.belief.state
     wishful = replace(settings.controller, avoidance="potential")
     pilot = make_pilot("joint", "ipm", found.layout, state, found.nominal, settings.estimator, wishful, FREE)
-    control: Array | None = None
-    drag = []
-    for _ in range(25):
-        plan = pilot.tick(flight.world.sense(), control)
+    flight.pilot, drag = pilot, []
+    for plan in flown(flight, 25):
         assert plan.source == "solved"
         drag.append(pilot.belief.parameters.drag)
-        control = plan.controls[0]
-        flight.world.step(control, settings.controller.dt)
     assert -1e-6 < np.min(drag) < 1e-3
 
 
@@ -285,12 +288,8 @@ def test_the_structure_is_compiled_once(compilations: list[int]) -> None:
     settings = FlightSettings(seed=SEED, coupling="joint")
     window = replace(settings.estimator.window, landmarks=4, length=5)
     flight = Flight(replace(settings, estimator=replace(settings.estimator, window=window)))
-    control: Array | None = None
     begun, known, retired = 0, [], 0
-    for tick in range(60):
-        plan = flight.pilot.tick(flight.world.sense(), control)
-        control = plan.controls[0]
-        flight.world.step(control, settings.controller.dt)
+    for tick, plan in enumerate(flown(flight, 60)):
         begun = len(compilations) if tick == 0 else begun
         known.append(len(flight.pilot.belief.landmarks))
         retired = known[-1] - int(flight.pilot.estimator.atlas.used.sum())
@@ -305,16 +304,13 @@ def test_a_flight_believes_what_the_joint_graph_says(association: str) -> None:
     settings = FlightSettings(seed=SEED, coupling="joint")
     flight = Flight(replace(settings, estimator=replace(settings.estimator, association=association)))
     pilot, world = flight.pilot, flight.world
-    control: Array | None = None
     errors, differences = [], []
-    for _ in range(50):
-        control = pilot.tick(world.sense(), control).controls[0]
+    for _ in flown(flight, 50):
         past = pilot.estimator.belief()
         errors.append(np.linalg.norm(pilot.belief.state[:3] - world.state[:3]))
         step = quadrotor.STATE.local(past.state[None], pilot.belief.state[None])[0]
         differences.append(np.abs(step / past.sigma).max())
         assert np.array_equal(past.covariance, pilot.belief.covariance)  # of the past's terms alone
-        world.step(control, settings.controller.dt)
     assert world.collisions == 0 and set(pilot.controller.loop.sources) == {"solved"}
     assert world.state[0] > flight.conditions.layout.start[0] + 2.0
     assert max(errors) < 0.1

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -144,13 +145,20 @@ def test_the_hessian_that_is_asked_for_is_used(solver: str) -> None:
         assert backend(CourseSettings(solver=solver, hessian=hessian)).hessian == hessian  # type: ignore[attr-defined]
 
 
-def test_what_cannot_be_asked_for() -> None:
-    with pytest.raises(BackendError, match="unknown backend 'newton'"):
-        run_course(CourseSettings(solver="newton"))
-    with pytest.raises(ScenarioError, match="unknown guess"):
-        run_course(CourseSettings(guess="luck"))  # type: ignore[arg-type]
-    with pytest.raises(BackendError, match="scalar cost 'cylinder'"):
-        run_course(CourseSettings(solver="alm", general=True))
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"solver": "newton"}, "unknown backend 'newton'"),
+        ({"guess": "luck"}, "unknown guess"),
+        ({"solver": "alm", "general": True}, "scalar cost 'cylinder'"),
+    ],
+)
+def test_what_cannot_be_asked_for(wrong: dict[str, Any], words: str) -> None:
+    with pytest.raises((BackendError, ScenarioError), match=words):
+        run_course(CourseSettings(**wrong))
+
+
+def test_a_guess_along_a_way_needs_one() -> None:
     corners = np.array([[1.0, -1.0], [3.0, -1.0], [3.0, 1.0], [1.0, 1.0]])
     box = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
     closed = Layout(np.zeros(3), np.array([2.0, 0.0, 1.0]), np.zeros((0, 3)), box, np.array([[-1, -2], [4, 2]]), "box")

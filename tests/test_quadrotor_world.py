@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,7 +21,6 @@ from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.scenarios.simulation.layouts import Layout, corridor
 from unifg.scenarios.simulation.space import Obstacle
-from unifg.typing import Array
 
 CALM = DisturbanceModel.calm()
 PARAMETERS = quadrotor.Parameters(mass=1.2, drag=(0.2, 0.3, 0.4), wind=(0.3, -0.2), updraft=0.1)
@@ -128,21 +128,20 @@ def test_clearance_is_the_nearest_of_everything() -> None:
 
 
 @pytest.mark.parametrize(
-    "start", [np.zeros(3), np.full(10, np.nan), [0, 0, 1, 2, 0, 0, 0, 0, 0, 0], [0, 0, -0.1, *LEVEL, 0, 0, 0]]
+    ("start", "control", "dt", "words"),
+    [
+        (np.zeros(3), HOVER, 0.05, "start"),
+        (np.full(10, np.nan), HOVER, 0.05, "start"),
+        ([0, 0, 1, 2, 0, 0, 0, 0, 0, 0], HOVER, 0.05, "start"),
+        ([0, 0, -0.1, *LEVEL, 0, 0, 0], HOVER, 0.05, "start"),
+        ([4.5, 0, 1, *LEVEL, 0, 0, 0], HOVER, 0.05, "cannot start at"),
+        (None, [0.0, 0.0, math.nan, 9.81], 0.05, "four finite"),
+        (None, HOVER, 0.0, "duration"),
+    ],
 )
-def test_bad_starts_are_refused(start: Array) -> None:
-    with pytest.raises(ScenarioError, match="start"):
-        QuadrotorWorld(field(), 0, start=start)
-
-
-def test_bad_steps_and_starts_in_things_are_refused() -> None:
-    with pytest.raises(ScenarioError, match="cannot start at"):
-        QuadrotorWorld(field([(0.5, 0.0, 0.3)]), 0)
-    world = QuadrotorWorld(field(), 0)
-    with pytest.raises(ScenarioError, match="four finite"):
-        world.step([0.0, 0.0, math.nan, 9.81])
-    with pytest.raises(ScenarioError, match="duration"):
-        world.step(HOVER, 0.0)
+def test_bad_starts_and_steps_are_refused(start: Any, control: Any, dt: float, words: str) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        QuadrotorWorld(field([(5.0, 0.0, 0.3)]), 0, start=start).step(control, dt)
 
 
 # ----------------------------------------------------------------------- movers
@@ -151,18 +150,18 @@ def test_bad_steps_and_starts_in_things_are_refused() -> None:
 def test_movers_keep_to_their_segments_whatever_the_vehicle_does() -> None:
     layout = corridor(11)
     first, second = (QuadrotorWorld(layout, 5, movers=4, disturbance=CALM) for _ in range(2))
-    assert first.mover_states().shape == (4, 3)
+    assert first.discs()[:, :3].shape == (4, 3)
     travelled = np.zeros(4)
     for tick in range(200):
-        before = first.mover_states()
+        before = first.discs()[:, :3]
         first.step(HOVER)
         second.step([0.0, 0.1, 0.0, 11.0] if tick < 5 else HOVER)
-        np.testing.assert_allclose(first.mover_states(), second.mover_states(), atol=1e-9)
-        travelled += np.linalg.norm((first.mover_states() - before)[:, :2], axis=1)
-        assert (layout.distance(first.mover_states()[:, :2]) >= first.mover_states()[:, 2] + 0.1 - 1e-9).all()
+        np.testing.assert_allclose(first.discs()[:, :3], second.discs()[:, :3], atol=1e-9)
+        travelled += np.linalg.norm((first.discs()[:, :3] - before)[:, :2], axis=1)
+        assert (layout.distance(first.discs()[:, :2]) >= first.discs()[:, 2] + 0.1 - 1e-9).all()
     for mover, distance in zip(first.movers, travelled, strict=True):
         assert distance == pytest.approx(mover.speed * 10.0, rel=0.02)
-    assert not np.array_equal(QuadrotorWorld(layout, 6, movers=4).mover_states(), before)
+    assert not np.array_equal(QuadrotorWorld(layout, 6, movers=4).discs()[:, :3], before)
 
 
 def test_a_mover_hits_and_pushes_a_hovering_vehicle() -> None:
@@ -353,7 +352,7 @@ def flown(ticks: int) -> FlightLog:
             landmarks=landmark_rows(
                 reading.ids, world.things()[reading.ids, :2], np.tile(np.eye(2), (count, 1, 1)), reading.radii
             ),
-            parameters=PARAMETERS.packed, parameters_sigma=np.zeros(7), seen=reading.ids, movers=world.mover_states(),
+            parameters=PARAMETERS.packed, parameters_sigma=np.zeros(7), seen=reading.ids, movers=world.discs()[:, :3],
             estimate_ms=1.0, plan_ms=2.0, compiled=0, statuses="converged", clearance=world.clearance(),
             emergency=tick == 1, health="ok", causes="", fault="gust" if tick == 1 else "",
         )  # fmt: skip

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from maps import field, walled
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_control import Controller
@@ -35,11 +36,8 @@ RADIUS = 0.17
 @functools.cache
 def hall(width: float = 2.0) -> tuple[OccupancyMap, DistanceMap]:
     """A corridor of 12 m along x, its walls at y = 0 and y = width."""
-    occupied = np.zeros((round(width / 0.05) + 4, 240), dtype=bool)
-    occupied[:2] = occupied[-2:] = True
-    occupied[:, :2] = occupied[:, -2:] = True
-    occupancy = OccupancyMap(occupied, ~occupied, 0.05, (0.0, -0.1, 0.0), "hall")
-    return occupancy, DistanceMap.from_occupancy(occupied, 0.05, occupancy.origin)
+    occupancy = walled(12.0, width + 0.2, 2, (0.0, -0.1, 0.0))
+    return occupancy, field(occupancy)
 
 
 def disc(x: float, y: float, radius: float, velocity: tuple[float, float] = (0.0, 0.0)) -> Tracks:
@@ -92,19 +90,14 @@ def test_route_refuses_a_gap_too_narrow_for_the_controller() -> None:
 
 def test_stuck_robot_looks_for_another_way_on_the_whole_map() -> None:
     """Two corridors side by side, joined at their ends: a disc that closes one sends the robot through the other."""
-    occupied = np.zeros((84, 400), dtype=bool)
-    occupied[:2] = occupied[-2:] = True
-    occupied[:, :2] = occupied[:, -2:] = True
-    occupied[40:44, 40:-40] = True
-    occupancy = OccupancyMap(occupied, ~occupied, 0.05, (0.0, 0.0, 0.0), "two corridors")
-    field = DistanceMap.from_occupancy(occupied, 0.05, occupancy.origin)
+    occupancy = walled(20.0, 4.2, 2, name="two corridors", blocks=[np.s_[40:44, 40:-40]])
     start, goal = np.array([1.0, 1.0, 0.0]), np.array([19.0, 1.0, 0.0])
     here = np.array([8.8, 1.0, 0.0])
     for closing, moved in (
         (disc(10.0, 1.0, 0.8), False),
         (replace(disc(10.0, 1.0, 0.8), mover=np.array([True])), True),
     ):
-        route = Route(occupancy, field, start, goal, RADIUS)
+        route = Route(occupancy, field(occupancy), start, goal, RADIUS)
         for x in np.arange(1.0, 9.0):
             route.reference(np.array([x, 1.0, 0.0]), 0.1 * np.arange(2.0))
         answers = [route.repair(here, closing) for _ in range(STUCK_TICKS + PATIENCE)]

@@ -9,11 +9,11 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.scenarios.planning.flat_path import Line
+from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
+from unifg.scenarios.quadrotor.one_step import FilterSettings, filtered
+from unifg.scenarios.quadrotor.oracle import Authority, Threat, escape, exists
+from unifg.scenarios.quadrotor.spline_planner import SplineSettings, around
 from unifg.scenarios.safe_flight import SafeSettings, flights
-from unifg.scenarios.safety.cbf_mpc import Obstacles
-from unifg.scenarios.safety.one_step import FilterSettings, filtered
-from unifg.scenarios.safety.oracle import Authority, Threat, escape, exists, exists_among
-from unifg.scenarios.safety.spline_planner import SplineSettings, around
 
 LINE = Line((-4.0, 0.0, 1.5), (4.0, 0.0, 1.5), 2.0, 1.5)
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -118,58 +118,58 @@ def test_baselines_pass_the_cylinder(controller: str) -> None:
 # ---------------------------------------------------------------- the oracle
 
 
-def test_the_oracle_is_right_about_a_vehicle_that_flies_straight_at_a_point() -> None:
+def test_the_oracle_is_right_about_a_vehicle_that_flies_straight_at_a_pillar() -> None:
     """Sideways it is half A (t - d)^2 away after t = distance / speed."""
     authority = Authority(vehicle=4.0, mass_error=0.0, delay=0.1)
-    away, speed, keep = np.array([-2.0, 0.0]), np.array([4.0, 0.0]), 0.3
-    certain, best = escape(away, speed, keep, authority)
-    assert 0.5 * 4.0 * 0.4**2 - keep == pytest.approx(best, abs=2e-3)
+    pillar = Threat(np.array([-2.0, 0.0, 0.0]), np.array([4.0, 0.0, 0.0]), 0.3, upright=True)
+    certain, best = escape([pillar], authority)
+    assert 0.5 * 4.0 * 0.4**2 - pillar.keep == pytest.approx(best, abs=2e-3)
     assert -1e-3 < certain <= best + 1e-9
-    assert exists(away, speed, 0.25, authority) == "yes"
-    assert exists(away, speed, 0.33, authority) == "no"
+    assert [exists([replace(pillar, keep=keep)], authority) for keep in (0.25, 0.33)] == ["yes", "no"]
 
 
 def test_what_is_known_of_an_obstacle_is_no_threat() -> None:
     """A ball that will fall short of the vehicle, seen while it still rises towards it."""
-    away, speed, authority = np.array([-1.0, 0.0, 0.5]), np.array([2.0, 0.0, -1.0]), Authority(vehicle=0.1, horizon=0.6)
-    falling = escape(away, speed, 0.3, authority, np.array([0.0, 0.0, -9.81]))
-    assert escape(away, speed, 0.3, authority)[1] < 0.0 < falling[0]
+    authority = Authority(vehicle=0.1, horizon=0.6)
+    ball = Threat(np.array([-1.0, 0.0, 0.5]), np.array([2.0, 0.0, -1.0]), 0.3)
+    falling = escape([replace(ball, pull=np.array([0.0, 0.0, -9.81]))], authority)
+    assert escape([ball], authority)[1] < 0.0 < falling[0]
     later = np.linspace(0.0, 0.6, 301)[:, None]
-    exact = np.linalg.norm(away + speed * later + 0.5 * 9.81 * later**2 * [0.0, 0.0, 1.0], axis=1).min() - 0.3
-    assert falling[0] == pytest.approx(exact, abs=0.02)
+    way = ball.away + ball.speed * later + 0.5 * 9.81 * later**2 * [0.0, 0.0, 1.0]
+    assert falling[0] == pytest.approx(np.linalg.norm(way, axis=1).min() - 0.3, abs=0.02)
 
 
 def test_more_to_give_never_makes_it_worse() -> None:
-    rng, base = np.random.default_rng(5), Authority(obstacle=1.0)
+    rng, base = np.random.default_rng(5), Authority()
     answers = []
     for _ in range(60):
-        away, speed, keep = rng.uniform(-2.0, 2.0, 3), rng.uniform(-5.0, 5.0, 3), rng.uniform(0.2, 0.8)
-        certain, best = escape(away, speed, keep, base)
+        threat = Threat(rng.uniform(-2.0, 2.0, 3), rng.uniform(-5.0, 5.0, 3), rng.uniform(0.2, 0.8), bend=1.0)
+        certain, best = escape([threat], base)
         assert certain <= best + 1e-9
-        answers.append(exists(away, speed, keep, base))
-        for name, less in (("vehicle", 3.0), ("mass_error", 0.5), ("delay", 0.4), ("obstacle", 3.0)):
-            weaker = replace(base, **{name: less})
-            assert escape(away, speed, keep, weaker)[0] <= certain + 1e-9
-            assert escape(away, speed, keep, weaker)[1] <= best + 1e-9
+        answers.append(exists([threat], base))
+        changes = (replace(base, vehicle=3.0), replace(base, mass_error=0.5), replace(base, delay=0.4))
+        weaker = [(threat, less) for less in changes] + [(replace(threat, bend=3.0), base)]
+        for worse, less in weaker:
+            assert (np.array(escape([worse], less)) <= np.array([certain, best]) + 1e-9).all()
     assert {"yes", "no"} <= set(answers)
 
 
 def test_where_the_oracle_says_yes_an_acceleration_that_is_held_escapes_whatever_the_obstacle_does() -> None:
-    rng, authority = np.random.default_rng(6), Authority(obstacle=1.5, horizon=1.5)
+    rng, authority, bend = np.random.default_rng(6), Authority(horizon=1.5), 1.5
     times = np.linspace(0.0, 1.5, 301)
+    angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
+    ways = authority.usable * np.column_stack([np.cos(angle), np.sin(angle)])
+    late = 0.5 * np.maximum(times - authority.delay, 0.0) ** 2
     seen = 0
     for _ in range(40):
-        away, speed = rng.uniform(-2.0, 2.0, 2), rng.uniform(-3.0, 3.0, 2)
-        if exists(away, speed, 0.4, authority) != "yes":
+        away, speed = np.append(rng.uniform(-2.0, 2.0, 2), 0.0), np.append(rng.uniform(-3.0, 3.0, 2), 0.0)
+        if exists([Threat(away, speed, 0.4, upright=True, bend=bend)], authority) != "yes":
             continue
         seen += 1
-        angle = np.linspace(0.0, 2.0 * np.pi, 72, endpoint=False)
-        ways = authority.usable * np.column_stack([np.cos(angle), np.sin(angle)])
-        late = 0.5 * np.maximum(times - authority.delay, 0.0) ** 2
         worst = np.full(72, np.inf)
         for turn in np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False):  # pushes of the obstacle, each held
-            push = authority.obstacle * np.array([np.cos(turn), np.sin(turn)])
-            place = away + times[:, None] * speed - 0.5 * push * times[:, None] ** 2
+            push = bend * np.array([np.cos(turn), np.sin(turn)])
+            place = (away + times[:, None] * speed)[:, :2] - 0.5 * push * times[:, None] ** 2
             place = place + ways[:, None, :] * late[:, None]
             worst = np.minimum(worst, np.linalg.norm(place, axis=2).min(axis=1))
         assert worst.max() >= 0.4 - 1e-9
@@ -179,18 +179,16 @@ def test_where_the_oracle_says_yes_an_acceleration_that_is_held_escapes_whatever
 def test_one_way_out_has_to_serve_against_all() -> None:
     authority, still = Authority(delay=0.1), np.zeros(3)
     coming = Threat(np.array([3.0, 0.0, 0.1]), np.array([-6.0, 0.0, 0.0]), 0.4)
-    assert exists_among([], authority) == "yes"
-    assert exists_among([coming], authority) == exists(coming.away, coming.speed, 0.4, authority) == "yes"
     level = [Threat(np.array([0.0, side, 0.0]), still, 0.25, upright=True) for side in (-0.3, 0.3)]
-    assert exists_among([coming, *level], authority) == "yes"  # upwards, between two pillars
-    lid = Threat(np.array([0.0, 0.0, -0.3]), still, 0.25)
-    floor = Threat(np.array([0.0, 0.0, 0.3]), still, 0.25)
-    assert exists_among([coming, *level, lid, floor], authority) == "unknown"  # each by itself could be escaped
+    lid, floor = (Threat(np.array([0.0, 0.0, height]), still, 0.25) for height in (-0.3, 0.3))
     late = Threat(np.array([0.5, 0.0, 0.0]), np.array([-5.0, 0.0, 0.0]), 0.4)
-    assert exists_among([late, *level], authority) == "no"
-    gone = replace(late, until=0.01)
-    assert exists_among([gone], authority) == "yes"
     falling = Threat(np.array([0.0, 0.0, 0.6]), np.array([0.0, 0.0, 3.0]), 0.4, pull=np.array([0.0, 0.0, -9.81]))
-    assert exists_among([falling], authority) == "yes"
-    bent = replace(coming, bend=20.0)
-    assert exists_among([bent], authority) == "unknown"
+    answers = {
+        "nothing": ([], "yes"), "one": ([coming], "yes"), "upwards, between pillars": ([coming, *level], "yes"),
+        "each by itself could be escaped": ([coming, *level, lid, floor], "unknown"), "late": ([late, *level], "no"),
+        "gone": ([replace(late, until=0.01)], "yes"), "falling": ([falling], "yes"),
+        "bent": ([replace(coming, bend=20.0)], "unknown"),
+    }  # fmt: skip
+    assert {name: exists(threats, authority) for name, (threats, _) in answers.items()} == {
+        name: expected for name, (_, expected) in answers.items()
+    }

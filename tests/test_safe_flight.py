@@ -16,8 +16,7 @@ from unifg.models import quadrotor
 from unifg.scenarios import command
 from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.planning.flat_path import FigureEight, Hover, Line
-from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
-from unifg.scenarios.safety.cbf_mpc import (
+from unifg.scenarios.quadrotor.cbf_mpc import (
     KEEP,
     PULL,
     SLOWING,
@@ -28,11 +27,12 @@ from unifg.scenarios.safety.cbf_mpc import (
     Obstacles,
     Reading,
 )
-from unifg.scenarios.safety.flatness import TUNED, FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.pace import Pace
-from unifg.scenarios.safety.situations import SITUATIONS, situation
-from unifg.scenarios.safety.state_filter import FilterStatistics, StateFilter
-from unifg.scenarios.safety.weighing import Weighing, WeighingSettings
+from unifg.scenarios.quadrotor.flatness import TUNED, FlatnessController, Gains, flat_flight
+from unifg.scenarios.quadrotor.pace import Pace
+from unifg.scenarios.quadrotor.situations import SITUATIONS, situation
+from unifg.scenarios.quadrotor.state_filter import FilterStatistics, StateFilter
+from unifg.scenarios.quadrotor.weighing import Weighing, WeighingSettings
+from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
 from unifg.scenarios.simulation.body_rate import Airframe, BodyRatePlant
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.typing import Array

@@ -10,10 +10,10 @@ import pytest
 
 from unifg.models import barriers, quadrotor
 from unifg.scenarios.planning.flat_path import Flown, Line
+from unifg.scenarios.quadrotor.cascade import CascadeSettings, Track
+from unifg.scenarios.quadrotor.cbf_mpc import CbfMpc, KeeperSettings, Obstacles, apart
+from unifg.scenarios.quadrotor.sightings import Sightings, SightingSettings
 from unifg.scenarios.safe_flight import SafeSettings, flights
-from unifg.scenarios.safety.cascade import CascadeSettings, Track
-from unifg.scenarios.safety.cbf_mpc import CbfMpc, KeeperSettings, Obstacles, apart
-from unifg.scenarios.safety.sightings import Sightings, SightingSettings
 from unifg.scenarios.simulation.body_rate import Airframe
 from unifg.typing import Array
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import functools
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+import maps
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
@@ -35,7 +36,6 @@ from unifg.scenarios.quadrotor.unmodelled import Unmodelled
 from unifg.scenarios.scenes.flight_plot import control
 from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.scenarios.simulation.air import QuadrotorWorld
-from unifg.scenarios.simulation.building import building_map
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault, one_of
 from unifg.scenarios.simulation.layouts import corridor
@@ -317,12 +317,6 @@ def test_single_beams_stop_nobody_and_lost_ones_do() -> None:
 # ------------------------------------------------------------------- found again
 
 
-@functools.cache
-def building() -> tuple[Any, DistanceMap]:
-    occupancy = building_map()
-    return occupancy, DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
-
-
 def searched(search: Relocaliser, sample: Scan) -> tuple[Found, int]:
     """Result of a search, and the number of its portions."""
     search.begin(sample)
@@ -335,7 +329,7 @@ def searched(search: Relocaliser, sample: Scan) -> tuple[Found, int]:
 
 @pytest.mark.parametrize("place", [(3.0, 25.2, 2.0), (21.0, 9.6, -2.0)], ids=str)
 def test_a_robot_put_down_anywhere_is_found(place: tuple[float, float, float]) -> None:
-    occupancy, field = building()
+    occupancy, field = maps.building()
     search = Relocaliser(occupancy, field, 0.17)
     found, ticks = searched(search, World(occupancy, place).scan())
     assert found.pose is not None and found.share > 0.9 and found.cause == ""
@@ -345,7 +339,7 @@ def test_a_robot_put_down_anywhere_is_found(place: tuple[float, float, float]) -
 
 
 def test_a_scan_of_another_building_is_found_nowhere() -> None:
-    occupancy, field = building()
+    occupancy, field = maps.building()
     other = askew(occupancy, np.array([10.8, 17.0, 0.0]))
     where = World(other, (10.8, 17.0, 0.0))
     found, _ = searched(Relocaliser(occupancy, field, 0.17), where.scan())
@@ -353,10 +347,10 @@ def test_a_scan_of_another_building_is_found_nowhere() -> None:
 
 
 def test_a_map_put_askew_leaves_the_robot_in_the_open() -> None:
-    occupancy, field = building()
+    occupancy, field = maps.building()
     here = np.array([10.8, 17.0, 0.3])
     other = askew(occupancy, here)
-    turned = DistanceMap.from_occupancy(other.occupied, other.resolution, other.origin)
+    turned = maps.field(other)
     assert turned.distance(here[None, :2])[0] == pytest.approx(field.distance(here[None, :2])[0], abs=0.03)
 
 
@@ -378,15 +372,8 @@ SHORT = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),), o
 @functools.cache
 def faulty(fault: str, coupling: str = "sequential", ticks: int = 50) -> EpisodeLog:
     """Some seconds with a fault from second 1."""
-    count = 0
-
-    def stop(done: float, text: str) -> None:
-        nonlocal count
-        count += 1
-        if count == ticks:
-            raise KeyboardInterrupt
-
-    return Episode(replace(SHORT, coupling=coupling, faults=(one_of(DRIVE_FAULTS)(fault),))).run(stop)
+    settings = replace(SHORT, coupling=coupling, faults=(one_of(DRIVE_FAULTS)(fault),))
+    return Episode(settings).run(maps.stop_after(ticks))
 
 
 @pytest.mark.parametrize("kind", ["lidar-max", "lidar-frozen", "lidar-delayed", "beams-missing"])
@@ -450,15 +437,7 @@ def test_other_faults_are_named_too(fault: str, cause: str) -> None:
 def test_a_tick_that_fails_stops_the_robot_and_not_the_record(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(SHORT)
     monkeypatch.setattr(episode.pilot.tracker, "update", lambda *_: np.linalg.inv(np.zeros((2, 2))))
-    count = 0
-
-    def stop(done: float, text: str) -> None:
-        nonlocal count
-        count += 1
-        if count == 10:
-            raise KeyboardInterrupt
-
-    log = episode.run(stop)
+    log = episode.run(maps.stop_after(10))
     assert log.ticks == 10 and not log.control.any()
     assert log.cause[-1] == "the tick failed: Singular matrix" and log.health[-1] == "degraded"
 
@@ -475,21 +454,21 @@ def believed(spread: float = 1e-4) -> Belief:
     return Belief(state, spread * np.eye(9), quadrotor.Parameters(), np.zeros(7), Landmarks.none())
 
 
-def looked(watch: FlightWatch, reading: Reading | None, now: float, applied: Array | None, belief: Belief) -> None:
-    """One tick of a vehicle that takes the sensor's names for its own."""
-    watch.judge(watch.admit(reading, now, applied, belief), belief)
+def looked(watch: FlightWatch, readings: Iterable[Reading | None], belief: Belief, begin: int = 0) -> None:
+    """Ticks of a vehicle that hovers and takes the sensor's names for its own."""
+    for tick, seen in enumerate(readings, start=begin):
+        watch.judge(watch.admit(seen, 0.05 * tick, HOVERED, belief), belief)
 
 
 def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> None:
-    watch, dt, applied = FlightWatch(0.05, SPREAD), 0.05, np.array([0.0, 0.0, 0.0, 9.81])
-    for tick in range(10):
-        looked(watch, reading(), tick * dt, applied, believed())
+    watch, dt = FlightWatch(0.05, SPREAD), 0.05
+    looked(watch, [reading()] * 10, believed())
     assert watch.verdict.cause == ""
     blind = reading(ids=np.zeros(0, int), bearings=np.zeros(0), ranges=np.zeros(0), radii=np.zeros(0),
                     kinds=np.zeros(0, int), moving=np.zeros(0, bool))  # fmt: skip
     rested = landed = 0.0
     for tick in range(1, 200):
-        looked(watch, blind, 0.5 + tick * dt, applied, believed())
+        looked(watch, [blind], believed(), 10 + tick)
         rested = rested or (tick * dt if watch.verdict.rests else 0.0)
         landed = landed or (tick * dt if watch.lands else 0.0)
     assert rested == pytest.approx(0.2) and watch.verdict.health is Health.LOST
@@ -511,21 +490,18 @@ def test_a_vehicle_that_sees_nothing_stops_in_time_and_lands_after_a_while() -> 
 )
 def test_readings_say_what_is_the_matter(changed: dict[str, Any], cause: str) -> None:
     watch = FlightWatch(0.05, SPREAD)
-    for tick in range(20):
-        looked(watch, reading(**(changed if tick else {})), 0.05 * tick, HOVERED, believed())
+    looked(watch, [reading(), *[reading(**changed)] * 19], believed())
     assert watch.verdict.cause == cause
 
 
 def test_a_detector_that_sees_ghosts_is_not_followed() -> None:
     watch = FlightWatch(0.05, SPREAD)
-    for tick in range(8):
-        looked(watch, reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick), 0.05 * tick, HOVERED, believed())
+    looked(watch, [reading(ids=np.array([0, 1, 50 + 10 * tick]) + tick) for tick in range(8)], believed())
     assert watch.verdict.rests and watch.verdict.cause == "the detector sees what was not there before"
     lost = FlightWatch(0.05, SPREAD)
-    for tick in range(3):
-        looked(lost, reading(), 0.05 * tick, HOVERED, believed(4.0))
+    looked(lost, [reading()] * 3, believed(4.0))
     assert lost.verdict.health is Health.LOST and "decimetres" in lost.verdict.cause
-    looked(lost, None, 0.2, None, believed(math.nan))
+    looked(lost, [None], believed(math.nan), 4)
     assert lost.verdict.rests and lost.validator.dropped["detector: nothing came"] == 1
 
 
@@ -588,9 +564,7 @@ def test_what_pushes_is_flown_against_at_once() -> None:
     belief = replace(believed(), parameters_sigma=np.full(7, 0.01))
     still = replace(belief, state=np.concatenate([belief.state[:7], np.zeros(3)]))
     assert watch.pushed(still) is still
-    for tick in range(4):
-        pushed = reading(force=np.array([0.0, 4.0 if tick else 0.0, 9.81]))
-        looked(watch, pushed, 0.05 * tick, np.array([0.0, 0.0, 0.0, 9.81]), still)
+    looked(watch, [reading(), *[reading(force=np.array([0.0, 4.0, 9.81]))] * 3], still)
     assert watch.verdict.cause == "a gust pushes" and watch.verdict.share < 1.0
     assert watch.pushed(still).parameters.wind == pytest.approx((0.0, 4.0), abs=0.01)
     assert watch.hover(still, least, most)[0] > 1.0, "it leans against it"
@@ -600,11 +574,9 @@ def test_a_landing_is_broken_off_when_all_is_well_again_but_not_near_the_floor()
     for height, lands in ((1.5, False), (0.4, True)):
         watch, here = FlightWatch(0.05, SPREAD), believed()
         here.state[2] = height
-        for tick in range(60):
-            looked(watch, None, 0.05 * tick, HOVERED, here)
+        looked(watch, [None] * 60, here)
         assert watch.lands
-        for tick in range(60, 80):
-            looked(watch, reading(), 0.05 * tick, HOVERED, here)
+        looked(watch, [reading()] * 20, here, 60)
         assert watch.verdict.health is not Health.LOST and watch.lands is lands
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maps import field, walled
 from unifg.errors import ScenarioError
 from unifg.files.contents import Limits
 from unifg.files.ros_map import OccupancyMap
@@ -27,13 +28,7 @@ FAR = Space(np.array([-50.0, 0.0]), 0.17)
 
 def hall() -> OccupancyMap:
     """A hall of 12 m by 4 m."""
-    occupied = np.zeros((80, 240), dtype=bool)
-    occupied[[0, -1]] = occupied[:, [0, -1]] = True
-    return OccupancyMap(occupied, ~occupied, 0.05, (0.0, 0.0, 0.0), "hall")
-
-
-def field(occupancy: OccupancyMap) -> DistanceMap:
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    return walled(12.0, 4.0)
 
 
 def person(way: Array, radius: float, pace: float, walls: DistanceMap) -> Mover:
@@ -48,6 +43,7 @@ def test_a_person_alone_takes_up_its_pace_as_the_forces_say() -> None:
     """dv / dt = (v0 - v) / tau: v = v0 (1 - exp(-t / tau))."""
     way = np.array([[2.0, 2.0], [10.0, 2.0]])
     walker = person(way, 0.2, 1.2, field(hall()))
+    assert walker.policy is not None
     for k in range(400):
         walker.body.velocity = walker.policy.velocity(walker, FAR, False, PAUSE)
         place, speed = walker.body.position, walker.body.velocity
@@ -137,7 +133,7 @@ def test_a_map_of_half_a_kilometre_is_read(monkeypatch: pytest.MonkeyPatch, tmp_
 def test_obstacles_may_be_other_than_the_robot_expects() -> None:
     def radii(between: tuple[float, float]) -> Array:
         settings = NavigationSettings(obstacles=6, seed=2, obstacle_radius=between)
-        return Episode(settings, rehearsal=True).world.obstacle_states()[:, 2]
+        return Episode(settings, rehearsal=True).world.discs()[:, 2]
 
     assert 0.15 <= radii((0.15, 0.25)).min() and radii((0.15, 0.25)).max() <= 0.25
     assert 0.08 <= radii((0.08, 0.1)).min() and radii((0.08, 0.1)).max() <= 0.1

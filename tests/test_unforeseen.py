@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+import maps
+from maps import walled
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
-from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.planning.grid import plan
 from unifg.scenarios.planning.polyline import polyline_distance
 from unifg.scenarios.simulation.placement import PlacementRules, place_obstacles
@@ -26,20 +27,16 @@ GOALS = np.array([[9.0, 6.0, 0.0], [18.5, 1.5, 0.0]])
 
 def floor(door: float = 1.4) -> OccupancyMap:
     """20 m x 8 m, two inner walls with one door each."""
-    occupied = np.zeros((160, 400), dtype=bool)
-    occupied[[0, -1], :] = True
-    occupied[:, [0, -1]] = True
     half = round(0.5 * door / 0.05)
-    for column, middle in ((120, 100), (260, 60)):
-        occupied[:, column : column + 3] = True
-        occupied[middle - half : middle + half, column : column + 3] = False
-    return OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=(0.0, 0.0, 0.0), name="floor")
+    beside = [
+        (rows, slice(column, column + 3))
+        for column, middle in ((120, 100), (260, 60))
+        for rows in (slice(0, middle - half), slice(middle + half, 160))
+    ]
+    return walled(20.0, 8.0, name="floor", blocks=beside)
 
 
-@functools.lru_cache(maxsize=4)
-def field(occupancy: OccupancyMap) -> DistanceMap:
-    """Distance map of an occupancy map."""
-    return DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+field = functools.lru_cache(maxsize=4)(maps.field)
 
 
 def route(occupancy: OccupancyMap, start: Array, goals: Array) -> Array:
@@ -98,17 +95,25 @@ def check(occupancy: OccupancyMap, path: Array, start: Array, goals: Array, obst
         assert joined(occupancy, start, goals, discs, 0.25)
 
 
+def placed(occupancy: OccupancyMap, count: int, seed: int) -> list[Obstacle]:
+    """Draw obstacles on a floor."""
+    rng, path = np.random.default_rng(seed), way(occupancy)
+    return place_obstacles(occupancy, field(occupancy), path, count, rng, start=START, goals=GOALS)
+
+
+@functools.lru_cache(maxsize=4)
+def way(occupancy: OccupancyMap) -> Array:
+    """The planned path over a floor."""
+    return route(occupancy, START, GOALS)
+
+
 def test_promises_hold_over_many_seeds() -> None:
     """Thirty draws of four obstacles on a floor with narrow doors."""
-    occupancy = floor()
-    distance_map = field(occupancy)
-    path = route(occupancy, START, GOALS)
-    near_door = 0
+    occupancy, near_door = floor(), 0
     for seed in range(30):
-        rng = np.random.default_rng(seed)
-        obstacles = place_obstacles(occupancy, distance_map, path, 4, rng, start=START, goals=GOALS)
+        obstacles = placed(occupancy, 4, seed)
         assert len(obstacles) == 4
-        check(occupancy, path, START, GOALS, obstacles)
+        check(occupancy, way(occupancy), START, GOALS, obstacles)
         doors = np.array([[6.1, 5.0], [13.1, 3.0]])
         near_door += any(np.linalg.norm(doors - o.centre, axis=1).min() < 1.0 for o in obstacles)
     assert near_door >= 5  # the doors are not simply avoided
@@ -117,68 +122,42 @@ def test_promises_hold_over_many_seeds() -> None:
 def test_narrow_doors_are_left_open() -> None:
     """Doors that let nothing pass beside an obstacle get no obstacle."""
     occupancy = floor(door=0.8)
-    path = route(occupancy, START, GOALS)
     for seed in range(10):
-        obstacles = place_obstacles(
-            occupancy, field(occupancy), path, 3, np.random.default_rng(seed), start=START, goals=GOALS
-        )
-        check(occupancy, path, START, GOALS, obstacles)
+        check(occupancy, way(occupancy), START, GOALS, placed(occupancy, 3, seed))
 
 
 def test_same_seed_same_obstacles() -> None:
     """The draws come from the generator alone; by default the path's ends are start and goal."""
     occupancy = floor()
-    path = route(occupancy, START, GOALS)
     first, again, other = (
-        place_obstacles(occupancy, field(occupancy), path, 3, np.random.default_rng(seed)) for seed in (5, 5, 6)
+        place_obstacles(occupancy, field(occupancy), way(occupancy), 3, np.random.default_rng(s)) for s in (5, 5, 6)
     )
     np.testing.assert_array_equal([o.centre for o in first], [o.centre for o in again])
     assert np.abs(first[0].centre - other[0].centre).max() > 0.01
-    assert place_obstacles(occupancy, field(occupancy), path, 0, np.random.default_rng(5)) == []
+    assert placed(occupancy, 0, 5) == []
 
 
 def test_no_room_is_said() -> None:
     """Too many obstacles, and a map that is too narrow from the start."""
     occupancy = floor()
-    path = route(occupancy, START, GOALS)
-    short = path[:70]
     with pytest.raises(ScenarioError, match=r"only \d of 6 unforeseen obstacles .*ask for at most"):
-        place_obstacles(occupancy, field(occupancy), short, 6, np.random.default_rng(0))
-    tight = floor(door=0.4)
+        place_obstacles(occupancy, field(occupancy), way(occupancy)[:70], 6, np.random.default_rng(0))
     with pytest.raises(ScenarioError, match="even without unforeseen obstacles"):
-        place_obstacles(
-            tight,
-            field(tight),
-            route(tight, START, GOALS),
-            1,
-            np.random.default_rng(0),
-            start=START,
-            goals=GOALS,
-        )
+        placed(floor(door=0.4), 1, 0)
 
 
 def test_movers_keep_off_walls_in_the_world() -> None:
     """Driven by the world for twenty seconds, no mover touches a wall, and all of them move."""
     occupancy = floor()
-    distance_map = field(occupancy)
-    obstacles = place_obstacles(
-        occupancy,
-        distance_map,
-        route(occupancy, START, GOALS),
-        6,
-        np.random.default_rng(2),
-        start=START,
-        goals=GOALS,
-    )
-    world = World(occupancy, START, obstacles, np.random.default_rng(0))
+    world = World(occupancy, START, placed(occupancy, 6, 2), np.random.default_rng(0))
     states = []
     for _ in range(200):
         world.step(0.0, 0.0)
-        states.append(world.obstacle_states())
+        states.append(world.discs())
     track = np.array(states)
     moving = track[0, :, 3] == 1.0
     assert moving.tolist() == [False, False, True, False, False, True]
-    assert (distance_map.distance(track[:, :, :2]) >= track[:, :, 2] - 1e-6).all()
+    assert (field(occupancy).distance(track[:, :, :2]) >= track[:, :, 2] - 1e-6).all()
     assert (np.ptp(track[:, moving, :2], axis=0).max(axis=1) > 0.4).all()
     assert np.ptp(track[:, ~moving, :2], axis=0).max() == 0.0
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from maps import walled
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.models.lidar import beam_endpoints
@@ -24,11 +25,7 @@ EXACT = OdometryModel(scale_sigma=0.0, noise_sigma=0.0)
 
 def room(width: float = 6.0, height: float = 4.0, origin: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> OccupancyMap:
     """A room with walls one cell thick; its inside begins one cell (0.05 m) from the origin."""
-    rows, columns = round(height / 0.05), round(width / 0.05)
-    occupied = np.zeros((rows, columns), dtype=bool)
-    occupied[[0, -1], :] = True
-    occupied[:, [0, -1]] = True
-    return OccupancyMap(occupied=occupied, free=~occupied, resolution=0.05, origin=origin, name="room")
+    return walled(width, height, origin=origin, name="room")
 
 
 def quiet_world(start: tuple[float, float, float], *obstacles: Obstacle, seed: int = 0) -> World:
@@ -117,7 +114,7 @@ def test_fixed_obstacle_is_a_collision_and_does_not_yield() -> None:
         world.step(0.8, 0.0)
     assert world.collisions == 1
     assert world.pose[0] == pytest.approx(3.0 - 0.37, abs=0.01)
-    np.testing.assert_allclose(world.obstacle_states(), [[3.0, 2.0, 0.2, 0.0]])
+    np.testing.assert_allclose(world.discs(), [[3.0, 2.0, 0.2, 0.0]])
 
 
 def test_clearance_to_walls_and_in_the_open() -> None:
@@ -134,10 +131,10 @@ def test_mover_keeps_its_pace_on_its_segment() -> None:
     xs = []
     for _ in range(110):
         world.step(0.0, 0.0)
-        xs.append(world.obstacle_states()[0, 0])
+        xs.append(world.discs()[0, 0])
     expected = 3.0 + np.abs((0.3 * 0.1 * np.arange(1, 111) + 1.5) % 3.0 - 1.5)
     np.testing.assert_allclose(xs, expected, atol=1e-6)
-    assert world.obstacle_states()[0, 3] == 1.0
+    assert world.discs()[0, 3] == 1.0
 
 
 @pytest.mark.parametrize("turning", [0.0, 0.6])
@@ -151,12 +148,12 @@ def test_mover_waits_for_a_robot_at_rest(turning: float) -> None:
     assert min(gaps) >= 0.1 - 1e-6
     assert gaps[-1] == pytest.approx(0.1, abs=0.005)
     assert world.collisions == 0
-    waiting = world.obstacle_states()[0, 0]
+    waiting = world.discs()[0, 0]
     while abs(math.remainder(world.pose[2] - math.pi / 2, 2 * math.pi)) > 0.05:
         world.step(0.0, 0.5)
     for _ in range(15):
         world.step(1.0, 0.0)
-    assert world.obstacle_states()[0, 0] < waiting - 0.2
+    assert world.discs()[0, 0] < waiting - 0.2
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
@@ -239,17 +236,19 @@ def test_same_seed_same_bits_and_streams_stay_apart() -> None:
     assert np.abs(first[1] - other_seed[1]).max() > 0.005
 
 
-def test_bad_input_is_refused() -> None:
-    """Standing in a wall, a start that is no pose, commands that are no numbers."""
-    with pytest.raises(ScenarioError, match="would overlap a wall or an obstacle"):
-        quiet_world((0.1, 2.0, 0.0))
-    with pytest.raises(ScenarioError, match="three finite numbers"):
-        World(room(), (1.0, math.nan, 0.0))
-    world = quiet_world((3.0, 2.0, 0.0))
-    with pytest.raises(ScenarioError, match="not finite"):
-        world.step(math.nan, 0.0)
-    with pytest.raises(ScenarioError, match="must be positive"):
-        world.step(0.1, 0.0, dt=0.0)
+@pytest.mark.parametrize(
+    ("start", "command", "dt", "words"),
+    [
+        ((0.1, 2.0, 0.0), 0.0, 0.1, "would overlap a wall or an obstacle"),
+        ((1.0, math.nan, 0.0), 0.0, 0.1, "three finite numbers"),
+        ((3.0, 2.0, 0.0), math.nan, 0.1, "not finite"),
+        ((3.0, 2.0, 0.0), 0.1, 0.0, "must be positive"),
+    ],
+)
+def test_bad_input_is_refused(start: tuple[float, float, float], command: float, dt: float, words: str) -> None:
+    """Standing in a wall, a start that is no pose, commands and durations that are no numbers."""
+    with pytest.raises(ScenarioError, match=words):
+        quiet_world(start).step(command, 0.0, dt)
 
 
 @pytest.mark.data

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
+from unifg.scenarios.quadrotor.situations import Kind
 from unifg.scenarios.safe_flight import SafeSettings, run_safe_flights
-from unifg.scenarios.safety.situations import Kind
 from unifg.scenarios.scenes.safe_plot import picture
 from unifg.style.figures import write_figure
 

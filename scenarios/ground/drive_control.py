@@ -14,7 +14,7 @@ from unifg.horizon import Context, ControlCost, Decision, InitialGuesses, LastPl
 from unifg.lie import wrap_angle
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.ground.drive_parts import Clearance, Drive, EvasiveTrajectory, Following, Limits, Motion, predicted
+from unifg.scenarios.ground.drive_parts import Clearance, Drive, EvasiveTrajectory, Limits, Motion, following, predicted
 from unifg.scenarios.ground.drive_past import robot
 from unifg.scenarios.ground.drive_settings import SECOND, ControllerSettings, backend
 from unifg.scenarios.ground.repulsion import Repulsion
@@ -50,7 +50,7 @@ class Controller:
         self._coming = np.zeros((0, 2))  # what would be driven next if nothing were decided any more
         self._evasion: int | None = None  # number of the evasion that was the last tick's way out
         terms: list[Term] = [
-            Following(s),
+            *following(s),
             ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.wanted),
             Motion(s),
             Limits(s),

@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import Context
+from unifg.horizon import Context, Term
 from unifg.models import obstacles, unicycle
 from unifg.models.barriers import share
 from unifg.models.distance_map import SmoothField
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.perception.tracks import Tracks, nearest
+from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.typing import Array, ArrayLike
 
 FAR_AWAY = 1e3  # [m]; where an unused disc waits
@@ -57,23 +58,14 @@ class Drive:
     evasive: EvasiveTrajectory
 
 
-@dataclass(frozen=True)
-class Following:
+def following(settings: ControllerSettings) -> list[Term]:
     """Costs of leaving the reference (eq. 8), the one at its end apart."""
-
-    settings: ControllerSettings
-
-    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
-        """Add the costs."""
-        s = self.settings
-        path = graph.data("reference", np.zeros((s.horizon - 1, 3)), each=True)
-        end = graph.data("end of reference", np.zeros(3))
-        graph.minimize(unicycle.tracking, x[1:-1], path, sigma=s.weighted(s.pose_sigma), name="path")
-        graph.minimize(unicycle.tracking, x[-1], end, sigma=s.weighted(s.terminal_sigma), name="end of path")
-
-    def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
-        """The reference."""
-        return {"reference": now.given.reference[1:-1], "end of reference": now.given.reference[-1]}
+    pose, end = settings.weighted(settings.pose_sigma), settings.weighted(settings.terminal_sigma)
+    tracking, between, last = unicycle.tracking, (1, -1), (-1, None)
+    return [
+        ReferenceCost("path", pose, lambda now: now.given.reference[1:-1], nodes=between, residual=tracking),
+        ReferenceCost("end of path", end, lambda now: now.given.reference[-1], nodes=last, residual=tracking),
+    ]
 
 
 @dataclass(frozen=True)
@@ -186,8 +178,7 @@ def wall_limits(s: ControllerSettings, field: SmoothField, evasive: Array, refer
     if s.avoidance == "barrier":
         spare = np.maximum(float(field.distance(evasive[:1, :2])[0]) - least, 0.0)
         least = least + spare * share(s.approach, s.dt * np.arange(1, s.horizon + 1))
-    limits: Array = np.minimum(least, field.distance(evasive[1:, :2]))[:, None]
-    return limits
+    return np.minimum(least, field.distance(evasive[1:, :2]))[:, None]
 
 
 def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
@@ -196,8 +187,7 @@ def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
     A mover goes straight on, even through the robot. It is not expected to go away, for it may turn round.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)
-    centres: Array = tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
-    return centres
+    return tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
 
 
 def disc_limits(

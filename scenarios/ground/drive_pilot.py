@@ -49,30 +49,24 @@ class Estimator(Protocol):
     @property
     def iterations(self) -> int:
         """Of the last update."""
-        ...
 
     @property
     def pose(self) -> Array:
         """(3,) present estimate [m, m, rad]."""
-        ...
 
     @property
     def covariance(self) -> Array:
         """(3, 3) of it, in the tangent space."""
-        ...
 
     @property
     def refused(self) -> str:
         """Why the last scan has not corrected the estimate, "" where it has."""
-        ...
 
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
         """Take in a scan, None for none, and the odometry (2,) since the last one, None on the first."""
-        ...
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
-        ...
 
 
 PlannerT = TypeVar("PlannerT", bound=Controller | PlannerAdapter)
@@ -125,11 +119,6 @@ class Pilot(Generic[PlannerT]):
         self._pause, self.search_said = 0, ""
         self._awake = False
         self._first: Scan | None = None
-
-    @property
-    def iterations(self) -> int:
-        """Iterations of the last estimate."""
-        return self.estimator.iterations
 
     @property
     def verdict(self) -> HealthReport:
@@ -265,10 +254,6 @@ class Pilot(Generic[PlannerT]):
         self.pose, self.relocated = self.estimator.pose, True
         self.tracker, self.points = DiscTracker(self._map), PointWatch()
         self.tracks = Tracks.none()
-
-    def forget(self) -> None:
-        """Drop the warm start of the horizon."""
-        self.controller.forget()
 
     def take_over(self, other: Pilot[PlannerT]) -> None:
         """Go on where another pilot, with another map, was."""

@@ -111,8 +111,7 @@ class ControllerSettings:
     def pace(self) -> Array:
         """(N,) speeds at the ends of the steps of one who drives at full speed and comes to rest at the end [m/s]."""
         braking = float(self.most[0]) * np.arange(self.horizon, 0.0, -1.0)
-        pace: Array = np.minimum(braking, min(self.speed, self.box[1][0]))
-        return pace
+        return np.minimum(braking, min(self.speed, self.box[1][0]))
 
     @property
     def stations(self) -> Array:
@@ -128,8 +127,7 @@ class ControllerSettings:
     @property
     def most(self) -> Array:
         """(2,) greatest changes of the controls in a step [m/s, rad/s]; more than from end to end means nothing."""
-        most: Array = np.minimum(np.array(self.accelerations) * self.dt, 2.0 * np.array(self.limits))
-        return most
+        return np.minimum(np.array(self.accelerations) * self.dt, 2.0 * np.array(self.limits))
 
     @property
     def box(self) -> tuple[Array, Array]:

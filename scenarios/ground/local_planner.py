@@ -25,6 +25,7 @@ from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.polyline import arc_lengths
 from unifg.typing import Array, ArrayLike, BoolArray
 
 __all__ = ["LocalPlanner", "PlannerAdapter", "PlannerContext", "Situation", "load_planner"]
@@ -85,14 +86,12 @@ class Situation:
         for centre, velocity, radius in zip(self.tracks.centre, self.tracks.velocity, self.tracks.radius, strict=True):
             offset = points - (centre + when * velocity)
             np.minimum(distance, np.hypot(offset[..., 0], offset[..., 1]) - radius - s.disc_clearance, out=distance)
-        left: Array = distance - s.robot_radius - self.doubt
-        return left
+        return distance - s.robot_radius - self.doubt
 
     def hits(self, clearance: Array, times: Array | float) -> BoolArray:
         """Flags of a drive of such clearances (...,) at those times: True for a hit that a robot at rest avoids."""
         rest = self.clearance(np.broadcast_to(self.pose[:2], (*np.shape(times), 2)), times)
-        struck: BoolArray = clearance < np.minimum(rest, 0.0) - TOLERANCE
-        return struck
+        return clearance < np.minimum(rest, 0.0) - TOLERANCE
 
     def reachable(self, wanted: Array) -> Array:
         """Controls (..., K, 2) nearest to those wanted within the limits of speed and acceleration from now on."""
@@ -106,8 +105,7 @@ class Situation:
 
     def along(self) -> Array:
         """(N + 1,) arc lengths of the reference [m]."""
-        steps = np.hypot(*np.diff(self.reference[:, :2], axis=0).T)
-        return np.concatenate([[0.0], np.cumsum(steps)])
+        return arc_lengths(self.reference[:, :2])
 
 
 class LocalPlanner(Protocol):
@@ -115,7 +113,6 @@ class LocalPlanner(Protocol):
 
     def control(self, now: Situation) -> ArrayLike | None:
         """Velocity (2,) or velocities (K, 2) from now on, the last of which holds on [m/s, rad/s]; None for no way."""
-        ...
 
 
 class PlannerAdapter:

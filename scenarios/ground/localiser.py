@@ -149,8 +149,7 @@ def scan_covariance(distance_map: DistanceMap, scan: Scan, pose: Array) -> Array
     beams, shared = _correlated(error)
     information = slopes.T @ slopes / (variance * beams)
     scale = np.diag([1.0, 1.0, LEVER**-2]) / FARTHEST**2  # what nothing is seen of
-    covariance: Array = np.linalg.inv(information + scale) + shared * variance * np.diag([1.0, 1.0, 0.0])
-    return covariance
+    return np.linalg.inv(information + scale) + shared * variance * np.diag([1.0, 1.0, 0.0])
 
 
 def _correlated(error: Array) -> tuple[float, float]:

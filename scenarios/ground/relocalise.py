@@ -16,6 +16,8 @@ from unifg.codegen.jit import compiled
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap, bilinear
+from unifg.scenarios.monitoring.validation import first_true
+from unifg.scenarios.perception.explaining import FARTHEST
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array
 
@@ -104,21 +106,19 @@ class Relocaliser:
             refined = refine(self._map, scan, pose)
             if not any(_same(refined, other) for _, other in kept):
                 kept.append((fit(self._map, scan, refined), refined))
-        if not kept:
-            return Found(None, 0.0, "no place on the map")
         kept.sort(key=lambda row: -row[0])
-        share, best = kept[0]
-        if share < BELIEVED:
-            return Found(None, share, "no place on the map fits the scan")
-        if len(kept) > 1 and kept[1][0] > share - CLEARLY:
-            return Found(None, share, "several places on the map look alike")
-        return Found(best, share, "")
+        share, best = kept[0] if kept else (0.0, None)
+        cause = first_true(
+            (best is None, "no place on the map"),
+            (share < BELIEVED, "no place on the map fits the scan"),
+            (any(rival > share - CLEARLY for rival, _ in kept[1:]), "several places on the map look alike"),
+        )
+        return Found(None if cause else best, share, cause)
 
 
 def fit(distance_map: DistanceMap, scan: Scan, pose: Array) -> float:
     """Share of the beams that end at a surface and have passed none, seen from a pose (3,)."""
-    with np.errstate(invalid="ignore"):
-        beams = scan.ranges <= 10.0
+    beams = scan.within(FARTHEST)
     ranges, bearing = scan.ranges[beams], scan.angles[beams] + pose[2]
     ray = ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     ends = np.abs(distance_map.distance(pose[:2] + ray)) <= END
@@ -128,8 +128,7 @@ def fit(distance_map: DistanceMap, scan: Scan, pose: Array) -> float:
 
 def refine(distance_map: DistanceMap, scan: Scan, pose: Array) -> Array:
     """Gauss-Newton on the beams that end near a surface, whose reach shrinks as the match improves, (3,)."""
-    with np.errstate(invalid="ignore"):
-        beams = scan.ranges <= 10.0
+    beams = scan.within(FARTHEST)
     ranges, angles = scan.ranges[beams], scan.angles[beams]
     for step in range(STEPS):
         bearing = angles + pose[2]
@@ -146,8 +145,7 @@ def refine(distance_map: DistanceMap, scan: Scan, pose: Array) -> Array:
 
 def _tips(scan: Scan) -> Array:
     """(H, n, 2) ends of beams spread over the turn, for every heading of the fan, seen from the robot [m]."""
-    with np.errstate(invalid="ignore"):
-        beams = np.flatnonzero(scan.ranges <= 10.0)
+    beams = scan.within(FARTHEST)
     chosen = beams[np.linspace(0, len(beams) - 1, min(BEAMS, len(beams))).round().astype(np.intp)]
     angles, ranges = FAN[:, None] + scan.angles[chosen], scan.ranges[chosen]
     return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=2)

@@ -224,9 +224,10 @@ class Route:
 
     def _detour(self, pose: Array, rejoin: float, tracks: Tracks, allowance: float, everywhere: bool = False) -> bool:
         """Plan around discs, on the map around the path up to ``rejoin`` [m] or on all of it; True if found."""
-        index = min(round(rejoin / SPACING), len(self.path) - 1)
+        last = len(self.path) - 1
+        here, index = min(int(self._reached / SPACING), last), min(round(rejoin / SPACING), last)
         target = self.path[index]
-        corners = np.stack([pose[:2], target[:2], *self.path[self._index() : index + 1, :2]])
+        corners = np.stack([pose[:2], target[:2], *self.path[here : index + 1, :2]])
         # A disc the robot nearly touches is taken as small as leaves it free to go.
         reach = np.hypot(*(tracks.centre - pose[:2]).T) - self._radius - STANDING_GAP
         discs = np.column_stack([tracks.centre, np.clip(reach, 0.0, tracks.radius + allowance)])
@@ -241,9 +242,6 @@ class Route:
         self._follow(np.concatenate([detour[:-1], self.path[index:]]))
         self.repairs += 1
         return True
-
-    def _index(self) -> int:
-        return min(int(self._reached / SPACING), len(self.path) - 1)
 
     def _window(self, corners: Array) -> tuple[OccupancyMap, DistanceMap]:
         """The part of the map around some points."""

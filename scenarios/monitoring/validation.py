@@ -15,7 +15,7 @@ import numpy as np
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.typing import Array, BoolArray
 
-__all__ = ["ValidationSettings", "Validator"]
+__all__ = ["ValidationSettings", "Validator", "first_true"]
 
 EARLY = 1e-6  # [s] by which a stamp may lie ahead of the clock
 
@@ -81,21 +81,18 @@ class Validator:
         ranges, angles = _numbers(scan.ranges, (self._beams,)), _numbers(scan.angles, (self._beams,))
         if ranges is None or angles is None or not np.isfinite(angles).all():
             return None, "not the size of a scan"
-        stamp = now if scan.time is None else _number(scan.time)
-        if math.isnan(stamp):
-            return None, "its time is not a number"
-        if stamp > now + EARLY:
-            return None, "from the future"
-        if now - stamp > self.settings.max_age + EARLY:
-            return None, "too old"
-        if scan.time is not None and stamp <= self._time:
-            return None, "not newer than the last"
-        if self._repeats(ranges):
-            return None, "the last one once more"
-        s = self.settings
+        s, stamp = self.settings, now if scan.time is None else _number(scan.time)
         measured = np.isfinite(ranges) & (ranges >= s.min_range) & (ranges <= s.max_range)
-        if measured.sum() < s.min_beams:
-            return None, _emptiness(ranges, s.min_range)
+        wrong = first_true(
+            (math.isnan(stamp), "its time is not a number"),
+            (stamp > now + EARLY, "from the future"),
+            (now - stamp > s.max_age + EARLY, "too old"),
+            (scan.time is not None and stamp <= self._time, "not newer than the last"),
+            (self._repeats(ranges), "the last one once more"),
+            (measured.sum() < s.min_beams, _emptiness(ranges, s.min_range)),
+        )
+        if wrong:
+            return None, wrong
         self._last, self._since[:] = ranges.copy(), 0.0
         self._time = stamp
         turn = _number(scan.turn)
@@ -118,17 +115,16 @@ class Validator:
             applied: (2,) asked for since the last tick.
             dt: duration [s].
         """
-        found, wrong = None if measured is None else _numbers(measured, (2,)), ""
-        if measured is None:
-            wrong = "none came"
-        elif found is None:
-            wrong = "not two numbers"
-        elif not np.isfinite(found).all():
-            wrong = "not finite"
-        elif (np.abs(found) > self.settings.max_speed).any():
-            wrong = "faster than any wheel"
+        found = _numbers(measured, (2,))
+        numbers = np.zeros(2) if found is None else found
+        wrong = first_true(
+            (measured is None, "none came"),
+            (found is None, "not two numbers"),
+            (not np.isfinite(numbers).all(), "not finite"),
+            (bool((np.abs(numbers) > self.settings.max_speed).any()), "faster than any wheel"),
+        )
         self._note("wheels", wrong)
-        velocities = applied if wrong or found is None else found
+        velocities = applied if wrong else numbers
         self._since += np.abs(velocities) * dt
         return velocities
 
@@ -164,6 +160,11 @@ class Validator:
         if wrong:
             self.refused[sensor] = wrong
             self.dropped[f"{sensor}: {wrong}"] += 1
+
+
+def first_true(*reasons: tuple[bool, str]) -> str:
+    """Words of the first reason that is given, "" for none."""
+    return next((words for given, words in reasons if given), "")
 
 
 _EMPTY = np.zeros(0)

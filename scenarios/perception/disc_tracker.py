@@ -247,5 +247,4 @@ class DiscTracker:
 
 def _centre_variance(distance: Array) -> Array:
     """Variance per axis of a disc's centre [m^2]: fit and pose, and the heading error over the distance."""
-    variance: Array = 0.03**2 + (0.01 * distance) ** 2
-    return variance
+    return 0.03**2 + (0.01 * distance) ** 2

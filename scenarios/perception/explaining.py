@@ -55,8 +55,7 @@ class Explained:
 
 def explained(distance_map: DistanceMap, scan: Scan, pose: Array) -> Explained:
     """Hold a scan, taken at a pose (3,) [m, m, rad], against the map."""
-    with np.errstate(invalid="ignore"):
-        beams = np.flatnonzero(scan.ranges <= FARTHEST)
+    beams = scan.within(FARTHEST)
     ranges, bearing = scan.ranges[beams], scan.angles[beams] + pose[2]
     points = pose[:2] + ranges[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
     give = THRESHOLD + GROWTH * ranges
@@ -126,14 +125,11 @@ def thinned(points: Array, apart: float) -> Array:
     if not len(points):
         return points
     _, first = np.unique(np.floor(points / apart).astype(np.int64), axis=0, return_index=True)
-    kept: Array = points[np.sort(first)]
-    return kept
+    return points[np.sort(first)]
 
 
 def _near(points: Array, others: Array, reach: float) -> BoolArray:
     """(n,) whether one of others (k, 2) is within reach of points (n, 2)."""
-    if not len(points) or not len(others):
-        return np.zeros(len(points), dtype=bool)
     gaps = np.hypot(*np.moveaxis(points[:, None] - others[None], 2, 0))
-    near: BoolArray = gaps.min(axis=1) <= reach
+    near: BoolArray = gaps.min(axis=1, initial=np.inf) <= reach
     return near

@@ -56,8 +56,7 @@ class _Track:
     def at(self, time: float) -> Array:
         """(2,) where it is expected [m]."""
         place, velocity, when = self.line
-        expected: Array = place + (time - when) * velocity
-        return expected
+        return place + (time - when) * velocity
 
 
 class LineTracker:

@@ -112,28 +112,23 @@ class MonteCarlo:
         self.own = own or MonteCarloSettings()
         self._rng, self._distances, self._occupancy = rng, distance_map, occupancy
         self._free: IntArray = np.argwhere(occupancy.free & ~occupancy.occupied)
-        count = self.own.particles[1]
-        self.particles: Array = np.asarray(pose) + np.asarray(sigma) * rng.standard_normal((count, 3))
-        self.weights: Array = np.full(count, 1.0 / count)
-        self.iterations, self.refused = count, ""
-        self._fresh = True  # nothing has been weighed yet
-        self._since: Array = np.zeros(3)  # where the wheels have gone since a scan was taken in
+        self.iterations, self.refused = self.own.particles[1], ""
         self._slow = self._fast = 0.0
-        self._summarise()
+        self.reset(np.asarray(pose), np.asarray(sigma))
 
     def everywhere(self) -> None:
         """Know nothing: particles all over the free part of the map."""
-        count = self.own.particles[1]
-        self.particles, self.weights = self._anywhere(count), np.full(count, 1.0 / count)
-        self._fresh = True
-        self._summarise()
+        self._begin(self._anywhere(self.own.particles[1]))
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew around a pose (3,), believed with ``sigma`` (3,)."""
-        count = self.own.particles[1]
-        self.particles = pose + sigma * self._rng.standard_normal((count, 3))
-        self.weights = np.full(count, 1.0 / count)
-        self._fresh, self._since = True, np.zeros(3)
+        self._begin(pose + sigma * self._rng.standard_normal((self.own.particles[1], 3)))
+
+    def _begin(self, particles: Array) -> None:
+        """Begin with particles (M, 3) of one weight."""
+        self.particles, self.weights = particles, np.full(len(particles), 1.0 / len(particles))
+        self._fresh = True  # nothing has been weighed yet
+        self._since: Array = np.zeros(3)  # where the wheels have gone since a scan was taken in
         self._summarise()
 
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:

@@ -86,11 +86,14 @@ class Scan:
         angles = self.angles + wrap_angle(bearing - self.angles)
         return replace(self, angles=angles, ranges=np.where(self.valid, np.hypot(*points.T), self.ranges), turn=0.0)
 
+    def within(self, reach: float) -> IntArray:
+        """Indices of the beams that came back from within a distance [m]."""
+        return np.flatnonzero(self.ranges <= reach)
+
     @property
     def valid(self) -> BoolArray:
         """(B,) True for beams that came back."""
-        returned: BoolArray = np.isfinite(self.ranges)
-        return returned
+        return np.isfinite(self.ranges)
 
 
 @dataclass(frozen=True)

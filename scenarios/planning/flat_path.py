@@ -32,7 +32,6 @@ class FlatPath(Protocol):
 
     def at(self, times: Array) -> Flown:
         """The path at times (n,) [s], before and after which it goes on as it is stated."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -80,26 +80,6 @@ class _Clearance:
             distance = np.minimum(distance, np.hypot(points[..., 0] - x, points[..., 1] - y) - radius)
         return distance
 
-    def with_gradient(self, points: Array) -> tuple[Array, Array]:
-        """(n, 2) [m] -> (n,) [m] and (n, 2) [-]."""
-        distance, gradient = self.field.distance_and_gradient(points)
-        for x, y, radius in self.discs:
-            offset = points - (x, y)
-            norm = np.hypot(offset[:, 0], offset[:, 1])
-            nearer = norm - radius < distance
-            distance = np.where(nearer, norm - radius, distance)
-            gradient = np.where(nearer[:, None], offset / np.maximum(norm, 1e-9)[:, None], gradient)
-        return distance, gradient
-
-    def free(self, points: Array) -> BoolArray:
-        """Flags of points (..., 2) that lie in cells of the map known to be free."""
-        cells = np.floor(self.occupancy.world_to_grid(points)).astype(np.intp)
-        height, width = self.occupancy.shape
-        row, column = cells[..., 1], cells[..., 0]
-        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        known = self.occupancy.free[row.clip(0, height - 1), column.clip(0, width - 1)]
-        return np.asarray(inside & known, dtype=bool)
-
     def open_cells(self, level: float) -> BoolArray:
         """Cells (H, W) that may be entered at this inflation."""
         return self.passable & (self.grid >= level)
@@ -121,11 +101,20 @@ class _Clearance:
         nearest = np.argsort(np.hypot(*(centres - point).T), kind="stable")[:64]
         line = np.linspace(0.0, 1.0, 21)[None, :, None]
         samples = point + line * (centres[nearest, None, :] - point)
-        clear = np.all((self.at(samples) >= least - 1e-9) & self.free(samples), axis=1)
+        clear = np.all((self.at(samples) >= least - 1e-9) & is_free(self.occupancy, samples), axis=1)
         if not clear.any():
             return None
         row_found, column_found = candidates[nearest[int(np.argmax(clear))]]
         return int(row_found), int(column_found)
+
+
+def is_free(occupancy: OccupancyMap, points: Array) -> BoolArray:
+    """Flags of points (..., 2) [m] that lie in cells of the map known to be free."""
+    cells = np.floor(occupancy.world_to_grid(points)).astype(np.intp)
+    height, width = occupancy.shape
+    row, column = cells[..., 1], cells[..., 0]
+    inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    return np.asarray(inside & occupancy.free[row.clip(0, height - 1), column.clip(0, width - 1)], dtype=bool)
 
 
 def _plain(array: NDArray[Scalar]) -> NDArray[Scalar]:
@@ -197,8 +186,9 @@ def plan(
     # of the grid.
     for stride in (1, 5):
         points = _shorten(clearance, resample(points, SPACING), float(level), robot_radius, stride)
-    points = _smooth(clearance, resample(points, SPACING), preferred)
-    return headed(_off_corners(clearance, resample(points, SPACING), float(level)), float(goal_pose[2]))
+    points = _plain(resample(_smooth(clearance, resample(points, SPACING), preferred), SPACING))
+    _leave_corners(clearance.field.table, clearance.discs, points, float(level))
+    return headed(points, float(goal_pose[2]))
 
 
 def smoothed(values: Array) -> Array:
@@ -247,7 +237,7 @@ def _check_standing(clearance: _Clearance, name: str, pose: Array, robot_radius:
             f"{where} lies outside map {occupancy.name!r}, which covers x {low[0]:.2f} to {high[0]:.2f}, "
             f"y {low[1]:.2f} to {high[1]:.2f} m; choose a point within"
         )
-    if not clearance.free(pose[:2]):
+    if not is_free(occupancy, pose[:2]):
         kind = "an occupied" if occupancy.occupied[int(row), int(column)] else "an unknown"
         raise ScenarioError(f"{where} lies in {kind} cell of map {occupancy.name!r}; choose a free one")
     distance = float(clearance.at(pose[:2]))
@@ -386,8 +376,7 @@ def _shorten(clearance: _Clearance, points: Array, level: float, robot_radius: f
     kept = _straightened(
         clearance.field.table, clearance.known, clearance.discs, points, spent, floor, stride, robot_radius
     )
-    shorter: Array = points[kept]
-    return shorter
+    return points[kept]
 
 
 @compiled
@@ -486,14 +475,15 @@ def _diffuse(table: Array, free: BoolArray, discs: Array, points: Array, preferr
                 known[i, 0], known[i, 1], known[i, 2] = trial, trial_x, trial_y
 
 
-def _off_corners(clearance: _Clearance, points: Array, level: float) -> Array:
-    """Undo the millimetres by which the chords of the last resampling cut a corner below the inflation."""
-    points = points.copy()
+@compiled
+def _leave_corners(table: Array, discs: Array, points: Array, level: float) -> None:
+    """Undo the millimetres by which the chords of the last resampling cut a corner below the inflation, in place."""
     for _ in range(4):
-        distance, gradient = clearance.with_gradient(points)
-        lacking = level - distance
-        # Larger gaps are the stubs at start and goal, which may lie nearer to a wall than the inflation.
-        move = np.where((lacking > 0.0) & (lacking < 0.01), lacking + 1e-9, 0.0)
-        move[[0, -1]] = 0.0
-        points += (move / np.maximum(np.einsum("ij,ij->i", gradient, gradient), 0.25))[:, None] * gradient
-    return points
+        for i in range(1, len(points) - 1):
+            distance, slope_x, slope_y = _nearest(table, discs, points[i, 0], points[i, 1])
+            lacking = level - distance
+            # Larger gaps are the stubs at start and goal, which may lie nearer to a wall than the inflation.
+            if 0.0 < lacking < 0.01:
+                move = (lacking + 1e-9) / max(slope_x * slope_x + slope_y * slope_y, 0.25)
+                points[i, 0] += move * slope_x
+                points[i, 1] += move * slope_y

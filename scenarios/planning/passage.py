@@ -10,9 +10,12 @@ bottleneck, and half of it is the greatest clearance.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from unifg.scenarios.planning.polyline import segment_distance
 from unifg.typing import Array, ArrayLike
@@ -57,24 +60,29 @@ def widest_way(start: ArrayLike, target: ArrayLike, cylinders: Array, walls: Arr
     radii = np.concatenate([cylinders[:, 2], np.zeros(len(walls))])
     open_ends = float(obstacle_distance(ends, cylinders, walls).min(initial=np.inf))
     edges: list[tuple[float, int, int, int]] = []
-    for i in range(len(cores)):
-        for j in range(i + 1, len(cores)):
-            first, second = _nearest_points(cores[i], cores[j])
-            gap = float(np.linalg.norm(first - second) - radii[i] - radii[j])
-            chain = np.stack([cores[i].mean(axis=0), first, second, cores[j].mean(axis=0)])
-            edges.append((gap, i, j, _crossings(chain, ends)))
+    for i, j in itertools.combinations(range(len(cores)), 2):
+        first, second = _nearest_points(cores[i], cores[j])
+        gap = float(np.linalg.norm(first - second) - radii[i] - radii[j])
+        chain = np.stack([cores[i].mean(axis=0), first, second, cores[j].mean(axis=0)])
+        edges.append((gap, i, j, _crossings(chain, ends)))
     edges.sort()
-    # Union-find with the parity of the way to the root.
-    parent, parity = list(range(len(cores))), [0] * len(cores)
-    for gap, i, j, odd in edges:
-        root_i, odd_i = _root(parent, parity, i)
-        root_j, odd_j = _root(parent, parity, j)
-        around = odd ^ odd_i ^ odd_j
-        if root_i != root_j:
-            parent[root_j], parity[root_j] = root_i, around
-        elif around:
-            return min(open_ends, 0.5 * gap)
-    return open_ends
+    closing = bisect.bisect_left(
+        range(1, len(edges) + 1), True, key=lambda count: _separates(edges[:count], len(cores))
+    )
+    return min(open_ends, 0.5 * edges[closing][0]) if closing < len(edges) else open_ends
+
+
+def _separates(edges: list[tuple[float, int, int, int]], count: int) -> bool:
+    """Return True if a cycle of overlaps among ``count`` cores winds around one end alone.
+
+    Edges lead from one copy of the graph to another where the crossings are odd: such a cycle joins both copies of a
+    core.
+    """
+    _, one, other, odd = np.array(edges).astype(np.intp).T
+    begins, ends = np.concatenate([one, one + count]), np.concatenate([other + count * odd, other + count * (1 - odd)])
+    copies = coo_array((np.ones(len(begins)), (begins, ends)), shape=(2 * count, 2 * count))
+    _, label = connected_components(copies, directed=False)
+    return bool((label[:count] == label[count:]).any())
 
 
 def _nearest_points(first: Array, second: Array) -> tuple[Array, Array]:
@@ -114,12 +122,3 @@ def _crossings(chain: Array, ends: Array) -> int:
                 crossing = begin[0] + (y - begin[1]) / (end[1] - begin[1]) * (end[0] - begin[0])
                 count += int(crossing > x)
     return count % 2
-
-
-def _root(parent: list[int], parity: list[int], node: int) -> tuple[int, int]:
-    """Representative of a node and the parity of the chain that leads there."""
-    odd = 0
-    while parent[node] != node:
-        odd ^= parity[node]
-        node = parent[node]
-    return node, odd

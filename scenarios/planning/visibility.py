@@ -119,16 +119,14 @@ def _cross(own: Array, walls: Array) -> BoolArray:
 
     def side(line: Array, point: Array) -> Array:
         span, offset = line[..., 1, :] - line[..., 0, :], point - line[..., 0, :]
-        turned: Array = span[..., 0] * offset[..., 1] - span[..., 1] * offset[..., 0]
-        return turned
+        return span[..., 0] * offset[..., 1] - span[..., 1] * offset[..., 0]
 
     a, b = own[:, None], walls[None]
     apart = (side(b, a[..., 0, :]) * side(b, a[..., 1, :]) > 0.0) | (
         side(a, b[..., 0, :]) * side(a, b[..., 1, :]) > 0.0
     )
     parallel = np.abs(side(b, a[..., 1, :]) - side(b, a[..., 0, :])) < 1e-12
-    crossing: BoolArray = ~apart & ~parallel
-    return crossing
+    return ~apart & ~parallel
 
 
 def _around(centres: Array, reach: Array, corners: int) -> tuple[Array, Array]:

@@ -1,1 +1,1 @@
-"""The quadrotor: where it is, how it flies, as two graphs or one."""
+"""The quadrotor: estimation, control among landmarks and by barriers, and controllers to compare with."""

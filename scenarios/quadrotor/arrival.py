@@ -9,83 +9,43 @@ is heading and tilt: a turn of everything changes the heading and nothing else, 
 
 from __future__ import annotations
 
-import math
 from functools import cache
 
 import numpy as np
 
 import unifg as fg
-from unifg.codegen.calls import local_matrix
-from unifg.codegen.jit import compiled
-from unifg.factors.kernel import Kernel
+from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual
-from unifg.lie import so3
+from unifg.lie import SO3
 from unifg.models import quadrotor
 from unifg.typing import Array
 
-STORED, TANGENT = 17, 16  # of state and parameters; landmarks follow
-WIND, WIND_TANGENT = 14, 13
+PARTS = (quadrotor.STATE, quadrotor.MASS, quadrotor.DRAG, quadrotor.WIND, quadrotor.UPDRAFT)
+STORED = 17  # of state and parameters; landmarks follow
 
 
-@compiled
-def _heading(x: Array, R: Array) -> tuple[float, float, float, float]:
-    """Cosine and sine of the heading, its derivatives along the second and third axis of the body; writes R."""
-    so3.write_matrix(x[3], x[4], x[5], x[6], R, 0)
-    square = R[0, 0] * R[0, 0] + R[1, 0] * R[1, 0]
-    length = math.sqrt(square)
-    return (
-        R[0, 0] / length,
-        R[1, 0] / length,
-        (R[1, 0] * R[0, 2] - R[0, 0] * R[1, 2]) / square,
-        (R[0, 0] * R[1, 1] - R[1, 0] * R[0, 1]) / square,
-    )
+def _seen(x: Array, mass: Array, drag: Array, wind: Array, updraft: Array, *marks: Array) -> Array:
+    """(n, 16 + 2 K) position, heading, R' e3 in part, velocity, parameters and landmarks seen from the vehicle."""
+    R = SO3.to_matrix(x[:, 3:7])
+    ahead = np.hypot(R[:, 0, 0], R[:, 1, 0])
+    c, s = R[:, 0, 0] / ahead, R[:, 1, 0] / ahead
+
+    def turned(d: Array) -> Array:
+        return np.stack([c * d[:, 0] + s * d[:, 1], c * d[:, 1] - s * d[:, 0]], axis=1)
+
+    heading, velocity = np.arctan2(s, c)[:, None], x[:, 7:]
+    rows = [x[:, :3], heading, R[:, 2, :2], turned(velocity), velocity[:, 2:], mass, drag, turned(wind), updraft]
+    return np.concatenate([*rows, *(turned(mark - x[:, :2]) for mark in marks)], axis=1)
 
 
-@compiled
-def _arrival(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+def _apart(*arguments: Array) -> Array:
     """Difference of state, parameters and landmarks from those of the reference, both seen from their vehicles."""
-    derive = len(J) > 0
-    if derive:
-        J[:] = 0.0
-    R = local_matrix(3, 3)
-    c0, s0, _, _ = _heading(p, R)
-    q0, q1 = R[2, 0], R[2, 1]
-    c, s, along, across = _heading(v, R)
-    for i in range(3):
-        r[i] = v[i] - p[i]
-        if derive:
-            J[i, i] = 1.0
-    r[3] = math.atan2(s * c0 - c * s0, c * c0 + s * s0)
-    r[4] = R[2, 0] - q0
-    r[5] = R[2, 1] - q1
-    if derive:
-        J[3, 4], J[3, 5] = along, across
-        J[4, 4], J[4, 5] = -R[2, 2], R[2, 1]
-        J[5, 3], J[5, 5] = R[2, 2], -R[2, 0]
-    r[8] = v[9] - p[9]
-    for i in range(7):
-        r[9 + i] = v[10 + i] - p[10 + i]
-    if derive:
-        for i in range(8, 16):
-            J[i, i] = 1.0
-    for k in range(2 + (len(v) - 17) // 2):  # velocity, wind, landmarks
-        at, row = 7, 6
-        if k == 1:
-            at, row = 14, 13
-        elif k > 1:
-            at, row = 17 + 2 * (k - 2), 16 + 2 * (k - 2)
-        dx, dy, ex, ey = v[at], v[at + 1], p[at], p[at + 1]
-        if k > 1:
-            dx, dy, ex, ey = dx - v[0], dy - v[1], ex - p[0], ey - p[1]
-        x, y = c * dx + s * dy, c * dy - s * dx
-        r[row] = x - (c0 * ex + s0 * ey)
-        r[row + 1] = y - (c0 * ey - s0 * ex)
-        if derive:
-            J[row, row], J[row, row + 1], J[row + 1, row], J[row + 1, row + 1] = c, s, -s, c
-            J[row, 4], J[row, 5] = y * along, y * across
-            J[row + 1, 4], J[row + 1, 5] = -x * along, -x * across
-            if k > 1:
-                J[row, 0], J[row, 1], J[row + 1, 0], J[row + 1, 1] = -c, -s, s, -c
+    *now, reference = arguments
+    ends = np.cumsum([part.shape[1] for part in now]).tolist()
+    here = [reference[:, end - part.shape[1] : end] for part, end in zip(now, ends, strict=True)]
+    apart = _seen(*now) - _seen(*here) - reference[:, ends[-1] :]
+    turn = apart[:, 3:4]
+    return np.concatenate([apart[:, :3], np.arctan2(np.sin(turn), np.cos(turn)), apart[:, 4:]], axis=1)
 
 
 @cache
@@ -94,57 +54,29 @@ def arrival(landmarks: int) -> Residual:
 
     Rows are differences of position (3), heading, the first two entries of R' e3, velocity (3), mass, drag (3), wind
     (2), updraft and landmarks (2 each); velocity, wind and landmarks as seen from the vehicle's place and heading.
-    reference: (17 + 2 K,), states, parameters and landmarks in the world side by side. For vehicles that lean by less
-    than a right angle.
+    reference: (33 + 4 K,), states, parameters and landmarks in the world side by side, and an offset of the rows. For
+    vehicles that lean by less than a right angle.
     """
-    marks = [fg.Rn(2)] * landmarks
-    parts = (quadrotor.STATE, quadrotor.MASS, quadrotor.DRAG, quadrotor.WIND, quadrotor.UPDRAFT, *marks)
-    kernel = Kernel(_arrival, (*parts, (STORED + 2 * landmarks,)), TANGENT + 2 * landmarks, name="arrival")
+    size = STORED + 2 * landmarks
+    kernel = StatedKernel(_apart, (*PARTS, *[fg.Rn(2)] * landmarks, (2 * size - 1,)), size - 1, name="arrival")
     return fg.residual(kernel)
 
 
-def seen_from_the_vehicle(here: Array, reference: Array, information: Array) -> tuple[Array, Array]:
+def seen_from_the_vehicle(here: Array, step: Array, information: Array) -> tuple[Array, Array]:
     """Express a joint prior, frozen at ``here``, in the coordinates of :func:`arrival`.
 
     Args:
         here: (S,) where it was linearised: state, parameters and landmarks.
-        reference: (S,) its lowest point.
+        step: (D,) from there to its lowest point, a right perturbation.
         information: (D, D) over right perturbations.
 
     Returns:
-        Reference (S,) in the world, and information (D, D) of the rows of :func:`arrival`.
+        Reference (S + D,), and information (D, D) of the rows of :func:`arrival`.
     """
-    here, reference = np.ascontiguousarray(here), np.ascontiguousarray(reference)
-    size = len(here) - 1
-    step = np.concatenate([quadrotor.STATE.local(here[:10], reference[:10]), reference[10:] - here[10:]])
-    change, J = np.empty(size), np.empty((size, size))
-    _arrival(here, here, np.zeros(0), change, J)
+    prior = arrival((len(here) - STORED) // 2)
+    assert prior.jacobian is not None
+    parts = np.split(here[None], [10, 11, 14, 16, *range(STORED, len(here), 2)], axis=1)
+    J = np.concatenate(prior.jacobian(*parts, np.concatenate([here, np.zeros_like(step)])), axis=2)[0]
     inverse = np.linalg.inv(J)
     information = inverse.T @ information @ inverse
-    return _moved(here, J @ step), 0.5 * (information + information.T)
-
-
-def _moved(here: Array, change: Array) -> Array:
-    """The point whose difference from ``here`` is ``change``."""
-    moved = here.copy()
-    moved[:3] += change[:3]
-    moved[9:] += change[8:]
-    R = np.empty((3, 3))
-    c0, s0, _, _ = _heading(here, R)
-    turn = math.atan2(s0, c0) + change[3]
-    c, s = math.cos(turn), math.sin(turn)
-    moved[3:7] = _attitude(c, s, R[2, 0] + change[4], R[2, 1] + change[5])
-    for at in (7, WIND, *range(STORED, len(here), 2)):
-        origin = (here[:2], moved[:2]) if at >= STORED else (0.0, 0.0)
-        x, y = here[at : at + 2] - origin[0]
-        x, y = c0 * x + s0 * y + change[at - 1], c0 * y - s0 * x + change[at]
-        moved[at : at + 2] = origin[1] + np.array([c * x - s * y, s * x + c * y])
-    return moved
-
-
-def _attitude(c: float, s: float, x: float, y: float) -> Array:
-    """The quaternion with heading (c, s) whose R' e3 begins with (x, y) and points up."""
-    z = math.sqrt(max(1.0 - x * x - y * y, 0.0))
-    h = math.sqrt(1.0 - x * x)
-    level = np.array([[h, -x * y / h, -x * z / h], [0.0, z / h, -y / h], [x, y, z]])
-    return fg.SO3.from_matrix(np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ level)
+    return np.concatenate([here, J @ step]), 0.5 * (information + information.T)

@@ -56,8 +56,7 @@ def stopping_path(position: Array, velocity: Array, times: Array) -> Array:
     speed = float(np.hypot(*velocity[:2]))
     braked = np.clip(times - DELAY, 0.0, speed / DECELERATION)
     travelled = speed * (np.minimum(times, DELAY) + braked) - 0.5 * DECELERATION * braked**2
-    path: Array = position[:2] + travelled[:, None] * velocity[:2] / max(speed, 1e-9)
-    return path
+    return position[:2] + travelled[:, None] * velocity[:2] / max(speed, 1e-9)
 
 
 def stopping_height(height: float, rate: float, times: Array) -> Array:

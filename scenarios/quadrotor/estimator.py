@@ -374,20 +374,6 @@ class Estimator:
             self.survey.places[slot], self.survey.known[slot] = self._corners[nearest], True
 
 
-class DeadReckoningEstimator(Estimator):
-    """The same sensors without dynamics: see :class:`DeadReckoning`."""
-
-    def __init__(
-        self,
-        state: Array,
-        nominal: quadrotor.Parameters,
-        settings: EstimatorSettings | None = None,
-        survey: Array | None = None,
-    ) -> None:
-        """State the graph; arguments as of :class:`Estimator`."""
-        super().__init__(state, nominal, settings, survey, DeadReckoning(nominal))
-
-
 def flyable(packed: Array) -> quadrotor.Parameters:
     """Parameters from an estimate (7,), which may lie where none can: mass is positive, drag not negative."""
     parameters = packed.copy()

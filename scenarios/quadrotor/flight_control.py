@@ -21,24 +21,25 @@ from unifg.horizon import (
     Plan,
     RecedingHorizon,
 )
-from unifg.models import quadrotor
+from unifg.models import landmarks, quadrotor
 from unifg.scenarios.perception.belief import Belief
 from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.scenarios.quadrotor.braking import brake
 from unifg.scenarios.quadrotor.flight_joint import believable
 from unifg.scenarios.quadrotor.flight_parts import (
     Clearance,
-    Flown,
-    Following,
+    FlightInput,
     GivenFlight,
-    Leaning,
     Limits,
     Potential,
+    following,
     level,
+    upright,
 )
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings, backend
 from unifg.scenarios.quadrotor.guide import Guide, Reference
-from unifg.scenarios.quadrotor.slots import Obstacles, Slots
+from unifg.scenarios.quadrotor.slots import SlotObstacles, Slots
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -93,12 +94,13 @@ class Controller:
         self.guide = Guide(target, self.walls, s.guide, bounds)
         self.slots = Slots(s, self.walls)
         effort = ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.hover)
-        terms = [*self.past.motion(), Limits(s), Leaning(s), effort]
+        lean = ReferenceCost("level", s.weighted(s.level_sigma), upright, "R", residual=landmarks.tilt, size=3)
+        terms = [*self.past.motion(), Limits(s), lean, effort]
         if s.avoidance == "potential":
             squares = not s.general_costs or not names.entry(solver).made_by.scalar_costs
             terms += [Potential(s, self.walls, target, squares), *self.past.apart(squares)]
         else:
-            terms += [Following(s), Clearance(s, self.walls), *self.past.apart(None)]
+            terms += [*following(s), Clearance(s, self.walls), *self.past.apart(None)]
         window = self.past.window
         self.loop = RecedingHorizon(
             self.past.robot, s.horizon, terms, solver=backend(solver, s), cold=backend(solver, s, cold=True),
@@ -122,20 +124,20 @@ class Controller:
         self.belief = self.past.believed(belief, self.loop)
         return plan
 
-    def given(self, belief: Belief, movers: Tracks) -> Flown:
+    def given(self, belief: Belief, movers: Tracks) -> FlightInput:
         """Context of the terms."""
         s = self.settings
         reference = self.guide.reference(belief.state, belief.landmarks, s.horizon + 1, s.dt)
         obstacles = self.slots.fill(belief.state, reference.positions, belief.landmarks, movers)
         hover = quadrotor.hover(belief.parameters)
-        return Flown(belief, hover, reference, obstacles, *self.past.split(obstacles))
+        return FlightInput(belief, hover, reference, obstacles, *self.past.split(obstacles))
 
     def forget(self) -> None:
         """Drop the warm start and the stored plan."""
         self.loop.abandon()
         self._flying = False
 
-    def along(self, now: Context[Flown]) -> tuple[Array, Array]:
+    def along(self, now: Context[FlightInput]) -> tuple[Array, Array]:
         """Guess a level flight along the reference."""
         belief, reference = now.given.belief, now.given.reference
         states = np.tile(belief.state, (self.settings.horizon + 1, 1))
@@ -143,7 +145,7 @@ class Controller:
         states[1:, 3:7] = level(belief)
         return states, np.tile(now.given.hover, (self.settings.horizon, 1))
 
-    def carry(self, guess: fg.Guess, now: Context[Flown]) -> fg.Guess:
+    def carry(self, guess: fg.Guess, now: Context[FlightInput]) -> fg.Guess:
         """A guess without multipliers of slots that hold something else now."""
         multipliers = dict(guess.multipliers)
         if "cylinders" in multipliers:
@@ -151,7 +153,7 @@ class Controller:
         return fg.Guess(guess.values, self.past.carry(multipliers, now) if multipliers else multipliers)
 
     def judge(
-        self, solution: fg.Solution, states: Array, controls: Array, now: Context[Flown], kept: LastPlan
+        self, solution: fg.Solution, states: Array, controls: Array, now: Context[FlightInput], kept: LastPlan
     ) -> Decision:
         """Fly a plan that keeps the constraints; otherwise what keeps off best of all there is."""
         s, given, belief = self.settings, now.given, now.given.belief
@@ -175,7 +177,7 @@ class Controller:
         # Go on from what is flown: from the reference the solver would meet the same difficulty again.
         return Decision(controls, states, source, after=(_next(states), _next(controls)))
 
-    def _room(self, states: Array, obstacles: Obstacles) -> float:
+    def _room(self, states: Array, obstacles: SlotObstacles) -> float:
         """Least distance of states (k, 10) beyond what is to be kept clear [m]; Ta's potential demands nothing."""
         return 0.0 if self.settings.avoidance == "potential" else obstacles.room(states, self.walls)
 

@@ -31,10 +31,10 @@ from unifg.horizon import Context, RecedingHorizon, Term
 from unifg.models import avoidance, quadrotor
 from unifg.scenarios.perception.belief import Belief
 from unifg.scenarios.quadrotor.estimator import Estimator, flyable
-from unifg.scenarios.quadrotor.flight_parts import Flown, GivenFlight, repel
+from unifg.scenarios.quadrotor.flight_parts import FlightInput, GivenFlight, repel
 from unifg.scenarios.quadrotor.flight_past import packed, parameters_in
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
-from unifg.scenarios.quadrotor.slots import FAR_AWAY, Obstacles
+from unifg.scenarios.quadrotor.slots import FAR_AWAY, SlotObstacles
 from unifg.typing import Array, ArrayLike, BoolArray
 
 STILL = np.zeros(6)  # process noise of the future
@@ -79,7 +79,7 @@ class SharedMotion:
         motion = (x[:-1], u, STILL, *parameters_in(graph), x[1:], self.settings.dt)
         graph.constrain(quadrotor.disturbed_dynamics, *motion, lower=0, upper=0, name="flight")
 
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[FlightInput]) -> Mapping[str, ArrayLike]:
         """Drag that the past puts below zero may stay there."""
         return {"least drag": np.minimum(now.constants["drag"][0], 0.0)} if self.drag else {}
 
@@ -109,7 +109,7 @@ class KeepClear:
         else:
             repel(graph, s, self.squares, kept, *pairs, name="landmarks", active=near)
 
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[FlightInput]) -> Mapping[str, ArrayLike]:
         """Flags of the landmarks that are obstacles now, their radii, and the clearances to keep."""
         s, given, count = self.settings, now.given, len(now.constants["landmarks"])
         hulls, limits = np.zeros((2, s.horizon, count))
@@ -154,7 +154,7 @@ class SharedFlight(GivenFlight):
         """Keep clear of the landmarks' variables; the slots keep what has left the window's map, and movers."""
         return [KeepClear(self.settings, squares)]
 
-    def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
+    def split(self, obstacles: SlotObstacles) -> tuple[SlotObstacles, BoolArray, list[int]]:
         """Obstacles without those that are landmarks of the window; which (M,) these are, and the slots they hold."""
         atlas = self.estimator.atlas
         slots = [atlas.slot_of(name) if name >= 0 else -1 for name in obstacles.names.tolist()]
@@ -162,7 +162,7 @@ class SharedFlight(GivenFlight):
         centres = np.where(held[:, None], FAR_AWAY, obstacles.centres)
         return replace(obstacles, centres=centres), held, [slot for slot in slots if slot >= 0]
 
-    def carry(self, multipliers: dict[str, Array], now: Context[Flown]) -> dict[str, Array]:
+    def carry(self, multipliers: dict[str, Array], now: Context[FlightInput]) -> dict[str, Array]:
         """Multipliers without those of what has changed its slot or its kind."""
         multipliers = dict(multipliers)
         same = self.estimator.atlas.names == self.names
@@ -174,7 +174,7 @@ class SharedFlight(GivenFlight):
                 multipliers[name] = np.where(kept, multipliers[name], 0.0)
         return multipliers
 
-    def moving_with(self, solution: fg.Solution, now: Context[Flown]) -> quadrotor.Parameters:
+    def moving_with(self, solution: fg.Solution, now: Context[FlightInput]) -> quadrotor.Parameters:
         """The parameters that were estimated."""
         families = {family.name: family for family in solution.values}
         return flyable(packed({static.name: solution[families[static.name]] for static in self.robot.constants}))

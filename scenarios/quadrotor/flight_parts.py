@@ -14,10 +14,11 @@ from unifg.horizon import Context, RecedingHorizon, Robot, Term, Window
 from unifg.lie import SO3
 from unifg.models import avoidance, landmarks, quadrotor
 from unifg.scenarios.perception.belief import Belief
+from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.scenarios.quadrotor.braking import stopping_height
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
 from unifg.scenarios.quadrotor.guide import Reference
-from unifg.scenarios.quadrotor.slots import FAR_AWAY, SPARE, Obstacles
+from unifg.scenarios.quadrotor.slots import FAR_AWAY, SPARE, SlotObstacles
 from unifg.typing import Array, ArrayLike, BoolArray
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -25,7 +26,7 @@ SLOWING = 0.3  # [s] in which a speed above the limit is to fade
 
 
 @dataclass(frozen=True)
-class Flown:
+class FlightInput:
     """Context of the terms at a tick.
 
     Attributes:
@@ -41,8 +42,8 @@ class Flown:
     belief: Belief
     hover: Array
     reference: Reference
-    obstacles: Obstacles
-    others: Obstacles
+    obstacles: SlotObstacles
+    others: SlotObstacles
     held: BoolArray
     marks: list[int]
 
@@ -59,7 +60,7 @@ class GivenMotion:
         motion = (x[:-1], u, x[1:], parameters, self.settings.dt)
         graph.constrain(quadrotor.dynamics, *motion, lower=0, upper=0, name="dynamics")
 
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[FlightInput]) -> Mapping[str, ArrayLike]:
         """Parameters as believed."""
         return {"parameters": now.given.belief.parameters.packed}
 
@@ -93,15 +94,15 @@ class GivenFlight:
         """Terms that keep clear of variables: hard, or for Ta's potential as sums of squares or not."""
         return []
 
-    def split(self, obstacles: Obstacles) -> tuple[Obstacles, BoolArray, list[int]]:
+    def split(self, obstacles: SlotObstacles) -> tuple[SlotObstacles, BoolArray, list[int]]:
         """Obstacles without those that are variables; which (M,) these are, and the variables."""
         return obstacles, np.zeros(len(obstacles.names), dtype=bool), []
 
-    def carry(self, multipliers: dict[str, Array], now: Context[Flown]) -> dict[str, Array]:
+    def carry(self, multipliers: dict[str, Array], now: Context[FlightInput]) -> dict[str, Array]:
         """Shifted multipliers that still hold."""
         return multipliers
 
-    def moving_with(self, solution: fg.Solution, now: Context[Flown]) -> quadrotor.Parameters:
+    def moving_with(self, solution: fg.Solution, now: Context[FlightInput]) -> quadrotor.Parameters:
         """Parameters with which a solution moves."""
         return now.given.belief.parameters
 
@@ -129,7 +130,7 @@ class Limits:
             landmarks.tilt, x.R[1:], np.zeros(3), lower=[-lean, -lean, -free], upper=[lean, lean, free], name="lean"
         )
 
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[FlightInput]) -> Mapping[str, ArrayLike]:
         """Heights as far as a vehicle keeps them that stops climbing or sinking."""
         s = self.settings
         least, most = (np.full((s.horizon, 3), side * np.inf) for side in (-1.0, 1.0))
@@ -139,21 +140,9 @@ class Limits:
         return {"low": least, "high": most}
 
 
-@dataclass(frozen=True)
-class Leaning:
-    """Cost of leaning otherwise than at hover."""
-
-    settings: ControllerSettings
-
-    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
-        """Add the cost."""
-        upright = graph.data("upright", UP)
-        sigma = self.settings.weighted(self.settings.level_sigma)
-        graph.minimize(landmarks.tilt, x.R[1:], upright, sigma=sigma, name="level")
-
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """Vertical axis in the body at hover."""
-        return {"upright": SO3.act(SO3.inverse(level(now.given.belief)), UP)}
+def upright(now: Context[FlightInput]) -> Array:
+    """(3,) vertical axis in the body at hover."""
+    return SO3.act(SO3.inverse(level(now.given.belief)), UP)
 
 
 def level(belief: Belief) -> Array:
@@ -163,34 +152,17 @@ def level(belief: Belief) -> Array:
     return SO3.compose(quadrotor.hover_attitude(belief.parameters), heading)
 
 
-@dataclass(frozen=True)
-class Following:
+def following(settings: ControllerSettings) -> list[Term]:
     """Costs of leaving the reference in position and velocity, others at its end."""
-
-    settings: ControllerSettings
-
-    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
-        """Add the costs."""
-        s = self.settings
-        n, last = s.horizon, np.sqrt(s.terminal_weight)
-        positions = graph.data("reference positions", np.zeros((n - 1, 3)), each=True)
-        velocities = graph.data("reference velocities", np.zeros((n - 1, 3)), each=True)
-        end, leaving = graph.data("end of reference", np.zeros(3)), graph.data("velocity at the end", np.zeros(3))
-        position, velocity = s.weighted(s.position_sigma), s.weighted(s.velocity_sigma)
-        graph.minimize(fg.prior, x.p[1:-1], positions, sigma=position, name="way")
-        graph.minimize(fg.prior, x.v[1:-1], velocities, sigma=velocity, name="pace")
-        graph.minimize(fg.prior, x.p[-1], end, sigma=position / last, name="end of way")
-        graph.minimize(fg.prior, x.v[-1], leaving, sigma=velocity / last, name="final pace")
-
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
-        """The reference."""
-        places, speeds = now.given.reference.positions, now.given.reference.velocities
-        return {
-            "reference positions": places[1:-1],
-            "reference velocities": speeds[1:-1],
-            "end of reference": places[-1],
-            "velocity at the end": speeds[-1],
-        }
+    s, between, end = settings, (1, -1), (-1, None)
+    last = np.sqrt(s.terminal_weight)
+    position, velocity = s.weighted(s.position_sigma), s.weighted(s.velocity_sigma)
+    return [
+        ReferenceCost("way", position, lambda now: now.given.reference.positions[1:-1], "p", between),
+        ReferenceCost("pace", velocity, lambda now: now.given.reference.velocities[1:-1], "v", between),
+        ReferenceCost("end of way", position / last, lambda now: now.given.reference.positions[-1], "p", end),
+        ReferenceCost("final pace", velocity / last, lambda now: now.given.reference.velocities[-1], "v", end),
+    ]
 
 
 @dataclass(frozen=True)
@@ -213,7 +185,7 @@ class Clearance:
             segments = x.p[1:], self.walls, np.zeros(count)
             graph.constrain(avoidance.segment_clearance, *segments, lower=beside, name="walls")
 
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[FlightInput]) -> Mapping[str, ArrayLike]:
         """Contents of the slots."""
         others = now.given.others
         found: dict[str, ArrayLike] = {"centres": others.centres, "radii": others.radii, "clearances": others.limits}
@@ -253,7 +225,7 @@ class Potential:
             hulls = x.p[1:], self.walls, np.full(len(self.walls), s.vehicle_radius)
             repel(graph, s, self.squares, avoidance.segment_clearance, *hulls, name="walls")
 
-    def data(self, now: Context[Flown]) -> Mapping[str, ArrayLike]:
+    def data(self, now: Context[FlightInput]) -> Mapping[str, ArrayLike]:
         """Contents of the slots, and a speed that the vehicle can come down to."""
         s, others = self.settings, now.given.others
         times, most = s.dt * np.arange(1.0, s.horizon + 1), s.guide.speed

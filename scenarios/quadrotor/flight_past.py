@@ -14,8 +14,6 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from unifg.codegen.jit import compiled
-from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual
 from unifg.horizon import Constant, Context, Measurement, Robot, Term, Window
 from unifg.models import landmarks, quadrotor
@@ -87,18 +85,9 @@ class WindowSettings:
 FORCE = specific_force(quadrotor.STATE)
 
 
-@compiled
-def _turned(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """Noise of the rates less what the gyro saw beyond those commanded."""
-    for i in range(3):
-        r[i] = v[i] - p[i]
-        if len(J):
-            for k in range(6):
-                J[i, k] = 1.0 if i == k else 0.0
-
-
-gyro = fg.residual(Kernel(_turned, (quadrotor.NOISE, (3,)), 3, name="gyro", linear=True))
-"""``gyro(w, beyond)``: noise of the rates less ``beyond`` (3,), measured less commanded rates [rad/s]."""
+def gyro(noise: Array, beyond: Array) -> Array:
+    """(n, 3) noise (n, 6) of the rates less ``beyond`` (n, 3), measured less commanded rates [rad/s]."""
+    return noise[:, :3] - beyond
 
 
 class SeenFromTheVehicle:
@@ -113,12 +102,12 @@ class SeenFromTheVehicle:
         return arrival(self._slots)
 
     def more(self, dim: int) -> int:
-        """Nothing: the reference is the lowest point."""
-        return 0
+        """The offset of the lowest point."""
+        return dim
 
     def express(self, here: Array, step: Array, lowest: Array, information: Array) -> tuple[Array, Array]:
         """As seen from the vehicle."""
-        return seen_from_the_vehicle(here, lowest, information)
+        return seen_from_the_vehicle(here, step, information)
 
 
 @dataclass(frozen=True)
@@ -183,7 +172,7 @@ class Accelerometer:
 
 
 @dataclass(frozen=True)
-class Sightings:
+class LandmarkSightings:
     """Bearings and ranges of the landmarks' slots."""
 
     settings: WindowSettings
@@ -204,7 +193,7 @@ class Sightings:
         graph.minimize(landmarks.bearing_range, *pairs, sigma=sigma, active=seen, name="sightings")
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """Sightings."""
+        """LandmarkSightings."""
         rows = now.past.recorded("sightings")[0].reshape(-1, 3)
         seen = rows[:, 2] > 0.0
         return {"sightings": np.where(seen[:, None], rows[:, :2], 1.0), "seen": seen}
@@ -265,7 +254,7 @@ def window(
     terms: list[Term] = [
         survey,
         Motion(settings),
-        Sightings(settings),
+        LandmarkSightings(settings),
         Measurement("height", landmarks.height, (), settings.height_sigma, component="p"),
         Measurement("tilt", landmarks.tilt, (3,), settings.tilt_sigma, component="R"),
     ]

@@ -11,7 +11,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.perception.belief import Belief
 from unifg.scenarios.perception.line_tracker import LineTracker
 from unifg.scenarios.perception.readings import Reading
-from unifg.scenarios.quadrotor.estimator import STILL, DeadReckoningEstimator, Estimator, EstimatorSettings
+from unifg.scenarios.quadrotor.estimator import STILL, DeadReckoning, Dynamics, Estimator, EstimatorSettings
 from unifg.scenarios.quadrotor.flight_control import Controller
 from unifg.scenarios.quadrotor.flight_joint import BELIEVABLE, JointSettings, SharedFlight
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
@@ -107,10 +107,10 @@ def make_pilot(
         ScenarioError: for an unknown coupling, association or avoidance.
         BackendError: for an unknown solver.
     """
-    kinds = {"separate": DeadReckoningEstimator, "sequential": Estimator, "joint": Estimator}
-    if coupling not in kinds:
+    if coupling not in COUPLINGS:
         raise ScenarioError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
-    past = kinds[coupling](state, nominal, estimator, layout.corners)
+    model = (DeadReckoning if coupling == "separate" else Dynamics)(nominal)
+    past = Estimator(state, nominal, estimator, layout.corners, model)
     if coupling == "joint":
         return Pilot(past, joint_controller(past, layout, solver, controller, joint or JointSettings()))
     return Pilot(past, Controller(layout.target, layout.walls, solver, controller, layout.size))

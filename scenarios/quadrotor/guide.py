@@ -161,8 +161,7 @@ class Guide:
         reachable = (
             np.minimum.accumulate((squared + 2.0 * s.acceleration * arc)[::-1])[::-1] - 2.0 * s.acceleration * arc
         )
-        allowed: Array = np.interp(stations, arc, reachable)
-        return allowed
+        return np.interp(stations, arc, reachable)
 
 
 def smoothed(way: Array) -> Array:

@@ -23,7 +23,7 @@ DODGE = 5.0  # [m/s^2] with which a vehicle can get out of the way
 
 
 @dataclass(frozen=True)
-class Obstacles:
+class SlotObstacles:
     """Contents of the slots at one tick; C slots of cylinders, then those of movers, M in all.
 
     Attributes:
@@ -65,7 +65,7 @@ class Slots:
         self._walls = walls
         self._names = np.full(settings.cylinders, -1, dtype=np.intp)
 
-    def fill(self, state: Array, positions: Array, landmarks: Landmarks, movers: Tracks) -> Obstacles:
+    def fill(self, state: Array, positions: Array, landmarks: Landmarks, movers: Tracks) -> SlotObstacles:
         """Fill the slots for a vehicle in a state (10,) that is to go along positions (N + 1, 3) [m]."""
         s = self._settings
         n, m = s.horizon, s.cylinders + s.movers
@@ -92,18 +92,24 @@ class Slots:
         least = s.vehicle_radius + s.margin
         names = np.concatenate([self._names, np.full(s.movers, -1, dtype=np.intp)])
         changed = np.concatenate([self._names != before, np.ones(s.movers, dtype=bool)])
-        return Obstacles(names, centres, radii, np.minimum(least + wider, kept), changed, np.minimum(least, beside))
+        return SlotObstacles(names, centres, radii, np.minimum(least + wider, kept), changed, np.minimum(least, beside))
 
     def _assign(self, known: Landmarks, positions: Array) -> IntArray:
         """Row of ``known`` in every slot of cylinders, -1 for none: those nearest to where the vehicle is to be."""
-        s = self._settings
         gaps = np.hypot(*np.moveaxis(known.positions - positions[:, None, :2], 2, 0)) - known.radii
-        chosen = np.argsort(gaps.min(axis=0), kind="stable")[: s.cylinders]
-        rows = np.full(s.cylinders, -1, dtype=np.intp)
+        chosen = np.argsort(gaps.min(axis=0), kind="stable")[: self._settings.cylinders]
         row_of = {int(known.ids[row]): int(row) for row in chosen}
-        for slot, name in enumerate(self._names.tolist()):
-            rows[slot] = row_of.pop(name, -1)
-        for row in row_of.values():
-            rows[int(np.argmin(rows))] = row
-        self._names = np.where(rows >= 0, known.ids[rows] if len(known) else -1, -1)
-        return rows
+        names = reassigned(self._names.tolist(), list(row_of))
+        self._names = np.array(names, dtype=np.intp)
+        return np.array([row_of.get(name, -1) for name in names], dtype=np.intp)
+
+
+def reassigned(held: list[int], wanted: list[int]) -> list[int]:
+    """Contents of the slots: what is wanted and was ``held`` keeps its slot, the rest fills the others in order.
+
+    Args:
+        held: what each slot has held; -1 for nothing.
+        wanted: what the slots are to hold, at most as much as there are slots.
+    """
+    fresh = [name for name in wanted if name not in held]
+    return [name if name in wanted else fresh.pop(0) if fresh else -1 for name in held]

@@ -46,7 +46,7 @@ SOFT = 0.8
 _FLOOR = -1  # owner of contacts with the floor; those of things are their ids, those of walls follow
 
 
-class QuadrotorWorld:
+class QuadrotorWorld(Space):
     """One vehicle among cylinders, walls and movers, above a floor.
 
     Things are named by id: cylinders of the layout first, then the walls' corners, then the movers.
@@ -96,12 +96,12 @@ class QuadrotorWorld:
         self.grounded = False
         self._state = _start_state(layout, start)
         self._rates, self._force = np.zeros(3), SO3.act(SO3.inverse(self._state[3:7]), UP)
-        self._space = space = Space(self._state[:2], VEHICLE_RADIUS)
+        super().__init__(self._state[:2], VEHICLE_RADIUS)
         if self._state[2] <= 0.0:
-            space.begin(_FLOOR, counts=False)  # a start on the ground is no collision
+            self.begin(_FLOOR, counts=False)  # a start on the ground is no collision
         shapes = self._add_things()
-        space.add_vehicle()
-        self._sensor = Sensor(self.sensor_model, space.engine, shapes, len(shapes) - len(self.movers), sensor_rng)
+        self.add_vehicle()
+        self._sensor = Sensor(self.sensor_model, self.engine, shapes, len(shapes) - len(self.movers), sensor_rng)
         if self.clearance() < 0.0:
             x, y, z = self._state[:3]
             raise ScenarioError(
@@ -111,17 +111,16 @@ class QuadrotorWorld:
 
     def _add_things(self) -> list[pymunk.Shape | None]:
         """Shapes by id, None for corners; walls are added too, their ends are what is named."""
-        space, layout = self._space, self.layout
-        static = space.engine.static_body
+        layout, static = self.layout, self.engine.static_body
         shapes: list[pymunk.Shape | None] = []
         for x, y, radius in layout.cylinders.tolist():
-            shapes.append(space.add(pymunk.Circle(static, radius, (x, y)), len(shapes)))
+            shapes.append(self.add(pymunk.Circle(static, radius, (x, y)), len(shapes)))
         shapes += [None] * len(layout.corners)
         for obstacle in self.movers:
-            shapes.append(space.add_disc(obstacle, len(shapes)))
+            shapes.append(self.add_disc(obstacle, len(shapes)))
         for index, (begin, end) in enumerate(layout.walls.tolist()):
             wall = pymunk.Segment(static, (begin[0], begin[1]), (end[0], end[1]), 0.0)
-            space.add(wall, len(shapes) + index)
+            self.add(wall, len(shapes) + index)
         return shapes
 
     # ------------------------------------------------------------------ motion
@@ -143,7 +142,7 @@ class QuadrotorWorld:
                 "rather than a plan that failed"
             )
         rates, path = list[Array](), [self._state]
-        for pause in self._space.substeps(dt):
+        for pause in self.substeps(dt):
             noise = self._disturbances.draw(pause)
             rates.append(u[:3] + noise[:3])
             flown = quadrotor.fly(self._state, u, pause, self.parameters, noise, substeps=1)
@@ -155,23 +154,22 @@ class QuadrotorWorld:
 
     def _collide(self, flown: Array, pause: float) -> Array:
         """Let the disc follow the integrator as far as it can; the state (10,) that is left."""
-        space, body = self._space, self._space.vehicle
-        wanted = pymunk.Vec2d(float(flown[0]), float(flown[1]))
-        body.velocity = space.without_contacts((wanted - body.position) / pause)
-        space.step(pause)  # movers do not wait: their path is the same in every flight
+        body, wanted = self.vehicle, pymunk.Vec2d(float(flown[0]), float(flown[1]))
+        body.velocity = self.without_contacts((wanted - body.position) / pause)
+        self.advance(pause)  # movers do not wait: their path is the same in every flight
         if body.position.get_distance(wanted) > _ARRIVED:
             flown[:2] = body.position
-        flown[7:9] = space.without_contacts(pymunk.Vec2d(float(flown[7]), float(flown[8])))
+        flown[7:9] = self.without_contacts(pymunk.Vec2d(float(flown[7]), float(flown[8])))
         return flown
 
     def _land(self, state: Array) -> Array:
         """Keep a state (10,) above the floor."""
         if state[2] <= 0.0:
-            if not self._space.touches(_FLOOR):
-                self._space.begin(_FLOOR, counts=float(np.linalg.norm(state[7:10])) > SOFT)
+            if not self.touches(_FLOOR):
+                self.begin(_FLOOR, counts=float(np.linalg.norm(state[7:10])) > SOFT)
             state[2], state[9] = 0.0, max(state[9], 0.0)
-        elif self._space.touches(_FLOOR):
-            self._space.separate(_FLOOR)
+        elif self.touches(_FLOOR):
+            self.separate(_FLOOR)
         return state
 
     # ----------------------------------------------------------------- sensors
@@ -187,30 +185,16 @@ class QuadrotorWorld:
         """(10,) true position, quaternion (w, x, y, z) and velocity."""
         return self._state.copy()
 
-    @property
-    def time(self) -> float:
-        """Time since the start [s]."""
-        return self._space.time
-
-    @property
-    def collisions(self) -> int:
-        """Contact events so far, with the floor too."""
-        return self._space.collisions
-
-    def mover_states(self) -> Array:
-        """(K, 3) x, y, radius of the movers now [m]."""
-        return self._space.discs()[:, :3]
-
     def things(self) -> Array:
         """(n, 3) x, y, radius of everything that can be seen, by id, as it stands now [m]; corners have radius 0."""
         corners = self.layout.corners
         return np.concatenate(
-            [self.layout.cylinders, np.column_stack([corners, np.zeros(len(corners))]), self.mover_states()]
+            [self.layout.cylinders, np.column_stack([corners, np.zeros(len(corners))]), self.discs()[:, :3]]
         )
 
     def clearance(self) -> float:
         """Distance from the hull to the nearest cylinder, mover, wall or the floor [m]; negative in an overlap."""
-        discs = np.concatenate([self.layout.cylinders, self.mover_states()])
+        discs = np.concatenate([self.layout.cylinders, self.discs()[:, :3]])
         beside = float(obstacle_distance(self._state[None, :2], discs, self.layout.walls)[0]) - VEHICLE_RADIUS
         return min(beside, float(self._state[2]))
 

@@ -134,25 +134,21 @@ class Sensor:
         )
 
     def _visible(self, index: int, state: Array, things: Array) -> bool:
-        """Return True if a ray to the axis, or one to either flank, meets this thing first."""
+        """Return True if a ray to the axis, or one to either flank, meets this thing first; one to a corner nothing."""
         x, y, radius = things[index].tolist()
-        origin = (float(state[0]), float(state[1]))
+        origin, shape = (float(state[0]), float(state[1])), self._shapes[index]
         dx, dy = x - origin[0], y - origin[1]
         distance = math.hypot(dx, dy)
-        shape = self._shapes[index]
-        if shape is None:
-            if distance <= _CORNER_GAP:
-                return True
-            keep = 1.0 - _CORNER_GAP / distance
-            tip = (origin[0] + keep * dx, origin[1] + keep * dy)
-            return self._space.segment_query_first(origin, tip, 0.0, OTHERS) is None
-        if distance <= radius:
+        if distance <= (_CORNER_GAP if shape is None else radius):
             return True
-        flank = _FLANK * math.asin(radius / distance)
-        for angle in (0.0, flank, -flank):
+        share, angles = 1.0 - _CORNER_GAP / distance, [0.0]
+        if shape is not None:
+            flank = _FLANK * math.asin(radius / distance)
+            share, angles = 1.0, [0.0, flank, -flank]
+        for angle in angles:
             c, s = math.cos(angle), math.sin(angle)
-            tip = (origin[0] + c * dx - s * dy, origin[1] + s * dx + c * dy)
+            tip = origin[0] + share * (c * dx - s * dy), origin[1] + share * (s * dx + c * dy)
             hit = self._space.segment_query_first(origin, tip, 0.0, OTHERS)
-            if hit is not None and hit.shape is shape:
+            if (None if hit is None else hit.shape) is shape:
                 return True
         return False

@@ -26,12 +26,6 @@ class Motion(Protocol):
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Positions (n, 3) [m] and velocities (n, 3) [m/s] at times (n,) [s]."""
-        ...
-
-    @property
-    def falls(self) -> bool:
-        """True if gravity bends the way, which a predictor knows."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -39,7 +33,6 @@ class Still:
     """A thing at rest at ``place`` [m]."""
 
     place: tuple[float, float, float]
-    falls: bool = False
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """The place."""
@@ -63,7 +56,6 @@ class Ellipse:
     speed: float
     phase: float = 0.0
     clockwise: bool = False
-    falls: bool = False
     _arc: tuple[Array, Array] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -88,11 +80,6 @@ class Ellipse:
         place = np.column_stack([a * np.cos(turn), b * np.sin(turn), level]) + np.array(self.centre)
         return place, np.column_stack([across, level])
 
-    @property
-    def greatest_acceleration(self) -> float:
-        """Acceleration where the curve bends most [m/s^2]."""
-        return self.speed**2 * max(self.axes) / min(self.axes) ** 2
-
 
 @dataclass(frozen=True)
 class Shuttle:
@@ -108,7 +95,6 @@ class Shuttle:
     end: tuple[float, float, float]
     speed: float
     phase: float = 0.0
-    falls: bool = False
 
     def at(self, times: Array) -> tuple[Array, Array]:
         """Positions and velocities."""
@@ -137,11 +123,6 @@ class Thrown:
     velocity: tuple[float, float, float]
     release: float
     floor: float = 0.1
-
-    @property
-    def falls(self) -> bool:
-        """Gravity bends its way."""
-        return True
 
     @property
     def flight(self) -> float:
@@ -201,7 +182,7 @@ class Bodies:
         self.bodies = tuple(bodies)
         self.radii = np.array([body.radius for body in self.bodies], dtype=np.float64)
         self.upright: BoolArray = np.array([body.upright for body in self.bodies], dtype=bool)
-        self.falls: BoolArray = np.array([body.motion.falls for body in self.bodies], dtype=bool)
+        self.falls: BoolArray = np.array([isinstance(body.motion, Thrown) for body in self.bodies], dtype=bool)
         if not (self.radii > 0.0).all():
             raise ScenarioError(f"obstacles need radii above zero, got {self.radii.tolist()}")
 

@@ -51,11 +51,6 @@ class Loops:
         if not (self.gain > 0.0 and self.lag > 0.0 and self.link >= 0.0):
             raise ScenarioError(f"loops need a gain and a lag above zero and a link of no negative delay, got {self}")
 
-    def step(self) -> Array:
-        """(8,) how one millisecond changes the loops, as :func:`unifg.models.quadrotor_loops.held` has it."""
-        found: Array = held(self.gain, self.lag, SUBSTEP)[0]
-        return found
-
     @property
     def delay(self) -> float:
         """Delay of the loops for slow commands: link and slope of the rate loop's phase [s]."""
@@ -138,13 +133,8 @@ class BodyRatePlant:
                 raise ScenarioError(f"a {what} of {length:g} s is no whole number of milliseconds")
         hover = quadrotor.hover(airframe.parameters)
         self.loops = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, hover[3]])
-        self._step = airframe.loops.step()
+        self._step: Array = held(airframe.loops.gain, airframe.loops.lag, SUBSTEP)[0]
         self._pipe: deque[Array] = deque([hover] * (self._rows + late))
-
-    @property
-    def late(self) -> float:
-        """Delay from a tick until its command begins to act [s]."""
-        return len(self._pipe) * SUBSTEP
 
     def tick(self, command: ArrayLike, noise: ArrayLike | None = None) -> Array:
         """Fly one tick; what is decided now acts after those decided before.
@@ -160,8 +150,9 @@ class BodyRatePlant:
         if not np.isfinite(told).all():
             raise ScenarioError(f"a command must be finite, got {np.asarray(command).tolist()}")
         self._pipe.extend([told] * self._rows)
-        rows = np.array([self._pipe.popleft() for _ in range(self._rows)])
-        return self._fly(rows, np.zeros(6) if noise is None else np.asarray(noise, dtype=np.float64))
+        rows = [self._pipe.popleft() for _ in range(self._rows)]
+        self.time += self._rows * SUBSTEP
+        return self._fly(self.state, self.loops, rows, noise)
 
     def ahead(self, state: Array, duration: float, noise: ArrayLike | None = None) -> tuple[Array, Array]:
         """Prediction from ``state`` after what is pending has acted for a while.
@@ -174,20 +165,16 @@ class BodyRatePlant:
         Returns:
             (10,) state and (7,) loops then.
         """
-        kept = self.state, self.loops.copy(), self.time
+        predicted = state.copy(), self.loops.copy()
         rows = list(self._pipe)[: round(duration / SUBSTEP)]
         rows += [self._pipe[-1]] * (round(duration / SUBSTEP) - len(rows))
-        self.state = state.copy()
-        if rows:
-            self._fly(np.array(rows), np.zeros(6) if noise is None else np.asarray(noise, dtype=np.float64))
-        predicted = self.state, self.loops
-        self.state, self.loops, self.time = kept
+        self._fly(*predicted, rows, noise)
         return predicted
 
-    def _fly(self, told: Array, noise: Array) -> Array:
-        path = np.empty((len(told) + 1, 3))
-        path[0] = self.state[:3]
-        rho = self.airframe.parameters.packed
-        _advance(self.state, self.loops, told, noise, rho, self._step, SUBSTEP, path[1:])
-        self.time += len(told) * SUBSTEP
+    def _fly(self, state: Array, loops: Array, rows: list[Array], noise: ArrayLike | None) -> Array:
+        """Move a state (10,) and loops (7,) by a substep per row of commands; the places (k + 1, 3) on the way [m]."""
+        told, path = np.array(rows).reshape(-1, 4), np.empty((len(rows) + 1, 3))
+        disturbed = np.zeros(6) if noise is None else np.asarray(noise, dtype=np.float64)
+        path[0] = state[:3]
+        _advance(state, loops, told, disturbed, self.airframe.parameters.packed, self._step, SUBSTEP, path[1:])
         return path

@@ -56,8 +56,7 @@ class DisturbanceModel:
         """
         gust = 2.0 * self.gust_time * np.square(self.gust)
         density = np.concatenate([np.full(3, self.rate_density**2), self.acceleration_density**2 + gust])
-        sigma: Array = np.sqrt(density / dt)
-        return sigma
+        return np.sqrt(density / dt)
 
 
 class Disturbances:

@@ -119,22 +119,19 @@ class DriveFaults(_Faults):
         self._scans.append(scan)
         if not self.hold("lidar-frozen", now):
             self._frozen = scan
-        if self.hold("lidar-dropped", now):
-            return None
-        if self.hold("lidar-delayed", now):
-            late = [old for old in self._scans if old.time is not None and old.time <= now - LATE + 1e-9]
-            return late[-1] if late else None
-        if self.hold("beams-missing", now):
-            return replace(scan, angles=scan.angles[:-1], ranges=scan.ranges[:-1])
-        if self._frozen is not None and self._frozen is not scan:
-            return replace(self._frozen, time=now)  # with a stamp that does not tell
-        if self.hold("lidar-blind", now):
-            return replace(scan, ranges=np.where(np.abs(scan.angles) < BLIND, math.nan, scan.ranges))
-        flat = {"lidar-nan": math.nan, "lidar-inf": math.inf, "lidar-max": RANGE_MAX}
-        for kind, value in flat.items():
-            if self.hold(kind, now):
-                return replace(scan, ranges=np.full_like(scan.ranges, value))
-        return replace(scan, ranges=-scan.ranges) if self.hold("lidar-negative", now) else scan
+        late = [old for old in self._scans if old.time is not None and old.time <= now - LATE + 1e-9]
+        arriving = {
+            "lidar-dropped": None,
+            "lidar-delayed": late[-1] if late else None,
+            "beams-missing": replace(scan, angles=scan.angles[:-1], ranges=scan.ranges[:-1]),
+            "lidar-frozen": replace(self._frozen or scan, time=now),  # with a stamp that does not tell
+            "lidar-blind": replace(scan, ranges=np.where(np.abs(scan.angles) < BLIND, math.nan, scan.ranges)),
+            "lidar-nan": replace(scan, ranges=np.full_like(scan.ranges, math.nan)),
+            "lidar-inf": replace(scan, ranges=np.full_like(scan.ranges, math.inf)),
+            "lidar-max": replace(scan, ranges=np.full_like(scan.ranges, RANGE_MAX)),
+            "lidar-negative": replace(scan, ranges=-scan.ranges),
+        }
+        return next((found for kind, found in arriving.items() if self.hold(kind, now)), scan)
 
     def odometry(self, measured: Array, now: float) -> Array:
         """Velocities (2,) of the wheels that arrive [m/s, rad/s]."""

@@ -15,7 +15,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.planning.grid import path_exists
+from unifg.scenarios.planning.grid import is_free, path_exists
 from unifg.scenarios.planning.polyline import polyline_distance
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.scenarios.simulation.space import Obstacle
@@ -73,12 +73,7 @@ class _Site:
 
     def room(self, points: Array) -> Array:
         """(n,) distance of points (n, 2) to the walls [m]; -1 where the map does not call them free."""
-        cells = np.floor(self.occupancy.world_to_grid(points)).astype(np.intp)
-        height, width = self.occupancy.shape
-        column, row = cells[:, 0], cells[:, 1]
-        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
-        known = self.occupancy.free[row.clip(0, height - 1), column.clip(0, width - 1)] & inside
-        return np.where(known, self.distance_map.distance(points), -1.0)
+        return np.where(is_free(self.occupancy, points), self.distance_map.distance(points), -1.0)
 
     def passable(self, discs: Array) -> bool:
         """Return True if the start is still joined to every goal around discs (K, 3) x, y, radius [m]."""

@@ -89,7 +89,7 @@ class OdometryModel:
     noise_sigma: float = option(0.02, text=not_negative, metavar="SHARE", flag="odometry-noise")
 
 
-class World:
+class World(Space):
     """One robot in one building, with things the map does not show.
 
     Each sensor draws from a stream of its own, and draws the same amount whatever it sees: two controllers
@@ -133,7 +133,6 @@ class World:
             raise ScenarioError(f"start must be three finite numbers x, y, theta; got {start!r}")
         self.occupancy = occupancy
         self.obstacles = tuple(obstacles)
-        self.robot_radius = robot_radius
         self.lidar = lidar or LidarModel()
         self._odometry_model = odometry or OdometryModel()
         lidar_rng, odometry_rng = (np.random.default_rng(0) if rng is None else rng).spawn(2)
@@ -145,18 +144,17 @@ class World:
         self._wheels = Wheels(self._drivetrain)
         self._command = (0.0, 0.0)
         self._left, self._spun, self._gripped = 0, 0.0, 0.0
-        self._space = Space(pose, robot_radius, yields)
+        super().__init__(pose, robot_radius, yields)
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
-            self._space.add_disc(obstacle, index)
+            self.add_disc(obstacle, index)
         for index, person in enumerate(people, start=len(self.obstacles)):
-            self._space.add_mover(person, index)
-        self._robot = self._space.vehicle
+            self.add_mover(person, index)
         self._trail: list[tuple[float, tuple[float, float, float]]] = [
-            (self.time, (*self._robot.position, self._robot.angle))
+            (self.time, (*self.vehicle.position, self.vehicle.angle))
         ]
-        self._robot.velocity_func = self._drive
-        self._space.add_vehicle()
+        self.vehicle.velocity_func = self._drive
+        self.add_vehicle()
         if self.clearance() < 0.0:
             raise ScenarioError(
                 f"the robot (radius {robot_radius:g} m) cannot start at ({pose[0]:g}, {pose[1]:g}): "
@@ -178,7 +176,7 @@ class World:
         )
         world_corners = self.occupancy.grid_to_world(corners.reshape(-1, 2)).reshape(-1, 4, 2)
         for polygon in world_corners.tolist():
-            self._space.add(pymunk.Poly(self._space.engine.static_body, [(x, y) for x, y in polygon]), _WALLS)
+            self.add(pymunk.Poly(self.engine.static_body, [(x, y) for x, y in polygon]), _WALLS)
 
     # ------------------------------------------------------------------ motion
 
@@ -198,15 +196,15 @@ class World:
                 f"the control (v, omega) = ({v}, {omega}) is not finite; stop the robot, do not drive on it"
             )
         self._wheels.tell((float(v), float(omega)))
-        before, heading_before = self._robot.position, self._robot.angle
+        before, heading_before = self.vehicle.position, self.vehicle.angle
         self._spun = self._gripped = 0.0
         self._trail = [entry for entry in self._trail if entry[0] >= self.time - self.lidar.turn]
-        for count, pause in enumerate(self._space.substeps(dt)):
+        for count, pause in enumerate(self.substeps(dt)):
             if not count:
                 self._left = round(dt / pause)
                 self._start_tick(pause)
-            self._space.step(pause, resting=self._robot.velocity.length < _REST_SPEED)
-            self._trail.append((self.time, (*self._robot.position, self._robot.angle)))
+            self.advance(pause, resting=self.vehicle.velocity.length < _REST_SPEED)
+            self._trail.append((self.time, (*self.vehicle.position, self.vehicle.angle)))
         self._measure(before, heading_before, dt, self._gripped / self._spun if self._spun > 0.0 else 1.0)
 
     def _drive(self, body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
@@ -230,13 +228,13 @@ class World:
         The engine integrates positions before it calls ``velocity_func``: without this the first substep of a
         tick would still run on the last tick's command.
         """
-        self._drive(self._robot, (0.0, 0.0), 1.0, pause)
-        self._robot.velocity = self._space.without_contacts(self._robot.velocity, relative=False)
+        self._drive(self.vehicle, (0.0, 0.0), 1.0, pause)
+        self.vehicle.velocity = self.without_contacts(self.vehicle.velocity, relative=False)
 
     def _measure(self, before: pymunk.Vec2d, heading_before: float, dt: float, grip: float) -> None:
         """Read the wheels: forward and turning part of the SE(2) logarithm of the motion made, and what was slipped."""
-        turn = self._robot.angle - heading_before
-        body_motion = (self._robot.position - before).rotated(-heading_before)
+        turn = self.vehicle.angle - heading_before
+        body_motion = (self.vehicle.position - before).rotated(-heading_before)
         half = 0.5 * turn
         stretch = half / math.tan(half) if abs(half) > 1e-9 else 1.0
         forward = stretch * body_motion.x + half * body_motion.y
@@ -246,9 +244,9 @@ class World:
     def carry(self, pose: ArrayLike) -> None:
         """Put the robot down at another pose (3,) [m, m, rad], at rest; its wheels do not turn."""
         place = np.asarray(pose, dtype=np.float64)
-        self._robot.position, self._robot.angle = (float(place[0]), float(place[1])), float(place[2])
-        self._robot.velocity, self._measured = (0.0, 0.0), np.zeros(2)
-        self._space.engine.reindex_shapes_for_body(self._robot)
+        self.vehicle.position, self.vehicle.angle = (float(place[0]), float(place[1])), float(place[2])
+        self.vehicle.velocity, self._measured = (0.0, 0.0), np.zeros(2)
+        self.engine.reindex_shapes_for_body(self.vehicle)
 
     # ----------------------------------------------------------------- sensors
 
@@ -258,7 +256,7 @@ class World:
         places = self._track(lidar.turn * (np.arange(lidar.beams) - (lidar.beams - 1)) / lidar.beams)
         bearing = places[:, 2] + self._angles
         tips = places[:, :2] + reach * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-        query = self._space.engine.segment_query_first
+        query = self.engine.segment_query_first
         hits = [
             query((x, y), (tip[0], tip[1]), 0.0, OTHERS)
             for (x, y), tip in zip(places[:, :2].tolist(), tips.tolist(), strict=True)
@@ -304,29 +302,15 @@ class World:
     @property
     def pose(self) -> Array:
         """(3,) true pose of the robot [m, m, rad], theta in [-pi, pi)."""
-        x, y = self._robot.position
-        return np.array([x, y, (self._robot.angle + math.pi) % (2.0 * math.pi) - math.pi])
-
-    @property
-    def time(self) -> float:
-        """Time since the start [s]."""
-        return self._space.time
-
-    @property
-    def collisions(self) -> int:
-        """Contact events so far."""
-        return self._space.collisions
+        x, y = self.vehicle.position
+        return np.array([x, y, (self.vehicle.angle + math.pi) % (2.0 * math.pi) - math.pi])
 
     def clearance(self) -> float:
         """Distance from the robot's hull to the nearest wall or obstacle [m]; negative when they overlap."""
-        reach, (x, y) = 2.0, self._robot.position
+        reach, (x, y) = 2.0, self.vehicle.position
         while reach < 1000.0:  # the engine tests every shape in reach, so begin near
-            nearest = self._space.engine.point_query_nearest((x, y), reach, OTHERS)
+            nearest = self.engine.point_query_nearest((x, y), reach, OTHERS)
             if nearest is not None:
-                return float(nearest.distance) - self.robot_radius
+                return float(nearest.distance) - self.radius
             reach *= 4.0
         return math.inf
-
-    def obstacle_states(self) -> Array:
-        """(K, 4) x, y, radius [m] of obstacles and people, and 1 for those that move, else 0."""
-        return self._space.discs()

@@ -9,6 +9,7 @@ beam and no robot reaches them.
 from __future__ import annotations
 
 import numpy as np
+from scipy import ndimage
 
 from unifg.typing import BoolArray, IntArray
 
@@ -24,14 +25,7 @@ def surface_cells(occupied: BoolArray) -> BoolArray:
     Returns:
         (H, W) True for the cells that can be seen or touched.
     """
-    height, width = occupied.shape
-    padded = np.zeros((height + 2, width + 2), dtype=bool)
-    padded[1:-1, 1:-1] = occupied
-    surrounded = np.ones_like(occupied)
-    for row in range(3):
-        for column in range(3):
-            surrounded &= padded[row : row + height, column : column + width]
-    surface: BoolArray = occupied & ~surrounded
+    surface: BoolArray = occupied & ~ndimage.binary_erosion(occupied, np.ones((3, 3)))
     return surface
 
 

@@ -17,7 +17,7 @@ import pymunk
 from unifg.errors import ScenarioError
 from unifg.typing import Array
 
-__all__ = ["OTHERS", "YIELD_GAP", "Mover", "Obstacle", "Policy", "Space", "ToAndFro"]
+__all__ = ["OTHERS", "YIELD_GAP", "Mover", "Obstacle", "Policy", "Space", "ToAndFro", "reflected"]
 
 YIELD_GAP = 0.1
 """Gap a mover keeps between its hull and that of a resting robot [m]."""
@@ -56,8 +56,7 @@ class Obstacle:
     def positions(self, fractions: Array) -> Array:
         """(n, 2) centres at fractions (n,) of the segment [m]; the same place for a fixed obstacle."""
         end = self.centre if self.end is None else self.end
-        positions: Array = self.centre + fractions[:, None] * (end - self.centre)
-        return positions
+        return self.centre + fractions[:, None] * (end - self.centre)
 
 
 class Policy(Protocol):
@@ -65,22 +64,21 @@ class Policy(Protocol):
 
     def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
         """Velocity for the next substep of ``dt`` [s]; ``resting``: the vehicle stands still [m/s]."""
-        ...
 
 
 class Mover:
-    """A kinematic disc.
+    """A disc that rests, or moves by a policy.
 
     Attributes:
-        body: kinematic; its position and velocity.
+        body: static or kinematic; its position and velocity.
         radius: [m].
-        policy: of its motion.
+        policy: of its motion; None for rest.
         shape: of the body.
     """
 
-    def __init__(self, place: Array, radius: float, policy: Policy) -> None:
+    def __init__(self, place: Array, radius: float, policy: Policy | None = None) -> None:
         """Stand at ``place`` (2,) [m]."""
-        self.body = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+        self.body = pymunk.Body(body_type=pymunk.Body.STATIC if policy is None else pymunk.Body.KINEMATIC)
         self.body.position = (float(place[0]), float(place[1]))
         self.radius, self.policy = radius, policy
         self.shape = pymunk.Circle(self.body, radius)
@@ -110,7 +108,7 @@ class Space:
         self.time = 0.0
         self.collisions = 0
         self._owner: dict[pymunk.Shape, int] = {}
-        self._discs: list[tuple[Array, float, Mover | None]] = []
+        self._discs: list[Mover] = []
         self._touching: dict[int, int] = {}
         self._separated: dict[int, float] = {}
 
@@ -125,17 +123,13 @@ class Space:
         return shape
 
     def add_disc(self, obstacle: Obstacle, owner: int) -> pymunk.Shape:
-        """Add a disc, on a body of its own if it moves."""
-        if obstacle.end is not None and obstacle.moving:
-            policy = ToAndFro(obstacle, obstacle.end, self._yields)
-            return self.add_mover(Mover(obstacle.centre, obstacle.radius, policy), owner)
-        self._discs.append((obstacle.centre, obstacle.radius, None))
-        offset = (float(obstacle.centre[0]), float(obstacle.centre[1]))
-        return self.add(pymunk.Circle(self.engine.static_body, obstacle.radius, offset), owner)
+        """Add a disc that rests or goes to and fro."""
+        policy = ToAndFro(obstacle, self._yields) if obstacle.moving else None
+        return self.add_mover(Mover(obstacle.centre, obstacle.radius, policy), owner)
 
     def add_mover(self, mover: Mover, owner: int) -> pymunk.Shape:
-        """Add a disc that moves by a policy."""
-        self._discs.append((np.zeros(2), mover.radius, mover))
+        """Add a disc on a body of its own."""
+        self._discs.append(mover)
         self.engine.add(mover.body)
         return self.add(mover.shape, owner)
 
@@ -149,11 +143,8 @@ class Space:
 
     def discs(self) -> Array:
         """(K, 4) x, y, radius [m] of the discs now, in the order they were added, and 1 for movers, else 0."""
-        states = np.zeros((len(self._discs), 4))
-        for index, (centre, radius, mover) in enumerate(self._discs):
-            place = centre if mover is None else mover.body.position
-            states[index] = place[0], place[1], radius, mover is not None
-        return states
+        rows = [(*disc.body.position, disc.radius, disc.policy is not None) for disc in self._discs]
+        return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
     # -------------------------------------------------------------------- time
 
@@ -170,11 +161,11 @@ class Space:
             self.time = begin + (k + 1) * (dt / count)
             yield dt / count
 
-    def step(self, pause: float, resting: bool = False) -> None:
+    def advance(self, pause: float, resting: bool = False) -> None:
         """Move everything for a substep [s]; movers that yield wait for a vehicle that is ``resting``."""
-        for _, _, mover in self._discs:
-            if mover is not None:
-                mover.body.velocity = mover.policy.velocity(mover, self, resting, pause)
+        for disc in self._discs:
+            if disc.policy is not None:
+                disc.body.velocity = disc.policy.velocity(disc, self, resting, pause)
         self.engine.step(pause)
 
     def without_contacts(self, velocity: pymunk.Vec2d, relative: bool = True) -> pymunk.Vec2d:
@@ -226,20 +217,16 @@ class Space:
 class ToAndFro:
     """To and fro along the segment of an obstacle at constant speed; waits where it would crowd a robot at rest."""
 
-    def __init__(self, obstacle: Obstacle, end: Array, yields: bool) -> None:
-        """Begin at the obstacle's centre, about to leave for ``end`` (2,) [m]; ``yields``: wait for robots at rest."""
-        self.origin = pymunk.Vec2d(*map(float, obstacle.centre))
-        span = pymunk.Vec2d(*map(float, end)) - self.origin
+    def __init__(self, obstacle: Obstacle, yields: bool) -> None:
+        """Begin at the obstacle's centre, about to leave for its end; ``yields``: wait for robots at rest."""
+        self.origin, end = (pymunk.Vec2d(*place) for place in obstacle.positions(np.array([0.0, 1.0])).tolist())
+        span = end - self.origin
         self.length, self.direction, self.speed = span.length, span.normalized(), obstacle.speed
         self.along, self.sense, self.yields = 0.0, 1.0, yields
 
     def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
         """Velocity to the next place on the segment, so that nothing drifts."""
-        along, sense = self.along + self.sense * self.speed * dt, self.sense
-        if along > self.length:
-            along, sense = max(2.0 * self.length - along, 0.0), -1.0
-        elif along < 0.0:
-            along, sense = min(-along, self.length), 1.0
+        along, sense = reflected(self.along, self.sense, self.speed * dt, self.length)
         target, robot = self.origin + along * self.direction, space.vehicle.position
         if resting and self.yields:
             hulls = space.radius + mover.radius
@@ -248,3 +235,11 @@ class ToAndFro:
                 return 0.0, 0.0
         self.along, self.sense = along, sense
         return (target - mover.body.position) / dt
+
+
+def reflected(along: float, sense: float, step: float, length: float) -> tuple[float, float]:
+    """Place [m] and sense after a step [m] to and fro on a way of a length [m], turning round at its ends."""
+    along += sense * step
+    if 0.0 <= along <= length:
+        return along, sense
+    return min(max(2.0 * length - along if along > length else -along, 0.0), length), -sense

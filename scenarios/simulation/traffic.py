@@ -17,7 +17,7 @@ from unifg.errors import ScenarioError
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.options import count, option, positive
 from unifg.scenarios.planning.polyline import arc_lengths, at_stations
-from unifg.scenarios.simulation.space import Mover, Space
+from unifg.scenarios.simulation.space import Mover, Space, reflected
 from unifg.typing import Array
 
 __all__ = ["Social", "Traffic", "draw_traffic"]
@@ -95,7 +95,7 @@ class Social:
         for _ in range(math.ceil(2.0 * float(self._arc[-1]) / STEP)):
             if float(np.hypot(*carrot)) >= CARROT:
                 break
-            self._go_on(STEP)
+            self._along, self._sense = reflected(self._along, self._sense, STEP, float(self._arc[-1]))
             carrot = at_stations(self.way, self._arc, np.array([self._along]))[0] - place
         made: Array = (self.pace * carrot / max(float(np.hypot(*carrot)), 1e-6) - velocity) / RELAXATION
         for other in self.others:
@@ -105,14 +105,6 @@ class Social:
         off_walls, slope = self._walls.distance_and_gradient(place)
         made += PUSH * math.exp(min((self.radius - float(off_walls)) / REACH, 1.0)) * slope
         return made
-
-    def _go_on(self, length: float) -> None:
-        """Move the place on the way that is gone for, turning round at its ends."""
-        along, most = self._along + self._sense * length, float(self._arc[-1])
-        if not 0.0 <= along <= most:
-            self._sense = -self._sense
-            along = float(np.clip(2.0 * most - along if along > most else -along, 0.0, most))
-        self._along = along
 
 
 def draw_traffic(traffic: Traffic, walls: DistanceMap, path: Array, rng: np.random.Generator) -> list[Mover]:

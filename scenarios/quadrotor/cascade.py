@@ -2,7 +2,7 @@
 
 The paper proposes it for planners that do not keep barriers (Yang et al. 2025, IV-A1): a coarse way from above, a
 filter that has the last word. Between two plans the vehicle follows the last one by differential flatness; what it
-wants for that is what the filter (:mod:`unifg.scenarios.safety.one_step`) changes as little as it can.
+wants for that is what the filter (:mod:`unifg.scenarios.quadrotor.one_step`) changes as little as it can.
 """
 
 from __future__ import annotations

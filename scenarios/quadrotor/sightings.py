@@ -25,7 +25,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import quadrotor
-from unifg.scenarios.safety.cbf_mpc import Obstacles
+from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
@@ -53,22 +53,19 @@ class SightingSettings:
     k: float = 3.0
 
 
-def missed(centre: Array, velocity: Array, since: Array, fall: Array, seen: Array) -> Array:
-    """(n, 3) by what what is believed of an obstacle misses a look at it, ``since`` (n, 1) seconds ago [m]."""
-    found: Array = centre + since * velocity + 0.5 * since * since * fall - seen
-    return found
+def missed(centre: Array, velocity: Array, own: Array, since: Array, fall: Array, seen: Array, beside: float) -> Array:
+    """(n, 3) innovation of a look at an obstacle taken ``since`` (n, 1) seconds ago [m].
 
-
-def weighed(own: Array, unsure: Array) -> Array:
-    """(1, 3) what the vehicle is beside where it is believed to be, in standard deviations ``unsure`` (1, 3) [m]."""
-    found: Array = own / unsure
-    return found
-
-
-def missed_from_here(centre: Array, velocity: Array, own: Array, since: Array, fall: Array, seen: Array) -> Array:
-    """(n, 3) the same of a look from a vehicle that is ``own`` (n, 3) beside where it is believed to be [m]."""
-    found: Array = missed(centre, velocity, since, fall, seen) - own
-    return found
+    Args:
+        centre: (n, 3) where it is believed to be now [m].
+        velocity: (n, 3) [m/s].
+        own: (n, 3) by which the vehicle is beside where it is believed to be [m].
+        since: (n, 1) time of the look, counted from now [s].
+        fall: (n, 3) acceleration of what falls [m/s^2].
+        seen: (n, 3) where it was seen [m].
+        beside: 1 where looks are from the vehicle, 0 where they say a place in the world.
+    """
+    return centre + since * velocity + 0.5 * since * since * fall - seen - beside * own
 
 
 class Sightings:
@@ -92,15 +89,13 @@ class Sightings:
         self._since = graph.data("since", np.zeros((n, 1)), each=True)
         self._looks = graph.data("seen", np.zeros((n, 3)), each=True)
         self._active = graph.data("remembered", np.zeros(n, dtype=bool), each=True)
-        looks = self._since, np.tile(fall, (s.looks, 1)), self._looks
         self.own = graph.variables("own", fg.Rn(3), 1)
-        ends: tuple[fg.Selection, ...] = self.place[every], self.speed[every]
-        ends = (*ends, self.own[np.zeros(n, dtype=np.intp)]) if relative else ends
-        misses = missed_from_here if relative else missed
-        graph.minimize(misses, *ends, *looks, sigma=s.believed, active=self._active, name="looks")
+        ends = self.place[every], self.speed[every], self.own[np.zeros(n, dtype=np.intp)]
+        looks = self._since, np.tile(fall, (s.looks, 1)), self._looks, float(relative)
+        graph.minimize(missed, *ends, *looks, sigma=s.believed, active=self._active, name="looks")
         graph.minimize(fg.prior, self.speed, np.zeros(3), sigma=s.fast, name="fast")
-        self._unsure = graph.data("unsure", np.ones((1, 3)))
-        graph.minimize(weighed, self.own, self._unsure, name="own place")
+        self._unsure = graph.data("unsure", np.ones(3))
+        graph.minimize(fg.prior, self.own, np.zeros(3), sigma=self._unsure, name="own place")
         self._run = GaussNewton(max_iterations=3).prepare(graph)
 
     def see(self, now: float, places: Array, here: Array, unsure: float) -> Obstacles:
@@ -121,7 +116,7 @@ class Sightings:
         since = np.repeat(np.nan_to_num(self._times - now), len(places))[:, None]
         data = {
             self._since: since, self._looks: self._seen.reshape(-1, 3), self._active: known,
-            self._unsure: np.full((1, 3), max(unsure, SUREST)),
+            self._unsure: np.full(3, max(unsure, SUREST)),
         }  # fmt: skip
         guess = {self.place: places, self.speed: np.zeros_like(places), self.own: np.zeros((1, 3))}
         solution = self._run.solve(guess, data=data)

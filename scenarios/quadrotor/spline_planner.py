@@ -20,7 +20,7 @@ from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
 from unifg.scenarios.planning.flat_path import Flown, Line
-from unifg.scenarios.safety.cbf_mpc import Obstacles
+from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.typing import Array
 
 __all__ = ["SplinePath", "SplineSettings", "around"]

@@ -70,17 +70,6 @@ class Gains:
     tilt: float = 8.0
     heading: float = 2.0
 
-    @property
-    def packed(self) -> Array:
-        """(6,) in this order."""
-        return np.array([*self.position, *self.velocity, self.tilt, self.heading])
-
-    @classmethod
-    def unpacked(cls, packed: Array) -> Gains:
-        """From (6,) numbers in the order of :attr:`packed`."""
-        a, b, c, d, e, f = packed.tolist()
-        return cls((a, b), (c, d), e, f)
-
 
 TUNED = Gains((225.0, 644.0), (32.8, 25.6), 65.5, 2.0)
 """Gains found by a search on a flight that appears in no table, from the gains of a new :class:`Gains`."""

@@ -20,20 +20,31 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 import unifg as fg
 from unifg import horizon
-from unifg.horizon import Context, ControlCost, InitialGuesses, LastPlan, RecedingHorizon, Robot, Term
+from unifg.horizon import (
+    Context,
+    ControlCost,
+    InitialGuesses,
+    LastPlan,
+    LastPlanThenBrake,
+    RecedingHorizon,
+    Robot,
+    Term,
+)
 from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
 from unifg.scenarios.planning.flat_path import Flown
-from unifg.scenarios.safety.flatness import FlatnessController, Gains, flat_flight
-from unifg.scenarios.safety.weighing import Weighing
+from unifg.scenarios.planning.reference_cost import ReferenceCost
+from unifg.scenarios.quadrotor.flatness import FlatnessController, Gains, flat_flight
+from unifg.scenarios.quadrotor.slots import reassigned
+from unifg.scenarios.quadrotor.weighing import Weighing
 from unifg.scenarios.simulation.body_rate import Airframe
 from unifg.solvers.names import backend
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
@@ -156,8 +167,7 @@ class Obstacles:
         """(n, M, 3) where they are expected ``later`` (n,) [s]: at constant velocity, or falling."""
         t = later[:, None, None]
         down = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * self.falls[:, None]
-        found: Array = self.position + self.velocity * t + 0.5 * down * t * t
-        return found
+        return self.position + self.velocity * t + 0.5 * down * t * t
 
     def clearance(self, places: Array, later: Array) -> Array:
         """(n, M) distances of places (n, 3) from where they are expected ``later`` (n,), beyond what is to be kept."""
@@ -249,8 +259,7 @@ def inverse_clearance(
     p: Array, t: Array, centre: Array, velocity: Array, fall: Array, keep: Array, *rest: Any
 ) -> Array:
     """(n, M) ``1/keep - 1/distance`` of the same [1/m] (eq. 15)."""
-    found: Array = 1.0 / keep - 1.0 / (keep + clearance(p, t, centre, velocity, fall, keep, *rest))
-    return found
+    return 1.0 / keep - 1.0 / (keep + clearance(p, t, centre, velocity, fall, keep, *rest))
 
 
 def slower(v: Array, limit: Array) -> Array:
@@ -268,7 +277,6 @@ class CbfMpc:
         airframe: as it is believed.
         nodes: times of the nodes of a plan, from its begin [s].
         loop: the prepared graph.
-        kept: barriers of the graph.
     """
 
     def __init__(
@@ -302,23 +310,24 @@ class CbfMpc:
             np.array([a, a, a, b]) ** -0.5 for a, b in ((s.rate, s.thrust), (s.rate_change, s.thrust_change))
         )
         terms: list[Term] = [
-            MassAndDrag(weighing, airframe), Path(s, share),
+            MassAndDrag(weighing, airframe), *along_path(s, share),
             ControlCost(effort * share**-0.5, change, wanted=lambda now: now.given.controls),
             Motion(airframe, steps), self._speed,
         ]  # fmt: skip
         terms += [self._barriers] if s.slots else []
         early = {"step_tolerance": np.inf} if solver == "ipm" and not s.settled else {}
         numbers = {"tolerance": s.tolerance, **({"penalty": PENALTY} if solver == "ipm" else {}), **early}
+        robot = Robot(quadrotor_loops.STATE, quadrotor.CONTROL)
+        self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
+        self._policy, self._refused = LastPlanThenBrake(robot, FEASIBLE, KEEP, self._brake), 0
         self.loop = RecedingHorizon(
-            Robot(quadrotor_loops.STATE, quadrotor.CONTROL), s.horizon, terms, times=self.nodes,
+            robot, s.horizon, terms, times=self.nodes,
             solver=backend(solver, time_limit=s.budget, max_iterations=s.iterations, **numbers),
             cold=backend(solver, **numbers), limits=(airframe.least, airframe.most), judge=self.judge,
             starts=InitialGuesses(cold=self._along, after_failure=self._braking),
         )  # fmt: skip
         self.loop.applied = quadrotor.hover(airframe.parameters)
-        self._planned, self._refused = False, 0
-        self._looked_at: list[int] = []
-        self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
+        self._looked_at = [-1] * s.slots
 
     def decide(self, start: Array, flown: Flown, obstacles: Obstacles, later: float, gust: Array) -> Decision:
         """Plan.
@@ -338,46 +347,40 @@ class CbfMpc:
         plan = self.loop.plan(start, Guarded(states, controls[:-1], near, later, gust))
         solution = self.loop.solution
         assert solution is not None
-        status, slack, p = plan.source, 0.0, self.believed
-        mass, drag = p.mass, np.array(p.drag)
+        status, slack, p = "last plan" if plan.source == "kept" else plan.source, 0.0, self.believed
+        mass, drag, places = p.mass, np.array(p.drag), plan.states[:, :3]
+        if plan.source == "kept":
+            places = self.loop.kept.states[:, :3]
         if not plan.emergency:
             status, mass, drag = plan.status.name.lower(), float(solution["mass"][0, 0]), solution["drag"][0]
             slack = max((use.amount for kept in self._barriers.kept for use in kept.used(solution)), default=0.0)
-            places = plan.states[:, :3]
             if len(obstacles.keep) and obstacles.clearance(places, later + self.nodes).min() < -INSIDE:
                 status = "too near"
         spent = 1e3 * (time.thread_time() - begin)
-        return Decision(plan.control, plan.states[:, :3], status, plan.iterations, slack, mass, drag, spent)
+        return Decision(plan.control, places, status, plan.iterations, slack, mass, drag, spent)
 
     def judge(
         self, solution: fg.Solution, states: Array, controls: Array, now: Context[Guarded], kept: LastPlan
     ) -> horizon.Decision:
         """Fly a plan that keeps the constraints; else the last one for a while; else brake."""
-        finite = bool(np.isfinite(states).all() and np.isfinite(controls).all())
-        if finite and solution.violation < FEASIBLE:
-            self._planned, self._refused = True, 0
-            return horizon.Decision(kept.within(controls), states, "solved")
+        decision = self._policy(solution, states, controls, now, kept)
         # A solve that was begun goes on in the next tick; after a few ticks it begins anew.
-        self._refused += 1
-        resumed = finite and self.loop.guess is not None and self._refused % TRIES > 0
-        left = kept.within(kept.left())
-        if self._planned and kept.age <= KEEP + 1e-9 and len(left):
-            rest = np.tile(left[-1], (len(controls) - len(left), 1))
-            return horizon.Decision(np.concatenate([left, rest]), kept.states, "last plan", resumed=resumed)
+        self._refused = 0 if decision.source == "solved" else self._refused + 1
+        begun = np.isfinite(states).all() and np.isfinite(controls).all() and self.loop.guess is not None
+        return replace(decision, resumed=bool(begun) and self._refused % TRIES > 0)
+
+    def _brake(self, now: Context[Guarded]) -> Array:
+        """(4,) control that takes the velocity away."""
         level = np.clip(-np.array(Gains().velocity)[[0, 0, 1]] * now.present[7:10], -BRAKING, BRAKING)
-        control = self._brakes.steer(now.present[:10], level, np.zeros(3), self.believed)
-        still = np.tile(now.present, (len(states), 1))
-        return horizon.Decision(np.tile(control, (len(controls), 1)), still, "braking", resumed=resumed)
+        return self._brakes.steer(now.present[:10], level, np.zeros(3), self.believed)
 
     def _nearest(self, start: Array, obstacles: Obstacles, later: float) -> IntArray:
         """Obstacles that are nearest to the plan or to braking; one that was chosen before keeps its place."""
-        ways = [_braked(start, self.nodes).position, *([self.loop.kept.states[:, :3]] if self._planned else [])]
+        ways = [_braked(start, self.nodes).position, *([] if self.states is None else [self.states[:, :3]])]
         near = np.min([obstacles.clearance(way, later + self.nodes).min(axis=0) for way in ways], axis=0)
         wanted = np.argsort(near, kind="stable")[: self.settings.slots]
-        fresh = [k for k in wanted.tolist() if k not in self._looked_at]
-        kept = [k if k in wanted else fresh.pop(0) for k in self._looked_at]
-        self._looked_at = kept + fresh
-        return np.array(self._looked_at, dtype=np.intp)
+        self._looked_at = reassigned(self._looked_at, wanted.tolist())
+        return np.array([k for k in self._looked_at if k >= 0], dtype=np.intp)
 
     def _along(self, now: Context[Guarded]) -> tuple[Array, Array]:
         """Guess a flight on the path from the second node on."""
@@ -391,7 +394,7 @@ class CbfMpc:
     @property
     def states(self) -> Array | None:
         """(N + 1, 17) of the last plan; None before there is one."""
-        return self.loop.kept.states if self._planned else None
+        return self.loop.kept.states if "solved" in self.loop.sources else None
 
     @property
     def believed(self) -> quadrotor.Parameters:
@@ -456,26 +459,16 @@ class MassAndDrag:
         return {name: value[None] for name, value in zip(("mass", "drag"), self._believed, strict=True)}
 
 
-@dataclass(frozen=True)
-class Path:
+def along_path(settings: KeeperSettings, share: Array) -> list[Term]:
     """Costs of leaving the path in position, attitude and velocity; ``share`` (N, 1) of steps in the longest."""
 
-    settings: KeeperSettings
-    share: Array
+    def cost(part: str, weight: float) -> Term:
+        columns = quadrotor.STATE.component(part).storage
+        sigma = np.broadcast_to((weight * share) ** -0.5, (len(share), 3))
+        return ReferenceCost(f"path {part}", sigma, lambda now: now.given.states[1:, columns], part)
 
-    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
-        """Add the costs."""
-        s, ahead, n = self.settings, x[1:], len(self.share)
-        for part, weight in {"p": s.position, "R": s.attitude, "v": s.velocity}.items():
-            rest = getattr(ahead, part)
-            data = graph.data(f"wanted {part}", np.tile(rest.manifold.identity(), (n, 1)), each=True)
-            sigma = np.broadcast_to((weight * self.share) ** -0.5, (n, 3))
-            graph.minimize(fg.prior, rest, data, sigma=sigma, name=f"path {part}")
-
-    def data(self, now: Context[Guarded]) -> Mapping[str, ArrayLike]:
-        """The path."""
-        states = now.given.states[1:]
-        return {"wanted p": states[:, :3], "wanted R": states[:, 3:7], "wanted v": states[:, 7:]}
+    weights = {"p": settings.position, "R": settings.attitude, "v": settings.velocity}
+    return [cost(part, weight) for part, weight in weights.items()]
 
 
 @dataclass(frozen=True)

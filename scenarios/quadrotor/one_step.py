@@ -18,7 +18,7 @@ import qpsolvers
 import scipy.sparse
 
 from unifg.models import quadrotor
-from unifg.scenarios.safety.cbf_mpc import Obstacles
+from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.typing import Array
 
 __all__ = ["FilterSettings", "filtered"]
