@@ -324,7 +324,10 @@ def test_overview_names_everything(log: EpisodeLog) -> None:
     for ax in axes:
         assert "[" in ax.get_ylabel() and ax.get_title(loc="left")
     legend = {text.get_text() for part in figure.subfigs for box in part.legends for text in box.get_texts()}
-    assert {"planned path", "true path", "estimate (lidar)", "wheel odometry alone", "unforeseen obstacle"} <= legend
+    assert {
+        "first route, on the map alone", "way driven so far", "estimate (lidar)", "wheel odometry alone",
+        "obstacle not on the map", "obstacle that moves", "walls and furniture on the map", "goals",
+    } <= legend  # fmt: skip
     title = figure.get_suptitle()
     assert "1 of 1 goals reached" in title and "alm" in title and "seed 3" in title
 

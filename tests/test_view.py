@@ -477,3 +477,38 @@ def test_numbers_beside_plots_keep_their_zeros() -> None:
     asked = f"{stated}console.log({list(shown)}.map(short).join(' '))"
     found = subprocess.run(["node", "-e", asked], capture_output=True, text=True, check=True)
     assert found.stdout.split() == list(shown.values())
+
+
+@pytest.mark.parametrize("projection", [None, "3d"])
+def test_a_frame_is_drawn_on_axes_as_a_browser_would_be_sent_it(projection: str | None) -> None:
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
+
+    from unifg.style.colours import css
+
+    scene = Scene()
+    scene.discs("pillar", [[3.0, 1.0, 0.5]], height=2.0, colour="moving")
+    scene.body("robot", "disc", size=0.2)
+    scene.lines("sight", [[[0.0, 0.0, 0.0], [3.0, 1.0, 1.0]]])
+    scene.label("here", [0.0, 0.0])
+    for k in range(3):
+        with scene.frame() as frame:
+            frame.place("robot", [float(k), 0.0, 0.0])
+            frame.trail("driven", [float(k), 0.0])
+            frame.points("hit", [[1.0, float(k)]])
+    figure = Figure()
+    ax: Any = figure.add_subplot(projection=projection)
+    assert scene.draw(ax, 1) is ax
+    assert ax.get_legend_handles_labels()[1] == ["pillar", "robot", "sight", "driven", "hit"]
+    figure.canvas.draw()
+    if projection:
+        assert [type(c).__name__ for c in ax.collections] == ["Line3DCollection", "Poly3DCollection"]
+        return
+    assert [text.get_text() for text in ax.texts] == ["here"]
+    shown = {to_hex(np.asarray(c.get_facecolor())[0]): c for c in ax.collections if isinstance(c, PolyCollection)}
+    pillar, driven = shown[css("moving")], shown[css(scene.colour("driven"))]
+    places = [np.concatenate([np.asarray(path.vertices) for path in c.get_paths()]) for c in (pillar, driven)]
+    np.testing.assert_allclose([places[0].min(axis=0), places[0].max(axis=0)], [[2.5, 0.5], [3.5, 1.5]])
+    assert places[1][:, 0].max() == pytest.approx(1.0)  # not further than this frame
+    assert pillar.get_zorder() > driven.get_zorder()

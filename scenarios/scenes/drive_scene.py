@@ -6,6 +6,7 @@ The same few functions show a whole log, and a drive while it goes on: they read
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +21,7 @@ from unifg.scenarios.scenes.parts import pillar
 from unifg.typing import Array, IntArray
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["drive_frame", "drive_scene", "drive_stage", "scan_points"]
+__all__ = ["drive_frame", "drive_scene", "drive_stage", "place_movers", "scan_points"]
 
 _MAX_POINTS = 90_000  # lidar points of the whole file; beyond, every second beam, every third, ...
 _FRAMES = 500  # that a file shows
@@ -90,7 +91,7 @@ def drive_scene(log: EpisodeLog) -> Scene:
     """
     if log.ticks == 0:
         raise ViewError("there is no tick, and nothing to show")
-    scene = drive_stage(log)
+    scene = drive_stage(log, log.outcomes)
     for tick in range(log.ticks):
         drive_frame(scene.frame(), log, tick, min(log.ticks, _FRAMES))
     m = episode_metrics(log)
@@ -110,11 +111,12 @@ def drive_scene(log: EpisodeLog) -> Scene:
     return scene
 
 
-def drive_stage(log: Any) -> Scene:
+def drive_stage(log: Any, outcomes: Sequence[str] = ()) -> Scene:
     """Static parts of a drive's scene, and the bodies that move in it.
 
     Args:
         log: an `EpisodeLog`, or one in the making: what is known before the first tick is asked of it.
+        outcomes: of the goals, as far as they are known.
     """
     scene = Scene(f"unifg: {log.scenario} on {log.occupancy.name}", dt=log.dt)
     corners = shapes.known_corners(log.occupancy)
@@ -134,8 +136,9 @@ def drive_stage(log: Any) -> Scene:
     _obstacles(scene, log)
     scene.map("building", log.occupancy, height=_WALL, legend="walls and furniture on the map")
     scene.label("start", log.start[:2])
-    for index, goal in enumerate(log.goals):
-        scene.label("goal" if len(log.goals) == 1 else f"goal {index + 1}", goal[:2])
+    for index, (goal, word) in enumerate(zip(log.goals, outcomes or ["reached"] * len(log.goals), strict=True)):
+        name = "goal" if len(log.goals) == 1 else f"goal {index + 1}"
+        scene.label(name + ("" if word == "reached" else " (missed)"), goal[:2])
     scene.label("robot", follows="robot")
     scene.label("odometry alone", follows="odometry", minor=True)
     scene.view("overview", "Whole building", _ABOVE)
@@ -171,10 +174,15 @@ def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
     rings = [shapes.ring(x[:2], float(x[2]) + 0.03, 0.06, _WALL + 0.01, corners=10) for x in log.detected[tick]]
     if rings:
         frame.mesh("detected", shapes.merge(rings))
-    for index in np.flatnonzero(log.obstacle_moves).tolist():
-        frame.place(f"obstacle {index}", [*log.obstacles[tick][index][:2], 0.0])
+    place_movers(frame, log, tick)
     _touch(frame, log, tick)
     show(frame, log, tick, NUMBERS)
+
+
+def place_movers(frame: Frame, log: Any, tick: int) -> None:
+    """Place the obstacles that move."""
+    for index in np.flatnonzero(log.obstacle_moves).tolist():
+        frame.place(f"obstacle {index}", [*log.obstacles[tick][index][:2], 0.0])
 
 
 def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
@@ -243,6 +251,7 @@ def _goals(scene: Scene, log: Any, stroke: float, pin: float) -> None:
         poles.append([x, y, 0.25 * stroke])
     scene.mesh("goals", shapes.merge(flags), colour="goal", swatch="flag", legend="goals")
     scene.discs("poles", poles, height=pin, colour="pole", legend="")
+    scene.poses("headings", np.vstack([log.start, log.goals]), length=4.0 * radius, colour="dark", legend="")
 
 
 def _obstacles(scene: Scene, log: Any) -> None:

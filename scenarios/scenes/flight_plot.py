@@ -1,7 +1,7 @@
 """A flight as pictures: from above at several moments, what it believed against the truth, and how it was flown.
 
-The view from above is as in Fig. 5 of Ta, Kobilarov and Dellaert (ICUAS 2014): the estimated past is blue, the
-predicted future green, the reach of the sensor magenta; cylinders seen by then are filled, others hollow. Limits of
+The view from above is as in Fig. 5 of Ta, Kobilarov and Dellaert (ICUAS 2014), a frame of the scene: the estimated past
+is blue, the predicted future green, the reach of the sensor magenta; cylinders not seen by then are faint. Limits of
 controls are drawn where the settings of the flight name them, at their top or under ``controller``: ``rate_limits``,
 three greatest rates [rad/s], and ``thrust_limits``, least and greatest thrust [N].
 """
@@ -17,13 +17,11 @@ from unifg.errors import ViewError
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
 from unifg.scenarios.logs.metrics import collision_words
-from unifg.scenarios.scenes.flight_scene import SIGMAS, first_sights, sensor_reach
+from unifg.scenarios.scenes.flight_scene import flight_frame, flight_stage, sensor_reach
 from unifg.scenarios.scenes.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
-from unifg.scenarios.simulation.air import VEHICLE_RADIUS
-from unifg.style.colours import GREY, INK, css
-from unifg.style.figures import discs, ground, headline, key_of, new_axes, new_figure
+from unifg.style.colours import INK, css
+from unifg.style.figures import ground, headline, key_of, new_axes, new_figure
 from unifg.typing import Array, IntArray
-from unifg.view.shapes import ellipse_axes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -74,7 +72,7 @@ def overview(log: FlightLog) -> Figure:
             ax.set_axis_off()
         for ax, tick in zip(grid.flat, shown.tolist(), strict=False):
             plot_moment(log, tick, ax=ax, legend=False).label_outer()
-        figure.legend(*key_of(grid.flat), loc="outside lower center", ncols=6)
+        figure.legend(*key_of(grid.flat), loc="outside lower center", ncols=4)
         reached = "target reached" if log.reached else "target not reached"
         how = "" if log.outcome in ("", "reached", "interrupted") else f", {log.outcome}"
         headline(figure, _title(log, f"{reached}, {collision_words(log.collisions)}{how}"))
@@ -152,28 +150,14 @@ def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bo
         ax: axes to draw into; None for new ones.
         legend: False leaves out the legend below the axes.
     """
-    ax = new_axes(ax)
-    _things(log, tick, ax)
-    estimated = has_estimate(log)
-    if estimated:
-        ax.plot(*log.truth[: tick + 1, :2].T, color=css("odometry"), lw=0.9, label="true way", zorder=4)
-    name = "estimated past" if estimated else "way flown"
-    ax.plot(*log.believed[: tick + 1, :2].T, color=css("trail"), lw=1.6, label=name, zorder=5)
-    past, plan = log.pasts[tick], log.plans[tick]
-    if len(past) > 1:
-        ax.plot(*past[:, :2].T, color=css("robot"), lw=2.6, label="its window that is smoothed", zorder=6)
-    if len(plan) > 1 and np.isfinite(plan).all():
-        ax.plot(*plan[:, :2].T, color=css("horizon"), lw=2.6, label="predicted future", zorder=7)
-    _landmarks(log, tick, ax)
-    x, y = log.truth[tick, :2].tolist()
-    reach = sensor_reach(log)
-    if reach is not None:
-        discs(ax, [x, y, reach], "reach of the sensor", fill=False, edgecolor=css("scan"), lw=1.3, zorder=3)
-    discs(ax, [x, y, VEHICLE_RADIUS], facecolor=css("robot"), edgecolor="white", lw=0.6, zorder=9)
-    ax.plot(*log.layout.start[:2], "o", color=css("start"), ms=4, zorder=8, label="start")
-    star: dict[str, Any] = {"color": css("goal"), "ms": 13, "mec": INK, "mew": 0.7, "ls": "none", "zorder": 10}
-    ax.plot(*log.layout.target[:2], "*", label="target", **star)
-
+    scene = flight_stage(log, sensed=sensor_reach(log) is not None, estimated=has_estimate(log))
+    past, before = slice(tick + 1), max(1, tick + 2 - len(log.pasts[tick]))
+    scene.way("trail", log.believed[:before, :3])
+    scene.way("truth", log.truth[past, :3] if has_estimate(log) else log.truth[:0, :3])
+    flight_frame(scene, scene.frame(), log, tick)
+    for index in range(log.movers.shape[1]):
+        scene.way(f"way of mover {index}", log.movers[past, index, :2], width=0.05, colour="moving", legend="")
+    ax = scene.draw(ax)
     ground(ax, log.layout.size[0] - _MARGIN, log.layout.size[1] + _MARGIN)
     speed = float(np.linalg.norm(log.truth[tick, 7:]))
     stored = ", stored plan flown" if log.emergency[tick] else ""
@@ -182,34 +166,6 @@ def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bo
     if legend:
         ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4)
     return ax
-
-
-def _things(log: FlightLog, tick: int, ax: Axes) -> None:
-    """Walls, cylinders and movers."""
-    for index, wall in enumerate(log.layout.walls):
-        ax.plot(*wall.T, color=css("wall"), lw=3.0, solid_capstyle="butt", zorder=2, label=None if index else "wall")
-    seen = np.array([first is not None and first <= tick for first in first_sights(log)], dtype=bool)
-    name = "cylinder" if sensor_reach(log) is None else "cylinder seen by then"
-    cylinders = log.layout.cylinders
-    discs(ax, cylinders[seen], name, zorder=2, lw=1.0, facecolor=css("fixed"), edgecolor=css("fixed"))
-    discs(ax, cylinders[~seen], "not seen yet", zorder=2, lw=1.0, fc="none", ec=GREY, ls=(0, (3, 2)))
-    for places in log.movers[: tick + 1].transpose(1, 0, 2):
-        ax.plot(*places[:, :2].T, color=css("moving"), lw=0.9, alpha=0.6, zorder=2)
-    style = {"facecolor": css("moving"), "edgecolor": "none", "zorder": 2}
-    discs(ax, log.movers[tick], "moving cylinder, and its way so far", **style)
-
-
-def _landmarks(log: FlightLog, tick: int, ax: Axes) -> None:
-    from matplotlib.colors import to_rgb
-    from matplotlib.patches import Ellipse
-
-    row = log.landmarks[tick]
-    style = {"facecolor": (*to_rgb(css("estimate")), 0.45), "edgecolor": css("estimate"), "lw": 0.8, "zorder": 6}
-    for index, (mean, covariance) in enumerate(zip(row["mean"].tolist(), row["covariance"], strict=True)):
-        long, short, direction = ellipse_axes(covariance, SIGMAS)
-        ellipse = Ellipse(mean, 2.0 * long, 2.0 * short, angle=math.degrees(direction), **style)
-        ellipse.set_label(None if index else "landmark as believed, 2\u03c3")
-        ax.add_patch(ellipse)
 
 
 def plot_parameter(log: FlightLog, name: str, ax: Axes | None = None) -> Axes:

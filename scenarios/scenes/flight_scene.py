@@ -23,7 +23,7 @@ from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["first_sights", "flight_frame", "flight_scene", "flight_stage", "sensor_reach"]
+__all__ = ["flight_frame", "flight_scene", "flight_stage", "sensor_reach"]
 
 SIGMAS = 2.0
 """Half axes of ellipses in standard deviations."""
@@ -115,19 +115,6 @@ def flight_scene(log: FlightLog) -> Scene:
     return scene
 
 
-def first_sights(log: FlightLog) -> list[int | None]:
-    """Tick at which each cylinder of the layout was first seen; None for never, all 0 in a flight without a sensor."""
-    count = len(log.layout.cylinders)
-    if not any(len(ids) for ids in log.seen):
-        return [0] * count
-    first: list[int | None] = [None] * count
-    for tick in reversed(range(log.ticks)):
-        for name in log.seen[tick].tolist():
-            if name < count:
-                first[name] = tick
-    return first
-
-
 def sensor_reach(log: FlightLog) -> float | None:
     """Reach of the sensor [m], ``settings["sensor_range"]`` or the usual one; None in a flight without a sensor."""
     if not any(len(ids) for ids in log.seen):
@@ -155,8 +142,6 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
     _layers(scene, sensed, estimated)
     _bodies(scene, float(log.settings.get("sensor_range", SensorModel().range_max)) if sensed else None)
     layout(scene, log.layout, _HEIGHT)
-    scene.label("start", log.layout.start[:2])
-    scene.label("target", log.layout.target)
     _views(scene, log)
     declare(scene, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
     return scene

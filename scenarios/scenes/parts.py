@@ -36,13 +36,15 @@ def layout(scene: Scene, placed: Layout, height: float) -> None:
         frames += [shapes.tube(line, 0.03, 4) for line in (foot, top)]
         frames += [shapes.tube(np.stack([foot[k], top[k]]), 0.03, 4) for k in range(2)]
     if sheets:
-        scene.mesh("walls", shapes.merge(sheets), colour="wall", opacity=0.22, legend="")
+        scene.mesh("walls", shapes.merge(sheets), colour="wall", opacity=0.22, legend="walls")
         scene.mesh("wall frames", shapes.merge(frames), colour="wall", lit=True, legend="")
     start, target = placed.start, placed.target
     scene.mesh("start", shapes.ring(start[:2], 0.18, 0.07, 0.012, corners=32), colour="start", legend="")
     rings = [shapes.ring(target[:2], r, 0.07, 0.012, corners=40) for r in (0.12, 0.4)]
     ball = shapes.copies(shapes.sphere(), target[None], 0.16 * np.eye(3)[None])
     scene.mesh("target", shapes.merge([*rings, ball]), colour="goal", swatch="disc", legend="target")
+    scene.label("start", start[:2])
+    scene.label("target", target)
     scene.discs("pole", [[target[0], target[1], 0.025]], height=float(target[2]), colour="pole", legend="")
 
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unifg.scenarios.logs.safe_log import SafeLog
-from unifg.style.colours import GREY, INK, css
-from unifg.style.figures import discs, face, ground, headline, new_figure
+from unifg.scenarios.scenes.safe_scene import place_bodies, resting, safe_stage
+from unifg.style.colours import GREY, css
+from unifg.style.figures import face, ground, headline, new_figure
 from unifg.typing import Array
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ __all__ = ["picture", "plot_above", "plot_distance", "plot_error", "plot_speed",
 
 _LINES = ("robot", "estimate", "horizon", "scan", "trail", "moving", "fixed", "start")
 _STAMPS = 6  # places drawn of a body that moves
-_STILL = 1e-9  # [m]
 _BESIDE = 0.6  # around everything [m]
 _TITLES = {
     "static": "A quadrotor is to follow a line through a cylinder",
@@ -50,32 +50,36 @@ def picture(logs: Sequence[SafeLog]) -> Figure:
 def plot_above(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Ways from above; what moves is drawn at a few times, the later the darker."""
     first = logs[0]
-    for body, (radius, upright) in enumerate(zip(first.radii.tolist(), first.upright.tolist(), strict=True)):
-        places = first.bodies[:, body]
-        still = float(np.ptp(places, axis=0).max()) < _STILL
-        stamps = [0] if still else np.linspace(0, first.ticks - 1, _STAMPS).round().astype(int).tolist()
-        colour = css("trail" if still else "moving")
-        for k, tick in enumerate(stamps):
-            row = [*places[tick, :2].tolist(), radius]
-            share = 0.9 if still else 0.15 + 0.5 * k / _STAMPS
-            discs(ax, row, fc=colour, ec=INK, lw=0.6, alpha=share, zorder=2 + upright, label=None)
-            keep = [*places[tick, :2].tolist(), radius + first.hull + first.margin]
-            if still:
-                discs(ax, keep, None, fc="none", ec=GREY, lw=0.9, ls=(0, (2, 2)), zorder=4)
-        if not still:
-            ax.plot(*places[:, :2].T, color=css("moving"), lw=0.7, alpha=0.5, zorder=1)
-    ax.plot(*first.wanted[:, :2].T, color=GREY, lw=1.2, ls="--", zorder=5, label="path")
-    for log, colour in _coloured(logs):
-        ax.plot(*log.states[:, :2].T, color=colour, lw=1.7, zorder=6, label=log.label)
+    scene = safe_stage(first, resting(first))
+    scene.way("path", first.wanted[:, :3])
+    for index, rests in enumerate(resting(first)):
+        places, radius = first.bodies[:, index, :2], first.radii[index]
+        if rests:
+            continue
+        scene.way(f"way {index}", places, width=0.03, colour="moving", legend="")
+        for k, tick in enumerate(np.linspace(0, first.ticks - 1, _STAMPS).round().astype(int).tolist()):
+            opacity = 0.15 + 0.5 * k / _STAMPS
+            row = [[*places[tick], radius]]
+            scene.discs(f"body {index}, {k}", row, opacity=opacity, colour="moving", legend="")
+    for log, colour in zip(logs, _LINES * len(logs), strict=False):
+        scene.way(log.label, log.states[:, :3], width=0.06, colour=colour)
+    place_bodies(scene.frame(), first, first.ticks - 1)
+    ax = scene.draw(ax)
+    ground(ax, *_extent(logs))
+    ax.set_title("From above; rings: nearer than this the margin is not kept" if len(first.radii) else "From above")
+    return ax
+
+
+def _extent(logs: Sequence[SafeLog]) -> tuple[Array, Array]:
+    """Corners (2,) of the ground that is shown [m]: ways and path, and bodies that are not far away."""
+    first = logs[0]
     ends = np.concatenate([log.states[:, :2] for log in logs] + [first.wanted[:, :2]])
     if len(first.radii):
         near = first.bodies[0][:, :2]
         inside = np.abs(near).max(axis=1) < 50.0
         reach = first.radii[inside, None]
         ends = np.concatenate([ends, near[inside] - reach, near[inside] + reach])
-    ground(ax, ends.min(axis=0) - _BESIDE, ends.max(axis=0) + _BESIDE)
-    ax.set_title("From above; dotted: nearer than this the margin is not kept" if len(first.radii) else "From above")
-    return ax
+    return ends.min(axis=0) - _BESIDE, ends.max(axis=0) + _BESIDE
 
 
 def plot_speed(logs: Sequence[SafeLog], ax: Axes) -> Axes:

@@ -14,8 +14,9 @@ from unifg.scenarios.scenes.numbers import Number, declare, show
 from unifg.scenarios.scenes.parts import floor, pillar, vehicle
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
+from unifg.view.bodies import body_of
 
-__all__ = ["safe_frame", "safe_scene", "safe_stage"]
+__all__ = ["place_bodies", "resting", "safe_frame", "safe_scene", "safe_stage"]
 
 _HEIGHT = 3.0  # of cylinders, which have no end [m]
 _STILL = 1e-9  # [m]
@@ -63,7 +64,7 @@ def safe_scene(log: SafeLog) -> Scene:
     """
     if log.ticks == 0:
         raise ViewError("there is no tick, and nothing to show")
-    scene = safe_stage(log, [_rests(log.bodies[:, index]) for index in range(len(log.radii))])
+    scene = safe_stage(log, resting(log))
     low, high = _extent(log)
     corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (low[0], high[0]) for y in (low[1], high[1])]
     scene.around, scene.ground = np.array(corners), False
@@ -110,12 +111,11 @@ def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
         colour = "fixed" if still[index] else "moving"
         name, words = f"body {index}", {"fixed": "at rest", "moving": "moves"}[colour]
         like = first.get(colour)
-        if upright:
+        parts = [pillar(radius, _HEIGHT, colour)] if upright else body_of("ball", radius, colour)
+        if upright or still[index]:
             edge = shapes.ring(np.zeros(2), radius + log.hull + log.margin - 0.02, 0.02, 0.014, corners=48)
-            parts = [pillar(radius, _HEIGHT, colour), Part("margin", edge, "moving", False)]
-            scene.body(name, parts, colour=colour, legend=words, like=like)
-        else:
-            scene.body(name, "ball", size=radius, colour=colour, legend=words, like=like)
+            parts.append(Part("margin", edge, "moving", False))
+        scene.body(name, parts, colour=colour, legend=words, like=like)
         first.setdefault(colour, name)
 
 
@@ -124,13 +124,23 @@ def safe_frame(frame: Frame, log: Any, tick: int) -> None:
     state, plan = log.states[tick], log.plans[tick]
     frame.place("drone", state[:7])
     frame.place("shadow", [state[0], state[1], 0.0])
-    for index, place in enumerate(log.bodies[tick]):
-        z = 0.0 if log.upright[index] else place[2]
-        frame.place(f"body {index}", [place[0], place[1], z, 1.0, 0.0, 0.0, 0.0])
+    place_bodies(frame, log, tick)
     frame.trail("flown", state[:3])
     if len(plan) > 1 and np.isfinite(plan).all() and not _rests(plan):
         frame.way("plan", shapes.thin(plan, _NODES))
     show(frame, log, tick, _numbers(log))
+
+
+def place_bodies(frame: Frame, log: Any, tick: int) -> None:
+    """Place the obstacles; cylinders stand on the ground."""
+    for index, place in enumerate(log.bodies[tick]):
+        z = 0.0 if log.upright[index] else place[2]
+        frame.place(f"body {index}", [place[0], place[1], z, 1.0, 0.0, 0.0, 0.0])
+
+
+def resting(log: SafeLog) -> list[bool]:
+    """True for the bodies that rest."""
+    return [_rests(log.bodies[:, index]) for index in range(len(log.radii))]
 
 
 def _rests(points: Array) -> bool:

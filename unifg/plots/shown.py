@@ -131,7 +131,7 @@ def draw_path(part: Shown, ax: Axes) -> Axes:
     ax.quiver(*at[shown].T, *forward[shown].T, color=css("robot"), angles="xy", pivot="middle", units="inches",
               scale_units="inches", scale=6.5, width=0.016, headwidth=5.0, headlength=5.0, zorder=3)  # fmt: skip
     if part.covariance is not None:
-        _ellipses(part, ax)
+        _ellipses(part, carried(part.manifold, part.values, part.covariance, lambda x: x[:, :2]), ax)
     ax.plot(*at[0], "o", ms=6.0, mfc="white", mec=INK, mew=1.2, zorder=4, label=f"first [{part.members[0]}]")
     if len(at) > 1:
         ax.plot(*at[-1], "s", ms=6.0, mfc=css("goal"), mec=INK, mew=0.9, zorder=4, label=f"last [{part.members[-1]}]")
@@ -153,12 +153,11 @@ def _forward(part: Shown) -> Array:
     return np.asarray(SO3.act(part.values[:, TURN[part.manifold] :], np.array([1.0, 0.0, 0.0])))[:, :2]
 
 
-def _ellipses(part: Shown, ax: Axes) -> None:
-    """Of positions in the world, at some of the poses."""
+def _ellipses(part: Shown, spread: Array, ax: Axes) -> None:
+    """Of covariances (n, 2, 2) of positions in the world, at some of the poses."""
     from matplotlib.collections import PolyCollection
 
     circle = np.stack([np.cos(angles := np.linspace(0.0, 2.0 * np.pi, 41)), np.sin(angles)], axis=1)
-    spread = _carried(part, lambda x: x[:, :2])
     shown = _some(len(spread), ELLIPSES)
     values, vectors = np.linalg.eigh(spread[shown])
     roots = SIGMAS * np.sqrt(np.maximum(values, 0.0))
@@ -210,7 +209,8 @@ def _curves(
     many = len(names) > CURVES
     spread = None
     if part.covariance is not None:
-        spread = SIGMAS * np.sqrt(np.maximum(np.einsum("nii->ni", _carried(part, shown)), 0.0))
+        covariances = carried(part.manifold, part.values, part.covariance, shown)
+        spread = SIGMAS * np.sqrt(np.maximum(np.einsum("nii->ni", covariances), 0.0))
     marker = "." if len(index) <= POINTS else ""
     for k, name in enumerate(names):
         colour = GREY if many else css(CYCLE[k % len(CYCLE)])
@@ -259,17 +259,21 @@ def _limits(part: Shown, ax: Axes, colours: Sequence[str]) -> None:
                     ls="--")  # fmt: skip
 
 
-def _carried(part: Shown, shown: Callable[[Array], Array]) -> Array:
-    """(n, k, k) covariances of what is shown, to first order, by central differences along the tangent."""
-    assert part.covariance is not None
+def carried(manifold: Manifold, values: Array, covariance: Array, shown: Callable[[Array], Array]) -> Array:
+    """(n, k, k) covariances of what is shown of values, to first order, by central differences along the tangent.
+
+    Args:
+        manifold: of the values.
+        values: (n, storage).
+        covariance: (n, d, d) in the tangent spaces.
+        shown: takes values, returns (n, k) numbers.
+    """
     columns = []
-    for axis in range(part.manifold.dim):
-        step = np.zeros((len(part.values), part.manifold.dim))
-        step[:, axis] = STEP
-        ends = [shown(np.asarray(part.manifold.retract(part.values, sign * step))) for sign in (1.0, -1.0)]
+    for step in STEP * np.eye(manifold.dim):
+        ends = [shown(np.asarray(manifold.retract(values, sign * np.tile(step, (len(values), 1))))) for sign in (1, -1)]
         columns.append((ends[0] - ends[1]) / (2.0 * STEP))
     slopes = np.stack(columns, axis=2)
-    return np.asarray(np.einsum("nia,nab,njb->nij", slopes, part.covariance, slopes))
+    return np.asarray(np.einsum("nia,nab,njb->nij", slopes, covariance, slopes))
 
 
 def apart(pairs: IntArray, members: IntArray) -> IntArray:

@@ -11,7 +11,9 @@ from unifg.errors import ViewError
 from unifg.view import drone
 from unifg.view.shapes import Mesh, box, column, copies, merge, ring, sphere, tube, wedge
 
-__all__ = ["BODIES", "Part", "body_of"]
+__all__ = ["BODIES", "Part", "beams", "body_of"]
+
+_AXES = (("x", "moving"), ("y", "closure"), ("z", "robot"))  # red, green, blue
 
 
 class Part(NamedTuple):
@@ -29,14 +31,17 @@ def arrow(size: float, colour: str) -> list[Part]:
     return [Part("head", wedge(size, 0.05 * size), colour, lit=False)]
 
 
+def beams(size: float) -> list[Part]:
+    """Three beams of that length from the origin: x red, y green, z blue."""
+    return [
+        Part(name, tube(np.stack([np.zeros(3), end]), 0.06 * size, 4), shade, lit=False)
+        for (name, shade), end in zip(_AXES, size * np.eye(3), strict=True)
+    ]
+
+
 def axes(size: float, colour: str) -> list[Part]:
-    """Axes of that length: x red, y green, z blue."""
-    parts = []
-    for axis, (name, shade) in enumerate((("x", "moving"), ("y", "closure"), ("z", "robot"))):
-        end = np.zeros((2, 3))
-        end[1, axis] = size
-        parts.append(Part(name, tube(end, 0.06 * size, 4), shade, lit=False))
-    return [*parts, Part("origin", box(np.zeros(3), np.full(3, 0.16 * size)), colour)]
+    """Axes of that length and a block at their origin."""
+    return [*beams(size), Part("origin", box(np.zeros(3), np.full(3, 0.16 * size)), colour)]
 
 
 def ball(size: float, colour: str) -> list[Part]:

@@ -12,31 +12,12 @@ from unifg.style.colours import rgb
 from unifg.typing import Array
 from unifg.view.bodies import Part
 from unifg.view.page import Key, Label, Plot, View
-from unifg.view.things import Thing
+from unifg.view.things import Layer, Thing
 
-__all__ = ["Body", "Content", "Layer", "Placement", "Shot"]
+__all__ = ["Body", "Content", "Placement", "Shot"]
 
 _PALETTE = ("robot", "landmark", "horizon", "estimate", "moving", "trail", "odometry", "plan")
 _RESERVED = re.compile(r"[%/<>\x00-\x1f\ud800-\udfff]")
-
-
-@dataclass
-class Layer:
-    """Everything of one name.
-
-    Attributes:
-        path: of its objects.
-        level: rank from the ground up.
-        key: its line of the legend, None for none.
-        colour: of everything drawn.
-        width: of lines where they are not given one [m].
-    """
-
-    path: str
-    level: int
-    key: Key | None
-    colour: str
-    width: float | None = None
 
 
 @dataclass(frozen=True)

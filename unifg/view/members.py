@@ -11,14 +11,13 @@ import numpy as np
 from unifg.errors import ViewError
 from unifg.lie import SE2, SE3, Manifold, Product, Rn
 from unifg.modeling.variables import Selection
+from unifg.plots.shown import carried
 from unifg.typing import Array
 
 __all__ = ["Position", "Reading", "finite", "reading_of"]
 
 Position: TypeAlias = Callable[[Array], Array]
 """Takes stored values (n, storage), returns (n, 2) or (n, 3) places [m] or (n, 7) poses, quaternion w first."""
-
-_STEP = 1e-5  # of differences, in the tangent space
 
 
 @dataclass(frozen=True)
@@ -65,25 +64,7 @@ class Reading:
         """
         if self.position is None and self.kind == "points":
             return marginals
-        if self.position is None:
-            size = 2 if self.kind == "plane" else 3
-            group = SE2 if self.kind == "plane" else SE3
-            slopes = group.matrix(values)[:, :size, :size]  # p Exp(d) = p + R d_p + ...
-            marginals = marginals[:, :size, :size]
-        else:
-            slopes = self._slopes(values, marginals.shape[-1])
-        result: Array = slopes @ marginals @ slopes.transpose(0, 2, 1)
-        return result
-
-    def _slopes(self, values: Array, dim: int) -> Array:
-        """(n, p, d) derivatives of the places, by central differences."""
-        columns = []
-        for k in range(dim):
-            step = np.zeros((len(values), dim))
-            step[:, k] = _STEP
-            ahead, behind = (self.read(self.manifold.retract(values, way * step))[0] for way in (1.0, -1.0))
-            columns.append((ahead - behind) / (2.0 * _STEP))
-        return np.stack(columns, axis=2)
+        return carried(self.manifold, values, marginals, lambda members: self.read(members)[0])
 
 
 def reading_of(selection: Selection, position: Position | None) -> Reading:

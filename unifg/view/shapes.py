@@ -20,6 +20,7 @@ __all__ = [
     "copies",
     "cover",
     "ellipse_axes",
+    "every",
     "extrude",
     "flat",
     "known_corners",
@@ -277,11 +278,18 @@ def on_ground(rows: Array) -> Array:
     return np.column_stack([rows[:, :2], np.zeros(len(rows))])
 
 
+def every(count: int, most: int) -> IntArray:
+    """At most that many of 0, 1, ..., evenly, the first and the last among them."""
+    if count <= most:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, max(most, 1)).round().astype(np.intp))
+
+
 def thin(points: Array, most: int) -> Array:
     """At most that many of the points of a polyline, its ends among them, after repeated neighbours are left out."""
     apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > _APART
     kept: Array = points[np.concatenate([[True], apart])]
-    return kept[np.unique(np.linspace(0, len(kept) - 1, most).round().astype(np.intp))]
+    return kept[every(len(kept), most)]
 
 
 def ellipse_axes(covariance: Array, sigmas: float) -> tuple[float, float, float]:
