@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -280,11 +281,6 @@ class _Meter:
         bad = ", ".join(f"{c.outcomes[name]} {name}" for name in (FAILED, ERROR, LOST) if c.outcomes[name])
         text = f"{done} of {c.episodes}" + (f", {bad}" if bad else "")
         if c.ran:
-            text += f", {_clock((time.monotonic() - self._began) / c.ran * (c.episodes - done))} left"
+            ahead = (time.monotonic() - self._began) / c.ran * (c.episodes - done)
+            text += f", {timedelta(seconds=round(ahead))} left"
         self._progress(done / max(1, c.episodes), text)
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 from unifg.solution.history import Iteration
 
-__all__ = ["Outcome", "Progress", "by_iterations", "synchronized"]
+__all__ = ["Outcome", "Progress", "by_iterations"]
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Takes the share that is done, and a word about it; raises KeyboardInterrupt when the user wants to stop."""
@@ -47,13 +47,3 @@ def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], st
         progress(1.0 - pace**row.number, say(row))
 
     return tell
-
-
-def synchronized(*callbacks: Callable[[Iteration], None]) -> Callable[[Iteration], None]:
-    """A callback of a solver that calls others, one after the other."""
-
-    def each(row: Iteration) -> None:
-        for callback in callbacks:
-            callback(row)
-
-    return each

@@ -260,12 +260,9 @@ def _obstacles(scene: Scene, log: Any) -> None:
     if (~moves).any():
         words = "obstacle not on the map"
         scene.discs("obstacles", places[~moves], height=_WALL, colour="fixed", legend=words)
-    first: str | None = None
     for index in np.flatnonzero(moves).tolist():
-        name, radius = f"obstacle {index}", float(places[index, 2])
-        words = "obstacle that moves" if first is None else ""
-        scene.body(name, [pillar(radius, _WALL, "moving")], colour="moving", legend=words, like=first)
-        first = first or name
+        parts = [pillar(float(places[index, 2]), _WALL, "moving")]
+        scene.body(f"obstacle {index}", parts, colour="moving", legend="obstacle that moves")
 
 
 def _touch(frame: Frame, log: Any, tick: int) -> None:

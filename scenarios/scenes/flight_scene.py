@@ -169,11 +169,9 @@ def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     for index, (x, y, radius) in enumerate(log.movers[tick].tolist()):
         name = f"mover {index}"
         if name not in scene.bodies:
-            words = "cylinder that moves" if index == 0 else ""
-            like = "mover 0" if index else None
             rim = shapes.ring(np.zeros(2), radius - 0.03, 0.03, _HEIGHT + 0.01, corners=32)
             parts = [pillar(radius, _HEIGHT, "moving"), Part("rim", rim, "start", False)]
-            scene.body(name, parts, colour="moving", legend=words, like=like)
+            scene.body(name, parts, colour="moving", legend="cylinder that moves")
         frame.place(name, [x, y, 0.0])
     for name, way in (("past", log.pasts[tick]), ("horizon", log.plans[tick])):
         points = shapes.thin(way, _NODES) if len(way) > 1 and np.isfinite(way).all() else way[:0]
@@ -192,9 +190,10 @@ def _layers(scene: Scene, sensed: bool, estimated: bool) -> None:
     scene.layer("trail", "line", "trail", words, width=0.06)
     scene.layer("truth", "thin", "odometry", "true way, where it differs", width=0.028)
     scene.layer("horizon", "line", "horizon", "predicted future, and its shadow on the ground", width=0.1)
-    scene.layer("below", "line", "horizon", "", like="horizon")
-    scene.layer("seen", "disc", "fixed", "cylinder that has been seen" if sensed else "cylinder")
-    scene.layer("rims", "ring", "start", "", like="seen")
+    scene.layer("below", "line", "horizon", "predicted future, and its shadow on the ground")
+    words = "cylinder that has been seen" if sensed else "cylinder"
+    scene.layer("seen", "disc", "fixed", words)
+    scene.layer("rims", "ring", "start", words)
     scene.layer("unseen", "ghost", "wall", "cylinder not seen yet")
 
 
@@ -227,13 +226,11 @@ def _landmarks(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     for name, mean, covariance, radius in log.landmarks[tick]:
         ellipse, outline = f"landmark {name}", f"outline {name}"
         if ellipse not in scene.bodies:
-            others = [body for body in scene.bodies if body.startswith("landmark ")]
             words = "landmark as believed: outline, and 2\u03c3 ellipse of its axis on top"
-            like = others[0] if others else None
-            scene.body(ellipse, "ellipse", colour="estimate", swatch="ghost", legend=words, like=like)
+            scene.body(ellipse, "ellipse", colour="estimate", swatch="ghost", legend=words)
             if radius > 0.0:
                 ring = shapes.ring(np.zeros(2), radius, 0.05, 0.02, corners=32)
-                scene.body(outline, [Part("ring", ring, "estimate", False)], legend="", like=like or ellipse)
+                scene.body(outline, [Part("ring", ring, "estimate", False)], legend=words)
         frame.ellipse(ellipse, mean, covariance, sigmas=SIGMAS, z=_HEIGHT + 0.02 if radius > 0.0 else 0.03)
         if outline in scene.bodies:
             frame.place(outline, [*mean, 0.0])

@@ -106,17 +106,14 @@ def _extent(log: SafeLog) -> tuple[Array, Array]:
 
 def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
     """Obstacles, with the margin on the ground."""
-    first: dict[str, str] = {}
     for index, (radius, upright) in enumerate(zip(log.radii.tolist(), log.upright.tolist(), strict=True)):
         colour = "fixed" if still[index] else "moving"
         name, words = f"body {index}", {"fixed": "at rest", "moving": "moves"}[colour]
-        like = first.get(colour)
         parts = [pillar(radius, _HEIGHT, colour)] if upright else body_of("ball", radius, colour)
         if upright or still[index]:
             edge = shapes.ring(np.zeros(2), radius + log.hull + log.margin - 0.02, 0.02, 0.014, corners=48)
             parts.append(Part("margin", edge, "moving", False))
-        scene.body(name, parts, colour=colour, legend=words, like=like)
-        first.setdefault(colour, name)
+        scene.body(name, parts, colour=colour, legend=words)
 
 
 def safe_frame(frame: Frame, log: Any, tick: int) -> None:

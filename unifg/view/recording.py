@@ -139,7 +139,8 @@ def keys_of(content: Content, shots: list[Shot]) -> list[Key]:
     there = set(content.things)
     for shot in shots:
         there |= shot.things.keys() | shot.placed.keys() | shot.trails.keys()
-    return [layer.key for name, layer in content.layers.items() if layer.key is not None and name in there]
+    keys = [layer.key for name, layer in content.layers.items() if layer.key is not None and name in there]
+    return [key for k, key in enumerate(keys) if key not in keys[:k]]
 
 
 def number_of(shot: Shot, plot: str) -> float | None:

@@ -176,7 +176,7 @@ class Scene(Content, Canvas):
 
     def body(
         self, name: str, kind: str | Iterable[Part] = "arrow", *, size: float = 1.0, colour: str | None = None,
-        swatch: str = "disc", legend: str | None = None, like: str | None = None,
+        swatch: str = "disc", legend: str | None = None,
     ) -> None:  # fmt: skip
         """Something rigid that frames place.
 
@@ -186,13 +186,12 @@ class Scene(Content, Canvas):
             size: length of an arrow, of axes or of a car, radius of a disc or of a quadrotor [m].
             colour: of the body.
             swatch: of the legend.
-            legend: words of the legend.
-            like: another layer, whose line of the legend switches this one too.
+            legend: words of the legend; bodies with the same words share a line, which switches all of them.
 
         Raises:
             ViewError: there is no such kind, or the size is not positive.
         """
-        layer = self.layer(name, swatch, colour, legend, like=like)
+        layer = self.layer(name, swatch, colour, legend)
         parts = body_of(kind, size, layer.colour) if isinstance(kind, str) else list(kind)
         reach = max(float(np.linalg.norm(part.mesh[0], axis=1).max()) for part in parts)
         self.bodies[name] = Body(parts, reach)
@@ -332,7 +331,7 @@ class Scene(Content, Canvas):
         recipe.draw(self, values, solution, solution)
         ways: dict[str, Array] = {}
         for entry in recipe.shown:
-            places, poses = entry.reading.read(entry.of(values))
+            places, poses = entry.read(entry.of(values))
             if len(places) < 2 or not entry.joined:
                 continue
             extent = float(np.ptp(places, axis=0).max())
