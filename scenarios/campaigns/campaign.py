@@ -194,12 +194,11 @@ def _on_file(found: Campaign, known: set[str], code: str, again: bool, any_code:
 
 
 def _remark_changes(found: Campaign, statement: Statement, code: str, done: dict[str, str]) -> None:
-    path = found.folder / MANIFEST
-    if not path.is_file():
+    if not (found.folder / MANIFEST).is_file():
         return
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))["campaign"]
-    except (OSError, ValueError, KeyError, TypeError):
+        before = manifest_of(found.folder)["campaign"]
+    except ScenarioError:
         found.remarks.append(f"{MANIFEST} cannot be read: it is written anew")
         return
     if before != json.loads(json.dumps(statement.given, default=str)):

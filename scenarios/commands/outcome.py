@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
+from unifg.scenarios.episode import Progress
 from unifg.solution.history import Iteration
 
 __all__ = ["Outcome", "Progress", "by_iterations"]
-
-Progress: TypeAlias = Callable[[float, str], None]
-"""Takes the share that is done, and a word about it; raises KeyboardInterrupt when the user wants to stop."""
 
 
 @dataclass(frozen=True)

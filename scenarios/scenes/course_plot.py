@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from unifg.plots.descent import draw_cost, draw_errors
 from unifg.scenarios.course import Course
 from unifg.scenarios.scenes.course_scene import HEIGHT, iterate_scene
 from unifg.scenarios.scenes.panels import shade_distance
@@ -96,31 +97,16 @@ def plot_space(course: Course, number: int, ax: Any) -> Any:
 
 def plot_numbers(course: Course, what: str, ax: Axes) -> Axes:
     """The "cost" or the largest "violation" of every iterate; those drawn above are marked."""
-    from matplotlib.ticker import MaxNLocator
-
-    history = course.solution.history
-    values = np.array([getattr(row, what) for row in history])
-    if what == "violation":
+    values = course.solution.history.column(what)
+    if what == "cost":
+        draw_cost(ax, values, _TITLES[what])
+    else:
         values = np.maximum(values, _FLOOR)
-    chosen = chosen_iterates(len(history))
-    ax.plot(values, color=INK, lw=1.2, marker=".", ms=5)
+        draw_errors(ax, {what: values})
+    chosen = chosen_iterates(len(values))
     ax.plot(chosen, values[chosen], "o", color=_WAY, ms=8, mec=INK, mew=0.8, label="iterates shown above")
-    if (values > 0.0).all() and values.max() > 10.0 * values.min():
-        _logarithmic(ax, wide=values.max() > 1e4 * values.min())
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(loc="best")
     return face(ax, _TITLES[what], x="iterate")
-
-
-def _logarithmic(ax: Axes, *, wide: bool) -> None:
-    """A logarithmic axis, with plain numbers where few powers of ten are shown."""
-    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
-
-    ax.set_yscale("log")
-    if not wide:
-        ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        ax.yaxis.set_major_formatter(FormatStrFormatter("%g"))
-        ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _extent(course: Course) -> Array:

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from unifg.plots.descent import draw_cost
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.scenarios.scenes.graph_scene import declare_layers, draw_graph, draw_points, line_width
-from unifg.style.colours import css
-from unifg.style.figures import face, headline, key_of, new_figure
+from unifg.style.figures import headline, key_of, new_figure
 from unifg.typing import BoolArray
 from unifg.view import Scene
 
@@ -65,23 +65,16 @@ def plot_graph(graph: PoseGraph, outliers: BoolArray, name: str, ax: Axes) -> Ax
 
 
 def plot_cost(solved: SolvedGraph, ax: Axes) -> Axes:
-    """The cost that was minimised over iterations, on a logarithmic scale where it falls to less than a third."""
-    from matplotlib.ticker import MaxNLocator
-
+    """The cost that was minimised over iterations; a line begins the next surrogate of a robust loss."""
     rows = solved.solution.history
-    numbers, costs = [row.number for row in rows], np.array([row.cost for row in rows])
-    ax.plot(numbers, np.maximum(costs, 1e-300), "o-", color=css("robot"), ms=3.5, lw=1.2)
-    if costs.min() > 0.0 and costs.max() > 3.0 * costs.min():
-        ax.set_yscale("log")
-    stages = [row.number for before, row in pairwise(rows) if _stage(before) != _stage(row)]
+    stages = [k for k, (before, row) in enumerate(pairwise(rows), start=1) if _stage(before) != _stage(row)]
     for number in stages:
         ax.axvline(number - 0.5, color="#d5d9df", lw=0.8, zorder=0)
     what = "Cost with the robust loss" if solved.loss is not None else "Cost, half of $\\chi^2$"
     more = "; a line begins the next surrogate of the loss" if stages else ""
     solve = 1e3 * solved.seconds["solve"]
     title = f"{what}, per iteration: {solved.solution.iterations} in {solve:.0f} ms{more}"
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return face(ax, title, "cost", "iteration")
+    return draw_cost(ax, rows.column("cost"), title)
 
 
 def _stage(row: Any) -> Any:

@@ -6,13 +6,14 @@ optimum is blue. Nothing is told by colour alone: the guess is dashed, the optim
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unifg.plots.descent import draw_errors
 from unifg.scenarios.manoeuvres import Manoeuvre
-from unifg.scenarios.scenes.panels import forbid, plot_convergence, shade_distance
-from unifg.style.colours import GREY, INK, css
+from unifg.scenarios.scenes.panels import plot_held, shade_distance
+from unifg.style.colours import INK, css
 from unifg.style.figures import face, ground, headline, new_figure
 from unifg.typing import Array
 from unifg.view import Part, Scene
@@ -80,12 +81,9 @@ def plot_iterates(manoeuvre: Manoeuvre, ax: Axes) -> Axes:
 
 def plot_control(manoeuvre: Manoeuvre, column: int, ax: Axes) -> Axes:
     """One control of the optimum over time against its limits; column 0 is v, column 1 is omega."""
-    m = manoeuvre
-    limit = m.settings.limits[column]
-    ax.axhline(0.0, color=GREY, lw=0.8)
-    forbid(ax, (-limit, limit), (-1.3 * limit, 1.3 * limit), m.time[-1])
-    held = np.append(m.controls[:, column], m.controls[-1, column])
-    ax.step(m.time, held, where="post", color=_LAST, lw=1.8)
+    m, limit = manoeuvre, manoeuvre.settings.limits[column]
+    title, label = (("Forward speed v", "v [m/s]"), ("Turning speed $\\omega$", "$\\omega$ [rad/s]"))[column]
+    plot_held(ax, m.time, m.controls[:, column], (-limit, limit), title, label, "control")
     for k in m.cusps:
         ax.axvline(m.time[k], color=_CUSP, lw=1.8, ls="--")
         ax.annotate(
@@ -94,28 +92,21 @@ def plot_control(manoeuvre: Manoeuvre, column: int, ax: Axes) -> Axes:
         )  # fmt: skip
     for k in m.inflections:
         ax.axvline(m.time[k], color=INK, lw=1.0, ls=":")
-    ax.set_ylim(-1.3 * limit, 1.3 * limit)
-    ax.set_xlim(0.0, m.time[-1])
-    title, label = (("Forward speed v", "v [m/s]"), ("Turning speed $\\omega$", "$\\omega$ [rad/s]"))[column]
-    return face(ax, title, label, "time [s]")
+    ax.set_xlabel("time [s]")
+    return ax
 
 
 def plot_violation(manoeuvre: Manoeuvre, ax: Axes) -> Axes:
     """Largest violation of every iterate, in the colours of the iterates, and how far from stationary it is."""
-    history, tolerance = manoeuvre.solution.history, manoeuvre.settings.tolerance
-    violation = np.maximum([row.violation for row in history], _FLOOR)
+    history = manoeuvre.solution.history
+    errors = {name: np.maximum(history.column(name), _FLOOR) for name in ("stationarity", "violation")}
     # A guess that is the reference itself costs nothing: without multipliers it is stationary by accident.
-    stationarity = [row.stationarity if row.stationarity > _FLOOR else np.nan for row in history]
-    values = {"stationarity": stationarity, "violation": violation}
-    shown: dict[str, dict[str, Any]] = {
-        "stationarity": {"color": GREY, "ls": ":"},
-        "violation": {"color": INK, "lw": 0.8, "zorder": 2, "label": "largest violation"},
-    }
-    plot_convergence(ax, history, shown, tolerance, lambda name: values[name])
-    ax.scatter([row.number for row in history], violation, c=shades(len(history)), s=34, ec=INK, lw=0.6, zorder=3)
+    errors["stationarity"][errors["stationarity"] == _FLOOR] = np.nan
+    draw_errors(ax, errors, manoeuvre.settings.tolerance)
+    numbers, violation = np.arange(len(history)), errors["violation"]
+    ax.scatter(numbers, violation, c=shades(len(history)), s=34, ec=INK, lw=0.6, zorder=3)
     ax.set_ylim(bottom=0.3 * _FLOOR)
-    ax.legend(loc="upper right")
-    return ax
+    return face(ax, "What is wrong with each iterate", x="iterate")
 
 
 def shades(count: int) -> Array:
@@ -154,7 +145,7 @@ def _discs(manoeuvre: Manoeuvre, scene: Scene, ax: Axes, low: Array, high: Array
 
     shade_distance(ax, low, high, distance, _REACH, "#b9c2cf")
     scene.discs("discs", places, colour="fixed", legend="unforeseen disc (ground: nearer is darker)")
-    rings = merge([ring(row[:2], row[2] + kept - 0.005, 0.01, 0.001) for row in places])
+    rings = merge([ring(row[:2], row[2] + kept - 0.005, 0.01, 0.001, corners=64) for row in places])
     scene.mesh("rings", rings, colour="ink", swatch="ring", legend="the robot's centre stays outside")
     for place in places:
         scene.label("unforeseen disc", place[:2])

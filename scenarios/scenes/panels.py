@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unifg.solution.history import Iteration
 from unifg.style.colours import GREY, css
 from unifg.style.figures import dashes, face, new_axes
 from unifg.typing import Array, ArrayLike
@@ -18,11 +17,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
-    "forbid",
     "over_time",
     "padded",
     "plot_clearance",
-    "plot_convergence",
+    "plot_held",
     "plot_times",
     "shade",
     "shade_distance",
@@ -76,11 +74,29 @@ def shade(ax: Axes, flags: Array, dt: float, colour: str, alpha: float) -> None:
         ax.axvspan(begin * dt, end * dt, color=colour, alpha=alpha, lw=0)
 
 
-def forbid(ax: Axes, limits: tuple[float, float], ends: tuple[float, float], at: float) -> None:
-    """Shade values beyond limits, up to the ends of the axis, and write so at the time ``at`` [s]."""
-    for limit, end in zip(limits, ends, strict=True):
+def plot_held(
+    ax: Axes, time: Array, values: Array, limits: tuple[float, float] | None, title: str, label: str, name: str
+) -> Axes:
+    """Draw a control that is held between nodes; what lies beyond its limits is shaded.
+
+    Args:
+        ax: axes to draw into.
+        time: (n + 1,) of the nodes [s].
+        values: (n,) held from each node to the next.
+        limits: least and greatest value; None without any.
+        title: of the panel.
+        label: of its axis.
+        name: of the curve, for a legend.
+    """
+    bottom, top = padded(0.0, values, limits or (), share=0.15)
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    for limit, end in zip(limits or (), (bottom, top), strict=False):
         ax.axhspan(min(limit, end), max(limit, end), color=GREY, alpha=0.22, lw=0)
-        ax.text(at, 0.5 * (limit + end), "not allowed ", ha="right", va="center", fontsize=8, color="#4b5563")
+        ax.text(time[-1], 0.5 * (limit + end), "not allowed ", ha="right", va="center", fontsize=8, color="#4b5563")
+    ax.step(time, np.append(values, values[-1]), where="post", color=css("robot"), lw=1.6, label=name)
+    ax.set_ylim(bottom, top)
+    ax.set_xlim(0.0, time[-1])
+    return face(ax, title, label)
 
 
 def shade_trouble(ax: Axes, dt: float, health: Sequence[str], causes: Sequence[str], what: str) -> None:
@@ -143,30 +159,6 @@ def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], a
         ax.set_ylim(bottom=0.5 * float(np.percentile(spent, 1.0)))
     ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
     return over_time(log, ax, f"Time per tick: median {p50:.1f} ms, 99 % within {p99:.0f} ms", "time [ms]")
-
-
-def plot_convergence(
-    ax: Axes,
-    history: Sequence[Iteration],
-    shown: Mapping[str, Mapping[str, Any]],
-    tolerance: float,
-    values: Callable[[str], ArrayLike],
-) -> Axes:
-    """Numbers of the KKT test at every iterate, on a logarithmic axis, with the tolerance.
-
-    Args:
-        ax: axes to draw into.
-        history: of the solution.
-        shown: attributes of its rows, each with the style of its line.
-        tolerance: of the test.
-        values: what is drawn of an attribute, one number per row.
-    """
-    for name, style in shown.items():
-        ax.plot([row.number for row in history], values(name), **{"lw": 1.0, "label": name, **style})
-    ax.axhline(tolerance, color=GREY, lw=0.9, ls="--")
-    ax.annotate("tolerance", (0, tolerance), xytext=(2, 2), textcoords="offset points", fontsize=8)
-    ax.set_yscale("log")
-    return face(ax, "What is wrong with each iterate", x="iterate")
 
 
 def shade_distance(

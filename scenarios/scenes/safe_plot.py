@@ -84,22 +84,19 @@ def _extent(logs: Sequence[SafeLog]) -> tuple[Array, Array]:
 
 def plot_speed(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Speed of the vehicle and of the path."""
-    paths: list[Array] = []
-    for log, colour in _coloured(logs):
-        wanted = np.linalg.norm(log.wanted[:, 3:], axis=1)
-        if not any(len(path) == len(wanted) and np.allclose(path, wanted) for path in paths):
-            ax.plot(log.time, wanted, color=GREY, lw=1.2, ls="--")
-            paths.append(wanted)
-        ax.plot(log.time, np.linalg.norm(log.states[:, 7:], axis=1), color=colour, lw=1.3)
+    paths = [np.linalg.norm(log.wanted[:, 3:], axis=1) for log in logs]
+    for k, (log, path) in enumerate(zip(logs, paths, strict=True)):
+        if not any(len(path) == len(other) and np.allclose(path, other) for other in paths[:k]):
+            ax.plot(log.time, path, color=GREY, lw=1.2, ls="--")
+    _curves(ax, logs, [np.linalg.norm(log.states[:, 7:], axis=1) for log in logs])
     return face(ax, "Speed; dashed: of the path", "[m/s]", "time [s]")
 
 
 def plot_distance(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Boundary distance: between hull and the nearest surface, beyond the margin."""
-    for log, colour in _coloured(logs):
-        ax.plot(log.time, log.boundary, color=colour, lw=1.4)
-        least = int(np.argmin(log.boundary))
-        ax.plot(log.time[least], log.boundary[least], "o", color=colour, ms=4)
+    _curves(ax, logs, [log.boundary for log in logs])
+    for log, colour in zip(logs, _LINES * len(logs), strict=False):
+        ax.plot(log.time[np.argmin(log.boundary)], log.boundary.min(), "o", color=css(colour), ms=4)
     ax.axhline(0.0, color=css("moving"), lw=1.0)
     ax.set_ylim(top=min(ax.get_ylim()[1], 4.0))
     return face(ax, "Boundary distance: beyond the margin, along the whole way", "[m]", "time [s]")
@@ -107,19 +104,20 @@ def plot_distance(logs: Sequence[SafeLog], ax: Axes) -> Axes:
 
 def plot_error(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Distance from where the path is."""
-    for log, colour in _coloured(logs):
-        ax.plot(log.time, 1e3 * np.linalg.norm(log.error, axis=1), color=colour, lw=1.0)
+    _curves(ax, logs, [1e3 * np.linalg.norm(log.error, axis=1) for log in logs])
     return face(ax, "Distance from the path", "[mm]", "time [s]")
 
 
 def plot_time(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Share of the ticks that were decided within a time."""
-    for log, colour in _coloured(logs):
-        ax.plot(np.sort(log.decide_ms), 100.0 * np.arange(1, log.ticks + 1) / log.ticks, color=colour, lw=1.4)
+    shares = [100.0 * np.arange(1, log.ticks + 1) / log.ticks for log in logs]
+    _curves(ax, logs, shares, [np.sort(log.decide_ms) for log in logs])
     ax.set_ylim(0.0, 102.0)
     ax.set_xlim(left=0.0)
     return face(ax, "Ticks decided within a processor time", "[%]", "[ms]")
 
 
-def _coloured(logs: Sequence[SafeLog]) -> list[tuple[SafeLog, str]]:
-    return [(log, css(_LINES[k % len(_LINES)])) for k, log in enumerate(logs)]
+def _curves(ax: Axes, logs: Sequence[SafeLog], values: Sequence[Array], over: Sequence[Array] | None = None) -> None:
+    """One curve for each flight, over its time unless something else is given."""
+    for x, y, colour in zip(over or [log.time for log in logs], values, _LINES * len(logs), strict=False):
+        ax.plot(x, y, color=css(colour), lw=1.4)
