@@ -22,7 +22,8 @@ from unifg.scenarios.scenes.flight_plot import control, estimates, moments, over
 from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.style.colours import css
-from unifg.view import drone, shapes
+from unifg.view import shapes
+from unifg.view.bodies import body_of
 
 umsgpack = pytest.importorskip("umsgpack")
 
@@ -275,11 +276,11 @@ def test_odd_flights_are_drawn_too(log: FlightLog) -> None:
 
 
 def test_drone_fits_its_radius() -> None:
-    for part in (drone.rotors(0.25, front=True), drone.rotors(0.25, front=False), drone.arms(0.25), drone.body(0.25)):
-        vertices, faces = part
+    parts = {part.name: part.mesh for part in body_of("quadrotor", 0.25, "robot")}
+    for vertices, faces in parts.values():
         assert np.hypot(vertices[:, 0], vertices[:, 1]).max() <= 0.25 + 1e-9
         assert faces.min() == 0 and faces.max() == len(vertices) - 1
-    rotors = [drone.rotors(0.25, front=front)[0] for front in (True, False)]
+    rotors = [parts["front/rotors"][0], parts["back/rotors"][0]]
     assert np.hypot(*rotors[0].T[:2]).max() == pytest.approx(0.25, rel=0.01)
     assert rotors[0][:, 0].min() > 0.0 > rotors[1][:, 0].max()
 

@@ -12,7 +12,7 @@ import json
 import logging
 import socket
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
@@ -268,19 +268,13 @@ class Live:
     def _grown(self, ground: Ground) -> Ground:
         """The ground of all that has been seen: a view of everything that follows each frame would tremble."""
         before = self._ground
-        if before is not None:
-            low, high = np.minimum(before.low, ground.low), np.maximum(before.high, ground.high)
-            size = max(float((high - low).max()), before.size)
+        if before is not None:  # some room beyond, so that it need not grow again at once
+            reach = np.maximum(before.high, ground.high) - np.minimum(before.low, ground.low)
+            size = max(float(reach.max()), before.size)
+            margin = 0.1 * size * np.array([1.0, 1.0, 0.0])
+            low = np.where(ground.low < before.low, ground.low - margin, before.low)
+            high = np.where(ground.high > before.high, ground.high + margin, before.high)
             ground = Ground(low, high, before.origin, size, before.flat and ground.flat)
-            if np.array_equal(low, before.low) and np.array_equal(high, before.high):
-                ground = replace(before, flat=ground.flat)
-            else:  # some room beyond, so that it need not grow again at once
-                margin = 0.1 * size * np.array([1.0, 1.0, 0.0])
-                ground = replace(
-                    ground,
-                    low=np.where(low < before.low, low - margin, low),
-                    high=np.where(high > before.high, high + margin, high),
-                )
         self._ground = ground
         return ground
 

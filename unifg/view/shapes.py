@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
+from unifg.plots.shown import every
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 __all__ = [
@@ -20,7 +21,6 @@ __all__ = [
     "copies",
     "cover",
     "ellipse_axes",
-    "every",
     "extrude",
     "flat",
     "known_corners",
@@ -276,13 +276,6 @@ def column(corners: int = 24, bottom: float = 1.0) -> Mesh:
 def on_ground(rows: Array) -> Array:
     """Places (n, 3) [m] on the ground of rows that begin with x and y."""
     return np.column_stack([rows[:, :2], np.zeros(len(rows))])
-
-
-def every(count: int, most: int) -> IntArray:
-    """At most that many of 0, 1, ..., evenly, the first and the last among them."""
-    if count <= most:
-        return np.arange(count)
-    return np.unique(np.linspace(0, count - 1, max(most, 1)).round().astype(np.intp))
 
 
 def thin(points: Array, most: int) -> Array:

@@ -9,11 +9,11 @@ import numpy as np
 
 from unifg.errors import ViewError
 from unifg.modeling.variables import Family, Selection, Variable, as_selection
+from unifg.plots.shown import every
 from unifg.solution.solution import Solution
 from unifg.typing import Array
 from unifg.view.canvas import Canvas, Frame
 from unifg.view.members import Members, Position, Values, members_of
-from unifg.view.shapes import every
 
 __all__ = ["Recipe", "recipe_of"]
 

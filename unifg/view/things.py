@@ -14,10 +14,11 @@ import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE3
+from unifg.plots.shown import every
 from unifg.typing import Array
 from unifg.view import bodies, shapes
 from unifg.view.page import Key
-from unifg.view.shapes import Mesh, every
+from unifg.view.shapes import Mesh
 
 __all__ = [
     "Layer",
