@@ -18,7 +18,7 @@ from unifg.scenarios.commands.flights import summary, write_results
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.logs.flight_metrics import flight_metrics, landmark_errors
-from unifg.scenarios.scenes.flight_plot import control, estimates, moments, overview, plot_moment
+from unifg.scenarios.scenes.flight_plot import control, estimates, overview, plot_moment
 from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.style.colours import css
@@ -355,19 +355,20 @@ def test_landmarks_far_from_everything_are_not_counted(log: FlightLog) -> None:
 
 def test_overview_draws_the_moments_it_names(log: FlightLog) -> None:
     from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
 
-    assert moments(log).tolist() == [0, 5, 9, 14, 18, 23] and moments(flight(3)).tolist() == [0, 1, 2]
+    assert len([ax for ax in overview(flight(3)).axes if ax.axison]) == 3
     figure = overview(log)
     times = [ax.get_title(loc="left")[:3] for ax in figure.axes]
     assert times == "0.0 0.2 0.5 0.7 0.9 1.2".split()
     legend = {text.get_text() for box in figure.legends for text in box.get_texts()}
     words = "window that is smoothed", "predicted future", "reach of the sensor", "cylinder that has been seen"
     assert all(any(word in text for text in legend) for word in words)
-    ax = plot_moment(log, 12)
+    ax = plot_moment(log, 12, Figure().subplots())
     faces = {to_hex(np.asarray(c.get_facecolor())[0]): c for c in ax.collections if len(np.asarray(c.get_facecolor()))}
     middles = {round(float(np.asarray(path.vertices).mean(axis=0)[0])) for path in faces[css("fixed")].get_paths()}
     assert 3 in middles and 6 in middles and max(middles) < 8  # cylinders 0 and 1 by then
-    assert "stored plan" in plot_moment(log, 5).get_title()
+    assert "stored plan" in plot_moment(log, 5, Figure().subplots()).get_title()
 
 
 def test_estimates_and_controls_show_what_there_is(log: FlightLog) -> None:

@@ -1,7 +1,6 @@
 """Scenes and plots: what is in the files, read back without a browser."""
 
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,15 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from episodes import HORIZON, episode, room
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from unifg.errors import ViewError
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.scenes import drive_plot
-from unifg.scenarios.scenes.drive_plot import overview, plot_controls, plot_localisation, plot_map
+from unifg.scenarios.scenes.drive_plot import overview, plot_localisation
 from unifg.scenarios.scenes.drive_scene import drive_scene, scan_points
-from unifg.scenarios.scenes.panels import plot_clearance, plot_times
+from unifg.scenarios.scenes.panels import plot_times
 from unifg.style.figures import write_figure
 from unifg.view.recorder import Recorder, viewer_script
 from unifg.view.shapes import cover, extrude, flat, known_corners, ribbon
@@ -249,25 +249,9 @@ def test_overview_names_everything(log: EpisodeLog) -> None:
     assert "1 of 1 goals reached" in title and "alm" in title and "seed 3" in title
 
 
-def test_plots_draw_into_the_axes_they_get_without_global_state(log: EpisodeLog) -> None:
-    from matplotlib.figure import Figure
-
-    def spent(log: EpisodeLog, ax: Axes | None = None) -> Axes:
-        return plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")}, ax)
-
-    before = "matplotlib.pyplot" in sys.modules
-    for plot in (plot_map, plot_localisation, plot_clearance, spent):
-        ax = Figure().subplots()
-        assert plot(log, ax=ax) is ax
-        assert plot(log) is not ax
-    pair = tuple(Figure().subplots(2, 1))
-    assert plot_controls(log, ax=pair) == pair
-    assert ("matplotlib.pyplot" in sys.modules) == before
-
-
 def test_times_stand_on_a_logarithmic_axis_and_ticks_that_compiled_are_marked(log: EpisodeLog) -> None:
     def drawn(log: EpisodeLog) -> Axes:
-        return plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")})
+        return plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")}, Figure().subplots())
 
     assert drawn(log).get_yscale() == "log"
     late = episode(ticks=200)
@@ -283,7 +267,7 @@ def test_times_stand_on_a_logarithmic_axis_and_ticks_that_compiled_are_marked(lo
 
 
 def test_plotted_error_is_the_error(log: EpisodeLog) -> None:
-    line = plot_localisation(log).get_lines()[0]
+    line = plot_localisation(log, Figure().subplots()).get_lines()[0]
     np.testing.assert_allclose(np.asarray(line.get_ydata()), 5.0)  # [cm]
 
 

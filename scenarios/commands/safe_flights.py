@@ -27,7 +27,7 @@ def run(settings: safe_flight.SafeSettings, progress: Progress, announce: Announ
         KeyboardInterrupt: when stopped before the first tick.
         ScenarioError: for a case or a controller that is unknown.
     """
-    with watching_ticks(announce, safe_stage, lambda scene, frame, log, tick: safe_frame(frame, log, tick)):
+    with watching_ticks(announce, safe_stage, safe_frame):
         logs = [log for log in safe_flight.run_safe_flights(settings, progress) if log.ticks]
     if not logs:
         raise KeyboardInterrupt

@@ -12,7 +12,7 @@ from unifg.scenarios.logs.metrics import collision_words
 from unifg.scenarios.scenes.drive_scene import drive_stage, place_movers
 from unifg.scenarios.scenes.panels import over_time, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import css
-from unifg.style.figures import headline, new_axes, new_figure
+from unifg.style.figures import headline, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,27 +29,21 @@ def overview(log: EpisodeLog) -> Figure:
     """
     with new_figure((15.0, 9.4), log.ticks) as figure:
         left, right = figure.subfigures(1, 2, width_ratios=(1.75, 1.0), squeeze=False)[0]
-        place = plot_map(log, ax=left.subplots(), legend=False)
+        place = plot_map(log, left.subplots())
         left.legend(*place.get_legend_handles_labels(), loc="outside lower center", ncols=4)
         panels = right.subplots(5, 1, sharex=True)
-        plot_localisation(log, ax=panels[0])
-        plot_controls(log, ax=(panels[1], panels[2]))
-        plot_clearance(log, ax=panels[3])
-        plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")}, ax=panels[4])
+        plot_localisation(log, panels[0])
+        plot_controls(log, panels[1], panels[2])
+        plot_clearance(log, panels[3])
+        plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")}, panels[4])
         panels[-1].set_xlabel("time [s]")
         right.align_ylabels(panels)
         headline(figure, _title(log))
     return figure
 
 
-def plot_map(log: EpisodeLog, ax: Axes | None = None, *, legend: bool = True) -> Axes:
-    """The scene of the end of the drive from above, with the ways of the estimate, of the wheels and of what moves.
-
-    Args:
-        log: the drive.
-        ax: axes to draw into; None for new ones.
-        legend: False leaves out the legend below the axes.
-    """
+def plot_map(log: EpisodeLog, ax: Axes) -> Axes:
+    """The scene of the end of the drive from above, with the ways of the estimate, of the wheels and of what moves."""
     scene = drive_stage(log, log.outcomes)
     scene.way("trail", log.true_pose[:, :2])
     thin = 0.3 * (scene.layers["trail"].width or 0.0)
@@ -63,14 +57,12 @@ def plot_map(log: EpisodeLog, ax: Axes | None = None, *, legend: bool = True) ->
     frame = scene.frame()
     frame.place("robot", log.true_pose[-1])
     place_movers(frame, log, log.ticks - 1)
-    ax = scene.draw(ax)
+    scene.draw(ax)
     ax.set_title("Where it went")
-    if legend:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.07), ncols=4)
     return ax
 
 
-def plot_localisation(log: EpisodeLog, ax: Axes | None = None) -> Axes:
+def plot_localisation(log: EpisodeLog, ax: Axes) -> Axes:
     """Distance between estimate and truth over time [cm], with dead reckoning where it fits into the picture."""
     error, odometry = (pose_errors(poses, log.true_pose)[0] for poses in (log.estimate, log.dead_reckoning))
     curves = (
@@ -79,7 +71,7 @@ def plot_localisation(log: EpisodeLog, ax: Axes | None = None) -> Axes:
     )
     top = 100.0 * max(1.3 * float(error.max()), 3.0 * float(error.mean()), 0.01)
     title = f"Localisation error, {100.0 * error.mean():.1f} cm on average"
-    ax = over_time(log, ax, title, "error [cm]", curves, bounds=(0.0, top))
+    over_time(log, ax, title, "error [cm]", curves, bounds=(0.0, top))
     if odometry.max() > error.max():
         ax.annotate(
             f"odometry ends {odometry[-1]:.2f} m off",
@@ -88,18 +80,17 @@ def plot_localisation(log: EpisodeLog, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_controls(log: EpisodeLog, ax: tuple[Axes, Axes] | None = None) -> tuple[Axes, Axes]:
+def plot_controls(log: EpisodeLog, speed: Axes, turning: Axes) -> None:
     """Forward and turning speed over time against their limits, in two axes."""
-    both = (new_axes(None), new_axes(None)) if ax is None else ax
     names = (("v [m/s]", "Forward speed and its limits"), ("$\\omega$ [rad/s]", "Turning speed and its limits"))
     style = {"color": css("robot"), "lw": 1.1, "drawstyle": "steps-post"}
-    for axes, values, limit, (label, title) in zip(both, log.control.T, log.control_limits, names, strict=True):
+    rows = zip((speed, turning), log.control.T, log.control_limits, names, strict=True)
+    for ax, values, limit, (label, title) in rows:
         bounds, curve = (-1.18 * limit, 1.18 * limit), (values, style)
-        over_time(log, axes, title, label, [curve], levels=(-limit, limit), bounds=bounds)
-    shade_trouble(both[0], log.dt, log.health, log.cause, "Forward speed")
+        over_time(log, ax, title, label, [curve], levels=(-limit, limit), bounds=bounds)
+    shade_trouble(speed, log.dt, log.health, log.cause, "Forward speed")
     if float(log.control[:, 0].min()) >= 0.0:  # it never reversed: show the half that was used
-        both[0].set_ylim(-0.08 * log.control_limits[0], 1.18 * log.control_limits[0])
-    return both
+        speed.set_ylim(bottom=-0.08 * log.control_limits[0])
 
 
 def _title(log: EpisodeLog) -> str:

@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from unifg.errors import ViewError
 from unifg.lie import SE2
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.metrics import collision_words, health
-from unifg.scenarios.scenes.numbers import Number, declare, in_words, metres, show
+from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
 from unifg.scenarios.scenes.parts import pillar
 from unifg.typing import Array, IntArray
 from unifg.view import Frame, Part, Scene, shapes
@@ -89,11 +89,8 @@ def drive_scene(log: EpisodeLog) -> Scene:
     Raises:
         ViewError: the drive has no tick.
     """
-    if log.ticks == 0:
-        raise ViewError("there is no tick, and nothing to show")
-    scene = drive_stage(log, log.outcomes)
-    for tick in range(log.ticks):
-        drive_frame(scene.frame(), log, tick, min(log.ticks, _FRAMES))
+    frames = min(log.ticks, _FRAMES)
+    scene = filled(log, partial(drive_stage, log, log.outcomes), partial(drive_frame, frames=frames))
     m = episode_metrics(log)
     stopped = ", interrupted by the user" if m["interrupted"] else ""
     missed = "".join(f"; {words}" for words in dict.fromkeys(m["outcomes"]) if words != "reached")  # each once
@@ -147,11 +144,12 @@ def drive_stage(log: Any, outcomes: Sequence[str] = ()) -> Scene:
     return scene
 
 
-def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
+def drive_frame(scene: Scene, frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
     """Draw a tick of a drive.
 
     Args:
-        frame: to be drawn on.
+        scene: begun by `drive_stage`.
+        frame: of it, to be drawn on.
         log: an `EpisodeLog`, or one in the making.
         tick: which.
         frames: how many the file will hold.

@@ -14,14 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.errors import ViewError
+from unifg.plots.shown import every
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
 from unifg.scenarios.logs.metrics import collision_words
 from unifg.scenarios.scenes.flight_scene import flight_frame, flight_stage, sensor_reach
 from unifg.scenarios.scenes.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import INK, css
-from unifg.style.figures import ground, headline, key_of, new_axes, new_figure
-from unifg.typing import Array, IntArray
+from unifg.style.figures import ground, headline, key_of, new_figure
+from unifg.typing import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 __all__ = [
     "control",
     "estimates",
-    "moments",
     "overview",
     "plot_control",
     "plot_height",
@@ -40,6 +40,7 @@ __all__ = [
     "plot_state_error",
 ]
 
+_MOMENTS = 6  # evenly spread from the first tick to the last
 _MARGIN = 0.6  # around the layout [m]
 _WIDE = 2.0  # layouts at least this many times as long as wide are drawn in two columns, others in three
 _COLUMNS = 3  # of panels with estimates
@@ -63,7 +64,7 @@ def overview(log: FlightLog) -> Figure:
     """
     width, height = np.ptp(log.layout.size, axis=0) + 2.0 * _MARGIN
     columns = 2 if width >= _WIDE * height else 3
-    shown = moments(log)
+    shown = every(log.ticks, _MOMENTS)
     rows = math.ceil(len(shown) / columns)
     panel = 14.4 / columns
     with new_figure((15.0, rows * (panel * height / width + 0.42) + 1.1), log.ticks) as figure:
@@ -71,7 +72,7 @@ def overview(log: FlightLog) -> Figure:
         for ax in grid.flat[len(shown) :]:
             ax.set_axis_off()
         for ax, tick in zip(grid.flat, shown.tolist(), strict=False):
-            plot_moment(log, tick, ax=ax, legend=False).label_outer()
+            plot_moment(log, tick, ax).label_outer()
         figure.legend(*key_of(grid.flat), loc="outside lower center", ncols=4)
         reached = "target reached" if log.reached else "target not reached"
         how = "" if log.outcome in ("", "reached", "interrupted") else f", {log.outcome}"
@@ -136,20 +137,8 @@ def control(log: FlightLog) -> Figure:
     return figure
 
 
-def moments(log: FlightLog, count: int = 6) -> IntArray:
-    """At most that many ticks, evenly spread from the first to the last."""
-    return np.unique(np.linspace(0, log.ticks - 1, count).round().astype(np.intp))
-
-
-def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bool = True) -> Axes:
-    """Obstacles, belief and plan at one tick, from above.
-
-    Args:
-        log: the flight.
-        tick: which.
-        ax: axes to draw into; None for new ones.
-        legend: False leaves out the legend below the axes.
-    """
+def plot_moment(log: FlightLog, tick: int, ax: Axes) -> Axes:
+    """Obstacles, belief and plan at one tick, from above."""
     scene = flight_stage(log, sensed=sensor_reach(log) is not None, estimated=has_estimate(log))
     past, before = slice(tick + 1), max(1, tick + 2 - len(log.pasts[tick]))
     scene.way("trail", log.believed[:before, :3])
@@ -157,24 +146,22 @@ def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bo
     flight_frame(scene, scene.frame(), log, tick)
     for index in range(log.movers.shape[1]):
         scene.way(f"way of mover {index}", log.movers[past, index, :2], width=0.05, colour="moving", legend="")
-    ax = scene.draw(ax)
+    scene.draw(ax)
     ground(ax, log.layout.size[0] - _MARGIN, log.layout.size[1] + _MARGIN)
     speed = float(np.linalg.norm(log.truth[tick, 7:]))
     stored = ", stored plan flown" if log.emergency[tick] else ""
     said = f"{log.time[tick]:.1f} s, {speed:.1f} m/s, height {log.truth[tick, 2]:.1f} m{stored}"
     ax.set_title(said + (f"\n{log.health[tick]}: {log.causes[tick]}" if log.causes[tick] else ""))
-    if legend:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4)
     return ax
 
 
-def plot_parameter(log: FlightLog, name: str, ax: Axes | None = None) -> Axes:
+def plot_parameter(log: FlightLog, name: str, ax: Axes) -> Axes:
     """One parameter over time, its band of two standard deviations, and the truth.
 
     Args:
         log: the flight.
         name: one of `unifg.scenarios.logs.flight_metrics.PARAMETERS`.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
     """
     index = PARAMETERS.index(name)
     values, sigmas = log.parameters[:, index], log.parameters_sigma[:, index]
@@ -186,13 +173,13 @@ def plot_parameter(log: FlightLog, name: str, ax: Axes | None = None) -> Axes:
     return _band(log, ax, f"{_NAMES[index]}, {ends}", f"[{_UNITS[index]}]", values, sigmas, true, bounds)
 
 
-def plot_state_error(log: FlightLog, component: int, ax: Axes | None = None) -> Axes:
+def plot_state_error(log: FlightLog, component: int, ax: Axes) -> Axes:
     """One component of the right perturbation from belief to truth, and two standard deviations around it.
 
     Args:
         log: the flight.
         component: 0-2 position, 3-5 attitude, 6-8 velocity.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
     """
     scale = _SCALES[component // 3]
     error = scale * state_errors(log)[:, component]
@@ -203,7 +190,7 @@ def plot_state_error(log: FlightLog, component: int, ax: Axes | None = None) -> 
 
 def _band(
     log: FlightLog,
-    ax: Axes | None,
+    ax: Axes,
     title: str,
     unit: str,
     values: Array,
@@ -212,7 +199,7 @@ def _band(
     bounds: tuple[float, float] | None = None,
 ) -> Axes:
     """Values, the truth, and a band of two sigmas around the values, or around zero for errors, which have no truth."""
-    ax, zero = new_axes(ax), np.zeros_like(values)
+    zero = np.zeros_like(values)
     middle, truth, name, colour = zero, 0.0, "error", "robot"
     if true is not None:
         middle, truth, name, colour = values, true, "estimate", "estimate"
@@ -226,13 +213,13 @@ def _band(
     return over_time(log, ax, f"{title}; {inside:.0f} % within 2\u03c3", unit, curves, bounds=bounds)
 
 
-def plot_control(log: FlightLog, index: int, ax: Axes | None = None) -> Axes:
+def plot_control(log: FlightLog, index: int, ax: Axes) -> Axes:
     """One control over time against its limits.
 
     Args:
         log: the flight.
         index: 0-2 body rates, 3 thrust.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
     """
     values, limits = log.controls[:, index], _limits(log, index)
     title, unit = _CONTROLS[index] + (" and its limits" if limits else ""), "[N]" if index == 3 else "[rad/s]"
@@ -240,16 +227,16 @@ def plot_control(log: FlightLog, index: int, ax: Axes | None = None) -> Axes:
     return over_time(log, ax, title, unit, [curve], levels=limits, bounds=padded(values, limits, least=0.1))
 
 
-def plot_speed(log: FlightLog, ax: Axes | None = None) -> Axes:
+def plot_speed(log: FlightLog, ax: Axes) -> Axes:
     """True speed over time [m/s]."""
     speed = np.linalg.norm(log.truth[:, 7:], axis=1)
     title, top = f"Speed, at most {speed.max():.2f} m/s", 1.12 * max(float(speed.max()), 0.1)
-    ax = over_time(log, ax, title, "[m/s]", [(speed, {"color": css("robot"), "lw": 1.4})], bounds=(0.0, top))
+    over_time(log, ax, title, "[m/s]", [(speed, {"color": css("robot"), "lw": 1.4})], bounds=(0.0, top))
     shade_trouble(ax, log.dt, log.health, log.causes, title)
     return ax
 
 
-def plot_height(log: FlightLog, ax: Axes | None = None) -> Axes:
+def plot_height(log: FlightLog, ax: Axes) -> Axes:
     """True height over time, with that of the target [m]."""
     height, target = log.truth[:, 2], np.full(log.ticks, log.layout.target[2])
     curves = (height, {"color": css("robot"), "lw": 1.4}), (target, {"color": css("goal"), "lw": 1.4, "ls": "--"})

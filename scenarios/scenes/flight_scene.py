@@ -8,15 +8,15 @@ with all cylinders solid from the start.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from unifg.errors import ViewError
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.logs.metrics import collision_words, health
-from unifg.scenarios.scenes.numbers import Number, declare, in_words, metres, show
+from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
 from unifg.scenarios.scenes.parts import layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
@@ -93,13 +93,10 @@ def flight_scene(log: FlightLog) -> Scene:
     Raises:
         ViewError: the flight has no tick.
     """
-    if log.ticks == 0:
-        raise ViewError("there is no tick, and nothing to show")
+    sensed, estimated = sensor_reach(log) is not None, has_estimate(log)
+    scene = filled(log, partial(flight_stage, log, sensed=sensed, estimated=estimated), flight_frame)
     m = flight_metrics(log)
     settings, error, tick_ms = m["settings"], m["position_error_m"], m["tick_ms"]
-    scene = flight_stage(log, sensed=sensor_reach(log) is not None, estimated=has_estimate(log))
-    for tick in range(log.ticks):
-        flight_frame(scene, scene.frame(), log, tick)
     reached = "target reached" if m["reached"] else f"{m['target_distance_m']:.1f} m short of the target"
     stopped = ", interrupted by the user" if m["interrupted"] else ""
     how = "" if log.outcome in ("", "reached", "interrupted") else f"; {log.outcome}"

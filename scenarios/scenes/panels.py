@@ -1,4 +1,4 @@
-"""Panels and marks that several pictures share; a panel draws into the given axes, or new ones, and returns them."""
+"""Panels and marks that several pictures share; a panel draws into the given axes and returns them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.style.colours import GREY, css
-from unifg.style.figures import dashes, face, new_axes
+from unifg.style.figures import dashes, face
 from unifg.typing import Array, ArrayLike
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ __all__ = [
 
 def over_time(
     log: Any,
-    ax: Axes | None,
+    ax: Axes,
     title: str,
     y: str,
     curves: Iterable[tuple[Array, Mapping[str, Any]]] = (),
@@ -42,14 +42,13 @@ def over_time(
 
     Args:
         log: with ticks, time, dt, and an emergency flag for each tick.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
         title: of the panel.
         y: label of the axis.
         curves: values (T,) of every tick, and the style of the line.
         levels: of dashed lines.
         bounds: lower and upper end of the axis; None for those that matplotlib finds.
     """
-    ax = new_axes(ax)
     dashes(ax, levels)
     for values, style in curves:
         ax.plot(log.time, values, **{"lw": 1.2, **style})
@@ -117,7 +116,7 @@ def shade_trouble(ax: Axes, dt: float, health: Sequence[str], causes: Sequence[s
         ax.set_title(fill(f"{what}; {states}: {named.most_common(1)[0][0]}", 72), fontsize=8)
 
 
-def plot_clearance(log: Any, ax: Axes | None = None) -> Axes:
+def plot_clearance(log: Any, ax: Axes) -> Axes:
     """Distance from the hull to the nearest thing over time [m]."""
     lowest = int(np.argmin(log.clearance))
     least = float(log.clearance[lowest])
@@ -132,7 +131,7 @@ def plot_clearance(log: Any, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], ax: Axes | None = None) -> Axes:
+def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], ax: Axes) -> Axes:
     """Time spent in each tick, in all and on each part [ms], on a logarithmic axis.
 
     Ticks in which something was compiled, or read from the disk, are marked: their time is not that of the others.
@@ -141,9 +140,8 @@ def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], a
         log: the run.
         total: (T,) [ms].
         parts: names to (T,) [ms] and colour.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
     """
-    ax = new_axes(ax)
     for name, (values, colour) in {"both": (total, "plan"), **parts}.items():
         if (values > 0.0).any():
             spent = np.where(values > 0.0, values, np.nan)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from unifg.errors import ViewError
 from unifg.scenarios.logs.safe_log import SafeLog
-from unifg.scenarios.scenes.numbers import Number, declare, show
+from unifg.scenarios.scenes.numbers import Number, declare, filled, show
 from unifg.scenarios.scenes.parts import floor, pillar, vehicle
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
@@ -62,8 +62,13 @@ def safe_scene(log: SafeLog) -> Scene:
     Raises:
         ViewError: the flight has no tick.
     """
-    if log.ticks == 0:
-        raise ViewError("there is no tick, and nothing to show")
+    scene = filled(log, partial(_begun, log), safe_frame)
+    _words(scene, log)
+    return scene
+
+
+def _begun(log: SafeLog) -> Scene:
+    """The scene with floor and path, which are known once the flight is over."""
     scene = safe_stage(log, resting(log))
     low, high = _extent(log)
     corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (low[0], high[0]) for y in (low[1], high[1])]
@@ -71,9 +76,6 @@ def safe_scene(log: SafeLog) -> Scene:
     floor(scene, low, high)
     if not _rests(log.wanted[:, :3]):
         scene.way("path", shapes.thin(log.wanted[:, :3], 200))
-    for tick in range(log.ticks):
-        safe_frame(scene.frame(), log, tick)
-    _words(scene, log)
     return scene
 
 
@@ -116,7 +118,7 @@ def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
         scene.body(name, parts, colour=colour, legend=words)
 
 
-def safe_frame(frame: Frame, log: Any, tick: int) -> None:
+def safe_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     """Draw a tick of a `SafeLog`, or of one in the making."""
     state, plan = log.states[tick], log.plans[tick]
     frame.place("drone", state[:7])
