@@ -137,20 +137,6 @@ def test_same_log_same_page(page: str, log: FlightLog, tmp_path: Path) -> None:
     assert flight_scene(FlightLog.load(tmp_path / "flight.npz")).html() == page
 
 
-def test_animation_moves_things_that_exist_and_ends_together(page: str, log: FlightLog) -> None:
-    commands = commands_of(page)
-    kinds = [command["type"] for command in commands]
-    assert kinds.count("set_animation") == 1 and kinds[-1] == "set_animation"
-    objects = _objects(commands)
-    for path, properties in tracks_of(commands).items():
-        assert any(name == path or name.startswith(path + "/") for name in objects), path
-        for name, keys in properties.items():
-            frames = [frame for frame, _ in keys]
-            assert frames == sorted(set(frames)), (path, name)
-            if name == ".visible":  # the viewer holds the first key backwards
-                assert frames[0] == 0 and frames[-1] == log.ticks - 1, path
-
-
 def test_drone_flies_and_leans_as_the_truth(page: str, log: FlightLog) -> None:
     tracks = tracks_of(commands_of(page))
     places = np.array([value for _, value in tracks["drone"][".position"]])
@@ -213,9 +199,6 @@ def test_horizon_and_past_of_every_frame_are_those_of_the_log(page: str, log: Fl
         for name, way in (("horizon", log.plans[tick]), ("past", log.pasts[tick])):
             middle = _vertices(commands, f"{name}/{tick}").reshape(-1, 3, 3).mean(axis=1)
             np.testing.assert_allclose(middle[[0, -1]], way[[0, -1]], atol=1e-6)
-        for name in ("horizon", "past", "below"):
-            shown = [_shown(tracks[f"{name}/{tick}"][".visible"], moment) for moment in range(log.ticks)]
-            assert shown == [moment == tick for moment in range(log.ticks)]
 
 
 def test_the_flown_way_appears_piece_by_piece(page: str, log: FlightLog) -> None:

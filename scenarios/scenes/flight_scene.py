@@ -17,7 +17,7 @@ from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.logs.metrics import collision_words, health
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
-from unifg.scenarios.scenes.parts import layout, pillar, vehicle
+from unifg.scenarios.scenes.parts import draw_way, layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
@@ -29,7 +29,6 @@ SIGMAS = 2.0
 """Half axes of ellipses in standard deviations."""
 
 _HEIGHT = 2.0  # of walls, cylinders and movers [m]; there they have no top
-_NODES = 16  # of a way that changes from frame to frame
 
 
 def _error(log: Any, k: int) -> float:
@@ -87,6 +86,16 @@ NUMBERS = (
 """Lines and curves of a flight."""
 
 
+LAYERS: tuple[tuple[Any, ...], ...] = (
+    ("past", "line", "robot", "estimated past: the window that is smoothed", 0.09),
+    ("truth", "thin", "odometry", "true way, where it differs", 0.028),
+    ("horizon", "line", "horizon", "predicted future, and its shadow on the ground", 0.1),
+    ("below", "line", "horizon", "predicted future, and its shadow on the ground"),
+    ("unseen", "ghost", "wall", "cylinder not seen yet"),
+)
+"""Names, swatches, colours, words and widths [m] of what changes with the ticks."""
+
+
 def flight_scene(log: FlightLog) -> Scene:
     """The scene of a flight.
 
@@ -136,7 +145,11 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
     if solver and log.settings.get("coupling"):
         solver += f" ({log.settings['coupling']})"
     scene.facts["solver"] = solver
-    _layers(scene, sensed, estimated)
+    past = "estimated past before that" if estimated else "way flown"
+    seen = "cylinder that has been seen" if sensed else "cylinder"
+    for row in (*LAYERS, ("trail", "line", "trail", past, 0.06), ("seen", "disc", "fixed", seen)):
+        scene.layer(*row)
+    scene.layer("rims", "ring", "start", seen)
     _bodies(scene, float(log.settings.get("sensor_range", SensorModel().range_max)) if sensed else None)
     layout(scene, log.layout, _HEIGHT)
     _views(scene, log)
@@ -170,28 +183,11 @@ def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
             parts = [pillar(radius, _HEIGHT, "moving"), Part("rim", rim, "start", False)]
             scene.body(name, parts, colour="moving", legend="cylinder that moves")
         frame.place(name, [x, y, 0.0])
-    for name, way in (("past", log.pasts[tick]), ("horizon", log.plans[tick])):
-        points = shapes.thin(way, _NODES) if len(way) > 1 and np.isfinite(way).all() else way[:0]
-        if len(points) > 1:
-            frame.way(name, points)
-            if name == "horizon":
-                below = shapes.ribbon(points, 0.06, 0.018)
-                frame.mesh("below", below, opacity=0.35)
+    draw_way(frame, "past", log.pasts[tick])
+    points = draw_way(frame, "horizon", log.plans[tick])
+    if len(points):
+        frame.mesh("below", shapes.ribbon(points, 0.06, 0.018), opacity=0.35)
     show(frame, log, tick, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
-
-
-def _layers(scene: Scene, sensed: bool, estimated: bool) -> None:
-    """Names, words and widths of what changes with the ticks."""
-    scene.layer("past", "line", "robot", "estimated past: the window that is smoothed", width=0.09)
-    words = "estimated past before that" if estimated else "way flown"
-    scene.layer("trail", "line", "trail", words, width=0.06)
-    scene.layer("truth", "thin", "odometry", "true way, where it differs", width=0.028)
-    scene.layer("horizon", "line", "horizon", "predicted future, and its shadow on the ground", width=0.1)
-    scene.layer("below", "line", "horizon", "predicted future, and its shadow on the ground")
-    words = "cylinder that has been seen" if sensed else "cylinder"
-    scene.layer("seen", "disc", "fixed", words)
-    scene.layer("rims", "ring", "start", words)
-    scene.layer("unseen", "ghost", "wall", "cylinder not seen yet")
 
 
 def _bodies(scene: Scene, reach: float | None) -> None:

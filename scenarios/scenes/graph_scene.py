@@ -45,11 +45,14 @@ def graph_scene(solved: SolvedGraph) -> Scene:
 
 def declare_layers(scene: Scene) -> None:
     """Names, colours and words of the parts of a graph."""
-    scene.layer("start", "line", "odometry", "trajectory at the start")
-    scene.layer("closures", "line", "closure", "loop closures: the same place seen again")
-    scene.layer("trajectory", "line", "robot", "trajectory: poses joined by odometry")
-    scene.layer("outliers", "line", "outlier", "loop closures taken for outliers")
-    scene.layer("landmarks", "line", "landmark", "landmarks")
+    for name, colour, words in (
+        ("start", "odometry", "trajectory at the start"),
+        ("closures", "closure", "loop closures: the same place seen again"),
+        ("trajectory", "robot", "trajectory: poses joined by odometry"),
+        ("outliers", "outlier", "loop closures taken for outliers"),
+        ("landmarks", "landmark", "landmarks"),
+    ):
+        scene.layer(name, "line", colour, words)
 
 
 def line_width(graph: PoseGraph) -> float:

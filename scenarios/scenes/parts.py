@@ -8,10 +8,11 @@ import numpy as np
 
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array
-from unifg.view import Part, Scene, shapes
+from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["floor", "layout", "pillar", "vehicle"]
+__all__ = ["draw_way", "floor", "layout", "pillar", "vehicle"]
 
+_NODES = 16  # of a way that changes from frame to frame
 _FLOOR = -0.02  # height of the floor, clear of what stands on it [m]
 
 
@@ -57,6 +58,17 @@ def vehicle(scene: Scene, radius: float, plumb: bool = False) -> None:
         parts.append(Part("plumb", line, "start", False, 0.5))
     scene.body("shadow", parts, colour="start", legend="")
     scene.label("drone", follows="drone", above=True)
+
+
+def draw_way(frame: Frame, name: str, way: Array) -> Array:
+    """Draw a way (n, 2 or 3) [m] that changes from frame to frame, if it is finite and leads anywhere; its nodes."""
+    if len(way) < 2 or not np.isfinite(way).all():
+        return way[:0]
+    points = shapes.thin(way, _NODES)
+    if len(points) < 2:
+        return way[:0]
+    frame.way(name, points)
+    return points
 
 
 def pillar(radius: float, height: float, colour: str) -> Part:

@@ -11,7 +11,7 @@ import numpy as np
 
 from unifg.scenarios.logs.safe_log import SafeLog
 from unifg.scenarios.scenes.numbers import Number, declare, filled, show
-from unifg.scenarios.scenes.parts import floor, pillar, vehicle
+from unifg.scenarios.scenes.parts import draw_way, floor, pillar, vehicle
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 from unifg.view.bodies import body_of
@@ -20,7 +20,6 @@ __all__ = ["place_bodies", "resting", "safe_frame", "safe_scene", "safe_stage"]
 
 _HEIGHT = 3.0  # of cylinders, which have no end [m]
 _STILL = 1e-9  # [m]
-_NODES = 16  # of a plan
 _BESIDE = 1.0  # around the flight [m]
 
 
@@ -50,6 +49,14 @@ NEARNESS = Number(
     {"unit": "m", "limit": 0.0, "colour": "horizon"},
 )  # fmt: skip
 """Line and curve of a flight among obstacles."""
+
+
+LAYERS = (
+    ("flown", "line", "trail", "way flown", 0.05),
+    ("path", "line", "plan", "path to follow", 0.024),
+    ("plan", "line", "horizon", "plan", 0.07),
+)
+"""Names, swatches, colours, words and widths [m] of the ways."""
 
 
 def _numbers(log: Any) -> tuple[Number, ...]:
@@ -88,9 +95,8 @@ def safe_stage(log: Any, still: Sequence[bool] = ()) -> Scene:
     """
     scene = Scene(f"unifg: quadrotor-cbf, {log.settings['case']}", dt=log.dt)
     scene.speeds = (0.1, 0.25, 0.5, 1, 2)
-    scene.layer("flown", "line", "trail", "way flown", width=0.05)
-    scene.layer("path", "line", "plan", "path to follow", width=0.024)
-    scene.layer("plan", "line", "horizon", "plan", width=0.07)
+    for row in LAYERS:
+        scene.layer(*row)
     vehicle(scene, log.hull)
     _bodies(scene, log, list(still) or [False] * len(log.radii))
     scene.view("overview", "Overview", [-0.55, -0.75, 0.8], 24.0)
@@ -125,8 +131,7 @@ def safe_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     frame.place("shadow", [state[0], state[1], 0.0])
     place_bodies(frame, log, tick)
     frame.trail("flown", state[:3])
-    if len(plan) > 1 and np.isfinite(plan).all() and not _rests(plan):
-        frame.way("plan", shapes.thin(plan, _NODES))
+    draw_way(frame, "plan", plan)
     show(frame, log, tick, _numbers(log))
 
 

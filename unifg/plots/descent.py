@@ -52,7 +52,7 @@ def draw_cost(ax: Axes, cost: Array, title: str) -> Axes:
 
 
 def draw_errors(ax: Axes, errors: Mapping[str, Array], tolerance: float | None = None) -> Axes:
-    """What has to become small, on a logarithmic axis.
+    """Draw what has to become small, on a logarithmic axis.
 
     Args:
         ax: axes to draw into.

@@ -160,9 +160,8 @@ class History(list[Iteration]):
         Raises:
             ViewError: there are no rows.
         """
-        kkt = ("stationarity", "violation", "complementarity")
-        errors = {name: self.column(name) for name in kkt} | {"step": self.column("step_norm")}
-        return draw_descent(self.column("cost"), errors)
+        kkt = {name: self.column(name) for name in ("stationarity", "violation", "complementarity")}
+        return draw_descent(self.column("cost"), kkt | {"step": self.column("step_norm")})
 
     def column(self, name: str) -> Array:
         """(k,) numbers of one attribute of all rows."""
