@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["picture", "plot_cost", "plot_graph"]
 
+_STRIPS = 3_000  # edges, up to which a trajectory has a width; beyond, it is hair-thin
+
 
 def picture(solved: SolvedGraph) -> Figure:
     """Start on the left, solution on the right, cost over iterations below."""
@@ -59,7 +61,8 @@ def plot_graph(graph: PoseGraph, outliers: BoolArray, name: str, ax: Axes) -> Ax
     """
     scene = Scene()
     declare_layers(scene)
-    draw_graph(scene, graph, outliers, name, 1.5 * line_width(graph))
+    width = 1.5 * line_width(graph) if len(graph.edges) <= _STRIPS else 0.0
+    draw_graph(scene, graph, outliers, name, width)
     draw_points(scene, graph)
     return scene.draw(ax)
 

@@ -15,7 +15,7 @@ from unifg.view.content import Content, Placement, Shot
 from unifg.view.members import finite
 from unifg.view.page import Plot
 from unifg.view.shapes import Mesh
-from unifg.view.things import Layer, Thing
+from unifg.view.things import Thing
 
 __all__ = ["Canvas", "Frame"]
 
@@ -48,7 +48,7 @@ class Canvas:
             ViewError: the shape is another, or a number is not finite.
         """
         places, flat = self._places(name, points)
-        layer = self._layer(name, "line", colour, legend)
+        layer = self._content.layer(name, "line", colour, legend)
         given = {"points": places, "flat": flat, "width": width or layer.width}
         self._drawn[name] = Thing(things.draw_way, given, places, len(places), _WAYS if flat else _TUBES)
 
@@ -62,7 +62,7 @@ class Canvas:
             ViewError: the shape is another, or a number is not finite.
         """
         places, flat = self._places(name, points)
-        self._layer(name, "dots", colour, legend)
+        self._content.layer(name, "dots", colour, legend)
         given = {"points": places, "flat": flat, "pixels": pixels}
         self._drawn[name] = Thing(things.draw_points, given, places, len(places), _DOTS)
 
@@ -80,7 +80,7 @@ class Canvas:
             raise ViewError(f"'{name}': lines are (n, 2, 2) or (n, 2, 3) [m], found {ends.shape}")
         finite(name, ends, "line")
         places, flat = self._places(name, ends.reshape(-1, ends.shape[2]))
-        layer = self._layer(name, "thin" if width is None else "line", colour, legend)
+        layer = self._content.layer(name, "thin" if width is None else "line", colour, legend)
         given = {"lines": places.reshape(-1, 2, 3), "flat": flat, "width": width or layer.width}
         most = _HAIRS if width is None else _STRIPS
         self._drawn[name] = Thing(things.draw_segments, given, places, len(ends), most)
@@ -109,7 +109,7 @@ class Canvas:
             raise ViewError(
                 f"'{name}': the quaternion of pose {k}, {rows[k, 3:].tolist()}, has not unit length", index=k
             )
-        self._layer(name, "arrow" if flat else "axes", colour, legend)
+        self._content.layer(name, "arrow" if flat else "axes", colour, legend)
         draw, most = (things.draw_arrows, _MARKS) if flat else (things.draw_triads, _MARKS // 4)
         corners = shapes.on_ground(rows) if flat else rows[:, :3]
         self._drawn[name] = Thing(draw, {"poses": rows, "length": length}, corners, len(rows), most)
@@ -147,7 +147,7 @@ class Canvas:
             raise ViewError(f"'{name}': covariance {k} has a negative variance, {variances[k].min():g} m^2", index=k)
         half = sigmas * np.sqrt(np.maximum(variances, 0.0))
         axes = np.einsum("nij,nj,nkj->nik", vectors, half, vectors)  # symmetric: it turns as little as can be
-        self._layer(name, "ghost", colour, legend)
+        self._content.layer(name, "ghost", colour, legend)
         given = {"centres": places, "axes": axes}
         largest = half.max(axis=1, initial=0.0)[:, None]
         corners = np.concatenate([places - largest, places + largest])
@@ -167,7 +167,7 @@ class Canvas:
             ViewError: the shape is another, or a number is not finite.
         """
         discs = _rows(name, rows, (3,), "disc", "discs are (n, 3) x, y, radius [m]")
-        self._layer(name, "disc" if opacity == 1.0 else "ghost", colour, legend)
+        self._content.layer(name, "disc" if opacity == 1.0 else "ghost", colour, legend)
         given = {"rows": discs, "height": height, "base": base, "opacity": opacity}
         low, high = discs - discs[:, 2:], discs + discs[:, 2:]
         low[:, 2], high[:, 2] = base, base + height
@@ -198,7 +198,7 @@ class Canvas:
         finite(name, edges, "size")
         if rows.shape[1] == 3:
             rows = np.column_stack([rows, np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1))])
-        self._layer(name, "block", colour, legend)
+        self._content.layer(name, "block", colour, legend)
         given = {"poses": rows, "sizes": edges, "opacity": opacity}
         half = 0.5 * np.linalg.norm(edges, axis=1)[:, None]
         corners = np.concatenate([rows[:, :3] - half, rows[:, :3] + half])
@@ -221,7 +221,7 @@ class Canvas:
             )
         corners = shapes.known_corners(occupancy)
         box = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, height)])
-        self._layer(name, "block", "wall", legend)
+        self._content.layer(name, "block", "wall", legend)
         given = {"occupancy": occupancy, "height": height}
         self._drawn[name] = Thing(things.draw_walls, given, box)
 
@@ -236,16 +236,13 @@ class Canvas:
         """
         vertices = np.asarray(mesh[0], dtype=np.float64)
         finite(name, vertices, "vertex")
-        self._layer(name, swatch, colour, legend)
+        self._content.layer(name, swatch, colour, legend)
         given = {"mesh": mesh, "lit": lit, "opacity": opacity}
         self._drawn[name] = Thing(things.draw_mesh, given, np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
 
     def colour(self, name: str) -> str:
         """Colour of a layer."""
         return self._content.layers[name].colour
-
-    def _layer(self, name: str, swatch: str, colour: str | None, legend: str | None) -> Layer:
-        return self._content.layer(name, swatch, colour, legend)
 
     def _places(self, name: str, points: ArrayLike) -> tuple[Array, bool]:
         """(n, 3) places, and whether they lie in the plane."""

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["draw_frame"]
 
 _MOST = 20_000  # members of a thing
+_FACES = 50_000  # triangles in space, from which on they are not made smaller
 _SIDE = 30.0  # longest side of a triangle in space, over half the width of a line
 _DOT = 0.55  # size of a dot in points, over its pixels
 _MARK: dict[str, Any] = {"ls": "none", "marker": "o"}
@@ -87,7 +88,7 @@ class Paper:
         if self._faces:
             faces, shades = np.concatenate(self._faces), np.concatenate(self._colours)
             sides = np.linalg.norm(np.roll(faces, -1, axis=1) - faces, axis=2)
-            while (long := sides.max(axis=1) > _SIDE * self.stroke).any():
+            while len(faces) < _FACES and (long := sides.max(axis=1) > _SIDE * self.stroke).any():
                 order = (sides[long].argmax(axis=1)[:, None] + np.arange(3)) % 3
                 begin, end, tip = np.take_along_axis(faces[long], order[..., None], axis=1).transpose(1, 0, 2)
                 middle = 0.5 * (begin + end)
