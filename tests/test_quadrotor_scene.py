@@ -194,7 +194,6 @@ def test_a_landmark_that_stands_still_does_not_creep(log: FlightLog) -> None:
 
 def test_horizon_and_past_of_every_frame_are_those_of_the_log(page: str, log: FlightLog) -> None:
     commands = commands_of(page)
-    tracks = tracks_of(commands)
     for tick in range(1, log.ticks):
         for name, way in (("horizon", log.plans[tick]), ("past", log.pasts[tick])):
             middle = _vertices(commands, f"{name}/{tick}").reshape(-1, 3, 3).mean(axis=1)
