@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unifg.plots.shown import every
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.logs.metrics import collision_words
@@ -19,6 +20,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["overview", "plot_controls", "plot_localisation", "plot_map"]
+
+_DOTS = 200  # along the way of the wheels
 
 
 def overview(log: EpisodeLog) -> Figure:
@@ -48,9 +51,11 @@ def plot_map(log: EpisodeLog, ax: Axes) -> Axes:
     scene.way("trail", log.true_pose[:, :2])
     thin = 0.3 * (scene.layers["trail"].width or 0.0)
     movers = {f"way {k}": log.obstacles[:, k, :2] for k in np.flatnonzero(log.obstacle_moves)}
-    ways = {"wheel odometry alone": log.dead_reckoning[:, :2], "estimate (lidar)": log.estimate[:, :2], **movers}
-    for name, colour in zip(ways, ["odometry", "estimate", *["moving"] * len(movers)], strict=True):
-        scene.way(name, ways[name], width=thin, colour=colour, legend="" if name in movers else None)
+    for name, way in movers.items():
+        scene.way(name, way, width=thin, colour="moving", legend="")
+    scene.way("estimate (lidar)", log.estimate[:, :2], width=thin, colour="estimate")
+    dots = log.dead_reckoning[every(log.ticks, _DOTS), :2]  # a line would look like the route
+    scene.points("wheel odometry alone", dots, pixels=2.5, colour="odometry")
     if log.emergency.any():
         stored = log.true_pose[log.emergency, :2]
         scene.points("stored", stored, colour="detected", legend="stored plan driven")
