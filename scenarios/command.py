@@ -40,9 +40,6 @@ __all__ = ["main"]
 
 SUCCEEDED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 
-_PAIRED_OPTIONS = ("--start", "--goal", "--force-bounds")
-_NEGATIVE = re.compile(r"-[\d.]")
-
 
 @dataclass(frozen=True)
 class Command:
@@ -64,7 +61,7 @@ class Command:
 
     def add(self, parser: argparse.ArgumentParser) -> None:
         """Add the arguments."""
-        group = parser.add_mutually_exclusive_group()
+        group = parser.add_mutually_exclusive_group() if self.exclusive else parser
         for name, options in self.arguments.items():
             (group if name in self.exclusive else parser).add_argument(name, **options)
         parser.set_defaults(does=self.does)
@@ -76,7 +73,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Args:
         argv: arguments without the program's name; None takes those of the process.
     """
-    arguments = _join_negative(list(sys.argv[1:] if argv is None else argv))
+    arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         chosen = _parser(arguments).parse_args(arguments)
     except ModuleNotFoundError as error:  # of the scenario that is named
@@ -97,24 +94,22 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     """Parser of the command line; only the scenario named by the words has its options."""
-    parser = argparse.ArgumentParser(
-        prog="unifg", description="Robot estimation and control as one factor graph.", allow_abbrev=False
-    )
+    parser = _Parser(prog="unifg", description="Robot estimation and control as one factor graph.")
     parser.add_argument("--version", action="version", version=f"unifg {__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    run = commands.add_parser("run", help="run a scenario", description="Run a scenario.", allow_abbrev=False)
+    run = commands.add_parser("run", help="run a scenario", description="Run a scenario.")
     scenarios = run.add_subparsers(title="scenarios", required=True, metavar="SCENARIO")
     for name, scenario in SCENARIOS.items():
-        one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary, allow_abbrev=False)
+        one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary)
         one.set_defaults(name=name, does=_run)
         if list(words[:2]) == ["run", name]:
             scenario.add_options(one)
-    solve = commands.add_parser("solve", help="solve a pose graph", description=SOLVE.summary, allow_abbrev=False)
+    solve = commands.add_parser("solve", help="solve a pose graph", description=SOLVE.summary)
     solve.set_defaults(name="solve", does=_run)
     if list(words[:1]) == ["solve"]:
         SOLVE.add_options(solve)
     for name, entry in COMMANDS.items():
-        entry.add(commands.add_parser(name, help=entry.summary, description=entry.about, allow_abbrev=False))
+        entry.add(commands.add_parser(name, help=entry.summary, description=entry.about))
     return parser
 
 
@@ -337,15 +332,12 @@ def _refuse(message: str) -> int:
     return REFUSED
 
 
-def _join_negative(arguments: list[str]) -> list[str]:
-    """``--start -2,-0.5,0`` as ``--start=-2,-0.5,0``: argparse would take the value for an option."""
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and joined[-1] in _PAIRED_OPTIONS and _NEGATIVE.match(argument):
-            joined[-1] += f"={argument}"
-        else:
-            joined.append(argument)
-    return joined
+class _Parser(argparse.ArgumentParser):
+    """Parser that takes ``-2,-0.5,0`` for a value, as the standard one takes ``-2``."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, **options)
+        self._negative_number_matcher = re.compile(r"-[\d.]")
 
 
 _ANY_CODE = {"action": "store_true", "help": "episodes that other states of the code have run count, too"}

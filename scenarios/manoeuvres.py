@@ -265,13 +265,7 @@ def metrics_of(manoeuvres: Sequence[Manoeuvre]) -> dict[str, Any]:
 def table(manoeuvres: Sequence[Manoeuvre]) -> str:
     """The outcome for people, one column per case."""
     columns = [_column(m) for m in manoeuvres]
-    first = max(map(len, columns[0]))
-    widths = [max(map(len, column.values())) for column in columns]
-    lines = (
-        "  ".join([f"{name:<{first}}", *(f"{c[name]:<{width}}" for c, width in zip(columns, widths, strict=True))])
-        for name in columns[0]
-    )
-    return "\n".join(line.rstrip() for line in lines)
+    return metrics.table((name, *(column[name] for column in columns)) for name in columns[0])
 
 
 def _column(manoeuvre: Manoeuvre) -> dict[str, str]:

@@ -213,27 +213,31 @@ share = number("a number in [0, 1)", lambda value: 0.0 <= value < 1.0)
 
 def pose(text: str) -> tuple[float, ...]:
     """Three numbers X,Y,THETA."""
-    what = f"{text!r} is not a pose: "
-    try:
-        values = tuple(float(word) for word in text.split(","))
-    except ValueError:
-        values = ()
+    values = _numbers(text)
     if len(values) != 3:
-        raise argparse.ArgumentTypeError(f"{what}expected three numbers X,Y,THETA [m, m, rad], without blanks")
-    if not all(abs(value) < float("inf") for value in values):
-        raise argparse.ArgumentTypeError(f"{what}every number must be finite")
+        what = "expected three numbers X,Y,THETA [m, m, rad], without blanks"
+        raise argparse.ArgumentTypeError(f"{text!r} is not a pose: {what}")
+    if not all(abs(value) < math.inf for value in values):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a pose: every number must be finite")
     return values
 
 
-def pair(text: str) -> tuple[float, float]:
+def pair(text: str) -> tuple[float, ...]:
     """Two numbers LO,HI, the first below the second."""
-    try:
-        low, high = (float(word) for word in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not LO,HI: expected two numbers [N], without blanks") from None
-    if not low < high:
+    values = _numbers(text)
+    if len(values) != 2:
+        raise argparse.ArgumentTypeError(f"{text!r} is not LO,HI: expected two numbers [N], without blanks")
+    if not values[0] < values[1]:
         raise argparse.ArgumentTypeError(f"{text!r}: the first number must be below the second")
-    return low, high
+    return values
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Numbers between commas; none where a word is no number."""
+    try:
+        return tuple(float(word) for word in text.split(","))
+    except ValueError:
+        return ()
 
 
 def existing(what: str) -> Text:

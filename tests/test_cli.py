@@ -164,6 +164,9 @@ def test_unknown_commands_exit_2(words: list[str], capsys: pytest.CaptureFixture
 def test_help_and_version_exit_0(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["--version"]) == 0
     assert capsys.readouterr().out == f"unifg {__version__}\n"
+    for words in command.COMMANDS:
+        assert command.main([words, "--help"]) == 0
+        assert f"usage: unifg {words}" in capsys.readouterr().out
     assert command.main(["run", "navigation", "--help"]) == 0
     said = capsys.readouterr().out
     for flag in ("--map", "--start", "--goal", "--solver", "--coupling", "--obstacles", "--seed", "--out"):

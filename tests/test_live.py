@@ -276,7 +276,7 @@ def test_a_run_is_watched_tick_by_tick(monkeypatch: pytest.MonkeyPatch) -> None:
         scenes.append(drive_stage(log))
         return scenes[-1]
 
-    with watching_ticks(told.append, begin, lambda scene, frame, log, tick: drive_frame(frame, log, tick)):
+    with watching_ticks(told.append, begin, drive_frame):
         recorder = Recorder(EpisodeLog, **{k: v for k, v in known.items() if k not in ("collisions", "reached")})
         with watched(None):  # a rehearsal
             Recorder(EpisodeLog, **known).add(**{name: getattr(done, name)[0] for name in names})

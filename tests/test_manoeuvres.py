@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex, to_rgb
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
 
 import unifg as fg
 from judge import judge
@@ -29,6 +29,7 @@ from unifg.scenarios.scenes import manoeuvre_plot as manoeuvre_plots
 from unifg.scenarios.scenes.manoeuvre_scene import manoeuvre_scene
 from unifg.solvers import SQP, names
 from unifg.style.colours import css
+from unifg.typing import Array
 
 SOLVERS = ("alm", "sqp")
 BEHIND = 59.47520  # J of the path behind the robot without a cost on changes, by IPOPT and by Crocoddyl's Box-FDDP
@@ -189,23 +190,33 @@ def test_picture_shows_what_happened(name: str) -> None:
     m = solved(name, "alm")
     figure = manoeuvre_plots.picture(m)
     place, speed, turning, convergence = figure.axes
-    lines = {str(line.get_label()): line for line in place.lines}
-    guess = lines["first iterate: the guess, on the path"]
-    last = lines[f"last iterate ({m.solution.iterations}): the optimum"]
+    handles, labels = place.get_legend_handles_labels()
+    keys = dict(zip(labels, handles, strict=True))
+    guess = keys["first iterate: the guess, on the path"]
     np.testing.assert_array_equal(np.column_stack(guess.get_data()), m.iterates[0, :, :2])
-    np.testing.assert_array_equal(np.column_stack(last.get_data()), m.states[:, :2])
-    assert to_hex(guess.get_color()) == css("horizon").lower() and to_hex(last.get_color()) == css("robot").lower()
-    assert sum(len(line.get_xdata()) == m.settings.horizon + 1 for line in place.lines) == len(m.iterates)  # type: ignore[arg-type]
+    assert guess.get_linestyle() == "--" and to_hex(guess.get_color()) == css("horizon")
+    assert {f"last iterate ({m.solution.iterations}): the optimum", "robot and its front, every 0.5 s"} <= keys.keys()
+    drawn: dict[str, list[Array]] = {}
+    for part in place.collections:
+        if isinstance(part, PolyCollection):
+            vertices = np.concatenate([np.asarray(path.vertices) for path in part.get_paths()])
+            drawn.setdefault(to_hex(np.asarray(part.get_facecolor())[0], keep_alpha=True), []).append(vertices)
+    (last,) = drawn[css("robot") + "ff"]
+    np.testing.assert_allclose(last.min(axis=0), m.states[:, :2].min(axis=0), atol=0.03)
+    np.testing.assert_allclose(last.max(axis=0), m.states[:, :2].max(axis=0), atol=0.03)
+    robots = drawn[css("robot") + "21"]
+    sizes = [float(np.ptp(robot, axis=0).max()) for robot in robots]  # discs are polygons
+    np.testing.assert_allclose(sizes, [2.0 * m.settings.robot_radius] * 11, rtol=1e-2)
+    assert sum(len(one) for shade, one in drawn.items() if shade.endswith("ff")) >= len(m.iterates) - 1
     words = {text.get_text() for text in place.texts}
     assert {"start", "goal"} <= words
     assert any("cusp at 1.0 s" in word for word in words) == (name == "behind")
-    assert ("cusp: v passes through 0" in lines) == (name == "behind")
-    assert len(lines["inflection: $\\omega$ changes sign"].get_xdata()) == 1  # type: ignore[arg-type]
-    radii = [patch.get_radius() for patch in place.patches if isinstance(patch, Circle)]
-    assert radii.count(m.settings.robot_radius) == 2 * 11  # fill and edge of eleven robots
-    for x, _, radius in m.case.discs:
-        assert {radius, radius + 0.2} <= set(np.round(radii, 9).tolist())
-        assert place.get_xlim()[0] < x < place.get_xlim()[1]
+    assert ("cusp: v passes through 0" in keys) == (name == "behind") and "inflection: $\\omega$ changes sign" in keys
+    for (x, y, radius), disc in zip(m.case.discs, drawn.get(css("fixed") + "ff", []), strict=True):
+        np.testing.assert_allclose(
+            [disc.min(axis=0), disc.max(axis=0)], [[x - radius, y - radius], [x + radius, y + radius]]
+        )
+        assert place.get_xlim()[0] < x < place.get_xlim()[1] and "the robot's centre stays outside" in keys
     for axes, column in ((speed, 0), (turning, 1)):
         (curve,) = (line for line in axes.lines if len(line.get_xdata()) == m.settings.horizon + 1)  # type: ignore[arg-type]
         np.testing.assert_array_equal(np.asarray(curve.get_ydata())[:-1], m.controls[:, column])

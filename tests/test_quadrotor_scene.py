@@ -18,13 +18,12 @@ from unifg.scenarios.commands.flights import summary, write_results
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.logs.flight_metrics import flight_metrics, landmark_errors
-from unifg.scenarios.scenes.flight_plot import control, estimates, moments, overview, plot_moment
-from unifg.scenarios.scenes.flight_scene import first_sights, flight_scene
+from unifg.scenarios.scenes.flight_plot import control, estimates, overview, plot_moment
+from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.style.colours import css
-from unifg.style.figures import write_figure
-from unifg.view import drone, shapes
-from unifg.view.stage import frame_ticks
+from unifg.view import shapes
+from unifg.view.bodies import body_of
 
 umsgpack = pytest.importorskip("umsgpack")
 
@@ -128,31 +127,14 @@ def test_page_loads_nothing_from_outside_and_says_what_it_shows(page: str) -> No
     assert [view["name"] for view in data["views"]] == ["overview", "follow", "top"]
 
 
-def test_failure_and_foreign_names_in_the_page(log: FlightLog) -> None:
-    named = replace(log, layout=replace(log.layout, name="</script><b>x"), reached=False, collisions=2)
-    around = without_viewer(flight_scene(named).html())
-    data = data_of(around)
+def test_failure_in_the_page(log: FlightLog) -> None:
+    data = data_of(flight_scene(replace(log, reached=False, collisions=2)).html())
     assert data["outcome"] == "0.0 m short of the target, 2 collisions" and data["good"] is False
-    assert "</script><b>" not in around and data["title"].endswith("</script><b>x")
 
 
 def test_same_log_same_page(page: str, log: FlightLog, tmp_path: Path) -> None:
     log.save(tmp_path / "flight.npz")
     assert flight_scene(FlightLog.load(tmp_path / "flight.npz")).html() == page
-
-
-def test_animation_moves_things_that_exist_and_ends_together(page: str, log: FlightLog) -> None:
-    commands = commands_of(page)
-    kinds = [command["type"] for command in commands]
-    assert kinds.count("set_animation") == 1 and kinds[-1] == "set_animation"
-    objects = _objects(commands)
-    for path, properties in tracks_of(commands).items():
-        assert any(name == path or name.startswith(path + "/") for name in objects), path
-        for name, keys in properties.items():
-            frames = [frame for frame, _ in keys]
-            assert frames == sorted(set(frames)), (path, name)
-            if name == ".visible":  # the viewer holds the first key backwards
-                assert frames[0] == 0 and frames[-1] == log.ticks - 1, path
 
 
 def test_drone_flies_and_leans_as_the_truth(page: str, log: FlightLog) -> None:
@@ -168,7 +150,6 @@ def test_drone_flies_and_leans_as_the_truth(page: str, log: FlightLog) -> None:
 
 
 def test_cylinders_are_faint_until_seen(page: str, log: FlightLog) -> None:
-    assert first_sights(log) == [0, 10, None]
     commands = commands_of(page)
     objects, tracks = _objects(commands), tracks_of(commands)
     assert {path for path in objects if path.startswith(("seen", "unseen"))} == {
@@ -213,14 +194,10 @@ def test_a_landmark_that_stands_still_does_not_creep(log: FlightLog) -> None:
 
 def test_horizon_and_past_of_every_frame_are_those_of_the_log(page: str, log: FlightLog) -> None:
     commands = commands_of(page)
-    tracks = tracks_of(commands)
     for tick in range(1, log.ticks):
         for name, way in (("horizon", log.plans[tick]), ("past", log.pasts[tick])):
             middle = _vertices(commands, f"{name}/{tick}").reshape(-1, 3, 3).mean(axis=1)
             np.testing.assert_allclose(middle[[0, -1]], way[[0, -1]], atol=1e-6)
-        for name in ("horizon", "past", "below"):
-            shown = [_shown(tracks[f"{name}/{tick}"][".visible"], moment) for moment in range(log.ticks)]
-            assert shown == [moment == tick for moment in range(log.ticks)]
 
 
 def test_the_flown_way_appears_piece_by_piece(page: str, log: FlightLog) -> None:
@@ -264,13 +241,6 @@ def test_readouts_are_those_of_the_log(page: str, log: FlightLog) -> None:
     assert rows["plan"]["texts"][5] == "converged: stored one flown" and rows["plan"]["alarms"][5] is True
 
 
-def test_long_flights_are_thinned_and_small() -> None:
-    long = flight(400)
-    assert frame_ticks(long.ticks).tolist() == list(range(400))
-    assert len(flight_scene(long).html()) < 6e6
-    assert data_of(flight_scene(flight(1001)).html())["ticks"] == [*range(0, 1000, 3), 1000]
-
-
 def test_odd_flights_are_drawn_too(log: FlightLog) -> None:
     single = flight(1)
     assert commands_of(flight_scene(single).html())[-1]["type"] == "set_animation"
@@ -288,11 +258,11 @@ def test_odd_flights_are_drawn_too(log: FlightLog) -> None:
 
 
 def test_drone_fits_its_radius() -> None:
-    for part in (drone.rotors(0.25, front=True), drone.rotors(0.25, front=False), drone.arms(0.25), drone.body(0.25)):
-        vertices, faces = part
+    parts = {part.name: part.mesh for part in body_of("quadrotor", 0.25, "robot")}
+    for vertices, faces in parts.values():
         assert np.hypot(vertices[:, 0], vertices[:, 1]).max() <= 0.25 + 1e-9
         assert faces.min() == 0 and faces.max() == len(vertices) - 1
-    rotors = [drone.rotors(0.25, front=front)[0] for front in (True, False)]
+    rotors = [parts["front/rotors"][0], parts["back/rotors"][0]]
     assert np.hypot(*rotors[0].T[:2]).max() == pytest.approx(0.25, rel=0.01)
     assert rotors[0][:, 0].min() > 0.0 > rotors[1][:, 0].max()
 
@@ -365,21 +335,22 @@ def test_landmarks_far_from_everything_are_not_counted(log: FlightLog) -> None:
     assert len(landmark_errors(replace(log, landmarks=[*log.landmarks[:-1], stray]))) == 1
 
 
-def test_overview_draws_the_moments_it_names(log: FlightLog, tmp_path: Path) -> None:
+def test_overview_draws_the_moments_it_names(log: FlightLog) -> None:
     from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
 
-    assert moments(log).tolist() == [0, 5, 9, 14, 18, 23] and moments(flight(3)).tolist() == [0, 1, 2]
+    assert len([ax for ax in overview(flight(3)).axes if ax.axison]) == 3
     figure = overview(log)
     times = [ax.get_title(loc="left")[:3] for ax in figure.axes]
     assert times == "0.0 0.2 0.5 0.7 0.9 1.2".split()
     legend = {text.get_text() for box in figure.legends for text in box.get_texts()}
-    assert {"estimated past", "predicted future", "reach of the sensor", "cylinder seen by then"} <= legend
-    first, second = (write_figure(tmp_path / name, overview(log), 50).read_bytes() for name in ("a.png", "b.png"))
-    assert first == second
-    ax = plot_moment(log, 12)
-    filled = [to_hex(patch.get_facecolor()) for patch in ax.patches if patch.get_fill()]
-    assert filled.count(css("fixed")) == 2  # cylinders 0 and 1 by then
-    assert "stored plan" in plot_moment(log, 5).get_title()
+    words = "window that is smoothed", "predicted future", "reach of the sensor", "cylinder that has been seen"
+    assert all(any(word in text for text in legend) for word in words)
+    ax = plot_moment(log, 12, Figure().subplots())
+    faces = {to_hex(np.asarray(c.get_facecolor())[0]): c for c in ax.collections if len(np.asarray(c.get_facecolor()))}
+    middles = {round(float(np.asarray(path.vertices).mean(axis=0)[0])) for path in faces[css("fixed")].get_paths()}
+    assert 3 in middles and 6 in middles and max(middles) < 8  # cylinders 0 and 1 by then
+    assert "stored plan" in plot_moment(log, 5, Figure().subplots()).get_title()
 
 
 def test_estimates_and_controls_show_what_there_is(log: FlightLog) -> None:

@@ -253,27 +253,27 @@ def everything() -> Scene:
     return scene
 
 
-def test_bad_numbers_are_refused_by_name() -> None:
-    scene = Scene()
-    bad = [[0.0, 1.0], [math.nan, 2.0]]
-    for draw in (scene.way, scene.points):
-        with pytest.raises(ViewError, match=r"'walk': place 1 is \[nan, 2.0\]") as caught:
-            draw("walk", bad)
-        assert caught.value.index == 1
-    with pytest.raises(ViewError, match="'p': pose 0"):
-        scene.poses("p", [[0.0, math.inf, 0.0]])
-    with pytest.raises(ViewError, match="'d': disc 0"):
-        scene.discs("d", [[0.0, math.nan, 0.0]])
-    with pytest.raises(ViewError, match="'c': covariance 0"):
-        scene.covariances("c", [[0.0, 0.0]], [[[math.nan, 0.0], [0.0, 1.0]]])
+BAD = [[0.0, 1.0], [math.nan, 2.0]]
+INDEFINITE = [[[1.0, 0.0], [0.0, 1.0]], [[1.0, 2.0], [2.0, 1.0]]]
+
+
+def placed(scene: Scene, pose: list[float]) -> None:
     scene.body("robot", "disc")
-    with pytest.raises(ViewError, match="'robot': pose 0"):
-        scene.frame().place("robot", [0.0, 0.0, math.nan])
+    scene.frame().place("robot", pose)
 
 
 @pytest.mark.parametrize(
     ("shape", "draw"),
     [
+        (r"'walk': place 1 is \[nan, 2.0\]", lambda scene: scene.way("walk", BAD)),
+        (r"'walk': place 1 is \[nan, 2.0\]", lambda scene: scene.points("walk", BAD)),
+        ("'p': pose 0", lambda scene: scene.poses("p", [[0.0, math.inf, 0.0]])),
+        ("'d': disc 0", lambda scene: scene.discs("d", [[0.0, math.nan, 0.0]])),
+        ("'c': covariance 0", lambda scene: scene.covariances("c", [[0.0, 0.0]], [[[math.nan, 0.0], [0.0, 1.0]]])),
+        ("'robot': pose 0", lambda scene: placed(scene, [0.0, 0.0, math.nan])),
+        ("covariance 1 has a negative", lambda scene: scene.covariances("c", np.zeros((2, 2)), np.array(INDEFINITE))),
+        ("quaternion of pose 0", lambda scene: scene.poses("p", [[0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]])),
+        ("quaternion of pose 0", lambda scene: scene.poses("p", [[0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0]])),
         ("places are", lambda scene: scene.way("a", np.zeros((2, 4)))),
         ("poses are", lambda scene: scene.poses("a", np.zeros((2, 4)))),
         ("lines are", lambda scene: scene.lines("a", np.zeros((2, 3, 2)))),
@@ -295,8 +295,15 @@ def test_bad_numbers_are_refused_by_name() -> None:
     ],
 )  # fmt: skip
 def test_refusals_say_what_was_found(shape: str, draw: Any) -> None:
-    with pytest.raises(ViewError, match=shape):
+    with pytest.raises(ViewError, match=shape) as caught:
         draw(Scene())
+    assert caught.value.index == (1 if "1 " in shape else 0 if " 0" in shape else None)
+
+
+def test_rounding_is_not_refused() -> None:
+    scene = Scene()
+    scene.covariances("c", np.zeros((1, 2)), [[[1.0, 1.0], [1.0, 1.0 - 1e-12]]])
+    scene.poses("p", [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
 
 
 def test_what_has_no_place_is_refused_with_what_to_do() -> None:
@@ -342,6 +349,27 @@ def test_empty_and_single_members_are_drawn() -> None:
     assert "none" not in objects(page) and np.ptp(np.array(data_of(page)["corners"]), axis=0)[0] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    ("name", "path"),
+    [
+        *((word, word) for word in ("@@VIEWER@@", "@@COMMANDS@@", "@@DATA@@", "@@LIVE@@")),
+        ("a/b", "a%2fb"), ("a", "a"), ("</script><img src=x>", "%3c%2fscript%3e%3cimg src=x%3e"), ("%2f", "%252f"),
+        ("name \udc80", "name %dc80"),
+    ],
+)  # fmt: skip
+def test_any_name_is_shown_as_it_is(name: str, path: str, tmp_path: Path) -> None:
+    """Words of the template, markup, parts of paths, lone surrogates."""
+    scene = Scene(name)
+    scene.points(name, [[0.0, 1.0]])
+    scene.label(name, [0.0, 0.0])
+    page = scene.save(tmp_path / "scene.html").read_text(encoding="utf-8")
+    around = without_viewer(page)  # which stands in it once
+    assert len(around) < 100_000 and around.count("</script>") == 3
+    assert "<img" not in around and "innerHTML" not in around
+    assert data_of(page)["title"] == data_of(page)["labels"][0]["text"] == legend(page)[0] == name
+    assert path in objects(page)
+
+
 def test_far_from_the_origin_nothing_jitters() -> None:
     """Metres of UTM are large: in single precision 5e6 m is known to half a metre."""
     solution, x, _ = chain(5, offset=5.4e6)
@@ -353,52 +381,16 @@ def test_far_from_the_origin_nothing_jitters() -> None:
     assert facts["shown around"] == "(5400002, 0, 0) m"
     assert np.abs(np.array(data["corners"])).max() < 10.0
     assert "shown around" not in dict(data_of(Scene.of(chain(5)[0]).html())["facts"])
-
-
-def test_bodies_and_labels_move_with_the_scene() -> None:
-    scene = Scene(dt=1.0)
+    scene = Scene(dt=1.0, keep=3)
     scene.body("car", "car", size=2.0)
     scene.label("depot", [1e6, 1e6])
-    for k in range(3):
+    for k in range(10):
         scene.frame().place("car", [1e6 + k, 1e6, 0.0])
     page = scene.html()
     places = np.array([value for _, value in tracks_of(commands_of(page))["car"][".position"]])
     assert np.abs(places).max() < 10.0 and np.abs(data_of(page)["labels"][0]["at"]).max() < 10.0
-    body = vertices(objects(page)["car/parts/body"])
-    assert np.abs(body).max() < 10.0
-
-
-def test_names_cannot_become_paths_or_markup() -> None:
-    scene = Scene("</script><script>alert(1)</script>")
-    for name in ("a/b", "a", "</script>", "%2f", "<object>"):
-        scene.points(name, [[0.0, 1.0]])
-    scene.label("<img src=x onerror=alert(1)>", [0.0, 0.0])
-    page = scene.html()
-    assert set(objects(page)) >= {"a%2fb", "a", "%3c%2fscript%3e", "%252f", "%3cobject%3e"}
-    around = without_viewer(page)
-    assert around.count("</script>") == 3 and "<img" not in around
-    assert data_of(page)["title"].startswith("</script>") and legend(page)[0] == "a/b"
-
-
-@pytest.mark.parametrize("word", ["@@VIEWER@@", "@@COMMANDS@@", "@@DATA@@", "@@LIVE@@"])
-def test_words_of_the_template_may_be_names(word: str) -> None:
-    scene = Scene(word)
-    scene.points(word, [[0.0, 1.0]])
-    scene.label(word, [0.0, 0.0])
-    page = scene.html()
-    around = without_viewer(page)  # which stands in it once
-    assert len(around) < 100_000 and around.count("</script>") == 3
-    assert data_of(page)["title"] == data_of(page)["labels"][0]["text"] == legend(page)[0] == word
-    assert word in objects(page)
-
-
-def test_lone_surrogates_may_be_in_names(tmp_path: Path) -> None:
-    scene = Scene("title \ud800")
-    scene.points("name \udc80", [[0.0, 1.0]])
-    scene.label("label \udfff", [0.0, 0.0])
-    page = scene.save(tmp_path / "scene.html").read_text(encoding="utf-8")
-    assert "name %dc80" in objects(page)
-    assert data_of(page)["title"] == "title \ud800" and legend(page)[0] == "name \udc80"
+    assert np.abs(vertices(objects(page)["car/parts/body"])).max() < 10.0
+    assert data_of(page)["ticks"] == [0, 1, 2]  # the latest three
 
 
 def test_long_ways_over_many_ticks_stay_small() -> None:
@@ -413,13 +405,6 @@ def test_long_ways_over_many_ticks_stay_small() -> None:
     assert len(page) < 12e6
     facts = dict(data_of(page)["facts"])
     assert facts["x, thinned"] == "333 of 2000" and facts["x: poses, thinned"] == "26 of 2000"
-
-
-def test_only_so_many_frames_are_kept() -> None:
-    scene = Scene(dt=0.1, keep=3)
-    for k in range(10):
-        scene.frame().points("p", [[float(k), 0.0]])
-    assert data_of(scene.html())["ticks"] == [0, 1, 2]
 
 
 def test_scenes_in_threads_do_not_meet() -> None:
@@ -457,17 +442,6 @@ def test_shapes_look_outwards() -> None:
     assert twice[:, 0].max() == pytest.approx(7.0) and faces.max() == len(twice) - 1
 
 
-def test_what_is_no_covariance_and_no_rotation_is_refused() -> None:
-    scene = Scene()
-    with pytest.raises(ViewError, match="covariance 1 has a negative variance"):
-        scene.covariances("c", np.zeros((2, 2)), np.array([np.eye(2), [[1.0, 2.0], [2.0, 1.0]]]))
-    for quaternion in ([0.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0]):
-        with pytest.raises(ViewError, match="quaternion of pose 0"):
-            scene.poses("p", [[0.0, 0.0, 0.0, *quaternion]])
-    scene.covariances("c", np.zeros((1, 2)), [[[1.0, 1.0], [1.0, 1.0 - 1e-12]]])  # but for rounding
-    scene.poses("p", [[0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]])
-
-
 @pytest.mark.skipif(shutil.which("node") is None, reason="node runs what the page says")
 def test_numbers_beside_plots_keep_their_zeros() -> None:
     """110 cm are no 11 cm."""
@@ -477,3 +451,38 @@ def test_numbers_beside_plots_keep_their_zeros() -> None:
     asked = f"{stated}console.log({list(shown)}.map(short).join(' '))"
     found = subprocess.run(["node", "-e", asked], capture_output=True, text=True, check=True)
     assert found.stdout.split() == list(shown.values())
+
+
+@pytest.mark.parametrize("projection", [None, "3d"])
+def test_a_frame_is_drawn_on_axes_as_a_browser_would_be_sent_it(projection: str | None) -> None:
+    from matplotlib.collections import PolyCollection
+    from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
+
+    from unifg.style.colours import css
+
+    scene = Scene()
+    scene.discs("pillar", [[3.0, 1.0, 0.5]], height=2.0, colour="moving")
+    scene.body("robot", "disc", size=0.2)
+    scene.lines("sight", [[[0.0, 0.0, 0.0], [3.0, 1.0, 1.0]]])
+    scene.label("here", [0.0, 0.0])
+    for k in range(3):
+        with scene.frame() as frame:
+            frame.place("robot", [float(k), 0.0, 0.0])
+            frame.trail("driven", [float(k), 0.0])
+            frame.points("hit", [[1.0, float(k)]])
+    figure = Figure()
+    ax: Any = figure.add_subplot(projection=projection)
+    assert scene.draw(ax, 1) is ax
+    assert ax.get_legend_handles_labels()[1] == ["pillar", "robot", "sight", "driven", "hit"]
+    figure.canvas.draw()
+    if projection:
+        assert [type(c).__name__ for c in ax.collections] == ["Line3DCollection", "Poly3DCollection"]
+        return
+    assert [text.get_text() for text in ax.texts] == ["here"]
+    shown = {to_hex(np.asarray(c.get_facecolor())[0]): c for c in ax.collections if isinstance(c, PolyCollection)}
+    pillar, driven = shown[css("moving")], shown[css(scene.colour("driven"))]
+    places = [np.concatenate([np.asarray(path.vertices) for path in c.get_paths()]) for c in (pillar, driven)]
+    np.testing.assert_allclose([places[0].min(axis=0), places[0].max(axis=0)], [[2.5, 0.5], [3.5, 1.5]])
+    assert places[1][:, 0].max() == pytest.approx(1.0)  # not further than this frame
+    assert pillar.get_zorder() > driven.get_zorder()

@@ -151,6 +151,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "scenarios/options.py": ("cli",),
     "scenarios/scenes/drive_scene.py": ("scene",),
     "unifg/view/canvas.py": ("view",),
+    "unifg/view/paper.py": ("view",),
     "unifg/view/recording.py": ("view", "scene", "quadrotor_scene"),
     "unifg/view/stage.py": ("scene", "quadrotor_scene"),
     "unifg/view/things.py": ("view",),

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from datetime import timedelta
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -193,12 +194,11 @@ def _on_file(found: Campaign, known: set[str], code: str, again: bool, any_code:
 
 
 def _remark_changes(found: Campaign, statement: Statement, code: str, done: dict[str, str]) -> None:
-    path = found.folder / MANIFEST
-    if not path.is_file():
+    if not (found.folder / MANIFEST).is_file():
         return
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))["campaign"]
-    except (OSError, ValueError, KeyError, TypeError):
+        before = manifest_of(found.folder)["campaign"]
+    except ScenarioError:
         found.remarks.append(f"{MANIFEST} cannot be read: it is written anew")
         return
     if before != json.loads(json.dumps(statement.given, default=str)):
@@ -280,11 +280,6 @@ class _Meter:
         bad = ", ".join(f"{c.outcomes[name]} {name}" for name in (FAILED, ERROR, LOST) if c.outcomes[name])
         text = f"{done} of {c.episodes}" + (f", {bad}" if bad else "")
         if c.ran:
-            text += f", {_clock((time.monotonic() - self._began) / c.ran * (c.episodes - done))} left"
+            ahead = (time.monotonic() - self._began) / c.ran * (c.episodes - done)
+            text += f", {timedelta(seconds=round(ahead))} left"
         self._progress(done / max(1, c.episodes), text)
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

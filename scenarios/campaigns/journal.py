@@ -91,23 +91,14 @@ class Journal:
             ) from None
 
     def _mend(self) -> None:
-        end = self._file.seek(0, os.SEEK_END)
-        if not end:
-            return
-        begin, last = end, b""
-        while begin and b"\n" not in last:
-            step = min(begin, 1 << 16)
-            begin -= step
-            self._file.seek(begin)
-            last = self._file.read(step) + last
-        rest = last.rpartition(b"\n")[2]
+        rest = self.path.read_bytes().rpartition(b"\n")[2]
         if not rest:
             return
         if _row(rest) is not None:
             self._file.write(b"\n")
             self.mended = "the last line had no end: it is complete"
         else:
-            self._file.truncate(end - len(rest))
+            self._file.truncate(self._file.seek(0, os.SEEK_END) - len(rest))
             self.mended = "the last line was cut off: it is taken away, and its episode repeated"
         _synced(self._file)
 

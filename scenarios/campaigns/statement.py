@@ -107,11 +107,6 @@ class Statement:
     base: Path
     given: Mapping[str, Any]
 
-    @property
-    def module(self) -> ModuleType:
-        """Runs the scenario."""
-        return module_of(self.scenario)
-
     @cached_property
     def fields(self) -> Fields:
         """The settings there are."""
@@ -207,7 +202,7 @@ def stated(given: Mapping[str, Any], base: str | Path = ".", name: str = "campai
     base = Path(base).resolve()
     known = fields_of(scenario, base)
     fixed = _assigned(known, _table(given, "settings", name), f"{name}, settings")
-    axes = tuple(_axis(known, axis, values, name) for axis, values in _table(given, "grid", name).items())
+    axes = tuple(_axis(known, axis, values, name) for axis, values in _flat(_table(given, "grid", name)))
     set_by = dict.fromkeys(fixed, "`settings`")
     for axis in axes:
         for path in dict.fromkeys(path for values in axis.values.values() for path in values):
@@ -303,11 +298,6 @@ def _flat(given: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any
 
 def _axis(known: Fields, name: str, values: Any, file: str) -> Axis:
     where = f"{file}, grid.{name}"
-    if isinstance(values, Mapping):  # grid.controller.speed = [...]
-        inner, *more = _flat(values, f"{name}.")
-        if more:
-            raise ScenarioError(f'{where}: write each axis on a line of its own: "{name}.NAME" = [...]')
-        return _axis(known, *inner, file)
     if not isinstance(values, list) or not values:
         raise ScenarioError(f"{where}: a list of values is expected, at least one")
     bundle = all(isinstance(value, Mapping) for value in values)

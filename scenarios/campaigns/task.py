@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import socket
 import threading
@@ -15,12 +14,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from unifg.errors import ScenarioError, UnifgError
 from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Episode, built, module_of
 from unifg.scenarios.episode import silent
+from unifg.scenarios.logs.metrics import strict
 
 __all__ = ["ERROR", "FAILED", "LOST", "OK", "Task", "WrongLibrary", "line", "lost", "run_task"]
 
@@ -78,7 +76,7 @@ def run_task(task: Task) -> str:
             began, cpu = time.perf_counter(), time.process_time()
             outcome = module.run(settings, silent)
             unclear = list[str]()
-            found = {"outcome": OK if outcome.succeeded else FAILED, "metrics": _plain(outcome.metrics, unclear)}
+            found = {"outcome": OK if outcome.succeeded else FAILED, "metrics": strict(outcome.metrics, unclear)}
             if unclear:
                 found["not_finite"] = sorted(unclear)
         except (Exception, SystemExit, KeyboardInterrupt) as error:
@@ -130,23 +128,3 @@ def _warmed(task: Task, module: Any, settings: Any) -> None:
         module.run(settings, stop)
     except (Exception, SystemExit, KeyboardInterrupt):
         return  # the episode itself will say so
-
-
-def _plain(value: Any, unclear: list[str], path: str = "") -> Any:
-    """Value as JSON can hold it, None for numbers that are not finite.
-
-    Args:
-        value: numbers of Python or NumPy, words, lists and mappings of them.
-        unclear: receives the paths of numbers that are not finite.
-        path: of the value.
-    """
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        return {str(name): _plain(inner, unclear, f"{path}.{name}".lstrip(".")) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner, unclear, f"{path}.{number}") for number, inner in enumerate(value)]
-    if isinstance(value, float) and not math.isfinite(value):
-        unclear.append(path)
-        return None
-    return value if value is None or isinstance(value, str | bool | int | float) else str(value)

@@ -26,6 +26,7 @@ from unifg.codegen.threads import cores
 from unifg.errors import UnifgError
 from unifg.scenarios.commands import performance
 from unifg.scenarios.commands.outcome import Progress
+from unifg.scenarios.workers import THREADS
 
 __all__ = ["Finding", "examined"]
 
@@ -140,12 +141,12 @@ def _cache(folder: Path) -> Iterator[Finding]:
 
 
 def _threads() -> Iterator[Finding]:
-    stated = ", ".join(f"{name}={value}" for name, value in performance.threads().items())
+    stated = ", ".join(f"{name}={os.environ[name]}" for name in THREADS if name in os.environ)
     yield Finding(
         "threads",
         f"{cores()} of {os.cpu_count()} cores for this process; {stated or 'no limit on threads of linear algebra'}",
     )
-    if "OMP_NUM_THREADS" not in performance.threads():
+    if "OMP_NUM_THREADS" not in os.environ:
         yield Finding(
             "threads", "matrices here are small: OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 spares what waits for others",
             good=None,
@@ -173,22 +174,12 @@ def _backends() -> Iterator[Finding]:
             said = f"{solution.status.name}, cost {solution.cost:.9g} for {right:.9g}"
             yield Finding("backends", f"{name:8} wrong: {said}", good=False)
             continue
-        ratio, milliseconds = _pace(solve)
-        text = f"{name:8} right; first {first:6.2f} s, then {milliseconds:6.2f} ms"
+        ratio, took, _ = np.median([performance.beside_reference(solve) for _ in range(REPEATS)], axis=0).tolist()
+        text = f"{name:8} right; first {first:6.2f} s, then {1e3 * took:6.2f} ms"
         recorded = None if record is None else record.ratios.get(f"backend {name}")
         factor = ratio / float(np.median(recorded)) if recorded else 1.0
         text += f", {factor:.1f} times the recorded" if recorded else ""
         yield Finding("backends", text, None if factor > SLOW else True)
-
-
-def _pace(solve: Callable[[], object]) -> tuple[float, float]:
-    """Ratio to the reference, and milliseconds of processor time: medians."""
-    ratios, times = list[float](), list[float]()
-    for _ in range(REPEATS):
-        before = performance.seconds(performance.reference)
-        times.append(performance.seconds(solve))
-        ratios.append(times[-1] / before)
-    return float(np.median(ratios)), 1e3 * float(np.median(times))
 
 
 def report(findings: list[Finding]) -> str:

@@ -27,7 +27,7 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
         KeyboardInterrupt: when stopped before the first tick.
         ScenarioError: when start, goals or obstacles do not fit the map.
     """
-    with watching_ticks(announce, drive_stage, lambda scene, frame, log, tick: drive_frame(frame, log, tick)):
+    with watching_ticks(announce, drive_stage, drive_frame):
         log = navigation.run_navigation(settings, progress=progress)
     if log.ticks == 0:
         raise KeyboardInterrupt

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from unifg.scenarios import manoeuvres
-from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations, synchronized
+from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.logs.metrics import write_metrics
 from unifg.scenarios.options import option
@@ -46,8 +46,8 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
 
         tell = by_iterations(part, 0.9, lambda row: f"iteration {row.number}, cost {row.cost:.5g}")
         case = manoeuvres.CASES[name]
-        with watching_iterates(announce, manoeuvre_stage(case), manoeuvre_iterate) as watch:
-            solved.append(manoeuvres.run_manoeuvre(case, settings.solver, progress=synchronized(tell, watch)))
+        with watching_iterates(announce, manoeuvre_stage(case), manoeuvre_iterate, tell) as watch:
+            solved.append(manoeuvres.run_manoeuvre(case, settings.solver, progress=watch))
         interrupted = solved[-1].solution.status is Status.INTERRUPTED
         if interrupted:
             break

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
+from unifg.scenarios.episode import Progress
 from unifg.solution.history import Iteration
 
-__all__ = ["Outcome", "Progress", "by_iterations", "synchronized"]
-
-Progress: TypeAlias = Callable[[float, str], None]
-"""Takes the share that is done, and a word about it; raises KeyboardInterrupt when the user wants to stop."""
+__all__ = ["Outcome", "Progress", "by_iterations"]
 
 
 @dataclass(frozen=True)
@@ -47,13 +45,3 @@ def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], st
         progress(1.0 - pace**row.number, say(row))
 
     return tell
-
-
-def synchronized(*callbacks: Callable[[Iteration], None]) -> Callable[[Iteration], None]:
-    """A callback of a solver that calls others, one after the other."""
-
-    def each(row: Iteration) -> None:
-        for callback in callbacks:
-            callback(row)
-
-    return each

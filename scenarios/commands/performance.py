@@ -10,7 +10,6 @@ above `SLOWER`.
 from __future__ import annotations
 
 import json
-import os
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -191,20 +190,24 @@ def measured(rounds: int, progress: Progress) -> Record:
     for k in range(rounds):
         progress(k / rounds, f"round {k + 1} of {rounds}")
         for name in rng.permutation(list(found)):
-            before, took, after = seconds(reference), seconds(found[name]), seconds(reference)
-            ratios[name].append(2.0 * took / (before + after))
+            ratio, took, usual = beside_reference(found[name])
+            ratios[name].append(ratio)
             spent[name].append(took)
-            spent["reference"] += [before, after]
+            spent["reference"].append(usual)
     progress(1.0, "done")
     milliseconds = {name: round(1e3 * float(np.median(times)), 4) for name, times in spent.items()}
     return Record(fg.__version__, datetime.now(UTC).date().isoformat(), machine(), milliseconds, ratios)
 
 
-def seconds(action: Action) -> float:
-    """Processor time of a call [s]."""
-    began = time.process_time()
-    action()
-    return time.process_time() - began
+def beside_reference(action: Action) -> tuple[float, float, float]:
+    """Ratio of a call to the reference right before and after it, and processor times of both [s]."""
+    times = []
+    for call in (reference, action, reference):
+        began = time.process_time()
+        call()
+        times.append(time.process_time() - began)
+    usual = 0.5 * (times[0] + times[2])
+    return times[1] / usual, times[1], usual
 
 
 def history(file: Path = HISTORY) -> list[Record]:
@@ -285,9 +288,3 @@ def report(now: Record, rows: Mapping[str, Comparison]) -> str:
         mark = "  SLOWER" if name in rows and rows[name].slower else ""
         lines.append(f"{name:18} {now.milliseconds[name]:9.3f} {float(np.median(ratios)):12.3f}  {against}{mark}")
     return "\n".join(lines)
-
-
-def threads() -> dict[str, str]:
-    """Environment variables that limit the threads of linear algebra."""
-    names = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-    return {name: os.environ[name] for name in names if name in os.environ}

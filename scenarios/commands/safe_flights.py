@@ -9,7 +9,7 @@ from typing import Any
 from unifg.scenarios import safe_flight
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.commands.watching import Announce, watching_ticks
-from unifg.scenarios.logs.metrics import write_metrics
+from unifg.scenarios.logs.metrics import table, write_metrics
 from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.scenes.safe_plot import picture
 from unifg.scenarios.scenes.safe_scene import safe_frame, safe_scene, safe_stage
@@ -27,7 +27,7 @@ def run(settings: safe_flight.SafeSettings, progress: Progress, announce: Announ
         KeyboardInterrupt: when stopped before the first tick.
         ScenarioError: for a case or a controller that is unknown.
     """
-    with watching_ticks(announce, safe_stage, lambda scene, frame, log, tick: safe_frame(frame, log, tick)):
+    with watching_ticks(announce, safe_stage, safe_frame):
         logs = [log for log in safe_flight.run_safe_flights(settings, progress) if log.ticks]
     if not logs:
         raise KeyboardInterrupt
@@ -65,8 +65,7 @@ def write_results(folder: str | Path, logs: Sequence[SafeLog]) -> list[Path]:
 
 def summary(logs: Sequence[SafeLog]) -> str:
     """The outcome for people, one line for each flight."""
-    heads = ("flight", "boundary distance", "path kept to", "top speed", "decided in", "outcome")
-    rows = [heads]
+    rows = [("flight", "boundary distance", "path kept to", "top speed", "decided in", "outcome")]
     for log in logs:
         m = safe_metrics(log)
         near = m["min_boundary_distance_m"]
@@ -89,7 +88,4 @@ def summary(logs: Sequence[SafeLog]) -> str:
                 ", ".join(words) or "flown to the end",
             )
         )
-    widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
-    return "\n".join(
-        "  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows
-    )
+    return table(rows)

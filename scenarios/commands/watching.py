@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 from unifg.scenarios.logs.columns import SoFar, watched
+from unifg.scenarios.scenes.numbers import Number, declare, show
 from unifg.solution.history import Iteration
 from unifg.view import Frame, Live, Scene
 
@@ -14,6 +15,18 @@ __all__ = ["Announce", "watching_iterates", "watching_ticks"]
 
 Announce: TypeAlias = Callable[[str], None]
 """Receives the address of the scene; None without a viewer."""
+
+
+NUMBERS = (
+    Number("iteration", lambda row, k: str(k)),
+    Number("cost", lambda row, k: f"{row.cost:.6g}", lambda row, k: row.cost),
+    Number("stationarity", None, lambda row, k: row.stationarity, plot={"log": True}),
+    Number(
+        "violation", lambda row, k: f"{row.violation:.1e}", lambda row, k: row.violation,
+        plot={"log": True, "colour": "moving"},
+    ),
+)  # fmt: skip
+"""Lines and curves of iterates."""
 
 
 @contextmanager
@@ -56,30 +69,26 @@ def watching_ticks(
 
 @contextmanager
 def watching_iterates(
-    announce: Announce | None, scene: Scene, draw: Callable[[Frame, Iteration], None]
+    announce: Announce | None, scene: Scene, draw: Callable[[Frame, Iteration], None], tell: Callable[[Iteration], None]
 ) -> Iterator[Callable[[Iteration], None]]:
-    """Callback of a solver that shows every iterate; without a viewer it does nothing.
+    """Callback of a solver that tells of every iterate and shows it, where there is a viewer.
 
     Args:
         announce: see `Announce`.
         scene: with what stays.
         draw: what an iterate shows, besides its numbers.
+        tell: called with every iterate.
     """
     if announce is None:
-        yield lambda row: None
+        yield tell
         return
-    scene.plot("cost")
-    scene.plot("stationarity", log=True)
-    scene.plot("violation", log=True, colour="moving")
+    declare(scene, NUMBERS)
 
     def watch(row: Iteration) -> None:
+        tell(row)
         with scene.frame() as frame:
             draw(frame, row)
-            frame.readout("iteration", str(row.number))
-            frame.readout("cost", f"{row.cost:.6g}")
-            frame.readout("violation", f"{row.violation:.1e}")
-            for name in ("cost", "stationarity", "violation"):
-                frame.value(name, getattr(row, name))
+            show(frame, row, row.number, NUMBERS)
 
     with scene.live() as live:
         announce(live.url)

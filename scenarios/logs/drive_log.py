@@ -126,11 +126,6 @@ class EpisodeLog(StoredLog):
     """What was made to go wrong just then."""
 
     @property
-    def ticks(self) -> int:
-        """Number of ticks recorded."""
-        return len(self.time)
-
-    @property
     def tick_ms(self) -> Array:
         """(T,) all that a tick takes [ms]."""
         total: Array = self.localise_ms + self.perceive_ms + self.route_ms + self.plan_ms
@@ -140,9 +135,3 @@ class EpisodeLog(StoredLog):
     def succeeded(self) -> bool:
         """True only if every goal was reached without a collision, in an episode run to its end."""
         return not self.interrupted and bool(self.reached) and all(self.reached) and self.collisions == 0
-
-    @property
-    def obstacles_first(self) -> Array:
-        """(K, 3) the obstacles at the beginning."""
-        first: Array = self.obstacles[0]
-        return first

@@ -104,7 +104,7 @@ def _messages(log: EpisodeLog) -> Iterator[tuple[float, Message]]:
             yield moment, ("/route", _poses(shown, moment))
         yield moment, ("/obstacles", _scene("true", _cylinders(log.obstacles[k]), moment))
         yield moment, ("/tracked", _scene("tracked", _cylinders(log.detected[k]), moment))
-        yield moment, ("/tick", {name: strict(np.asarray(getattr(log, name)[k]).tolist()) for name in _plain(log)})
+        yield moment, ("/tick", {name: strict(getattr(log, name)[k]) for name in _plain(log)})
 
 
 def _plain(log: EpisodeLog) -> list[str]:

@@ -94,11 +94,6 @@ class FlightLog(StoredLog):
     """Injected fault of the tick."""
 
     @property
-    def ticks(self) -> int:
-        """Number of ticks recorded."""
-        return len(self.truth)
-
-    @property
     def time(self) -> Array:
         """(T,) since the start [s]."""
         return self.dt * np.arange(self.ticks, dtype=np.float64)

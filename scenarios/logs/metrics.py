@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -103,22 +103,33 @@ def write_metrics(path: str | Path, metrics: Mapping[str, object]) -> Path:
     return path
 
 
-def strict(value: object) -> object:
-    """The same value for a strict JSON reader, which knows neither NaN nor infinity."""
+def strict(value: object, unclear: list[str] | None = None, path: str = "") -> Any:
+    """The same value for a strict JSON reader, which knows neither NaN nor infinity: such numbers are None.
+
+    Args:
+        value: numbers of Python or NumPy, words, lists and mappings of them; anything else becomes its text.
+        unclear: receives the paths of numbers that are not finite.
+        path: of the value.
+    """
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): strict(item) for key, item in value.items()}
+        return {str(name): strict(inner, unclear, f"{path}.{name}".lstrip(".")) for name, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [strict(item) for item in value]
+        return [strict(inner, unclear, f"{path}.{number}") for number, inner in enumerate(value)]
     if isinstance(value, float) and not math.isfinite(value):
+        if unclear is not None:
+            unclear.append(path)
         return None
-    return value
+    return value if value is None or isinstance(value, str | bool | int | float) else str(value)
 
 
-def table(rows: Iterable[tuple[str, str]]) -> str:
-    """Names and values for people, as a table of two columns; empty values are left out."""
-    shown = [(name, value) for name, value in rows if value]
-    width = max(len(name) for name, _ in shown)
-    return "\n".join(f"{name:<{width}}  {value}" for name, value in shown)
+def table(rows: Iterable[Sequence[str]]) -> str:
+    """Rows of cells for people, in columns as wide as need be; rows of a name and nothing else are left out."""
+    shown = [row for row in rows if any(row[1:])]
+    widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
+    lines = ("  ".join(f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True)) for row in shown)
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def health(m: Mapping[str, Any]) -> str:

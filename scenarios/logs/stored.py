@@ -31,6 +31,11 @@ class StoredLog:
 
     KIND: ClassVar[str]
 
+    @property
+    def ticks(self) -> int:
+        """Number of ticks recorded."""
+        return len(getattr(self, next(iter(columns(self)))))
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one compressed file."""
         declared, arrays, rest = columns(self), dict[str, Any](), dict[str, Any]()
@@ -80,13 +85,10 @@ def _flattened(log: Any, without: Any = ()) -> dict[str, Any]:
     """Fields of a dataclass, those of nested dataclasses as ``NAME.FIELD``."""
     found: dict[str, Any] = {}
     for declared in fields(log):
-        value = getattr(log, declared.name)
-        if declared.name in without:
-            continue
-        if is_dataclass(value):
-            found |= {f"{declared.name}.{inner}": part for inner, part in _flattened(value).items()}
-        else:
-            found[declared.name] = value
+        if declared.name not in without:
+            value = getattr(log, declared.name)
+            inner = _flattened(value) if is_dataclass(value) else {"": value}
+            found |= {f"{declared.name}.{name}".rstrip("."): part for name, part in inner.items()}
     return found
 
 

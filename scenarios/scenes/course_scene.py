@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from unifg.scenarios.course import CourseSettings
+import numpy as np
+
+from unifg.scenarios.course import Course, CourseSettings
 from unifg.scenarios.scenes.parts import layout
+from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.solution.history import Iteration
+from unifg.typing import Array
 from unifg.view import Frame, Scene
 
-__all__ = ["course_iterate", "course_stage"]
+__all__ = ["HEIGHT", "course_iterate", "course_stage", "iterate_scene"]
 
-_HEIGHT = 2.0  # up to which obstacles are drawn; they have no top [m]
+HEIGHT = 2.0
+"""Height up to which obstacles are drawn, which have no top [m]."""
+
+_APART = 0.75  # two quadrotors are drawn at least so far apart [m]
 
 
 def course_stage(settings: CourseSettings) -> Scene:
@@ -17,9 +24,32 @@ def course_stage(settings: CourseSettings) -> Scene:
     placed = settings.layout()
     scene = Scene(f"unifg: {placed.name or 'a course'}, as it is solved", counts="iteration")
     scene.ground = False
-    layout(scene, placed, _HEIGHT)
-    scene.discs("cylinders", placed.cylinders, height=_HEIGHT, colour="fixed")
+    layout(scene, placed, HEIGHT)
+    scene.discs("cylinders", placed.cylinders, height=HEIGHT, colour="fixed")
     return scene
+
+
+def iterate_scene(course: Course, number: int) -> Scene:
+    """One iterate of a solved course, the quadrotor at its start or, of the last one, along it."""
+    nodes, scene = course.iterates[number], course_stage(course.settings)
+    scene.way("way", nodes[:, :3], width=0.06, colour="horizon", legend="planned way and its nodes")
+    frame = scene.frame()
+    for k, node in enumerate(_apart(nodes) if number == len(course.iterates) - 1 else nodes[:1]):
+        words = "" if k else "quadrotor, to scale"
+        scene.body(f"quadrotor {k}", "quadrotor", size=VEHICLE_RADIUS, colour="robot", legend=words)
+        frame.place(f"quadrotor {k}", node[:7])
+    return scene
+
+
+def _apart(nodes: Array) -> Array:
+    """Nodes far enough apart to draw a quadrotor at each, first and last among them."""
+    kept = [nodes[0]]
+    for node in nodes[1:]:
+        if np.linalg.norm(node[:3] - kept[-1][:3]) >= _APART:
+            kept.append(node)
+    if np.linalg.norm(nodes[-1, :3] - kept[-1][:3]) > 0.5 * _APART or len(kept) == 1:
+        kept.append(nodes[-1])
+    return np.array(kept)
 
 
 def course_iterate(frame: Frame, row: Iteration) -> None:

@@ -6,27 +6,27 @@ The same few functions show a whole log, and a drive while it goes on: they read
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from unifg.errors import ViewError
 from unifg.lie import SE2
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.metrics import collision_words, health
-from unifg.scenarios.scenes.numbers import Number, declare, in_words, metres, show
-from unifg.scenarios.scenes.parts import pillar
+from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
+from unifg.scenarios.scenes.parts import draw_way, pillar
 from unifg.typing import Array, IntArray
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["drive_frame", "drive_scene", "drive_stage", "scan_points"]
+__all__ = ["drive_frame", "drive_scene", "drive_stage", "place_movers", "scan_points"]
 
 _MAX_POINTS = 90_000  # lidar points of the whole file; beyond, every second beam, every third, ...
 _FRAMES = 500  # that a file shows
 _WALL = 0.6  # height of walls and obstacles [m]: low enough to look into rooms
 _BODY = 0.3  # height of the robot [m]
-_NODES = 16  # of the predicted way
 _ABOVE = (0.0, -math.cos(1.1), math.sin(1.1))  # where the camera stands
 _SIGMAS, _ENLARGED = 3.0, 10.0  # of the ellipse of the estimate: centimetres in a building
 
@@ -82,17 +82,25 @@ NUMBERS = (
 """Lines and curves of a drive."""
 
 
+LAYERS = (
+    ("scan", "dots", "scan", "lidar hits", 0.0),
+    ("horizon", "line", "horizon", "plan for the next seconds", 1.0),
+    ("trail", "line", "trail", "way driven so far", 0.9),
+    ("route", "line", "plan", "route it follows, repaired where blocked", 0.6),
+    ("detected", "ring", "detected", "obstacle as detected", 0.0),
+    ("contact", "block", "moving", "contact", 0.0),
+)
+"""Names, swatches, colours, words and widths over those of lines of what changes with the ticks."""
+
+
 def drive_scene(log: EpisodeLog) -> Scene:
     """The scene of a drive.
 
     Raises:
         ViewError: the drive has no tick.
     """
-    if log.ticks == 0:
-        raise ViewError("there is no tick, and nothing to show")
-    scene = drive_stage(log)
-    for tick in range(log.ticks):
-        drive_frame(scene.frame(), log, tick, min(log.ticks, _FRAMES))
+    frames = min(log.ticks, _FRAMES)
+    scene = filled(log, partial(drive_stage, log, log.outcomes), partial(drive_frame, frames=frames))
     m = episode_metrics(log)
     stopped = ", interrupted by the user" if m["interrupted"] else ""
     missed = "".join(f"; {words}" for words in dict.fromkeys(m["outcomes"]) if words != "reached")  # each once
@@ -110,11 +118,12 @@ def drive_scene(log: EpisodeLog) -> Scene:
     return scene
 
 
-def drive_stage(log: Any) -> Scene:
+def drive_stage(log: Any, outcomes: Sequence[str] = ()) -> Scene:
     """Static parts of a drive's scene, and the bodies that move in it.
 
     Args:
         log: an `EpisodeLog`, or one in the making: what is known before the first tick is asked of it.
+        outcomes: of the goals, as far as they are known.
     """
     scene = Scene(f"unifg: {log.scenario} on {log.occupancy.name}", dt=log.dt)
     corners = shapes.known_corners(log.occupancy)
@@ -125,7 +134,8 @@ def drive_stage(log: Any) -> Scene:
     scene.speeds = (1, 2, 4, 8)
     scene.facts |= {"solver": f"{log.solver} ({log.coupling})", "seed": str(log.seed)}
     _robots(scene, log.robot_radius, pin)
-    _growing(scene, stroke)
+    for name, swatch, colour, words, width in LAYERS:
+        scene.layer(name, swatch, colour, words, width * stroke or None)
     _goals(scene, log, stroke, pin)
     if len(log.path) > 1:
         scene.way(
@@ -134,8 +144,9 @@ def drive_stage(log: Any) -> Scene:
     _obstacles(scene, log)
     scene.map("building", log.occupancy, height=_WALL, legend="walls and furniture on the map")
     scene.label("start", log.start[:2])
-    for index, goal in enumerate(log.goals):
-        scene.label("goal" if len(log.goals) == 1 else f"goal {index + 1}", goal[:2])
+    for index, (goal, word) in enumerate(zip(log.goals, outcomes or ["reached"] * len(log.goals), strict=True)):
+        name = "goal" if len(log.goals) == 1 else f"goal {index + 1}"
+        scene.label(name + ("" if word == "reached" else " (missed)"), goal[:2])
     scene.label("robot", follows="robot")
     scene.label("odometry alone", follows="odometry", minor=True)
     scene.view("overview", "Whole building", _ABOVE)
@@ -144,11 +155,12 @@ def drive_stage(log: Any) -> Scene:
     return scene
 
 
-def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
+def drive_frame(scene: Scene, frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
     """Draw a tick of a drive.
 
     Args:
-        frame: to be drawn on.
+        scene: begun by `drive_stage`.
+        frame: of it, to be drawn on.
         log: an `EpisodeLog`, or one in the making.
         tick: which.
         frames: how many the file will hold.
@@ -164,17 +176,19 @@ def drive_frame(frame: Frame, log: Any, tick: int, frames: int = 1) -> None:
     beams = np.arange(0, len(log.scan_angles), math.ceil(frames * len(log.scan_angles) / _MAX_POINTS))
     hits = scan_points(log, tick, beams)
     frame.points("scan", np.column_stack([hits, np.full(len(hits), _WALL + 0.02)]), pixels=4.0)
-    horizon = log.horizon[tick]
-    nodes = np.unique(np.linspace(0, len(horizon) - 1, _NODES).round().astype(np.intp))
-    if len(nodes) > 1 and np.isfinite(horizon[nodes]).all():
-        frame.way("horizon", horizon[nodes, :2])
+    draw_way(frame, "horizon", log.horizon[tick][:, :2])
     rings = [shapes.ring(x[:2], float(x[2]) + 0.03, 0.06, _WALL + 0.01, corners=10) for x in log.detected[tick]]
     if rings:
         frame.mesh("detected", shapes.merge(rings))
-    for index in np.flatnonzero(log.obstacle_moves).tolist():
-        frame.place(f"obstacle {index}", [*log.obstacles[tick][index][:2], 0.0])
+    place_movers(frame, log, tick)
     _touch(frame, log, tick)
     show(frame, log, tick, NUMBERS)
+
+
+def place_movers(frame: Frame, log: Any, tick: int) -> None:
+    """Place the obstacles that move."""
+    for index in np.flatnonzero(log.obstacle_moves).tolist():
+        frame.place(f"obstacle {index}", [*log.obstacles[tick][index][:2], 0.0])
 
 
 def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
@@ -189,47 +203,24 @@ def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
 
 def _robots(scene: Scene, radius: float, pin: float) -> None:
     """The robot where it truly is, where it believes to be, and where its wheels alone would put it."""
-    middle, none = np.zeros((1, 3)), np.zeros(3)
-
-    def upright(height: float, wide: float) -> shapes.Mesh:
-        return shapes.copies(shapes.column(), middle, np.diag([wide, wide, height])[None])
-
     # A pin hovers above the robot, which would be a few pixels in a whole building.
-    tip = shapes.copies(
-        shapes.column(bottom=0.0), none[None] + [0.0, 0.0, _WALL + 0.05], np.diag([0.25, 0.25, 0.75])[None] * pin
-    )
-    heading = shapes.wedge(1.2 * radius, _BODY + 0.02)
-    robot = [
-        Part("body", upright(_BODY, radius), "robot"),
-        Part("heading", heading, "heading", False),
-        Part("pin", tip, "robot"),
-    ]
-    scene.body("robot", robot, colour="robot", legend="robot, where it truly is")
-    believed = [
-        Part("body", upright(_BODY + 0.12, radius + 0.06), "estimate", True, 0.3),
-        Part("heading", shapes.wedge(1.2 * radius, _BODY + 0.14), "estimate", False, 0.55),
-    ]
-    words = "where it believes it is: lidar localisation"
-    scene.body("estimate", believed, colour="estimate", swatch="ghost", legend=words)
+    turned = np.diag([0.25 * pin, 0.25 * pin, 0.75 * pin])[None]
+    tip = shapes.copies(shapes.column(bottom=0.0), np.array([[0.0, 0.0, _WALL + 0.05]]), turned)
+    for name, higher, wider, opacity, clear, words in (
+        ("robot", 0.0, 0.0, 1.0, 1.0, "robot, where it truly is"),
+        ("estimate", 0.12, 0.06, 0.3, 0.55, "where it believes it is: lidar localisation"),
+        ("odometry", 0.0, 0.0, 0.55, 0.8, "where its wheels alone would put it"),
+    ):
+        true, height = name == "robot", _BODY + higher
+        heading = shapes.wedge(1.2 * radius, height + 0.02)
+        parts = [
+            pillar(radius + wider, height, name)._replace(opacity=opacity),
+            Part("heading", heading, "heading" if true else name, False, clear),
+            *([Part("pin", tip, "robot")] if true else []),
+        ]
+        scene.body(name, parts, colour=name, swatch="disc" if true else "ghost", legend=words)
     words = f"how sure it is: {_SIGMAS:g}\u03c3, {_ENLARGED:g} times enlarged"
     scene.body("sigma", "ellipse", colour="estimate", swatch="ring", legend=words)
-    drifted = [
-        Part("body", upright(_BODY, radius), "odometry", True, 0.55),
-        Part("heading", heading, "odometry", False, 0.8),
-    ]
-    words = "where its wheels alone would put it"
-    scene.body("odometry", drifted, colour="odometry", swatch="ghost", legend=words)
-
-
-def _growing(scene: Scene, stroke: float) -> None:
-    """Names, words and widths of what changes with the ticks."""
-    scene.layer("scan", "dots", "scan", "lidar hits")
-    scene.layer("horizon", "line", "horizon", "plan for the next seconds", width=stroke)
-    scene.layer("trail", "line", "trail", "way driven so far", width=0.9 * stroke)
-    words = "route it follows, repaired where blocked"
-    scene.layer("route", "line", "plan", words, width=0.6 * stroke)
-    scene.layer("detected", "ring", "detected", "obstacle as detected")
-    scene.layer("contact", "block", "moving", "contact")
 
 
 def _goals(scene: Scene, log: Any, stroke: float, pin: float) -> None:
@@ -243,20 +234,18 @@ def _goals(scene: Scene, log: Any, stroke: float, pin: float) -> None:
         poles.append([x, y, 0.25 * stroke])
     scene.mesh("goals", shapes.merge(flags), colour="goal", swatch="flag", legend="goals")
     scene.discs("poles", poles, height=pin, colour="pole", legend="")
+    scene.poses("headings", np.vstack([log.start, log.goals]), length=4.0 * radius, colour="dark", legend="")
 
 
 def _obstacles(scene: Scene, log: Any) -> None:
     """Those that stand stay; those that move are bodies, switched by one line of the legend."""
-    moves, places = log.obstacle_moves, log.obstacles_first
+    moves, places = log.obstacle_moves, log.obstacles[0]
     if (~moves).any():
         words = "obstacle not on the map"
         scene.discs("obstacles", places[~moves], height=_WALL, colour="fixed", legend=words)
-    first: str | None = None
     for index in np.flatnonzero(moves).tolist():
-        name, radius = f"obstacle {index}", float(places[index, 2])
-        words = "obstacle that moves" if first is None else ""
-        scene.body(name, [pillar(radius, _WALL, "moving")], colour="moving", legend=words, like=first)
-        first = first or name
+        parts = [pillar(float(places[index, 2]), _WALL, "moving")]
+        scene.body(f"obstacle {index}", parts, colour="moving", legend="obstacle that moves")
 
 
 def _touch(frame: Frame, log: Any, tick: int) -> None:

@@ -1,7 +1,7 @@
 """A flight as pictures: from above at several moments, what it believed against the truth, and how it was flown.
 
-The view from above is as in Fig. 5 of Ta, Kobilarov and Dellaert (ICUAS 2014): the estimated past is blue, the
-predicted future green, the reach of the sensor magenta; cylinders seen by then are filled, others hollow. Limits of
+The view from above is as in Fig. 5 of Ta, Kobilarov and Dellaert (ICUAS 2014), a frame of the scene: the estimated past
+is blue, the predicted future green, the reach of the sensor magenta; cylinders not seen by then are faint. Limits of
 controls are drawn where the settings of the flight name them, at their top or under ``controller``: ``rate_limits``,
 three greatest rates [rad/s], and ``thrust_limits``, least and greatest thrust [N].
 """
@@ -14,16 +14,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from unifg.errors import ViewError
+from unifg.plots.shown import every
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
 from unifg.scenarios.logs.metrics import collision_words
-from unifg.scenarios.scenes.flight_scene import SIGMAS, first_sights, sensor_reach
+from unifg.scenarios.scenes.flight_scene import flight_frame, flight_stage, sensor_reach
 from unifg.scenarios.scenes.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
-from unifg.scenarios.simulation.air import VEHICLE_RADIUS
-from unifg.style.colours import GREY, INK, css
-from unifg.style.figures import discs, ground, headline, key_of, new_axes, new_figure
-from unifg.typing import Array, IntArray
-from unifg.view.shapes import ellipse_axes
+from unifg.style.colours import INK, css
+from unifg.style.figures import ground, headline, key_of, new_figure
+from unifg.typing import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
 __all__ = [
     "control",
     "estimates",
-    "moments",
     "overview",
     "plot_control",
     "plot_height",
@@ -42,6 +40,7 @@ __all__ = [
     "plot_state_error",
 ]
 
+_MOMENTS = 6  # evenly spread from the first tick to the last
 _MARGIN = 0.6  # around the layout [m]
 _WIDE = 2.0  # layouts at least this many times as long as wide are drawn in two columns, others in three
 _COLUMNS = 3  # of panels with estimates
@@ -65,7 +64,7 @@ def overview(log: FlightLog) -> Figure:
     """
     width, height = np.ptp(log.layout.size, axis=0) + 2.0 * _MARGIN
     columns = 2 if width >= _WIDE * height else 3
-    shown = moments(log)
+    shown = every(log.ticks, _MOMENTS)
     rows = math.ceil(len(shown) / columns)
     panel = 14.4 / columns
     with new_figure((15.0, rows * (panel * height / width + 0.42) + 1.1), log.ticks) as figure:
@@ -73,8 +72,8 @@ def overview(log: FlightLog) -> Figure:
         for ax in grid.flat[len(shown) :]:
             ax.set_axis_off()
         for ax, tick in zip(grid.flat, shown.tolist(), strict=False):
-            plot_moment(log, tick, ax=ax, legend=False).label_outer()
-        figure.legend(*key_of(grid.flat), loc="outside lower center", ncols=6)
+            plot_moment(log, tick, ax).label_outer()
+        figure.legend(*key_of(grid.flat), loc="outside lower center", ncols=4)
         reached = "target reached" if log.reached else "target not reached"
         how = "" if log.outcome in ("", "reached", "interrupted") else f", {log.outcome}"
         headline(figure, _title(log, f"{reached}, {collision_words(log.collisions)}{how}"))
@@ -138,87 +137,31 @@ def control(log: FlightLog) -> Figure:
     return figure
 
 
-def moments(log: FlightLog, count: int = 6) -> IntArray:
-    """At most that many ticks, evenly spread from the first to the last."""
-    return np.unique(np.linspace(0, log.ticks - 1, count).round().astype(np.intp))
-
-
-def plot_moment(log: FlightLog, tick: int, ax: Axes | None = None, *, legend: bool = True) -> Axes:
-    """Obstacles, belief and plan at one tick, from above.
-
-    Args:
-        log: the flight.
-        tick: which.
-        ax: axes to draw into; None for new ones.
-        legend: False leaves out the legend below the axes.
-    """
-    ax = new_axes(ax)
-    _things(log, tick, ax)
-    estimated = has_estimate(log)
-    if estimated:
-        ax.plot(*log.truth[: tick + 1, :2].T, color=css("odometry"), lw=0.9, label="true way", zorder=4)
-    name = "estimated past" if estimated else "way flown"
-    ax.plot(*log.believed[: tick + 1, :2].T, color=css("trail"), lw=1.6, label=name, zorder=5)
-    past, plan = log.pasts[tick], log.plans[tick]
-    if len(past) > 1:
-        ax.plot(*past[:, :2].T, color=css("robot"), lw=2.6, label="its window that is smoothed", zorder=6)
-    if len(plan) > 1 and np.isfinite(plan).all():
-        ax.plot(*plan[:, :2].T, color=css("horizon"), lw=2.6, label="predicted future", zorder=7)
-    _landmarks(log, tick, ax)
-    x, y = log.truth[tick, :2].tolist()
-    reach = sensor_reach(log)
-    if reach is not None:
-        discs(ax, [x, y, reach], "reach of the sensor", fill=False, edgecolor=css("scan"), lw=1.3, zorder=3)
-    discs(ax, [x, y, VEHICLE_RADIUS], facecolor=css("robot"), edgecolor="white", lw=0.6, zorder=9)
-    ax.plot(*log.layout.start[:2], "o", color=css("start"), ms=4, zorder=8, label="start")
-    star: dict[str, Any] = {"color": css("goal"), "ms": 13, "mec": INK, "mew": 0.7, "ls": "none", "zorder": 10}
-    ax.plot(*log.layout.target[:2], "*", label="target", **star)
-
+def plot_moment(log: FlightLog, tick: int, ax: Axes) -> Axes:
+    """Obstacles, belief and plan at one tick, from above."""
+    scene = flight_stage(log, sensed=sensor_reach(log) is not None, estimated=has_estimate(log))
+    past, before = slice(tick + 1), max(1, tick + 2 - len(log.pasts[tick]))
+    scene.way("trail", log.believed[:before, :3])
+    scene.way("truth", log.truth[past, :3] if has_estimate(log) else log.truth[:0, :3])
+    flight_frame(scene, scene.frame(), log, tick)
+    for index in range(log.movers.shape[1]):
+        scene.way(f"way of mover {index}", log.movers[past, index, :2], width=0.05, colour="moving", legend="")
+    scene.draw(ax)
     ground(ax, log.layout.size[0] - _MARGIN, log.layout.size[1] + _MARGIN)
     speed = float(np.linalg.norm(log.truth[tick, 7:]))
     stored = ", stored plan flown" if log.emergency[tick] else ""
     said = f"{log.time[tick]:.1f} s, {speed:.1f} m/s, height {log.truth[tick, 2]:.1f} m{stored}"
     ax.set_title(said + (f"\n{log.health[tick]}: {log.causes[tick]}" if log.causes[tick] else ""))
-    if legend:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4)
     return ax
 
 
-def _things(log: FlightLog, tick: int, ax: Axes) -> None:
-    """Walls, cylinders and movers."""
-    for index, wall in enumerate(log.layout.walls):
-        ax.plot(*wall.T, color=css("wall"), lw=3.0, solid_capstyle="butt", zorder=2, label=None if index else "wall")
-    seen = np.array([first is not None and first <= tick for first in first_sights(log)], dtype=bool)
-    name = "cylinder" if sensor_reach(log) is None else "cylinder seen by then"
-    cylinders = log.layout.cylinders
-    discs(ax, cylinders[seen], name, zorder=2, lw=1.0, facecolor=css("fixed"), edgecolor=css("fixed"))
-    discs(ax, cylinders[~seen], "not seen yet", zorder=2, lw=1.0, fc="none", ec=GREY, ls=(0, (3, 2)))
-    for places in log.movers[: tick + 1].transpose(1, 0, 2):
-        ax.plot(*places[:, :2].T, color=css("moving"), lw=0.9, alpha=0.6, zorder=2)
-    style = {"facecolor": css("moving"), "edgecolor": "none", "zorder": 2}
-    discs(ax, log.movers[tick], "moving cylinder, and its way so far", **style)
-
-
-def _landmarks(log: FlightLog, tick: int, ax: Axes) -> None:
-    from matplotlib.colors import to_rgb
-    from matplotlib.patches import Ellipse
-
-    row = log.landmarks[tick]
-    style = {"facecolor": (*to_rgb(css("estimate")), 0.45), "edgecolor": css("estimate"), "lw": 0.8, "zorder": 6}
-    for index, (mean, covariance) in enumerate(zip(row["mean"].tolist(), row["covariance"], strict=True)):
-        long, short, direction = ellipse_axes(covariance, SIGMAS)
-        ellipse = Ellipse(mean, 2.0 * long, 2.0 * short, angle=math.degrees(direction), **style)
-        ellipse.set_label(None if index else "landmark as believed, 2\u03c3")
-        ax.add_patch(ellipse)
-
-
-def plot_parameter(log: FlightLog, name: str, ax: Axes | None = None) -> Axes:
+def plot_parameter(log: FlightLog, name: str, ax: Axes) -> Axes:
     """One parameter over time, its band of two standard deviations, and the truth.
 
     Args:
         log: the flight.
         name: one of `unifg.scenarios.logs.flight_metrics.PARAMETERS`.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
     """
     index = PARAMETERS.index(name)
     values, sigmas = log.parameters[:, index], log.parameters_sigma[:, index]
@@ -230,13 +173,13 @@ def plot_parameter(log: FlightLog, name: str, ax: Axes | None = None) -> Axes:
     return _band(log, ax, f"{_NAMES[index]}, {ends}", f"[{_UNITS[index]}]", values, sigmas, true, bounds)
 
 
-def plot_state_error(log: FlightLog, component: int, ax: Axes | None = None) -> Axes:
+def plot_state_error(log: FlightLog, component: int, ax: Axes) -> Axes:
     """One component of the right perturbation from belief to truth, and two standard deviations around it.
 
     Args:
         log: the flight.
         component: 0-2 position, 3-5 attitude, 6-8 velocity.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
     """
     scale = _SCALES[component // 3]
     error = scale * state_errors(log)[:, component]
@@ -247,7 +190,7 @@ def plot_state_error(log: FlightLog, component: int, ax: Axes | None = None) -> 
 
 def _band(
     log: FlightLog,
-    ax: Axes | None,
+    ax: Axes,
     title: str,
     unit: str,
     values: Array,
@@ -256,7 +199,7 @@ def _band(
     bounds: tuple[float, float] | None = None,
 ) -> Axes:
     """Values, the truth, and a band of two sigmas around the values, or around zero for errors, which have no truth."""
-    ax, zero = new_axes(ax), np.zeros_like(values)
+    zero = np.zeros_like(values)
     middle, truth, name, colour = zero, 0.0, "error", "robot"
     if true is not None:
         middle, truth, name, colour = values, true, "estimate", "estimate"
@@ -270,13 +213,13 @@ def _band(
     return over_time(log, ax, f"{title}; {inside:.0f} % within 2\u03c3", unit, curves, bounds=bounds)
 
 
-def plot_control(log: FlightLog, index: int, ax: Axes | None = None) -> Axes:
+def plot_control(log: FlightLog, index: int, ax: Axes) -> Axes:
     """One control over time against its limits.
 
     Args:
         log: the flight.
         index: 0-2 body rates, 3 thrust.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
     """
     values, limits = log.controls[:, index], _limits(log, index)
     title, unit = _CONTROLS[index] + (" and its limits" if limits else ""), "[N]" if index == 3 else "[rad/s]"
@@ -284,16 +227,16 @@ def plot_control(log: FlightLog, index: int, ax: Axes | None = None) -> Axes:
     return over_time(log, ax, title, unit, [curve], levels=limits, bounds=padded(values, limits, least=0.1))
 
 
-def plot_speed(log: FlightLog, ax: Axes | None = None) -> Axes:
+def plot_speed(log: FlightLog, ax: Axes) -> Axes:
     """True speed over time [m/s]."""
     speed = np.linalg.norm(log.truth[:, 7:], axis=1)
     title, top = f"Speed, at most {speed.max():.2f} m/s", 1.12 * max(float(speed.max()), 0.1)
-    ax = over_time(log, ax, title, "[m/s]", [(speed, {"color": css("robot"), "lw": 1.4})], bounds=(0.0, top))
+    over_time(log, ax, title, "[m/s]", [(speed, {"color": css("robot"), "lw": 1.4})], bounds=(0.0, top))
     shade_trouble(ax, log.dt, log.health, log.causes, title)
     return ax
 
 
-def plot_height(log: FlightLog, ax: Axes | None = None) -> Axes:
+def plot_height(log: FlightLog, ax: Axes) -> Axes:
     """True height over time, with that of the target [m]."""
     height, target = log.truth[:, 2], np.full(log.ticks, log.layout.target[2])
     curves = (height, {"color": css("robot"), "lw": 1.4}), (target, {"color": css("goal"), "lw": 1.4, "ls": "--"})

@@ -8,28 +8,27 @@ with all cylinders solid from the start.
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from unifg.errors import ViewError
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.logs.metrics import collision_words, health
-from unifg.scenarios.scenes.numbers import Number, declare, in_words, metres, show
-from unifg.scenarios.scenes.parts import layout, pillar, vehicle
+from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
+from unifg.scenarios.scenes.parts import draw_way, layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["first_sights", "flight_frame", "flight_scene", "flight_stage", "sensor_reach"]
+__all__ = ["flight_frame", "flight_scene", "flight_stage", "sensor_reach"]
 
 SIGMAS = 2.0
 """Half axes of ellipses in standard deviations."""
 
 _HEIGHT = 2.0  # of walls, cylinders and movers [m]; there they have no top
-_NODES = 16  # of a way that changes from frame to frame
 
 
 def _error(log: Any, k: int) -> float:
@@ -87,19 +86,26 @@ NUMBERS = (
 """Lines and curves of a flight."""
 
 
+LAYERS: tuple[tuple[Any, ...], ...] = (
+    ("past", "line", "robot", "estimated past: the window that is smoothed", 0.09),
+    ("truth", "thin", "odometry", "true way, where it differs", 0.028),
+    ("horizon", "line", "horizon", "predicted future, and its shadow on the ground", 0.1),
+    ("below", "line", "horizon", "predicted future, and its shadow on the ground"),
+    ("unseen", "ghost", "wall", "cylinder not seen yet"),
+)
+"""Names, swatches, colours, words and widths [m] of what changes with the ticks."""
+
+
 def flight_scene(log: FlightLog) -> Scene:
     """The scene of a flight.
 
     Raises:
         ViewError: the flight has no tick.
     """
-    if log.ticks == 0:
-        raise ViewError("there is no tick, and nothing to show")
+    sensed, estimated = sensor_reach(log) is not None, has_estimate(log)
+    scene = filled(log, partial(flight_stage, log, sensed=sensed, estimated=estimated), flight_frame)
     m = flight_metrics(log)
     settings, error, tick_ms = m["settings"], m["position_error_m"], m["tick_ms"]
-    scene = flight_stage(log, sensed=sensor_reach(log) is not None, estimated=has_estimate(log))
-    for tick in range(log.ticks):
-        flight_frame(scene, scene.frame(), log, tick)
     reached = "target reached" if m["reached"] else f"{m['target_distance_m']:.1f} m short of the target"
     stopped = ", interrupted by the user" if m["interrupted"] else ""
     how = "" if log.outcome in ("", "reached", "interrupted") else f"; {log.outcome}"
@@ -113,19 +119,6 @@ def flight_scene(log: FlightLog) -> Scene:
         "estimate + plan": f"{tick_ms['p50']:.1f} ms median" if tick_ms["max"] > 0.0 else "",
     }
     return scene
-
-
-def first_sights(log: FlightLog) -> list[int | None]:
-    """Tick at which each cylinder of the layout was first seen; None for never, all 0 in a flight without a sensor."""
-    count = len(log.layout.cylinders)
-    if not any(len(ids) for ids in log.seen):
-        return [0] * count
-    first: list[int | None] = [None] * count
-    for tick in reversed(range(log.ticks)):
-        for name in log.seen[tick].tolist():
-            if name < count:
-                first[name] = tick
-    return first
 
 
 def sensor_reach(log: FlightLog) -> float | None:
@@ -152,11 +145,13 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
     if solver and log.settings.get("coupling"):
         solver += f" ({log.settings['coupling']})"
     scene.facts["solver"] = solver
-    _layers(scene, sensed, estimated)
+    past = "estimated past before that" if estimated else "way flown"
+    seen = "cylinder that has been seen" if sensed else "cylinder"
+    for row in (*LAYERS, ("trail", "line", "trail", past, 0.06), ("seen", "disc", "fixed", seen)):
+        scene.layer(*row)
+    scene.layer("rims", "ring", "start", seen)
     _bodies(scene, float(log.settings.get("sensor_range", SensorModel().range_max)) if sensed else None)
     layout(scene, log.layout, _HEIGHT)
-    scene.label("start", log.layout.start[:2])
-    scene.label("target", log.layout.target)
     _views(scene, log)
     declare(scene, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
     return scene
@@ -184,33 +179,15 @@ def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     for index, (x, y, radius) in enumerate(log.movers[tick].tolist()):
         name = f"mover {index}"
         if name not in scene.bodies:
-            words = "cylinder that moves" if index == 0 else ""
-            like = "mover 0" if index else None
             rim = shapes.ring(np.zeros(2), radius - 0.03, 0.03, _HEIGHT + 0.01, corners=32)
             parts = [pillar(radius, _HEIGHT, "moving"), Part("rim", rim, "start", False)]
-            scene.body(name, parts, colour="moving", legend=words, like=like)
+            scene.body(name, parts, colour="moving", legend="cylinder that moves")
         frame.place(name, [x, y, 0.0])
-    for name, way in (("past", log.pasts[tick]), ("horizon", log.plans[tick])):
-        points = shapes.thin(way, _NODES) if len(way) > 1 and np.isfinite(way).all() else way[:0]
-        if len(points) > 1:
-            frame.way(name, points)
-            if name == "horizon":
-                below = shapes.ribbon(points, 0.06, 0.018)
-                frame.mesh("below", below, opacity=0.35)
+    draw_way(frame, "past", log.pasts[tick])
+    points = draw_way(frame, "horizon", log.plans[tick])
+    if len(points):
+        frame.mesh("below", shapes.ribbon(points, 0.06, 0.018), opacity=0.35)
     show(frame, log, tick, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
-
-
-def _layers(scene: Scene, sensed: bool, estimated: bool) -> None:
-    """Names, words and widths of what changes with the ticks."""
-    scene.layer("past", "line", "robot", "estimated past: the window that is smoothed", width=0.09)
-    words = "estimated past before that" if estimated else "way flown"
-    scene.layer("trail", "line", "trail", words, width=0.06)
-    scene.layer("truth", "thin", "odometry", "true way, where it differs", width=0.028)
-    scene.layer("horizon", "line", "horizon", "predicted future, and its shadow on the ground", width=0.1)
-    scene.layer("below", "line", "horizon", "", like="horizon")
-    scene.layer("seen", "disc", "fixed", "cylinder that has been seen" if sensed else "cylinder")
-    scene.layer("rims", "ring", "start", "", like="seen")
-    scene.layer("unseen", "ghost", "wall", "cylinder not seen yet")
 
 
 def _bodies(scene: Scene, reach: float | None) -> None:
@@ -242,13 +219,11 @@ def _landmarks(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     for name, mean, covariance, radius in log.landmarks[tick]:
         ellipse, outline = f"landmark {name}", f"outline {name}"
         if ellipse not in scene.bodies:
-            others = [body for body in scene.bodies if body.startswith("landmark ")]
             words = "landmark as believed: outline, and 2\u03c3 ellipse of its axis on top"
-            like = others[0] if others else None
-            scene.body(ellipse, "ellipse", colour="estimate", swatch="ghost", legend=words, like=like)
+            scene.body(ellipse, "ellipse", colour="estimate", swatch="ghost", legend=words)
             if radius > 0.0:
                 ring = shapes.ring(np.zeros(2), radius, 0.05, 0.02, corners=32)
-                scene.body(outline, [Part("ring", ring, "estimate", False)], legend="", like=like or ellipse)
+                scene.body(outline, [Part("ring", ring, "estimate", False)], legend=words)
         frame.ellipse(ellipse, mean, covariance, sigmas=SIGMAS, z=_HEIGHT + 0.02 if radius > 0.0 else 0.03)
         if outline in scene.bodies:
             frame.place(outline, [*mean, 0.0])

@@ -8,12 +8,11 @@ import numpy as np
 
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.scenes.graph_plot import segments
-from unifg.typing import Array
+from unifg.typing import Array, BoolArray
 from unifg.view import Scene
 from unifg.view.canvas import Canvas
 
-__all__ = ["graph_scene", "shown_steps"]
+__all__ = ["declare_layers", "draw_graph", "draw_points", "graph_scene", "line_width", "shown_steps"]
 
 _MOST = 60_000  # edges drawn over all iterations; beyond, only the first guess and the solution are shown
 _MOST_STRIPS = 30_000  # odometry edges drawn with a width; beyond, as hair-thin lines
@@ -24,29 +23,18 @@ _DIRECTIONS = {2: (0.0, -1e-4, 1.0), 3: (0.55, -0.67, 0.5)}  # to the camera, fo
 def graph_scene(solved: SolvedGraph) -> Scene:
     """The scene of a solved pose graph, one frame for each iterate shown."""
     graph, shown, solution = solved.after, shown_steps(solved), solved.solution
-    size, odometry = graph.group.point_dim, graph.edges.odometry
-    extent = float(np.ptp(graph.poses[:, :size], axis=0).max())
-    width = (0.0022 if size == 2 else 0.004) * extent  # strips in space are seen from the side
+    size, width = graph.group.point_dim, line_width(graph)
     scene = Scene(f"unifg: {solved.name}", counts="iteration")
     scene.around, scene.ground = _corners(solved), False
-    scene.layer("start", "line", "odometry", "trajectory at the start")
-    scene.layer("closures", "line", "closure", "loop closures: the same place seen again")
-    scene.layer("trajectory", "line", "robot", "trajectory: poses joined by odometry")
-    scene.layer("outliers", "line", "outlier", "loop closures taken for outliers")
-    scene.layer("landmarks", "line", "landmark", "landmarks")
+    declare_layers(scene)
     _trajectory(scene, "start", solved.before, 0.6 * width)
-    if len(graph.landmarks):
-        scene.points("landmarks", graph.landmarks)
-    scene.points("first", graph.poses[:1, :size], pixels=9.0, colour="ink", legend="")
+    draw_points(scene, graph)
     costs = {row.number: row.cost for row in solution.history}
     scene.numbers = [int(solved.step_numbers[k]) for k in shown]
     scene.plot("cost", log=True)
     for k, number in zip(shown, scene.numbers, strict=True):
         iterate, frame, cost = graph.with_poses(solved.steps[k]), scene.frame(), costs.get(number, solution.cost)
-        for name, edges in (("closures", ~odometry & ~solved.outliers), ("outliers", solved.outliers)):
-            if edges.any():
-                frame.lines(name, segments(iterate, edges))
-        _trajectory(frame, "trajectory", iterate, width)
+        draw_graph(frame, iterate, solved.outliers, "trajectory", width)
         frame.readout("cost", f"{cost:.7g}")
         frame.value("cost", cost)
     scene.outcome, scene.good = solution.status.value, solution.converged
@@ -55,10 +43,50 @@ def graph_scene(solved: SolvedGraph) -> Scene:
     return scene
 
 
+def declare_layers(scene: Scene) -> None:
+    """Names, colours and words of the parts of a graph."""
+    for name, colour, words in (
+        ("start", "odometry", "trajectory at the start"),
+        ("closures", "closure", "loop closures: the same place seen again"),
+        ("trajectory", "robot", "trajectory: poses joined by odometry"),
+        ("outliers", "outlier", "loop closures taken for outliers"),
+        ("landmarks", "landmark", "landmarks"),
+    ):
+        scene.layer(name, "line", colour, words)
+
+
+def line_width(graph: PoseGraph) -> float:
+    """Width of the strips of a trajectory [m]; those in space are seen from the side."""
+    size = graph.group.point_dim
+    return (0.0022 if size == 2 else 0.004) * float(np.ptp(graph.poses[:, :size], axis=0).max())
+
+
+def draw_points(canvas: Canvas, graph: PoseGraph) -> None:
+    """Draw landmarks and the first pose."""
+    if len(graph.landmarks):
+        canvas.points("landmarks", graph.landmarks)
+    canvas.points("first", graph.poses[:1, : graph.group.point_dim], pixels=9.0, colour="ink", legend="first pose")
+
+
+def draw_graph(canvas: Canvas, graph: PoseGraph, outliers: BoolArray, name: str, width: float) -> None:
+    """Draw closures, outliers and, in the layer of a name, the trajectory of a width [m]."""
+    odometry = graph.edges.odometry
+    for layer, edges in (("closures", ~odometry & ~outliers), ("outliers", outliers)):
+        if edges.any():
+            canvas.lines(layer, segments(graph, edges))
+    _trajectory(canvas, name, graph, width)
+
+
 def shown_steps(solved: SolvedGraph) -> list[int]:
     """Indices of ``solved.steps`` that are drawn: all, or of a large graph the first and the last."""
     last = len(solved.steps) - 1
     return list(range(last + 1)) if len(solved.after.edges) * (last + 1) <= _MOST else sorted({0, last})
+
+
+def segments(graph: PoseGraph, chosen: BoolArray) -> Array:
+    """Straight lines (k, 2, d) between the poses that the chosen edges join."""
+    places = graph.poses[:, : graph.group.point_dim]
+    return np.stack([places[graph.edges.first[chosen]], places[graph.edges.second[chosen]]], axis=1)
 
 
 def _trajectory(canvas: Canvas, name: str, poses: PoseGraph, width: float) -> None:

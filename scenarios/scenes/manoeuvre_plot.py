@@ -6,15 +6,19 @@ optimum is blue. Nothing is told by colour alone: the guess is dashed, the optim
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from unifg.plots.descent import draw_errors
 from unifg.scenarios.manoeuvres import Manoeuvre
-from unifg.scenarios.scenes.panels import forbid, plot_convergence, shade_distance
-from unifg.style.colours import GREY, INK, css
-from unifg.style.figures import discs, face, ground, headline, new_figure, word
+from unifg.scenarios.scenes.panels import plot_held, shade_distance
+from unifg.style.colours import INK, css
+from unifg.style.figures import face, ground, headline, new_figure
 from unifg.typing import Array
+from unifg.view import Part, Scene
+from unifg.view.bodies import body_of
+from unifg.view.shapes import merge, ring, wedge
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +31,7 @@ _PINK, _WHITENED = np.array([0.84, 0.0, 0.42]), np.array([1.0, 0.86, 0.93])
 _CUSP = css("fixed")
 _REACH = 0.8  # [m]; how far from a disc the shading goes
 _EVERY = 5  # nodes between two drawn robots
+_ABOVE = 1.0  # height of marks, which nothing hides [m]
 _STRAY = 0.6  # [m]; how far around the first and the last iterate the others are shown
 _FLOOR = 1e-10  # smaller violations are drawn here
 
@@ -48,46 +53,37 @@ def picture(manoeuvre: Manoeuvre) -> Figure:
 
 def plot_iterates(manoeuvre: Manoeuvre, ax: Axes) -> Axes:
     """Every iterate from the guess to the optimum, the robot along the optimum, and what stands in the way."""
-    from matplotlib.patches import Polygon
+    from matplotlib.colors import to_hex
 
-    m = manoeuvre
+    m, last = manoeuvre, len(manoeuvre.iterates) - 1
     low, high = _extent(m)
-    _discs(m, ax, low, high)
-
-    colours = shades(len(m.iterates))
-    middle = range(1, len(m.iterates) - 1)
-    for number in middle:
-        name = f"iterates 1 to {middle[-1]}, whitening" if number == 1 else None
-        ax.plot(*m.iterates[number, :, :2].T, color=colours[number], lw=1.3, zorder=3, label=name)
-    guess = m.iterates[0, :, :2].T
-    ax.plot(*guess, color=_FIRST, lw=2.4, ls=(0, (4, 1.5)), zorder=5, label="first iterate: the guess, on the path")
-    name = f"last iterate ({len(m.iterates) - 1}): the optimum"
-    ax.plot(*m.states[:, :2].T, color=_LAST, lw=2.8, zorder=6, label=name)
-
-    radius = m.settings.robot_radius
+    scene = Scene()
+    _discs(m, scene, ax, low, high)
+    width = 0.004 * float((high - low).max())
+    for number, colour in enumerate(map(to_hex, shades(last + 1)[1:]), start=1):
+        name = f"last iterate ({last}): the optimum" if number == last else f"iterates 1 to {last - 1}, whitening"
+        size = 1.6 * width if number == last else 0.8 * width
+        scene.way(f"iterate {number}", m.iterates[number, :, :2], width=size, colour=colour, legend=name)
+    guess, dashed = m.iterates[0, :, :2].T, (0, (4, 1.5))
+    ax.plot(*guess, color=_FIRST, lw=2.4, ls=dashed, zorder=2.1, label="first iterate: the guess, on the path")
+    frame = scene.frame()
+    name = f"robot and its front, every {_EVERY * m.settings.dt:g} s"
     for k in range(0, len(m.states), _EVERY):
-        x, y, heading = m.states[k].tolist()
-        discs(ax, [x, y, radius], fc=_LAST, ec=_LAST, alpha=0.13, lw=0, zorder=4)
-        discs(ax, [x, y, radius], fill=False, ec=_LAST, alpha=0.5, lw=0.7, zorder=4)
-        nose = radius * np.array([[0.95, 0.0], [0.4, 0.24], [0.4, -0.24]])
-        turn = np.array([[np.cos(heading), -np.sin(heading)], [np.sin(heading), np.cos(heading)]])
-        ax.add_patch(Polygon(nose @ turn.T + [x, y], fc="white", ec=INK, lw=1.0, zorder=7))
-    name = f"front of the robot, every {_EVERY * m.settings.dt:g} s"
-    ax.plot([], [], ">", color="white", mec=INK, ms=8, label=name)
-    _marks(m, ax)
-
+        faint = [part._replace(opacity=0.13) for part in body_of("disc", m.settings.robot_radius, "robot")[:1]]
+        nose = Part("front", wedge(0.5 * m.settings.robot_radius, 0.3), "ink", False)
+        scene.body(f"robot {k}", [*faint, nose], colour="robot", legend=name)
+        frame.place(f"robot {k}", m.states[k])
+    _marks(m, scene)
+    scene.draw(ax)
     ground(ax, low, high)
     return ax
 
 
 def plot_control(manoeuvre: Manoeuvre, column: int, ax: Axes) -> Axes:
     """One control of the optimum over time against its limits; column 0 is v, column 1 is omega."""
-    m = manoeuvre
-    limit = m.settings.limits[column]
-    ax.axhline(0.0, color=GREY, lw=0.8)
-    forbid(ax, (-limit, limit), (-1.3 * limit, 1.3 * limit), m.time[-1])
-    held = np.append(m.controls[:, column], m.controls[-1, column])
-    ax.step(m.time, held, where="post", color=_LAST, lw=1.8)
+    m, limit = manoeuvre, manoeuvre.settings.limits[column]
+    title, label = (("Forward speed v", "v [m/s]"), ("Turning speed $\\omega$", "$\\omega$ [rad/s]"))[column]
+    plot_held(ax, m.time, m.controls[:, column], (-limit, limit), title, label, "control")
     for k in m.cusps:
         ax.axvline(m.time[k], color=_CUSP, lw=1.8, ls="--")
         ax.annotate(
@@ -96,28 +92,21 @@ def plot_control(manoeuvre: Manoeuvre, column: int, ax: Axes) -> Axes:
         )  # fmt: skip
     for k in m.inflections:
         ax.axvline(m.time[k], color=INK, lw=1.0, ls=":")
-    ax.set_ylim(-1.3 * limit, 1.3 * limit)
-    ax.set_xlim(0.0, m.time[-1])
-    title, label = (("Forward speed v", "v [m/s]"), ("Turning speed $\\omega$", "$\\omega$ [rad/s]"))[column]
-    return face(ax, title, label, "time [s]")
+    ax.set_xlabel("time [s]")
+    return ax
 
 
 def plot_violation(manoeuvre: Manoeuvre, ax: Axes) -> Axes:
     """Largest violation of every iterate, in the colours of the iterates, and how far from stationary it is."""
-    history, tolerance = manoeuvre.solution.history, manoeuvre.settings.tolerance
-    violation = np.maximum([row.violation for row in history], _FLOOR)
+    history = manoeuvre.solution.history
+    errors = {name: np.maximum(history.column(name), _FLOOR) for name in ("stationarity", "violation")}
     # A guess that is the reference itself costs nothing: without multipliers it is stationary by accident.
-    stationarity = [row.stationarity if row.stationarity > _FLOOR else np.nan for row in history]
-    values = {"stationarity": stationarity, "violation": violation}
-    shown: dict[str, dict[str, Any]] = {
-        "stationarity": {"color": GREY, "ls": ":"},
-        "violation": {"color": INK, "lw": 0.8, "zorder": 2, "label": "largest violation"},
-    }
-    plot_convergence(ax, history, shown, tolerance, lambda name: values[name])
-    ax.scatter([row.number for row in history], violation, c=shades(len(history)), s=34, ec=INK, lw=0.6, zorder=3)
+    errors["stationarity"][errors["stationarity"] == _FLOOR] = np.nan
+    draw_errors(ax, errors, manoeuvre.settings.tolerance)
+    numbers, violation = np.arange(len(history)), errors["violation"]
+    ax.scatter(numbers, violation, c=shades(len(history)), s=34, ec=INK, lw=0.6, zorder=3)
     ax.set_ylim(bottom=0.3 * _FLOOR)
-    ax.legend(loc="upper right")
-    return ax
+    return face(ax, "What is wrong with each iterate", x="iterate")
 
 
 def shades(count: int) -> Array:
@@ -141,7 +130,7 @@ def _extent(manoeuvre: Manoeuvre) -> tuple[Array, Array]:
     return np.minimum(low - robot, strays.min(axis=0)) - 0.1, np.maximum(high + robot, strays.max(axis=0)) + 0.1
 
 
-def _discs(manoeuvre: Manoeuvre, ax: Axes, low: Array, high: Array) -> None:
+def _discs(manoeuvre: Manoeuvre, scene: Scene, ax: Axes, low: Array, high: Array) -> None:
     """The discs, the ring that the robot's centre must not enter, and the distance to it as shading."""
     m = manoeuvre
     if not m.case.discs:
@@ -155,30 +144,27 @@ def _discs(manoeuvre: Manoeuvre, ax: Axes, low: Array, high: Array) -> None:
         return nearest
 
     shade_distance(ax, low, high, distance, _REACH, "#b9c2cf")
-    discs(ax, places, "unforeseen disc (ground: nearer is darker)", fc=css("fixed"), ec="none", zorder=1)
-    rings = places + np.array([0.0, 0.0, kept])
-    discs(ax, rings, "the robot's centre stays outside", fill=False, ec=INK, lw=1.1, ls=(0, (2, 2)), zorder=2)
-    for x, y, radius in places.tolist():
-        ax.text(x, y - 0.5 * radius, "unforeseen\ndisc", ha="center", va="center", fontweight="bold", zorder=6)
+    scene.discs("discs", places, colour="fixed", legend="unforeseen disc (ground: nearer is darker)")
+    rings = merge([ring(row[:2], row[2] + kept - 0.005, 0.01, 0.001, corners=64) for row in places])
+    scene.mesh("rings", rings, colour="ink", swatch="ring", legend="the robot's centre stays outside")
+    for place in places:
+        scene.label("unforeseen disc", place[:2])
 
 
-def _marks(manoeuvre: Manoeuvre, ax: Axes) -> None:
+def _marks(manoeuvre: Manoeuvre, scene: Scene) -> None:
     """Start, end of the path, cusps and inflections, each with a word."""
     m = manoeuvre
-    start, goal = m.states[0], m.case.reference(m.settings)[-1]
-    ax.plot(*start[:2], "o", color=css("start"), ms=8, mec="white", mew=0.8, zorder=9)
-    ax.plot(*goal[:2], "*", color=css("goal"), ms=17, mec=INK, mew=0.8, zorder=9)
-    word(ax, start, "start", (0, 30))
-    word(ax, goal, "goal", (0, 30))
+    ends = {"start": m.states[0], "goal": m.case.reference(m.settings)[-1]}
+    for (name, pose), colour in zip(ends.items(), ("start", "goal"), strict=True):
+        scene.points(name, [*pose[:2], _ABOVE], pixels=16.0, colour=colour, legend="")
+        scene.label(name, pose[:2])
     for k in m.cusps:
-        name = "cusp: v passes through 0" if k == m.cusps[0] else None
-        ax.plot(*m.states[k, :2], "D", color=_CUSP, ms=9, mec=INK, mew=1.0, zorder=10, label=name)
-        forward = m.controls[k, 0] > 0.0
-        ways = ("backward", "forward") if forward else ("forward", "backward")
-        word(ax, m.states[k], f"cusp at {m.time[k]:.1f} s:\n{ways[0]} till here,\n{ways[1]} from here", (105, -14))
-    for k in m.inflections:
-        name = "inflection: $\\omega$ changes sign" if k == m.inflections[0] else None
-        ax.plot(*m.states[k, :2], "s", color=INK, ms=6, mec="white", mew=1.0, zorder=8, label=name)
+        ways = ("backward", "forward") if m.controls[k, 0] > 0.0 else ("forward", "backward")
+        scene.label(f"cusp at {m.time[k]:.1f} s:\n{ways[0]} till here,\n{ways[1]} from here", m.states[k, :2])
+    for name, nodes, colour in (("cusp: v passes through 0", m.cusps, "fixed"),
+                                ("inflection: $\\omega$ changes sign", m.inflections, "ink")):  # fmt: skip
+        if nodes:
+            scene.points(name, [[*m.states[k, :2], _ABOVE] for k in nodes], pixels=14.0, colour=colour)
 
 
 def _title(manoeuvre: Manoeuvre) -> str:

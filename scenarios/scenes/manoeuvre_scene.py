@@ -5,10 +5,41 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.scenarios.manoeuvres import Case, Manoeuvre, ManoeuvreSettings
+from unifg.scenarios.scenes.numbers import Number, declare, show
 from unifg.solution.history import Iteration
 from unifg.view import Frame, Scene
 
 __all__ = ["manoeuvre_iterate", "manoeuvre_scene", "manoeuvre_stage"]
+
+
+def _control(m: Manoeuvre, k: int, column: int) -> float:
+    """Control held from a node on; at the last one, that which led to it."""
+    return float(m.controls[min(k, len(m.controls) - 1), column])
+
+
+def _away(m: Manoeuvre, k: int) -> float:
+    """Distance from the path [m]."""
+    return float(np.hypot(*(m.states[k] - m.case.reference(m.settings)[k])[:2]))
+
+
+NUMBERS = (
+    Number("drives", lambda m, k: "backward" if _control(m, k, 0) < 0.0 else "forward"),
+    Number("speed", lambda m, k: f"{_control(m, k, 0):.2f} m/s"),
+    Number("turn", lambda m, k: f"{_control(m, k, 1):.2f} rad/s"),
+    Number("forward speed", None, lambda m, k: _control(m, k, 0), plot={"unit": "m/s", "limit": 0.0}),
+    Number(
+        "turning speed", None, lambda m, k: _control(m, k, 1),
+        plot={"unit": "rad/s", "limit": 0.0, "colour": "estimate"},
+    ),
+    Number("from the path", lambda m, k: f"{_away(m, k):.2f} m", _away, plot={"unit": "m", "colour": "goal"}),
+)  # fmt: skip
+"""Lines and curves of a manoeuvre."""
+
+
+def _clearance(wanted: float) -> Number:
+    """Line and curve of the clearance, with the one that is kept [m]."""
+    plot = {"unit": "m", "limit": wanted, "colour": "horizon"}
+    return Number("clearance", lambda m, k: f"{m.clearance[k]:.3f} m", lambda m, k: m.clearance[k], plot=plot)
 
 
 def manoeuvre_scene(manoeuvre: Manoeuvre) -> Scene:
@@ -31,28 +62,14 @@ def manoeuvre_scene(manoeuvre: Manoeuvre) -> Scene:
     scene.label("robot", follows="robot", above=True)
     scene.view("above", "From above", (0.0, -1e-4, 1.0))
     scene.view("follow", "Follow robot", (0.0, -0.5, 0.9), follows="robot", distance=20.0 * s.robot_radius)
-    scene.plot("forward speed", unit="m/s", limit=0.0)
-    scene.plot("turning speed", unit="rad/s", limit=0.0, colour="estimate")
-    scene.plot("from the path", unit="m", colour="goal")
-    if m.case.discs:
-        scene.plot("clearance", unit="m", limit=s.clearance, colour="horizon")
-    last = len(m.controls) - 1
+    numbers = [*NUMBERS, *([_clearance(s.clearance)] if m.case.discs else [])]
+    declare(scene, numbers)
     for tick, (pose, asked) in enumerate(zip(m.states, reference, strict=True)):
-        frame, (speed, turn) = scene.frame(), m.controls[min(tick, last)].tolist()
+        frame = scene.frame()
         frame.place("robot", pose)
         frame.place("wanted", asked)
         frame.trail("trail", pose[:2])
-        away = float(np.hypot(*(pose - asked)[:2]))
-        frame.readout("drives", "backward" if speed < 0.0 else "forward")
-        frame.readout("speed", f"{speed:.2f} m/s")
-        frame.readout("turn", f"{turn:.2f} rad/s")
-        frame.readout("from the path", f"{away:.2f} m")
-        frame.value("forward speed", speed)
-        frame.value("turning speed", turn)
-        frame.value("from the path", away)
-        if m.case.discs:
-            frame.readout("clearance", f"{m.clearance[tick]:.3f} m")
-            frame.value("clearance", float(m.clearance[tick]))
+        show(frame, m, tick, numbers)
     scene.outcome, scene.good = m.solution.status.value, m.succeeded
     scene.facts |= {
         "asked": m.case.title,
@@ -71,7 +88,7 @@ def manoeuvre_stage(case: Case) -> Scene:
     if case.discs:
         scene.discs("discs", np.array(case.discs), colour="fixed", legend="unforeseen disc")
     scene.layer("plan", "line", "horizon", "plan of this iterate")
-    scene.layer("poses", "arrow", "horizon", "", like="plan")
+    scene.layer("poses", "arrow", "horizon", "plan of this iterate")
     return scene
 
 

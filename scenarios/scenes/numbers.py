@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from unifg.errors import ViewError
 from unifg.view import Frame, Scene
 
-__all__ = ["Number", "declare", "in_words", "metres", "show"]
+__all__ = ["Number", "declare", "filled", "in_words", "metres", "show"]
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,25 @@ def show(frame: Frame, log: Any, tick: int, numbers: Sequence[Number]) -> None:
             frame.readout(number.name, text, alarm=number.alarm is not None and bool(number.alarm(log, tick)))
         if number.value is not None:
             frame.value(number.name, float(number.value(log, tick)))
+
+
+def filled(log: Any, begin: Callable[[], Scene], draw: Callable[[Scene, Frame, Any, int], None]) -> Scene:
+    """A scene of a log, a frame for each tick.
+
+    Args:
+        log: the run.
+        begin: makes the scene with what stays.
+        draw: draws a tick of the log on a frame of the scene.
+
+    Raises:
+        ViewError: there is no tick.
+    """
+    if log.ticks == 0:
+        raise ViewError("there is no tick, and nothing to show")
+    scene = begin()
+    for tick in range(log.ticks):
+        draw(scene, scene.frame(), log, tick)
+    return scene
 
 
 def in_words(state: str, cause: str) -> str:

@@ -1,4 +1,4 @@
-"""Panels and marks that several pictures share; a panel draws into the given axes, or new ones, and returns them."""
+"""Panels and marks that several pictures share; a panel draws into the given axes and returns them."""
 
 from __future__ import annotations
 
@@ -9,20 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from unifg.solution.history import Iteration
 from unifg.style.colours import GREY, css
-from unifg.style.figures import dashes, face, new_axes
+from unifg.style.figures import dashes, face
 from unifg.typing import Array, ArrayLike
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 __all__ = [
-    "forbid",
     "over_time",
     "padded",
     "plot_clearance",
-    "plot_convergence",
+    "plot_held",
     "plot_times",
     "shade",
     "shade_distance",
@@ -32,7 +30,7 @@ __all__ = [
 
 def over_time(
     log: Any,
-    ax: Axes | None,
+    ax: Axes,
     title: str,
     y: str,
     curves: Iterable[tuple[Array, Mapping[str, Any]]] = (),
@@ -44,14 +42,13 @@ def over_time(
 
     Args:
         log: with ticks, time, dt, and an emergency flag for each tick.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
         title: of the panel.
         y: label of the axis.
         curves: values (T,) of every tick, and the style of the line.
         levels: of dashed lines.
         bounds: lower and upper end of the axis; None for those that matplotlib finds.
     """
-    ax = new_axes(ax)
     dashes(ax, levels)
     for values, style in curves:
         ax.plot(log.time, values, **{"lw": 1.2, **style})
@@ -76,11 +73,29 @@ def shade(ax: Axes, flags: Array, dt: float, colour: str, alpha: float) -> None:
         ax.axvspan(begin * dt, end * dt, color=colour, alpha=alpha, lw=0)
 
 
-def forbid(ax: Axes, limits: tuple[float, float], ends: tuple[float, float], at: float) -> None:
-    """Shade values beyond limits, up to the ends of the axis, and write so at the time ``at`` [s]."""
-    for limit, end in zip(limits, ends, strict=True):
+def plot_held(
+    ax: Axes, time: Array, values: Array, limits: tuple[float, float] | None, title: str, label: str, name: str
+) -> Axes:
+    """Draw a control that is held between nodes; what lies beyond its limits is shaded.
+
+    Args:
+        ax: axes to draw into.
+        time: (n + 1,) of the nodes [s].
+        values: (n,) held from each node to the next.
+        limits: least and greatest value; None without any.
+        title: of the panel.
+        label: of its axis.
+        name: of the curve, for a legend.
+    """
+    bottom, top = padded(0.0, values, limits or (), share=0.15)
+    ax.axhline(0.0, color=GREY, lw=0.8)
+    for limit, end in zip(limits or (), (bottom, top), strict=False):
         ax.axhspan(min(limit, end), max(limit, end), color=GREY, alpha=0.22, lw=0)
-        ax.text(at, 0.5 * (limit + end), "not allowed ", ha="right", va="center", fontsize=8, color="#4b5563")
+        ax.text(time[-1], 0.5 * (limit + end), "not allowed ", ha="right", va="center", fontsize=8, color="#4b5563")
+    ax.step(time, np.append(values, values[-1]), where="post", color=css("robot"), lw=1.6, label=name)
+    ax.set_ylim(bottom, top)
+    ax.set_xlim(0.0, time[-1])
+    return face(ax, title, label)
 
 
 def shade_trouble(ax: Axes, dt: float, health: Sequence[str], causes: Sequence[str], what: str) -> None:
@@ -101,7 +116,7 @@ def shade_trouble(ax: Axes, dt: float, health: Sequence[str], causes: Sequence[s
         ax.set_title(fill(f"{what}; {states}: {named.most_common(1)[0][0]}", 72), fontsize=8)
 
 
-def plot_clearance(log: Any, ax: Axes | None = None) -> Axes:
+def plot_clearance(log: Any, ax: Axes) -> Axes:
     """Distance from the hull to the nearest thing over time [m]."""
     lowest = int(np.argmin(log.clearance))
     least = float(log.clearance[lowest])
@@ -116,7 +131,7 @@ def plot_clearance(log: Any, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], ax: Axes | None = None) -> Axes:
+def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], ax: Axes) -> Axes:
     """Time spent in each tick, in all and on each part [ms], on a logarithmic axis.
 
     Ticks in which something was compiled, or read from the disk, are marked: their time is not that of the others.
@@ -125,9 +140,8 @@ def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], a
         log: the run.
         total: (T,) [ms].
         parts: names to (T,) [ms] and colour.
-        ax: axes to draw into; None for new ones.
+        ax: axes to draw into.
     """
-    ax = new_axes(ax)
     for name, (values, colour) in {"both": (total, "plan"), **parts}.items():
         if (values > 0.0).any():
             spent = np.where(values > 0.0, values, np.nan)
@@ -143,30 +157,6 @@ def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], a
         ax.set_ylim(bottom=0.5 * float(np.percentile(spent, 1.0)))
     ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
     return over_time(log, ax, f"Time per tick: median {p50:.1f} ms, 99 % within {p99:.0f} ms", "time [ms]")
-
-
-def plot_convergence(
-    ax: Axes,
-    history: Sequence[Iteration],
-    shown: Mapping[str, Mapping[str, Any]],
-    tolerance: float,
-    values: Callable[[str], ArrayLike],
-) -> Axes:
-    """Numbers of the KKT test at every iterate, on a logarithmic axis, with the tolerance.
-
-    Args:
-        ax: axes to draw into.
-        history: of the solution.
-        shown: attributes of its rows, each with the style of its line.
-        tolerance: of the test.
-        values: what is drawn of an attribute, one number per row.
-    """
-    for name, style in shown.items():
-        ax.plot([row.number for row in history], values(name), **{"lw": 1.0, "label": name, **style})
-    ax.axhline(tolerance, color=GREY, lw=0.9, ls="--")
-    ax.annotate("tolerance", (0, tolerance), xytext=(2, 2), textcoords="offset points", fontsize=8)
-    ax.set_yscale("log")
-    return face(ax, "What is wrong with each iterate", x="iterate")
 
 
 def shade_distance(

@@ -8,10 +8,11 @@ import numpy as np
 
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array
-from unifg.view import Part, Scene, shapes
+from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["floor", "layout", "pillar", "vehicle"]
+__all__ = ["draw_way", "floor", "layout", "pillar", "vehicle"]
 
+_NODES = 16  # of a way that changes from frame to frame
 _FLOOR = -0.02  # height of the floor, clear of what stands on it [m]
 
 
@@ -36,13 +37,15 @@ def layout(scene: Scene, placed: Layout, height: float) -> None:
         frames += [shapes.tube(line, 0.03, 4) for line in (foot, top)]
         frames += [shapes.tube(np.stack([foot[k], top[k]]), 0.03, 4) for k in range(2)]
     if sheets:
-        scene.mesh("walls", shapes.merge(sheets), colour="wall", opacity=0.22, legend="")
+        scene.mesh("walls", shapes.merge(sheets), colour="wall", opacity=0.22, legend="walls")
         scene.mesh("wall frames", shapes.merge(frames), colour="wall", lit=True, legend="")
     start, target = placed.start, placed.target
     scene.mesh("start", shapes.ring(start[:2], 0.18, 0.07, 0.012, corners=32), colour="start", legend="")
     rings = [shapes.ring(target[:2], r, 0.07, 0.012, corners=40) for r in (0.12, 0.4)]
     ball = shapes.copies(shapes.sphere(), target[None], 0.16 * np.eye(3)[None])
     scene.mesh("target", shapes.merge([*rings, ball]), colour="goal", swatch="disc", legend="target")
+    scene.label("start", start[:2])
+    scene.label("target", target)
     scene.discs("pole", [[target[0], target[1], 0.025]], height=float(target[2]), colour="pole", legend="")
 
 
@@ -55,6 +58,17 @@ def vehicle(scene: Scene, radius: float, plumb: bool = False) -> None:
         parts.append(Part("plumb", line, "start", False, 0.5))
     scene.body("shadow", parts, colour="start", legend="")
     scene.label("drone", follows="drone", above=True)
+
+
+def draw_way(frame: Frame, name: str, way: Array) -> Array:
+    """Draw a way (n, 2 or 3) [m] that changes from frame to frame, if it is finite and leads anywhere; its nodes."""
+    if len(way) < 2 or not np.isfinite(way).all():
+        return way[:0]
+    points = shapes.thin(way, _NODES)
+    if len(points) < 2:
+        return way[:0]
+    frame.way(name, points)
+    return points
 
 
 def pillar(radius: float, height: float, colour: str) -> Part:

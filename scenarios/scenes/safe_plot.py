@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from unifg.scenarios.logs.safe_log import SafeLog
-from unifg.style.colours import GREY, INK, css
-from unifg.style.figures import discs, face, ground, headline, new_figure
+from unifg.scenarios.scenes.safe_scene import place_bodies, resting, safe_stage
+from unifg.style.colours import GREY, css
+from unifg.style.figures import face, ground, headline, new_figure
 from unifg.typing import Array
 
 if TYPE_CHECKING:
@@ -23,7 +24,6 @@ __all__ = ["picture", "plot_above", "plot_distance", "plot_error", "plot_speed",
 
 _LINES = ("robot", "estimate", "horizon", "scan", "trail", "moving", "fixed", "start")
 _STAMPS = 6  # places drawn of a body that moves
-_STILL = 1e-9  # [m]
 _BESIDE = 0.6  # around everything [m]
 _TITLES = {
     "static": "A quadrotor is to follow a line through a cylinder",
@@ -50,52 +50,53 @@ def picture(logs: Sequence[SafeLog]) -> Figure:
 def plot_above(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Ways from above; what moves is drawn at a few times, the later the darker."""
     first = logs[0]
-    for body, (radius, upright) in enumerate(zip(first.radii.tolist(), first.upright.tolist(), strict=True)):
-        places = first.bodies[:, body]
-        still = float(np.ptp(places, axis=0).max()) < _STILL
-        stamps = [0] if still else np.linspace(0, first.ticks - 1, _STAMPS).round().astype(int).tolist()
-        colour = css("trail" if still else "moving")
-        for k, tick in enumerate(stamps):
-            row = [*places[tick, :2].tolist(), radius]
-            share = 0.9 if still else 0.15 + 0.5 * k / _STAMPS
-            discs(ax, row, fc=colour, ec=INK, lw=0.6, alpha=share, zorder=2 + upright, label=None)
-            keep = [*places[tick, :2].tolist(), radius + first.hull + first.margin]
-            if still:
-                discs(ax, keep, None, fc="none", ec=GREY, lw=0.9, ls=(0, (2, 2)), zorder=4)
-        if not still:
-            ax.plot(*places[:, :2].T, color=css("moving"), lw=0.7, alpha=0.5, zorder=1)
-    ax.plot(*first.wanted[:, :2].T, color=GREY, lw=1.2, ls="--", zorder=5, label="path")
-    for log, colour in _coloured(logs):
-        ax.plot(*log.states[:, :2].T, color=colour, lw=1.7, zorder=6, label=log.label)
+    scene = safe_stage(first, resting(first))
+    scene.way("path", first.wanted[:, :3])
+    for index, rests in enumerate(resting(first)):
+        places, radius = first.bodies[:, index, :2], first.radii[index]
+        if rests:
+            continue
+        scene.way(f"way {index}", places, width=0.03, colour="moving", legend="")
+        for k, tick in enumerate(np.linspace(0, first.ticks - 1, _STAMPS).round().astype(int).tolist()):
+            opacity = 0.15 + 0.5 * k / _STAMPS
+            row = [[*places[tick], radius]]
+            scene.discs(f"body {index}, {k}", row, opacity=opacity, colour="moving", legend="")
+    for log, colour in zip(logs, _LINES * len(logs), strict=False):
+        scene.way(log.label, log.states[:, :3], width=0.06, colour=colour)
+    place_bodies(scene.frame(), first, first.ticks - 1)
+    ax = scene.draw(ax)
+    ground(ax, *_extent(logs))
+    ax.set_title("From above; rings: nearer than this the margin is not kept" if len(first.radii) else "From above")
+    return ax
+
+
+def _extent(logs: Sequence[SafeLog]) -> tuple[Array, Array]:
+    """Corners (2,) of the ground that is shown [m]: ways and path, and bodies that are not far away."""
+    first = logs[0]
     ends = np.concatenate([log.states[:, :2] for log in logs] + [first.wanted[:, :2]])
     if len(first.radii):
         near = first.bodies[0][:, :2]
         inside = np.abs(near).max(axis=1) < 50.0
         reach = first.radii[inside, None]
         ends = np.concatenate([ends, near[inside] - reach, near[inside] + reach])
-    ground(ax, ends.min(axis=0) - _BESIDE, ends.max(axis=0) + _BESIDE)
-    ax.set_title("From above; dotted: nearer than this the margin is not kept" if len(first.radii) else "From above")
-    return ax
+    return ends.min(axis=0) - _BESIDE, ends.max(axis=0) + _BESIDE
 
 
 def plot_speed(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Speed of the vehicle and of the path."""
-    paths: list[Array] = []
-    for log, colour in _coloured(logs):
-        wanted = np.linalg.norm(log.wanted[:, 3:], axis=1)
-        if not any(len(path) == len(wanted) and np.allclose(path, wanted) for path in paths):
-            ax.plot(log.time, wanted, color=GREY, lw=1.2, ls="--")
-            paths.append(wanted)
-        ax.plot(log.time, np.linalg.norm(log.states[:, 7:], axis=1), color=colour, lw=1.3)
+    paths = [np.linalg.norm(log.wanted[:, 3:], axis=1) for log in logs]
+    for k, (log, path) in enumerate(zip(logs, paths, strict=True)):
+        if not any(len(path) == len(other) and np.allclose(path, other) for other in paths[:k]):
+            ax.plot(log.time, path, color=GREY, lw=1.2, ls="--")
+    _curves(ax, logs, [np.linalg.norm(log.states[:, 7:], axis=1) for log in logs])
     return face(ax, "Speed; dashed: of the path", "[m/s]", "time [s]")
 
 
 def plot_distance(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Boundary distance: between hull and the nearest surface, beyond the margin."""
-    for log, colour in _coloured(logs):
-        ax.plot(log.time, log.boundary, color=colour, lw=1.4)
-        least = int(np.argmin(log.boundary))
-        ax.plot(log.time[least], log.boundary[least], "o", color=colour, ms=4)
+    _curves(ax, logs, [log.boundary for log in logs])
+    for log, colour in zip(logs, _LINES * len(logs), strict=False):
+        ax.plot(log.time[np.argmin(log.boundary)], log.boundary.min(), "o", color=css(colour), ms=4)
     ax.axhline(0.0, color=css("moving"), lw=1.0)
     ax.set_ylim(top=min(ax.get_ylim()[1], 4.0))
     return face(ax, "Boundary distance: beyond the margin, along the whole way", "[m]", "time [s]")
@@ -103,19 +104,20 @@ def plot_distance(logs: Sequence[SafeLog], ax: Axes) -> Axes:
 
 def plot_error(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Distance from where the path is."""
-    for log, colour in _coloured(logs):
-        ax.plot(log.time, 1e3 * np.linalg.norm(log.error, axis=1), color=colour, lw=1.0)
+    _curves(ax, logs, [1e3 * np.linalg.norm(log.error, axis=1) for log in logs])
     return face(ax, "Distance from the path", "[mm]", "time [s]")
 
 
 def plot_time(logs: Sequence[SafeLog], ax: Axes) -> Axes:
     """Share of the ticks that were decided within a time."""
-    for log, colour in _coloured(logs):
-        ax.plot(np.sort(log.decide_ms), 100.0 * np.arange(1, log.ticks + 1) / log.ticks, color=colour, lw=1.4)
+    shares = [100.0 * np.arange(1, log.ticks + 1) / log.ticks for log in logs]
+    _curves(ax, logs, shares, [np.sort(log.decide_ms) for log in logs])
     ax.set_ylim(0.0, 102.0)
     ax.set_xlim(left=0.0)
     return face(ax, "Ticks decided within a processor time", "[%]", "[ms]")
 
 
-def _coloured(logs: Sequence[SafeLog]) -> list[tuple[SafeLog, str]]:
-    return [(log, css(_LINES[k % len(_LINES)])) for k, log in enumerate(logs)]
+def _curves(ax: Axes, logs: Sequence[SafeLog], values: Sequence[Array], over: Sequence[Array] | None = None) -> None:
+    """One curve for each flight, over its time unless something else is given."""
+    for x, y, colour in zip(over or [log.time for log in logs], values, _LINES * len(logs), strict=False):
+        ax.plot(x, y, color=css(colour), lw=1.4)

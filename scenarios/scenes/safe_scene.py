@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from unifg.errors import ViewError
 from unifg.scenarios.logs.safe_log import SafeLog
-from unifg.scenarios.scenes.numbers import Number, declare, show
-from unifg.scenarios.scenes.parts import floor, pillar, vehicle
+from unifg.scenarios.scenes.numbers import Number, declare, filled, show
+from unifg.scenarios.scenes.parts import draw_way, floor, pillar, vehicle
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
+from unifg.view.bodies import body_of
 
-__all__ = ["safe_frame", "safe_scene", "safe_stage"]
+__all__ = ["place_bodies", "resting", "safe_frame", "safe_scene", "safe_stage"]
 
 _HEIGHT = 3.0  # of cylinders, which have no end [m]
 _STILL = 1e-9  # [m]
-_NODES = 16  # of a plan
 _BESIDE = 1.0  # around the flight [m]
 
 
@@ -51,6 +51,14 @@ NEARNESS = Number(
 """Line and curve of a flight among obstacles."""
 
 
+LAYERS = (
+    ("flown", "line", "trail", "way flown", 0.05),
+    ("path", "line", "plan", "path to follow", 0.024),
+    ("plan", "line", "horizon", "plan", 0.07),
+)
+"""Names, swatches, colours, words and widths [m] of the ways."""
+
+
 def _numbers(log: Any) -> tuple[Number, ...]:
     return (NEARNESS, *NUMBERS) if len(log.radii) else NUMBERS
 
@@ -61,18 +69,20 @@ def safe_scene(log: SafeLog) -> Scene:
     Raises:
         ViewError: the flight has no tick.
     """
-    if log.ticks == 0:
-        raise ViewError("there is no tick, and nothing to show")
-    scene = safe_stage(log, [_rests(log.bodies[:, index]) for index in range(len(log.radii))])
+    scene = filled(log, partial(_begun, log), safe_frame)
+    _words(scene, log)
+    return scene
+
+
+def _begun(log: SafeLog) -> Scene:
+    """The scene with floor and path, which are known once the flight is over."""
+    scene = safe_stage(log, resting(log))
     low, high = _extent(log)
     corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (low[0], high[0]) for y in (low[1], high[1])]
     scene.around, scene.ground = np.array(corners), False
     floor(scene, low, high)
     if not _rests(log.wanted[:, :3]):
         scene.way("path", shapes.thin(log.wanted[:, :3], 200))
-    for tick in range(log.ticks):
-        safe_frame(scene.frame(), log, tick)
-    _words(scene, log)
     return scene
 
 
@@ -85,9 +95,8 @@ def safe_stage(log: Any, still: Sequence[bool] = ()) -> Scene:
     """
     scene = Scene(f"unifg: quadrotor-cbf, {log.settings['case']}", dt=log.dt)
     scene.speeds = (0.1, 0.25, 0.5, 1, 2)
-    scene.layer("flown", "line", "trail", "way flown", width=0.05)
-    scene.layer("path", "line", "plan", "path to follow", width=0.024)
-    scene.layer("plan", "line", "horizon", "plan", width=0.07)
+    for row in LAYERS:
+        scene.layer(*row)
     vehicle(scene, log.hull)
     _bodies(scene, log, list(still) or [False] * len(log.radii))
     scene.view("overview", "Overview", [-0.55, -0.75, 0.8], 24.0)
@@ -105,32 +114,37 @@ def _extent(log: SafeLog) -> tuple[Array, Array]:
 
 def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
     """Obstacles, with the margin on the ground."""
-    first: dict[str, str] = {}
     for index, (radius, upright) in enumerate(zip(log.radii.tolist(), log.upright.tolist(), strict=True)):
         colour = "fixed" if still[index] else "moving"
         name, words = f"body {index}", {"fixed": "at rest", "moving": "moves"}[colour]
-        like = first.get(colour)
-        if upright:
+        parts = [pillar(radius, _HEIGHT, colour)] if upright else body_of("ball", radius, colour)
+        if upright or still[index]:
             edge = shapes.ring(np.zeros(2), radius + log.hull + log.margin - 0.02, 0.02, 0.014, corners=48)
-            parts = [pillar(radius, _HEIGHT, colour), Part("margin", edge, "moving", False)]
-            scene.body(name, parts, colour=colour, legend=words, like=like)
-        else:
-            scene.body(name, "ball", size=radius, colour=colour, legend=words, like=like)
-        first.setdefault(colour, name)
+            parts.append(Part("margin", edge, "moving", False))
+        scene.body(name, parts, colour=colour, legend=words)
 
 
-def safe_frame(frame: Frame, log: Any, tick: int) -> None:
+def safe_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     """Draw a tick of a `SafeLog`, or of one in the making."""
     state, plan = log.states[tick], log.plans[tick]
     frame.place("drone", state[:7])
     frame.place("shadow", [state[0], state[1], 0.0])
+    place_bodies(frame, log, tick)
+    frame.trail("flown", state[:3])
+    draw_way(frame, "plan", plan)
+    show(frame, log, tick, _numbers(log))
+
+
+def place_bodies(frame: Frame, log: Any, tick: int) -> None:
+    """Place the obstacles; cylinders stand on the ground."""
     for index, place in enumerate(log.bodies[tick]):
         z = 0.0 if log.upright[index] else place[2]
         frame.place(f"body {index}", [place[0], place[1], z, 1.0, 0.0, 0.0, 0.0])
-    frame.trail("flown", state[:3])
-    if len(plan) > 1 and np.isfinite(plan).all() and not _rests(plan):
-        frame.way("plan", shapes.thin(plan, _NODES))
-    show(frame, log, tick, _numbers(log))
+
+
+def resting(log: SafeLog) -> list[bool]:
+    """True for the bodies that rest."""
+    return [_rests(log.bodies[:, index]) for index in range(len(log.radii))]
 
 
 def _rests(points: Array) -> bool:

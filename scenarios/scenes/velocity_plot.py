@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from unifg.scenarios.scenes.panels import forbid, padded, plot_convergence
+from unifg.plots.descent import draw_errors
+from unifg.scenarios.scenes.panels import plot_held
 from unifg.scenarios.velocity_tracking import Drive, metrics
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import face, headline, new_figure
@@ -55,45 +54,26 @@ def plot_error(drive: Drive, ax: Axes) -> Axes:
 
 def plot_force(drive: Drive, ax: Axes) -> Axes:
     """Force over time, its bounds, and what the road and the air take."""
-    bounds, force = drive.settings.force_bounds, drive.force
-    low, high = float(min(force.min(), 0.0)), float(max(force.max(), 0.0))
-    ax.axhline(0.0, color=GREY, lw=0.8)
-    low, high = padded(low, high, bounds or (), share=0.14)
-    if bounds is not None:
-        forbid(ax, bounds, (low, high), drive.time[-1])
-    ax.step(drive.time, np.append(force, force[-1]), where="post", color=_DRIVEN, lw=1.3, label="force of the vehicle")
+    title, name = "Drive and brake force", "force of the vehicle"
+    plot_held(ax, drive.time, drive.force, drive.settings.force_bounds, title, "force [N]", name)
     car = drive.settings.vehicle.linearised() if drive.settings.linear else drive.settings.vehicle
     resistance = car.resistance(drive.speed, drive.profile.slope)
     ax.plot(drive.time, resistance, color=INK, lw=1.0, ls=(0, (4, 2)), label="resistance of air and road")
-    ax.set_ylim(low, high)
-    face(ax, "Drive and brake force", "force [N]")
     _key(ax)
     return ax
 
 
 def plot_numbers(drive: Drive, ax: Axes) -> Axes:
-    """The KKT numbers of every iterate."""
-    from matplotlib.ticker import MaxNLocator
-
-    history = drive.solution.history
-    shown = {"stationarity": (_DRIVEN, "o", "-"), "violation": (INK, "s", "--")}
-    if drive.settings.force_bounds is not None:
-        shown["complementarity"] = (_MISSED, "^", ":")
-    styles = {name: {"color": c, "marker": mark, "ms": 4, "ls": line} for name, (c, mark, line) in shown.items()}
-
-    def values(name: str) -> list[float]:
-        """Values of a row; exact zeros, which have no place on a logarithmic axis, are NaN."""
-        return [value if (value := getattr(row, name)) > 0.0 else np.nan for row in history]
-
-    plot_convergence(ax, history, styles, drive.settings.tolerance, values)
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    """The KKT numbers of every iterate; those that are zero throughout are left out."""
+    history, kkt = drive.solution.history, ("stationarity", "violation", "complementarity")
+    draw_errors(ax, {name: history.column(name) for name in kkt}, drive.settings.tolerance)
     _key(ax)
-    return ax
+    return face(ax, "What is wrong with each iterate", x="iterate")
 
 
 def _key(ax: Axes) -> None:
     """The legend beside the title, where it hides nothing."""
-    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=3)
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=4)
 
 
 def _title(drive: Drive) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.scenarios.scenes.numbers import Number, declare, show
 from unifg.scenarios.velocity_tracking import Drive, TrackingSettings, metrics
 from unifg.typing import Array
 from unifg.view import Scene, shapes
@@ -13,6 +14,27 @@ __all__ = ["velocity_scene", "velocity_stage"]
 _LANE = 3.5  # m
 _CAR = 4.5  # length [m]
 _POST = 50.0  # between posts beside the road [m]
+
+
+def _force(drive: Drive, k: int) -> float:
+    """Force held from a sample on [N]; at the last one, that which led to it."""
+    return float(drive.force[min(k, len(drive.force) - 1)])
+
+
+NUMBERS = (
+    Number("speed", lambda d, k: f"{d.speed[k]:.2f} m/s", lambda d, k: d.speed[k], plot={"unit": "m/s"}),
+    Number("deviation", None, lambda d, k: d.error[k], plot={"unit": "m/s", "limit": 0.0, "colour": "moving"}),
+    Number(
+        "profile", lambda d, k: f"{d.profile.speed[k]:.2f} m/s", lambda d, k: d.profile.speed[k],
+        plot={"unit": "m/s", "colour": "goal"},
+    ),
+    Number(
+        "force", lambda d, k: f"{_force(d, k):.0f} N, " + ("drives" if _force(d, k) >= 0.0 else "brakes"), _force,
+        plot={"unit": "N", "limit": 0.0, "colour": "horizon"},
+    ),
+    Number("driven", lambda d, k: f"{_travelled(d.speed, d.profile.dt)[k]:.0f} m"),
+)  # fmt: skip
+"""Lines and curves of a drive."""
 
 
 def velocity_scene(drive: Drive) -> Scene:
@@ -39,23 +61,12 @@ def velocity_scene(drive: Drive) -> Scene:
         "follow", "Follow the car", (-0.55, -0.9, 0.45), 30.0, follows="car", distance=55.0, ahead=(2.0, 0.0, 0.0)
     )
     scene.view("overview", "Whole road", (-0.15, -0.85, 0.5), 20.0)
-    scene.plot("speed", unit="m/s")
-    scene.plot("deviation", unit="m/s", limit=0.0, colour="moving")
-    scene.plot("profile", unit="m/s", colour="goal")
-    scene.plot("force", unit="N", limit=0.0, colour="horizon")
-    last = len(drive.force) - 1
-    for k, speed in enumerate(drive.speed.tolist()):
-        frame, force = scene.frame(), float(drive.force[min(k, last)])
+    declare(scene, NUMBERS)
+    for k in range(len(drive.speed)):
+        frame = scene.frame()
         for name, x, lane in (("car", way[k], -0.5), ("ghost", wanted[k], 0.5)):
             frame.place(name, [float(x), lane * _LANE, float(height[k]), 1.0, 0.0, 0.0, 0.0])
-        frame.readout("speed", f"{speed:.2f} m/s")
-        frame.readout("profile", f"{drive.profile.speed[k]:.2f} m/s")
-        frame.readout("force", f"{force:.0f} N, " + ("drives" if force >= 0.0 else "brakes"))
-        frame.readout("driven", f"{way[k]:.0f} m")
-        frame.value("speed", speed)
-        frame.value("profile", float(drive.profile.speed[k]))
-        frame.value("deviation", float(drive.error[k]))
-        frame.value("force", force)
+        show(frame, drive, k, NUMBERS)
     m = metrics(drive)
     scene.outcome, scene.good = drive.solution.status.value, drive.succeeded
     scene.facts |= {

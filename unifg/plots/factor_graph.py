@@ -97,7 +97,10 @@ def _draw_score(families: Sequence[Family], terms: Sequence[Term], fixes: Sequen
                 _draw_family(ax, line, places[line.what], _fixed(line.what, fixes), diameter)
             else:
                 _draw_factors(ax, line, places, height, 0.75 * diameter)
-        _finish(ax, lines, terms, fixes)
+        ax.set_ylim(lines[-1].y - 0.7, lines[0].y + 0.7)
+        ax.margins(x=0.02)
+        ax.set_axis_off()
+        _key(ax, terms, fixes)
         headline(figure, _title(families, terms), 10.5)
         return figure
 
@@ -269,13 +272,6 @@ def _short(text: str, longest: int = LONGEST) -> str:
     return text if len(text) <= longest else text[: longest - 2] + ".."
 
 
-def _finish(ax: Axes, lines: Sequence[Line], terms: Sequence[Term], fixes: Sequence[Fix]) -> None:
-    ax.set_ylim(lines[-1].y - 0.7, lines[0].y + 0.7)
-    ax.margins(x=0.02)
-    ax.set_axis_off()
-    _key(ax, terms, fixes)
-
-
 # ---------------------------------------------------------------- family by family
 
 
@@ -302,7 +298,9 @@ def _draw_grouped(families: Sequence[Family], terms: Sequence[Term], fixes: Sequ
             colour = css(COLOURS[kind_of(group.first)])
             _segments(ax, np.array([[(x, y), (spot[family], 0.0)] for family in group.first.families]), colour, 1.4)
             ax.plot(x, y, "s", ms=11, mfc=colour, mec=colour, zorder=3)
-            said = ", ".join(filter(None, [_joined(group), _components(group), weight(group.first)]))
+            count = len(group.first.selections)
+            joined = f"joins {count}" if count > 1 else ""
+            said = ", ".join(filter(None, [joined, _components(group), weight(group.first)]))
             _beside(ax, (x, y), f"{_short(group.name)}  {group.factors}", said, colour, 11)
         for family, x in spot.items():
             held = int(_fixed(family, fixes).sum())
@@ -322,12 +320,6 @@ def _draw_grouped(families: Sequence[Family], terms: Sequence[Term], fixes: Sequ
         _key(ax, terms, fixes)
         headline(figure, _title(families, terms), 10.5)
         return figure
-
-
-def _joined(group: Group) -> str:
-    """Number of variables of one factor, where there are several."""
-    count = len(group.first.selections)
-    return f"joins {count}" if count > 1 else ""
 
 
 # ---------------------------------------------------------------- what both have

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -35,6 +36,10 @@ CYCLE = ("robot", "fixed", "horizon", "estimate", "moving", "trail", "goal", "od
 TURN: dict[Manifold, int] = {SO3: 0, SE3: 3, SE23: 6}
 """Where the rotation stands in storage."""
 STEP = 1e-6  # of differences from tangent steps to what is drawn
+
+
+Panel: TypeAlias = "Callable[[Shown, Axes], Axes]"
+"""Draws a component into axes."""
 
 
 @dataclass(frozen=True)
@@ -100,17 +105,30 @@ def draw_shown(parts: Sequence[Shown], title: str = "") -> Figure:
         return figure
 
 
-def _panels(leaf: Shown) -> list[Callable[[Shown, Axes], object]]:
-    """Panels of a component."""
-    if leaf.manifold == SE2:
-        return [draw_path]
-    if leaf.manifold == SE3:
-        return [draw_path, _draw_height, _draw_angles]
-    if leaf.manifold == SE23:
-        return [draw_path, _draw_height, _draw_velocity, _draw_angles]
-    if leaf.manifold == SO3:
-        return [_draw_angles]
-    return [draw_numbers]
+def _panels(leaf: Shown) -> list[Panel]:
+    """Panels of a component: poses from above, then everything that is numbers over the index of the member."""
+    manifold, title = leaf.manifold, f"{leaf.name}: {len(leaf.members)} x {leaf.manifold.name}"
+    if manifold not in (SE2, *TURN):
+        count = manifold.storage
+        names = ["angle"] if manifold == SO2 else [f"[{k}]" for k in range(count)] if count > 1 else [""]
+        shown: Callable[[Array], Array] = partial(np.unwrap, axis=0) if manifold == SO2 else np.asarray
+        return [partial(_curves, shown=shown, names=names, title=title, unit="[rad]" if manifold == SO2 else "")]
+    rotation = partial(_curves, names=["roll", "pitch", "yaw"], title=f"{leaf.name}: rotation", unit="[rad]")
+    angles = partial(rotation, shown=lambda x: _angles(x[:, TURN[manifold] :]))
+    height = partial(_curves, shown=lambda x: x[:, 2:3], names=["z"], title=f"{leaf.name}: height", unit="z [m]")
+    title, names = f"{leaf.name}: velocity", ["vx", "vy", "vz"]
+    velocity = partial(_curves, shown=lambda x: x[:, 3:6], names=names, title=title, unit="[m/s]")
+    panels: dict[Manifold, list[Panel]] = {
+        SE2: [draw_path],
+        SE3: [draw_path, height, angles],
+        SE23: [draw_path, height, velocity, angles],
+    }
+    return panels.get(manifold, [angles])
+
+
+def _angles(turns: Array) -> Array:
+    """(n, 3) roll, pitch and yaw of rotations (n, 4), without jumps."""
+    return np.unwrap(np.stack(SO3.to_rpy(turns), axis=1), axis=0)
 
 
 # ---------------------------------------------------------------- paths
@@ -127,11 +145,11 @@ def draw_path(part: Shown, ax: Axes) -> Axes:
         ax.add_collection(lines)
     for first, last in _runs(part.members):
         ax.plot(at[first:last, 0], at[first:last, 1], color=css("trail"), lw=1.3, zorder=2)
-    shown = _some(len(at), ARROWS)
+    shown = every(len(at), ARROWS)
     ax.quiver(*at[shown].T, *forward[shown].T, color=css("robot"), angles="xy", pivot="middle", units="inches",
               scale_units="inches", scale=6.5, width=0.016, headwidth=5.0, headlength=5.0, zorder=3)  # fmt: skip
     if part.covariance is not None:
-        _ellipses(part, ax)
+        _ellipses(part, carried(part.manifold, part.values, part.covariance, lambda x: x[:, :2]), ax)
     ax.plot(*at[0], "o", ms=6.0, mfc="white", mec=INK, mew=1.2, zorder=4, label=f"first [{part.members[0]}]")
     if len(at) > 1:
         ax.plot(*at[-1], "s", ms=6.0, mfc=css("goal"), mec=INK, mew=0.9, zorder=4, label=f"last [{part.members[-1]}]")
@@ -153,13 +171,12 @@ def _forward(part: Shown) -> Array:
     return np.asarray(SO3.act(part.values[:, TURN[part.manifold] :], np.array([1.0, 0.0, 0.0])))[:, :2]
 
 
-def _ellipses(part: Shown, ax: Axes) -> None:
-    """Of positions in the world, at some of the poses."""
+def _ellipses(part: Shown, spread: Array, ax: Axes) -> None:
+    """Of covariances (n, 2, 2) of positions in the world, at some of the poses."""
     from matplotlib.collections import PolyCollection
 
     circle = np.stack([np.cos(angles := np.linspace(0.0, 2.0 * np.pi, 41)), np.sin(angles)], axis=1)
-    spread = _carried(part, lambda x: x[:, :2])
-    shown = _some(len(spread), ELLIPSES)
+    shown = every(len(spread), ELLIPSES)
     values, vectors = np.linalg.eigh(spread[shown])
     roots = SIGMAS * np.sqrt(np.maximum(values, 0.0))
     shapes = np.einsum("nij,nj,kj->nki", vectors, roots, circle) + part.values[shown, None, :2]
@@ -173,33 +190,6 @@ def _ellipses(part: Shown, ax: Axes) -> None:
 # ---------------------------------------------------------------- numbers over the index
 
 
-def draw_numbers(part: Shown, ax: Axes) -> Axes:
-    """Coordinates over the index of the member."""
-    title = f"{part.name}: {len(part.members)} x {part.manifold.name}"
-    if part.manifold == SO2:
-        return _curves(part, ax, lambda x: np.unwrap(x, axis=0), ["angle"], title, "[rad]")
-    count = part.manifold.storage
-    names = [f"[{k}]" for k in range(count)] if count > 1 else [""]
-    return _curves(part, ax, lambda x: x, names, title, "")
-
-
-def _draw_height(part: Shown, ax: Axes) -> Axes:
-    return _curves(part, ax, lambda x: x[:, 2:3], ["z"], f"{part.name}: height", "z [m]")
-
-
-def _draw_velocity(part: Shown, ax: Axes) -> Axes:
-    return _curves(part, ax, lambda x: x[:, 3:6], ["vx", "vy", "vz"], f"{part.name}: velocity", "[m/s]")
-
-
-def _draw_angles(part: Shown, ax: Axes) -> Axes:
-    first = TURN[part.manifold]
-
-    def angles(x: Array) -> Array:
-        return np.unwrap(np.stack(SO3.to_rpy(x[:, first:]), axis=1), axis=0)
-
-    return _curves(part, ax, angles, ["roll", "pitch", "yaw"], f"{part.name}: rotation", "[rad]")
-
-
 def _curves(
     part: Shown, ax: Axes, shown: Callable[[Array], Array], names: Sequence[str], title: str, unit: str
 ) -> Axes:
@@ -210,7 +200,8 @@ def _curves(
     many = len(names) > CURVES
     spread = None
     if part.covariance is not None:
-        spread = SIGMAS * np.sqrt(np.maximum(np.einsum("nii->ni", _carried(part, shown)), 0.0))
+        covariances = carried(part.manifold, part.values, part.covariance, shown)
+        spread = SIGMAS * np.sqrt(np.maximum(np.einsum("nii->ni", covariances), 0.0))
     marker = "." if len(index) <= POINTS else ""
     for k, name in enumerate(names):
         colour = GREY if many else css(CYCLE[k % len(CYCLE)])
@@ -259,17 +250,21 @@ def _limits(part: Shown, ax: Axes, colours: Sequence[str]) -> None:
                     ls="--")  # fmt: skip
 
 
-def _carried(part: Shown, shown: Callable[[Array], Array]) -> Array:
-    """(n, k, k) covariances of what is shown, to first order, by central differences along the tangent."""
-    assert part.covariance is not None
+def carried(manifold: Manifold, values: Array, covariance: Array, shown: Callable[[Array], Array]) -> Array:
+    """(n, k, k) covariances of what is shown of values, to first order, by central differences along the tangent.
+
+    Args:
+        manifold: of the values.
+        values: (n, storage).
+        covariance: (n, d, d) in the tangent spaces.
+        shown: takes values, returns (n, k) numbers.
+    """
     columns = []
-    for axis in range(part.manifold.dim):
-        step = np.zeros((len(part.values), part.manifold.dim))
-        step[:, axis] = STEP
-        ends = [shown(np.asarray(part.manifold.retract(part.values, sign * step))) for sign in (1.0, -1.0)]
+    for step in STEP * np.eye(manifold.dim):
+        ends = [shown(np.asarray(manifold.retract(values, sign * np.tile(step, (len(values), 1))))) for sign in (1, -1)]
         columns.append((ends[0] - ends[1]) / (2.0 * STEP))
     slopes = np.stack(columns, axis=2)
-    return np.asarray(np.einsum("nia,nab,njb->nij", slopes, part.covariance, slopes))
+    return np.asarray(np.einsum("nia,nab,njb->nij", slopes, covariance, slopes))
 
 
 def apart(pairs: IntArray, members: IntArray) -> IntArray:
@@ -289,6 +284,8 @@ def _runs(members: IntArray) -> list[tuple[int, int]]:
     return [(first, last) for first, last in pairwise(ends) if last > first]
 
 
-def _some(count: int, most: int) -> IntArray:
-    """At most so many rows, evenly, the first and the last among them."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(np.intp))
+def every(count: int, most: int) -> IntArray:
+    """At most that many of 0, 1, ..., evenly, the first and the last among them."""
+    if count <= most:
+        return np.arange(count)
+    return np.unique(np.linspace(0, count - 1, max(most, 1)).round().astype(np.intp))

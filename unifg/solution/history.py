@@ -160,10 +160,12 @@ class History(list[Iteration]):
         Raises:
             ViewError: there are no rows.
         """
-        kkt = ("stationarity", "violation", "complementarity")
-        errors = {name: np.array([getattr(row, name) for row in self]) for name in kkt}
-        errors["step"] = np.array([row.step_norm for row in self])
-        return draw_descent(np.array([row.cost for row in self]), errors)
+        kkt = {name: self.column(name) for name in ("stationarity", "violation", "complementarity")}
+        return draw_descent(self.column("cost"), kkt | {"step": self.column("step_norm")})
+
+    def column(self, name: str) -> Array:
+        """(k,) numbers of one attribute of all rows."""
+        return np.array([getattr(row, name) for row in self], dtype=np.float64)
 
 
 logger = logging.getLogger("unifg")

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "dashes",
-    "discs",
     "face",
     "ground",
     "headline",
@@ -129,14 +128,6 @@ def ground(ax: Axes, low: ArrayLike, high: ArrayLike) -> None:
     ax.set_aspect("equal")
     ax.set_xlabel("x [m]")
     ax.set_ylabel("y [m]")
-
-
-def discs(ax: Axes, rows: ArrayLike, label: str | None = None, **style: Any) -> None:
-    """Circles x, y, radius [m]; the first one is named in the legend."""
-    from matplotlib.patches import Circle
-
-    for index, (x, y, radius) in enumerate(np.asarray(rows).reshape(-1, 3).tolist()):
-        ax.add_patch(Circle((x, y), radius, label=None if index else label, **style))
 
 
 def word(ax: Axes, at: Array, text: str, offset: tuple[int, int], **style: Any) -> None:

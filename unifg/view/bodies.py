@@ -8,10 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.view import drone
 from unifg.view.shapes import Mesh, box, column, copies, merge, ring, sphere, tube, wedge
 
-__all__ = ["BODIES", "Part", "body_of"]
+__all__ = ["BODIES", "Part", "beams", "body_of"]
+
+_ROTOR = 0.36  # radius of the rotors of a quadrotor over its own
+_AXES = (("x", "moving"), ("y", "closure"), ("z", "robot"))  # red, green, blue
 
 
 class Part(NamedTuple):
@@ -29,14 +31,17 @@ def arrow(size: float, colour: str) -> list[Part]:
     return [Part("head", wedge(size, 0.05 * size), colour, lit=False)]
 
 
+def beams(size: float) -> list[Part]:
+    """Three beams of that length from the origin: x red, y green, z blue."""
+    return [
+        Part(name, tube(np.stack([np.zeros(3), end]), 0.06 * size, 4), shade, lit=False)
+        for (name, shade), end in zip(_AXES, size * np.eye(3), strict=True)
+    ]
+
+
 def axes(size: float, colour: str) -> list[Part]:
-    """Axes of that length: x red, y green, z blue."""
-    parts = []
-    for axis, (name, shade) in enumerate((("x", "moving"), ("y", "closure"), ("z", "robot"))):
-        end = np.zeros((2, 3))
-        end[1, axis] = size
-        parts.append(Part(name, tube(end, 0.06 * size, 4), shade, lit=False))
-    return [*parts, Part("origin", box(np.zeros(3), np.full(3, 0.16 * size)), colour)]
+    """Axes of that length and a block at their origin."""
+    return [*beams(size), Part("origin", box(np.zeros(3), np.full(3, 0.16 * size)), colour)]
 
 
 def ball(size: float, colour: str) -> list[Part]:
@@ -75,15 +80,26 @@ def car(size: float, colour: str) -> list[Part]:
 
 
 def quadrotor(size: float, colour: str) -> list[Part]:
-    """A quadrotor of that radius, rotors included; those at its front have a colour of their own."""
+    """A quadrotor of that radius, rotors included, its nose along x; the rotors at its front have their own colour."""
+    rotor, level = _ROTOR * size, 0.17 * size
+    angles = np.pi / 4.0 + np.pi / 2.0 * np.arange(4)
+    hubs = (1.0 - _ROTOR) * size * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(4)])
+    beams = [tube(hubs[[k, k + 2]], 0.055 * size, sides=4) for k in range(2)]
+    posts = [box(hub + np.array([0.0, 0.0, 0.06 * size]), np.array([0.1, 0.1, 0.2]) * size) for hub in hubs]
     parts = [
-        Part("body", drone.body(size), colour),
-        Part("nose", drone.nose(size), "goal"),
-        Part("arms", drone.arms(size), "dark"),
+        Part("body", box(np.zeros(3), np.array([0.52, 0.34, 0.22]) * size), colour),
+        Part("nose", box(np.array([0.34, 0.0, 0.02]) * size, np.array([0.2, 0.26, 0.16]) * size), "goal"),
+        Part("arms", merge(beams + posts), "dark"),
     ]
-    for name, front, shade in (("front", True, "scan"), ("back", False, "dark")):
-        parts.append(Part(f"{name}/rotors", drone.rotors(size, front=front), shade, lit=False))
-        parts.append(Part(f"{name}/swept", drone.swept(size, front=front), shade, lit=False, opacity=0.4))
+    for name, pair, shade in (("front", hubs[[0, 3], :2], "scan"), ("back", hubs[[1, 2], :2], "dark")):
+        meshes = []
+        for hub in pair:
+            across = 0.9 * rotor * np.array([-hub[1], hub[0]]) / np.linalg.norm(hub)
+            blade = np.column_stack([np.stack([hub - across, hub + across]), np.full(2, level)])
+            meshes += [ring(hub, 0.84 * rotor, 0.16 * rotor, level, corners=24), tube(blade, 0.05 * size, sides=4)]
+        swept = merge([ring(hub, 0.0, rotor, 0.99 * level, corners=24) for hub in pair])
+        parts.append(Part(f"{name}/rotors", merge(meshes), shade, lit=False))
+        parts.append(Part(f"{name}/swept", swept, shade, lit=False, opacity=0.4))
     return parts
 
 

@@ -49,13 +49,7 @@ class Canvas:
         """
         places, flat = self._places(name, points)
         layer = self._content.layer(name, "line", colour, legend)
-        given = {
-            "points": places,
-            "flat": flat,
-            "colour": layer.colour,
-            "width": width or layer.width,
-            "level": layer.level,
-        }
+        given = {"points": places, "flat": flat, "width": width or layer.width}
         self._drawn[name] = Thing(things.draw_way, given, places, len(places), _WAYS if flat else _TUBES)
 
     def points(
@@ -68,8 +62,8 @@ class Canvas:
             ViewError: the shape is another, or a number is not finite.
         """
         places, flat = self._places(name, points)
-        layer = self._content.layer(name, "dots", colour, legend)
-        given = {"points": places, "flat": flat, "colour": layer.colour, "pixels": pixels, "level": layer.level}
+        self._content.layer(name, "dots", colour, legend)
+        given = {"points": places, "flat": flat, "pixels": pixels}
         self._drawn[name] = Thing(things.draw_points, given, places, len(places), _DOTS)
 
     def lines(
@@ -85,19 +79,11 @@ class Canvas:
         if ends.ndim != 3 or ends.shape[1] != 2 or ends.shape[2] not in (2, 3):
             raise ViewError(f"'{name}': lines are (n, 2, 2) or (n, 2, 3) [m], found {ends.shape}")
         finite(name, ends, "line")
-        flat = ends.shape[2] == 2
-        full = np.concatenate([ends, np.zeros((len(ends), 2, 1))], axis=2) if flat else ends.copy()
+        places, flat = self._places(name, ends.reshape(-1, ends.shape[2]))
         layer = self._content.layer(name, "thin" if width is None else "line", colour, legend)
-        given = {
-            "lines": full,
-            "flat": flat,
-            "colour": layer.colour,
-            "width": width or layer.width,
-            "level": layer.level,
-        }
-        self._drawn[name] = Thing(
-            things.draw_segments, given, full.reshape(-1, 3), len(full), _HAIRS if width is None else _STRIPS
-        )
+        given = {"lines": places.reshape(-1, 2, 3), "flat": flat, "width": width or layer.width}
+        most = _HAIRS if width is None else _STRIPS
+        self._drawn[name] = Thing(things.draw_segments, given, places, len(ends), most)
 
     def poses(
         self, name: str, poses: ArrayLike, *, length: float | None = None, colour: str | None = None,
@@ -115,27 +101,18 @@ class Canvas:
         Raises:
             ViewError: the shape is another, a number is not finite, or a quaternion has not unit length.
         """
-        rows = np.atleast_2d(np.array(poses, dtype=np.float64))
-        if rows.ndim != 2 or rows.shape[1] not in (3, 7):
-            raise ViewError(
-                f"'{name}': poses are (n, 3) x, y, theta or (n, 7) position and quaternion, found {rows.shape}"
-            )
-        finite(name, rows, "pose")
-        off = (
-            np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) > 1e-6 if rows.shape[1] == 7 else np.zeros(0, dtype=bool)
-        )
-        if off.any():
+        rows = _rows(name, poses, (3, 7), "pose", "poses are (n, 3) x, y, theta or (n, 7) position and quaternion")
+        flat = rows.shape[1] == 3
+        off = np.abs(np.linalg.norm(rows[:, 3:], axis=1) - 1.0) > 1e-6
+        if not flat and off.any():
             k = int(np.argmax(off))
             raise ViewError(
                 f"'{name}': the quaternion of pose {k}, {rows[k, 3:].tolist()}, has not unit length", index=k
             )
-        layer = self._content.layer(name, "arrow" if rows.shape[1] == 3 else "axes", colour, legend)
-        if rows.shape[1] == 3:
-            given = {"poses": rows, "length": length, "colour": layer.colour, "level": layer.level}
-            self._drawn[name] = Thing(things.draw_arrows, given, shapes.on_ground(rows), len(rows), _MARKS)
-        else:
-            given = {"poses": rows, "length": length, "level": layer.level}
-            self._drawn[name] = Thing(things.draw_triads, given, rows[:, :3], len(rows), _MARKS // 4)
+        self._content.layer(name, "arrow" if flat else "axes", colour, legend)
+        draw, most = (things.draw_arrows, _MARKS) if flat else (things.draw_triads, _MARKS // 4)
+        corners = shapes.on_ground(rows) if flat else rows[:, :3]
+        self._drawn[name] = Thing(draw, {"poses": rows, "length": length}, corners, len(rows), most)
 
     def covariances(
         self, name: str, centres: ArrayLike, covariances: ArrayLike, *, sigmas: float = 3.0, colour: str | None = None,
@@ -170,8 +147,8 @@ class Canvas:
             raise ViewError(f"'{name}': covariance {k} has a negative variance, {variances[k].min():g} m^2", index=k)
         half = sigmas * np.sqrt(np.maximum(variances, 0.0))
         axes = np.einsum("nij,nj,nkj->nik", vectors, half, vectors)  # symmetric: it turns as little as can be
-        layer = self._content.layer(name, "ghost", colour, legend)
-        given = {"centres": places, "axes": axes, "colour": layer.colour, "level": layer.level}
+        self._content.layer(name, "ghost", colour, legend)
+        given = {"centres": places, "axes": axes}
         largest = half.max(axis=1, initial=0.0)[:, None]
         corners = np.concatenate([places - largest, places + largest])
         if flat:
@@ -189,19 +166,9 @@ class Canvas:
         Raises:
             ViewError: the shape is another, or a number is not finite.
         """
-        discs = (
-            np.array(rows, dtype=np.float64).reshape(-1, 3)
-            if np.size(rows) == 0
-            else np.atleast_2d(np.array(rows, dtype=np.float64))
-        )
-        if discs.ndim != 2 or discs.shape[1] != 3:
-            raise ViewError(f"'{name}': discs are (n, 3) x, y, radius [m], found {discs.shape}")
-        finite(name, discs, "disc")
-        layer = self._content.layer(name, "disc" if opacity == 1.0 else "ghost", colour, legend)
-        given = {
-            "rows": discs, "height": height, "base": base, "colour": layer.colour, "opacity": opacity,
-            "level": layer.level,
-        }  # fmt: skip
+        discs = _rows(name, rows, (3,), "disc", "discs are (n, 3) x, y, radius [m]")
+        self._content.layer(name, "disc" if opacity == 1.0 else "ghost", colour, legend)
+        given = {"rows": discs, "height": height, "base": base, "opacity": opacity}
         low, high = discs - discs[:, 2:], discs + discs[:, 2:]
         low[:, 2], high[:, 2] = base, base + height
         self._drawn[name] = Thing(things.draw_discs, given, np.concatenate([low, high]), len(discs), 4 * _MARKS)
@@ -223,10 +190,7 @@ class Canvas:
         Raises:
             ViewError: a shape is another, or a number is not finite.
         """
-        rows = np.atleast_2d(np.array(poses, dtype=np.float64))
-        if rows.ndim != 2 or rows.shape[1] not in (3, 7):
-            raise ViewError(f"'{name}': boxes stand at (n, 3) places or (n, 7) poses, found {rows.shape}")
-        finite(name, rows, "box")
+        rows = _rows(name, poses, (3, 7), "box", "boxes stand at (n, 3) places or (n, 7) poses")
         edges = np.asarray(sizes, dtype=np.float64)
         if edges.shape not in ((3,), (len(rows), 3)):
             raise ViewError(f"'{name}': sizes are (3,) or ({len(rows)}, 3) [m], found {edges.shape}")
@@ -234,8 +198,8 @@ class Canvas:
         finite(name, edges, "size")
         if rows.shape[1] == 3:
             rows = np.column_stack([rows, np.tile([1.0, 0.0, 0.0, 0.0], (len(rows), 1))])
-        layer = self._content.layer(name, "block", colour, legend)
-        given = {"poses": rows, "sizes": edges, "colour": layer.colour, "opacity": opacity, "level": layer.level}
+        self._content.layer(name, "block", colour, legend)
+        given = {"poses": rows, "sizes": edges, "opacity": opacity}
         half = 0.5 * np.linalg.norm(edges, axis=1)[:, None]
         corners = np.concatenate([rows[:, :3] - half, rows[:, :3] + half])
         self._drawn[name] = Thing(things.draw_boxes, given, corners, len(rows), _MARKS)
@@ -257,8 +221,8 @@ class Canvas:
             )
         corners = shapes.known_corners(occupancy)
         box = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, height)])
-        layer = self._content.layer(name, "block", "wall", legend)
-        given = {"occupancy": occupancy, "height": height, "level": layer.level}
+        self._content.layer(name, "block", "wall", legend)
+        given = {"occupancy": occupancy, "height": height}
         self._drawn[name] = Thing(things.draw_walls, given, box)
 
     def mesh(
@@ -272,8 +236,8 @@ class Canvas:
         """
         vertices = np.asarray(mesh[0], dtype=np.float64)
         finite(name, vertices, "vertex")
-        layer = self._content.layer(name, swatch, colour, legend)
-        given = {"mesh": mesh, "colour": layer.colour, "lit": lit, "opacity": opacity, "level": layer.level}
+        self._content.layer(name, swatch, colour, legend)
+        given = {"mesh": mesh, "lit": lit, "opacity": opacity}
         self._drawn[name] = Thing(things.draw_mesh, given, np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
 
     def colour(self, name: str) -> str:
@@ -282,13 +246,24 @@ class Canvas:
 
     def _places(self, name: str, points: ArrayLike) -> tuple[Array, bool]:
         """(n, 3) places, and whether they lie in the plane."""
-        rows = np.asarray(points, dtype=np.float64)
-        rows = rows.reshape(-1, rows.shape[-1] if rows.ndim > 1 else 2) if rows.size == 0 else np.atleast_2d(rows)
-        if rows.ndim != 2 or rows.shape[1] not in (2, 3):
-            raise ViewError(f"'{name}': places are (n, 2) or (n, 3) [m], found {rows.shape}")
-        finite(name, rows, "place")
+        rows = _rows(name, points, (2, 3), "place", "places are (n, 2) or (n, 3) [m]")
         flat = rows.shape[1] == 2
-        return (np.column_stack([rows, np.zeros(len(rows))]) if flat else rows.copy()), flat
+        return (shapes.on_ground(rows) if flat else rows), flat
+
+
+def _rows(name: str, values: ArrayLike, columns: tuple[int, ...], what: str, said: str) -> Array:
+    """A copy (n, m) of finite values, m among ``columns``; nothing has the columns that it has, or the first number.
+
+    Raises:
+        ViewError: the shape is another than ``said``, or a number is not finite; the message names ``what`` it is of.
+    """
+    rows = np.atleast_2d(np.array(values, dtype=np.float64))
+    if rows.size == 0:
+        rows = np.zeros((0, rows.shape[-1] or columns[0]))
+    if rows.ndim != 2 or rows.shape[1] not in columns:
+        raise ViewError(f"'{name}': {said}, found {np.shape(values)}")
+    finite(name, rows, what)
+    return rows
 
 
 class Frame(Shot, Canvas):

@@ -12,31 +12,12 @@ from unifg.style.colours import rgb
 from unifg.typing import Array
 from unifg.view.bodies import Part
 from unifg.view.page import Key, Label, Plot, View
-from unifg.view.things import Thing
+from unifg.view.things import Layer, Thing
 
-__all__ = ["Body", "Content", "Layer", "Placement", "Shot"]
+__all__ = ["Body", "Content", "Placement", "Shot"]
 
 _PALETTE = ("robot", "landmark", "horizon", "estimate", "moving", "trail", "odometry", "plan")
 _RESERVED = re.compile(r"[%/<>\x00-\x1f\ud800-\udfff]")
-
-
-@dataclass
-class Layer:
-    """Everything of one name.
-
-    Attributes:
-        path: of its objects.
-        level: rank from the ground up.
-        key: its line of the legend, None for none.
-        colour: of everything drawn.
-        width: of lines where they are not given one [m].
-    """
-
-    path: str
-    level: int
-    key: Key | None
-    colour: str
-    width: float | None = None
 
 
 @dataclass(frozen=True)
@@ -133,18 +114,16 @@ class Content:
         self.lock = threading.RLock()
 
     def layer(
-        self, name: str, swatch: str, colour: str | None, legend: str | None, width: float | None = None,
-        like: str | None = None,
-    ) -> Layer:  # fmt: skip
+        self, name: str, swatch: str, colour: str | None, legend: str | None, width: float | None = None
+    ) -> Layer:
         """The layer of a name; a new one gets a line of the legend, in the order of making.
 
         Args:
             name: of everything drawn in it.
             swatch: of its line: disc, ghost, ring, line, thin, dots, block, flag, arrow or axes.
             colour: of it; None for the next of a palette.
-            legend: words; None for the name, empty for no line.
+            legend: words; None for the name, empty for no line; layers with the same words share a line.
             width: of lines where they are not given one [m].
-            like: another layer, whose line of the legend switches this one too.
 
         Raises:
             ViewError: the name is empty, or there is no such colour.
@@ -158,8 +137,10 @@ class Content:
                 rgb(chosen)
                 path = _RESERVED.sub(lambda found: f"%{ord(found[0]):02x}", name)
                 text = name if legend is None else legend
-                key = Key(chosen, swatch, text, [path]) if text and like is None else None
-                if like is not None and (other := self.layers[like].key) is not None:
-                    other.parts.append(path)
+                key = next((one.key for one in self.layers.values() if one.key and one.key.text == text), None)
+                if key is not None:
+                    key.parts.append(path)
+                elif text:
+                    key = Key(chosen, swatch, text, [path])
                 layer = self.layers[name] = Layer(path, len(self.layers) + 1, key, chosen, width)
         return layer

@@ -10,10 +10,9 @@ import asyncio
 import contextlib
 import json
 import logging
-import math
 import socket
 import threading
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any
 
@@ -21,11 +20,10 @@ import numpy as np
 
 from unifg.errors import ViewError
 from unifg.lie import SE3
-from unifg.style.colours import css
 from unifg.typing import Array
 from unifg.view.content import Body, Content, Placement, Shot
 from unifg.view.recorder import load_meshcat
-from unifg.view.recording import Ground, default_views, ground_of, labels_of, lay_ground, legend_of, set_body
+from unifg.view.recording import Ground, ground_of, lay_ground, number_of, page_of, set_body
 from unifg.view.stage import Stage, page_text
 from unifg.view.things import Thing, draw_way
 
@@ -227,14 +225,12 @@ class Live:
             await server.close_all_connections()
 
     def _first(self) -> dict[str, Any]:
-        """First message of the page."""
-        return {
-            "live": True, "title": self._content.title, "outcome": "", "good": True, "facts": [], "legend": [],
-            "labels": [], "readouts": [], "plots": [], "speeds": [], "counts": "live", "numbers": [0], "ticks": [0],
+        """First message of the page, before anything is drawn."""
+        empty = Content(self._content.title, None, "live")
+        ground = Ground(np.array([-1.0, -1.0, 0.0]), np.ones(3), np.zeros(3), 2.0, True)
+        return page_of(empty, ground, []) | {
+            "live": True, "readouts": [], "speeds": [], "counts": "live", "numbers": [0], "ticks": [0],
             "dt": 1.0, "duration": 0.0, "step": 1.0, "play": False,
-            "corners": [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)],
-            "views": [{"name": "above", "text": "From above", "direction": [0.0, -1e-4, 1.0], "fov": 20.0,
-                       "follows": None, "distance": 0.0, "ahead": [0.0, 0.0, 0.0]}],
         }  # fmt: skip
 
     def _message(self, known: Known) -> str | None:
@@ -263,31 +259,22 @@ class Live:
         for name, (passed, points) in trails.items():
             if passed > 1 and known.trails.get(name) != passed:
                 known.trails[name] = passed
-                layer, flat = content.layers[name], content.flat_trails[name]
-                path = f"{layer.path}/way"
-                draw_way(
-                    stage, path, 400, points=points, flat=flat, colour=layer.colour, width=layer.width,
-                    level=layer.level,
-                )  # fmt: skip
+                layer = content.layers[name]
+                path, flat = f"{layer.path}/way", content.flat_trails[name]
+                draw_way(stage, path, 400, layer, points=points, flat=flat, width=layer.width)
         commands = stage.recorder.packed_base64()
         return json.dumps({"page": self._words(shot, ground), "commands": commands}, allow_nan=False)
 
     def _grown(self, ground: Ground) -> Ground:
         """The ground of all that has been seen: a view of everything that follows each frame would tremble."""
         before = self._ground
-        if before is not None:
-            low, high = np.minimum(before.low, ground.low), np.maximum(before.high, ground.high)
-            size = max(float((high - low).max()), before.size)
+        if before is not None:  # some room beyond, so that it need not grow again at once
+            reach = np.maximum(before.high, ground.high) - np.minimum(before.low, ground.low)
+            size = max(float(reach.max()), before.size)
+            margin = 0.1 * size * np.array([1.0, 1.0, 0.0])
+            low = np.where(ground.low < before.low, ground.low - margin, before.low)
+            high = np.where(ground.high > before.high, ground.high + margin, before.high)
             ground = Ground(low, high, before.origin, size, before.flat and ground.flat)
-            if np.array_equal(low, before.low) and np.array_equal(high, before.high):
-                ground = replace(before, flat=ground.flat)
-            else:  # some room beyond, so that it need not grow again at once
-                margin = 0.1 * size * np.array([1.0, 1.0, 0.0])
-                ground = replace(
-                    ground,
-                    low=np.where(low < before.low, low - margin, low),
-                    high=np.where(high > before.high, high + margin, high),
-                )
         self._ground = ground
         return ground
 
@@ -313,29 +300,18 @@ class Live:
             elif not (isinstance(before, Thing) and now.same(before)):
                 if before is not None:
                     stage.delete(path)
-                now.draw(stage, path, max(2, now.budget // _SHARE), **now.given)
+                now.put(stage, path, max(2, now.budget // _SHARE), content.layers[name])
             known.drawn[path] = now
 
     def _words(self, shot: Shot, ground: Ground) -> dict[str, Any]:
         """Text of the panel."""
-        content = self._content
-        clock = f"{content.counts} {shot.number}" if content.dt is None else f"{content.dt * shot.number:.2f} s"
-        plots = []
-        for name, plot in list(content.plots.items()):
-            value = shot.values.get(name, math.nan)
-            plots.append(asdict(plot) | {"colour": css(plot.colour), "now": value if math.isfinite(value) else None})
-        return {
-            "title": content.title,
-            "outcome": content.outcome,
-            "good": content.good,
-            "facts": [[name, text] for name, text in list(content.facts.items()) if text],
-            "legend": [asdict(key) | {"colour": css(key.colour)} for key in legend_of(content, [shot])],
-            "labels": [asdict(label) for label in labels_of(content, ground)],
-            "views": [asdict(view) for view in content.views or default_views(content, ground)],
-            "corners": ground.corners.round(4).tolist(),
-            "clock": clock,
+        content, words = self._content, page_of(self._content, ground, [shot])
+        return words | {
+            "clock": f"{content.dt * shot.number:.2f} s"
+            if content.dt is not None
+            else f"{content.counts} {shot.number}",
             "now": [[name, *shot.texts.get(name, ("\u2013", False))] for name in list(content.readouts)],
-            "plots": plots,
+            "plots": [plot | {"now": number_of(shot, plot["name"])} for plot in words["plots"]],
         }
 
 

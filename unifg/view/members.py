@@ -2,40 +2,61 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
-from unifg.errors import ViewError
+from unifg.errors import GraphError, ViewError
 from unifg.lie import SE2, SE3, Manifold, Product, Rn
-from unifg.modeling.variables import Selection
+from unifg.modeling.variables import Family, Selection
+from unifg.plots.shown import carried
 from unifg.typing import Array
 
-__all__ = ["Position", "Reading", "finite", "reading_of"]
+__all__ = ["Members", "Position", "Values", "finite", "members_of"]
 
 Position: TypeAlias = Callable[[Array], Array]
 """Takes stored values (n, storage), returns (n, 2) or (n, 3) places [m] or (n, 7) poses, quaternion w first."""
 
-_STEP = 1e-5  # of differences, in the tangent space
+Values: TypeAlias = Mapping[Family, Array]
 
 
 @dataclass(frozen=True)
-class Reading:
-    """Reading of the members of a family.
+class Members:
+    """Members of a family, or of a part of it, as drawn.
 
     Attributes:
-        name: of the family, with its component.
+        selection: of them.
         kind: "plane" for poses (x, y, theta), "space" for poses (position, quaternion w first), "points" for places.
-        manifold: of the members.
         position: for members that are none of the three.
     """
 
-    name: str
+    selection: Selection
     kind: str
-    manifold: Manifold
     position: Position | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the family, with its component; that of the layer."""
+        component = self.selection.component
+        return self.selection.family.name + (f".{component}" if component else "")
+
+    @property
+    def joined(self) -> bool:
+        """True if its members are a way: those of a family of bare points are not."""
+        return self.kind != "points" or self.position is not None or bool(self.selection.component)
+
+    def of(self, values: Values) -> Array:
+        """(n, storage) values of the members shown.
+
+        Raises:
+            GraphError: they are those of another graph.
+        """
+        family = self.selection.family
+        if family not in values:
+            raise GraphError(f"family '{family.name}' is not part of this solution", family=family.name)
+        return values[family][self.selection.indices][:, self.selection.storage]
 
     def read(self, values: Array) -> tuple[Array, Array | None]:
         """Places (n, 2) or (n, 3) [m], and poses (n, 3) or (n, 7) of what has an attitude, of values (n, storage).
@@ -65,29 +86,11 @@ class Reading:
         """
         if self.position is None and self.kind == "points":
             return marginals
-        if self.position is None:
-            size = 2 if self.kind == "plane" else 3
-            group = SE2 if self.kind == "plane" else SE3
-            slopes = group.matrix(values)[:, :size, :size]  # p Exp(d) = p + R d_p + ...
-            marginals = marginals[:, :size, :size]
-        else:
-            slopes = self._slopes(values, marginals.shape[-1])
-        result: Array = slopes @ marginals @ slopes.transpose(0, 2, 1)
-        return result
-
-    def _slopes(self, values: Array, dim: int) -> Array:
-        """(n, p, d) derivatives of the places, by central differences."""
-        columns = []
-        for k in range(dim):
-            step = np.zeros((len(values), dim))
-            step[:, k] = _STEP
-            ahead, behind = (self.read(self.manifold.retract(values, way * step))[0] for way in (1.0, -1.0))
-            columns.append((ahead - behind) / (2.0 * _STEP))
-        return np.stack(columns, axis=2)
+        return carried(self.selection.manifold, values, marginals, lambda members: self.read(members)[0])
 
 
-def reading_of(selection: Selection, position: Position | None) -> Reading:
-    """Reading of a family or a part of it.
+def members_of(selection: Selection, position: Position | None) -> Members:
+    """Members of a family or a part of it: poses and points as what they are, all else by a function.
 
     Args:
         selection: the family, some of its members, or a component.
@@ -96,18 +99,14 @@ def reading_of(selection: Selection, position: Position | None) -> Reading:
     Raises:
         ViewError: there is no telling where its members are.
     """
-    name = selection.family.name + (f".{selection.component}" if selection.component else "")
     manifold = selection.manifold
-    if position is not None:
-        return Reading(name, "points", manifold, position)
     kind = _kind(manifold)
-    if kind is not None:
-        return Reading(name, kind, manifold)
+    if kind is not None or position is not None:
+        return Members(selection, kind or "points", position if kind is None else None)
+    name, way = Members(selection, "points").name, "give"
     if isinstance(manifold, Product) and selection.component is None:
         parts = [part for part, component in manifold.components.items() if _kind(component.manifold)]
         way = f"name a component ({' or '.join(f'{name}.{part}' for part in parts)}), or give" if parts else "give"
-    else:
-        way = "give"
     raise ViewError(
         f"'{name}' of {manifold.name} cannot be drawn: its members have no place. SE2, SE3, Rn(2) and Rn(3) have one; "
         f"{way} position=lambda values: (n, 2) or (n, 3) places",

@@ -1,13 +1,11 @@
-"""Page around a scene: title, facts, legend, labels, numbers of the moment, plots, and views."""
+"""Entries of the page around a scene: lines of the legend, labels, plots, and views of the camera."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from unifg.typing import Array
-
-__all__ = ["Key", "Label", "Page", "Plot", "Readout", "View"]
+__all__ = ["Key", "Label", "Plot", "View"]
 
 
 @dataclass
@@ -32,15 +30,6 @@ class Label:
     follows: str | None = None
     above: bool = False
     minor: bool = False
-
-
-@dataclass
-class Readout:
-    """A number that changes: one text per frame, those of alarms in red."""
-
-    name: str
-    texts: list[str]
-    alarms: list[bool] = field(default_factory=list)
 
 
 @dataclass
@@ -85,38 +74,3 @@ class View:
     follows: str | None = None
     distance: float = 0.0
     ahead: Sequence[float] = (0.0, 0.0, 0.0)
-
-
-@dataclass
-class Page:
-    """The words and numbers around the picture, and what the camera must see.
-
-    Attributes:
-        title: what this is.
-        outcome: how it ended.
-        good: whether that is what was asked for.
-        facts: names and values; empty values are left out.
-        corners: (n, 3) [m] that a view of everything must hold.
-        legend: what is drawn, from top to bottom.
-        labels: words in the picture.
-        readouts: numbers of the moment.
-        views: of the camera, the first one at the start.
-        speeds: to choose from; none leaves out the choice.
-        counts: what the slider counts; "time" in seconds, anything else by ``numbers``.
-        numbers: what is counted, one per frame.
-        plots: numbers over the frames.
-    """
-
-    title: str
-    outcome: str
-    good: bool
-    facts: dict[str, str]
-    corners: Array
-    legend: list[Key]
-    labels: list[Label]
-    readouts: list[Readout]
-    views: list[View]
-    speeds: tuple[float, ...] = ()
-    counts: str = "time"
-    numbers: list[int] = field(default_factory=list)
-    plots: list[Plot] = field(default_factory=list)

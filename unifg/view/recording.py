@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from unifg.errors import ViewError
+from unifg.style.colours import css
 from unifg.typing import Array
 from unifg.view import shapes, things
-from unifg.view.content import Body, Content, Layer, Shot
-from unifg.view.page import Key, Label, Page, Plot, Readout, View
-from unifg.view.stage import Stage
-from unifg.view.things import Thing
+from unifg.view.content import Body, Content, Shot
+from unifg.view.page import Key, Label, View
+from unifg.view.stage import Stage, page_text
+from unifg.view.things import Layer, Thing
 
-__all__ = ["Ground", "default_views", "ground_of", "labels_of", "lay_ground", "legend_of", "recorded", "set_body"]
+__all__ = ["Ground", "ground_of", "keys_of", "lay_ground", "number_of", "page_of", "recorded", "set_body"]
 
 FAR = 100.0  # a scene farther from the origin than this many times its size is moved there
 STROKE = 0.0022  # half width of lines, over the size of the scene
+WATCHED = 40.0  # [s]; a scene starts at the lowest speed that shows it within this time
 COUNTED = 0.5  # seconds a frame is shown where frames are merely counted; sums of it are exact, as seeking needs
 _HALF = np.array([0.5, 0.5, 0.0])  # around a single place [m]
 _AROUND = 0.3  # of the size of what is looked at: how much more a view of everything shows of earlier frames
@@ -54,8 +58,8 @@ class Ground:
         return np.stack(np.meshgrid(*box.T), axis=-1).reshape(-1, 3)
 
 
-def recorded(content: Content) -> Stage:
-    """Put a scene on a stage.
+def recorded(content: Content) -> str:
+    """A scene as a page that refers to no other file.
 
     Raises:
         ViewError: nothing is drawn, or meshcat is not installed.
@@ -74,31 +78,75 @@ def recorded(content: Content) -> Stage:
         _move(stage, content.layers[name], body, shots, name)
     for name, flat in content.flat_trails.items():
         _grow(stage, content.layers[name], shots, name, flat)
-    facts = dict(content.facts)
-    if step:
-        facts["grid"] = f"{step:g} m"
-    if ground.origin.any():
-        facts["shown around"] = "(" + ", ".join(f"{value:.0f}" for value in ground.origin) + ") m"
-    facts |= thinned
-    ticks = stage.ticks.tolist()
+    stage.play()
+    facts = {
+        "grid": f"{step:g} m" if step else "",
+        "shown around": f"({', '.join(f'{value:.0f}' for value in ground.origin)}) m" if ground.origin.any() else "",
+        **thinned,
+    }
+    ticks, timed, duration = stage.ticks.tolist(), content.dt is not None, dt * stage.last
     chosen = [shots[tick] for tick in ticks]
-    numbers = list(range(len(shots))) if content.numbers is None else content.numbers
-    page = Page(
-        title=content.title,
-        outcome=content.outcome,
-        good=content.good,
-        facts=facts,
-        corners=ground.corners,
-        legend=legend_of(content, shots),
-        labels=labels_of(content, ground),
-        readouts=[_readout(name, chosen) for name in content.readouts],
-        views=content.views or default_views(content, ground),
-        speeds=() if content.dt is None else content.speeds,
-        counts="time" if content.dt is not None else content.counts,
-        numbers=[] if content.dt is not None else [numbers[tick] for tick in ticks],
-        plots=[replace(plot, values=_values(plot, chosen)) for plot in content.plots.values() if len(shots) > 1],
+    speeds = content.speeds if timed else ()
+    fitting = [speed for speed in speeds if speed >= 1.0 and duration / speed <= WATCHED]
+    numbers = range(len(shots)) if content.numbers is None else content.numbers
+    data = page_of(content, ground, shots, facts)
+    plots = data["plots"] if len(shots) > 1 else []
+    return page_text(
+        data
+        | {
+            "readouts": [_readout(name, chosen) for name in content.readouts],
+            "plots": [plot | {"values": [number_of(shot, plot["name"]) for shot in chosen]} for plot in plots],
+            "speeds": speeds,
+            "speed": fitting[0] if fitting else speeds[-1] if speeds else 1.0,
+            "counts": "time" if timed else content.counts,
+            "numbers": [] if timed else [numbers[tick] for tick in ticks],
+            "dt": dt,
+            "duration": duration,
+            "ticks": ticks,
+            "step": 0.01 if timed else dt,
+            "play": timed,
+        },
+        stage.recorder.packed_base64(),
     )
-    return stage.finish(page)
+
+
+def page_of(
+    content: Content, ground: Ground, shots: list[Shot], facts: Mapping[str, str] = MappingProxyType({})
+) -> dict[str, Any]:
+    """Words and views of a page, for its script.
+
+    Args:
+        content: of the scene.
+        ground: its extent.
+        shots: whose things stand in the legend.
+        facts: more of them; empty values are left out.
+    """
+    return {
+        "title": content.title,
+        "outcome": content.outcome,
+        "good": content.good,
+        "facts": [[name, text] for name, text in {**content.facts, **facts}.items() if text],
+        "legend": [asdict(key) | {"colour": css(key.colour)} for key in keys_of(content, shots)],
+        "labels": [_label(label, content, ground) for label in content.labels],
+        "views": [asdict(view) for view in content.views or _default_views(content, ground)],
+        "corners": ground.corners.round(4).tolist(),
+        "plots": [asdict(plot) | {"colour": css(plot.colour)} for plot in list(content.plots.values())],
+    }
+
+
+def keys_of(content: Content, shots: list[Shot]) -> list[Key]:
+    """The lines of the legend whose things are there."""
+    there = set(content.things)
+    for shot in shots:
+        there |= shot.things.keys() | shot.placed.keys() | shot.trails.keys()
+    keys = [layer.key for name, layer in content.layers.items() if layer.key is not None and name in there]
+    return [key for k, key in enumerate(keys) if key not in keys[:k]]
+
+
+def number_of(shot: Shot, plot: str) -> float | None:
+    """Number of a plot in a frame; None where there is none, or no finite one."""
+    value = shot.values.get(plot, math.nan)
+    return value if math.isfinite(value) else None
 
 
 def ground_of(content: Content, shots: list[Shot]) -> Ground:
@@ -152,27 +200,14 @@ def set_body(stage: Stage, layer: Layer, body: Body) -> None:
             stage.mesh(path, part.mesh, part.colour, lit=part.lit, opacity=part.opacity)
 
 
-def legend_of(content: Content, shots: list[Shot]) -> list[Key]:
-    """The lines of the legend whose things are there."""
-    there = set(content.things)
-    for shot in shots:
-        there |= shot.things.keys() | shot.placed.keys() | shot.trails.keys()
-    return [layer.key for name, layer in content.layers.items() if layer.key is not None and name in there]
+def _label(label: Label, content: Content, ground: Ground) -> dict[str, Any]:
+    """A label at a place of the stage, and with a path in place of a name."""
+    at = None if label.at is None else (np.array(label.at) - ground.origin).tolist()
+    follows = None if label.follows is None else content.layers[label.follows].path
+    return asdict(label) | {"at": at, "follows": follows}
 
 
-def labels_of(content: Content, ground: Ground) -> list[Label]:
-    """Labels at places of the stage, and with paths in place of names."""
-    return [
-        replace(
-            label,
-            at=None if label.at is None else (np.array(label.at) - ground.origin).tolist(),
-            follows=None if label.follows is None else content.layers[label.follows].path,
-        )
-        for label in content.labels
-    ]
-
-
-def default_views(content: Content, ground: Ground) -> list[View]:
+def _default_views(content: Content, ground: Ground) -> list[View]:
     """From above for what lies in the plane, from the side as well for what does not, and along with each body."""
     above = View("above", "From above", (0.0, -1e-4, 1.0), 20.0)
     slant = (0.0, -math.cos(1.1), math.sin(1.1)) if ground.flat else (0.55, -0.67, 0.5)
@@ -225,7 +260,7 @@ def _draw(stage: Stage, layer: Layer, runs: list[tuple[int, int | None, Thing]],
     for begin, end, thing in runs:
         always = begin == 0 and end is None
         path = layer.path if always else f"{layer.path}/{begin}"
-        thing.draw(stage, path, most, **thing.given)
+        thing.put(stage, path, most, layer)
         if not always:
             stage.appear(path, begin, end)
 
@@ -266,18 +301,11 @@ def _grow(stage: Stage, layer: Layer, shots: list[Shot], name: str, flat: bool) 
         points = shapes.thin(np.array(places), 3) if len(places) > 1 else np.zeros((0, 3))
         if len(points) > 1:
             path = f"{layer.path}/{begin}"
-            things.draw_way(
-                stage, path, len(points), points=points, flat=flat, colour=layer.colour, width=layer.width,
-                level=layer.level,
-            )  # fmt: skip
+            things.draw_way(stage, path, len(points), layer, points=points, flat=flat, width=layer.width)
             stage.appear(path, end)
 
 
-def _readout(name: str, shots: list[Shot]) -> Readout:
+def _readout(name: str, shots: list[Shot]) -> dict[str, Any]:
+    """A line of the panel: one text per frame, and which of them are alarms."""
     rows = [shot.texts.get(name, ("\u2013", False)) for shot in shots]
-    return Readout(name, [text for text, _ in rows], [alarm for _, alarm in rows])
-
-
-def _values(plot: Plot, shots: list[Shot]) -> list[float | None]:
-    values = [shot.values.get(plot.name, math.nan) for shot in shots]
-    return [value if math.isfinite(value) else None for value in values]
+    return {"name": name, "texts": [text for text, _ in rows], "alarms": [alarm for _, alarm in rows]}

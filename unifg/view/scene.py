@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from unifg.errors import ViewError
 from unifg.modeling.variables import Family, Variable
 from unifg.solution.solution import Solution
 from unifg.style.colours import rgb
+from unifg.style.figures import new_axes
 from unifg.typing import Array, ArrayLike
 from unifg.view.bodies import Part, body_of
 from unifg.view.canvas import Canvas, Frame
@@ -26,8 +28,12 @@ from unifg.view.content import Body, Content
 from unifg.view.live import Live
 from unifg.view.members import Position
 from unifg.view.page import Label, Plot, View
+from unifg.view.paper import draw_frame
 from unifg.view.recording import recorded
 from unifg.view.solutions import Recipe, recipe_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 __all__ = ["Scene"]
 
@@ -170,7 +176,7 @@ class Scene(Content, Canvas):
 
     def body(
         self, name: str, kind: str | Iterable[Part] = "arrow", *, size: float = 1.0, colour: str | None = None,
-        swatch: str = "disc", legend: str | None = None, like: str | None = None,
+        swatch: str = "disc", legend: str | None = None,
     ) -> None:  # fmt: skip
         """Something rigid that frames place.
 
@@ -180,13 +186,12 @@ class Scene(Content, Canvas):
             size: length of an arrow, of axes or of a car, radius of a disc or of a quadrotor [m].
             colour: of the body.
             swatch: of the legend.
-            legend: words of the legend.
-            like: another layer, whose line of the legend switches this one too.
+            legend: words of the legend; bodies with the same words share a line, which switches all of them.
 
         Raises:
             ViewError: there is no such kind, or the size is not positive.
         """
-        layer = self.layer(name, swatch, colour, legend, like=like)
+        layer = self.layer(name, swatch, colour, legend)
         parts = body_of(kind, size, layer.colour) if isinstance(kind, str) else list(kind)
         reach = max(float(np.linalg.norm(part.mesh[0], axis=1).max()) for part in parts)
         self.bodies[name] = Body(parts, reach)
@@ -248,7 +253,22 @@ class Scene(Content, Canvas):
         Raises:
             ViewError: nothing is drawn, or meshcat is not installed.
         """
-        return recorded(self).html()
+        return recorded(self)
+
+    def draw(self, ax: Axes | None = None, frame: int = -1) -> Axes:
+        """Draw a frame on axes of matplotlib: from above, or in space on axes with three dimensions.
+
+        Args:
+            ax: axes to draw on; None for new ones.
+            frame: which; what stays is drawn with each.
+
+        Returns:
+            The axes; their legend names what is drawn.
+
+        Raises:
+            ViewError: nothing is drawn.
+        """
+        return draw_frame(self, new_axes(ax), frame)
 
     def _repr_html_(self) -> str:
         """HTML of a notebook: the page in a frame."""
@@ -311,7 +331,7 @@ class Scene(Content, Canvas):
         recipe.draw(self, values, solution, solution)
         ways: dict[str, Array] = {}
         for entry in recipe.shown:
-            places, poses = entry.reading.read(entry.of(values))
+            places, poses = entry.read(entry.of(values))
             if len(places) < 2 or not entry.joined:
                 continue
             extent = float(np.ptp(places, axis=0).max())

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
+from unifg.plots.shown import every
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 __all__ = [
@@ -281,7 +282,7 @@ def thin(points: Array, most: int) -> Array:
     """At most that many of the points of a polyline, its ends among them, after repeated neighbours are left out."""
     apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > _APART
     kept: Array = points[np.concatenate([[True], apart])]
-    return kept[np.unique(np.linspace(0, len(kept) - 1, most).round().astype(np.intp))]
+    return kept[every(len(kept), most)]
 
 
 def ellipse_axes(covariance: Array, sigmas: float) -> tuple[float, float, float]:

@@ -2,52 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.errors import GraphError, ViewError
+from unifg.errors import ViewError
 from unifg.modeling.variables import Family, Selection, Variable, as_selection
+from unifg.plots.shown import every
 from unifg.solution.solution import Solution
-from unifg.typing import Array, IntArray
+from unifg.typing import Array
 from unifg.view.canvas import Canvas, Frame
-from unifg.view.members import Position, Reading, reading_of
+from unifg.view.members import Members, Position, Values, members_of
 
 __all__ = ["Recipe", "recipe_of"]
 
 _ALONG = 20  # ellipses along a way
-
-Values = Mapping[Family, Array]
-
-
-@dataclass(frozen=True)
-class Shown:
-    """A family, or a part of it, with how it is read."""
-
-    selection: Selection
-    reading: Reading
-
-    @property
-    def name(self) -> str:
-        """Of its layer."""
-        return self.reading.name
-
-    @property
-    def joined(self) -> bool:
-        """True if its members are a way: those of a family of bare points are not."""
-        return self.reading.kind != "points" or self.reading.position is not None or bool(self.selection.component)
-
-    def of(self, values: Values) -> Array:
-        """(n, storage) values of the members shown.
-
-        Raises:
-            GraphError: they are those of another graph.
-        """
-        family = self.selection.family
-        if family not in values:
-            raise GraphError(f"family '{family.name}' is not part of this solution", family=family.name)
-        return values[self.selection.family][self.selection.indices][:, self.selection.storage]
 
 
 @dataclass(frozen=True)
@@ -61,7 +31,7 @@ class Recipe:
         position: where members are that are neither poses nor points.
     """
 
-    shown: Sequence[Shown]
+    shown: Sequence[Members]
     sigmas: float | None
     terms: Sequence[str]
     position: Position | None
@@ -80,7 +50,7 @@ class Recipe:
             GraphError: covariances are asked for and do not exist.
         """
         for entry in self.shown:
-            places, poses = entry.reading.read(entry.of(values))
+            places, poses = entry.read(entry.of(values))
             if entry.joined and len(places) != 1:
                 canvas.way(entry.name, places)
             if poses is not None:
@@ -91,9 +61,9 @@ class Recipe:
             elif not entry.joined or len(places) == 1:
                 canvas.points(entry.name, places)
             if self.sigmas is not None and solution is not None and len(places):
-                some = _few(len(places)) if entry.joined else np.arange(len(places))
+                some = every(len(places), _ALONG) if entry.joined else np.arange(len(places))
                 marginals = solution.marginals(entry.selection[some])
-                spread = entry.reading.covariances(entry.of(values)[some], marginals)
+                spread = entry.covariances(entry.of(values)[some], marginals)
                 name = f"{entry.name}: {self.sigmas:g}\u03c3"
                 canvas.covariances(name, places[some], spread, sigmas=self.sigmas, colour="estimate")
         for term in self.terms:
@@ -112,12 +82,10 @@ class Recipe:
         ends = []
         for selection in solution.selections(term):
             try:
-                reading = reading_of(selection, None)
+                members = members_of(selection, self.position)
             except ViewError:
-                if self.position is None:
-                    continue  # controls, biases, ...: they are nowhere
-                reading = reading_of(selection, self.position)
-            ends.append(reading.read(Shown(selection, reading).of(values))[0])
+                continue  # controls, biases, ...: they are nowhere
+            ends.append(members.read(members.of(values))[0])
         if len(ends) < 2:
             raise ViewError(
                 f"the factors of '{term}' touch {len(ends)} variable{'s' * (len(ends) != 1)} with a place: "
@@ -128,11 +96,6 @@ class Recipe:
         full = [np.pad(end, ((0, 0), (0, size - end.shape[1]))) for end in ends]
         full = [np.broadcast_to(end, (count, size)) for end in full]
         return np.concatenate([np.stack([full[0], end], axis=1) for end in full[1:]])
-
-
-def _few(count: int) -> IntArray:
-    """Members of a way whose ellipses can still be told apart, the first and the last among them."""
-    return np.unique(np.linspace(0, count - 1, _ALONG).round().astype(np.intp))
 
 
 def recipe_of(
@@ -157,7 +120,7 @@ def recipe_of(
     """
     if sigmas is not None and not (np.isfinite(sigmas) and sigmas > 0.0):
         raise ViewError(f"sigmas={sigmas!r}: half axes are a positive number of standard deviations")
-    entries: list[Shown] = []
+    entries: list[Members] = []
     if shown:
         for variable in shown:
             if not isinstance(variable, Family | Selection):
@@ -167,15 +130,15 @@ def recipe_of(
                 )
             selection = as_selection(variable)
             solution[selection]
-            entries.append(Shown(selection, _reading(selection, position)))
+            entries.append(members_of(selection, position))
     else:
         tried: list[str] = []
         for family in solution.values:
             try:
-                entries.append(Shown(family[:], _reading(family[:], position)))
+                entries.append(members_of(family[:], position))
             except ViewError:
                 tried.append(f"'{family.name}' of {family.manifold.name}")
-        poses = [entry for entry in entries if entry.reading.kind != "points"]
+        poses = [entry for entry in entries if entry.kind != "points"]
         entries = poses or entries  # beside poses, a family of R^2 may as well be controls
         if not entries:
             raise ViewError(
@@ -185,13 +148,3 @@ def recipe_of(
     for term in terms:
         solution.selections(term)
     return Recipe(entries, sigmas, tuple(terms), position)
-
-
-def _reading(selection: Selection, position: Position | None) -> Reading:
-    """Poses and points are read as what they are, all else by the function, if there is one."""
-    try:
-        return reading_of(selection, None)
-    except ViewError:
-        if position is None:
-            raise
-        return reading_of(selection, position)

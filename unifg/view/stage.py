@@ -1,9 +1,8 @@
 """A scene as one HTML file: objects, what becomes of them from frame to frame, and the words around the picture.
 
 The file carries its viewer (meshcat) and needs neither a server nor a network; the same log gives the same bytes,
-provided that the same version of meshcat wrote them. A kind of scene is a function that puts layers on a `Stage` and
-fills in its `Page`. What only moves, turns or stretches is animated; what changes shape from frame to frame is one
-object per frame, shown in turn.
+provided that the same version of meshcat wrote them. What only moves, turns or stretches is animated; what changes
+shape from frame to frame is one object per frame, shown in turn.
 """
 
 from __future__ import annotations
@@ -13,16 +12,14 @@ import math
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from importlib import resources
 from typing import Any
 
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.style.colours import css, rgb
+from unifg.style.colours import rgb
 from unifg.typing import Array, ArrayLike, IntArray
-from unifg.view.page import Page
 from unifg.view.recorder import Recorder, load_meshcat, viewer_script
 from unifg.view.shapes import Mesh
 
@@ -32,7 +29,6 @@ MAX_FRAMES = 500
 """Longer runs show every second tick, every third, ..."""
 
 _PIECES = 200  # of a way that appears bit by bit
-_WATCHED = 40.0  # [s]; a scene starts at the lowest speed that shows it within this time
 _KINDS = {"position": "vector3", "scale": "vector3", "quaternion": "quaternion", "visible": "boolean"}
 
 
@@ -52,7 +48,6 @@ class Stage:
         recorder: everything sent.
         origin: (3,) of the world, where the stage has its own [m]; a browser reckons in single precision.
         stroke: half the width of a line that is to be seen well [m].
-        page: around it; set by :meth:`finish`.
     """
 
     def __init__(self, ticks: int, dt: float, *, origin: ArrayLike = (0.0, 0.0, 0.0), stroke: float = 0.05) -> None:
@@ -164,32 +159,9 @@ class Stage:
         for begin in range(0, self.last, stride):
             yield begin, min(begin + stride, self.last)
 
-    # ------------------------------------------------------------------- the page
-
-    def finish(self, page: Page) -> Stage:
-        """Send the animation, put the page around it, and return the scene."""
+    def play(self) -> None:
+        """Send the animation."""
         self._viewer.set_animation(self._animation, play=True, repetitions=1)
-        self.page = page
-        return self
-
-    def html(self) -> str:
-        """The page of a finished scene, which refers to no other file."""
-        page, duration = self.page, float(self.dt * self.last)
-        fitting = [speed for speed in page.speeds if speed >= 1.0 and duration / speed <= _WATCHED]
-        data: dict[str, Any] = asdict(page)
-        data |= {
-            "facts": [[name, text] for name, text in page.facts.items() if text],
-            "corners": page.corners.round(4).tolist(),
-            "legend": [asdict(key) | {"colour": css(key.colour)} for key in page.legend],
-            "plots": [asdict(plot) | {"colour": css(plot.colour)} for plot in page.plots],
-            "dt": self.dt,
-            "duration": duration,
-            "ticks": self.ticks.tolist(),
-            "speed": fitting[0] if fitting else page.speeds[-1] if page.speeds else 1.0,
-            "step": 0.01 if page.counts == "time" else self.dt,
-            "play": page.counts == "time",
-        }
-        return page_text(data, self.recorder.packed_base64())
 
 
 def page_text(data: dict[str, Any], commands: list[str], *, connect: str = "", live: str = "") -> str:

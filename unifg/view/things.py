@@ -8,18 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE3
-from unifg.typing import Array, IntArray
-from unifg.view import shapes
+from unifg.plots.shown import every
+from unifg.typing import Array
+from unifg.view import bodies, shapes
+from unifg.view.page import Key
 from unifg.view.shapes import Mesh
-from unifg.view.stage import Stage
 
 __all__ = [
+    "Layer",
     "Thing",
     "draw_arrows",
     "draw_boxes",
@@ -35,7 +37,42 @@ __all__ = [
 ]
 
 _CORNERS = 28  # of an ellipse
-_AXES = (("x", "moving"), ("y", "closure"), ("z", "robot"))  # red, green, blue
+
+
+class Surface(Protocol):
+    """Destination of drawings: a stage for a browser, or axes of matplotlib; ``stroke`` is half a line's width [m]."""
+
+    @property
+    def stroke(self) -> float:
+        """Half the width of a line that is to be seen well [m]."""
+
+    def mesh(self, path: str, mesh: Mesh, colour: str, *, lit: bool = False, opacity: float = 1.0) -> None:
+        """Draw a mesh."""
+
+    def points(self, path: str, points: Array, colour: str, pixels: float) -> None:
+        """Draw dots (n, 3) [m] of a size on the screen."""
+
+    def lines(self, path: str, lines: Array, colour: str) -> None:
+        """Draw thin straight lines (n, 2, 3) [m]."""
+
+
+@dataclass
+class Layer:
+    """Everything of one name.
+
+    Attributes:
+        path: of its objects.
+        level: rank from the ground up.
+        key: its line of the legend, None for none.
+        colour: of everything drawn.
+        width: of lines where they are not given one [m].
+    """
+
+    path: str
+    level: int
+    key: Key | None
+    colour: str
+    width: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +80,7 @@ class Thing:
     """Something to be drawn, or a part of it.
 
     Attributes:
-        draw: called with the stage, the path, the most members to draw, and ``given``.
+        draw: called with the stage, the path, the most members to draw, the layer, and ``given``.
         given: its numbers.
         corners: (n, 3) places that a view of it must hold [m].
         members: how many points, poses, ... it has.
@@ -57,6 +94,11 @@ class Thing:
     members: int = 1
     budget: int = 10**9
     slack: float = 0.0
+
+    def put(self, stage: Surface, path: str, most: int, layer: Layer) -> None:
+        """Draw at most so many of its members."""
+        if self.members:
+            self.draw(stage, path, most, layer, **self.given)
 
     def same(self, other: Thing | None) -> bool:
         """Test whether another one looks the same."""
@@ -74,16 +116,9 @@ class Thing:
         return one.shape == other.shape and bool((np.abs(one - other) <= self.slack).all())
 
 
-def every(count: int, most: int) -> IntArray:
-    """At most that many of 0, 1, ..., evenly, the first and the last among them."""
-    if count <= most:
-        return np.arange(count)
-    return np.unique(np.linspace(0, count - 1, max(most, 1)).round().astype(np.intp))
-
-
-def lift(stage: Stage, level: float) -> float:
+def lift(stage: Surface, layer: Layer) -> float:
     """Height of a layer [m]."""
-    return 0.25 * stage.stroke * level
+    return 0.25 * stage.stroke * layer.level
 
 
 def raised(places: Array, height: float) -> Array:
@@ -93,130 +128,106 @@ def raised(places: Array, height: float) -> Array:
 
 
 def draw_way(
-    stage: Stage, path: str, most: int, *, points: Array, flat: bool, colour: str, width: float | None, level: float
+    stage: Surface, path: str, most: int, layer: Layer, *, points: Array, flat: bool, width: float | None
 ) -> None:
     """A line through points (n, 3) [m]."""
     kept = shapes.thin(points, most)
     if len(kept) < 2:
         return
     if flat:
-        mesh = shapes.ribbon(kept, 2.0 * stage.stroke if width is None else width, lift(stage, level))
+        mesh = shapes.ribbon(kept, 2.0 * stage.stroke if width is None else width, lift(stage, layer))
     else:
         mesh = shapes.tube(kept, 0.8 * stage.stroke if width is None else 0.5 * width)
-    stage.mesh(path, mesh, colour)
+    stage.mesh(path, mesh, layer.colour)
 
 
 def draw_points(
-    stage: Stage, path: str, most: int, *, points: Array, flat: bool, colour: str, pixels: float, level: float
+    stage: Surface, path: str, most: int, layer: Layer, *, points: Array, flat: bool, pixels: float
 ) -> None:
     """Dots at (n, 3) [m]."""
-    if len(points):
-        kept = points[every(len(points), most)]
-        stage.points(path, raised(kept, lift(stage, level) if flat else 0.0), colour, pixels)
+    kept = points[every(len(points), most)]
+    stage.points(path, raised(kept, lift(stage, layer) if flat else 0.0), layer.colour, pixels)
 
 
 def draw_segments(
-    stage: Stage, path: str, most: int, *, lines: Array, flat: bool, colour: str, width: float | None, level: float
+    stage: Surface, path: str, most: int, layer: Layer, *, lines: Array, flat: bool, width: float | None
 ) -> None:
     """Straight lines (n, 2, 3) [m]; hair-thin ones where the width is None."""
-    if not len(lines):
-        return
-    kept = raised(lines[every(len(lines), most)], lift(stage, level) if flat else 0.0)
+    kept = raised(lines[every(len(lines), most)], lift(stage, layer) if flat else 0.0)
     if width is None:
-        stage.lines(path, kept, colour)
+        stage.lines(path, kept, layer.colour)
     else:
-        stage.mesh(path, shapes.strips(kept, width, not flat), colour)
+        stage.mesh(path, shapes.strips(kept, width, not flat), layer.colour)
 
 
-def draw_arrows(
-    stage: Stage, path: str, most: int, *, poses: Array, length: float | None, colour: str, level: float
-) -> None:
+def draw_arrows(stage: Surface, path: str, most: int, layer: Layer, *, poses: Array, length: float | None) -> None:
     """Arrow heads at poses in the plane (n, 3), pointing along their x."""
-    if not len(poses):
-        return
     kept = poses[every(len(poses), most)]
     size = 8.0 * stage.stroke if length is None else length
     cosine, sine, zero = np.cos(kept[:, 2]), np.sin(kept[:, 2]), np.zeros(len(kept))
     turns = np.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
-    places = np.column_stack([kept[:, :2], np.full(len(kept), lift(stage, level))])
-    stage.mesh(path, shapes.copies(shapes.wedge(size, 0.0), places, turns), colour)
+    places = np.column_stack([kept[:, :2], np.full(len(kept), lift(stage, layer))])
+    stage.mesh(path, shapes.copies(shapes.wedge(size, 0.0), places, turns), layer.colour)
 
 
-def draw_triads(stage: Stage, path: str, most: int, *, poses: Array, length: float | None, level: float) -> None:
+def draw_triads(stage: Surface, path: str, most: int, layer: Layer, *, poses: Array, length: float | None) -> None:
     """Axes of poses in space (n, 7): x red, y green, z blue."""
-    if not len(poses):
-        return
     matrices = SE3.matrix(poses[every(len(poses), most)])
-    size = 10.0 * stage.stroke if length is None else length
-    for axis, (name, colour) in enumerate(_AXES):
-        end = np.zeros((2, 3))
-        end[1, axis] = size
-        beam = shapes.tube(end, 0.06 * size, 4)
-        stage.mesh(f"{path}/{name}", shapes.copies(beam, matrices[:, :3, 3], matrices[:, :3, :3]), colour)
+    for beam in bodies.beams(10.0 * stage.stroke if length is None else length):
+        mesh = shapes.copies(beam.mesh, matrices[:, :3, 3], matrices[:, :3, :3])
+        stage.mesh(f"{path}/{beam.name}", mesh, beam.colour)
 
 
-def draw_ellipses(
-    stage: Stage, path: str, most: int, *, centres: Array, axes: Array, colour: str, level: float
-) -> None:
+def draw_ellipses(stage: Surface, path: str, most: int, layer: Layer, *, centres: Array, axes: Array) -> None:
     """Outlines around (n, 3) [m]: the unit circle under axes (n, 2, 2) [m]."""
-    if not len(centres):
-        return
     chosen = every(len(centres), most)
     angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1)
     outer = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ axes[chosen].transpose(0, 2, 1)
     reach = np.linalg.norm(outer, axis=2, keepdims=True)
     inner = outer * np.maximum(1.0 - stage.stroke / np.maximum(reach, 1e-300), 0.0)
-    places = raised(centres[chosen], lift(stage, level))[:, None]
+    places = raised(centres[chosen], lift(stage, layer))[:, None]
     rows = [np.concatenate([row, np.zeros((*row.shape[:2], 1))], axis=2) + places for row in (outer, inner)]
     rim = np.stack([rows[0][:, :-1], rows[0][:, 1:], rows[1][:, 1:], rows[1][:, :-1]], axis=2)
-    stage.mesh(f"{path}/edge", shapes.quads(rim.reshape(-1, 4, 3)), colour)
+    stage.mesh(f"{path}/edge", shapes.quads(rim.reshape(-1, 4, 3)), layer.colour)
     turns = np.zeros((len(chosen), 3, 3))
     turns[:, :2, :2] = axes[chosen]
     disc = shapes.ring(np.zeros(2), 0.0, 1.0, 0.0, corners=_CORNERS)
-    stage.mesh(f"{path}/disc", shapes.copies(disc, places[:, 0], turns), colour, opacity=0.13)
+    stage.mesh(f"{path}/disc", shapes.copies(disc, places[:, 0], turns), layer.colour, opacity=0.13)
 
 
-def draw_ellipsoids(
-    stage: Stage, path: str, most: int, *, centres: Array, axes: Array, colour: str, level: float
-) -> None:
+def draw_ellipsoids(stage: Surface, path: str, most: int, layer: Layer, *, centres: Array, axes: Array) -> None:
     """Surfaces around (n, 3) [m]: the unit sphere under axes (n, 3, 3) [m]."""
-    if len(centres):
-        number = every(len(centres), most)
-        mesh = shapes.copies(shapes.sphere(), centres[number], axes[number])
-        stage.mesh(path, mesh, colour, lit=True, opacity=0.3)
+    number = every(len(centres), most)
+    mesh = shapes.copies(shapes.sphere(), centres[number], axes[number])
+    stage.mesh(path, mesh, layer.colour, lit=True, opacity=0.3)
 
 
 def draw_discs(
-    stage: Stage, path: str, most: int, *, rows: Array, height: float, base: float, colour: str, opacity: float,
-    level: float,
-) -> None:  # fmt: skip
+    stage: Surface, path: str, most: int, layer: Layer, *, rows: Array, height: float, base: float, opacity: float
+) -> None:
     """Discs (n, 3) x, y, radius [m], upright cylinders where there is a height [m]."""
-    if not len(rows):
-        return
     kept = rows[every(len(rows), most)]
     turns = np.zeros((len(kept), 3, 3))
     turns[:, 0, 0] = turns[:, 1, 1] = kept[:, 2]
     turns[:, 2, 2] = max(height, 0.0) or 1.0
     shape = shapes.column() if height > 0.0 else shapes.ring(np.zeros(2), 0.0, 1.0, 0.0, corners=32)
-    z = base if height > 0.0 else base + lift(stage, level)
+    z = base if height > 0.0 else base + lift(stage, layer)
     mesh = shapes.copies(shape, np.column_stack([kept[:, :2], np.full(len(kept), z)]), turns)
-    stage.mesh(path, mesh, colour, lit=height > 0.0, opacity=opacity)
+    stage.mesh(path, mesh, layer.colour, lit=height > 0.0, opacity=opacity)
 
 
 def draw_boxes(
-    stage: Stage, path: str, most: int, *, poses: Array, sizes: Array, colour: str, opacity: float, level: float
+    stage: Surface, path: str, most: int, layer: Layer, *, poses: Array, sizes: Array, opacity: float
 ) -> None:
     """Boxes of sizes (n, 3) [m] around poses in space (n, 7)."""
-    if not len(poses):
-        return
     number = every(len(poses), most)
     matrices = SE3.matrix(poses[number])
     turns = matrices[:, :3, :3] * sizes[number][:, None, :]
     mesh = shapes.copies(shapes.box(np.zeros(3), np.ones(3)), matrices[:, :3, 3], turns)
-    stage.mesh(path, mesh, colour, lit=True, opacity=opacity)
+    stage.mesh(path, mesh, layer.colour, lit=True, opacity=opacity)
 
 
-def draw_walls(stage: Stage, path: str, most: int, *, occupancy: OccupancyMap, height: float, level: float) -> None:
+def draw_walls(stage: Surface, path: str, most: int, layer: Layer, *, occupancy: OccupancyMap, height: float) -> None:
     """The free cells of a map as floor, the occupied ones as walls of a height [m]."""
     if occupancy.free.any():
         stage.mesh(f"{path}/floor", shapes.flat(occupancy, occupancy.free, -0.01 * height), "floor")
@@ -224,8 +235,6 @@ def draw_walls(stage: Stage, path: str, most: int, *, occupancy: OccupancyMap, h
         stage.mesh(f"{path}/walls", shapes.extrude(occupancy, height), "wall", lit=True)
 
 
-def draw_mesh(
-    stage: Stage, path: str, most: int, *, mesh: Mesh, colour: str, lit: bool, opacity: float, level: float
-) -> None:
+def draw_mesh(stage: Surface, path: str, most: int, layer: Layer, *, mesh: Mesh, lit: bool, opacity: float) -> None:
     """A mesh as it is."""
-    stage.mesh(path, mesh, colour, lit=lit, opacity=opacity)
+    stage.mesh(path, mesh, layer.colour, lit=lit, opacity=opacity)
