@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -88,6 +90,23 @@ def test_started_at_the_answer_takes_no_step(solver: fg.Solver) -> None:
     assert again.converged
     assert again.iterations == 0
     assert again.cost == first.cost
+
+
+@pytest.mark.parametrize("solver", BACKENDS, ids=IDS)
+def test_single_solves_share_a_workspace_and_nothing_else(solver: fg.Solver) -> None:
+    """A later solve of a graph takes over memory and structure; its answer is that of a graph stated anew."""
+    problem = next(problem for problem in PROBLEMS if takes(solver, problem))
+    graph, guess = problem.build()
+    first = solver.solve(graph, guess)
+    moved = {family: first[family] for family in guess}
+    solver.solve(graph, moved)
+    again = replace(solver).solve(graph, guess)
+    kept = graph.compile().workspaces
+    assert len(kept) == 1 and again.iterations == first.iterations and again.checked == first.checked
+    for family in guess:
+        np.testing.assert_array_equal(again[family], first[family])
+    replace(solver, tolerance=2.0 * solver.tolerance).solve(graph, guess)
+    assert len(kept) == 2
 
 
 def test_bazzana_schedule_is_the_literal_loop() -> None:

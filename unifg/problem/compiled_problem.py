@@ -85,6 +85,7 @@ class CompiledProblem:
         python_seconds: time spent so far in terms that Python evaluates.
         buffers: memory for linearisations.
         verifications: of the traced terms, once a guess has been read.
+        workspaces: of single solves: backend, options, memory.
         turn: held by who binds data, until nobody needs them any more, and while anything is evaluated.
     """
 
@@ -114,6 +115,7 @@ class CompiledProblem:
         self.costs = Rows(self.table, self.cost_terms, True, self.size)
         self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
         self.systems = Systems(self.normal, self.blocks, self.constraints)
+        self.workspaces: list[tuple[type, dict[str, Any], Any]] = []
         self._found: dict[Callable[[CompiledProblem], Any], Any] = {}
         self._pairs: dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, Array, IntArray]] = {}
         self._cost_slices = _slices(self.cost_terms)

@@ -40,6 +40,7 @@ logger = logging.getLogger("unifg")
 Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
+KEPT = 4  # workspaces of single solves, for each graph
 EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new branches
 AT_ONCE, LATER = 4, 256  # verifications of new branches: so many without delay, then one in so many solves
 FEW = 3  # iterations that are asked for as such, one after the other in a control loop
@@ -148,7 +149,9 @@ class Solver(Backend):
 
         ``duals`` are multipliers by term name, overriding those of the guess.
         """
-        return self.bound(graph).solve(guess, data=data, duals=duals, check=check, callback=callback)
+        prepared = self.bound(graph)
+        prepared.single = True
+        return prepared.solve(guess, data=data, duals=duals, check=check, callback=callback)
 
     def prepare(self, graph: Model) -> Prepared:
         """Compile the graph, and everything that its solves can reach, for repeated solves.
@@ -509,6 +512,7 @@ class Prepared:
     Attributes:
         solver: the backend and its options.
         program: the compiled graph.
+        single: whether it is for one solve, whose workspace later ones of the graph take over.
     """
 
     def __init__(self, solver: Solver, program: CompiledProblem, graph: Model | None = None) -> None:
@@ -517,6 +521,7 @@ class Prepared:
         self.program = program
         self._graph = graph or program.graph
         self._edition = self._graph.edition
+        self.single = False
         self._workspace: Any = None
         self._solves, self._owed, self._of_branches = 0, False, 0
         self._last: ReferenceType[Solution] | None = None
@@ -669,9 +674,18 @@ class Prepared:
             )  # fmt: skip
 
     def allocate(self) -> None:
-        """Make the backend's workspace, unless there is one."""
-        if self._workspace is None:
-            self._workspace = self.solver.workspace(self.program)
+        """Make the backend's workspace, unless there is one; of single solves, unless an earlier one has left its own."""
+        if self._workspace is not None:
+            return
+        kept = self.program.workspaces
+        for solver, options, workspace in kept if self.single else ():
+            if solver is type(self.solver) and _same(options, vars(self.solver)):
+                self._workspace = workspace
+                return
+        self._workspace = self.solver.workspace(self.program)
+        if self.single:
+            kept.append((type(self.solver), dict(vars(self.solver)), self._workspace))
+            del kept[:-KEPT]
 
     def __getstate__(self) -> dict[str, Any]:
         """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""
@@ -723,3 +737,13 @@ class Prepared:
                     index=index,
                 )
         raise GraphError("a Jacobian is not finite at the guess: run graph.check(guess) to find the term")
+
+
+def _same(options: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
+    """Test whether options are the same numbers and words, or the same objects."""
+    plain = bool | int | float | str
+    return options.keys() == others.keys() and all(
+        value is others[name]
+        or (isinstance(value, plain) and isinstance(others[name], plain) and value == others[name])
+        for name, value in options.items()
+    )
