@@ -97,13 +97,17 @@ def test_carmen_lines(tmp_path: Path, packed: bool) -> None:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("ODOM 1 2 3 4 5 6 7 host", "line 8: ODOM: 9 words, expected 10"),
-        ("ODOM 1 2 x 4 5 6 7 host 8", "line 8: ODOM: 'x' is not a number"),
-        ("ODOM 1 2 1_0 4 5 6 7 host 8", "line 8: ODOM: '1_0' is not a number"),
-        ("FLASER 3 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 13 words, expected 14"),
+        ("ODOM 1 2 3 4 5 6 7 host", "line 8: ODOM: 8 fields, expected 9"),
+        ("ODOM 1 2 x 4 5 6 7 host 8", "line 8: ODOM: field theta is 'x', not a number"),
+        ("ODOM 1 2 1_0 4 5 6 7 host 8", "line 8: ODOM: field theta is '1_0', not a number"),
+        ("FLASER 3 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 12 fields, expected 13"),
         ("FLASER x 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 'x' is not a number of readings"),
-        ("FLASER 2 1 inf 0 0 0 0 0 0 7 host 8", "line 8: FLASER: inf is not a finite"),
-        ("ROBOTLASER1 0 1 2 3", "line 8: ROBOTLASER1: "),
+        ("FLASER 2 1 inf 0 0 0 0 0 0 7 host 8", "line 8: FLASER: field r2 is 'inf', not a finite"),
+        ("ROBOTLASER1 0 1 2 3", "line 8: ROBOTLASER1: 4 fields are too few"),
+        (
+            "ROBOTLASER1 0 0 3 9e9 80 0 0 2 1 1 0 0 0 0 0 0 0 0 0 0 0 0 7 host 8",
+            "line 8: ROBOTLASER1: 2 beams from 0 rad",
+        ),
     ],
 )
 def test_carmen_refusals(tmp_path: Path, line: str, message: str) -> None:

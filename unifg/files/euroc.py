@@ -14,7 +14,7 @@ import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, legible, read_text
-from unifg.files.fields import finite, norms
+from unifg.files.text import decimal, norms
 from unifg.files.tum import Trajectory
 
 __all__ = ["read_euroc"]
@@ -51,7 +51,9 @@ def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
         if not _WHOLE.fullmatch(words[0]):
             raise FileFormatError(f"{place}: the time {reprlib.repr(words[0])} is not in whole nanoseconds")
         stamps.append(int(words[0]))
-        rows.append([finite(place, field, word) for field, word in zip(_FIELDS[1:], words[1:], strict=False)])
+        rows.append(
+            [decimal(f"{place}: field {field}", word) for field, word in zip(_FIELDS[1:], words[1:], strict=False)]
+        )
         lines.append(number)
     table = np.array(rows, dtype=np.float64).reshape(-1, 7)
     time = np.array([1e-9 * (stamp - stamps[0]) for stamp in stamps], dtype=np.float64)
