@@ -24,10 +24,9 @@ def relinearize(memory: Address, v: int, scratch: Array) -> None:
     at = v - v  # zero, of which compiled code does not know it: functions are compiled anew for a literal
     retract(memory, v, scratch, at)
     if variable.frozen == 2:
-        c = state.counters[0].priors
-        while c >= 0:
-            _rewrite(memory, c, v, scratch)
-            c = state.cliques[c].next
+        for c in range(state.counters[0].clique_end):
+            if state.cliques[c].prior:
+                _rewrite(memory, c, v, scratch)
     for k in range(storage):
         numbers[value + k] = scratch[k]
     for k in range(2 * dim):

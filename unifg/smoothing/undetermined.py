@@ -30,7 +30,7 @@ def enough(state: State, variable: int) -> bool:
         rows.append(np.full(len(own), int(state.types["rows"][kind])))
         single.append(np.full(len(own), slots == 1))
     cliques = state.cliques[: int(counters["clique_end"])]
-    priors = np.flatnonzero((cliques["prior"] == 1) & (cliques["filled"] == 1))
+    priors = np.flatnonzero(cliques["prior"] == 1)
     places = zip(*(cliques[name][priors].tolist() for name in ("list", "pivots", "count")), strict=True)
     total = _tie(ties, total, [state.lists[at + gone : at + n] for at, gone, n in places])
     rows.append((cliques["size"] - cliques["pivot_rows"])[priors].astype(np.int64))

@@ -15,7 +15,7 @@ from unifg.elimination.symbolic import cliques as find_cliques
 from unifg.elimination.symbolic import separators
 from unifg.smoothing.cliques import add_child, add_factor, begin_clique, eliminate_clique, substitute
 from unifg.smoothing.linear import linearize
-from unifg.smoothing.memory import found, grown, length_of_front, more
+from unifg.smoothing.memory import found, grown, length_of_front, more, next_row
 from unifg.smoothing.state import LINEAR, SLOTS_MAX, opened
 from unifg.smoothing.tree import dissolve, give_up, mark_factor, move_points, sort_by_age
 from unifg.typing import Array, IntArray
@@ -124,12 +124,7 @@ def renew(
         np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room), np.empty(room), np.empty(room),
     )  # fmt: skip
     for k in range(made):
-        c = counters.clique_free
-        if c >= 0:
-            counters.clique_free = cliques[c].next
-        else:
-            c = counters.clique_end
-            counters.clique_end = c + 1
+        c, counters.clique_free, counters.clique_end = next_row(cliques, counters.clique_free, counters.clique_end)
         slot_of[k] = c
         cliques[c].child = -1
     for k in range(made):
