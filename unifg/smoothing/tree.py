@@ -144,13 +144,24 @@ def give_up(memory: Address, failed: int) -> None:
 
 @compiled
 def sort_by_age(memory: Address, members: IntArray) -> None:
-    """Sort variables in place, oldest stamp first, then in the order of creation."""
-    variables = opened(memory).variables
-    stamps, sequences = np.empty(len(members)), np.empty(len(members), np.int64)
-    for i in range(len(members)):
-        stamps[i], sequences[i] = variables[members[i]].stamp, variables[members[i]].sequence
-    order = np.argsort(sequences)
-    members[:] = members[order[np.argsort(stamps[order], kind="mergesort")]]
+    """Sort variables in place, oldest stamp first, then in the order of creation (D. Shell's method, 1959)."""
+    state = opened(memory)
+    variables, count = state.variables, len(members)
+    gap = 1
+    while gap < count // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, count):
+            v, k = members[i], i
+            while k >= gap:
+                other = members[k - gap]
+                a, b = variables[other], variables[v]
+                if not (a.stamp > b.stamp or (a.stamp == b.stamp and a.sequence > b.sequence)):
+                    break
+                members[k] = other
+                k -= gap
+            members[k] = v
+        gap //= 3
 
 
 @compiled
