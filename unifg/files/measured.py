@@ -93,30 +93,17 @@ class _Measured(NamedTuple):
     information: Array
 
 
-class _Places:
-    """Positions of distinct identifiers (n,)."""
+def _positions(identifiers: Ids, table: Table, column: int, what: str) -> IntArray:
+    """Positions among distinct identifiers (n,) of those in a column of a table, which must be what is said.
 
-    def __init__(self, identifiers: Ids) -> None:
-        self._order: IntArray = np.argsort(identifiers, kind="stable")
-        self._sorted = identifiers[self._order]
-
-    def find(self, identifiers: Ids) -> IntArray:
-        """Positions of identifiers; -1 for unknown ones."""
-        if not len(self._sorted):
-            return np.full(len(identifiers), -1, dtype=np.intp)
-        place = np.minimum(np.searchsorted(self._sorted, identifiers), len(self._sorted) - 1)
-        return np.where(self._sorted[place] == identifiers, self._order[place], -1)
-
-    def of(self, table: Table, column: int, what: str) -> IntArray:
-        """Positions of the identifiers in a column of a table, which must be what is said.
-
-        Raises:
-            FileFormatError: an identifier is unknown.
-        """
-        wanted = table.integers[:, column]
-        found = self.find(wanted)
-        table.refuse(found < 0, lambda k: f"there is no {what} {wanted[k]} in the file")
-        return found
+    Raises:
+        FileFormatError: an identifier is unknown.
+    """
+    wanted, order = table.integers[:, column], np.argsort(identifiers, kind="stable")
+    found: IntArray = np.append(order, len(order))[np.searchsorted(identifiers, wanted, sorter=order)]
+    unknown = (found == len(order)) | (np.append(identifiers, 0)[found] != wanted)
+    table.refuse(unknown, lambda k: f"there is no {what} {wanted[k]} in the file")
+    return found
 
 
 class _Remarks:
@@ -218,23 +205,22 @@ def parse(file: TextFile, formats: tuple[Format, Format], repair: Repair | None)
         landmarks, lines = np.zeros((len(point_ids), form.group.point_dim)), np.zeros(len(ids) + len(point_ids), int)
     names = np.concatenate([ids, point_ids])
     Table(file.path, lines, names[:, None], np.zeros((len(names), 0))).distinct(names, "vertex")
-    places, point_places = _Places(ids), _Places(point_ids)
-    first, second = (places.of(edges.table, k, "pose") for k in (0, 1))
+    first, second = (_positions(ids, edges.table, k, "pose") for k in (0, 1))
     joined = Edges(first, second, edges.table.numbers, remarks.weights("edges", edges))
     remarks.pairs(joined, ids, edges.table.lines)
     seen: dict[str, Sightings] = {}
     held: dict[str, Priors] = {}
     for kind, found in measured.items():
-        pose, values = places.of(found.table, 0, "pose"), found.table.numbers
+        pose, values = _positions(ids, found.table, 0, "pose"), found.table.numbers
         if found.table.integers.shape[1] == 2:
-            landmark = point_places.of(found.table, 1, "landmark")
+            landmark = _positions(point_ids, found.table, 1, "landmark")
             seen[kind] = Sightings(pose, landmark, values, remarks.weights(f"sightings '{kind}'", found))
         else:
             held[kind] = Priors(pose, values, remarks.weights(f"priors '{kind}'", found))
     measuring = [some.pose for some in seen.values()] + [some.pose for some in held.values()]
     remarks.isolated("pose", ids, [first, second, *measuring])
     remarks.isolated("landmark", point_ids, [first[:0], *(some.landmark for some in seen.values())])
-    fixed = _fixed(file, places, point_places) if "FIX" in form.others else ()
+    fixed = _fixed(file, names) if "FIX" in form.others else ()
     graph = PoseGraph(
         ids, poses, joined, point_ids, landmarks, seen, fixed, skipped, remarks=tuple(remarks.sentences), priors=held
     )
@@ -258,7 +244,7 @@ def _measurements(file: TextFile, form: Format, remarks: _Remarks) -> dict[str, 
     """Measurements by kind; those of a sensor that is not at the origin of the body are moved there."""
     sensors = file.table(_SENSOR if _SENSOR in form.others else "", 1, f"parameter {form.fields}")
     sensors.distinct(sensors.integers[:, 0], "vertex")
-    places, offsets = _Places(sensors.integers[:, 0]), form.read(sensors, sensors.numbers, remarks.say)
+    offsets = form.read(sensors, sensors.numbers, remarks.say)
     found: dict[str, list[_Measured]] = {}
     for tag in form.tags:
         if tag.name not in file and (tag.kind != "edges" or "edges" in found):
@@ -273,7 +259,7 @@ def _measurements(file: TextFile, form: Format, remarks: _Remarks) -> dict[str, 
         if tag.kind in _POSES:
             values = form.read(table, values, remarks.say)
         if len(names) > vertices:
-            sensor = offsets[places.of(table, vertices, _SENSOR)]
+            sensor = offsets[_positions(sensors.integers[:, 0], table, vertices, _SENSOR)]
             if tag.kind == "point":
                 values, transport = SE3.act(sensor, values), SE3.matrix(sensor)[:, :3, :3]
             else:
@@ -332,14 +318,12 @@ def _symmetric(matrices: Array) -> Array:
     return np.asarray(0.5 * (matrices + np.swapaxes(matrices, 1, 2)), dtype=np.float64)
 
 
-def _fixed(file: TextFile, *places: _Places) -> tuple[int, ...]:
+def _fixed(file: TextFile, names: Ids) -> tuple[int, ...]:
     """Identifiers on FIX lines, which may hold several."""
-    fixed: list[int] = []
+    known, fixed = set(names.tolist()), list[int]()
     for row in file.rows("FIX").tolist():
         for word in file.words(row):
-            known = word.isdecimal() and len(word) <= 19 and int(word) < 2**63
-            wanted = np.array([int(word) if known else -1])
-            if not known or not any(part.find(wanted)[0] >= 0 for part in places):
+            if not word.isdecimal() or int(word) not in known:
                 raise FileFormatError(f"{file.place(row)}: FIX {word}: there is no such vertex in the file")
             fixed.append(int(word))
     return tuple(fixed)

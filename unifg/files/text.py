@@ -13,6 +13,7 @@ import reprlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 
 import numpy as np
 from numpy.typing import NDArray
@@ -246,7 +247,7 @@ class TextFile:
             hint = "; fields are separated by blanks, not commas" if b"," in text else ""
             raise FileFormatError(
                 f"{self.place(rows[wrong])}{about}: {len(text.split())} fields, expected {len(fields)} "
-                f"({_shortened(names)}){hint}"
+                f"({shorten(names, 200)}){hint}"
             )
         if strange.any():  # nearly never
             strange &= np.array([name != IGNORED for name in fields])
@@ -259,10 +260,6 @@ class TextFile:
                     else:
                         numbers[row, column - integers] = decimal(place, words[column])
         return Table(self.path, self.number[rows], whole, numbers)
-
-
-def _shortened(names: str) -> str:
-    return names if len(names) <= 200 else f"{names[:100]} ... {names[-60:]}"
 
 
 def norms(quaternions: Array, place: Callable[[int], str], say: Callable[[str], None] = logger.warning) -> Array:
