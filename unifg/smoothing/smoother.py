@@ -258,14 +258,10 @@ class Smoother:
         result: Array = root.T @ root
         if all(selection.component is None for selection in selections):
             return result
-        kept: list[IntArray] = []
-        at = 0
-        for selection in selections:
-            for _ in range(len(selection)):
-                kept.append(at + np.arange(selection.tangent.start, selection.tangent.stop))
-                at += selection.family.manifold.dim
-        columns = np.concatenate(kept)
-        return result[np.ix_(columns, columns)]
+        whole = [np.arange(selection.family.manifold.dim) for selection in selections for _ in range(len(selection))]
+        parts = [selection.tangent for selection in selections for _ in range(len(selection))]
+        columns = np.concatenate([np.isin(own, own[part]) for own, part in zip(whole, parts, strict=True)])
+        return np.asarray(result[np.ix_(columns, columns)])
 
     @property
     @synchronized
@@ -402,24 +398,21 @@ class Smoother:
 
     def _reserve(self, variables: int, factors: int) -> None:
         """Make the tables long enough; arenas grow by themselves."""
-        state, counts = self._state, self._counts.tolist()
-        variable_end, factor_end, clique_end = counts[VARIABLE_END], counts[FACTOR_END], counts[CLIQUE_END]
-        grown: dict[str, Any] = {}
-        if variable_end + variables > len(state.variables):
-            grown["variables"] = longer(state.variables, variable_end + variables)
-        if factor_end + factors > len(state.factors):
-            grown["factors"] = longer(state.factors, factor_end + factors)
-        if clique_end + variable_end + variables + 1 > len(state.cliques):
-            grown["cliques"] = longer(state.cliques, clique_end + variable_end + variables + 1)
-        if len(self._types.slots) > len(state.slots):
-            grown["slots"] = np.array(self._types.slots, dtype=SLOT)
-        if len(self._types.fields) > len(state.types):
-            grown["types"] = longer(state.types, len(self._types.fields))
+        state, counts, types = self._state, self._counts.tolist(), len(self._types.fields)
+        variables += counts[VARIABLE_END]
+        needed = (
+            ("variables", variables), ("factors", counts[FACTOR_END] + factors),
+            ("cliques", counts[CLIQUE_END] + variables + 1), ("types", types),
+        )  # fmt: skip
+        grown: dict[str, Any] = {n: longer(getattr(state, n), k) for n, k in needed if k > len(getattr(state, n))}
         if grown:
-            self._hold(state := state._replace(**grown))
-        if self._written < len(self._types.fields):
-            self._written = len(self._types.fields)
-            state.types[: self._written] = np.array(self._types.fields, dtype=TYPE)
+            state = state._replace(**grown)
+        if self._written < types:
+            state = state._replace(slots=np.array(self._types.slots, dtype=SLOT))
+            state.types[:types] = np.array(self._types.fields, dtype=TYPE)
+            self._written = types
+        if state is not self._state:
+            self._hold(state)
         self._counts[SCRATCH] = self._types.scratch
 
     def _move(self, lists: IntArray | None, numbers: Array | None) -> None:
