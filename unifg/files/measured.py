@@ -228,7 +228,7 @@ def parse(file: TextFile, formats: tuple[Format, Format], repair: Repair | None)
 
 
 def _dimension(file: TextFile, formats: tuple[Format, Format]) -> tuple[bool, int]:
-    """Whether a file holds poses, and 0 for the plane or 1 for space."""
+    """True for a file that holds poses; 0 for the plane, 1 for space."""
     found = [form.pose in file for form in formats]
     given = any(found)
     if not given:
