@@ -71,6 +71,7 @@ def put(folder: Path, text: str) -> Path:
         (read_carmen, CARMEN, "ODOM 1 2 x 4 5 6 7 host 8", "line 8: ODOM: field theta is 'x', not a number"),
         (read_carmen, CARMEN, "FLASER 3 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 12 fields, expected 13"),
         (read_carmen, CARMEN, "FLASER x 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 'x' is not a number of readings"),
+        (read_carmen, CARMEN, f"FLASER {'9' * 20} 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 12 fields are too few"),
         (read_carmen, CARMEN, "FLASER 2 1 inf 0 0 0 0 0 0 7 host 8", "line 8: FLASER: field r2 is 'inf', not a finite"),
         (read_carmen, CARMEN, "ROBOTLASER1 0 1 2 3", "line 8: ROBOTLASER1: 4 fields are too few"),
         (

@@ -134,10 +134,10 @@ def _configuration(file: TextFile, row: int) -> tuple[str | float, ...]:
     place = f"{file.place(row)}: {tag}"
 
     def readings(at: int) -> int:
-        if at >= len(words):
-            raise FileFormatError(f"{place}: {len(words)} fields are too few")
-        if not words[at].isdecimal():
+        if at < len(words) and not words[at].isdecimal():
             raise FileFormatError(f"{place}: {words[at]!r} is not a number of readings")
+        if at >= len(words) or at + int(words[at]) >= len(words):
+            raise FileFormatError(f"{place}: {len(words)} fields are too few")
         return int(words[at])
 
     count = readings(first)
