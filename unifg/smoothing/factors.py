@@ -196,7 +196,9 @@ class Types:
                 return _active(staged, active), None
             known = term.kernel, wrapped, term.trace
             if term.trace is None or not _compiled_in(term.trace, normal):
-                self._remember(key, known)
+                if len(self._kernels) >= REMEMBERED:  # functions made anew for each statement are not kept for ever
+                    self._kernels.clear()
+                self._kernels[key] = known
         (kernel, _, trace), form = known, form or PLAIN
         values = [argument.value if isinstance(argument, Data) else argument for argument in normal]
         for place, manifold in elements_of(wrapped).items():
@@ -226,12 +228,6 @@ class Types:
         counts = data.shape[1] - whitener.shape[1], data.shape[1], whitening, size
         kind = self._kind(kernel, counts, selections, shapes, *form)
         return _active(Staged(kind, families, members, data, name), active), trace
-
-    def _remember(self, key: tuple[Any, ...], known: tuple[Kernel, Residual, Trace | None]) -> None:
-        """Keep what the next statement of its kind needs; functions made anew for each are not kept for ever."""
-        if len(self._kernels) >= REMEMBERED:
-            self._kernels.clear()
-        self._kernels[key] = known
 
     def _kind(
         self,
