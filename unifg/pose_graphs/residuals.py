@@ -56,9 +56,7 @@ def _spatial_chart(functions: Functions) -> Callable[..., None]:
         homogeneous(error, pose)
         a, b, c, d = 0.5 * sign * error[3], 0.5 * r[3], 0.5 * r[4], 0.5 * r[5]
         after[:] = 0.0
-        for i in range(3):
-            for k in range(3):
-                after[i, k] = pose[i, k]
+        after[:3, :3] = pose[:3, :3]
         # q (1, d/2) has the vector part v + (w I + [v]x) d / 2.
         after[3, 3], after[3, 4], after[3, 5] = a, -d, c
         after[4, 3], after[4, 4], after[4, 5] = d, a, -b
@@ -67,11 +65,9 @@ def _spatial_chart(functions: Functions) -> Callable[..., None]:
         adjoint(seen, transport)
         for i in range(6):
             for k in range(6):
-                total = 0.0
+                J[i, k], J[i, 6 + k] = 0.0, after[i, k]
                 for j in range(6):
-                    total += after[i, j] * transport[j, k]
-                J[i, k] = -total
-                J[i, 6 + k] = after[i, k]
+                    J[i, k] -= after[i, j] * transport[j, k]
 
     return kernel
 
