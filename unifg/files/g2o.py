@@ -64,7 +64,7 @@ G2O = (
             Tag("EDGE_PRIOR_SE2_XY", "position", "pose", "x y", 2),
         ),
         ("FIX",),
-        lambda table, numbers, say: numbers,
+        lambda table, numbers, say: numbers.copy(),
         lambda poses: poses,
     ),
     Format(

@@ -255,9 +255,8 @@ def _measurements(file: TextFile, form: Format, remarks: _Remarks) -> dict[str, 
         if tag.kind == "pose" and len(file.words(rows[0])) == vertices + size + len(weights.split()):
             names = names[:vertices]  # also written without the parameter
         table = file.table(tag.name, len(names), " ".join([*names, tag.fields, weights]), rows)
-        values, information = table.numbers[:, :size].copy(), _information(table, tag, table.numbers[:, size:])
-        if tag.kind in _POSES:
-            values = form.read(table, values, remarks.say)
+        values, information = table.numbers[:, :size], _information(table, tag, table.numbers[:, size:])
+        values = form.read(table, values, remarks.say) if tag.kind in _POSES else values.copy()
         if len(names) > vertices:
             sensor = offsets[_positions(sensors.integers[:, 0], table, vertices, _SENSOR)]
             if tag.kind == "point":

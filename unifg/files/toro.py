@@ -48,7 +48,7 @@ TORO = (
         "",
         (Tag("EDGE2", "edges", "i j", "dx dy dtheta", 3, order=[0, 1, 3, 5, 2, 4]),),
         (),
-        lambda table, numbers, say: numbers,
+        lambda table, numbers, say: numbers.copy(),
         lambda poses: poses,
     ),
     Format(
