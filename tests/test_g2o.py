@@ -190,6 +190,7 @@ def test_what_is_wrong_is_named_with_its_line(tmp_path: Path, line: str, message
         (b"\x1f\x8b\x08zz", "cannot be"),
         (b"VERTEX_SE2 0 0 0\nVERTEX_SE2 1 0 0 0 0\n", "line 1: VERTEX_SE2: 3 fields"),  # as many fields as needed
         (b"VERTEX_SE3:QUAT 1 0 0 0 0 0 0 0\n", "line 1: the quaternion .* has norm 0"),
+        (b"VERTEX_SE2 -2 0 0 0\nVERTEX_SE2 -1 0 0 0\nEDGE_SE2 -2 0 1 0 0 1 0 0 1 0 1\n", "line 3: there is no pose 0"),
     ],
 )
 def test_files_that_are_none(tmp_path: Path, content: bytes | None, message: str) -> None:
