@@ -33,7 +33,7 @@ from pathlib import Path
 CHECKOUT = Path(__file__).resolve().parent.parent
 TESTS = (  # what needs no checkout: names, every backend on problems with known answers, files, processes
     "test_public.py", "test_doctor.py", "test_choice.py", "test_solvers.py", "test_processes.py", "test_g2o.py",
-    "test_tum.py",
+    "test_trajectories.py",
 )  # fmt: skip
 TRIAL = """
 import sys

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -150,17 +151,6 @@ def test_units_and_offsets_decide_nothing(weight: float, at: float) -> None:
     assert better is not None and certify(folded.with_poses(better), tolerance=1e-5).certified
 
 
-def in_units(pose_graph: PoseGraph, unit: float) -> PoseGraph:
-    """The same graph with lengths in units of so many metres."""
-    dim, edges = pose_graph.group.point_dim, pose_graph.edges
-    poses, measured = pose_graph.poses.copy(), edges.measured.copy()
-    poses[:, :dim] /= unit
-    measured[:, :dim] /= unit
-    by = np.where(np.arange(pose_graph.group.dim) < dim, unit, 1.0)
-    information = edges.information * by[:, None] * by
-    return replace(pose_graph, poses=poses, edges=Edges(edges.first, edges.second, measured, information))
-
-
 @pytest.mark.parametrize("made", [manhattan(120, seed=3), sphere(5, 12, seed=1)], ids=["plane", "space"])
 def test_the_unit_of_length_decides_nothing(made: Simulated) -> None:
     """In kilometres, feet or millimetres: the same proof, the same gap, the same caveats, the same map."""
@@ -172,20 +162,35 @@ def test_the_unit_of_length_decides_nothing(made: Simulated) -> None:
     asked = certify(graph)
     assert asked.certified and 0.0 < asked.gap < 1e-5 * asked.chi2
     for unit in (1000.0, 0.3048, 1e-3, 1e-9):
-        np.testing.assert_array_equal(_measured_in(graph, unit).poses, in_units(graph, unit).poses)
-        found = certify(in_units(graph, unit))
+        found = certify(_measured_in(graph, unit))
         assert found.certified and found.gap == pytest.approx(asked.gap, rel=1e-3)
         assert found.tolerance == pytest.approx(asked.tolerance, rel=1e-9)
         assert found.chi2 == pytest.approx(asked.chi2, rel=1e-9)
         np.testing.assert_allclose(unit * found.poses[:, :dim], asked.poses[:, :dim], atol=1e-6)
-        assert certify(in_units(bound, unit)).caveats == certify(bound).caveats != ()
+        assert certify(_measured_in(bound, unit)).caveats == certify(bound).caveats != ()
 
 
-def test_what_is_used_has_one_word_for_each_edge() -> None:
-    graph = ring(6, 1)
-    for used in (np.ones(5, dtype=bool), np.ones((6, 1), dtype=bool), np.array(True), np.arange(6)):
-        with pytest.raises(GraphError, match=rf"used has shape {re.escape(str(used.shape))}.*expected \(6,\) of bool"):
-            certify(graph, used=used)  # type: ignore[arg-type]
+INDEFINITE = np.concatenate([np.tile(np.eye(3), (5, 1, 1)), -np.eye(3)[None]])
+WRONG: list[tuple[dict[str, Any], Any, str]] = [
+    ({"landmark_ids": np.array([99]), "landmarks": np.zeros((1, 2))}, None, "landmarks"),
+    ({"fixed_ids": (0, 5)}, None, "two poses"),
+    (
+        {"edges": replace(ring(6, 1).edges, information=INDEFINITE)},
+        None,
+        "edge 5 has a negative eigenvalue, of 1 edges",
+    ),
+    ({"edges": replace(ring(6, 1).edges, information=np.nan * INDEFINITE)}, None, "finite"),
+    *(
+        ({}, used, rf"used has shape {re.escape(str(used.shape))}.*expected \(6,\) of bool")
+        for used in (np.ones(5, dtype=bool), np.ones((6, 1), dtype=bool), np.array(True), np.arange(6))
+    ),
+]
+
+
+@pytest.mark.parametrize(("changed", "used", "message"), WRONG)
+def test_what_it_cannot_judge_is_refused(changed: dict[str, Any], used: Any, message: str) -> None:
+    with pytest.raises(GraphError, match=message):
+        certify(replace(ring(6, 1), **changed), used=used)
 
 
 def test_parts_are_judged_together() -> None:
@@ -381,14 +386,6 @@ def test_what_the_form_cannot_hold_is_said() -> None:
     assert all(caveat in found.sentence() for caveat in found.caveats)
 
 
-def test_landmarks_and_known_poses_are_refused() -> None:
-    graph = ring(20, 1)
-    with pytest.raises(GraphError, match="landmarks"):
-        certify(replace(graph, landmark_ids=np.array([99]), landmarks=np.zeros((1, 2))))
-    with pytest.raises(GraphError, match="two poses"):
-        certify(replace(graph, fixed_ids=(0, 5)))
-
-
 @pytest.mark.parametrize("name", GROUPS)
 def test_edges_without_information_say_nothing(name: str) -> None:
     graph = ring(6, 1, GROUPS[name])
@@ -406,7 +403,7 @@ def test_edges_without_information_say_nothing(name: str) -> None:
         chordal(nothing)
 
 
-def test_hostile_graphs_are_certified_rightly_or_refused() -> None:
+def test_odd_graphs_are_certified_rightly() -> None:
     loop = solved(ring(20, 1))
     for fixed in ((7,), (0,)):
         assert certify(replace(loop, fixed_ids=fixed)).certified
@@ -418,11 +415,6 @@ def test_hostile_graphs_are_certified_rightly_or_refused() -> None:
     for edges, said in ((nothing, 0), (itself, 1)):
         one = certify(PoseGraph(np.arange(1), np.zeros((1, 3)), edges))
         assert one.certified and one.chi2 == 0.0 and one.moved == (0.0, 0.0) and len(one.caveats) == said
-    for value, message in ((-np.eye(3), "edge 5 has a negative eigenvalue, of 1 edges"), (np.nan, "finite")):
-        information = loop.edges.information.copy()
-        information[5] = value
-        with pytest.raises(GraphError, match=message):
-            certify(replace(loop, edges=replace(loop.edges, information=information)))
 
 
 @pytest.mark.parametrize("name", names.LEAST_SQUARES)
@@ -475,13 +467,6 @@ def test_worst_edges_are_named() -> None:
     named = judge(replace(graph, ids=np.arange(100, 120), edges=replace(graph.edges, measured=measured)))
     assert named.worst[0].tolist() == [107, 108]
     assert named.worst_chi2[0] == named.worst_chi2.max()
-
-
-def test_gauss_newton_agrees_from_the_best_start() -> None:
-    made = sphere(5, 8, seed=5).pose_graph
-    _, poses = best_guess(made)
-    graph, x, guess = made.with_poses(poses).graph()
-    assert certify(made.with_poses(GaussNewton().solve(graph, guess, check=True)[x])).certified
 
 
 @pytest.mark.parametrize("made", [manhattan(150, seed=3), sphere(5, 8, seed=3)], ids=["plane", "space"])

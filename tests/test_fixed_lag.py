@@ -94,7 +94,7 @@ def test_a_prior_is_rewritten_when_a_point_moves(group: Any) -> None:
     smoother.update({x: group.random(rng, (4,))})
     assert list(smoother.window(x).indices) == [1, 2, 3]
     state = smoother._state
-    clique = state.cliques[state.counters["priors"][0]]
+    clique = state.cliques[np.flatnonzero(state.cliques["prior"])[0]]
 
     def prior() -> tuple[Array, Array]:
         size, stride = clique["size"], clique["stride"]

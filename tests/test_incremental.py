@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,14 +13,11 @@ from scipy.optimize import least_squares
 
 import unifg as fg
 from dense import Batch, drive, one_by_one, seen_once, state
-from unifg.codegen.views import described
 from unifg.elimination.symbolic import cliques as find_cliques
 from unifg.elimination.symbolic import separators as find_separators
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.smoothing import Incremental
-from unifg.smoothing.memory import give_list, give_numbers, take_list, take_numbers
-from unifg.smoothing.state import empty_state
 from unifg.typing import Array
 
 
@@ -209,38 +207,36 @@ def test_what_is_missing_is_named_and_may_be_added_later() -> None:
     assert len(smoother) == 3
 
 
-def test_refusals_name_term_and_family() -> None:
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda s, x, y, v: s.minimize(lambda p: p[:, :, None], x[0], sigma=1.0), r"returned shape \(1, 3, 1\)"),
+        (lambda s, x, y, v: s.minimize(fg.prior, y[0], np.zeros(3), sigma=1.0), "belongs to another graph"),
+        (lambda s, x, y, v: s.minimize(fg.between, x[0], v[0], np.zeros(3), sigma=1.0), "of between is SE2; found"),
+        (lambda s, x, y, v: s.minimize(fg.prior, x[0], [np.nan, 0.0, 0.0], sigma=1.0), "not finite"),
+        (
+            lambda s, x, y, v: s.minimize(fg.prior, x[0], np.zeros(3), information=np.diag([1.0, 1.0, -1.0])),
+            "negative eigenvalue",
+        ),
+        (lambda s, x, y, v: s.minimize(fg.prior, x[0], np.zeros(3), sigma=0.0), "sigma must be positive"),
+        (lambda s, x, y, v: s.minimize(fg.prior, x[0], np.zeros(3), sigma=1.0, information=np.eye(3)), "not both"),
+        (
+            lambda s, x, y, v: s.minimize(fg.between, x[[0, 1]], x[[1, 2, 3]], np.zeros(3), sigma=1.0),
+            "number of factors is unclear",
+        ),
+        (lambda s, x, y, v: s.variables("x", fg.SE3), "exists already"),
+        (lambda s, x, y, v: s.update({x: [0.0, np.inf, 0.0]}), r"x\[0\].*not on SE2"),
+        (lambda s, x, y, v: s.update({x: [0.0, 0.0]}), r"have shape \(2,\)"),
+        (lambda s, x, y, v: s.update({y: np.zeros(3)}), "not a family of this smoother"),
+        (lambda s, x, y, v: s.estimate(x[0]), "has no value yet"),
+        (lambda s, x, y, v: Incremental(relinearize=-1.0), "must not be negative"),
+    ],
+)
+def test_refusals_name_term_and_family(wrong: Callable[..., object], message: str) -> None:
     smoother, other = Incremental(), Incremental()
-    x, y = smoother.variables("x", fg.SE2), other.variables("y", fg.SE2)
-    v = smoother.variables("v", fg.Rn(2))
-    with pytest.raises(GraphError, match=r"returned shape \(1, 3, 1\)"):
-        smoother.minimize(lambda pose: pose[:, :, None], x[0], sigma=1.0)
-    with pytest.raises(GraphError, match="belongs to another graph"):
-        smoother.minimize(fg.prior, y[0], np.zeros(3), sigma=1.0)
-    with pytest.raises(GraphError, match="of between is SE2; found"):
-        smoother.minimize(fg.between, x[0], v[0], np.zeros(3), sigma=1.0)
-    with pytest.raises(GraphError, match="not finite"):
-        smoother.minimize(fg.prior, x[0], [np.nan, 0.0, 0.0], sigma=1.0)
-    with pytest.raises(GraphError, match="negative eigenvalue"):
-        smoother.minimize(fg.prior, x[0], np.zeros(3), information=np.diag([1.0, 1.0, -1.0]))
-    with pytest.raises(GraphError, match="sigma must be positive"):
-        smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.0)
-    with pytest.raises(GraphError, match="not both"):
-        smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=1.0, information=np.eye(3))
-    with pytest.raises(GraphError, match="number of factors is unclear"):
-        smoother.minimize(fg.between, x[[0, 1]], x[[1, 2, 3]], np.zeros(3), sigma=1.0)
-    with pytest.raises(GraphError, match="exists already"):
-        smoother.variables("x", fg.SE3)
-    with pytest.raises(GraphError, match=r"x\[0\].*not on SE2"):
-        smoother.update({x: [0.0, np.inf, 0.0]})
-    with pytest.raises(GraphError, match=r"have shape \(2,\)"):
-        smoother.update({x: [0.0, 0.0]})
-    with pytest.raises(GraphError, match="not a family of this smoother"):
-        smoother.update({y: np.zeros(3)})
-    with pytest.raises(GraphError, match="has no value yet"):
-        smoother.estimate(x[0])
-    with pytest.raises(GraphError, match="must not be negative"):
-        Incremental(relinearize=-1.0)
+    x, v, y = smoother.variables("x", fg.SE2), smoother.variables("v", fg.Rn(2)), other.variables("y", fg.SE2)
+    with pytest.raises(GraphError, match=message):
+        wrong(smoother, x, y, v)
     assert len(x) == 0 and len(smoother) == 0
 
 
@@ -295,31 +291,6 @@ def test_cliques_hold_what_they_must(seed: int) -> None:
         if members:
             assert members[0] in cliques[parent[k]] and parent[k] > k
             assert set(members) <= cliques[parent[k]] | set(separators[parent[k]])
-
-
-def test_blocks_of_memory_never_overlap() -> None:
-    rng = np.random.default_rng(0)
-    state = empty_state()
-    words = described(state)
-    memory = words.ctypes.data
-    for take, give, array, end in (
-        (take_numbers, give_numbers, state.numbers, "numbers_end"),
-        (take_list, give_list, state.lists, "lists_end"),
-    ):
-        held: dict[int, int] = {}
-        for _ in range(2000):
-            if held and (rng.random() < 0.5 or state.counters[end][0] > len(array) - 600):
-                at = int(rng.choice(list(held)))
-                length = held.pop(at)
-                assert (array[at : at + length] == at).all()
-                give(memory, length, at)
-            else:
-                length = int(rng.integers(1, 120))
-                at = take(memory, length)
-                array[at : at + length] = at
-                held[at] = length
-        for at, length in held.items():
-            assert (array[at : at + length] == at).all()
 
 
 @pytest.mark.data

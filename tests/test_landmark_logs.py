@@ -75,11 +75,11 @@ def test_times_that_run_backwards_are_sorted_with_what_belongs_to_them(
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
-        ("Barcodes", b"6 72", b"1 72", r"Barcodes\.dat, line 3: subject 1 stands in line 2 already"),
-        ("Barcodes", b"7 27", b"7 72", r"Barcodes\.dat, line 4: barcode 72 stands in line 3 already"),
+        ("Barcodes", b"6 72", b"1 72", r"Barcodes\.dat, line 3: subject 1 is defined twice, first in line 2"),
+        ("Barcodes", b"7 27", b"7 72", r"Barcodes\.dat, line 4: barcode 72 is defined twice, first in line 3"),
         ("Barcodes", b"6 72", b"6.5 72", r"Barcodes\.dat, line 3: field subject is '6\.5', not an integer"),
         ("Barcodes", b"6 72", b"6 72 1", r"Barcodes\.dat, line 3: 3 fields, expected 2 \(subject barcode\)"),
-        ("Landmark_Groundtruth", b"7 3", b"6 3", r"line 3: landmark 6 stands in line 2 already"),
+        ("Landmark_Groundtruth", b"7 3", b"6 3", r"line 3: landmark 6 is defined twice, first in line 2"),
         ("Landmark_Groundtruth", b"0.0002", b"-0.0002", r"line 2: a standard deviation is below zero"),
         ("Robot1_Odometry", b"0.5", b"0_5", r"Robot1_Odometry\.dat, line 3: field forward is '0_5', not a number"),
         ("Robot1_Odometry", b"0.5", b"nan", r"line 3: field forward is 'nan', not a finite number"),

@@ -193,28 +193,24 @@ def test_a_landmark_can_be_known(rng: np.random.Generator) -> None:
 # ---------------------------------------------------------------- first guesses
 
 
+@pytest.mark.parametrize("known", [(), (3, 7)])
 @pytest.mark.parametrize("method", [odometric, chordal, lago])
 @pytest.mark.parametrize("group", [fg.SE2, fg.SE3], ids=lambda group: group.name)
-def test_consistent_measurements_give_the_truth(method: Method, group: fg.LieGroup, rng: np.random.Generator) -> None:
-    graph, truth = chain(group, 30, rng)  # three times around: headings beyond pi
-    start = graph.with_poses(group.random(rng, (30,)))
-    start.poses[0] = truth[0]
+def test_consistent_measurements_give_the_truth(
+    method: Method, group: fg.LieGroup, known: tuple[int, ...], rng: np.random.Generator
+) -> None:
+    """From random poses but for those that are known, which stay; three times around: headings beyond pi."""
+    graph, truth = chain(group, 30, rng)
+    moved, held = group.compose(group.random(rng), truth), list(known or (0,))
+    start = replace(graph, poses=group.random(rng, (30,)), fixed_ids=known)
+    start.poses[held] = moved[held]
     if method is lago and group is fg.SE3:
         with pytest.raises(GraphError, match="use chordal"):
             lago(start)
         return
-    assert distance(group, truth, method(start)) < 1e-8
-
-
-@pytest.mark.parametrize("method", [odometric, chordal, lago])
-def test_known_poses_stay(method: Method, rng: np.random.Generator) -> None:
-    graph, truth = chain(fg.SE2, 12, rng)
-    moved = fg.SE2.compose([3.0, -2.0, 2.5], truth)
-    start = replace(graph, poses=fg.SE2.random(rng, (12,)), fixed_ids=(3, 7))
-    start.poses[[3, 7]] = moved[[3, 7]]
     guess = method(start)
-    np.testing.assert_array_equal(guess[[3, 7]], moved[[3, 7]])
-    assert distance(fg.SE2, moved, guess) < 1e-8
+    np.testing.assert_array_equal(guess[held], moved[held])
+    assert distance(group, moved, guess) < 1e-8
 
 
 def test_linear_guesses_are_better_than_odometry() -> None:
@@ -224,32 +220,12 @@ def test_linear_guesses_are_better_than_odometry() -> None:
             assert graph.with_poses(method(graph)).chi2() < 1.3 * best < 0.1 * graph.chi2()
 
 
-def test_long_drives_do_not_confuse_lago() -> None:
-    """After 8000 steps of odometry a heading is uncertain by 1.8 rad; whole turns are found along short paths only."""
-    graph = manhattan(8000, 0).pose_graph
-    degrees = 3 * len(graph.edges) - 3 * len(graph.poses)
-    assert graph.with_poses(lago(graph)).chi2() < 3.0 * degrees
-
-
 def test_damping_does_not_stiffen_a_chain() -> None:
     for seed in range(3):
         graph, _, guess = manhattan(1000, seed).pose_graph.graph()
         bare, damped = (solver().solve(graph, guess, check=True) for solver in (GaussNewton, LevenbergMarquardt))
         assert damped.iterations == bare.iterations < 8
         assert LevenbergMarquardt(damping=1e-3).solve(graph, guess).iterations > damped.iterations
-
-
-def test_correlations_count() -> None:
-    """With strong correlation between position and heading, positions given headings must use it."""
-    sim = manhattan(300, 2)
-    root = np.linalg.cholesky(sim.pose_graph.edges.information[0])
-    mixing = np.eye(3) + np.array([[0, 0, 0.9], [0, 0, -0.9], [0, 0, 0]])
-    information = root @ mixing @ mixing.T @ root.T
-    edges = replace(sim.pose_graph.edges, information=np.tile(information, (len(sim.outliers), 1, 1)))
-    graph = replace(sim.pose_graph, edges=edges)
-    blind = np.tile(np.diag(np.diag(information)), (len(sim.outliers), 1, 1))
-    guess = graph.with_poses(lago(graph)).chi2()
-    assert guess < graph.with_poses(lago(replace(graph, edges=replace(edges, information=blind)))).chi2()
 
 
 def test_landmarks_alone_do_not_initialise(rng: np.random.Generator) -> None:

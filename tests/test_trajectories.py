@@ -1,21 +1,35 @@
-"""KITTI trajectories, spatial TUM trajectories, and CARMEN logs."""
+"""Trajectories (TUM, KITTI, EuRoC) and CARMEN logs: what is written is read back, and a bad line is named."""
 
 from __future__ import annotations
 
 import gzip
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
 import unifg as fg
 from unifg.errors import FileFormatError
 from unifg.files.carmen import read_carmen
+from unifg.files.euroc import read_euroc
 from unifg.files.kitti import read_kitti, write_kitti
 from unifg.files.tum import read_tum, write_tum
+from unifg.lie import wrap_angle
 
-LOG = """\
+TUM = "# t tx ty tz qx qy qz qw\n0 0 0 0 0 0 0 1\n"
+KITTI = "1 0 0 0 0 1 0 0 0 0 1 0\n"
+EUROC = """\
+#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z [], v_x
+1403636580838555648,4.688319,-1.786938,0.783338,0.6,0,0,0.8,-0.027876
+
+1403636580843555648, 4.688177, -1.786770, 0.787350, 1.2, 0, 0, 1.6
+"""
+CARMEN = """\
 # a comment
 PARAM robot_length 0.5
 ODOM 1.0 2.0 0.5 0.3 -0.1 0 10.0 host 0.5
@@ -26,13 +40,89 @@ NEFF 12
 """
 
 
-def test_kitti_round_trip(tmp_path: Path, rng: np.random.Generator) -> None:
+def put(folder: Path, text: str) -> Path:
+    path = folder / "file.txt"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("read", "before", "line", "message"),
+    [
+        (read_tum, TUM, "1 2 3", "line 3: 3 fields, expected 8"),
+        (read_tum, TUM, "1,2,3,4,5,6,7,8", "separated by blanks, not commas"),
+        (read_tum, TUM, "1 2 x 4 0 0 0 1", "line 3: field ty is 'x'"),
+        (read_tum, TUM, "1 2 1_0 4 0 0 0 1", "line 3: field ty is '1_0', not a number"),
+        (read_tum, TUM, "1 2 \u0663 4 0 0 0 1", "line 3: field ty is '\u0663', not a number"),
+        (read_tum, TUM, "1 2 nan 4 0 0 0 1", "line 3: field ty is 'nan', not a finite"),
+        (read_tum, TUM, "1 2 3 4 0 0 0 0", "line 3: the quaternion .* has norm 0"),
+        (read_kitti, KITTI, "1 0 0 0 0 1 0 0 0 0 1", "line 2: 11 fields, expected 12"),
+        (read_kitti, KITTI, "1 0 0 0 0 2 0 0 0 0 1 0", "line 2: .* not a rotation matrix"),
+        (read_kitti, KITTI, "1 0 0 0 0 1 0 0 0 0 -1 0", "line 2: .* not a rotation matrix"),  # a reflection
+        (read_euroc, EUROC, "1,2,3", "line 5: 3 fields between commas, expected 8"),
+        (read_euroc, EUROC, "1 0 0 0 1 0 0 0", "line 5: 1 fields between commas"),
+        (read_euroc, EUROC, "1.5,0,0,0,1,0,0,0,0", r"line 5: field t is '1\.5', not an integer of 64 bits"),
+        (read_euroc, EUROC, "-1,0,0,0,1,0,0,0,0", "line 5: the time is below zero"),
+        (read_euroc, EUROC, "1,0,0,0,1,,0,0,0", "line 5: 7 fields, expected 8"),
+        (read_euroc, EUROC, "1,0,x,0,1,0,0,0,0", "line 5: field y is 'x', not a number"),
+        (read_euroc, EUROC, "1,0,0,inf,1,0,0,0,0", "line 5: field z is 'inf', not a finite number"),
+        (read_euroc, EUROC, "1,0,0,0,0,0,0,0,0", "line 5: the quaternion .* has norm 0"),
+        (read_carmen, CARMEN, "ODOM 1 2 3 4 5 6 7 host", "line 8: ODOM: 8 fields, expected 9"),
+        (read_carmen, CARMEN, "ODOM 1 2 x 4 5 6 7 host 8", "line 8: ODOM: field theta is 'x', not a number"),
+        (read_carmen, CARMEN, "FLASER 3 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 12 fields, expected 13"),
+        (read_carmen, CARMEN, "FLASER x 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 'x' is not a number of readings"),
+        (read_carmen, CARMEN, f"FLASER {'9' * 20} 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 12 fields are too few"),
+        (read_carmen, CARMEN, "FLASER 2 1 inf 0 0 0 0 0 0 7 host 8", "line 8: FLASER: field r2 is 'inf', not a finite"),
+        (read_carmen, CARMEN, "ROBOTLASER1 0 1 2 3", "line 8: ROBOTLASER1: 4 fields are too few"),
+        (
+            read_carmen, CARMEN, "ROBOTLASER1 0 0 3 9e9 80 0 0 1 1 0 0 0 0 0 0 0 0 0 0 0 0 0 7 host 8",
+            "line 8: ROBOTLASER1: 1 beams from 0",
+        ),
+        (read_carmen, "", "VERTEX_SE2 0 0 0 0", "is this a CARMEN log"),
+    ],
+)  # fmt: skip
+def test_bad_lines_are_named(
+    tmp_path: Path, read: Callable[[Path], object], before: str, line: str, message: str
+) -> None:
+    with pytest.raises(FileFormatError, match=message):
+        read(put(tmp_path, f"{before}{line}\n"))
+
+
+# ---------------------------------------------------------------- TUM, KITTI and EuRoC
+
+
+def test_tum_lines_are_as_other_tools_write_them(tmp_path: Path) -> None:
+    half = "0.707106781"
+    line = f"0.100000000 1.000000000 -2.000000000 0.000000000 0.000000000 0.000000000 {half} {half}\n"
+    assert write_tum(tmp_path / "a.tum", [0.1], [[1.0, -2.0, np.pi / 2]]).read_bytes() == line.encode()
+    assert "-0.0" not in write_tum(tmp_path / "a.tum", [0.0], [[-0.0, -1e-12, -1e-12]]).read_text()
+
+
+@given(arrays(np.float64, (5, 3), elements=st.floats(-100.0, 100.0)))
+def test_planar_poses_come_back(tmp_path_factory: pytest.TempPathFactory, poses: np.ndarray) -> None:
+    back = read_tum(write_tum(tmp_path_factory.mktemp("tum") / "a.tum", 0.1 * np.arange(5), poses))
+    np.testing.assert_allclose(back.time, 0.1 * np.arange(5), atol=1e-9)
+    np.testing.assert_allclose(back.planar()[:, :2], poses[:, :2], atol=1e-9)
+    assert np.abs(wrap_angle(back.planar()[:, 2] - poses[:, 2])).max() < 1e-8
+    np.testing.assert_allclose(np.linalg.norm(back.quaternion_xyzw, axis=1), 1.0, atol=1e-14)
+
+
+def test_tum_skips_comments_and_scales_quaternions(tmp_path: Path) -> None:
+    trajectory = read_tum(put(tmp_path, "# t\n\n1 2 3 4 0 0 0 5\n2 0 0 0  0 0 -2 0\n"))
+    np.testing.assert_array_equal(trajectory.position, [[2, 3, 4], [0, 0, 0]])
+    np.testing.assert_array_equal(trajectory.quaternion_xyzw, [[0, 0, 0, 1], [0, 0, -1, 0]])  # the scalar comes last
+    np.testing.assert_allclose(np.abs(trajectory.planar()[:, 2]), [0.0, np.pi])
+
+
+def test_spatial_poses_come_back(tmp_path: Path, rng: np.random.Generator) -> None:
     poses = fg.SE3.random(rng, (9,))
-    path = write_kitti(tmp_path / "poses.txt", poses)
-    lines = path.read_text().splitlines()
+    read = read_tum(write_tum(tmp_path / "t.tum", np.arange(9.0), poses))
+    np.testing.assert_allclose(read.position, poses[:, :3], atol=1e-9)
+    np.testing.assert_allclose(read.quaternion_xyzw, poses[:, [4, 5, 6, 3]], atol=2e-9)
+    lines = write_kitti(tmp_path / "t.kitti", poses).read_text().splitlines()
     assert (len(lines), len(lines[0].split())) == (9, 12)
     np.testing.assert_allclose(float(lines[3].split()[7]), poses[3, 1], rtol=1e-9)  # y ends the second row
-    np.testing.assert_allclose(fg.SE3.matrix(read_kitti(path)), fg.SE3.matrix(poses), atol=2e-9)
+    np.testing.assert_allclose(fg.SE3.matrix(read_kitti(tmp_path / "t.kitti")), fg.SE3.matrix(poses), atol=2e-9)
 
 
 def test_kitti_lifts_the_plane(tmp_path: Path) -> None:
@@ -42,82 +132,58 @@ def test_kitti_lifts_the_plane(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "message"),
+    ("write", "message"),
     [
-        ("1 0 0 0 0 1 0 0 0 0 1", "line 2: 11 fields, expected 12"),
-        ("1,0,0,0,0,1,0,0,0,0,1,0", "blanks, not commas"),
-        ("1 0 0 0 0 1 0 0 0 0 one 0", "line 2: field r33 is 'one', not a number"),
-        ("1 0 0 0 0 1 0 0 0 0 1 1_0", "line 2: field tz is '1_0', not a number"),
-        ("1 0 0 0 0 2 0 0 0 0 1 0", "line 2: .* not a rotation matrix"),
-        ("1 0 0 0 0 1 0 0 0 0 -1 0", "line 2: .* not a rotation matrix"),  # a reflection
-        ("1 0 0 nan 0 1 0 0 0 0 1 0", "line 2: "),
+        (lambda path: write_tum(path, [0.0, 1.0], np.array([[0, 0, 0], [0, np.nan, 0]])), "pose 1 is not finite"),
+        (lambda path: write_tum(path, [0.0, 1.0], [[0, 0, 0]]), r"\(2,\) and poses \(1, 3\)"),
+        (lambda path: write_kitti(path, np.zeros((2, 4))), r"shape \(2, 4\)"),
+        (lambda path: write_kitti(path, np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]])), "pose 1 is not finite"),
     ],
 )
-def test_kitti_refusals(tmp_path: Path, line: str, message: str) -> None:
-    path = tmp_path / "poses.txt"
-    path.write_text(f"1 0 0 0 0 1 0 0 0 0 1 0\n{line}\n")
+def test_what_could_not_be_read_is_not_written(tmp_path: Path, write: Callable[[Path], object], message: str) -> None:
     with pytest.raises(FileFormatError, match=message):
-        read_kitti(path)
+        write(tmp_path / "file.txt")
+    assert not (tmp_path / "file.txt").exists()
 
 
-def test_kitti_writes_poses_only(tmp_path: Path) -> None:
-    with pytest.raises(FileFormatError, match=r"shape \(2, 4\)"):
-        write_kitti(tmp_path / "p.txt", np.zeros((2, 4)))
-    with pytest.raises(FileFormatError, match="pose 1 is not finite"):
-        write_kitti(tmp_path / "p.txt", np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]))
+def test_euroc_has_nanoseconds_and_the_scalar_first(tmp_path: Path) -> None:
+    found = read_euroc(put(tmp_path, EUROC))
+    np.testing.assert_allclose(found.time, [0.0, 0.005], rtol=1e-12)  # as floats, the stamps differ by 512 ns steps
+    np.testing.assert_allclose(found.quaternion_xyzw, [[0, 0, 0.8, 0.6]] * 2)
+    assert found.position[1].tolist() == [4.688177, -1.786770, 0.787350]
 
 
-def test_tum_takes_poses_in_space(tmp_path: Path, rng: np.random.Generator) -> None:
-    poses = fg.SE3.random(rng, (5,))
-    read = read_tum(write_tum(tmp_path / "t.tum", np.arange(5.0), poses))
-    np.testing.assert_allclose(read.position, poses[:, :3], atol=1e-9)
-    np.testing.assert_allclose(read.quaternion_xyzw, poses[:, [4, 5, 6, 3]], atol=2e-9)  # the scalar goes last
+def test_evo_reads_what_is_written(tmp_path: Path, rng: np.random.Generator) -> None:
+    """It asks for exactly eight, or twelve, fields with one blank between them."""
+    evo = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")
+    poses = fg.SE3.random(rng, (6,))
+    stamped = evo.read_tum_trajectory_file(str(write_tum(tmp_path / "t.tum", np.arange(6.0), poses)))
+    np.testing.assert_allclose(stamped.positions_xyz, poses[:, :3], atol=1e-9)
+    again = read_tum(tmp_path / "t.tum").quaternion_xyzw
+    np.testing.assert_allclose(stamped.orientations_quat_wxyz[:, [1, 2, 3, 0]], again, atol=1e-9)
+    matrices = evo.read_kitti_poses_file(str(write_kitti(tmp_path / "t.kitti", poses))).poses_se3
+    np.testing.assert_allclose(matrices, fg.SE3.matrix(poses), atol=1e-8)
+
+
+# ---------------------------------------------------------------- CARMEN
 
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_carmen_lines(tmp_path: Path, packed: bool) -> None:
     path = tmp_path / "robot.log"
-    path.write_bytes(gzip.compress(LOG.encode()) if packed else LOG.encode())
+    path.write_bytes(gzip.compress(CARMEN.encode()) if packed else CARMEN.encode())
     log = read_carmen(path)
-    assert log.odometry.pose.tolist() == [[1.0, 2.0, 0.5]]
-    assert log.odometry.velocity.tolist() == [[0.3, -0.1]]
+    assert log.odometry.pose.tolist() == [[1.0, 2.0, 0.5]] and log.odometry.velocity.tolist() == [[0.3, -0.1]]
     assert log.odometry.time.tolist() == [0.5]
     front, robot = log.scans
     assert (len(front), front.maximum) == (2, math.inf)
     np.testing.assert_allclose(front.angles, np.array([-2, -1, 0, 1]) * math.pi / 4)
     assert front.ranges[1].tolist() == [1.5, 2.5, 3.5, 81.0]
-    assert front.pose.tolist() == [[1.1, 2.1, 0.6], [1.2, 2.2, 0.7]]
-    assert front.robot[0].tolist() == [1.2, 2.2, 0.7]
+    assert front.pose.tolist() == [[1.1, 2.1, 0.6], [1.2, 2.2, 0.7]] and front.robot[0].tolist() == [1.2, 2.2, 0.7]
     assert (len(robot), robot.maximum, robot.time.tolist()) == (1, 30.0, [0.8])
     np.testing.assert_allclose(robot.angles, [-1.5, -0.75, 0.0, 0.75, 1.5])
     assert (robot.ranges[0].tolist(), robot.pose[0].tolist()) == ([1, 2, 3, 4, 5], [7, 8, 0.1])
     assert log.skipped == {"PARAM": 1, "NEFF": 1}
-
-
-@pytest.mark.parametrize(
-    ("line", "message"),
-    [
-        ("ODOM 1 2 3 4 5 6 7 host", "line 8: ODOM: 9 words, expected 10"),
-        ("ODOM 1 2 x 4 5 6 7 host 8", "line 8: ODOM: 'x' is not a number"),
-        ("ODOM 1 2 1_0 4 5 6 7 host 8", "line 8: ODOM: '1_0' is not a number"),
-        ("FLASER 3 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 13 words, expected 14"),
-        ("FLASER x 1 2 0 0 0 0 0 0 7 host 8", "line 8: FLASER: 'x' is not a number of readings"),
-        ("FLASER 2 1 inf 0 0 0 0 0 0 7 host 8", "line 8: FLASER: inf is not a finite"),
-        ("ROBOTLASER1 0 1 2 3", "line 8: ROBOTLASER1: "),
-    ],
-)
-def test_carmen_refusals(tmp_path: Path, line: str, message: str) -> None:
-    path = tmp_path / "robot.log"
-    path.write_text(LOG + line + "\n")
-    with pytest.raises(FileFormatError, match=message):
-        read_carmen(path)
-
-
-def test_something_else_is_no_log(tmp_path: Path) -> None:
-    path = tmp_path / "robot.log"
-    path.write_text("VERTEX_SE2 0 0 0 0\n")
-    with pytest.raises(FileFormatError, match="is this a CARMEN log"):
-        read_carmen(path)
 
 
 @pytest.mark.data

@@ -13,15 +13,16 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits, legible, read_text
-from unifg.files.fields import decimal
-from unifg.typing import Array
+from unifg.files.contents import LIMITS, Limits
+from unifg.files.text import TextFile, decimal
+from unifg.typing import Array, IntArray
 
 __all__ = ["CarmenLog", "Odometry", "Scans", "read_carmen"]
 
@@ -29,7 +30,8 @@ logger = logging.getLogger("unifg")
 
 _READ = ("ODOM", "FLASER", "ROBOTLASER1")
 _WIDEST = 8.0 * math.pi  # where the first beam points and how far the others reach [rad]
-_ENDING = 3  # time, computer, time since the beginning
+_LASER = ("type", "start_angle", "field_of_view", "resolution", "maximum_range", "accuracy", "remission_mode")
+_POSES, _ENDING = "x y theta odom_x odom_y odom_theta", "time - since"  # fields called - are not read
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,15 +89,6 @@ class CarmenLog:
     skipped: dict[str, int]
 
 
-@dataclass
-class _Group:
-    """Scans of one configuration while reading."""
-
-    angles: Array
-    maximum: float
-    rows: list[list[float]] = field(default_factory=list)  # time, poses, ranges
-
-
 def read_carmen(path: str | Path, field_of_view: float = math.pi, limits: Limits = LIMITS) -> CarmenLog:
     """Read a log, gzipped or not; negative ranges, and times that run backwards, are named in one warning each.
 
@@ -109,108 +102,68 @@ def read_carmen(path: str | Path, field_of_view: float = math.pi, limits: Limits
         FileFormatError: the file is missing or holds none of the lines that are read, or a line, named in the message,
             is too short or has something else where a number should be.
     """
-    name = legible(path)
-    motions: list[list[float]] = []
-    groups: dict[tuple[float | str, ...], _Group] = {}
-    skipped: dict[str, int] = {}
-    for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        tag = words[0]
-        if tag not in _READ:
-            skipped[tag] = skipped.get(tag, 0) + 1
-            continue
-        try:
-            if tag == "ODOM":
-                motions.append(_motion(words))
-            elif tag == "FLASER":
-                _front_laser(words, groups, field_of_view)
-            else:
-                _robot_laser(words, groups)
-        except (FileFormatError, IndexError) as error:
-            raise FileFormatError(f"{name}, line {number}: {tag}: {error}") from None
-    if not motions and not groups:
-        raise FileFormatError(f"{name}: no line begins with {', '.join(_READ)}: is this a CARMEN log?")
-    table = np.array(motions, dtype=np.float64).reshape(-1, 6)
-    _report(name, table[:, 0], list(groups.values()))
-    return CarmenLog(
-        Odometry(table[:, 0], table[:, 1:4], table[:, 4:]),
-        tuple(_scans(group) for group in groups.values()),
-        skipped,
-    )
-
-
-def _report(name: str, odometry: Array, groups: list[_Group]) -> None:
-    """Warn of what is readable and cannot be."""
-    times = {"ODOM": odometry} | {f"laser {k}": np.array([row[0] for row in g.rows]) for k, g in enumerate(groups)}
-    back = {kind: int((np.diff(values) < 0.0).sum()) for kind, values in times.items()}
-    if any(back.values()):
-        said = ", ".join(f"{count} times in {kind}" for kind, count in back.items() if count)
-        logger.warning("%s: time runs backwards: %s", name, said)
-    negative = sum(value < 0.0 for group in groups for row in group.rows for value in row[7:])
+    file = TextFile.read(path, limits)
+    if not any(tag in file for tag in _READ):
+        raise FileFormatError(f"{file.path}: no line begins with {', '.join(_READ)}: is this a CARMEN log?")
+    motions = file.table("ODOM", 0, f"x y theta tv rv - {_ENDING}")
+    groups: dict[tuple[str | float, ...], list[int]] = {}
+    for row in np.flatnonzero(np.isin(file.kind, [file.tags.get(tag, -1) for tag in _READ[1:]])).tolist():
+        groups.setdefault(_configuration(file, row), []).append(row)
+    scans = [_scans(file, key, np.array(rows), field_of_view) for key, rows in groups.items()]
+    back = {"ODOM": motions.numbers[:, -1]} | {f"laser {k}": laser.time for k, laser in enumerate(scans)}
+    said = [f"{count} times in {kind}" for kind, time in back.items() if (count := (np.diff(time) < 0.0).sum())]
+    if said:
+        logger.warning("%s: time runs backwards: %s", file.path, ", ".join(said))
+    negative = sum(int((laser.ranges < 0.0).sum()) for laser in scans)
     if negative:
         logger.warning(
-            "%s: %d ranges of scans are negative: lasers say so where they have measured nothing", name, negative
+            "%s: %d ranges of scans are negative: lasers say so where they have measured nothing", file.path, negative
         )
+    odometry = Odometry(motions.numbers[:, -1], motions.numbers[:, :3], motions.numbers[:, 3:5])
+    return CarmenLog(odometry, tuple(scans), file.others(set(_READ)))
 
 
-def _motion(words: list[str]) -> list[float]:
-    """Time, pose and velocity of an ODOM line."""
-    _require(words, 7 + _ENDING)
-    return [_number(words[-1]), *map(_number, words[1:6])]
+def _configuration(file: TextFile, row: int) -> tuple[str | float, ...]:
+    """Tag, numbers of readings and of remissions of a scan and, where they stand there, start, step, maximum range.
 
+    Raises:
+        FileFormatError: the line is too short, or has something else in the place of these.
+    """
+    words, front = file.words(row), file.kind[row] == file.tags.get("FLASER")
+    tag, first = ("FLASER", 0) if front else ("ROBOTLASER1", len(_LASER))
+    place = f"{file.place(row)}: {tag}"
 
-def _front_laser(words: list[str], groups: dict[tuple[float | str, ...], _Group], field_of_view: float) -> None:
-    count = _count(words[1])
-    _require(words, 2 + count + 6 + _ENDING)
-    key = (words[0], count)
-    if key not in groups:
-        step = field_of_view / max(count - count % 2, 1)
-        groups[key] = _Group(-0.5 * field_of_view + step * np.arange(count, dtype=np.float64), math.inf)
-    _append(groups[key], words, 2, count, 2 + count)
+    def readings(at: int) -> int:
+        if at < len(words) and not words[at].isdecimal():
+            raise FileFormatError(f"{place}: {words[at]!r} is not a number of readings")
+        if at >= len(words) or at + int(words[at]) >= len(words):
+            raise FileFormatError(f"{place}: {len(words)} fields are too few")
+        return int(words[at])
 
-
-def _robot_laser(words: list[str], groups: dict[tuple[float | str, ...], _Group]) -> None:
-    start, _, step, maximum = (_number(words[k]) for k in (2, 3, 4, 5))
-    count = _count(words[8])
-    remissions = _count(words[9 + count])
-    poses = 10 + count + remissions
-    _require(words, poses + 11 + _ENDING)
-    key = (words[0], count, start, step, maximum)
+    count = readings(first)
+    if front:
+        return tag, count, 0
+    remissions = readings(first + 1 + count)
+    start, step, maximum = (decimal(f"{place}: field {_LASER[k]}", words[k]) for k in (1, 3, 4))
     if not abs(start) + count * abs(step) < _WIDEST:
-        raise FileFormatError(f"{count} beams from {start:g} rad in steps of {step:g} rad are no scan")
-    if key not in groups:
-        groups[key] = _Group(start + step * np.arange(count, dtype=np.float64), maximum)
-    _append(groups[key], words, 9, count, poses)
+        raise FileFormatError(f"{place}: {count} beams from {start:g} rad in steps of {step:g} rad are no scan")
+    return tag, count, remissions, start, step, maximum
 
 
-def _append(group: _Group, words: list[str], ranges: int, count: int, poses: int) -> None:
-    numbers = [*words[poses : poses + 6], *words[ranges : ranges + count]]
-    group.rows.append([_number(words[-1]), *map(_number, numbers)])
-
-
-def _scans(group: _Group) -> Scans:
-    table = np.array(group.rows, dtype=np.float64)
-    return Scans(table[:, 0], group.angles, table[:, 7:], table[:, 1:4], table[:, 4:7], group.maximum)
-
-
-def _require(words: list[str], count: int) -> None:
-    if len(words) != count:
-        raise FileFormatError(f"{len(words)} words, expected {count}")
-
-
-def _count(word: str) -> int:
-    if not word.isdecimal():
-        raise FileFormatError(f"{word!r} is not a number of readings")
-    return int(word)
-
-
-def _number(word: str) -> float:
-    try:
-        value = decimal(word)
-    except ValueError:
-        raise FileFormatError(f"{word!r} is not a number") from None
-    if not math.isfinite(value):
-        raise FileFormatError(f"{word} is not a finite number")
-    return value
+def _scans(file: TextFile, key: tuple[Any, ...], rows: IntArray, field_of_view: float) -> Scans:
+    """The scans of one configuration."""
+    tag, count, remissions, *laser = key
+    ranges = " ".join(f"r{k}" for k in range(1, count + 1))
+    if laser:
+        start, step, maximum = laser
+        head, tail, ignored = f"{'- ' * len(_LASER)}-", "- - - - -", f"- {'- ' * remissions}"
+    else:
+        step = field_of_view / max(count - count % 2, 1)
+        start, maximum, head, tail, ignored = -0.5 * field_of_view, math.inf, "-", "", ""
+    numbers = file.table(tag, 0, f"{head} {ranges} {ignored} {_POSES} {tail} {_ENDING}", rows).numbers
+    first = len(head.split())
+    poses = first + count + len(ignored.split())
+    return Scans(
+        numbers[:, -1], start + step * np.arange(count, dtype=np.float64), numbers[:, first : first + count],
+        numbers[:, poses : poses + 3], numbers[:, poses + 3 : poses + 6], maximum,
+    )  # fmt: skip

@@ -11,13 +11,18 @@ import io
 import os
 import stat
 import zlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from unifg.atomic_write import write_atomically
 from unifg.errors import FileFormatError
 
-__all__ = ["LIMITS", "Limits", "checked_text", "legible", "read_bytes", "read_text", "write_text"]
+__all__ = ["LIMITS", "Limits"]
 
 _GZIP = b"\x1f\x8b"
 _ALLOWED = bytes([9, 10, 13, *range(32, 127), *range(128, 256)])
@@ -128,3 +133,47 @@ def write_text(path: Path, text: str) -> Path:
     data = text.encode("ascii")
     write_atomically(path, gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
     return path
+
+
+def require_finite(path: str | Path, what: str, rows: NDArray[Any]) -> None:
+    """Require that numbers (n, k) to be written are finite; ``what`` names a row in the message.
+
+    Raises:
+        FileFormatError: one is not.
+    """
+    bad = np.flatnonzero(~np.isfinite(rows).all(axis=1))
+    if bad.size:
+        raise FileFormatError(f"{legible(path)}: {what} {bad[0]} is not finite: {rows[bad[0]]}")
+
+
+def write_rows(
+    path: str | Path,
+    columns: Sequence[NDArray[Any]],
+    names: str = "",
+    spelled: Callable[[Any], str] = repr,
+    separator: str = "\t",
+) -> Path:
+    """Write a table of numbers.
+
+    Args:
+        path: file to write; an existing one is replaced, and a name that ends in ``.gz`` is gzipped.
+        columns: (n,) or (n, k) each, side by side; integers stay integers.
+        names: of all fields, for a comment in the first line.
+        spelled: text of a number; by default the shortest decimal that is read back exactly.
+        separator: of numbers.
+
+    Returns:
+        The path written.
+
+    Raises:
+        FileFormatError: a number is not finite, or the columns differ in length.
+    """
+    parts = [part[:, None] if part.ndim == 1 else part for part in columns]
+    lengths = sorted({len(part) for part in parts})
+    if len(lengths) > 1:
+        raise FileFormatError(f"{legible(path)}: columns of {', '.join(map(str, lengths))} rows do not fit")
+    for part in parts:
+        require_finite(path, "row", part)
+    rows = zip(*(part.tolist() for part in parts), strict=True)
+    lines = [separator.join(spelled(value) for part in row for value in part) for row in rows]
+    return write_text(Path(path), "".join(f"{line}\n" for line in ([f"# {names}"] if names else []) + lines))

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from unifg.codegen.jit import compiled, in_order
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["BLANKS", "parse_fields"]
+__all__ = ()  # for readers only
 
-BLANKS = b" \t\r"  # that separate words within a line
 DIGITS = 19  # of a number below 2^64
 REACH = 60  # largest |q|
 EXACT = 22  # 10^22 is the largest power of ten that float64 holds
@@ -42,7 +41,7 @@ TENS: Array = np.array([float(10**exponent) for exponent in range(EXACT + 1)])
 
 @compiled
 def is_blank(byte: int) -> bool:
-    """Test whether a byte separates words; see `BLANKS`."""
+    """Test whether a byte separates words within a line."""
     return byte == 32 or byte == 9 or byte == 13
 
 

@@ -6,21 +6,19 @@ M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 35(10), 2016.
 
 from __future__ import annotations
 
-import re
-import reprlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits, legible, read_text
-from unifg.files.fields import finite, norms
+from unifg.files.contents import LIMITS, Limits
+from unifg.files.text import TextFile, norms
 from unifg.files.tum import Trajectory
 
 __all__ = ["read_euroc"]
 
-_FIELDS = ("t", "x", "y", "z", "qw", "qx", "qy", "qz")
-_WHOLE = re.compile(r"[0-9]{1,19}")
+_FIELDS, _COUNT = "t x y z qw qx qy qz", 8
 
 
 def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
@@ -39,21 +37,17 @@ def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
         FileFormatError: the file is missing, or a line (named in the message) does not begin with whole nanoseconds and
             seven finite numbers with a usable quaternion.
     """
-    name, stamps, rows, lines = legible(path), list[int](), list[list[float]](), list[int]()
-    for number, line in enumerate(read_text(path, limits).split("\n"), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        place, words = f"{name}, line {number}", [word.strip() for word in line.split(",")]
-        if len(words) < len(_FIELDS):
-            raise FileFormatError(
-                f"{place}: {len(words)} fields between commas, expected {len(_FIELDS)} or more ({', '.join(_FIELDS)})"
-            )
-        if not _WHOLE.fullmatch(words[0]):
-            raise FileFormatError(f"{place}: the time {reprlib.repr(words[0])} is not in whole nanoseconds")
-        stamps.append(int(words[0]))
-        rows.append([finite(place, field, word) for field, word in zip(_FIELDS[1:], words[1:], strict=False)])
-        lines.append(number)
-    table = np.array(rows, dtype=np.float64).reshape(-1, 7)
-    time = np.array([1e-9 * (stamp - stamps[0]) for stamp in stamps], dtype=np.float64)
-    turned = table[:, [4, 5, 6, 3]]
-    return Trajectory(time, table[:, :3], turned / norms(turned, lambda row: f"{name}, line {lines[row]}")[:, None])
+    file = TextFile.read(path, limits, tagged=False)
+    ends = []
+    for row, (begin, end) in enumerate(zip(file.begin.tolist(), file.end.tolist(), strict=True)):
+        fields = file.content[begin:end].split(b",")
+        if len(fields) < _COUNT:
+            found = f"{len(fields)} fields between commas, expected {_COUNT} or more ({_FIELDS})"
+            raise FileFormatError(f"{file.place(row)}: {found}")
+        ends.append(begin + len(b",".join(fields[:_COUNT])))
+    content = file.content.replace(b",", b" ")
+    table = replace(file, content=content, end=np.array(ends, dtype=np.intp)).table("", 1, _FIELDS)
+    stamps, turned = table.integers[:, 0], table.numbers[:, [4, 5, 6, 3]]
+    table.refuse(stamps < 0, "the time is below zero")
+    time = 1e-9 * (stamps - stamps[:1]).astype(np.float64)
+    return Trajectory(time, table.numbers[:, :3], turned / norms(turned, table.place)[:, None])

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits, write_text
-from unifg.files.fields import NEAR
-from unifg.files.tables import Table
+from unifg.files.contents import LIMITS, Limits, require_finite, write_rows
+from unifg.files.text import NEAR, Table
 from unifg.lie import SE2, SE3
 from unifg.typing import Array, ArrayLike
 
@@ -45,9 +44,7 @@ def read_kitti(path: str | Path, limits: Limits = LIMITS) -> Array:
     with np.errstate(all="ignore"):
         off = np.abs(np.swapaxes(rotations, 1, 2) @ rotations - np.eye(3)).max(axis=(1, 2), initial=0.0)
         right = (off < _ROTATION) & (np.linalg.det(rotations) > 0.0)
-    if not right.all():
-        k = int(np.flatnonzero(~right)[0])
-        raise rows.refuse(k, "columns 1 to 3, 5 to 7, 9 to 11 are not a rotation matrix")
+    rows.refuse(~right, "columns 1 to 3, 5 to 7, 9 to 11 are not a rotation matrix")
     if (far := np.flatnonzero(off > 2.0 * NEAR)).size:  # of R'R, which is twice as far as R
         logger.warning(
             "%d of %d rotation matrices are farther than %g from a rotation, and the nearest is taken; first: %s",
@@ -71,17 +68,14 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
     Raises:
         FileFormatError: the array has another shape, or a number is not finite.
     """
-    path, array = Path(path), np.asarray(poses, dtype=np.float64)
+    array = np.asarray(poses, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] not in (3, 7):
         raise FileFormatError(f"{path}: poses have shape {array.shape}, expected (n, 7) or (n, 3)")
-    bad = np.flatnonzero(~np.isfinite(array).all(axis=1))
-    if bad.size:
-        raise FileFormatError(f"{path}: pose {bad[0]} is not finite: {array[bad[0]]}")
+    require_finite(path, "pose", array)
     rows = np.zeros((len(array), 3, 4))
     if array.shape[1] == 7:
         rows[:] = SE3.matrix(array)[:, :3]
     else:
         rows[:, 2, 2] = 1.0
         rows[:, :2, [0, 1, 3]] = SE2.matrix(array)[:, :2]
-    lines = [" ".join(f"{value + 0.0:.9e}" for value in row) for row in rows.reshape(-1, 12).tolist()]
-    return write_text(path, "".join(line + "\n" for line in lines))
+    return write_rows(path, [rows.reshape(-1, 12) + 0.0], spelled="{:.9e}".format, separator=" ")  # no -0.0

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits
-from unifg.files.tables import Table, write_rows
+from unifg.files.contents import LIMITS, Limits, write_rows
+from unifg.files.text import Table
 from unifg.typing import Array
 
 __all__ = ["NOBODY", "MrclamLog", "read_mrclam", "write_mrclam"]
@@ -92,14 +92,14 @@ def read_mrclam(folder: str | Path, robot: int = 1, limits: Limits = LIMITS) -> 
     folder = Path(folder)
     bearers, owners = _barcodes(Table.read(folder / "Barcodes.dat", 2, "subject barcode", limits))
     surveyed = Table.read(folder / "Landmark_Groundtruth.dat", 1, "subject x y x_sigma y_sigma", limits)
-    _once(surveyed, surveyed.integers[:, 0], "landmark")
-    surveyed.refuse_first(surveyed.numbers[:, 2:].min(axis=1) < 0.0, "a standard deviation is below zero")
+    surveyed.distinct(surveyed.integers[:, 0], "landmark")
+    surveyed.refuse(surveyed.numbers[:, 2:].min(axis=1) < 0.0, "a standard deviation is below zero")
     moves = Table.read(folder / f"Robot{robot}_Odometry.dat", 0, "time forward turning", limits)
     if not len(moves):
         raise FileFormatError(f"{moves.path}: no line holds odometry")
     seen = Table.read(folder / f"Robot{robot}_Measurement.dat", 0, "time barcode range bearing", limits)
-    seen.refuse_first(seen.numbers[:, 2] < 0.0, "the range is below zero")
-    seen.refuse_first(np.abs(seen.numbers[:, 3]) > _TURN, "the bearing is beyond a turn: is it in radians?")
+    seen.refuse(seen.numbers[:, 2] < 0.0, "the range is below zero")
+    seen.refuse(np.abs(seen.numbers[:, 3]) > _TURN, "the bearing is beyond a turn: is it in radians?")
     truth_path, truth = folder / f"Robot{robot}_Groundtruth.dat", np.zeros((0, 4))
     if truth_path.exists():
         poses = Table.read(truth_path, 0, "time x y heading", limits)
@@ -135,29 +135,20 @@ def write_mrclam(folder: str | Path, log: MrclamLog, robot: int = 1) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     of_robot = f"Robot{robot}_"
     bearers = np.array([*log.barcodes.items()], dtype=np.int64).reshape(-1, 2)
-    write_rows(folder / "Barcodes.dat", "subject barcode", [bearers])
+    write_rows(folder / "Barcodes.dat", [bearers], "subject barcode")
     marks = [log.landmark_ids, log.landmarks, log.landmark_sigma]
-    write_rows(folder / "Landmark_Groundtruth.dat", "subject x y x_sigma y_sigma", marks)
-    write_rows(folder / f"{of_robot}Odometry.dat", "time forward turning", [log.odometry_time, log.velocity])
+    write_rows(folder / "Landmark_Groundtruth.dat", marks, "subject x y x_sigma y_sigma")
+    write_rows(folder / f"{of_robot}Odometry.dat", [log.odometry_time, log.velocity], "time forward turning")
     sightings = [log.time, log.barcode, log.measured[:, ::-1]]
-    write_rows(folder / f"{of_robot}Measurement.dat", "time barcode range bearing", sightings)
+    write_rows(folder / f"{of_robot}Measurement.dat", sightings, "time barcode range bearing")
     if len(log.truth):
-        write_rows(folder / f"{of_robot}Groundtruth.dat", "time x y heading", [log.truth_time, log.truth])
+        write_rows(folder / f"{of_robot}Groundtruth.dat", [log.truth_time, log.truth], "time x y heading")
     return folder
 
 
 def _barcodes(table: Table) -> tuple[dict[int, int], dict[int, int]]:
     """Barcodes by subject, and subjects by barcode."""
     for column, what in enumerate(("subject", "barcode")):
-        _once(table, table.integers[:, column], what)
+        table.distinct(table.integers[:, column], what)
     bearers = dict(zip(*(part.tolist() for part in table.integers.T), strict=True))
     return bearers, {code: subject for subject, code in bearers.items()}
-
-
-def _once(table: Table, names: NDArray[np.int64], what: str) -> None:
-    """See that every name is given once."""
-    _, first, counts = np.unique(names, return_index=True, return_counts=True)
-    if (counts > 1).any():
-        k = int(first[counts > 1][0])
-        again = int(np.flatnonzero(names == names[k])[1])
-        raise table.refuse(again, f"{what} {names[k]} stands in line {table.lines[k]} already")

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits
-from unifg.files.tables import Table, write_rows
+from unifg.files.contents import LIMITS, Limits, write_rows
+from unifg.files.text import Table
 from unifg.typing import Array
 
 __all__ = ["PlazaLog", "read_plaza", "write_plaza"]
@@ -60,7 +60,7 @@ def read_plaza(odometry: str | Path, ranges: str | Path, limits: Limits = LIMITS
     if not len(moves):
         raise FileFormatError(f"{moves.path}: no line holds odometry")
     seen = Table.read(ranges, 0, "time sender beacon range", limits)
-    seen.refuse_first(seen.numbers[:, 3] < 0.0, "the range is below zero")
+    seen.refuse(seen.numbers[:, 3] < 0.0, "the range is below zero")
     motion, order = moves.numbers[moves.in_time()], seen.in_time()
     return PlazaLog(
         motion[:, 0], motion[:, 1:], seen.numbers[order, 0],
@@ -79,5 +79,5 @@ def write_plaza(odometry: str | Path, ranges: str | Path, log: PlazaLog) -> None
     Raises:
         FileFormatError: a number is not finite, or arrays that belong together differ in length.
     """
-    write_rows(odometry, "time distance turn", [log.odometry_time, log.steps])
-    write_rows(ranges, "time sender beacon range", [log.time, log.sender, log.beacon, log.measured])
+    write_rows(odometry, [log.odometry_time, log.steps], "time distance turn")
+    write_rows(ranges, [log.time, log.sender, log.beacon, log.measured], "time sender beacon range")

@@ -5,16 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 from unifg.files.contents import LIMITS, Limits
-from unifg.files.g2o import parse_g2o
-from unifg.files.tagged import TaggedFile
-from unifg.files.toro import parse_toro
+from unifg.files.g2o import G2O
+from unifg.files.measured import parse
+from unifg.files.text import TextFile
+from unifg.files.toro import TORO
 from unifg.pose_graphs.information import Repair
 from unifg.pose_graphs.pose_graph import PoseGraph
 
 __all__ = ["read_pose_graph"]
-
-
-TORO = ("VERTEX2", "VERTEX3", "EDGE2", "EDGE3")  # tags that nobody else has
 
 
 def read_pose_graph(path: str | Path, limits: Limits = LIMITS, *, repair: Repair | None = None) -> PoseGraph:
@@ -28,6 +26,6 @@ def read_pose_graph(path: str | Path, limits: Limits = LIMITS, *, repair: Repair
     Raises:
         FileFormatError: as `unifg.files.g2o.read_g2o` and `unifg.files.toro.read_toro`.
     """
-    file = TaggedFile.read(path, limits)
-    parse = parse_toro if any(tag in file for tag in TORO) else parse_g2o
-    return parse(file, repair)
+    file = TextFile.read(path, limits)
+    toro = any(form.pose in file or any(tag.name in file for tag in form.tags) for form in TORO)
+    return parse(file, TORO if toro else G2O, repair)

@@ -6,23 +6,19 @@ Exactly eight fields separated by single blanks, no trailing blank, the quaterni
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import LIMITS, Limits, write_text
-from unifg.files.fields import norms
-from unifg.files.tables import Table
+from unifg.files.contents import LIMITS, Limits, require_finite, write_rows
+from unifg.files.text import Table, norms
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["Trajectory", "read_tum", "write_tum"]
 
 _FIELDS = "t tx ty tz qx qy qz qw"
-
-logger = logging.getLogger("unifg")
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,23 +56,19 @@ def write_tum(path: str | Path, time: ArrayLike, poses: ArrayLike) -> Path:
     Raises:
         FileFormatError: the arrays do not fit each other, or a number is not finite.
     """
-    path = Path(path)
     times, array = np.asarray(time, dtype=np.float64), np.asarray(poses, dtype=np.float64)
     if times.ndim != 1 or array.shape not in ((len(times), 3), (len(times), 7)):
         raise FileFormatError(
             f"{path}: time {times.shape} and poses {array.shape} must be (n,) and (n, 3) or (n, 7) of the same n"
         )
-    bad = np.flatnonzero(~(np.isfinite(times) & np.isfinite(array).all(axis=1)))
-    if bad.size:
-        raise FileFormatError(f"{path}: pose {bad[0]} is not finite (t = {times[bad[0]]}, pose {array[bad[0]]})")
+    require_finite(path, "time and pose", np.column_stack([times, array]))
     rows = np.column_stack([times, array[:, :3], array[:, 4:], array[:, 3:4]])  # the scalar goes last
     if array.shape == (len(times), 3):
         zero = np.zeros_like(times)
         half = array[:, 2] / 2.0
         rows = np.column_stack([times, array[:, :2], zero, zero, zero, np.sin(half), np.cos(half)])
     rows = np.round(rows, 9) + 0.0  # the sum turns -0.0 into 0.0
-    lines = [" ".join(f"{value:.9f}" for value in row) for row in rows.tolist()]
-    return write_text(path, "".join(line + "\n" for line in lines))
+    return write_rows(path, [rows], spelled="{:.9f}".format, separator=" ")
 
 
 def read_tum(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
@@ -97,7 +89,5 @@ def read_tum(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
     """
     rows = Table.read(path, 0, _FIELDS, limits)
     table = rows.numbers
-    back = np.flatnonzero(np.diff(table[:, 0]) < 0.0)
-    if len(back):
-        logger.warning("%s: time runs backwards, here and %d times more", rows.place(int(back[0]) + 1), len(back) - 1)
+    rows.remark_order()
     return Trajectory(table[:, 0], table[:, 1:4], table[:, 4:] / norms(table[:, 4:], rows.place)[:, None])

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.pose_graphs.linear import BlockQuadratic
+from unifg.pose_graphs.linear import BlockQuadratic, polar
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.pose_graphs.relaxation import Relaxation
 from unifg.solvers.least_squares import LevenbergMarquardt
@@ -148,7 +148,8 @@ def certify(
         least = Relaxation.of(scaled, below=True)
         whole = float(pose_graph.squared_errors().sum()) if len(pose_graph.edges) else 0.0
         # Where nothing was lost, both are one problem.
-        lower = dual if _same(least, problem) else _bound(_Judge(least, tolerance), start, staircase)[3]
+        same = np.allclose(least.by_first, problem.by_first, rtol=1e-12, atol=0.0)
+        lower = dual if same else _bound(_Judge(least, tolerance), start, staircase)[3]
         interval = min(lower, whole), whole
     found = Certificate(
         chi2 - dual <= allowed, chi2, dual, max(chi2 - dual, 0.0), allowed, verdict.least, poses, moved, rank,
@@ -168,11 +169,6 @@ def _bound(judge: _Judge, start: Array, staircase: bool) -> tuple[Array, _Verdic
         verdict = judge(point)
         dual = max(verdict.dual, bound)
     return point, verdict, rank, max(dual, 0.0)
-
-
-def _same(one: Relaxation, other: Relaxation) -> bool:
-    """Equality of the weights of two relaxations but for rounding."""
-    return np.allclose(one.by_first, other.by_first, rtol=1e-12, atol=0.0)
 
 
 def _improved(
@@ -254,35 +250,33 @@ class _Judge:
         system = self.quadratic.factorization
         lifted = np.tile(np.arange(dim + 1) > 0, problem.count).astype(np.float64)
         value = min(float(np.trace(multipliers, axis1=1, axis2=2).sum()), cost)  # of the dual; more is rounding
+        nowhere = np.zeros((problem.count, dim + 1))
         shift = 0.5 * tolerance / frames
         greatest = 1e3 * self.weight
         if not self.weight > 0.0:  # every map costs nothing
-            return _Verdict(cost, cost, tolerance, 0.0, np.zeros((problem.count, dim + 1)))
+            return _Verdict(cost, cost, tolerance, 0.0, nowhere)
         largest = (tolerance - (cost - value)) / frames * (1.0 - 1e-9)  # that still proves what is asked
         while not (system.factor(entries, shift * lifted) and system.definite):
             shift = largest if shift < largest else 10.0 * shift
             if not shift < greatest:
-                return _Verdict(cost, -np.inf, tolerance, -np.inf, np.zeros((problem.count, dim + 1)))
+                return _Verdict(cost, -np.inf, tolerance, -np.inf, nowhere)
         dual = value - shift * frames
         if cost - dual <= tolerance:
-            return _Verdict(cost, dual, tolerance, -shift, np.zeros((problem.count, dim + 1)))
+            return _Verdict(cost, dual, tolerance, -shift, nowhere)
         places = np.flatnonzero(lifted)
-        whole = np.zeros(len(lifted))
 
-        def inverse(right: Array) -> Array:
-            whole[:] = 0.0
+        def solved(right: Array) -> Array:
+            whole = np.zeros(len(lifted))
             whole[places] = right.ravel()
-            return system.solve(whole)[places]
+            return system.solve(whole)
 
         from scipy.sparse.linalg import LinearOperator, eigsh  # slow to load, and seldom needed
 
-        operator = LinearOperator((len(places), len(places)), matvec=inverse, dtype=np.float64)
+        operator = LinearOperator((len(places), len(places)), matvec=lambda x: solved(x)[places], dtype=np.float64)
         start = np.random.default_rng(0).standard_normal(len(places))
         values, vectors = eigsh(operator, k=1, which="LA", v0=start, tol=1e-6)
         least = 1.0 / float(values[0]) - shift
-        whole[:] = 0.0
-        whole[places] = vectors[:, 0]
-        direction = system.solve(whole).reshape(problem.count, dim + 1) / float(values[0])
+        direction = solved(vectors[:, 0]).reshape(problem.count, dim + 1) / float(values[0])
         # The eigenvalue is found to its own tolerance; what is proven is the shift that could be factorised.
         for share in (1.001, 1.01, 1.1):
             nearer = max(-least * share, 0.5 * tolerance / frames)
@@ -317,8 +311,7 @@ def _leave(problem: Relaxation, point: Array, direction: Array) -> Array:
     for _ in range(STEPS):
         trial = lifted.copy()
         trial[:, :, -1] += step * direction
-        left, _, right = np.linalg.svd(trial[:, 1:], full_matrices=False)
-        trial[:, 1:] = left @ right
+        trial[:, 1:] = polar(trial[:, 1:])
         if problem.cost(trial) < cost:
             return trial
         step *= 0.5

@@ -11,11 +11,8 @@ community detection", Internet Mathematics 11(4-5), 2015.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
 from unifg.factors.whitening import quick_roots
 from unifg.pose_graphs.pose_graph import PoseGraph
@@ -79,7 +76,11 @@ def pairwise_consistent(pose_graph: PoseGraph, probability: float = 0.9999, trie
         for k in range(len(own) - 1):
             a, others = own[k], own[k + 1 :]
             error = group.log(group.compose(offset[a], group.inverse(offset[others])))
-            _test(error, covariance, drift, first, second, a, others, bound, agreeing[k, k + 1 :])
+            spread = covariance[a] + covariance[others]
+            for ends in (first, second):
+                spread += drift[np.maximum(ends[a], ends[others])] - drift[np.minimum(ends[a], ends[others])]
+            squared = np.einsum("ni,ni->n", error, np.linalg.solve(spread, error[:, :, None])[:, :, 0])
+            agreeing[k, k + 1 :] = (squared >= 0.0) & (squared <= bound)
         agreeing |= agreeing.T
         keep[closures[own[_clique(agreeing, tries)]]] = True
     return keep
@@ -106,56 +107,6 @@ def _dead_reckoned(pose_graph: PoseGraph, certain: BoolArray) -> tuple[Array, Ar
     seen = group.adjoint(poses)
     added = np.where(step[:, None, None] >= 0, seen @ noise @ np.swapaxes(seen, 1, 2), 0.0)
     return poses, np.cumsum(added, axis=0), np.cumsum(step < 0)
-
-
-@compiled
-def _test(
-    error: Array,
-    covariance: Array,
-    drift: Array,
-    first: IntArray,
-    second: IntArray,
-    one: int,
-    others: IntArray,
-    bound: float,
-    agree: BoolArray,
-) -> None:
-    """Test whether loops of one closure with others close: e' S^-1 e against a bound, S by Cholesky.
-
-    Args:
-        error: (k, d) of the loops.
-        covariance: (m, d, d) of the closures, seen from the start.
-        drift: (n, d, d) of odometry up to every pose, seen from the start.
-        first: (m,) poses.
-        second: (m,) poses.
-        one: closure.
-        others: (k,) closures.
-        bound: of the squared error.
-        agree: (k,) takes the answer.
-    """
-    dim = error.shape[1]
-    S, e = np.empty((dim, dim)), np.empty(dim)
-    for k in range(len(others)):
-        other = others[k]
-        i, j = min(first[one], first[other]), max(first[one], first[other])
-        u, v = min(second[one], second[other]), max(second[one], second[other])
-        for r in range(dim):
-            for c in range(r + 1):
-                S[r, c] = covariance[one, r, c] + covariance[other, r, c]
-                S[r, c] += drift[j, r, c] - drift[i, r, c] + drift[v, r, c] - drift[u, r, c]
-        total = 0.0
-        for r in range(dim):
-            for c in range(r + 1):
-                value = S[r, c]
-                for s in range(c):
-                    value -= S[r, s] * S[c, s]
-                S[r, c] = math.sqrt(value) if r == c else value / S[c, c]
-            value = error[k, r]
-            for s in range(r):
-                value -= S[r, s] * e[s]
-            e[r] = value / S[r, r]
-            total += e[r] * e[r]
-        agree[k] = total <= bound
 
 
 def _clique(agreeing: BoolArray, tries: int) -> IntArray:

@@ -7,6 +7,7 @@ survey on rotation estimation and its use in pose graph optimization", ICRA 2015
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -14,8 +15,8 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.factors.robust import Loss
-from unifg.lie import SE2, SE3, SO3, LieGroup
-from unifg.pose_graphs.linear import block_least_squares
+from unifg.lie import SE2
+from unifg.pose_graphs.linear import block_least_squares, with_rotations
 from unifg.pose_graphs.pose_graph import GUESSES, PoseGraph, ResidualName
 from unifg.pose_graphs.spanning import spanning_tree
 from unifg.typing import Array, BoolArray, IntArray
@@ -95,11 +96,7 @@ def odometric(pose_graph: PoseGraph) -> Array:
     along = forward[inner][:, None]
     relative[inner] = np.where(along, measured, group.inverse(measured))
     relative[fixed] = pose_graph.poses[fixed]
-    # Every pose relative to its parent, then to its grandparent, ...: as many rounds as the logarithm of the depth.
-    while np.any(parent[:count] != count):
-        relative[:count] = group.compose(relative[parent[:count]], relative[:count])
-        parent = parent[parent]
-    return relative[:count].copy()
+    return _accumulated(parent, relative, group.compose)
 
 
 def lago(pose_graph: PoseGraph) -> Array:
@@ -117,7 +114,7 @@ def lago(pose_graph: PoseGraph) -> Array:
     if pose_graph.group is not SE2:
         raise GraphError("lago is for poses in SE2; use chordal")
     edges, fixed = pose_graph.edges, pose_graph.anchors()[0]
-    precision = _marginal(edges.information, slice(2, 3))
+    precision = _rotation_information(edges.information, 2)
     along_tree = _tree_headings(pose_graph, fixed, 1.0 / np.maximum(precision[:, 0, 0], _BLIND))
     turn = edges.measured[:, 2]
     turns = np.round((along_tree[edges.second] - along_tree[edges.first] - turn) / (2.0 * np.pi))
@@ -146,10 +143,9 @@ def chordal(pose_graph: PoseGraph) -> Array:
     """
     group, edges, fixed = pose_graph.group, pose_graph.edges, pose_graph.anchors()[0]
     dim = group.point_dim
-    rotations = _rotations(group, pose_graph.poses)
-    measured = _rotations(group, edges.measured)
+    rotations, measured = (group.matrix(poses)[:, :dim, :dim] for poses in (pose_graph.poses, edges.measured))
     angles = group.dim - dim
-    precision = _marginal(edges.information, slice(dim, group.dim))
+    precision = _rotation_information(edges.information, dim)
     spread = np.trace(np.linalg.pinv(precision, hermitian=True), axis1=1, axis2=2)
     kappa = np.divide(angles, spread, out=np.zeros(len(edges)), where=spread > 0.0)  # an edge may not see rotations
     root = np.sqrt(kappa)[:, None, None]
@@ -159,7 +155,7 @@ def chordal(pose_graph: PoseGraph) -> Array:
         edges.first, edges.second, -root * np.swapaxes(measured, 1, 2), root * np.eye(dim), np.zeros_like(measured),
         start, fixed,
     )  # fmt: skip
-    poses = _with_rotations(group, pose_graph.poses, np.swapaxes(relaxed, 1, 2))
+    poses = with_rotations(group, pose_graph.poses, np.swapaxes(relaxed, 1, 2))
     poses[fixed] = pose_graph.poses[fixed]
     return _positions(pose_graph, poses, fixed)
 
@@ -171,8 +167,8 @@ def _positions(pose_graph: PoseGraph, poses: Array, fixed: IntArray) -> Array:
     """
     group, edges = pose_graph.group, pose_graph.edges
     dim = group.point_dim
-    turned = _rotations(group, edges.measured)
-    to_edge = np.swapaxes(_rotations(group, poses[edges.first]) @ turned, 1, 2)
+    turned = group.matrix(edges.measured)[:, :dim, :dim]
+    to_edge = np.swapaxes(group.matrix(poses[edges.first])[:, :dim, :dim] @ turned, 1, 2)
     target = (np.swapaxes(turned, 1, 2) @ edges.measured[:, :dim, None]).copy()
     error = group.log(group.between(edges.measured, group.between(poses[edges.first], poses[edges.second])))
     inner, cross = edges.information[:, :dim, :dim], edges.information[:, :dim, dim:]
@@ -188,31 +184,11 @@ def _positions(pose_graph: PoseGraph, poses: Array, fixed: IntArray) -> Array:
     return result
 
 
-def _marginal(information: Array, part: slice) -> Array:
-    """Information about some coordinates when the others are free: the Schur complement, (m, k, k)."""
-    size = information.shape[-1]
-    kept = np.arange(size)[part]
-    others = np.setdiff1d(np.arange(size), kept)
-    cross = information[:, kept[:, None], others]
-    inner = np.linalg.pinv(information[:, others[:, None], others], hermitian=True)
-    result: Array = information[:, kept[:, None], kept] - cross @ inner @ np.swapaxes(cross, 1, 2)
-    return result
-
-
-def _rotations(group: LieGroup, poses: Array) -> Array:
-    """Rotation matrices (n, d, d) of poses."""
-    size = group.point_dim
-    return group.matrix(poses)[:, :size, :size]
-
-
-def _with_rotations(group: LieGroup, poses: Array, matrices: Array) -> Array:
-    """Poses with the rotations nearest to (n, d, d) matrices."""
-    result = poses.copy()
-    if group is SE3:
-        result[:, 3:] = SO3.from_matrix(matrices)
-    else:  # the nearest rotation maximises tr(R' M)
-        sine, cosine = matrices[:, 1, 0] - matrices[:, 0, 1], matrices[:, 0, 0] + matrices[:, 1, 1]
-        result[:, 2] = np.arctan2(sine, cosine)
+def _rotation_information(information: Array, dim: int) -> Array:
+    """Information about the rotation where the first ``dim`` coordinates are free: the Schur complement, (m, k, k)."""
+    cross = information[:, dim:, :dim]
+    inner = np.linalg.pinv(information[:, :dim, :dim], hermitian=True)
+    result: Array = information[:, dim:, dim:] - cross @ inner @ np.swapaxes(cross, 1, 2)
     return result
 
 
@@ -224,10 +200,19 @@ def _tree_headings(pose_graph: PoseGraph, fixed: IntArray, variance: Array) -> A
     inner = np.flatnonzero(edge >= 0)
     total[inner] = np.where(forward[inner], 1.0, -1.0) * pose_graph.edges.measured[edge[inner], 2]
     total[fixed] = pose_graph.poses[fixed, 2]
+    return _accumulated(parent, total, np.add)
+
+
+def _accumulated(parent: IntArray, steps: Array, combine: Callable[[Array, Array], Array]) -> Array:
+    """Combine steps from parents (n + 1, ...), that of the root n among them, from the root down: (n, ...).
+
+    Every step begins at the parent, then at the grandparent, ...: as many rounds as the logarithm of the depth.
+    """
+    count = len(parent) - 1
     while np.any(parent[:count] != count):
-        total[:count] += total[parent[:count]]
+        steps[:count] = combine(steps[parent[:count]], steps[:count])
         parent = parent[parent]
-    return total[:count]
+    return steps[:count].copy()
 
 
 def _tree(pose_graph: PoseGraph, fixed: IntArray, cost: Array, shortest: bool) -> tuple[IntArray, IntArray, BoolArray]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from unifg.modeling.summary import counted
 from unifg.pose_graphs.information import indefinite
-from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
+from unifg.pose_graphs.pose_graph import PoseGraph, Priors, ResidualName, Sightings
 from unifg.solution.fit import is_far, ratio_sentence
 from unifg.typing import Array, IntArray
 
@@ -95,12 +95,10 @@ def judge(pose_graph: PoseGraph, residual: ResidualName = "log") -> Judgement:
     rows = int(seen.sum())
     touched = np.zeros(len(ids), dtype=bool)
     touched[edges.first[greatest > 0.0]] = touched[edges.second[greatest > 0.0]] = True
-    for kind in pose_graph.sightings.values():
+    others: list[Sightings | Priors] = [*pose_graph.sightings.values(), *pose_graph.priors.values()]
+    for kind in others:
         rows += int(np.linalg.matrix_rank(kind.information, hermitian=True).sum())
         touched[kind.pose] = True
-    for held in pose_graph.priors.values():
-        rows += int(np.linalg.matrix_rank(held.information, hermitian=True).sum())
-        touched[held.pose] = True
     anchors, known = pose_graph.anchors(priors=True)
     added = ids[anchors][~np.isin(ids[anchors], np.array(pose_graph.fixed_ids, dtype=np.int64))]
     unknown = (len(ids) - len(anchors)) * pose_graph.group.dim

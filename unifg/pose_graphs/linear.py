@@ -7,9 +7,28 @@ import numpy as np
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.symmetric import Symmetric, scatter
 from unifg.errors import GraphError
+from unifg.lie import SE3, SO3, LieGroup
 from unifg.typing import Array, IntArray
 
-__all__ = ["BlockQuadratic", "block_gradient", "block_least_squares"]
+__all__ = ["BlockQuadratic", "block_gradient", "block_least_squares", "polar", "with_rotations"]
+
+
+def polar(matrices: Array) -> Array:
+    """(n, d, r) orthonormal rows nearest to the rows of matrices, d <= r."""
+    left, _, right = np.linalg.svd(matrices, full_matrices=False)
+    result: Array = left @ right
+    return result
+
+
+def with_rotations(group: LieGroup, poses: Array, matrices: Array) -> Array:
+    """Poses (n, storage) with the rotations nearest to (n, d, d) matrices in the place of their own."""
+    result = poses.copy()
+    if group is SE3:
+        result[:, 3:] = SO3.from_matrix(matrices)
+    else:  # the nearest rotation maximises tr(R' M)
+        sine, cosine = matrices[:, 1, 0] - matrices[:, 0, 1], matrices[:, 0, 0] + matrices[:, 1, 1]
+        result[:, 2] = np.arctan2(sine, cosine)
+    return result
 
 
 class BlockQuadratic:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,8 +39,19 @@ GUESSES: list[Callable[[PoseGraph], Array]] = []
 """First guesses from measurements alone, entered by :mod:`unifg.pose_graphs.initialise`, which stands on this file."""
 
 
+class _Measurements:
+    """Base of measurements."""
+
+    measured: Array
+    information: Array
+
+    def __len__(self) -> int:
+        """Number of measurements."""
+        return len(self.measured)
+
+
 @dataclass(frozen=True, eq=False)
-class Edges:
+class Edges(_Measurements):
     """Relative measurements between poses.
 
     Attributes:
@@ -54,10 +65,6 @@ class Edges:
     measured: Array
     information: Array
 
-    def __len__(self) -> int:
-        """Number of edges."""
-        return len(self.first)
-
     def __getitem__(self, chosen: IntArray | BoolArray | slice) -> Edges:
         """Some of the edges, by mask, positions or slice."""
         return Edges(self.first[chosen], self.second[chosen], self.measured[chosen], self.information[chosen])
@@ -70,7 +77,7 @@ class Edges:
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
+class Sightings(_Measurements):
     """Measurements of landmarks from poses.
 
     Attributes:
@@ -85,13 +92,9 @@ class Sightings:
     measured: Array
     information: Array
 
-    def __len__(self) -> int:
-        """Number of sightings."""
-        return len(self.pose)
-
 
 @dataclass(frozen=True, eq=False)
-class Priors:
+class Priors(_Measurements):
     """Absolute measurements of poses.
 
     Attributes:
@@ -104,9 +107,16 @@ class Priors:
     measured: Array
     information: Array
 
-    def __len__(self) -> int:
-        """Number of priors."""
-        return len(self.pose)
+
+class _Term(NamedTuple):
+    """Measurements with their residual, of constants, poses and landmarks, whose positions these are."""
+
+    name: str
+    function: ManifoldResidual | Residual
+    constants: tuple[Array, ...]
+    poses: tuple[IntArray, ...]
+    landmarks: tuple[IntArray, ...]
+    batch: _Measurements
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,40 +188,26 @@ class PoseGraph:
         Raises:
             GraphError: on an unknown residual or kind of sighting, or a graph without edges.
         """
-        relative = self._relative(residual)
+        along = self.edges.odometry
+        edges = {"odometry": self.edges[along], "closures": self.edges[~along]}
+        terms = self._terms(residual, {name: part for name, part in edges.items() if len(part)})
         if robust_on not in ("closures", "all"):
             raise GraphError(f"robust_on is {robust_on!r}: expected 'closures' or 'all'")
         everywhere = robust if robust_on == "all" else None
         graph = Graph()
         x = graph.variables("poses", self.group, len(self.poses))
         guess = {x: self.poses}
-        along = self.edges.odometry
-        for name, edges, loss in (
-            ("odometry", self.edges[along], everywhere),
-            ("closures", self.edges[~along], robust),
-        ):
-            if len(edges):
-                measured = graph.data(name, edges.measured, each=True)
-                graph.minimize(
-                    relative, x[edges.first], x[edges.second], measured,
-                    information=edges.information, robust=loss, name=name,
-                )  # fmt: skip
         if len(self.landmarks):
             places = graph.variables("landmarks", Rn(self.landmarks.shape[1]), len(self.landmarks))
             guess[places] = self.landmarks
-            for kind, seen in self.sightings.items():
-                measured = graph.data(kind, seen.measured, each=True)
+        for term in terms:
+            if len(self.landmarks) or not term.landmarks:
+                measured = graph.data(term.name, term.batch.measured, each=True)
+                variables = [x[rows] for rows in term.poses] + [places[rows] for rows in term.landmarks]
                 graph.minimize(
-                    self._seen(kind), x[seen.pose], places[seen.landmark], measured,
-                    information=seen.information, robust=everywhere, name=kind,
+                    term.function, *term.constants, *variables, measured, information=term.batch.information,
+                    robust=robust if term.name == "closures" else everywhere, name=term.name,
                 )  # fmt: skip
-        for kind, held in self.priors.items():
-            function, reference = self._prior(kind, relative)
-            measured = graph.data(f"{kind} prior", held.measured, each=True)
-            graph.minimize(
-                function, *reference, x[held.pose], measured,
-                information=held.information, robust=everywhere, name=f"{kind} prior",
-            )  # fmt: skip
         fixed, known = self.anchors(priors=True)
         if len(fixed):
             graph.fix(x[fixed], self.poses[fixed], name="anchor")
@@ -227,21 +223,11 @@ class PoseGraph:
 
     def seen_chi2(self, residual: ResidualName = "log") -> float:
         """Sum of r' Omega r over the sightings and priors at the present values."""
-        total = 0.0
-        for kind, held in self.priors.items():
-            function, reference = self._prior(kind, self._relative(residual))
-            whole = function.on(self.group) if isinstance(function, ManifoldResidual) else function
-            total += float(_squared(whole, held, *reference, self.poses[held.pose]).sum())
-        for kind, seen in self.sightings.items():
-            function = self._seen(kind)
-            whole = function.on(self.group) if isinstance(function, ManifoldResidual) else function
-            total += float(_squared(whole, seen, self.poses[seen.pose], self.landmarks[seen.landmark]).sum())
-        return total
+        return sum(float(self._squared(term).sum()) for term in self._terms(residual, {}))
 
     def squared_errors(self, residual: ResidualName = "log") -> Array:
         """(m,) r' Omega r of every edge at the present values."""
-        function = self._relative(residual).on(self.group)
-        return _squared(function, self.edges, self.poses[self.edges.first], self.poses[self.edges.second])
+        return self._squared(self._terms(residual, {"edges": self.edges})[0])
 
     def anchors(self, priors: bool = False) -> tuple[IntArray, IntArray]:
         """Positions of the poses and landmarks held fixed: those known, or the first pose of a connected part.
@@ -255,7 +241,8 @@ class PoseGraph:
         part = self.parts()
         held = np.concatenate([part[poses], part[len(self.poses) + landmarks]])
         if priors and self.priors:
-            whole = np.concatenate([_full_rank(kind.information, self.group.dim) for kind in self.priors.values()])
+            ranks = [np.linalg.matrix_rank(kind.information, hermitian=True) for kind in self.priors.values()]
+            whole = np.concatenate(ranks) == self.group.dim
             where = np.concatenate([kind.pose for kind in self.priors.values()])
             counts = np.bincount(part[np.unique(where)])
             held = np.concatenate([held, part[where[whole]], np.flatnonzero(counts >= self.group.point_dim)])
@@ -280,25 +267,37 @@ class PoseGraph:
         columns = [self.edges.second, *(count + seen.landmark for seen in self.sightings.values())]
         return components(count + len(self.landmarks), np.concatenate(rows), np.concatenate(columns))
 
-    def _relative(self, residual: str) -> ManifoldResidual:
+    def _terms(self, residual: str, edges: Mapping[str, Edges]) -> list[_Term]:
+        """Terms of some edges, by name, then of all sightings and priors."""
         if residual not in _RELATIVE:
             raise GraphError(f"residual is {residual!r}: expected {' or '.join(map(repr, _RELATIVE))}")
+        relative = _RELATIVE[residual]
         if not len(self.edges) and not self.sightings and not self.priors:
             raise GraphError("the pose graph has no measurement: there is nothing to solve")
-        return _RELATIVE[residual]
+        terms = [_Term(name, relative, (), (part.first, part.second), (), part) for name, part in edges.items()]
+        for kind, seen in self.sightings.items():
+            if kind not in _SEEN:
+                raise GraphError(f"sightings of kind {kind!r}: expected one of {', '.join(map(repr, _SEEN))}")
+            terms.append(_Term(kind, _SEEN[kind], (), (seen.pose,), (seen.landmark,), seen))
+        for kind, held in self.priors.items():
+            name, rows = f"{kind} prior", (held.pose,)
+            if kind == "pose":
+                terms.append(_Term(name, relative, (self.group.identity(),), rows, (), held))
+            elif kind == "position" and self.group is SE2:
+                terms.append(_Term(name, position, (), rows, (), held))
+            else:
+                where = self.group.name
+                raise GraphError(f"priors of kind {kind!r} in {where}: expected 'pose' or, in SE2, 'position'")
+        return terms
 
-    def _seen(self, kind: str) -> ManifoldResidual | Residual:
-        if kind not in _SEEN:
-            raise GraphError(f"sightings of kind {kind!r}: expected one of {', '.join(map(repr, _SEEN))}")
-        return _SEEN[kind]
-
-    def _prior(self, kind: str, relative: ManifoldResidual) -> tuple[ManifoldResidual | Residual, list[Array]]:
-        """Residual of a prior, and what comes before the pose among its arguments."""
-        if kind == "pose":
-            return relative, [self.group.identity()]
-        if kind != "position" or self.group != SE2:
-            raise GraphError(f"priors of kind {kind!r} in {self.group.name}: expected 'pose' or, in SE2, 'position'")
-        return position, []
+    def _squared(self, term: _Term) -> Array:
+        """(k,) r' Omega r of a term at the present values."""
+        function = term.function
+        whole = function.on(self.group) if isinstance(function, ManifoldResidual) else function
+        points = [self.poses[rows] for rows in term.poses] + [self.landmarks[rows] for rows in term.landmarks]
+        error = whole(*term.constants, *points, term.batch.measured)
+        result: Array = np.einsum("ni,nij,nj->n", error, term.batch.information, error)
+        return result
 
     def __repr__(self) -> str:
         """Counts."""
@@ -317,15 +316,3 @@ def _require(who: str, what: str, places: tuple[IntArray, ...], count: int) -> N
         if len(wrong):
             k = int(wrong[0])
             raise GraphError(f"{who}, number {k}, names position {positions[k]}, and there are {count} {what}", index=k)
-
-
-def _full_rank(information: Array, dim: int) -> BoolArray:
-    """(k,) whether information matrices determine a whole pose."""
-    whole: BoolArray = np.linalg.matrix_rank(information, hermitian=True) == dim
-    return whole
-
-
-def _squared(function: Residual, batch: Edges | Sightings | Priors, *points: Any) -> Array:
-    error = function(*points, batch.measured)
-    result: Array = np.einsum("ni,nij,nj->n", error, batch.information, error)
-    return result

@@ -17,9 +17,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.lie import SO3
 from unifg.pose_graphs.information import bounded_below, indefinite
-from unifg.pose_graphs.linear import BlockQuadratic, block_gradient
+from unifg.pose_graphs.linear import BlockQuadratic, block_gradient, polar, with_rotations
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -141,9 +140,9 @@ class Relaxation:
 
     def lower(self, point: Array, pose_graph: PoseGraph) -> Array:
         """(n, storage) poses of a point of rank d, frames being rotations."""
-        if self.dim == 3:
-            return np.column_stack([point[:, 0], SO3.from_matrix(np.swapaxes(point[:, 1:], 1, 2))])
-        return np.column_stack([point[:, 0], np.arctan2(point[:, 1, 1], point[:, 1, 0])])
+        poses = with_rotations(pose_graph.group, pose_graph.poses, np.swapaxes(point[:, 1:], 1, 2))
+        poses[:, : self.dim] = point[:, 0]
+        return poses
 
     def errors(self, point: Array) -> Array:
         """(m, d + 1, r) whitened errors of the edges."""
@@ -264,6 +263,5 @@ def _tangents(point: Array, spins: list[tuple[int, int]]) -> Array:
 def _retract(point: Array, basis: Array, step: Array) -> Array:
     """The nearest frames to a point moved by steps (n, q)."""
     moved: Array = point + np.einsum("narq,nq->nar", basis, step)
-    left, _, right = np.linalg.svd(moved[:, 1:], full_matrices=False)
-    moved[:, 1:] = left @ right
+    moved[:, 1:] = polar(moved[:, 1:])
     return moved

@@ -56,9 +56,7 @@ def _spatial_chart(functions: Functions) -> Callable[..., None]:
         homogeneous(error, pose)
         a, b, c, d = 0.5 * sign * error[3], 0.5 * r[3], 0.5 * r[4], 0.5 * r[5]
         after[:] = 0.0
-        for i in range(3):
-            for k in range(3):
-                after[i, k] = pose[i, k]
+        after[:3, :3] = pose[:3, :3]
         # q (1, d/2) has the vector part v + (w I + [v]x) d / 2.
         after[3, 3], after[3, 4], after[3, 5] = a, -d, c
         after[4, 3], after[4, 4], after[4, 5] = d, a, -b
@@ -67,11 +65,9 @@ def _spatial_chart(functions: Functions) -> Callable[..., None]:
         adjoint(seen, transport)
         for i in range(6):
             for k in range(6):
-                total = 0.0
+                J[i, k], J[i, 6 + k] = 0.0, after[i, k]
                 for j in range(6):
-                    total += after[i, j] * transport[j, k]
-                J[i, k] = -total
-                J[i, 6 + k] = after[i, k]
+                    J[i, k] -= after[i, j] * transport[j, k]
 
     return kernel
 
@@ -129,39 +125,17 @@ def _planar_sighting(pose: Array, landmark: Array, measured: Array) -> Array:
     return np.stack([ahead - measured[:, 0], aside - measured[:, 1]], axis=1)
 
 
-def _spatial_sighting(functions: Functions) -> Callable[..., None]:
-    """The same in space; derivatives [-I, [p]x] and R', by hand: derived ones take 1.5 of the time."""
-    homogeneous = functions.matrix
-
-    @compiled
-    def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-        pose = local_matrix(4, 4)
-        homogeneous(vector(v, 0, 7), pose)
-        for i in range(3):
-            r[i] = 0.0
-            for k in range(3):
-                r[i] += pose[k, i] * (v[7 + k] - pose[k, 3])
-        if len(J):
-            J[:] = 0.0
-            x, y, z = r[0], r[1], r[2]
-            J[0, 0] = J[1, 1] = J[2, 2] = -1.0
-            J[0, 4], J[0, 5], J[1, 3], J[1, 5], J[2, 3], J[2, 4] = -z, y, z, -x, -y, x
-            for i in range(3):
-                for k in range(3):
-                    J[i, 6 + k] = pose[k, i]
-        for i in range(3):
-            r[i] -= p[i]
-
-    return kernel
+def _spatial_sighting(pose: Array, landmark: Array, measured: Array) -> Array:
+    """The same in space."""
+    turn, away = SE3.matrix(pose), landmark - pose[:, :3]
+    local = [turn[:, 0, k] * away[:, 0] + turn[:, 1, k] * away[:, 1] + turn[:, 2, k] * away[:, 2] for k in range(3)]
+    return np.stack([local[k] - measured[:, k] for k in range(3)], axis=1)
 
 
 @cache
 def _sighting_kernel(space: bool) -> Kernel:
-    if not space:
-        return StatedKernel(_planar_sighting, (SE2, Rn(2), (2,)), 2, name="sighting")
-    functions = functions_of(SE3)
-    assert functions is not None
-    return Kernel(_spatial_sighting(functions), (SE3, Rn(3), (3,)), 3, name="sighting")
+    function, group, size = (_spatial_sighting, SE3, 3) if space else (_planar_sighting, SE2, 2)
+    return StatedKernel(function, (group, Rn(size), (size,)), size, name="sighting")
 
 
 def _build_sighting(manifold: Manifold) -> Residual:

@@ -7,6 +7,8 @@ other: by the edge that leads to it, or by the whole path. SciPy has both, and l
 
 from __future__ import annotations
 
+from heapq import heappop, heappush
+
 import numpy as np
 
 from unifg.codegen.jit import compiled
@@ -15,7 +17,6 @@ from unifg.typing import Array, BoolArray, IntArray
 __all__ = ["spanning_tree"]
 
 
-@compiled
 def spanning_tree(
     first: IntArray, second: IntArray, cost: Array, roots: IntArray, count: int, shortest: bool
 ) -> tuple[IntArray, IntArray, BoolArray]:
@@ -33,30 +34,27 @@ def spanning_tree(
         (n + 1,) parents; n, its own parent, is that of every root, and -1 that of nodes that are not reached. (n,) the
         edge to the parent, or -1; (n,) whether it begins at the parent.
     """
-    edges = len(first)
-    start = np.zeros(count + 2, np.int64)  # of the neighbours of each node
-    for e in range(edges):
-        start[first[e] + 2] += 1
-        start[second[e] + 2] += 1
-    for node in range(count):
-        start[node + 2] += start[node + 1]
-    beside = np.empty(2 * edges, np.int64)
-    for e in range(edges):
-        beside[start[first[e] + 1]] = e
-        start[first[e] + 1] += 1
-        beside[start[second[e] + 1]] = e
-        start[second[e] + 1] += 1
+    ends = np.stack([first, second], axis=1).ravel()
+    beside = np.argsort(ends, kind="stable") // 2  # edges of node after node
+    start = np.concatenate([[0], np.cumsum(np.bincount(ends, minlength=count))])
+    return _grown(first, second, cost, roots, start, beside, shortest)
+
+
+@compiled
+def _grown(
+    first: IntArray, second: IntArray, cost: Array, roots: IntArray, start: IntArray, beside: IntArray, shortest: bool
+) -> tuple[IntArray, IntArray, BoolArray]:
+    """Grow the tree; the edges of node k are ``beside[start[k] : start[k + 1]]``."""
+    count = len(start) - 1
     parent, edge, forward = np.full(count + 1, -1), np.full(count, -1), np.zeros(count, np.bool_)
     parent[count] = count
     length, done = np.full(count, np.inf), np.zeros(count, np.bool_)
-    keys, nodes = np.empty(2 * edges + len(roots)), np.empty(2 * edges + len(roots), np.int64)  # a heap
-    size = 0
-    for k in range(len(roots)):
-        parent[roots[k]], length[roots[k]] = count, 0.0
-        size = _push(keys, nodes, size, 0.0, roots[k])
-    while size:
-        node = nodes[0]
-        size = _pop(keys, nodes, size)
+    heap = [(0.0, root) for root in roots]  # of equal keys the lower number comes first
+    heap.sort()
+    for root in roots:
+        parent[root], length[root] = count, 0.0
+    while heap:
+        _, node = heappop(heap)
         if done[node]:
             continue
         done[node] = True
@@ -66,40 +64,5 @@ def spanning_tree(
             far = cost[e] + (length[node] if shortest else 0.0)
             if not done[other] and far < length[other]:
                 length[other], parent[other], edge[other], forward[other] = far, node, e, first[e] == node
-                size = _push(keys, nodes, size, far, other)
+                heappush(heap, (far, other))
     return parent, edge, forward
-
-
-@compiled
-def _push(keys: Array, nodes: IntArray, size: int, key: float, node: int) -> int:
-    """Add to a heap of so many; how many there are then."""
-    k = size
-    while k and _before(key, node, keys[(k - 1) // 2], nodes[(k - 1) // 2]):
-        keys[k], nodes[k] = keys[(k - 1) // 2], nodes[(k - 1) // 2]
-        k = (k - 1) // 2
-    keys[k], nodes[k] = key, node
-    return size + 1
-
-
-@compiled
-def _pop(keys: Array, nodes: IntArray, size: int) -> int:
-    """Take the first from a heap of so many; how many are left."""
-    size -= 1
-    key, node = keys[size], nodes[size]
-    k = 0
-    while 2 * k + 1 < size:
-        child = 2 * k + 1
-        if child + 1 < size and _before(keys[child + 1], nodes[child + 1], keys[child], nodes[child]):
-            child += 1
-        if not _before(keys[child], nodes[child], key, node):
-            break
-        keys[k], nodes[k] = keys[child], nodes[child]
-        k = child
-    keys[k], nodes[k] = key, node
-    return size
-
-
-@compiled
-def _before(key: float, node: int, other_key: float, other: int) -> bool:
-    """Test whether one entry comes before another: of equal ones the lower number."""
-    return key < other_key or (key == other_key and node < other)

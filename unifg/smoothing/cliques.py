@@ -42,20 +42,15 @@ def begin_clique(
     clique.pivots, clique.count = last - first, last - first + end - begin
     clique.size, clique.stride, clique.marked, clique.prior, clique.filled = size, size + 1, 0, 0, 1
     clique.list, clique.front = take_list(memory, clique.count), take_numbers(memory, length_of_front(size))
-    clique.parent, clique.sibling = -1, -1
-    at, row = clique.list, 0
-    for q in range(first, last):
-        v = members[order[q]]
-        lists[at], place[order[q]] = v, row
-        variables[v].clique, variables[v].place = c, row
+    clique.parent, clique.sibling, row = -1, -1, 0
+    for k in range(clique.count):
+        local = order[first + k] if k < clique.pivots else separator[begin + k - clique.pivots]
+        v = members[local]
+        lists[clique.list + k], place[local] = v, row
+        if k < clique.pivots:
+            variables[v].clique, variables[v].place = c, row
+            clique.pivot_rows = row + variables[v].dim
         row += variables[v].dim
-        at += 1
-    clique.pivot_rows = row
-    for q in range(begin, end):
-        v = members[separator[q]]
-        lists[at], place[separator[q]] = v, row
-        row += variables[v].dim
-        at += 1
     at, zero = clique.front, splat(0.0)
     for q in range(size):  # from the diagonal on, and where vectors that begin in the row above may end
         store(numbers, at, zero)

@@ -17,7 +17,7 @@ from unifg.errors import GraphError
 from unifg.factors.kernel import Kernel, side_by_side
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import QUADRATIC, Form, Loss, form_of
-from unifg.factors.whitening import DIAGONAL, FULL, quick_roots, reciprocals, square_roots
+from unifg.factors.whitening import DIAGONAL, FULL, reciprocals, square_roots
 from unifg.lie import Manifold
 from unifg.lie.product import leaves
 from unifg.lie.retraction import ADDITION, move_of
@@ -49,7 +49,7 @@ class Staged:
     Attributes:
         kind: number of their type.
         families: of their variables, in order.
-        members: (n,) for each family, or one number where all factors share it.
+        members: (n,) for each family, or (1,) where all factors share it.
         data: (n, numbers) parameters and whitener.
         name: for messages.
         term: what evaluates them, where that is Python.
@@ -58,7 +58,7 @@ class Staged:
 
     kind: int
     families: list[GrowingFamily]
-    members: list[IntArray | int]
+    members: list[IntArray]
     data: Array
     name: str
     term: CompiledTerm | None = None
@@ -66,7 +66,7 @@ class Staged:
 
     def keep(self, wanted: BoolArray) -> None:
         """Leave out the others."""
-        self.members = [m if isinstance(m, int) else m[wanted] for m in self.members]
+        self.members = [m if len(m) == 1 else m[wanted] for m in self.members]
         self.data = self.data[wanted]
         self.items = self.items[wanted] if len(self.items) else self.items
 
@@ -120,7 +120,7 @@ class Types:
         if kind is not None:
             data = numbers_of(kind, arguments, sigma, information)
             if data is not None:
-                members: list[IntArray | int] = [int(arguments[place].indices[0]) for place in kind.variables]
+                members = [arguments[place].indices for place in kind.variables]
                 return Staged(kind.number, kind.families, members, data, kind.name)
         staged, trace = self._looked_at(function, arguments, sigma, information, robust, active, given)
         if key is not None and staged.term is None and (trace is None or not trace.reached):
@@ -181,7 +181,7 @@ class Types:
                     family=selection.family.name,
                 )
             families.append(selection.family)
-        members = [int(s.indices[0]) if len(s) == 1 else s.indices for s in selections]
+        members = [selection.indices for selection in selections]
         form = form_of(robust)
         key = self._key(wrapped, normal, rows, count)
         known = self._kernels.get(key) if form is not None else None
@@ -196,7 +196,9 @@ class Types:
                 return _active(staged, active), None
             known = term.kernel, wrapped, term.trace
             if term.trace is None or not _compiled_in(term.trace, normal):
-                self._remember(key, known)
+                if len(self._kernels) >= REMEMBERED:  # functions made anew for each statement are not kept for ever
+                    self._kernels.clear()
+                self._kernels[key] = known
         (kernel, _, trace), form = known, form or PLAIN
         values = [argument.value if isinstance(argument, Data) else argument for argument in normal]
         for place, manifold in elements_of(wrapped).items():
@@ -216,13 +218,8 @@ class Types:
         if sigma is not None:
             whitening, whitener = DIAGONAL, reciprocals(name, _numbers(name, "sigma", sigma), count, size)
         elif information is not None:
-            matrices = _numbers(name, "information", information)
-            stack = np.array(matrices, ndmin=3, order="C")
-            whitener = np.empty((len(stack), size * size))
-            if stack.shape[1:] != (size, size) or len(stack) not in (1, count) or not quick_roots(stack, whitener):
-                roots = square_roots(name, matrices, count, size)
-                whitener = roots.reshape(len(roots), size * size)
-            whitening = FULL
+            roots = square_roots(name, _numbers(name, "information", information), count, size)
+            whitening, whitener = FULL, roots.reshape(len(roots), size * size)
         data = side_by_side([*parameters, whitener], count)
         finite = np.isfinite(data).all(axis=1)
         if not finite.all():
@@ -231,12 +228,6 @@ class Types:
         counts = data.shape[1] - whitener.shape[1], data.shape[1], whitening, size
         kind = self._kind(kernel, counts, selections, shapes, *form)
         return _active(Staged(kind, families, members, data, name), active), trace
-
-    def _remember(self, key: tuple[Any, ...], known: tuple[Kernel, Residual, Trace | None]) -> None:
-        """Keep what the next statement of its kind needs; functions made anew for each are not kept for ever."""
-        if len(self._kernels) >= REMEMBERED:
-            self._kernels.clear()
-        self._kernels[key] = known
 
     def _kind(
         self,
@@ -277,22 +268,16 @@ class Types:
         if kernel is None and not wrapped.rows:  # what a trace makes of constants depends on all of this
             stated = [a.manifold if isinstance(a, Selection) else _told(a) for a in arguments]
             return id(wrapped.function), id(wrapped.jacobian), wrapped.derivatives, count, rows, *stated
-        expected = kernel.arguments if kernel is not None else ()
         parts: list[Any] = [
-            id(kernel) if kernel is not None else (id(wrapped.function), id(wrapped.jacobian), wrapped.rows)
+            id(kernel) if kernel is not None else (id(wrapped.function), id(wrapped.jacobian), wrapped.rows),
+            rows,
         ]
-        for place, argument in enumerate(arguments):
+        for argument in arguments:
             if isinstance(argument, Selection):
                 parts.append(argument.manifold)
-            elif kernel is not None and place < len(expected):
-                axes = expected[place]
-                value = argument.value if isinstance(argument, Data) else argument
-                shape = np.shape(value)[np.ndim(value) - axes :] if isinstance(axes, int) else axes
-                parts.append(shape if isinstance(axes, int | tuple) else "constant")
-            elif wrapped.rows:
+            else:
                 shape = argument.value.shape if isinstance(argument, Data) else np.shape(argument)
-                own = rows[place]
-                parts.append(shape[1:] if (len(shape) > 1 if own is None else own) else shape)
+                parts.append(("each", shape[1:]) if count > 1 and shape[:1] == (count,) else shape)
         return tuple(parts)
 
 

@@ -74,6 +74,10 @@ class GrowingFamily(Family):
             return -2
         return int(self._rows[member - self._base]) if member >= self._base else -1
 
+    def lowest(self, members: IntArray) -> int:
+        """Lowest of the rows of some members; quick for one."""
+        return self.row(int(members[0])) if len(members) == 1 else int(self.rows(members).min())
+
     def rows(self, members: IntArray) -> IntArray:
         """The same of many members."""
         if len(members) == 1:

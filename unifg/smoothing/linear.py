@@ -41,19 +41,32 @@ def retract(memory: Address, v: int, out: Array, at: int) -> None:
 
 
 @compiled
-def linearize(memory: Address, f: int, scratch: Array) -> None:
-    """Evaluate a factor at the linearisation points of its variables, and keep what :func:`keep` keeps."""
+def evaluate(memory: Address, f: int, estimated: bool, scratch: Array) -> tuple[int, float]:
+    """Whiten the residual of a factor at the estimates, or with its Jacobian at the linearisation points.
+
+    Args:
+        memory: address of the description of the smoother's arrays.
+        f: the factor.
+        estimated: whether its variables are where their steps lead, and no Jacobian is wanted.
+        scratch: takes the values of the variables, the residual and the Jacobian.
+
+    Returns:
+        Where the residual begins in scratch, and its squared norm.
+    """
     state = opened(memory)
     numbers, lists, variables, factor = state.numbers, state.lists, state.variables, state.factors[f]
     kind = state.types[factor.type]
     m, data, at = kind.rows, factor.data, 0
     for s in range(kind.slots):
-        slot = state.slots[kind.slot + s]
-        value = variables[lists[factor.variables + s]].value + slot.start
+        slot, v = state.slots[kind.slot + s], lists[factor.variables + s]
+        source, begin = numbers, variables[v].value + slot.start
+        if estimated:
+            retract(memory, v, scratch, at)
+            source, begin = scratch, at + slot.start
         for k in range(slot.storage):
-            scratch[at + k] = numbers[value + k]
+            scratch[at + k] = source[begin + k]
         at += slot.storage
-    r, J = vector(scratch, at, m), matrix(scratch, at + m, m, kind.width)
+    r, J = vector(scratch, at, m), matrix(scratch, at + m, 0 if estimated else m, kind.width)
     call_residual(
         kind.address,
         vector(scratch, 0, at),
@@ -63,12 +76,21 @@ def linearize(memory: Address, f: int, scratch: Array) -> None:
         J,
     )
     whiten(kind.whitening, numbers, data + kind.parameters, 0, r, J)
+    squared = 0.0
+    for a in range(m):
+        squared += r[a] * r[a]
+    return at, squared
+
+
+@compiled
+def linearize(memory: Address, f: int, scratch: Array) -> None:
+    """Evaluate a factor at the linearisation points of its variables, and keep what :func:`keep` keeps."""
+    state = opened(memory)
+    kind = state.types[state.factors[f].type]
+    at, squared = evaluate(memory, f, False, scratch)
     if kind.loss != QUADRATIC:
-        squared = 0.0
-        for a in range(m):
-            squared += r[a] * r[a]
         root = sqrt(weight_of(kind.loss, kind.first, kind.second, squared))
-        for k in range(at, at + m + m * kind.width):
+        for k in range(at, at + kind.rows * (1 + kind.width)):
             scratch[k] *= root
     keep(memory, f, scratch, at)
 
@@ -147,28 +169,7 @@ def take_in(memory: Address, chosen: IntArray, residual: Array, jacobian: Array)
 def cost_of(memory: Address, f: int, scratch: Array) -> float:
     """1/2 rho(|W r|^2) of a factor at the estimates of its variables; 0 where Python has to evaluate it."""
     state = opened(memory)
-    numbers, lists, factor = state.numbers, state.lists, state.factors[f]
-    kind = state.types[factor.type]
+    kind = state.types[state.factors[f].type]
     if kind.address == 0:
         return 0.0
-    m, data, at = kind.rows, factor.data, 0
-    for s in range(kind.slots):
-        slot = state.slots[kind.slot + s]
-        retract(memory, lists[factor.variables + s], scratch, at)
-        for k in range(slot.storage if slot.start else 0):
-            scratch[at + k] = scratch[at + slot.start + k]
-        at += slot.storage
-    r, none = vector(scratch, at, m), matrix(scratch, 0, 0, 0)
-    call_residual(
-        kind.address,
-        vector(scratch, 0, at),
-        vector(numbers, data, kind.parameters),
-        vector_at(kind.table, kind.table_size),
-        r,
-        none,
-    )
-    whiten(kind.whitening, numbers, data + kind.parameters, 0, r, none)
-    squared = 0.0
-    for a in range(m):
-        squared += r[a] * r[a]
-    return 0.5 * value_of(kind.loss, kind.first, kind.second, squared)
+    return 0.5 * value_of(kind.loss, kind.first, kind.second, evaluate(memory, f, True, scratch)[1])

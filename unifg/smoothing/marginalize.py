@@ -27,17 +27,14 @@ def marginalize(memory: Address, until: float, frozen: int) -> IntArray:
     """
     state = opened(memory)
     variables, counters, count = state.variables, state.counters[0], 0
-    for v in range(counters.variable_end):
-        if variables[v].alive and variables[v].clique >= 0 and variables[v].stamp <= until:
-            count += 1
-    leaving = np.empty(count, np.int64)
-    if count == 0:
-        return leaving
-    count = 0
+    leaving = np.empty(counters.variable_end, np.int64)
     for v in range(counters.variable_end):
         if variables[v].alive and variables[v].clique >= 0 and variables[v].stamp <= until:
             leaving[count] = v
             count += 1
+    leaving = leaving[:count]
+    if count == 0:
+        return leaving
     v, kept = counters.candidates, -1
     while v >= 0:
         following = variables[v].next_candidate
@@ -64,11 +61,9 @@ def _drop(memory: Address, v: int, frozen: int) -> None:
     child = clique.child
     while child >= 0:  # priors, and part of this one
         following = cliques[child].sibling
-        _discard(memory, child)
+        release(memory, child)
         child = following
     clique.child, clique.prior = -1, 1
-    clique.next = counters.priors
-    counters.priors = c
     for q in range(clique.list + clique.pivots, clique.list + clique.count):
         variables[lists[q]].frozen = frozen
     link = variables[v].link
@@ -89,7 +84,7 @@ def _drop(memory: Address, v: int, frozen: int) -> None:
         factors[f].next = counters.factor_free
         counters.factor_free = f
     if clique.count == clique.pivots:
-        _discard(memory, c)
+        release(memory, c)
     else:
         _unite(memory, c)
     give_numbers(memory, variables[v].length, variables[v].value)
@@ -167,19 +162,4 @@ def _merge(memory: Address, source: int, target: int, parent: int) -> None:
         while cliques[before].sibling != source:
             before = cliques[before].sibling
         cliques[before].sibling = cliques[source].sibling
-    _discard(memory, source)
-
-
-@compiled
-def _discard(memory: Address, c: int) -> None:
-    """Release a prior."""
-    state = opened(memory)
-    cliques, counters = state.cliques, state.counters[0]
-    if counters.priors == c:
-        counters.priors = cliques[c].next
-    else:
-        before = counters.priors
-        while cliques[before].next != c:
-            before = cliques[before].next
-        cliques[before].next = cliques[c].next
-    release(memory, c)
+    release(memory, source)

@@ -12,7 +12,7 @@ import numpy as np
 from unifg.codegen.jit import compiled
 from unifg.codegen.vectors import Address
 from unifg.codegen.views import redescribe
-from unifg.smoothing.state import CLASSES, State, opened
+from unifg.smoothing.state import CLASSES, Record, State, opened
 from unifg.typing import Array, IntArray
 
 LEAST, VECTORS = 4, 16  # the shortest blocks; those of floats are whole vectors of four
@@ -42,27 +42,23 @@ def length_of_front(size: int) -> int:
 
 
 @compiled
+def _take(arena: T, heads: IntArray, kind: int, size: int, end: int) -> tuple[int, int]:
+    """A block of a class in an arena in use up to some end; where it begins, and the end then."""
+    at = int(heads[kind])
+    if at < 0:
+        return end, end + size
+    heads[kind] = int(arena[at])
+    return at, end
+
+
+@compiled
 def take_list(memory: Address, length: int) -> int:
     """A block of integers; there must be room."""
     state = opened(memory)
     kind, size = rounded(length, LEAST)
-    counters, heads = state.counters[0], state.heads
-    at = heads[kind]
-    if at >= 0:
-        heads[kind] = state.lists[at]
-        return int(at)
-    at = counters.lists_end
-    counters.lists_end = at + size
-    return int(at)
-
-
-@compiled
-def give_list(memory: Address, length: int, at: int) -> None:
-    """Return a block of integers."""
-    state = opened(memory)
-    kind, _ = rounded(length, LEAST)
-    state.lists[at] = state.heads[kind]
-    state.heads[kind] = at
+    at, end = _take(state.lists, state.heads, kind, size, state.counters[0].lists_end)
+    state.counters[0].lists_end = end
+    return at
 
 
 @compiled
@@ -70,23 +66,33 @@ def take_numbers(memory: Address, length: int) -> int:
     """A block of floats; there must be room."""
     state = opened(memory)
     kind, size = rounded(length, VECTORS)
-    counters, heads = state.counters[0], state.heads
-    at = heads[CLASSES + kind]
-    if at >= 0:
-        heads[CLASSES + kind] = int(state.numbers[at])
-        return int(at)
-    at = counters.numbers_end
-    counters.numbers_end = at + size
-    return int(at)
+    at, end = _take(state.numbers, state.heads, CLASSES + kind, size, state.counters[0].numbers_end)
+    state.counters[0].numbers_end = end
+    return at
+
+
+@compiled
+def give_list(memory: Address, length: int, at: int) -> None:
+    """Return a block of integers."""
+    state = opened(memory)
+    kind = rounded(length, LEAST)[0]
+    state.lists[at], state.heads[kind] = state.heads[kind], at
 
 
 @compiled
 def give_numbers(memory: Address, length: int, at: int) -> None:
     """Return a block of floats."""
     state = opened(memory)
-    kind, _ = rounded(length, VECTORS)
-    state.numbers[at] = float(state.heads[CLASSES + kind])
-    state.heads[CLASSES + kind] = at
+    kind = CLASSES + rounded(length, VECTORS)[0]
+    state.numbers[at], state.heads[kind] = float(state.heads[kind]), at
+
+
+@compiled
+def next_row(table: Record, free: int, end: int) -> tuple[int, int, int]:
+    """A free row of a table; the first of the chain of free rows, and where the rows in use end, without it."""
+    if free >= 0:
+        return free, table[free].next, end
+    return end, free, end + 1
 
 
 @compiled

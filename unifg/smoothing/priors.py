@@ -24,10 +24,9 @@ def relinearize(memory: Address, v: int, scratch: Array) -> None:
     at = v - v  # zero, of which compiled code does not know it: functions are compiled anew for a literal
     retract(memory, v, scratch, at)
     if variable.frozen == 2:
-        c = state.counters[0].priors
-        while c >= 0:
-            _rewrite(memory, c, v, scratch)
-            c = state.cliques[c].next
+        for c in range(state.counters[0].clique_end):
+            if state.cliques[c].prior:
+                _rewrite(memory, c, v, scratch)
     for k in range(storage):
         numbers[value + k] = scratch[k]
     for k in range(2 * dim):
@@ -51,17 +50,21 @@ def _rewrite(memory: Address, c: int, v: int, scratch: Array) -> None:
     front, stride, size, value = clique.front, clique.stride, clique.size, variables[v].value
     storage, dim = variables[v].storage, variables[v].dim
     step = value + storage
+    for k in range(row, row + dim):  # both triangles of what is about the variable
+        for i in range(clique.pivot_rows, size):
+            low, high = min(i, k), max(i, k)
+            numbers[front + high * stride + low] = numbers[front + low * stride + high]
     for i in range(clique.pivot_rows, size):
         total = 0.0
         for d in range(dim):
-            total += numbers[front + _upper(stride, i, row + d)] * numbers[step + d]
+            total += numbers[front + i * stride + row + d] * numbers[step + d]
         numbers[front + i * stride + size] -= total
     for p in range(variables[v].part, variables[v].part + variables[v].parts):
         part = state.parts[p]
-        where, at, length, tangent, width = part.deviation, part.start, part.storage, part.tangent, part.dim
+        where, at, length, width = part.deviation, part.start, part.storage, part.dim
         if where == 0:
             continue
-        start, first = storage + width, row + tangent
+        start, first = storage + width, row + part.tangent
         J, moved = matrix(scratch, start, width, width), start + width * width
         if where == BY_PYTHON:
             J = matrix(numbers, step + 3 * dim + storage, width, width)
@@ -74,31 +77,14 @@ def _rewrite(memory: Address, c: int, v: int, scratch: Array) -> None:
                 vector(scratch, storage, width),
                 J,
             )
-        for i in range(clique.pivot_rows, size + 1):
-            if first <= i < first + width:
-                continue
-            for b in range(width):
-                total = 0.0
-                for a in range(width):
-                    total += numbers[front + _upper(stride, i, first + a)] * J[a, b]
-                scratch[moved + b] = total
-            for b in range(width):
-                numbers[front + _upper(stride, i, first + b)] = scratch[moved + b]
-        for a in range(width):
-            for b in range(width):
-                total = 0.0
-                for e in range(width):
-                    total += numbers[front + _upper(stride, first + a, first + e)] * J[e, b]
-                scratch[moved + a * width + b] = total
-        for a in range(width):
-            for b in range(a, width):
-                total = 0.0
-                for e in range(width):
-                    total += J[e, a] * scratch[moved + e * width + b]
-                numbers[front + _upper(stride, first + a, first + b)] = total
-
-
-@compiled
-def _upper(stride: int, i: int, j: int) -> int:
-    """Position of entry (i, j) of a symmetric matrix of which the upper triangle is stored."""
-    return i * stride + j if i < j else j * stride + i
+        # Its columns from the right, then its rows from the left, those of the right-hand side as well.
+        for along, across, end in ((stride, 1, size), (1, stride, size + 1)):
+            for i in range(clique.pivot_rows, end):
+                entry = front + i * along + first * across
+                for b in range(width):
+                    total = 0.0
+                    for a in range(width):
+                        total += numbers[entry + a * across] * J[a, b]
+                    scratch[moved + b] = total
+                for b in range(width):
+                    numbers[entry + b * across] = scratch[moved + b]

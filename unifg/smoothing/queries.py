@@ -8,7 +8,7 @@ from unifg.codegen.jit import compiled
 from unifg.codegen.vectors import Address
 from unifg.elimination.ordering import filled
 from unifg.smoothing.linear import cost_of, length_of, retract
-from unifg.smoothing.memory import found, grown, more, take_list, take_numbers
+from unifg.smoothing.memory import found, grown, more, next_row, take_list, take_numbers
 from unifg.smoothing.state import BY_PYTHON, FRESH, SLOTS_MAX, opened
 from unifg.smoothing.tree import paths
 from unifg.typing import Array, IntArray
@@ -49,12 +49,9 @@ def add_variables(
     state = grown(memory, np.empty(0, np.int64), longer)
     numbers = state.numbers
     for k in range(count):
-        v = counters.variable_free
-        if v >= 0:
-            counters.variable_free = variables[v].next
-        else:
-            v = counters.variable_end
-            counters.variable_end = v + 1
+        v, counters.variable_free, counters.variable_end = next_row(
+            variables, counters.variable_free, counters.variable_end
+        )
         variable, at = variables[v], take_numbers(memory, length)
         variable.part, variable.parts, variable.dim, variable.storage, variable.value = part, parts, dim, storage, at
         variable.clique, variable.place, variable.link, variable.mark, variable.changed = -1, 0, -1, 0, 0
@@ -64,12 +61,10 @@ def add_variables(
         variable.next = counters.new_variables
         counters.new_variables = v
         variable.stamp = stamps[k]
-        for i in range(storage):
-            numbers[at + i] = values[k, i]
-        for i in range(3 * dim):
-            numbers[at + storage + i] = 0.0
-        for i in range(length - storage - 3 * dim):
-            numbers[at + storage + 3 * dim + i] = values[k, i] if i < storage else 0.0
+        numbers[at : at + storage] = values[k]
+        numbers[at + storage : at + length] = 0.0
+        if length > storage + 3 * dim:
+            numbers[at + storage + 3 * dim : at + 2 * storage + 3 * dim] = values[k]
         out[k] = v
     return found(longer)
 
@@ -98,17 +93,11 @@ def add_factors(
     state = grown(memory, more_lists, more_numbers)
     lists, numbers = state.lists, state.numbers
     for k in range(count):
-        f = counters.factor_free
-        if f >= 0:
-            counters.factor_free = factors[f].next
-        else:
-            f = counters.factor_end
-            counters.factor_end = f + 1
+        f, counters.factor_free, counters.factor_end = next_row(factors, counters.factor_free, counters.factor_end)
         factor, at, where = factors[f], take_numbers(memory, length), take_list(memory, 2 * slots)
         factor.type, factor.variables, factor.data, factor.state, factor.used = kind, where, at, FRESH, 1
         factor.batch, factor.item = batch, items[k] if len(items) else k
-        for i in range(size):
-            numbers[at + i] = data[k, i]
+        numbers[at : at + size] = data[k]
         for s in range(slots):
             v = touched[k, s]
             lists[where + s] = v
@@ -186,11 +175,11 @@ def total_cost(memory: Address) -> float:
 
 
 @compiled
-def joint_covariance(memory: Address, chosen: IntArray) -> Array:
-    """Covariance of some variables, in the order given.
+def covariance_root(memory: Address, chosen: IntArray) -> Array:
+    """Y of the covariance Y'Y of some variables, in the order given.
 
-    With H = U'U it is Y'Y, where Y solves U'Y = E for the unit columns E of the variables, and is zero outside the
-    paths from them to their roots.
+    With H = U'U, Y solves U'Y = E for the unit columns E of the variables, and is zero outside the paths from them to
+    their roots.
     """
     state = opened(memory)
     variables, cliques, lists, numbers = state.variables, state.cliques, state.lists, state.numbers
@@ -222,10 +211,4 @@ def joint_covariance(memory: Address, chosen: IntArray) -> Array:
                         j += 1
             c = cliques[c].parent
         column += dim
-    result = np.zeros((width, width))
-    for i in range(rows):
-        for a in range(width):
-            if Y[i, a] != 0.0:
-                for b in range(width):
-                    result[a, b] += Y[i, a] * Y[i, b]
-    return result
+    return Y

@@ -23,9 +23,9 @@ from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.queries import (
     add_factors,
     add_variables,
+    covariance_root,
     estimates,
     full_steps,
-    joint_covariance,
     total_cost,
 )
 from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, Records, State, empty_state
@@ -254,17 +254,14 @@ class Smoother:
         selections = [as_selection(variable) for variable in variables]
         rows = np.concatenate([self._rows(selection) for selection in selections])
         self._require_solved()
-        result: Array = joint_covariance(self._memory, rows)
+        root = covariance_root(self._memory, rows)
+        result: Array = root.T @ root
         if all(selection.component is None for selection in selections):
             return result
-        kept: list[IntArray] = []
-        at = 0
-        for selection in selections:
-            for _ in range(len(selection)):
-                kept.append(at + np.arange(selection.tangent.start, selection.tangent.stop))
-                at += selection.family.manifold.dim
-        columns = np.concatenate(kept)
-        return result[np.ix_(columns, columns)]
+        whole = [np.arange(selection.family.manifold.dim) for selection in selections for _ in range(len(selection))]
+        parts = [selection.tangent for selection in selections for _ in range(len(selection))]
+        columns = np.concatenate([np.isin(own, own[part]) for own, part in zip(whole, parts, strict=True)])
+        return np.asarray(result[np.ix_(columns, columns)])
 
     @property
     @synchronized
@@ -313,7 +310,7 @@ class Smoother:
         """Factors with a variable that was marginalised: (n,) which of them."""
         self._staged.remove(item)
         for family, members in zip(item.families, item.members, strict=True):
-            if (family.rows(np.atleast_1d(members)) == -1).any():
+            if (family.rows(members) == -1).any():
                 self._rows(family[members], item.name)
 
     def _solve(self) -> None:
@@ -379,47 +376,43 @@ class Smoother:
     def _admit(self, new: Mapping[GrowingFamily, int]) -> None:
         """Check that all variables of staged factors have values, or get them now."""
         for item in list(self._staged):
-            gone = False
-            for family, members in zip(item.families, item.members, strict=True):
-                row = family.row(members) if isinstance(members, int) else int(family.rows(members).min())
-                if row >= 0:
-                    continue
-                largest = members if isinstance(members, int) else int(members.max())
-                if largest >= family.count + new.get(family, 0):
-                    raise GraphError(
-                        f"term '{item.name}': {family.name}[{largest}] has no value: give it one in this update",
-                        term=item.name,
-                        family=family.name,
-                        index=largest,
-                    )
-                gone = gone or row == -1 or not isinstance(members, int)
-            if gone:
-                left = np.zeros(len(item.data), dtype=bool)
-                for family, members in zip(item.families, item.members, strict=True):
-                    left |= family.rows(np.atleast_1d(members)) == -1
-                if left.any():
-                    self._late(item, left)
+            pairs, late = list(zip(item.families, item.members, strict=True)), False
+            for family, members in pairs:
+                row, single = family.lowest(members), len(members) == 1
+                if row < 0:
+                    largest = int(members[0] if single else members.max())
+                    if largest >= family.count + new.get(family, 0):
+                        raise GraphError(
+                            f"term '{item.name}': {family.name}[{largest}] has no value: give it one in this update",
+                            term=item.name,
+                            family=family.name,
+                            index=largest,
+                        )
+                    late = late or row == -1 or not single
+            if late:
+                gone = np.zeros(len(item.data), dtype=bool)
+                for family, members in pairs:
+                    gone |= family.rows(members) == -1
+                if gone.any():
+                    self._late(item, gone)
 
     def _reserve(self, variables: int, factors: int) -> None:
         """Make the tables long enough; arenas grow by themselves."""
-        state, counts = self._state, self._counts.tolist()
-        variable_end, factor_end, clique_end = counts[VARIABLE_END], counts[FACTOR_END], counts[CLIQUE_END]
-        grown: dict[str, Any] = {}
-        if variable_end + variables > len(state.variables):
-            grown["variables"] = longer(state.variables, variable_end + variables)
-        if factor_end + factors > len(state.factors):
-            grown["factors"] = longer(state.factors, factor_end + factors)
-        if clique_end + variable_end + variables + 1 > len(state.cliques):
-            grown["cliques"] = longer(state.cliques, clique_end + variable_end + variables + 1)
-        if len(self._types.slots) > len(state.slots):
-            grown["slots"] = np.array(self._types.slots, dtype=SLOT)
-        if len(self._types.fields) > len(state.types):
-            grown["types"] = longer(state.types, len(self._types.fields))
+        state, counts, types = self._state, self._counts.tolist(), len(self._types.fields)
+        variables += counts[VARIABLE_END]
+        needed = (
+            ("variables", variables), ("factors", counts[FACTOR_END] + factors),
+            ("cliques", counts[CLIQUE_END] + variables + 1), ("types", types),
+        )  # fmt: skip
+        grown: dict[str, Any] = {n: longer(getattr(state, n), k) for n, k in needed if k > len(getattr(state, n))}
         if grown:
-            self._hold(state := state._replace(**grown))
-        if self._written < len(self._types.fields):
-            self._written = len(self._types.fields)
-            state.types[: self._written] = np.array(self._types.fields, dtype=TYPE)
+            state = state._replace(**grown)
+        if self._written < types:
+            state = state._replace(slots=np.array(self._types.slots, dtype=SLOT))
+            state.types[:types] = np.array(self._types.fields, dtype=TYPE)
+            self._written = types
+        if state is not self._state:
+            self._hold(state)
         self._counts[SCRATCH] = self._types.scratch
 
     def _move(self, lists: IntArray | None, numbers: Array | None) -> None:
@@ -466,9 +459,8 @@ def _touched(item: Staged) -> IntArray:
     """(n, slots) rows of the variables of staged factors."""
     pairs = zip(item.families, item.members, strict=True)
     if len(item.data) == 1:
-        return np.array([[f.row(m if isinstance(m, int) else int(m[0])) for f, m in pairs]])
-    columns = [np.broadcast_to(f.row(m) if isinstance(m, int) else f.rows(m), (len(item.data),)) for f, m in pairs]
-    return np.stack(columns, axis=1).astype(np.int64)
+        return np.array([[family.lowest(members) for family, members in pairs]])
+    return np.stack(np.broadcast_arrays(*(family.rows(members) for family, members in pairs)), axis=1)
 
 
 def _batch(item: Staged, touched: IntArray) -> Batch:

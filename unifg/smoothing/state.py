@@ -101,7 +101,7 @@ CLIQUE = _record(
     "child",  # first
     "sibling",  # next
     "marked",  # number of the update that dissolves it
-    "next",  # in the chain of dissolved cliques, of priors, or of free rows
+    "next",  # in the chain of dissolved cliques, or of free rows
     "prior",  # 1: its pivots were marginalised, only the update matrix counts
     "filled",  # 1: in use
 )
@@ -118,7 +118,6 @@ COUNTERS = _record(
     "new_variables",  # chains
     "new_factors",
     "candidates",
-    "priors",
     "updates",  # so far
     "sequences",
     "failed",  # variable whose pivot vanished; -1: none
@@ -127,7 +126,7 @@ COUNTERS = _record(
 )
 PLACE = {name: place for place, name in enumerate(COUNTERS.names or ())}  # all are integers
 CHAINS = (
-    "variable_free", "factor_free", "clique_free", "new_variables", "new_factors", "candidates", "priors", "failed",
+    "variable_free", "factor_free", "clique_free", "new_variables", "new_factors", "candidates", "failed",
 )  # fmt: skip
 
 BY_PYTHON = -1  # in the place of an address

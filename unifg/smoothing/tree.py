@@ -52,10 +52,9 @@ def move_points(memory: Address, limit: float, update: int, chain: int, scratch:
         if largest > limit:
             count += 1
             relinearize(memory, v, scratch)
-            c = counters.priors if variables[v].frozen == 2 else -1
-            while c >= 0:
-                chain = mark_path(memory, cliques[c].parent, update, chain)
-                c = cliques[c].next
+            for c in range(counters.clique_end if variables[v].frozen == 2 else 0):
+                if cliques[c].prior:
+                    chain = mark_path(memory, cliques[c].parent, update, chain)
             link = variables[v].link
             while link >= 0:
                 f = link // SLOTS_MAX
@@ -74,9 +73,7 @@ def release(memory: Address, c: int) -> None:
     clique = state.cliques[c]
     give_list(memory, clique.count, clique.list)
     give_numbers(memory, length_of_front(clique.size), clique.front)
-    clique.filled = 0
-    clique.marked = 0
-    clique.next = state.counters[0].clique_free
+    clique.filled, clique.prior, clique.marked, clique.next = 0, 0, 0, state.counters[0].clique_free
     state.counters[0].clique_free = c
 
 
@@ -90,27 +87,9 @@ def dissolve(memory: Address, chain: int, update: int) -> tuple[IntArray, IntArr
     """
     state = opened(memory)
     variables, cliques, lists, counters = state.variables, state.cliques, state.lists, state.counters[0]
-    rebuild = counters.failed >= 0  # nothing but priors is left
+    members, lost = np.empty(counters.variable_end, np.int64), np.empty(counters.clique_end, np.int64)
     count, orphans, c = 0, 0, chain
     while c >= 0:
-        count += cliques[c].pivots
-        child = cliques[c].child
-        while child >= 0:
-            if cliques[child].marked != update:
-                orphans += 1
-            child = cliques[child].sibling
-        c = cliques[c].next
-    v = counters.new_variables
-    while v >= 0:
-        count += 1
-        v = variables[v].next
-    if rebuild:
-        for c in range(counters.clique_end):
-            orphans += cliques[c].filled
-    members, lost = np.empty(count, np.int64), np.empty(orphans, np.int64)
-    count, orphans, c = 0, 0, chain
-    while c >= 0:
-        following = cliques[c].next
         for k in range(cliques[c].list, cliques[c].list + cliques[c].pivots):
             members[count] = lists[k]
             count += 1
@@ -120,13 +99,11 @@ def dissolve(memory: Address, chain: int, update: int) -> tuple[IntArray, IntArr
                 lost[orphans] = child
                 orphans += 1
             child = cliques[child].sibling
-        c = following
-    c = chain  # only now: a released clique no longer says that it was marked
-    while c >= 0:
-        following = cliques[c].next
+        c = cliques[c].next
+    while chain >= 0:  # only now: a released clique no longer says that it was marked
+        c, chain = chain, cliques[chain].next
         release(memory, c)
-        c = following
-    if rebuild:
+    if counters.failed >= 0:  # nothing but priors is left
         for c in range(counters.clique_end):
             if cliques[c].filled:
                 lost[orphans] = c
@@ -142,7 +119,7 @@ def dissolve(memory: Address, chain: int, update: int) -> tuple[IntArray, IntArr
         variables[members[i]].clique = -1
         variables[members[i]].mark = update
         variables[members[i]].local = i
-    return members, lost
+    return members[:count], lost[:orphans]
 
 
 @compiled

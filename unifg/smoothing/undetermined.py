@@ -8,6 +8,8 @@ from unifg.elimination.components import components
 from unifg.smoothing.state import State
 from unifg.typing import IntArray
 
+NOBODY: IntArray = np.zeros(0, dtype=np.int64)
+
 
 def enough(state: State, variable: int) -> bool:
     """Test whether as many rows as unknowns, one of them from a single variable, touch all neighbours of a variable.
@@ -18,35 +20,22 @@ def enough(state: State, variable: int) -> bool:
         state: of the smoother.
         variable: whose pivot has vanished.
     """
-    counters, variables = state.counters[0], state.variables
-    count = int(counters["variable_end"])
-    ties, rows, single = [np.zeros((0, 2), dtype=np.int64)], [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=bool)]
-    total = 0
-    factors = np.flatnonzero(state.factors["used"][: int(counters["factor_end"])])
-    for kind in np.unique(state.factors["type"][factors]).tolist():
-        own = factors[state.factors["type"][factors] == kind]
-        slots = int(state.types["slots"][kind])
-        total = _tie(ties, total, [state.lists[at : at + slots] for at in state.factors["variables"][own].tolist()])
-        rows.append(np.full(len(own), int(state.types["rows"][kind])))
-        single.append(np.full(len(own), slots == 1))
-    cliques = state.cliques[: int(counters["clique_end"])]
-    priors = np.flatnonzero((cliques["prior"] == 1) & (cliques["filled"] == 1))
-    places = zip(*(cliques[name][priors].tolist() for name in ("list", "pivots", "count")), strict=True)
-    total = _tie(ties, total, [state.lists[at + gone : at + n] for at, gone, n in places])
-    rows.append((cliques["size"] - cliques["pivot_rows"])[priors].astype(np.int64))
-    single.append(np.ones(len(priors), dtype=bool))  # a prior speaks of where its variables are
-    pairs = np.concatenate(ties)
-    label = components(count + total, pairs[:, 0] + count, np.ascontiguousarray(pairs[:, 1]))
+    variables, count = state.variables, int(state.counters[0]["variable_end"])
+    touched, rows, single = list[IntArray](), list[int](), list[bool]()
+    for factor in state.factors[state.factors["used"] == 1]:
+        kind, at = state.types[factor["type"]], factor["variables"]
+        touched.append(state.lists[at : at + kind["slots"]])
+        rows.append(kind["rows"])
+        single.append(kind["slots"] == 1)
+    for clique in state.cliques[state.cliques["prior"] == 1]:
+        at = clique["list"]
+        touched.append(state.lists[at + clique["pivots"] : at + clique["count"]])
+        rows.append(clique["size"] - clique["pivot_rows"])
+        single.append(True)  # a prior speaks of where its variables are
+    numbers = np.repeat(np.arange(len(touched)), [len(part) for part in touched])
+    label = components(count + len(touched), count + numbers, np.concatenate([NOBODY, *touched]))
     component = label[variable]
     alive = variables["alive"][:count].astype(bool) & (label[:count] == component)
     spoken = label[count:] == component
     unknowns = int(variables["dim"][:count][alive].sum())
-    return bool(np.concatenate(rows)[spoken].sum() >= unknowns and np.concatenate(single)[spoken].any())
-
-
-def _tie(ties: list[IntArray], begin: int, members: list[IntArray]) -> int:
-    """Note which variables each of many things ties, which are numbered from ``begin``; returns the next number."""
-    if members:
-        numbers = np.repeat(begin + np.arange(len(members)), [len(part) for part in members])
-        ties.append(np.column_stack([numbers, np.concatenate(members)]))
-    return begin + len(members)
+    return bool(np.array(rows)[spoken].sum() >= unknowns and np.array(single)[spoken].any())

@@ -15,7 +15,7 @@ from unifg.elimination.symbolic import cliques as find_cliques
 from unifg.elimination.symbolic import separators
 from unifg.smoothing.cliques import add_child, add_factor, begin_clique, eliminate_clique, substitute
 from unifg.smoothing.linear import linearize
-from unifg.smoothing.memory import found, grown, length_of_front, more
+from unifg.smoothing.memory import found, grown, length_of_front, more, next_row
 from unifg.smoothing.state import LINEAR, SLOTS_MAX, opened
 from unifg.smoothing.tree import dissolve, give_up, mark_factor, move_points, sort_by_age
 from unifg.typing import Array, IntArray
@@ -78,18 +78,15 @@ def renew(
         return -1, found(more_lists), found(more_numbers)
     inside = _whole_factors(memory, members, update)
     pool, pointer = _elements(memory, orphans, inside)
-    weight, given, last = np.empty(n, np.int64), np.empty(n if chronological else 0, np.int64), 0
+    weight, given, last = np.empty(n, np.int64), members[: n if chronological else 0].copy(), 0
     stage, alone = filled(n, 0), np.empty(n, np.bool_)
     for i in range(n):
         weight[i], alone[i] = variables[members[i]].dim, chronological
         if variables[members[i]].sequence > variables[members[last]].sequence:
             last = i
-    if chronological:
-        for i in range(n):
-            given[i] = members[i]
-        sort_by_age(memory, given)
-        for i in range(n):
-            given[i] = variables[given[i]].local
+    sort_by_age(memory, given)
+    for i in range(len(given)):
+        given[i] = variables[given[i]].local
     stage[last], alone[last] = 0 if chronological else 1, True
     order, first, parent, _, begin_at, sizes, held = find_cliques(weight, stage, alone, given, False, pool, pointer)
     separator, bounds, home = separators(order, begin_at, sizes, held, first, pool, pointer)
@@ -124,12 +121,7 @@ def renew(
         np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room), np.empty(room), np.empty(room),
     )  # fmt: skip
     for k in range(made):
-        c = counters.clique_free
-        if c >= 0:
-            counters.clique_free = cliques[c].next
-        else:
-            c = counters.clique_end
-            counters.clique_end = c + 1
+        c, counters.clique_free, counters.clique_end = next_row(cliques, counters.clique_free, counters.clique_end)
         slot_of[k] = c
         cliques[c].child = -1
     for k in range(made):
@@ -174,24 +166,20 @@ def _whole_factors(memory: Address, members: IntArray, update: int) -> IntArray:
     variables, factors, types, lists, counters = (
         state.variables, state.factors, state.types, state.lists, state.counters[0],
     )  # fmt: skip
-    count, inside, scratch = 0, np.empty(2 * len(members) + 16, np.int64), np.empty(counters.scratch)
+    count, inside, scratch = 0, np.empty(counters.factor_end, np.int64), np.empty(counters.scratch)
     for i in range(len(members)):
         link = variables[members[i]].link
         while link >= 0:
             f, slot = link // SLOTS_MAX, link % SLOTS_MAX
-            at, slots = factors[f].variables, types[factors[f].type].slots
-            if slot == 0:
-                whole = True
-                for s in range(1, slots):
-                    whole = whole and variables[lists[at + s]].mark == update
-                if whole:
-                    if count == len(inside):
-                        inside = more(inside, count, count)
-                    inside[count] = f
-                    count += 1
-                    if factors[f].state != LINEAR:
-                        linearize(memory, f, scratch)
-                        counters.linearized += 1
+            at, slots, whole = factors[f].variables, types[factors[f].type].slots, slot == 0
+            for s in range(1, slots if whole else 1):
+                whole = whole and variables[lists[at + s]].mark == update
+            if whole:
+                inside[count] = f
+                count += 1
+                if factors[f].state != LINEAR:
+                    linearize(memory, f, scratch)
+                    counters.linearized += 1
             link = lists[at + slots + slot]
     return inside[:count]
 
@@ -200,31 +188,28 @@ def _whole_factors(memory: Address, members: IntArray, update: int) -> IntArray:
 def _elements(memory: Address, orphans: IntArray, inside: IntArray) -> tuple[IntArray, IntArray]:
     """Variables that touch each other, by their local numbers: separators of the orphans, variables of the factors."""
     state = opened(memory)
-    variables, factors, types, lists, cliques = (
-        state.variables, state.factors, state.types, state.lists, state.cliques,
-    )  # fmt: skip
-    length, first = 0, len(orphans)
-    for k in range(len(orphans)):
-        length += cliques[orphans[k]].count - cliques[orphans[k]].pivots
+    variables, lists, first, length = state.variables, state.lists, len(orphans), 0
+    pointer, starts, ends = (
+        filled(first + len(inside) + 1, 0),
+        filled(first + len(inside), 0),
+        filled(first + len(inside), 0),
+    )
+    for k in range(first):
+        clique = state.cliques[orphans[k]]
+        starts[k], ends[k] = clique.list + clique.pivots, clique.list + clique.count
     for k in range(len(inside)):
-        length += types[factors[inside[k]].type].slots
-    pool, pointer, length = np.empty(length, np.int64), filled(first + len(inside) + 1, 0), 0
-    for k in range(len(orphans)):
-        clique = cliques[orphans[k]]
-        for q in range(clique.list + clique.pivots, clique.list + clique.count):
-            pool[length] = variables[lists[q]].local
-            length += 1
-        pointer[k + 1] = length
-    for k in range(len(inside)):
-        factor = factors[inside[k]]
-        for s in range(types[factor.type].slots):
-            local, known = variables[lists[factor.variables + s]].local, False
-            for q in range(pointer[first + k], length):
-                known = known or pool[q] == local
+        factor = state.factors[inside[k]]
+        starts[first + k], ends[first + k] = factor.variables, factor.variables + state.types[factor.type].slots
+    pool = np.empty((ends - starts).sum(), np.int64)
+    for k in range(len(starts)):
+        for q in range(starts[k], ends[k]):
+            local, known = variables[lists[q]].local, False
+            for p in range(pointer[k], length if k >= first else pointer[k]):  # a factor may name a variable twice
+                known = known or pool[p] == local
             if not known:
                 pool[length] = local
                 length += 1
-        pointer[first + k + 1] = length
+        pointer[k + 1] = length
     return pool[:length], pointer
 
 
