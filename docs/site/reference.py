@@ -19,7 +19,7 @@ ROOMS = ("unifg", "unifg.solvers", "unifg.horizon", "unifg.smoothing", "unifg.po
 """Their names are public where they are listed."""
 SHELVES = ("unifg.models", "unifg.files")
 """The modules that they list are."""
-ALONE = ("unifg.errors", "unifg.solution.status", "unifg.solution.solver", "unifg.solvers.names")
+ALONE = ("unifg.solution.solver", "unifg.solvers.names")
 MOVED = {
     "](../../README.md": "](../readme.md",
     "](../../CHANGELOG.md": "](../changelog.md",

@@ -674,7 +674,7 @@ class Prepared:
             )  # fmt: skip
 
     def allocate(self) -> None:
-        """Make the backend's workspace, unless there is one; of single solves, unless an earlier one has left its own."""
+        """Make the backend's workspace, unless there is one, or an earlier single solve has left its own."""
         if self._workspace is not None:
             return
         kept = self.program.workspaces
