@@ -1,6 +1,8 @@
 """The rules of the house: imports point down, floor by floor and without a circle; the library is silent."""
 
 import ast
+import importlib
+import inspect
 import re
 import subprocess
 from collections.abc import Iterator
@@ -386,6 +388,48 @@ def test_only_the_machine_knows_the_inside_of_numba() -> None:
     assert wrong == {}
     inside = [path for package, path in LIBRARY if room_of(module_of(package, path)) == "codegen"]
     assert any(private_sides(path.read_text(encoding="utf-8")) for path in inside)  # the witness sees what there is
+
+
+# Names of Numba that it does not promise, and where they are found: all that unifg.codegen uses.
+BELOW_THE_SURFACE = {
+    "_rebuild": "numba.core.compiler:CompileResult",
+    "_unique_ids": "numba.core.bytecode:FunctionIdentity",
+    "_final_module": "numba.core.codegen:CPUCodeLibrary",
+    "_get_module_for_linking": "numba.core.codegen:CPUCodeLibrary",
+    "_optimize_final_module": "numba.core.codegen:CPUCodeLibrary",
+    "_add_module": "numba.core.codegen:JITCPUCodegen",
+    "_tm": "numba.core.codegen:JITCPUCodegen",
+    "_cache": "numba.core.dispatcher:Dispatcher",
+    "_getvalue": "numba.core.cgutils:_StructProxy",
+    "_helperlib": "numba",
+    "_nrt_python": "numba.core.runtime",
+}
+
+
+@pytest.mark.parametrize("name", BELOW_THE_SURFACE)
+def test_a_private_name_of_numba_is_there(name: str) -> None:
+    """It fails by the name that a new version of Numba has taken away."""
+    module, _, kind = BELOW_THE_SURFACE[name].partition(":")
+    found = importlib.import_module(module)
+    assert hasattr(found, name) or name in inspect.getsource(getattr(found, kind)), name
+
+
+def test_no_other_private_name_of_numba_is_used() -> None:
+    own = set[str]()
+    used = set[str]()
+    for package, path in LIBRARY:
+        if room_of(module_of(package, path)) != "codegen":
+            continue
+        for node in ast.walk(parsed(path)):
+            if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__"):
+                mine = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls", "own")
+                (own if mine else used).add(node.attr)
+            elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+                own.add(node.name)
+            elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("numba"):
+                used |= {alias.name for alias in node.names if alias.name.startswith("_")}
+    assert used - own - {"_fields"} <= set(BELOW_THE_SURFACE)
+    assert "getrefcount" not in "".join(path.read_text(encoding="utf-8") for _, path in LIBRARY)
 
 
 def test_numba_is_one_that_the_machine_knows() -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.calls import vector
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import copy_to
 from unifg.codegen.vectors import Address
 from unifg.elimination.ordering import filled
 from unifg.smoothing.linear import cost_of, length_of, retract
@@ -61,10 +63,10 @@ def add_variables(
         variable.next = counters.new_variables
         counters.new_variables = v
         variable.stamp = stamps[k]
-        numbers[at : at + storage] = values[k]
+        copy_to(values[k], vector(numbers, at, storage))
         numbers[at + storage : at + length] = 0.0
         if length > storage + 3 * dim:
-            numbers[at + storage + 3 * dim : at + 2 * storage + 3 * dim] = values[k]
+            copy_to(values[k], vector(numbers, at + storage + 3 * dim, storage))
         out[k] = v
     return found(longer)
 
@@ -97,7 +99,7 @@ def add_factors(
         factor, at, where = factors[f], take_numbers(memory, length), take_list(memory, 2 * slots)
         factor.type, factor.variables, factor.data, factor.state, factor.used = kind, where, at, FRESH, 1
         factor.batch, factor.item = batch, items[k] if len(items) else k
-        numbers[at : at + size] = data[k]
+        copy_to(data[k], vector(numbers, at, size))
         for s in range(slots):
             v = touched[k, s]
             lists[where + s] = v
