@@ -19,10 +19,11 @@ from types import CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple, cast
 
 import numpy as np
+from numba import types
 from numba.core.dispatcher import Dispatcher
 
 SHIPPED, SHAPES = Path(__file__).with_name("kernels.zip"), "shapes.json"
-_CONSTANTS = (int, float, complex, str, tuple, np.ndarray, np.generic)
+_CONSTANTS = (int, float, complex, str, tuple, np.ndarray, np.generic, np.dtype, types.Type)
 _FOREIGN = ("numpy", "math", "numba", "llvmlite")
 _GENERATORS = "unifg.codegen."  # functions of these modules are looked at though they are not compiled
 _IGNORED = {"type_params", "type_comment", "kind", "ctx", "annotation", "returns", "decorator_list"}
@@ -33,7 +34,7 @@ class Shape(NamedTuple):
 
     Attributes:
         digest: of it.
-        names: that it mentions, sorted.
+        names: that it mentions, without its own variables, sorted.
     """
 
     digest: str
@@ -107,11 +108,26 @@ def _parsed(content: bytes) -> dict[str, Shape]:
     for node in ast.walk(ast.parse(content)):
         if isinstance(node, ast.FunctionDef):
             first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-            names = {inner.id for inner in ast.walk(node) if isinstance(inner, ast.Name)}
-            names |= {inner.attr for inner in ast.walk(node) if isinstance(inner, ast.Attribute)}
             digest = hashlib.sha256(_spelled(node).encode()).hexdigest()
-            found[f"{node.name}:{first}"] = Shape(digest, tuple(sorted(names)))
+            found[f"{node.name}:{first}"] = Shape(digest, tuple(sorted(_mentioned(node))))
     return found
+
+
+def _mentioned(function: ast.FunctionDef) -> set[str]:
+    """Names and attributes in a function, without its own variables; those of comprehensions may be others' as well."""
+    nodes = list(ast.walk(function))
+    attributes = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
+    names = [node for node in nodes if isinstance(node, ast.Name)]
+    counted = {
+        name.id
+        for node in nodes
+        if isinstance(node, ast.comprehension)
+        for name in ast.walk(node.target)
+        if isinstance(name, ast.Name)
+    }
+    stored = {name.id for name in names if isinstance(name.ctx, ast.Store)} - counted
+    given = {node.arg for node in nodes if isinstance(node, ast.arg)}
+    return attributes | {name.id for name in names} - stored - given
 
 
 def _spelled(node: Any) -> str:
@@ -139,6 +155,8 @@ def _parts(function: Any, seen: set[int]) -> Iterator[str]:
         inner = found if is_compiled(found) else getattr(found, "__wrapped__", found)  # primitives wrap generators
         if is_compiled(inner) or _generates(inner):
             yield from _parts(inner, seen)
+        elif isinstance(found, type) and issubclass(found, tuple):
+            yield f"{name} = {getattr(found, '_fields', ())}"
         elif isinstance(found, _CONSTANTS) or name in python.__code__.co_freevars:
             yield f"{name} = {_constant(found)}"
 
@@ -150,9 +168,8 @@ def _generates(found: Any) -> bool:
 
 def _reached(function: FunctionType, names: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
     """Names that a function refers to, and what they stand for: in its closure, its module and modules it names."""
-    code, known = function.__code__, function.__globals__
-    yield from zip(code.co_freevars, (c.cell_contents for c in function.__closure__ or ()), strict=True)
-    own = {*code.co_freevars, *code.co_varnames, *code.co_cellvars}
+    own, known = function.__code__.co_freevars, function.__globals__
+    yield from zip(own, (c.cell_contents for c in function.__closure__ or ()), strict=True)
     for name in names:
         if name in known and name not in own:
             yield name, known[name]
