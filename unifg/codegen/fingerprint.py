@@ -88,7 +88,10 @@ def _shapes(path: str, date: int, size: int) -> dict[str, Shape]:
         content = file.read()
     digest = hashlib.sha256(content).hexdigest()
     found = archived().get(digest)
-    parsed[digest] = _parsed(content) if found is None else {name: Shape(*shape) for name, shape in found.items()}
+    if found is None:
+        parsed[digest] = _parsed(content)
+    else:
+        parsed[digest] = {name: Shape(shape, tuple(mentioned)) for name, (shape, mentioned) in found.items()}
     return parsed[digest]
 
 
