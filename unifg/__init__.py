@@ -12,7 +12,6 @@ print(solution.report())
 
 from collections.abc import Callable as _Callable
 from collections.abc import Mapping as _Mapping
-from importlib import metadata as _metadata
 from pathlib import Path as _Path
 
 from unifg.codegen.jit import compiled
@@ -67,10 +66,7 @@ _HERE = _Path(__file__).resolve().parent
 if not (_HERE / "solvers" / "__init__.py").is_file() and (_HERE.parent / "solvers" / "__init__.py").is_file():
     __path__.append(str(_HERE.parent))
 
-try:
-    __version__ = _metadata.version("unifg")
-except _metadata.PackageNotFoundError:  # running from a source tree that was never installed
-    __version__ = "0.0.0"
+__version__: str
 
 __all__ = [
     "DCS",
@@ -190,6 +186,15 @@ def warmup(progress: _Callable[[float, str], object] | None = None) -> None:
     from unifg.precompile import jobs, perform
 
     perform("library", lambda: list(jobs()), progress)
+
+
+def __getattr__(name: str) -> str:
+    """Version, looked up when it is asked for."""
+    if name != "__version__":
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    from unifg.codegen.cache_folder import version
+
+    return version()
 
 
 def __dir__() -> list[str]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import os
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from threading import Event
 
@@ -36,10 +35,17 @@ def place() -> Path:
     """Path of the folder, there or not."""
     given = os.environ.get(VARIABLE)
     root = Path(given) if given else user_cache_path("unifg", appauthor=False)
+    return root / version()
+
+
+def version() -> str:
+    """Version of unifg, "0.0.0" in a source tree that was never installed."""
+    from importlib import metadata  # which loads a parser of mails
+
     try:
-        return root / version("unifg")
-    except PackageNotFoundError:
-        return root / "source"
+        return metadata.version("unifg")
+    except metadata.PackageNotFoundError:
+        return "0.0.0"
 
 
 def _refused(folder: Path) -> str:

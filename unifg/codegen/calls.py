@@ -15,7 +15,6 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 
 VECTOR = types.Array(types.float64, 1, "C")
 MATRIX = types.Array(types.float64, 2, "C")
@@ -76,6 +75,8 @@ def call_retraction(typing: Any, function: Any, point: Any, step: Any, moved: An
 
 def _view(context: Any, builder: Any, kind: Any, data: Any, shape: list[Any]) -> Any:
     """Build an array that borrows memory: no reference is counted."""
+    from numba.np.arrayobj import populate_array  # a fortieth of a second, for what is compiled alone
+
     array = cgutils.create_struct_proxy(kind)(context, builder)
     item = context.get_constant(types.intp, 8)
     strides = [item] if len(shape) == 1 else [builder.mul(item, shape[1]), item]

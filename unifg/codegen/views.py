@@ -16,7 +16,6 @@ from llvmlite import ir
 from numba import from_dtype, types
 from numba.core import cgutils
 from numba.extending import intrinsic
-from numba.np.arrayobj import populate_array
 
 from unifg.typing import IntArray
 
@@ -41,13 +40,17 @@ def opener(form: Callable[..., T], dtypes: Sequence[np.dtype[Any]]) -> Callable[
 
     def opened(typing: Any, where: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            from numba.np import arrayobj  # a fortieth of a second, for what is compiled alone
+
             data, parts = builder.inttoptr(values[0], WORD.as_pointer()), []
             for k, kind in enumerate(kinds):
                 begin, length = (builder.load(cgutils.gep(builder, data, 2 * k + j)) for j in range(2))
                 array = context.make_array(kind)(context, builder)
                 item = context.get_constant(types.intp, dtypes[k].itemsize)
                 pointer = builder.inttoptr(begin, cast(ir.PointerType, array.data.type))
-                populate_array(array, data=pointer, shape=[length], strides=[item], itemsize=item, meminfo=None)
+                arrayobj.populate_array(
+                    array, data=pointer, shape=[length], strides=[item], itemsize=item, meminfo=None
+                )
                 parts.append(array._getvalue())
             return context.make_tuple(builder, whole, parts)
 
