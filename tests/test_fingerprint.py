@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -76,6 +78,7 @@ NEUTRAL = {
 def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Folder of modules that are imported anew each time."""
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(room, "began", float("inf"))
     yield tmp_path
     _forget()
 
@@ -108,6 +111,28 @@ def test_what_computes_something_else_has_another_fingerprint(places: Path, chan
 @pytest.mark.parametrize("change", NEUTRAL)
 def test_what_computes_the_same_has_the_same(places: Path, change: str) -> None:
     assert digest(places, NEUTRAL[change]) == digest(places)
+
+
+def test_a_file_that_has_changed_since_it_was_loaded_says_nothing(
+    places: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression test: machine code of a function as it was would be kept as that of the function as it is."""
+    digest(places)
+    import entry
+
+    function, before = entry.entry, fingerprint(entry.entry)
+    monkeypatch.setattr(room, "began", time.time())
+    later = time.time() + 10.0
+    for name in ("entry.py", "callee.py"):
+        path = places / name
+        path.write_text(path.read_text(encoding="utf-8").replace("1.0", "2.0").replace("FACTOR * x", "FACTOR + x"))
+        os.utime(path, (later, later))
+    now = fingerprint(function)
+    monkeypatch.setattr(room, "began", float("inf"))
+    _forget()
+    import entry
+
+    assert fingerprint(entry.entry) not in (before, now)
 
 
 def viewed(x: Any) -> Any:

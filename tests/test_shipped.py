@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from unifg.codegen import compile_counter, jit, precompiled
+from unifg.codegen import compile_counter, fingerprint, jit, precompiled
 from unifg.codegen.compile_counter import Tally, counting
 from unifg.codegen.jit import compiled, in_order
 
@@ -45,6 +45,7 @@ def module(path: Path, source: str) -> Any:
 def forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """The module is nobody else's, and so is the cache."""
     (tmp_path / "kept").mkdir()
+    monkeypatch.setattr(fingerprint, "began", float("inf"))
     monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path / "kept")
     yield
     sys.modules.pop("doubling", None)

@@ -11,6 +11,7 @@ import ast
 import hashlib
 import json
 import os
+import time
 import zipfile
 from collections.abc import Iterator
 from functools import cache
@@ -41,6 +42,7 @@ class Shape(NamedTuple):
     names: tuple[str, ...]
 
 
+began = time.time()
 parsed: dict[str, dict[str, Shape]] = {}
 """Syntax of all files that were looked at, by their digests."""
 
@@ -73,10 +75,13 @@ def shape_of(code: CodeType) -> Shape:
 
 
 def shapes(path: str) -> dict[str, Shape]:
-    """Syntax of all functions of a file by their names and first lines; of none where it cannot be read."""
+    """Syntax of all functions of a file by their names and first lines.
+
+    Of none where it cannot be read, or has been changed since the process began: what runs may be what stood there.
+    """
     try:
         status = os.stat(path)
-        return _shapes(path, status.st_mtime_ns, status.st_size)
+        return _shapes(path, status.st_mtime_ns, status.st_size) if status.st_mtime <= began else {}
     except (OSError, SyntaxError, ValueError, TypeError):
         return {}
 
