@@ -30,6 +30,7 @@ from typing import Any
 from unifg import __version__
 from unifg.codegen import precompiled
 from unifg.codegen.cache_folder import place
+from unifg.codegen.threads import cores
 from unifg.errors import UnifgError
 from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
@@ -180,7 +181,7 @@ def _warm_up(chosen: argparse.Namespace) -> int:
             archive = warm.ship(progress)
             print(f"{archive}: {archive.stat().st_size / 1e6:.1f} MB")
             return SUCCEEDED
-        done = warm.run(progress)
+        done = warm.run(progress, processes=cores())
     parts = (len(done.compiled), "compiled"), (len(done.generated), "generated"), (len(done.read), "read")
     text = ", ".join(f"{count} functions {what}" for count, what in parts if count)
     print(f"{text or 'everything is there: found'} in {time.perf_counter() - began:.1f} s")

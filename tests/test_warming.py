@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -58,6 +60,26 @@ def test_a_cache_that_cannot_be_written_is_no_error(
     assert warmed(done, tmp_path / "kept.nbi") and warmed(done, tmp_path / "kept.nbi")
 
 
+def leave(path: Path) -> None:
+    """Leave a file with the number of the process."""
+    path.write_text(str(os.getpid()), encoding="utf-8")
+
+
+def test_where_nothing_came_precompiled_processes_compile_at_once(
+    done: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told: list[str] = []
+    works = [(name, partial(leave, tmp_path / name)) for name in ("a", "b", "c")]
+    monkeypatch.setattr(precompile, "_compile_at_once", lambda done, *_: told.extend(title for title, _ in done))
+    precompile.perform("some", lambda: list(works), anew=True, processes=2)
+    assert told == ([] if precompiled.archive().usable else ["a", "b", "c"])
+    monkeypatch.undo()
+    told.clear()
+    precompile._compile_at_once(list(works), 2, lambda share, title: told.append(title))
+    assert sorted(told) == ["a", "b", "c"]
+    assert str(os.getpid()) not in {(tmp_path / name).read_text(encoding="utf-8") for name in told}
+
+
 def test_every_job_has_a_title_and_every_mode_is_rehearsed() -> None:
     titles = [title for title, _ in precompile.jobs()]
     assert len(titles) == len(set(titles)) and all(titles)
@@ -87,7 +109,7 @@ from unifg.codegen.compile_counter import Tally
 from unifg.scenarios import command
 from unifg.scenarios.commands import warm
 
-def perform(name, works, progress, anew):
+def perform(name, works, progress, anew, processes):
     print(name, sum(title.startswith("pose graph") for title, _ in works()))
     return Tally()
 

@@ -10,9 +10,11 @@ import hashlib
 import json
 import pkgutil
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import suppress
 from functools import partial
 from importlib import import_module
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -22,7 +24,7 @@ from unifg.atomic_write import write_atomically
 from unifg.codegen.cache_folder import cache_folder
 from unifg.codegen.compile_counter import Tally, counting
 from unifg.codegen.jit import processor
-from unifg.codegen.precompiled import versions
+from unifg.codegen.precompiled import archive, versions
 from unifg.codegen.threads import cores, threads, use_threads
 from unifg.errors import UnifgError
 from unifg.factors.autodiff.stated import StatedKernel
@@ -52,7 +54,13 @@ GROUPS: tuple[LieGroup, ...] = (SE2, SE3, SE23, SO2, SO3, Rn(1), Rn(2), Rn(3), P
 LOSSES = (Huber(1.0), Cauchy(1.0), GemanMcClure(1.0), Tukey(1.0), TruncatedLeastSquares(1.0), DCS(1.0))
 
 
-def perform(name: str, works: Callable[[], list[Job]], progress: Progress | None = None, anew: bool = False) -> Tally:
+def perform(
+    name: str,
+    works: Callable[[], list[Job]],
+    progress: Progress | None = None,
+    anew: bool = False,
+    processes: int = 1,
+) -> Tally:
     """Do one job after another, unless all of it has been done before and is still there.
 
     Args:
@@ -60,6 +68,8 @@ def perform(name: str, works: Callable[[], list[Job]], progress: Progress | None
         works: titles and functions.
         progress: called with the share that is done, and what comes next.
         anew: do it again.
+        processes: that compile at once where nothing came precompiled; more than one only where ``__main__`` can be
+            imported without doing anything.
 
     Returns:
         What was compiled, generated and read.
@@ -70,6 +80,8 @@ def perform(name: str, works: Callable[[], list[Job]], progress: Progress | None
         return Tally()
     with counting() as counted:
         done = works()
+        if processes > 1 and not archive().usable:
+            _compile_at_once(done, processes, progress)
         for number, (title, job) in enumerate(done):
             if progress is not None:
                 progress(number / len(done), title)
@@ -81,6 +93,16 @@ def perform(name: str, works: Callable[[], list[Job]], progress: Progress | None
             mark.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(mark, json.dumps({"of": present, "files": sorted(set(counted.files))}))
     return counted
+
+
+def _compile_at_once(done: list[Job], processes: int, progress: Progress | None) -> None:
+    """Do all jobs in other processes, so that what they compile is there to be read."""
+    with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
+        futures = {pool.submit(job): title for title, job in done}
+        for number, future in enumerate(as_completed(futures)):
+            future.result()
+            if progress is not None:
+                progress(number / len(done), futures[future])
 
 
 def _holds(mark: Path, present: str) -> bool:

@@ -25,11 +25,11 @@ def missing() -> str:
     return ""
 
 
-def run(progress: Progress, anew: bool = False) -> Tally:
+def run(progress: Progress, anew: bool = False, processes: int = 1) -> Tally:
     """Compile what the library and its scenarios can reach, or find that it is there; no scenarios without extras."""
     if missing():
-        return perform("library", lambda: list(jobs()), progress, anew)
-    return perform("all", lambda: [*jobs(), *_scenarios()], progress, anew)
+        return perform("library", lambda: list(jobs()), progress, anew, processes)
+    return perform("all", lambda: [*jobs(), *_scenarios()], progress, anew, processes)
 
 
 def ship(progress: Progress) -> Path:
