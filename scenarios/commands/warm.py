@@ -41,9 +41,7 @@ def ship(progress: Progress) -> Path:
         ScenarioError: Numba optimises for this processor.
     """
     if numba.config.CPU_NAME != "generic":
-        raise ScenarioError(
-            "kernels that ship are for no processor: set NUMBA_CPU_NAME=generic (make kernels)"
-        )
+        raise ScenarioError("kernels that ship are for no processor: set NUMBA_CPU_NAME=generic (make kernels)")
     list(_scenarios())  # raises without the extras that they need
     with precompiled.recording() as recorder:
         run(progress, anew=True)
