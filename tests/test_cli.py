@@ -25,6 +25,7 @@ from unifg.files.tum import read_tum
 from unifg.scenarios import command
 from unifg.scenarios import navigation as navigation_scenario
 from unifg.scenarios.commands import drives
+from unifg.scenarios.commands.catalogue import SCENARIOS
 from unifg.scenarios.commands.outcome import Writer
 from unifg.scenarios.episode import run_ticks
 from unifg.scenarios.ground.drive_settings import ControllerSettings
@@ -370,8 +371,8 @@ def test_without_extras_everything_works_or_names_the_extra(tmp_path: Path) -> N
     episode(ticks=2).save(tmp_path / "drive.npz")
     works = ["--help", "solve --help", "solve p.g2o", "doctor", *(f"{name} --help" for name in command.COMMANDS)]
     extras = {"report .": "scenarios", "replay . key": "view", "mcap .": "mcap", "campaign drives.toml": "scenarios"}
-    extras |= {f"run {name}": "(view|scenarios)" for name in command.SCENARIOS}
-    helps = [f"run {name} --help" for name in command.SCENARIOS]
+    extras |= {f"run {name}": "(view|scenarios)" for name in SCENARIOS}
+    helps = [f"run {name} --help" for name in SCENARIOS]
     example = next(block for block in fences(Path(__file__).parent.parent / "README.md") if block.language == "python")
     words = [example.code, *works, *extras, *helps]
     root = str(Path(__file__).parent.parent)
