@@ -23,9 +23,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from unifg import __version__
 from unifg.codegen import precompiled
@@ -34,6 +35,7 @@ from unifg.codegen.threads import cores
 from unifg.errors import UnifgError
 from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
+from unifg.scenarios.commands.extras import absent, remedy
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.options import count, settings_of
 
@@ -52,6 +54,7 @@ class Command:
         about: a sentence for its own help.
         arguments: names and options of each, as for `argparse.ArgumentParser.add_argument`.
         exclusive: of these arguments at most one may be given.
+        extras: that it needs.
     """
 
     does: Callable[[argparse.Namespace], int]
@@ -59,13 +62,14 @@ class Command:
     about: str
     arguments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     exclusive: tuple[str, ...] = ()
+    extras: tuple[str, ...] = ()
 
     def add(self, parser: argparse.ArgumentParser) -> None:
         """Add the arguments."""
         group = parser.add_mutually_exclusive_group() if self.exclusive else parser
         for name, options in self.arguments.items():
             (group if name in self.exclusive else parser).add_argument(name, **options)
-        parser.set_defaults(does=self.does)
+        parser.set_defaults(does=self.does, extras=self.extras, parser=parser)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -76,16 +80,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        chosen = _parser(arguments).parse_args(arguments)
-    except ModuleNotFoundError as error:  # of the scenario that is named
-        return _refuse(f"scenarios need {error.name}: pip install 'unifg[scenarios]'")
-    except SystemExit as stop:  # argparse has said what is wrong, or has printed help
-        return stop.code if isinstance(stop.code, int) else REFUSED
-    try:
+        chosen, unknown = _parser(arguments).parse_known_args(arguments)
+        if unknown:
+            chosen.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
+        if lacking := absent(*chosen.extras):
+            return _refuse(str(remedy(lacking)))
         does: Callable[[argparse.Namespace], int] = chosen.does
         return does(chosen)
+    except SystemExit as stop:  # argparse has said what is wrong, or has printed help
+        return stop.code if isinstance(stop.code, int) else REFUSED
     except UnifgError as error:
         return _refuse(str(error))
+    except ImportError as error:
+        said = str(error) if isinstance(error.__cause__, ImportError) else remedy(error.name)
+        if said is None:
+            raise
+        return _refuse(said)
     except OSError as error:
         return _refuse(f"{error.filename}: cannot be written ({error.strerror})")
     except KeyboardInterrupt:
@@ -102,11 +112,11 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     scenarios = run.add_subparsers(title="scenarios", required=True, metavar="SCENARIO")
     for name, scenario in SCENARIOS.items():
         one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary)
-        one.set_defaults(name=name, does=_run)
+        one.set_defaults(name=name, does=_run, extras=("view",), parser=one)  # pictures are wanted at the end
         if list(words[:2]) == ["run", name]:
             scenario.add_options(one)
     solve = commands.add_parser("solve", help="solve a pose graph", description=SOLVE.summary)
-    solve.set_defaults(name="solve", does=_run)
+    solve.set_defaults(name="solve", does=_run, extras=(), parser=solve)
     if list(words[:1]) == ["solve"]:
         SOLVE.add_options(solve)
     for name, entry in COMMANDS.items():
@@ -159,10 +169,7 @@ def _mcap(chosen: argparse.Namespace) -> int:
     stored: Path = chosen.folder / "drive.npz" if chosen.folder.is_dir() else chosen.folder
     out: Path = chosen.out or stored.with_suffix(".mcap")
     log = EpisodeLog.load(stored)
-    try:
-        write_mcap(out, log)
-    except ImportError as error:
-        return _refuse(str(error))
+    write_mcap(out, log)
     print(legible(out))
     return SUCCEEDED
 
@@ -244,12 +251,14 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
         folder.mkdir(parents=True, exist_ok=True)  # better refused now than after the run
     except OSError as error:
         return _refuse(f"--out {folder}: cannot make this folder ({error.strerror})")
-    with _progress_bar(name) as progress:
+    with _interrupts() as told:
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
-        outcome: Outcome = module.run(settings, progress, **watched)
+        with _bar(name) as show:
+            outcome: Outcome = module.run(settings, told(show), **watched)
         try:
             # each file is written whole, also after a signal
-            files = outcome.write(folder)
+            with _bar("writing", interval=0.0) as show:
+                files = outcome.write(folder, show)
         except OSError as error:
             return _refuse(f"--out {folder}: cannot write the results ({error})")
         except KeyboardInterrupt:
@@ -266,13 +275,22 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
 
 @contextmanager
 def _progress_bar(name: str, begun: bool = False) -> Iterator[Progress]:
-    """A bar on stderr; the first control-C or SIGTERM waits for the end of a tick, so that the record stays whole.
+    """A bar whose run may be interrupted, see :func:`_interrupts`."""
+    with _interrupts(begun) as told, _bar(name) as show:
+        yield told(show)
+
+
+@contextmanager
+def _interrupts(begun: bool = False) -> Iterator[Callable[[Progress], Progress]]:
+    """The first control-C or SIGTERM waits for the end of a tick, so that the record stays whole.
 
     Before the first tick there is no record, and nothing to wait for; after the last one the results are written first.
 
     Args:
-        name: beside the bar.
         begun: whether there is something to keep from the beginning.
+
+    Yields:
+        Maker of a progress that ends the run after a signal, from one that shows it.
     """
     wanted = False
 
@@ -283,8 +301,7 @@ def _progress_bar(name: str, begun: bool = False) -> Iterator[Progress]:
         if at_once:
             raise KeyboardInterrupt
 
-    with _bar(name) as show:
-
+    def told(show: Progress) -> Progress:
         def progress(done: float, text: str) -> None:
             nonlocal wanted, begun
             show(done, text)
@@ -293,28 +310,38 @@ def _progress_bar(name: str, begun: bool = False) -> Iterator[Progress]:
                 wanted = False
                 raise KeyboardInterrupt
 
-        try:
-            before = [(stop, signal.signal(stop, interrupt)) for stop in (signal.SIGINT, signal.SIGTERM)]
-        except ValueError:  # not in the main thread, where no interrupt arrives either
-            yield progress
-            return
-        try:
-            yield progress
-        finally:
-            for stop, handler in before:
-                signal.signal(stop, handler)
+        return progress
+
+    try:
+        before = [(stop, signal.signal(stop, interrupt)) for stop in (signal.SIGINT, signal.SIGTERM)]
+    except ValueError:  # not in the main thread, where no interrupt arrives either
+        yield told
+        return
+    try:
+        yield told
+    finally:
+        for stop, handler in before:
+            signal.signal(stop, handler)
 
 
 @contextmanager
-def _bar(name: str) -> Iterator[Progress]:
-    """Progress bar; nothing is drawn where tqdm is not installed."""
-    try:
-        from tqdm import tqdm
-    except ImportError:
+def _bar(name: str, interval: float = 0.1) -> Iterator[Progress]:
+    """Progress bar on a terminal; elsewhere, and where tqdm is not installed, one line at the end.
+
+    Args:
+        name: beside the bar.
+        interval: least time between two changes of it [s].
+    """
+    if not sys.stderr.isatty() or find_spec("tqdm") is None:
+        began = time.monotonic()
         yield lambda done, text: None
+        print(f"{name}: done in {time.monotonic() - began:.1f} s", file=sys.stderr)
         return
+    from tqdm import tqdm
+
     layout = "{desc} {percentage:3.0f}%|{bar}| {elapsed} {postfix}"
-    with tqdm(total=1.0, desc=name, bar_format=layout, file=sys.stderr) as bar:
+    settings = {"bar_format": layout, "mininterval": interval, "miniters": 0.0}
+    with tqdm(total=1.0, desc=name, file=sys.stderr, **settings) as bar:
 
         def show(done: float, text: str) -> None:
             bar.set_postfix_str(text, refresh=False)
@@ -334,11 +361,16 @@ def _refuse(message: str) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that takes ``-2,-0.5,0`` for a value, as the standard one takes ``-2``."""
+    """Parser that takes ``-2,-0.5,0`` for a value, as the standard one takes ``-2``; an error takes two lines."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, **options)
         self._negative_number_matcher = re.compile(r"-[\d.]")
+
+    def error(self, message: str) -> NoReturn:
+        """Report an error first, then the usage without the options, in a line."""
+        usage = re.sub(r"\[.*\]", "[options]", " ".join(self.format_usage().split()))
+        self.exit(REFUSED, f"{self.prog}: error: {message}\n{usage} (options: {self.prog} --help)\n")
 
 
 _ANY_CODE = {"action": "store_true", "help": "episodes that other states of the code have run count, too"}
@@ -414,6 +446,7 @@ COMMANDS = {
             "--out": {"type": Path, "metavar": "DIR2", "help": "folder for results (default: DIR/replay/KEY)"},
             "--live": _LIVE,
         },
+        extras=("view",),
     ),
     "mcap": Command(
         _mcap, "export a drive",

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from episodes import episode, room
+from fences import fences
 from unifg import __version__
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
@@ -24,6 +25,8 @@ from unifg.files.tum import read_tum
 from unifg.scenarios import command
 from unifg.scenarios import navigation as navigation_scenario
 from unifg.scenarios.commands import drives
+from unifg.scenarios.commands.catalogue import SCENARIOS
+from unifg.scenarios.commands.outcome import Writer
 from unifg.scenarios.episode import run_ticks
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.logs.drive_log import EpisodeLog
@@ -60,7 +63,7 @@ def navigation(monkeypatch: pytest.MonkeyPatch) -> FakeNavigation:
 @pytest.fixture
 def no_files(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare tests that look at settings alone the drawing of pictures."""
-    monkeypatch.setattr(drives, "write_results", lambda folder, log: [])
+    monkeypatch.setattr(drives, "results", lambda log: {})
 
 
 def run(tmp_path: Path, *words: str) -> int:
@@ -78,11 +81,21 @@ def test_writes_every_file_and_names_it(
         assert str(file) in said.out.splitlines()
     for words in ("goals reached", "1 of 1", "collisions", "localisation error", "median"):
         assert words in said.out
-    assert "100%" in said.err and "100%" not in said.out  # the bar stays out of pipes
+    assert re.fullmatch(r"navigation: done in [\d.]+ s\nwriting: done in [\d.]+ s\n", said.err)
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["steps"] == 5
     truth, estimate = (read_tum(tmp_path / "out" / name).planar() for name in FILES if name.endswith(".tum"))
     np.testing.assert_allclose(truth, navigation.log.true_pose, atol=1e-8)
     np.testing.assert_allclose(estimate, navigation.log.estimate, atol=1e-8)
+
+
+def test_bars_are_drawn_on_a_terminal(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    assert run(tmp_path) == 0
+    said = capsys.readouterr()
+    assert re.search(r"navigation 100%\|.*done", said.err) and "100%" not in said.out
+    assert "overview.png" in said.err and re.search(r"writing 100%\|.*done", said.err)
 
 
 @pytest.mark.usefixtures("no_files")
@@ -151,7 +164,9 @@ def test_bad_arguments_exit_2(
     navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], message: str
 ) -> None:
     assert run(tmp_path, *words) == 2
-    assert re.search(message, capsys.readouterr().err)
+    error, usage = capsys.readouterr().err.splitlines()
+    assert re.search(rf"^unifg run navigation: error: .*{message}", error)
+    assert usage == "usage: unifg run navigation [options] (options: unifg run navigation --help)"
     assert navigation.settings == []
 
 
@@ -241,7 +256,7 @@ def test_an_end_asked_for_at_any_moment_loses_nothing(
     Python prints and drops what is raised in finalisers, also the interrupt; the first tick is then the last.
     """
     ticks: list[int] = []
-    written = drives.write_results
+    written = drives.results
 
     def ask(moment: str) -> None:
         if when == moment:
@@ -258,13 +273,12 @@ def test_an_end_asked_for_at_any_moment_loses_nothing(
             ask("swallowed")
         return replace(navigation.log, interrupted=run_ticks(10, tick, progress))
 
-    def write(folder: Path, log: EpisodeLog) -> list[Path]:
-        ask("while writing")
-        return written(folder, log)
+    def results(log: EpisodeLog) -> dict[str, Writer]:
+        return {"note": lambda path: ask("while writing"), **written(log)}
 
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(navigation_scenario, "run_navigation", loop)
-    monkeypatch.setattr(drives, "write_results", write)
+    monkeypatch.setattr(drives, "results", results)
     assert run(tmp_path) == status
     assert len(ticks) == count
     assert (tmp_path / "out" / "scene.html").exists() is (when != "before")
@@ -334,6 +348,46 @@ def test_help_loads_the_scenario_it_speaks_of_and_no_other(words: list[str], abs
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.startswith(f"usage: unifg {' '.join(words[:-1])}".rstrip())
+
+
+BARE = """
+import contextlib, io, json, sys
+for name in ("matplotlib", "mcap", "meshcat", "pandas", "PIL", "pymunk", "tqdm", "yaml", "distributed"):
+    sys.modules[name] = None
+from unifg.scenarios.command import main
+example, *commands = sys.argv[1:]
+exec(example, {})
+for words in commands:
+    with contextlib.redirect_stderr(io.StringIO()) as said, contextlib.redirect_stdout(io.StringIO()):
+        status = main(words.split())
+    print(json.dumps([words, status, said.getvalue()]))
+"""
+
+
+def test_without_extras_everything_works_or_names_the_extra(tmp_path: Path) -> None:
+    """Plain ``pip install .``: README's first example, every help, and every command."""
+    (tmp_path / "p.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 1 1 0 0 1 0 1\n")
+    (tmp_path / "drives.toml").write_text('scenario = "navigation"\nseeds = 1\n')
+    episode(ticks=2).save(tmp_path / "drive.npz")
+    works = ["--help", "solve --help", "solve p.g2o", "doctor", *(f"{name} --help" for name in command.COMMANDS)]
+    extras = {"report .": "scenarios", "replay . key": "view", "mcap .": "mcap", "campaign drives.toml": "scenarios"}
+    extras |= {f"run {name}": "(view|scenarios)" for name in SCENARIOS}
+    helps = [f"run {name} --help" for name in SCENARIOS]
+    example = next(block for block in fences(Path(__file__).parent.parent / "README.md") if block.language == "python")
+    words = [example.code, *works, *extras, *helps]
+    root = str(Path(__file__).parent.parent)
+    done = subprocess.run(
+        [sys.executable, "-c", BARE, *words], capture_output=True, text=True, cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": root}, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    example_said, *lines = done.stdout.splitlines()
+    assert "The KKT conditions of the problem hold" in example_said
+    for asked, status, said in map(json.loads, lines):
+        extra = extras.get(asked, "scenarios")
+        refused = re.search(rf"^unifg: error: .* need.* pip install 'unifg\[{extra}\]'$", said) is not None
+        assert status == (2 if refused else 0), (asked, said)
+        assert refused is (asked in extras) or asked in helps, (asked, said)
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,7 @@ def test_what_is_missing_is_named_with_what_it_is_for(monkeypatch: pytest.Monkey
     monkeypatch.setattr("unifg.scenarios.commands.doctor.find_spec", spec)
     found = list(doctor._versions())
     assert said(found, False) == ["missing: osqp; install unifg again"]
-    assert "pymunk is not installed; it is for driving scenarios: unifg[scenarios]" in said(found, None)
+    assert "pymunk is not installed; it is for simulated worlds: unifg[scenarios]" in said(found, None)
 
 
 def test_threads_that_wait_for_each_other_are_mentioned(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -401,7 +401,7 @@ def test_the_exit_status_says_whether_it_arrived(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, collisions: int, status: int
 ) -> None:
     only_a_moment(monkeypatch, lambda log: replace(log, reached=True, collisions=collisions))
-    monkeypatch.setattr(results, "write_results", lambda folder, log: [])
+    monkeypatch.setattr(results, "results", lambda log, metrics: {})
     assert command.main(["run", "quadrotor-mpc", "--seed", str(SEED), "--out", str(tmp_path)]) == status
 
 

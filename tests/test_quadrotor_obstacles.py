@@ -218,7 +218,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_the_command_line_reports_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from unifg.scenarios.commands import courses
 
-    monkeypatch.setattr(courses, "write_results", lambda folder, course: [])
+    monkeypatch.setattr(courses, "results", lambda course: {})
     words = ["run", "quadrotor-obstacles", "--avoidance", "hard", "--guess", "hover", "--out", str(tmp_path)]
     assert command.main(words) == 1
 

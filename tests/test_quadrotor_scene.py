@@ -14,7 +14,9 @@ from scenes import check_offline, commands_of, data_of, tracks_of, without_viewe
 from unifg.errors import ScenarioError, ViewError
 from unifg.lie import SO3
 from unifg.scenarios.commands import flights as results
-from unifg.scenarios.commands.flights import summary, write_results
+from unifg.scenarios.commands.flights import summary
+from unifg.scenarios.commands.outcome import Outcome
+from unifg.scenarios.episode import silent
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.logs.flight_metrics import flight_metrics, landmark_errors
@@ -367,10 +369,14 @@ def test_estimates_and_controls_show_what_there_is(log: FlightLog) -> None:
     assert len([ax for part in control(flight(estimated=False)).subfigs for ax in part.axes]) == 7
 
 
+def written(folder: Path, log: FlightLog, metrics: dict[str, Any]) -> list[Path]:
+    return Outcome(True, False, "", metrics, results.results(log, metrics)).write(folder, silent)
+
+
 def test_results_leave_files_that_can_be_read_again(log: FlightLog, tmp_path: Path) -> None:
-    written = write_results(tmp_path, log)
-    names = ["scene.html", "overview.png", "estimates.png", "control.png", "metrics.json", "flight.npz"]
-    assert [path.name for path in written] == names and all(path.stat().st_size > 0 for path in written)
+    files = written(tmp_path, log, flight_metrics(log))
+    names = ["scene.html", "control.png", "estimates.png", "overview.png", "flight.npz", "metrics.json"]
+    assert [path.name for path in files] == names and all(path.stat().st_size > 0 for path in files)
     assert json.loads((tmp_path / "metrics.json").read_text())["position_error_m"]["rms"] == pytest.approx(0.05)
     assert flight_metrics(FlightLog.load(tmp_path / "flight.npz")) == flight_metrics(log)
     table = summary(log)
@@ -381,7 +387,7 @@ def test_results_of_a_flight_without_estimate(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(results, "write_figure", lambda path, figure, dpi: path)
     monkeypatch.setattr(results, "flight_scene", lambda log: SimpleNamespace(save=lambda path: path))
     plain = flight(estimated=False)
-    names = [path.name for path in write_results(tmp_path, plain, {"own": 1})]
-    assert names == ["scene.html", "overview.png", "control.png", "metrics.json", "flight.npz"]
+    names = [path.name for path in written(tmp_path, plain, {"own": 1})]
+    assert names == ["scene.html", "control.png", "overview.png", "flight.npz", "metrics.json"]
     assert json.loads((tmp_path / "metrics.json").read_text()) == {"own": 1}
     assert "position error" not in summary(plain) and "mass error" not in summary(plain)

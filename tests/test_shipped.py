@@ -7,6 +7,7 @@ import importlib.util
 import logging
 import lzma
 import re
+import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
@@ -170,6 +171,34 @@ def twice(n):
     with counting() as counted, pytest.raises(ValueError, match="arrays of other sizes"):
         function(-1)
     assert (counted.compiled, counted.generated) == ([], ["doubling.twice"])
+
+
+FIRST = """
+import importlib.util, sys
+from pathlib import Path
+from unifg.codegen import jit, precompiled
+from unifg.codegen.compile_counter import counting
+
+precompiled.ARCHIVE, source = map(Path, sys.argv[1:])
+jit.cache_folder = lambda: None
+spec = importlib.util.spec_from_file_location("unifg.doubling", source)
+module = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+with counting() as counted:
+    assert jit.compiled(module.first)((3.0, 1.0)) == 3.0
+assert (counted.compiled, counted.generated) == ([], ["unifg.doubling.first"]), counted
+"""
+
+
+def test_the_first_function_of_a_process_can_be_generated(archive: Path, tmp_path: Path) -> None:
+    """Nothing has been compiled there that would have loaded Numba's rules for tuples."""
+    source = "def first(pair):\n    return pair[0] + 0.0\n"
+    with precompiled.recording() as recorder:
+        compiled(module(tmp_path / "there" / "doubling.py", source).first)((3.0, 1.0))
+    recorder.write(archive)
+    command = [sys.executable, "-c", FIRST, str(archive), str(tmp_path / "there" / "doubling.py")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(

@@ -255,7 +255,7 @@ def test_command_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[
         assert str(tmp_path / name) in said.out.splitlines()
         largest = 2_000_000 if name.endswith("html") else 250_000  # a scene carries its viewer
         assert 0 < (tmp_path / name).stat().st_size < largest
-    assert "cost J (without 1/2)" in said.out and "100%" in said.err and "100%" not in said.out
+    assert "cost J (without 1/2)" in said.out and "done in" in said.err and "done in" not in said.out
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert {**found, "solve_ms": 0.0} == {**metrics(solved("kkt")), "solve_ms": 0.0}
     assert (found["solver"], found["length"], found["drag"], found["force_bounds_n"]) == ("kkt", 60, "quadratic", None)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from unifg.scenarios import course as courses
-from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.course import Course
 from unifg.scenarios.logs.metrics import of_solution, table, write_metrics
@@ -19,7 +18,7 @@ from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.solution.status import Status
 from unifg.style.figures import write_figure
 
-__all__ = ["SETTINGS", "course_metrics", "run", "summary", "write_results"]
+__all__ = ["SETTINGS", "course_metrics", "results", "run", "summary"]
 
 SETTINGS = courses.CourseSettings
 
@@ -34,9 +33,7 @@ def run(settings: courses.CourseSettings, progress: Progress, announce: Announce
     progress(1.0, "solved")
     interrupted = course.solution.status is Status.INTERRUPTED
     numbers = course_metrics(course)
-    return Outcome(
-        course.succeeded, interrupted, summary(course), numbers, lambda folder: write_results(folder, course)
-    )
+    return Outcome(course.succeeded, interrupted, summary(course), numbers, results(course))
 
 
 def course_metrics(course: Course) -> dict[str, Any]:
@@ -76,20 +73,13 @@ def course_metrics(course: Course) -> dict[str, Any]:
     }
 
 
-def write_results(folder: str | Path, course: Course) -> list[Path]:
-    """Write numbers, picture and scene of a flight.
-
-    Args:
-        folder: existing folder; files of the same names are replaced.
-        course: with its iterates.
-
-    Returns:
-        The files written: ``scene.html``, ``iterates.png`` and ``metrics.json``.
-    """
-    folder = Path(folder)
-    numbers = write_metrics(folder / "metrics.json", course_metrics(course))
-    shown = write_figure(folder / "iterates.png", picture(course), 90)
-    return [flight_scene(course_log(course)).save(folder / "scene.html"), shown, numbers]
+def results(course: Course) -> dict[str, Writer]:
+    """Results of a flight with its iterates: numbers, a picture and a scene."""
+    return {
+        "metrics.json": lambda path: write_metrics(path, course_metrics(course)),
+        "iterates.png": lambda path: write_figure(path, picture(course), 90),
+        "scene.html": lambda path: flight_scene(course_log(course)).save(path),
+    }
 
 
 def summary(course: Course) -> str:

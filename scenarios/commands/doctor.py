@@ -25,23 +25,13 @@ from unifg.codegen.objects import read_sealed
 from unifg.codegen.threads import cores
 from unifg.errors import UnifgError
 from unifg.scenarios.commands import performance
+from unifg.scenarios.commands.extras import PACKAGES
 from unifg.scenarios.commands.outcome import Progress
 from unifg.scenarios.workers import THREADS
 
 __all__ = ["Finding", "examined"]
 
 NEEDED = ("numpy", "scipy", "numba", "llvmlite", "osqp", "piqp", "qpsolvers")
-OPTIONAL = {  # package: what imports it, and what it is for
-    "matplotlib": ("matplotlib", "pictures: unifg[view]"),
-    "meshcat": ("meshcat", "scenes: unifg[view]"),
-    "pandas": ("pandas", "reports of campaigns: unifg[scenarios]"),
-    "pymunk": ("pymunk", "driving scenarios: unifg[scenarios]"),
-    "pillow": ("PIL", "maps and scenarios: unifg[scenarios]"),
-    "pyyaml": ("yaml", "ROS maps: unifg[scenarios]"),
-    "tqdm": ("tqdm", "progress: unifg[scenarios]"),
-    "casadi": ("casadi", "fg.from_casadi: unifg[casadi]"),
-    "distributed": ("distributed", "campaigns on clusters: unifg[campaign]"),
-}
 CORRECT = 1e-5  # of a cost, relative to max(1, cost)
 SECONDS = 2.0  # given to reading the cache
 REPEATS = 7
@@ -84,12 +74,12 @@ def _versions() -> Iterator[Finding]:
     yield Finding("versions", ", ".join(f"{name} {_version(name)}" for name in NEEDED if name not in missing))
     if missing:
         yield Finding("versions", f"missing: {', '.join(missing)}; install unifg again", good=False)
-    there = [name for name, (module, _) in OPTIONAL.items() if find_spec(module) is not None]
+    there = [one.name for module, one in PACKAGES.items() if find_spec(module) is not None]
     if there:
         yield Finding("versions", ", ".join(f"{name} {_version(name)}" for name in there))
-    for name, (_, purpose) in OPTIONAL.items():
+    for name, extra, purpose in PACKAGES.values():
         if name not in there:
-            yield Finding("versions", f"{name} is not installed; it is for {purpose}", good=None)
+            yield Finding("versions", f"{name} is not installed; it is for {purpose}: unifg[{extra}]", good=None)
 
 
 def _version(package: str) -> str | None:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from unifg.files.tum import write_tum
 from unifg.scenarios import navigation
-from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
@@ -15,7 +13,7 @@ from unifg.scenarios.scenes.drive_plot import overview
 from unifg.scenarios.scenes.drive_scene import drive_frame, drive_scene, drive_stage
 from unifg.style.figures import write_figure
 
-__all__ = ["SETTINGS", "run", "summary", "write_results"]
+__all__ = ["SETTINGS", "results", "run", "summary"]
 
 SETTINGS = navigation.NavigationSettings
 
@@ -32,32 +30,22 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
     if log.ticks == 0:
         raise KeyboardInterrupt
     numbers = episode_metrics(log)
-    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, lambda folder: write_results(folder, log))
+    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log))
 
 
-def write_results(folder: Path, log: EpisodeLog) -> list[Path]:
-    """Write scene, picture, metrics, log and both trajectories of an episode.
+def results(log: EpisodeLog) -> dict[str, Writer]:
+    """Results of an episode of at least one tick: numbers, both trajectories, the log, a picture and a scene.
 
-    Args:
-        folder: existing folder; files of the same names are replaced.
-        log: an episode of at least one tick.
-
-    Returns:
-        The files written: ``scene.html``, ``overview.png``, ``metrics.json``, ``trajectory.tum`` (the truth),
-        ``estimate.tum`` and ``drive.npz``, which `EpisodeLog.load` reads.
-
-    Raises:
-        ViewError: the episode has no tick.
+    ``trajectory.tum`` is the truth, `EpisodeLog.load` reads ``drive.npz``.
     """
-    # The cheapest and most precious first, in case the user loses patience.
-    metrics = write_metrics(folder / "metrics.json", episode_metrics(log))
-    trajectory = write_tum(folder / "trajectory.tum", log.time, log.true_pose)
-    estimate = write_tum(folder / "estimate.tum", log.time, log.estimate)
-    stored = folder / "drive.npz"
-    log.save(stored)
-    picture = write_figure(folder / "overview.png", overview(log), 130)
-    scene = drive_scene(log).save(folder / "scene.html")
-    return [scene, picture, metrics, trajectory, estimate, stored]
+    return {
+        "metrics.json": lambda path: write_metrics(path, episode_metrics(log)),
+        "trajectory.tum": lambda path: write_tum(path, log.time, log.true_pose),
+        "estimate.tum": lambda path: write_tum(path, log.time, log.estimate),
+        "drive.npz": log.save,
+        "overview.png": lambda path: write_figure(path, overview(log), 130),
+        "scene.html": lambda path: drive_scene(log).save(path),
+    }
 
 
 def summary(log: EpisodeLog) -> str:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 from unifg.scenarios import flight
-from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
@@ -15,7 +14,7 @@ from unifg.scenarios.scenes.flight_plot import control, estimates, overview
 from unifg.scenarios.scenes.flight_scene import flight_frame, flight_scene, flight_stage
 from unifg.style.figures import write_figure
 
-__all__ = ["SETTINGS", "run", "summary", "write_results"]
+__all__ = ["SETTINGS", "results", "run", "summary"]
 
 SETTINGS = flight.FlightSettings
 
@@ -32,34 +31,26 @@ def run(settings: flight.FlightSettings, progress: Progress, announce: Announce 
     if log.ticks == 0:
         raise KeyboardInterrupt
     numbers = flight_metrics(log)
-    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, lambda folder: write_results(folder, log))
+    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log, numbers))
 
 
-def write_results(folder: str | Path, log: FlightLog, metrics: Mapping[str, object] | None = None) -> list[Path]:
-    """Write log, metrics, pictures and scene of a flight.
+def results(log: FlightLog, metrics: Mapping[str, object]) -> dict[str, Writer]:
+    """Results of a flight of at least one tick: numbers, log, pictures and scene; `FlightLog.load` reads the log.
 
     Args:
-        folder: existing folder; files of the same names are replaced.
-        log: a flight of at least one tick.
-        metrics: what to write as metrics; None for `flight_metrics`.
-
-    Returns:
-        The files written: ``scene.html``, ``overview.png``, ``estimates.png`` (of a flight with an estimate),
-        ``control.png``, ``metrics.json`` and ``flight.npz``, which `FlightLog.load` reads.
-
-    Raises:
-        ViewError: the flight has no tick, or meshcat is not installed.
+        log: a flight; one without an estimate has no picture of it.
+        metrics: what to write as metrics.
     """
-    folder = Path(folder)
-    # The cheapest and most precious first, in case the user loses patience.
-    numbers = write_metrics(folder / "metrics.json", flight_metrics(log) if metrics is None else metrics)
-    stored = folder / "flight.npz"
-    log.save(stored)
-    pictures = [write_figure(folder / "overview.png", overview(log), 130)]
+    files: dict[str, Writer] = {
+        "metrics.json": lambda path: write_metrics(path, metrics),
+        "flight.npz": log.save,
+        "overview.png": lambda path: write_figure(path, overview(log), 130),
+    }
     if has_estimate(log):
-        pictures.append(write_figure(folder / "estimates.png", estimates(log), 120))
-    pictures.append(write_figure(folder / "control.png", control(log), 120))
-    return [flight_scene(log).save(folder / "scene.html"), *pictures, numbers, stored]
+        files["estimates.png"] = lambda path: write_figure(path, estimates(log), 120)
+    files["control.png"] = lambda path: write_figure(path, control(log), 120)
+    files["scene.html"] = lambda path: flight_scene(log).save(path)
+    return files
 
 
 def summary(log: FlightLog) -> str:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +12,13 @@ from unifg.files.g2o import write_g2o
 from unifg.files.tum import write_tum
 from unifg.pose_graphs.certificate import Certificate
 from unifg.scenarios import pose_graph
-from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.commands.extras import absent, remedy
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.logs.metrics import table, write_metrics
 from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.solution.fit import FAR
 
-__all__ = ["SETTINGS", "metrics", "run", "summary", "write_results"]
+__all__ = ["SETTINGS", "metrics", "results", "run", "summary"]
 
 SETTINGS = pose_graph.SolveSettings
 
@@ -35,38 +34,33 @@ def run(settings: pose_graph.SolveSettings, progress: Progress) -> Outcome:
         solved.interrupted,
         summary(solved),
         numbers,
-        lambda folder: write_results(folder, solved),
+        results(solved),
     )
 
 
-def write_results(folder: Path, solved: SolvedGraph) -> list[Path]:
-    """Write solution, trajectory, numbers, picture and scene.
+def results(solved: SolvedGraph) -> dict[str, Writer]:
+    """Results of a solve: graph, trajectory (the positions in the file as times), numbers, a picture and a scene.
 
-    Args:
-        folder: existing folder; files of the same names are replaced.
-        solved: a solved pose graph.
-
-    Returns:
-        The files written: ``graph.g2o``, ``trajectory.tum`` (the positions in the file as times), ``metrics.json``
-        and, unless they were not wanted or what draws is not installed, ``graph.png`` and ``scene.html``.
+    The last two are left out where they are not wanted, or what draws them is not installed.
     """
-    graph = write_g2o(folder / "graph.g2o", solved.after)
     poses = solved.after.poses
-    trajectory = write_tum(folder / "trajectory.tum", np.arange(len(poses), dtype=np.float64), poses)
-    numbers = write_metrics(folder / "metrics.json", metrics(solved))
+    files: dict[str, Writer] = {
+        "metrics.json": lambda path: write_metrics(path, metrics(solved)),
+        "trajectory.tum": lambda path: write_tum(path, np.arange(len(poses), dtype=np.float64), poses),
+        "graph.g2o": lambda path: write_g2o(path, solved.after),
+    }
     if solved.settings.no_scene:
-        return [graph, trajectory, numbers]
-    absent = [name for name in ("matplotlib", "meshcat") if find_spec(name) is None]
-    if absent:  # numbers need nothing but the library
-        logger.warning("no picture and no scene: they need %s: pip install 'unifg[view]'", absent[0])
-        return [graph, trajectory, numbers]
+        return files
+    if lacking := absent("view"):  # numbers need nothing but the library
+        logger.warning("no picture and no scene: %s", remedy(lacking))
+        return files
     from unifg.scenarios.scenes.graph_plot import picture
     from unifg.scenarios.scenes.graph_scene import graph_scene
     from unifg.style.figures import write_figure
 
-    shown = write_figure(folder / "graph.png", picture(solved), 130)
-    scene = graph_scene(solved).save(folder / "scene.html")
-    return [scene, shown, graph, trajectory, numbers]
+    files["graph.png"] = lambda path: write_figure(path, picture(solved), 130)
+    files["scene.html"] = lambda path: graph_scene(solved).save(path)
+    return files
 
 
 def metrics(solved: SolvedGraph) -> dict[str, Any]:

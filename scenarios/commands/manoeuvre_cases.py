@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from unifg.scenarios import manoeuvres
-from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.logs.metrics import write_metrics
 from unifg.scenarios.options import option
@@ -55,9 +54,8 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
 
     numbers = manoeuvres.metrics_of(solved)
 
-    def write(folder: Path) -> list[Path]:
-        written = write_metrics(folder / "metrics.json", numbers)
-        scenes = [manoeuvre_scene(m).save(folder / f"{m.case.name}.html") for m in solved]
-        return [*scenes, *(write_figure(folder / f"{m.case.name}.png", picture(m), 105) for m in solved), written]
-
-    return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), numbers, write)
+    files: dict[str, Writer] = {"metrics.json": lambda path: write_metrics(path, numbers)}
+    for one in solved:
+        files[f"{one.case.name}.png"] = lambda path, one=one: write_figure(path, picture(one), 105)
+        files[f"{one.case.name}.html"] = lambda path, one=one: manoeuvre_scene(one).save(path)
+    return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), numbers, files)

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from unifg.scenarios.episode import Progress
 from unifg.solution.history import Iteration
 
-__all__ = ["Outcome", "Progress", "by_iterations"]
+__all__ = ["Outcome", "Progress", "Writer", "by_iterations"]
+
+Writer: TypeAlias = Callable[[Path], object]
+"""Writes a file of this path."""
 
 
 @dataclass(frozen=True)
@@ -22,14 +25,27 @@ class Outcome:
         interrupted: whether the user stopped it.
         summary: table for people.
         metrics: numbers and words for programs, as ``metrics.json`` holds them.
-        write: writes the results into an existing folder and returns the files.
+        files: results by file name, in the order they are written: the cheapest and most precious first, in case the
+            user loses patience.
     """
 
     succeeded: bool
     interrupted: bool
     summary: str
     metrics: Mapping[str, Any]
-    write: Callable[[Path], list[Path]]
+    files: dict[str, Writer]
+
+    def write(self, folder: Path, progress: Progress) -> list[Path]:
+        """Write the results into an existing folder, where files of the same names are replaced.
+
+        Returns:
+            The files, what was written last first.
+        """
+        for number, (name, write) in enumerate(self.files.items()):
+            progress(number / len(self.files), name)
+            write(folder / name)
+        progress(1.0, "done")
+        return [folder / name for name in reversed(self.files)]
 
 
 def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], str]) -> Callable[[Iteration], None]:

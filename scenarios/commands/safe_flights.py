@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from unifg.scenarios import safe_flight
-from unifg.scenarios.commands.outcome import Outcome, Progress
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.metrics import table, write_metrics
 from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
@@ -15,7 +14,7 @@ from unifg.scenarios.scenes.safe_plot import picture
 from unifg.scenarios.scenes.safe_scene import safe_frame, safe_scene, safe_stage
 from unifg.style.figures import write_figure
 
-__all__ = ["SETTINGS", "run", "safe_numbers", "summary", "write_results"]
+__all__ = ["SETTINGS", "results", "run", "safe_numbers", "summary"]
 
 SETTINGS = safe_flight.SafeSettings
 
@@ -32,9 +31,7 @@ def run(settings: safe_flight.SafeSettings, progress: Progress, announce: Announ
     if not logs:
         raise KeyboardInterrupt
     succeeded = all(log.succeeded for log in logs)
-    return Outcome(
-        succeeded, logs[-1].interrupted, summary(logs), safe_numbers(logs), lambda folder: write_results(folder, logs)
-    )
+    return Outcome(succeeded, logs[-1].interrupted, summary(logs), safe_numbers(logs), results(logs))
 
 
 def safe_numbers(logs: Sequence[SafeLog]) -> dict[str, Any]:
@@ -47,20 +44,13 @@ def safe_numbers(logs: Sequence[SafeLog]) -> dict[str, Any]:
     }
 
 
-def write_results(folder: str | Path, logs: Sequence[SafeLog]) -> list[Path]:
-    """Write numbers, one picture of all flights, and a scene of the first.
-
-    Args:
-        folder: existing folder; files of the same names are replaced.
-        logs: flights of one case, of at least one tick each.
-
-    Returns:
-        The files written: ``scene.html``, ``flights.png`` and ``metrics.json``.
-    """
-    folder = Path(folder)
-    numbers = write_metrics(folder / "metrics.json", safe_numbers(logs))
-    shown = write_figure(folder / "flights.png", picture(logs), 110)
-    return [safe_scene(logs[0]).save(folder / "scene.html"), shown, numbers]
+def results(logs: Sequence[SafeLog]) -> dict[str, Writer]:
+    """Results of flights of one case, of at least one tick each: numbers, a picture of all, a scene of the first."""
+    return {
+        "metrics.json": lambda path: write_metrics(path, safe_numbers(logs)),
+        "flights.png": lambda path: write_figure(path, picture(logs), 110),
+        "scene.html": lambda path: safe_scene(logs[0]).save(path),
+    }
 
 
 def summary(logs: Sequence[SafeLog]) -> str:

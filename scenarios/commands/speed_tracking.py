@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from unifg.scenarios import velocity_tracking
-from unifg.scenarios.commands.outcome import Outcome, Progress, by_iterations
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.logs.metrics import write_metrics
 from unifg.scenarios.scenes.velocity_plot import picture
@@ -27,10 +25,10 @@ def run(settings: velocity_tracking.TrackingSettings, progress: Progress, announ
 
     numbers = velocity_tracking.metrics(drive)
 
-    def write(folder: Path) -> list[Path]:
-        shown = write_figure(folder / "velocity_tracking.png", picture(drive), 105)
-        scene = velocity_scene(drive).save(folder / "scene.html")
-        return [scene, shown, write_metrics(folder / "metrics.json", numbers)]
-
+    files: dict[str, Writer] = {
+        "metrics.json": lambda path: write_metrics(path, numbers),
+        "velocity_tracking.png": lambda path: write_figure(path, picture(drive), 105),
+        "scene.html": lambda path: velocity_scene(drive).save(path),
+    }
     interrupted = drive.solution.status is Status.INTERRUPTED
-    return Outcome(drive.succeeded, interrupted, velocity_tracking.table(drive), numbers, write)
+    return Outcome(drive.succeeded, interrupted, velocity_tracking.table(drive), numbers, files)

@@ -119,6 +119,7 @@ class _Cache:
             return found
         if (half := precompiled.archive().find(self._shipping_key(signature))) is None:
             return None
+        target.refresh()  # wrappers for Python are made here, of Numba's own types
         header, text = half
         arguments = normalize_signature(signature)[0]
         made = finished(target, header, text, self._py_func, arguments, header["called"])
@@ -130,7 +131,7 @@ class _Cache:
     def _ready(self, target: Any) -> None:
         """Set up what code needs to run: with Numba's own types, and what can be made of them, a third of a second.
 
-        The library's own code needs its memory alone. The rest waits for something to compile, which asks for it.
+        The library's own code needs its memory alone. The rest waits for something to compile or to generate.
         """
         if self._py_func.__module__.startswith("unifg."):
             rtsys.initialize(target)
