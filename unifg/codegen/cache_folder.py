@@ -33,7 +33,7 @@ def cache_folder() -> Path | None:
 
 
 def place() -> Path:
-    """Where the folder is or would be."""
+    """Return the folder, whether or not it exists."""
     given = os.environ.get(VARIABLE)
     root = Path(given) if given else user_cache_path("unifg", appauthor=False)
     try:
