@@ -1,6 +1,6 @@
 # Everything needs only make and Python >= 3.11: the first target you call builds a virtual environment in .venv.
 #
-#   make demo     drive a robot through the shipped building, write out/demo/scene.html
+#   make demo     one graph that estimates and plans drives a robot through a building; writes out/demo/scene.html
 #   make test     run the tests; of large tables of cases a draw, another one for each commit
 #   make test-all run the tests with all cases
 #   make test-lowest    the same with the lowest versions of all packages that pyproject.toml allows, in .venv-lowest
@@ -43,9 +43,8 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
-demo: $(VENV)/ready
-	$(BIN)/unifg warmup
-	$(BIN)/unifg run navigation --obstacles 3 --seed 0 --out out/demo
+demo: $(VENV)/installed
+	$(BIN)/unifg run navigation --coupling joint --obstacles 3 --seed 0 --out out/demo
 
 test: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg warmup
@@ -130,15 +129,22 @@ clean:
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Each file marks one finished installation; a change of pyproject.toml repeats it.
-$(VENV)/ready: pyproject.toml
+$(VENV)/installed: pyproject.toml
 	@command -v $(PYTHON) >/dev/null || { \
 		echo "unifg needs Python 3.11 or newer and found no '$(PYTHON)'. Install one, or name it: make PYTHON=/path/to/python3" >&2; exit 1; }
 	@$(PYTHON) -c 'import sys; v = sys.version.split()[0]; sys.exit(None if sys.version_info >= (3, 11) else \
 		"unifg needs Python 3.11 or newer, and $(PYTHON) is %s. Name a newer one: make PYTHON=/path/to/python3" % v)'
-	@echo "Building $(VENV) and installing unifg into it (once, a minute or two)"
+	@echo "Building $(VENV) and installing unifg into it (once, half a minute)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); \
 		echo "$(PYTHON) cannot build virtual environments; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+	@$(PIP) install --no-compile --editable ".[scenarios]"
+	@touch $@
+
+# Tests raise warnings, also those that compiling the packages' sources gives: it is done beforehand.
+$(VENV)/ready: $(VENV)/installed
+	@echo "Installing what tests need into $(VENV)"
 	@$(PIP) install --editable ".[scenarios,test]"
+	@$(BIN)/python -W ignore -m compileall -qq $(VENV)/lib || true
 	@touch $@
 
 $(VENV)-lowest/ready: pyproject.toml tests/lowest.py

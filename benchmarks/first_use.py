@@ -22,7 +22,7 @@ from unifg.codegen.cache_folder import VARIABLE
 
 SOURCES = "from pathlib import Path\nfrom unifg.codegen import precompiled\nprecompiled.ARCHIVE = Path('none')\n"
 IMPORTS = {"numpy, numba": "import numpy, numba", "unifg": "import unifg as fg; fg.Graph, fg.solve, fg.SE2"}
-DEMO = "from unifg.scenarios.command import main; main(['warmup']); main('run navigation --obstacles 3'.split())"
+DEMO = "from unifg.scenarios.command import main; main('run navigation --coupling joint --obstacles 3'.split())"
 REPEATS = 3  # of imports, the least of which counts
 COLUMNS = ("first", "second", "from sources", "import numpy, numba", "import unifg", "demo")
 

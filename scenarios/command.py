@@ -254,6 +254,7 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
     with _interrupts() as told:
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
         with _bar(name) as show:
+            show(0.0, "preparing")
             outcome: Outcome = module.run(settings, told(show), **watched)
         try:
             # each file is written whole, also after a signal

@@ -28,6 +28,15 @@ def test_the_first_example_is_short_and_prints_what_it_says() -> None:
     assert times.sub("", printed.getvalue()) == times.sub("", blocks[first + 1].code.rstrip("\n") + "\n")
 
 
+def test_the_demo_is_what_pages_say() -> None:
+    makefile = (CHECKOUT / "Makefile").read_text(encoding="utf-8")
+    (words,) = re.findall(
+        r"^demo: .*\n\t\S+unifg (run .*--coupling joint.*) --seed 0 --out out/demo$", makefile, re.MULTILINE
+    )
+    for page in ("README.md", "docs/results/navigation.md"):
+        assert f"unifg {words} " in (CHECKOUT / page).read_text(encoding="utf-8"), page
+
+
 def test_the_film_is_small_and_moves() -> None:
     image = pytest.importorskip("PIL.Image")
     film = CHECKOUT / "docs" / "images" / "demo.gif"

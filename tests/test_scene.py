@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from episodes import HORIZON, episode, room
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from unifg.errors import ViewError
+from unifg.scenarios.commands.drives import summary
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.scenes import drive_plot
 from unifg.scenarios.scenes.drive_plot import overview, plot_localisation
@@ -54,6 +55,12 @@ def test_page_has_no_placeholder_left_and_says_what_it_shows(page: str, log: Epi
     lost = replace(log, goals=np.tile(log.goals, (2, 1)), reached=[False] * 2, outcomes=["lost: no beam came back"] * 2)
     assert data_of(drive_scene(lost).html())["outcome"].count("lost: no beam came back") == 1
     assert 'good ? "good" : "bad"' in around
+
+
+def test_a_joint_drive_says_that_one_graph_estimates_and_plans(log: EpisodeLog) -> None:
+    joint, words = replace(log, coupling="joint"), "navigation on room, one graph estimates and plans"
+    assert drive_scene(joint).title == f"unifg: {words}" and words in summary(joint)
+    assert overview(joint).get_suptitle().startswith(f"{words}: 1 of 1 goals reached")
 
 
 def test_readouts_are_those_of_the_log(page: str, log: EpisodeLog) -> None:

@@ -226,7 +226,7 @@ def frame(ax: Axes, title: str, x: tuple[float, float], y: tuple[float, float]) 
 
 def overview() -> Any:
     """The whole way on the map, and one moment beside an obstacle."""
-    log = run_navigation(NavigationSettings(obstacles=3, seed=0))
+    log = run_navigation(NavigationSettings(coupling="joint", obstacles=3, seed=0))
     if not log.succeeded:
         raise SystemExit("the demonstration did not reach its goals: no picture of that")
     index = int(np.flatnonzero(~log.obstacle_moves)[-1])  # shown from near; a standing disc needs no prediction
@@ -296,7 +296,7 @@ def one_moment(ax: Axes, log: EpisodeLog, tick: int, view: tuple[float, float, f
     ax.set(aspect="equal", xlim=(x - half, x + half), ylim=(y - half, y + half), xticks=[], yticks=[])
     for spine in ax.spines.values():
         spine.set(color=css("scan"), linewidth=1.6)
-    ax.set_title("One tick: where am I, what should I do?", fontsize=12)
+    ax.set_title("One tick, one graph: where am I, what should I do?", fontsize=12)
 
 
 def walls(ax: Axes, log: EpisodeLog) -> None:

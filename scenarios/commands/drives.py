@@ -8,7 +8,7 @@ from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
-from unifg.scenarios.logs.metrics import health, table, write_metrics
+from unifg.scenarios.logs.metrics import health, one_graph, table, write_metrics
 from unifg.scenarios.scenes.drive_plot import overview
 from unifg.scenarios.scenes.drive_scene import drive_frame, drive_scene, drive_stage
 from unifg.style.figures import write_figure
@@ -54,7 +54,7 @@ def summary(log: EpisodeLog) -> str:
     stopped = " (interrupted)" if m["interrupted"] else ""
     spread = "mean {mean:.4f} {unit}, std {std:.4f}, max {max:.4f}"
     rows = (
-        ("scenario", f"{m['scenario']} on {m['map']}"),
+        ("scenario", f"{m['scenario']} on {m['map']}{one_graph(m['coupling'])}"),
         ("solver, coupling, seed", f"{m['solver']}, {m['coupling']}, {m['seed']}"),
         ("goals reached", f"{m['goals_reached']} of {m['goals']}{stopped}"),
         *((f"goal {k + 1}", words) for k, words in enumerate(m["outcomes"]) if words != "reached"),

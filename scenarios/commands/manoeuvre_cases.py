@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 from unifg.scenarios import manoeuvres
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
@@ -56,6 +58,14 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
 
     files: dict[str, Writer] = {"metrics.json": lambda path: write_metrics(path, numbers)}
     for one in solved:
-        files[f"{one.case.name}.png"] = lambda path, one=one: write_figure(path, picture(one), 105)
-        files[f"{one.case.name}.html"] = lambda path, one=one: manoeuvre_scene(one).save(path)
+        files[f"{one.case.name}.png"] = partial(_draw, one)
+        files[f"{one.case.name}.html"] = partial(_show, one)
     return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), numbers, files)
+
+
+def _draw(solved: manoeuvres.Manoeuvre, path: Path) -> None:
+    write_figure(path, picture(solved), 105)
+
+
+def _show(solved: manoeuvres.Manoeuvre, path: Path) -> None:
+    manoeuvre_scene(solved).save(path)

@@ -25,6 +25,7 @@ __all__ = [
     "health",
     "iterations",
     "of_solution",
+    "one_graph",
     "spread",
     "statistics",
     "strict",
@@ -66,6 +67,11 @@ def iterations(values: IntArray) -> dict[str, float]:
 def collision_words(count: int) -> str:
     """Number of collisions in words."""
     return "no collision" if count == 0 else f"{count} collision{'s' if count > 1 else ''}"
+
+
+def one_graph(coupling: object) -> str:
+    """Part of a title, where estimation and control are joined."""
+    return ", one graph estimates and plans" if coupling == "joint" else ""
 
 
 def without_timings(metrics: Mapping[str, object]) -> dict[str, object]:

@@ -9,7 +9,7 @@ import numpy as np
 from unifg.plots.shown import every
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
-from unifg.scenarios.logs.metrics import collision_words
+from unifg.scenarios.logs.metrics import collision_words, one_graph
 from unifg.scenarios.scenes.drive_scene import drive_stage, place_movers
 from unifg.scenarios.scenes.panels import over_time, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import css
@@ -105,7 +105,8 @@ def _title(log: EpisodeLog) -> str:
     missed = dict.fromkeys(words.partition(":")[0] for words in log.outcomes if words != "reached")
     stopped += "".join(f", {words}" for words in missed)
     return (
-        f"{log.scenario} on {log.occupancy.name}: {m['goals_reached']} of {m['goals']} goals reached, "
+        f"{log.scenario} on {log.occupancy.name}{one_graph(log.coupling)}: "
+        f"{m['goals_reached']} of {m['goals']} goals reached, "
         f"{collision_words(log.collisions)}{stopped}  |  {m['path_length_m']:.1f} m in {m['duration_s']:.1f} s  |  "
         f"solver {log.solver} ({log.coupling}), seed {log.seed}"
     )

@@ -15,7 +15,7 @@ import numpy as np
 from unifg.lie import SE2
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
-from unifg.scenarios.logs.metrics import collision_words, health
+from unifg.scenarios.logs.metrics import collision_words, health, one_graph
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
 from unifg.scenarios.scenes.parts import draw_way, pillar
 from unifg.typing import Array, IntArray
@@ -125,7 +125,7 @@ def drive_stage(log: Any, outcomes: Sequence[str] = ()) -> Scene:
         log: an `EpisodeLog`, or one in the making: what is known before the first tick is asked of it.
         outcomes: of the goals, as far as they are known.
     """
-    scene = Scene(f"unifg: {log.scenario} on {log.occupancy.name}", dt=log.dt)
+    scene = Scene(f"unifg: {log.scenario} on {log.occupancy.name}{one_graph(log.coupling)}", dt=log.dt)
     corners = shapes.known_corners(log.occupancy)
     extent = float(np.ptp(corners, axis=0).max())
     stroke = float(np.clip(0.004 * extent, 0.03, 0.14))  # width of ribbons [m]

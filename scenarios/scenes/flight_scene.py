@@ -15,7 +15,7 @@ import numpy as np
 
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
-from unifg.scenarios.logs.metrics import collision_words, health
+from unifg.scenarios.logs.metrics import collision_words, health, one_graph
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
 from unifg.scenarios.scenes.parts import draw_way, layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
@@ -137,7 +137,8 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
         estimated: True for a flight with an estimate.
     """
     name = str(log.settings.get("scenario", "quadrotor"))
-    scene = Scene(f"unifg: {name}" + (f", {log.layout.name}" if log.layout.name else ""), dt=log.dt)
+    name += (f", {log.layout.name}" if log.layout.name else "") + one_graph(log.settings.get("coupling"))
+    scene = Scene(f"unifg: {name}", dt=log.dt)
     (left, low), (right, high) = log.layout.size.tolist()
     scene.around = np.array([[x, y, z] for z in (0.0, _HEIGHT) for x in (left, right) for y in (low, high)])
     scene.ground, scene.speeds = False, (0.25, 0.5, 1, 2, 4)
