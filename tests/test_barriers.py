@@ -443,6 +443,7 @@ SETTINGS = {
 
 @pytest.mark.parametrize("where", SETTINGS)
 @pytest.mark.parametrize("name", INEQUALITIES)
+@pytest.mark.product(12)
 def test_backends_answer_barriers(name: str, where: str) -> None:
     solver = INEQUALITIES[name]
     start, centre, radius, alpha, dt = SETTINGS[where]
@@ -619,6 +620,7 @@ def past_two(form: keeping.Form, unit: float, offset: float, flat: bool) -> tupl
 
 @pytest.mark.parametrize("form", ["hinge", "hard", "slack", "exact slack"])
 @pytest.mark.parametrize("name", INEQUALITIES)
+@pytest.mark.product(8)
 def test_neither_units_nor_offsets_nor_the_robot_matter(name: str, form: keeping.Form) -> None:
     for unit, offset, flat in ((1.0, 0.0, False), (1.0, 1e6, False), (1e3, 0.0, False), (1.0, 1e6, True)):
         graph, guess, least, (x, start) = past_two(form, unit, offset, flat)
