@@ -53,11 +53,15 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("page", PAGES, ids=relative)
+def python_blocks(page: Path) -> list[Fence]:
+    """Blocks of a page that are run."""
+    return [f for f in fences(page) if f.language in PYTHON and f.skip is None]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if python_blocks(page)], ids=relative)
+@pytest.mark.product(18)
 def test_python_blocks_run(page: Path, scratch: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    blocks = [f for f in fences(page) if f.language in PYTHON and f.skip is None]
-    if not blocks:
-        pytest.skip("this page shows no Python")
+    blocks = python_blocks(page)
     for peer in ("casadi", "gtsam"):  # extras that the tests do not ask for
         if find_spec(peer) is None:
             blocks = [f for f in blocks if not f.code.startswith(f"import {peer}")]
@@ -192,7 +196,7 @@ def test_unclosed_fence_is_an_error(tmp_path: Path) -> None:
 
 
 def test_blocks_share_a_namespace(scratch: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    blocks = [f for f in fences(_page(scratch, PAGE)) if f.language in PYTHON and f.skip is None]
+    blocks = python_blocks(_page(scratch, PAGE))
     run_page(blocks, monkeypatch)  # the second block asserts what the first assigned
     with pytest.raises(pytest.fail.Exception, match="NameError: name 'value'"):
         run_page(blocks[1:], monkeypatch)

@@ -72,6 +72,7 @@ def test_names_do_not_depend_on_where_the_code_stands() -> None:
 
 
 @pytest.mark.parametrize("path", TARGETS)
+@pytest.mark.product(25)
 def test_mutants_of_the_decisions_read_and_have_tests(path: str) -> None:
     source = (CHECKOUT / path).read_text(encoding="utf-8")
     found = mutations(source)
