@@ -159,6 +159,7 @@ def test_graduation_wants_a_loss_it_can_graduate() -> None:
 
 @pytest.mark.parametrize("loss", [fg.TruncatedLeastSquares(3.4), fg.GemanMcClure(3.4)], ids=repr)
 @pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.product(3)
 def test_a_third_of_all_loop_closures_wrong(loss: Loss, seed: int) -> None:
     sim = manhattan(300, seed, outliers=0.3)
     graph = sim.pose_graph
