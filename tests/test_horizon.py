@@ -608,11 +608,18 @@ def test_a_plan_that_comes_too_late_serves_the_next_tick() -> None:
     warm, cold = (Delayed(run, now, 0.02) for run in (loop.warm, loop.cold))
     warm.late[2] = 1.0
     loop.warm, loop.cold = warm, cold  # type: ignore[assignment]
+    data = loop.data
+
+    def slowly(context: Context[Any]) -> Any:
+        now[0] += 0.03
+        return data(context)
+
+    loop.data = slowly  # type: ignore[method-assign]
     plans, _ = drive(loop, 5)
     assert [plan.source for plan in plans] == ["solved", "solved", "late", "solved", "solved"]
-    assert plans[2].milliseconds == pytest.approx(1000.0) and loop.sources["late"] == 1
+    assert plans[2].milliseconds == pytest.approx(1030.0) and loop.sources["late"] == 1
     assert np.array_equal(plans[2].controls[:-1], plans[1].controls[1:])
-    assert cold.limits + warm.limits == pytest.approx([0.1] * 5)
+    assert cold.limits + warm.limits == pytest.approx([0.07] * 5)
     assert loop.guess is not None
 
 
