@@ -614,7 +614,7 @@ def test_a_plan_that_comes_too_late_serves_the_next_tick() -> None:
         now[0] += 0.03
         return data(context)
 
-    loop.data = slowly  # type: ignore[method-assign]
+    loop.data = slowly  # type: ignore[assignment, method-assign]
     plans, _ = drive(loop, 5)
     assert [plan.source for plan in plans] == ["solved", "solved", "late", "solved", "solved"]
     assert plans[2].milliseconds == pytest.approx(1030.0) and loop.sources["late"] == 1
