@@ -77,7 +77,6 @@ def pytest_report_header(config: pytest.Config) -> str:
 
 def pytest_collection_finish() -> None:
     """Leave what has been imported out of every later search for garbage."""
-    gc.collect()
     gc.freeze()
 
 
