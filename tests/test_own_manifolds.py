@@ -35,7 +35,7 @@ SHIPPED: list[fg.Manifold] = [fg.SO2, fg.SE2, fg.SO3, fg.SE3, fg.Rn(3), fg.Produ
 
 
 @pytest.mark.parametrize("manifold", SHIPPED + OWN, ids=lambda m: m.name)
-@pytest.mark.product(4)
+@pytest.mark.product(2)
 def test_axioms_hold(manifold: fg.Manifold) -> None:
     report = fg.check_manifold(manifold)
     assert report.ok, str(report)

@@ -221,6 +221,7 @@ def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
 
 
 @pytest.mark.parametrize("speed", [0.2, 0.5])
+@pytest.mark.product(1)
 def test_one_who_goes_to_and_fro_stays_a_mover(speed: float) -> None:
     occupancy = hall()
     mover = Obstacle(np.array([4.0, 5.5]), 0.2, np.array([4.8, 5.5]), speed)

@@ -46,6 +46,7 @@ def short(seconds: float = 1.0, **changes: object) -> FlightSettings:
 
 
 @pytest.mark.parametrize("coupling", COUPLINGS)
+@pytest.mark.product(1)
 def test_every_coupling_flies_and_knows_where_it_is(coupling: str) -> None:
     log = run_flight(short(1.5, coupling=coupling))
     assert (log.ticks, log.collisions, log.reached) == (30, 0, False)
