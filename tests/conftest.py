@@ -4,6 +4,7 @@ A test marked ``product(n)`` is a large table, of which n cases are drawn; anoth
 the whole, ``UNIFG_TEST_SEED`` repeats a draw.
 """
 
+import gc
 import os
 import random
 import subprocess
@@ -72,6 +73,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_report_header(config: pytest.Config) -> str:
     """Say how to repeat the draw."""
     return "all cases" if config.getoption("--all") else f"products drawn with UNIFG_TEST_SEED={_seed()}"
+
+
+def pytest_collection_finish() -> None:
+    """Leave what has been imported out of every later search for garbage."""
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -83,11 +84,6 @@ def test_nothing_is_left_of_the_parameter_of_a_path() -> None:
     moving = {tape.a[i] for i in tape.live(expression.rows) if tape.op[i] == Op.TANGENT}
     assert moving == {0, 1, 2}
     assert all(0 <= j <= k < 3 for j, k in expression.curvature)
-
-
-def test_a_rate_at_the_centre_is_a_number() -> None:
-    still = rate(lambda s, p: avoidance.sphere_clearance(p + s * 1.0, CENTRE[:1], RADIUS[:1]), np.zeros((1, 3)))
-    assert still.tolist() == [[0.0]]
 
 
 def test_a_rate_of_what_is_known_is_refused_in_a_trace() -> None:
@@ -191,40 +187,100 @@ def test_every_clearance_has_a_barrier_with_exact_derivatives(name: str) -> None
     np.testing.assert_allclose(kept, values[1:] - np.exp(-0.07) * values[:-1], atol=1e-12)
 
 
-def test_the_other_way_round_of_a_fence() -> None:
-    """Inside it is positive, and a vehicle that leaves the centre loses as much as it travels."""
-    p = np.array([[0.5, 0.0, 0.0], [2.5, 0.0, 0.0]])
-    np.testing.assert_allclose(clearances.inside_sphere(p, np.zeros(3), 2.0)[:, 0], [1.5, -0.5])
-    np.testing.assert_allclose(
-        clearances.inside_sphere(p + np.array([0.0, 0.0, 9.0]), np.zeros(2), 2.0)[:, 0], [1.5, -0.5]
-    )
-
-
-def test_critical_points_turn_with_the_body() -> None:
-    x = quadrotor.STATE.identity()[None].copy()
-    x[0, 3:7] = fg.SO3.exp(np.array([0.0, 0.0, np.pi / 2]))
-    x[0, :3] = 3.0, 0.0, 0.0
-    found = clearances.on_body(avoidance.sphere_clearance, [[0.5, 0.0, 0.0], [0.0, 1.0, 0.0]])(
-        x, CENTRE[:1], RADIUS[:1]
-    )
-    np.testing.assert_allclose(found, [[np.hypot(3.0, 0.5) - 0.4, 2.0 - 0.4]], atol=1e-12)
-
-
 # ---------------------------------------------------------------- formulas
 
 
-def test_the_decay_is_exponential_whatever_the_step() -> None:
-    """With 1 - alpha dt a long step would ask for the other side."""
-    h = barriers.still(lambda x: x)
-    x, after = np.array([[2.0]]), np.array([[0.5]])
-    for alpha, dt in ((0.0, 0.1), (3.0, 0.05), (3.0, 10.0), (1e9, 1.0), (3.0, 0.0)):
-        assert barriers.decay(h, alpha)(x, after, 0.0, dt)[0, 0] == pytest.approx(0.5 - 2.0 * np.exp(-alpha * dt))
+def state(p: list[float], turn: float = 0.0, v: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Array:
+    """State of a quadrotor that is turned about the vertical."""
+    return np.concatenate([p, fg.SO3.exp(np.array([0.0, 0.0, turn])), v])
 
 
-def test_intervals_may_differ() -> None:
-    h = barriers.still(lambda x: x)
-    found = barriers.decay(h, 2.0)(np.ones((2, 1)), np.ones((2, 1)), np.zeros(2), np.array([0.01, 0.05]))
-    np.testing.assert_allclose(found[:, 0], 1.0 - np.exp([-0.02, -0.1]))
+LINEAR, RESTING = barriers.still(lambda x: x), barriers.still(avoidance.sphere_clearance)
+MOVING, FIRST = barriers.moving(avoidance.sphere_clearance), (CENTRE[:1], RADIUS[:1])
+LEAVES_COMES = np.array([state([0.3, 0.0, 0.0], v=(1.0, 0.0, 0.0)), state([0.6, 0.0, 0.0], v=(-1.0, 0.0, 0.0))])
+STAYS, FLEES = (CENTRE[:1], np.zeros((1, 3)), RADIUS[:1]), (CENTRE[:1], np.array([[1.0, 0.0, 0.0]]), RADIUS[:1])
+INVERSE = barriers.inverse(barriers.still(clearances.to_point), 0.75)
+AHEAD, NEARS = np.array([[2.0, 0.0, 0.0]]), np.array([[-0.5, 0.0, 0.0]])
+FACING = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2], [0.0, 0.0, np.pi / 4]])
+POSE = np.array([[1.0, 2.0, 0.7]])
+LEFT = terminal.brakeable(RESTING, 2.0, 3.0, p=slice(0, 3), v=slice(3, 6))
+ON_BODY = clearances.on_body(avoidance.sphere_clearance, [[0.5, 0.0, 0.0], [0.0, 1.0, 0.0]])
+VALUES: dict[str, tuple[Callable[..., Array], tuple[Any, ...], Any]] = {
+    "inside a sphere it is positive": (
+        clearances.inside_sphere, (np.array([[0.5, 0.0, 0.0], [2.5, 0.0, 0.0]]), np.zeros(3), 2.0), [[1.5], [-0.5]],
+    ),
+    "a cylinder has no height": (
+        clearances.inside_sphere, (np.array([[0.5, 0.0, 9.0], [2.5, 0.0, 9.0]]), np.zeros(2), 2.0), [[1.5], [-0.5]],
+    ),
+    "points turn with the body": (
+        ON_BODY, (state([3.0, 0.0, 0.0], np.pi / 2)[None], *FIRST), [[np.hypot(3.0, 0.5) - 0.4, 2.0 - 0.4]],
+    ),
+    "of a pose the first two axes count": (clearances.to_point, (POSE, np.array([[1.0, 3.0]]), 0.25), [[0.75]]),
+    "as of a position in the plane": (clearances.to_point, (POSE[:, :2], np.array([1.0, 3.0]), 0.25), [[0.75]]),
+    **{  # exponential for any step: with 1 - alpha dt a long one would ask for the other side
+        f"decay {alpha} in {dt} s": (
+            barriers.decay(LINEAR, alpha), (np.array([[2.0]]), np.array([[0.5]]), 0.0, dt),
+            [[0.5 - 2.0 * np.exp(-alpha * dt)]],
+        )
+        for alpha, dt in ((0.0, 0.1), (3.0, 0.05), (3.0, 10.0), (1e9, 1.0), (3.0, 0.0))
+    },
+    "intervals differ": (
+        barriers.decay(LINEAR, 2.0), (np.ones((2, 1)), np.ones((2, 1)), np.zeros(2), np.array([0.01, 0.05])),
+        1.0 - np.exp([[-0.02], [-0.1]]),
+    ),
+    "what is thrown falls": (
+        barriers.thrown(clearances.to_point),
+        (np.zeros((1, 3)), 0.5, np.array([[1.0, 0.0, 2.0]]), np.array([[-1.0, 0.0, 1.0]]), 0.1),
+        [[np.hypot(0.5, 2.0 + 0.5 - 0.125 * 9.81) - 0.1]],
+    ),
+    "the paper's 1/d": (
+        INVERSE, (np.diag([0.75, 0.5, 2.0]), 0.0, np.zeros(3), 0.75),
+        1 / 0.75 - 1 / np.array([[0.75], [0.5], [2.0]]),
+    ),
+    # {h_v >= 0} is no subset of {h >= 0}, nor the other way round: one recedes inside, one approaches outside
+    "extended by velocity": (
+        barriers.velocity_extended(MOVING, MOVING, 0.5), (LEAVES_COMES, 0.0, *STAYS), [[-0.1 + 0.5], [0.2 - 0.5]],
+    ),
+    "extended by nothing": (
+        barriers.velocity_extended(MOVING, MOVING, 0.0), (LEAVES_COMES, 0.0, *STAYS), [[-0.1], [0.2]],
+    ),
+    "followed as fast": (
+        barriers.velocity_extended(MOVING, MOVING, 0.5), (LEAVES_COMES, 0.0, *FLEES), [[-0.1], [0.2 - 1.0]],
+    ),
+    "condition": (
+        barriers.condition(MOVING, 0.3, fg.Rn(3), lambda p, v: v), (AHEAD, NEARS, 0.0, *FLEES),
+        [[-0.5 - 1.0 + 0.3 * 1.6]],
+    ),
+    "condition as published, the obstacle at rest": (
+        barriers.condition(MOVING, 0.3, fg.Rn(3), lambda p, v: v, as_published=True), (AHEAD, NEARS, 0.0, *FLEES),
+        [[-0.5 + 0.3 * 1.6]],
+    ),
+    "uncertain along the obstacle only": (
+        barriers.uncertain(RESTING, 3.0), (AHEAD, 0.0, np.diag([0.1, 5.0, 5.0]), *FIRST), [[1.6 - 3.0 * 0.1]],
+    ),
+    "certain": (barriers.uncertain(RESTING, 0.0), (AHEAD, 0.0, np.diag([0.1, 5.0, 5.0]), *FIRST), [[1.6]]),
+    "the covariance of a pose lies in its own axes": (
+        barriers.uncertain(barriers.still(obstacles.disc_clearance), 3.0, fg.SE2),
+        (FACING, 0.0, np.diag([0.2, 0.05, 0.3]), np.array([[2.0, 0.0]]), np.array([0.5])),
+        [[1.5 - 0.6], [1.5 - 0.15], [1.5 - 3.0 * np.sqrt(0.5 * (0.2**2 + 0.05**2))]],
+    ),
+    "controls beyond their limits": (
+        universal.excess, (np.array([[-2.0, 0.5, 3.0]]), np.full(3, -1.0), np.full(3, 1.0)), [[1.0, 0.0, 2.0]],
+    ),
+    "brakeable 0.6 and 0.25 m from spheres": (
+        LEFT, (np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 1.0]]), 0.0, CENTRE, RADIUS),
+        [[0.2, 2.0 * (np.linalg.norm([0.5, 0.2, 0.1]) - 0.3) - 1.0, 0.5]],
+    ),
+    "a rate at the centre is a number": (
+        partial(rate, lambda s, p: avoidance.sphere_clearance(p + s * 1.0, *FIRST)), (np.zeros((1, 3)),), [[0.0]],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VALUES)
+def test_values_by_hand(name: str) -> None:
+    function, arguments, expected = VALUES[name]
+    np.testing.assert_allclose(function(*arguments), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_obstacles_move_with_the_time_at_each_end() -> None:
@@ -236,12 +292,6 @@ def test_obstacles_move_with_the_time_at_each_end() -> None:
         expected = np.linalg.norm(q[k] - then, axis=1) - RADIUS
         expected = expected - np.exp(-0.11) * (np.linalg.norm(p[k] - now, axis=1) - RADIUS)
         np.testing.assert_allclose(found[k], expected, atol=1e-13)
-
-
-def test_what_is_thrown_falls() -> None:
-    h = barriers.thrown(clearances.to_point)
-    found = h(np.zeros((1, 3)), 0.5, np.array([[1.0, 0.0, 2.0]]), np.array([[-1.0, 0.0, 1.0]]), 0.1)
-    assert found[0, 0] == pytest.approx(np.hypot(0.5, 2.0 + 0.5 - 0.125 * 9.81) - 0.1)
 
 
 def test_some_of_a_set_may_fall() -> None:
@@ -315,36 +365,6 @@ def test_any_motion_is_a_function_of_the_time() -> None:
     assert found.converged and (away[1:] >= np.exp(-0.2) * away[:-1] - 1e-4).all() and away.min() > -1e-4
 
 
-def test_in_the_papers_units_the_boundary_is_the_same() -> None:
-    h = barriers.inverse(barriers.still(clearances.to_point), 0.75)
-    for d in (0.75, 0.5, 2.0):
-        assert h(np.array([[d, 0.0, 0.0]]), 0.0, np.zeros(3), 0.75)[0, 0] == pytest.approx(1 / 0.75 - 1 / d)
-
-
-def test_a_receding_vehicle_may_be_inside_the_velocity_extended_set() -> None:
-    """{h_v >= 0} is no subset of {h >= 0}, nor the other way round."""
-    h = barriers.moving(avoidance.sphere_clearance)
-    extended = barriers.velocity_extended(h, h, 0.5)
-    x = np.tile(quadrotor.STATE.identity(), (2, 1))
-    x[0, :3], x[0, 7:] = (0.3, 0.0, 0.0), (1.0, 0.0, 0.0)  # inside, receding
-    x[1, :3], x[1, 7:] = (0.6, 0.0, 0.0), (-1.0, 0.0, 0.0)  # outside, approaching
-    found = extended(x, 0.0, CENTRE[:1], np.zeros((1, 3)), RADIUS[:1])[:, 0]
-    np.testing.assert_allclose(found, [-0.1 + 0.5, 0.2 - 0.5], atol=1e-12)
-    off = barriers.velocity_extended(h, h, 0.0)(x, 0.0, CENTRE[:1], np.zeros((1, 3)), RADIUS[:1])
-    np.testing.assert_allclose(off[:, 0], [-0.1, 0.2], atol=1e-12)
-    chased = extended(x, 0.0, CENTRE[:1], np.array([[1.0, 0.0, 0.0]]), RADIUS[:1])[:, 0]  # it follows as fast
-    np.testing.assert_allclose(chased, [-0.1, 0.2 - 1.0], atol=1e-12)
-
-
-def test_as_published_the_obstacle_rests_in_the_derivative() -> None:
-    h = barriers.moving(avoidance.sphere_clearance)
-    p, v, velocity = np.array([[2.0, 0.0, 0.0]]), np.array([[-0.5, 0.0, 0.0]]), np.array([[1.0, 0.0, 0.0]])
-    ours = barriers.condition(h, 0.3, fg.Rn(3), lambda p, v: v)(p, v, 0.0, CENTRE[:1], velocity, RADIUS[:1])
-    theirs = barriers.condition(h, 0.3, fg.Rn(3), lambda p, v: v, as_published=True)
-    assert ours[0, 0] == pytest.approx(-0.5 - 1.0 + 0.3 * 1.6)
-    assert theirs(p, v, 0.0, CENTRE[:1], velocity, RADIUS[:1])[0, 0] == pytest.approx(-0.5 + 0.3 * 1.6)
-
-
 def test_the_condition_is_what_the_decay_comes_to() -> None:
     """(h(x + dt v) - exp(-alpha dt) h(x)) / dt tends to h' + alpha h."""
     h = barriers.moving(avoidance.sphere_clearance)
@@ -354,30 +374,6 @@ def test_the_condition_is_what_the_decay_comes_to() -> None:
     np.testing.assert_allclose(
         barriers.condition(h, 2.0, fg.Rn(3), lambda p, v: v)(p, v, 0.3, *obstacle), whole, atol=1e-4
     )
-
-
-def test_the_uncertainty_counts_along_the_obstacle_only() -> None:
-    h = barriers.still(avoidance.sphere_clearance)
-    p, root = np.array([[2.0, 0.0, 0.0]]), np.diag([0.1, 5.0, 5.0])
-    found = barriers.uncertain(h, 3.0)(p, 0.0, root, CENTRE[:1], RADIUS[:1])
-    assert found[0, 0] == pytest.approx(1.6 - 3.0 * 0.1)
-    assert barriers.uncertain(h, 0.0)(p, 0.0, root, CENTRE[:1], RADIUS[:1])[0, 0] == pytest.approx(1.6)
-
-
-def test_the_covariance_of_a_pose_lies_in_its_own_axes() -> None:
-    """As ``solution.covariance`` has it: who faces the disc knows that distance worst."""
-    x = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2], [0.0, 0.0, np.pi / 4]])
-    root, disc = np.diag([0.2, 0.05, 0.3]), (np.array([[2.0, 0.0]]), np.array([0.5]))
-    found = barriers.uncertain(barriers.still(obstacles.disc_clearance), 3.0, fg.SE2)(x, 0.0, root, *disc)
-    middle = np.sqrt(0.5 * (0.2**2 + 0.05**2))
-    np.testing.assert_allclose(found[:, 0], [1.5 - 0.6, 1.5 - 0.15, 1.5 - 3.0 * middle], atol=1e-12)
-
-
-def test_a_planar_robot_keeps_off_a_disc_that_is_estimated() -> None:
-    """Of a pose the first two axes count, as of a position in space three."""
-    pose, place = np.array([[1.0, 2.0, 0.7]]), np.array([[1.0, 3.0]])
-    assert clearances.to_point(pose, place, 0.25)[0, 0] == pytest.approx(0.75)
-    assert clearances.to_point(pose[:, :2], place[0], 0.25)[0, 0] == pytest.approx(0.75)
 
 
 @pytest.mark.parametrize("value", [-1.0, np.inf, np.nan])
@@ -395,11 +391,8 @@ def test_gains_that_mean_nothing_are_refused(value: float) -> None:
     for name, make in makers.items():
         with pytest.raises(ModelError, match=name):
             make()
-
-
-def test_zero_radius_has_no_inverse() -> None:
     with pytest.raises(ModelError, match="use the distance itself"):
-        barriers.inverse(barriers.still(clearances.to_point), 0.0)
+        barriers.inverse(h, 0.0)
 
 
 # ---------------------------------------------------------------- small problems, every backend, judged from outside
@@ -450,6 +443,7 @@ SETTINGS = {
 
 @pytest.mark.parametrize("where", SETTINGS)
 @pytest.mark.parametrize("name", INEQUALITIES)
+@pytest.mark.product(12)
 def test_backends_answer_barriers(name: str, where: str) -> None:
     solver = INEQUALITIES[name]
     start, centre, radius, alpha, dt = SETTINGS[where]
@@ -626,6 +620,7 @@ def past_two(form: keeping.Form, unit: float, offset: float, flat: bool) -> tupl
 
 @pytest.mark.parametrize("form", ["hinge", "hard", "slack", "exact slack"])
 @pytest.mark.parametrize("name", INEQUALITIES)
+@pytest.mark.product(8)
 def test_neither_units_nor_offsets_nor_the_robot_matter(name: str, form: keeping.Form) -> None:
     for unit, offset, flat in ((1.0, 0.0, False), (1.0, 1e6, False), (1e3, 0.0, False), (1.0, 1e6, True)):
         graph, guess, least, (x, start) = past_two(form, unit, offset, flat)
@@ -862,11 +857,6 @@ def test_three_equalities_and_six_costs_weigh_what_the_covariance_says() -> None
     np.testing.assert_allclose((ours**2).sum(axis=1), weighed, rtol=1e-9)
 
 
-def test_controls_beyond_their_limits() -> None:
-    found = universal.excess(np.array([[-2.0, 0.5, 3.0]]), np.full(3, -1.0), np.full(3, 1.0))
-    np.testing.assert_allclose(found, [[1.0, 0.0, 2.0]])
-
-
 # ---------------------------------------------------------------- where a plan may end
 
 
@@ -924,75 +914,6 @@ def test_a_terminal_set_keeps_hard_plans_possible(end: str) -> None:
         assert all(held) and away.min() > -1e-6, (end, seed, len(held))
 
 
-class Floor:
-    """A point above a floor, planned anew several times a node, hard; each plan is whatever the constraints allow."""
-
-    def __init__(self, aligns: bool, carries: bool, end: str) -> None:
-        self.aligns, self.carries, n, node = aligns, carries, 4, 0.1
-        self.graph = graph = fg.Graph()
-        self.x, self.u = x, u = graph.variables("x", fg.Rn(2), n + 1), graph.variables("u", fg.Rn(1), n)
-        self.start = graph.data("start", np.ones(2))
-        self.passed = graph.data("passed", np.ones((1, 2)), each=True)
-        self.lengths = graph.data("lengths", np.full((n, 1), node), each=True)
-        self.first, self.wish = graph.data("first", node), graph.data("wish", np.zeros((n, 1)), each=True)
-        self.alpha, self.push = graph.data("alpha", 1.0), graph.data("push", np.ones(1))
-        graph.fix(x[0], self.start)
-        graph.minimize(fg.prior, u, self.wish)
-        graph.constrain(self.motion, x[:-1], u, x[1:], self.lengths, lower=0.0, upper=0.0, name="motion")
-        graph.constrain(lambda u, a: np.concatenate([a - u, a + u], axis=1), u, self.push, lower=0.0, name="push")
-        graph.constrain(self.decay, self.passed, x[1:2], self.first, self.alpha, lower=0.0, name="first")
-        graph.constrain(self.decay, x[1:-1], x[2:], node, self.alpha, lower=0.0, name="barrier")
-        if end == "rest":
-            graph.constrain(lambda x: x[:, 1:], x[-1:], lower=0.0, upper=0.0, name="end")
-        else:
-            graph.constrain(self.brakeable, x[-1:], self.alpha, self.push, lower=0.0, name="end")
-        self.run = InteriorPoint(tolerance=1e-9, max_iterations=100).prepare(graph)
-
-    @staticmethod
-    def motion(x: Array, u: Array, y: Array, h: Array) -> Array:
-        found: Array = y - np.concatenate([x[:, :1] + h * x[:, 1:] + 0.5 * h * h * u, x[:, 1:] + h * u], axis=1)
-        return found
-
-    @staticmethod
-    def decay(x: Array, y: Array, h: Any, alpha: Any) -> Array:
-        found: Array = y[:, :1] - np.exp(-alpha * h) * x[:, :1]
-        return found
-
-    @staticmethod
-    def brakeable(x: Array, alpha: Any, push: Any) -> Array:
-        """``terminal.brakeable`` of a line, up and down, with numbers that are data."""
-        both = np.concatenate([x[:, 1:], -x[:, 1:]], axis=1)
-        return np.concatenate([alpha * x[:, :1] - both, push / alpha - both], axis=1)
-
-    def fly(self, seed: int, ticks: int = 40) -> float:
-        """The worst violation of any tick, in a random world, after a first plan."""
-        rng = np.random.default_rng(seed)
-        parts, alpha, push = int(rng.integers(2, 6)), float(rng.uniform(0.5, 15.0)), float(rng.uniform(1.0, 6.0))
-        state, worst = np.array([rng.uniform(0.1, 1.0), 0.0]), 0.0
-        plan: Any = {self.x: np.tile(state, (5, 1)), self.u: np.zeros((4, 1))}
-        for k in range(ticks):
-            spans = (keeping.aligned(4, 0.1 / parts, 0.1, k) if self.aligns else keeping.grid(4, 0.1 / parts, 0.1))[1]
-            if not self.carries or k % parts == 0:
-                passed, first = state[None], spans[0]
-            given = {self.start: state, self.lengths: spans[:, None], self.passed: passed, self.first: first}
-            wish = -1e2 * push * (rng.normal(size=(4, 1)) if rng.random() < 0.7 else np.ones((4, 1)))  # a vertex
-            given |= {self.alpha: alpha, self.push: np.array([push]), self.wish: wish}
-            plan = self.run.solve(plan, data=given)
-            worst = max(worst, float(plan.violation))
-            pushed, h = plan[self.u][0, 0], 0.1 / parts
-            state = state + h * np.array([state[1] + 0.5 * h * pushed, pushed])
-        return worst
-
-
-@pytest.mark.parametrize("end", ["rest", "brake"])
-def test_nodes_that_stay_keep_hard_plans_possible_at_every_tick(end: str) -> None:
-    """Nodes that move on by a tick do not, nor do those that stay if what has passed is forgotten."""
-    stays, moves, forgets = (Floor(*how, end) for how in ((True, True), (False, False), (True, False)))
-    assert max(stays.fly(seed) for seed in range(16)) < 1e-6
-    assert sum(moves.fly(seed) > 1e-5 for seed in range(16)) >= 8
-    assert max(forgets.fly(seed) for seed in range(16)) > 1e-4
-
-
 def test_aligned_nodes_stay_where_they_are() -> None:
     for number in range(12):
         begins, lengths = keeping.aligned(3, 0.01, 0.05, number)
@@ -1012,11 +933,6 @@ def test_without_a_terminal_set_hard_plans_end() -> None:
 
 
 def test_the_sets_to_end_in_are_what_they_say() -> None:
-    h = barriers.still(avoidance.sphere_clearance)
-    left = terminal.brakeable(h, 2.0, 3.0, p=slice(0, 3), v=slice(3, 6))
-    x = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 1.0]])  # 0.6 and 0.25 m from the spheres
-    near = float(np.linalg.norm([0.5, 0.2, 0.1])) - 0.3
-    np.testing.assert_allclose(left(x, 0.0, CENTRE, RADIUS), [[0.2, 2.0 * near - 1.0, 0.5]], atol=1e-12)
     whole = quadrotor.STATE.identity()[None].copy()
     assert not terminal.resting(whole).any()
     whole[0, 3:7], whole[0, 7:] = fg.SO3.exp(np.array([0.3, 0.0, 0.0])), (1.0, 2.0, 3.0)

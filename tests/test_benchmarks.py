@@ -159,21 +159,19 @@ def told(rows: list[Row]) -> str:
     return ", ".join(str(row.get("double", row.get("error"))) for row in rows)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_a_study_measures_the_cells_that_are_missing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
-) -> None:
+def test_a_study_measures_the_cells_that_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In two processes, but for those that are measured alone, and in one."""
     monkeypatch.setattr(runner, "OUT", tmp_path)
     monkeypatch.setattr(runner, "machine", lambda codes: "here")
     study = Study(cells, doubled, told, range(2), alone=lambda cell: cell.alone)
 
-    def run(code: str, seeds: range | None = None, **chosen: bool) -> str:
+    def run(code: str, seeds: range | None = None, workers: int = 1, **chosen: bool) -> str:
         monkeypatch.setattr(runner, "commit", lambda: code)
         options = {"report": False, "any_code": False, "fresh": False, **chosen}
         return study.run("doubles", argparse.Namespace(seeds=seeds, workers=workers, **options))
 
     store = tmp_path / "doubles.jsonl"
-    assert run("old") == "0, 0, 2, 2\n\nhere"
+    assert run("old", workers=2) == "0, 0, 2, 2\n\nhere"
     assert run("old", range(3)) == "0, 0, 2, 2, 4, 4\n\nhere"
     assert len(store.read_text().splitlines()) == 6, "nothing is measured twice"
     store.write_text(store.read_text() + '{"cut off')

@@ -256,6 +256,7 @@ def test_a_retraction_too_short_for_second_derivatives_is_refused() -> None:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda manifold: manifold.name)
+@pytest.mark.product(2)
 def test_manifolds_that_know_nothing_of_tracing(manifold: fg.Manifold) -> None:
     """Retraction and local coordinates agree with fourth-order differences along the manifold's own retraction."""
     rng = np.random.default_rng(6)
@@ -405,7 +406,9 @@ def local_code(group: Any) -> tuple[Native, Native]:
 
 
 @pytest.mark.parametrize("far", [0.0, 1e6])
-@pytest.mark.parametrize("turn", [0.0, 1e-9, 1e-4, 0.3, 0.4999, 0.5001, np.pi / 2, np.pi - 1e-2, np.pi - 1e-5])
+@pytest.mark.parametrize(
+    "turn", [0.0, 1e-12, 1e-8, 1e-5, 1e-3, 0.05, 0.3, 0.4999, 0.5001, np.pi / 2, np.pi - 1e-2, np.pi - 1e-5]
+)
 @pytest.mark.parametrize("group", [SE2, SE3], ids=["SE2", "SE3"])
 def test_derivatives_keep_their_digits(group: Any, turn: float, far: float) -> None:
     """First and second derivatives of Log(x^-1 y) against differences in sixty digits along one direction."""

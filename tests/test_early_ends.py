@@ -94,13 +94,14 @@ BACKENDS: dict[str, Callable[[int], fg.Solver]] = {
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("iterations", [1, 2, 3, 5])
 @pytest.mark.parametrize("feasible", [True, False], ids=["rolled out", "shifted"])
-@pytest.mark.product(24)
+@pytest.mark.product(10)
 def test_few_iterations_follow_a_moved_goal(name: str, iterations: int, feasible: bool) -> None:
     arrives_as_converged(name, lambda loop: loop.drive(BACKENDS[name](iterations), feasible), feasible)
 
 
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("feasible", [True, False], ids=["rolled out", "shifted"])
+@pytest.mark.product(6)
 def test_little_time_follows_a_moved_goal(name: str, feasible: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     # An iteration takes a second.
     monkeypatch.setattr(SolveState, "seconds", property(lambda run: run.iterations + 1.0))
@@ -127,6 +128,7 @@ def converged_end(name: str, feasible: bool) -> Array:
 
 @pytest.mark.parametrize("name", [name for name in BACKENDS if "kkt" not in name])
 @pytest.mark.parametrize("iterations", [1, 3])
+@pytest.mark.product(6)
 def test_few_iterations_pass_a_disc(name: str, iterations: int) -> None:
     loop = RecedingHorizon(disc=True)
     poses = loop.drive(BACKENDS[name](iterations), feasible=True)
@@ -222,6 +224,7 @@ def test_nothing_unbounded_is_called_converged() -> None:
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("feasible", [True, False])
 @pytest.mark.parametrize("iterations", [4, 5, 7, 9])
+@pytest.mark.product(30)
 def test_a_limit_returns_the_iterate_of_least_merit(
     name: str, iterations: int, feasible: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -209,6 +209,7 @@ def test_inactive_rows_of_data_may_be_anything() -> None:
 
 
 @pytest.mark.parametrize("smoother", [fg.Incremental, lambda: fg.FixedLag(9)])
+@pytest.mark.product(1)
 def test_smoothers_check_every_factor_alike(smoother: Callable[[], Any]) -> None:
     graph = smoother()
     x = graph.variables("x", fg.SE3)

@@ -153,6 +153,7 @@ def test_rows_in_the_checkout_are_of_the_campaigns(name: str, tmp_path: Path) ->
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "most"), [("graph", 0.06), ("AMCL, wheels trusted", 0.06)])
+@pytest.mark.product(1)
 def test_half_of_a_real_log_is_localised_on_a_map_of_the_other(shared_data: Path, name: str, most: float) -> None:
     """Both localisers find the corrected poses of scans that the map has not seen, all the way of some forty metres."""
     scans = read_carmen(shared_data / "lidar" / LOG).scans[0]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -12,18 +10,6 @@ from judge import judge
 from problems.known import line, short_drive
 from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
-
-
-def test_data_changes_the_answer_without_a_new_program() -> None:
-    graph, x = line(1)
-    target = graph.data("target", [1.0, 2.0])
-    graph.minimize(fg.prior, x, target)
-    run = GaussNewton().prepare(graph)
-    program = graph.compile()
-    np.testing.assert_allclose(run.solve({x: np.zeros((1, 2))})[x], [[1.0, 2.0]])
-    np.testing.assert_allclose(run.solve({x: np.zeros((1, 2))}, data={target: [5.0, 6.0]})[x], [[5.0, 6.0]])
-    np.testing.assert_allclose(run.solve({x: np.zeros((1, 2))})[x], [[1.0, 2.0]])
-    assert graph.compile() is program
 
 
 def test_shared_variable_is_broadcast_over_factors() -> None:
@@ -162,38 +148,6 @@ def test_reweighted_loss_holds_its_weights_during_the_line_search() -> None:
     inside = {x: np.array([[0.5, 0.0]])}
     assert program.evaluate(inside, lin.weights).cost == pytest.approx(0.125)
     assert program.evaluate(inside).cost == pytest.approx(0.25 * 0.125)
-
-
-def test_covariance_of_a_chain_and_of_a_constrained_pose() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
-    graph.minimize(fg.prior, x[0], [0.0], sigma=0.1)
-    graph.minimize(fg.difference, x[:-1], x[1:], sigma=0.2)
-    solution = GaussNewton().solve(graph, {x: np.ones((3, 1))})
-    np.testing.assert_allclose(np.diag(solution.covariance(x)), [0.01, 0.05, 0.09], rtol=1e-9)
-    np.testing.assert_allclose(solution.marginals(x).ravel(), [0.01, 0.05, 0.09], rtol=1e-9)
-    np.testing.assert_array_equal(solution.covariance(x[2], x[0]), solution.covariance(x)[np.ix_([2, 0], [2, 0])])
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(2), 1)
-    graph.minimize(fg.prior, p, [0.0, 0.0], sigma=[1.0, 2.0])
-    graph.constrain(lambda q: q[:, :1] - q[:, 1:], p, lower=0.0, upper=0.0)
-    solution = SQP().solve(graph, {p: np.ones((1, 2))}, check=True)
-    np.testing.assert_allclose(solution.covariance(p), np.full((2, 2), 0.8), rtol=1e-6)  # 1 / (1 + 1/4)
-
-
-def test_graphs_solutions_and_prepared_solvers_pickle() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 2)
-    graph.fix(x[0], [0.0, 0.0, 0.0])
-    graph.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.3], sigma=0.1)
-    solution = GaussNewton().solve(graph, {x: np.zeros((2, 3))}, check=True)
-    again = pickle.loads(pickle.dumps(solution))
-    assert again.cost == solution.cost
-    copy = pickle.loads(pickle.dumps(graph))
-    y = copy.families["x"]
-    np.testing.assert_allclose(GaussNewton().solve(copy, {y: np.zeros((2, 3))})[y], solution[x])
-    run = pickle.loads(pickle.dumps(SQP().prepare(graph)))
-    assert run.solve({run.program.graph.families["x"]: np.zeros((2, 3))}).converged
 
 
 def test_history_has_each_term_and_timing() -> None:

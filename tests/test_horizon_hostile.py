@@ -283,7 +283,17 @@ def test_a_measurement_that_is_taken_back_was_none() -> None:
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"time": np.nan}, {"time": np.inf}, {"time": "now"}, {"applied": [0.0, 0.0]}, {"applied": [np.nan]}],
+    [
+        {"time": np.nan},
+        {"time": np.inf},
+        {"time": "now"},
+        {"applied": [0.0, 0.0]},
+        {"applied": [np.nan]},
+        {"measured": {"p": np.zeros(2)}},
+        {"measured": {"p": ["here"]}},
+        {"measured": {"sonar": np.zeros(1)}},
+        {"measured": {"p": [0.2], "sonar": [0.1]}},
+    ],
     ids=str,
 )
 @pytest.mark.parametrize("before", [0, 2])
@@ -293,15 +303,9 @@ def test_a_first_tick_refuses_what_later_ones_refuse(before: int, wrong: dict[st
         loop.tick(time=float(k))
         fresh.tick(time=float(k))
     with pytest.raises(fg.GraphError):
-        loop.tick(measured={"p": [1.0]}, **wrong)
+        loop.tick(**{"measured": {"p": [1.0]}} | wrong)
     plan, again = (own.tick(measured={"p": [1.0]}, time=5.0) for own in (loop, fresh))
     np.testing.assert_array_equal(plan.controls, again.controls)
-
-
-@pytest.mark.parametrize("pull", [[1.0, 2.0, 3.0], [1.0], [[1.0, 2.0]], "far"], ids=str)
-def test_a_pull_fits_the_state(pull: Any) -> None:
-    with pytest.raises(fg.GraphError, match=r"pull.*\(2,\)"):
-        loop_of(coupling="joint", pull=pull)
 
 
 class Mute:

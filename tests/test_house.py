@@ -76,9 +76,14 @@ HOUSE = [*LIBRARY, *((name, path) for name, folder in MEASURING.items() for path
 
 
 @cache
+def tree_of(source: str) -> ast.Module:
+    """Parse a source once."""
+    return ast.parse(source)
+
+
 def parsed(path: Path) -> ast.Module:
-    """Parse a file once."""
-    return ast.parse(path.read_text(encoding="utf-8"))
+    """Parse a file."""
+    return tree_of(path.read_text(encoding="utf-8"))
 
 
 def name_of(path: Path) -> str:
@@ -145,7 +150,7 @@ def storey_of(module: str) -> int:
 def known(source: str, package: str) -> tuple[tuple[int, str], ...]:
     """(line, module) of what a source imports of this house; of a name in a module, the module."""
     found = []
-    for line, name in imports(ast.parse(source), package):
+    for line, name in imports(tree_of(source), package):
         module = name if name in MODULES else name.rpartition(".")[0]
         if module in MODULES and (module == name or module != "unifg"):
             found.append((line, module))
@@ -374,7 +379,7 @@ PRIVATE_NAME = re.compile(r"\.(py_func|overloads|targetoptions|get_pointer_to_fu
 
 def private_sides(source: str) -> list[str]:
     """List where a source reaches into Numba."""
-    modules = [f"line {line}: {name}" for line, name in imports(ast.parse(source)) if PRIVATE_MODULE.match(name)]
+    modules = [f"line {line}: {name}" for line, name in imports(tree_of(source)) if PRIVATE_MODULE.match(name)]
     lines = enumerate(source.splitlines(), start=1)
     return modules + [f"line {number}: {line.strip()}" for number, line in lines if PRIVATE_NAME.search(line)]
 

@@ -61,6 +61,7 @@ def flown() -> Array:
 
 
 @EVERY_METHOD
+@pytest.mark.product(3)
 def test_order_on_position_attitude_velocity(method: Method) -> None:
     """The state of a flying robot, against rk4 at a sixteenth of the finest step."""
     order, errors = METHODS[cast(str, method)].order, []
@@ -151,6 +152,7 @@ def linearized(
 
 @pytest.mark.parametrize("method", [*NAMES, HEUN], ids=str)
 @EVERY_GROUP
+@pytest.mark.product(10)
 def test_jacobians(group: fg.LieGroup, method: Method) -> None:
     """Traced in a graph: against differences of the defect."""
     points, manifolds = step_of(group)

@@ -11,7 +11,7 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems.control import Unicycle
-from problems.known import STARTS, ecg2o, pose_chain, short_drive, three_variable_qp
+from problems.known import STARTS, ecg2o, pose_chain, three_variable_qp
 from unifg.models import unicycle
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import KKT, SQP, InteriorPoint
@@ -188,17 +188,6 @@ def test_scales_of_costs_do_not_matter(scale: float, tolerance: float) -> None:
     solution = KKT(tolerance=tolerance).solve(graph, {x: np.array([[0.3, 2.0]])})
     assert solution.converged, solution.report()
     np.testing.assert_allclose(solution[x], 0.5**0.5, rtol=1e-4)
-
-
-def test_inequalities_and_scalar_costs_are_refused_by_name() -> None:
-    graph, guess = short_drive()
-    with pytest.raises(fg.BackendError, match="KKT cannot take the inequality 'limits'"):
-        KKT().solve(graph, guess)
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
-    graph.minimize_scalar(lambda p: p[:, 0] ** 4, x, name="quartic")
-    with pytest.raises(fg.BackendError, match="scalar cost 'quartic'"):
-        KKT().solve(graph, {x: np.ones((1, 1))})
 
 
 def test_limits_that_are_data_are_looked_at_in_every_solve() -> None:

@@ -230,6 +230,7 @@ def test_a_scan_again_and_again_makes_no_surer() -> None:
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
+@pytest.mark.product(1)
 def test_errors_are_as_large_as_their_covariances(coupling: str) -> None:
     lidar = LidarModel(turn=0.1)
     log = Episode(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.known import PROBLEMS, Guess, ecg2o, ecg2o_inequality, short_drive, three_variable_qp
+from problems.known import PROBLEMS, Guess, ecg2o, ecg2o_inequality, three_variable_qp
 from test_sqp_exact import two_rotations
 from unifg.models import unicycle
 from unifg.problem.compiled_problem import CompiledProblem
@@ -327,9 +327,3 @@ def test_drawing() -> None:
     assert any(line.get_linestyle() == "--" for line in axes[0].lines), "curvature hangs on dashed lines"
     assert {text.get_text() for text in axes[1].texts} == set(both.dual.variables)
     axes[0].figure.canvas.draw()
-
-
-def test_short_drive_is_refused_for_its_limits() -> None:
-    graph, guess = short_drive(disc=False)
-    with pytest.raises(fg.BackendError, match="'limits'"):
-        SQP(qp="elimination").solve(graph, guess)

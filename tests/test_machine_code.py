@@ -42,7 +42,8 @@ COPIES = [copy.deepcopy, lambda thing: pickle.loads(pickle.dumps(thing))]
 
 @pytest.fixture(autouse=True)
 def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Objects:
-    """Nothing that other processes have kept is found, and no kernel is remembered."""
+    """Nothing that other processes have kept is found, and no kernel is remembered; old objects are no garbage."""
+    gc.freeze()  # these tests look for garbage all the time, and other tests have left a million objects behind
     own = Objects(tmp_path / "kept")
     monkeypatch.setattr(expression_room, "_objects", lambda: own)
     monkeypatch.setattr(derived_room, "_kernels", OrderedDict())

@@ -41,6 +41,7 @@ CORNER = NavigationSettings(start=(10.8, 17.0, -1.57), goals=((16.5, 14.0, 0.0),
     [replace(CORRIDOR, obstacles=2, seed=1), replace(CORNER, obstacles=1, seed=2)],
     ids=["corridor", "corner"],
 )
+@pytest.mark.product(2)
 def test_short_drive_reaches_its_goal(settings: NavigationSettings, solver: str) -> None:
     log = run_navigation(replace(settings, solver=solver))
     metrics = episode_metrics(log)
@@ -70,6 +71,7 @@ def test_a_goal_that_looks_back_along_the_way_is_reached(coupling: str) -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.product(1)
 def test_turtlebot_world(shared_data: Path, solver: str) -> None:
     settings = NavigationSettings(
         map=shared_data / "maps" / "turtlebot3_world.yaml",
@@ -90,6 +92,7 @@ def test_turtlebot_world(shared_data: Path, solver: str) -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.product(1)
 def test_same_seed_same_drive(solver: str) -> None:
     settings = replace(CORRIDOR, solver=solver, obstacles=2, seed=5)
     one, two = (Episode(settings).run(stop_after(40)) for _ in range(2))
@@ -161,6 +164,7 @@ def replace_solver(monkeypatch: pytest.MonkeyPatch, episode: Episode, double: ob
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("good", [12, 30], ids=["straight", "in the turn"])
+@pytest.mark.product(2)
 def test_failed_solves_brake_to_rest_along_the_stored_plan(
     monkeypatch: pytest.MonkeyPatch, solver: str, good: int
 ) -> None:

@@ -35,7 +35,7 @@ SHIPPED: list[fg.Manifold] = [fg.SO2, fg.SE2, fg.SO3, fg.SE3, fg.Rn(3), fg.Produ
 
 
 @pytest.mark.parametrize("manifold", SHIPPED + OWN, ids=lambda m: m.name)
-@pytest.mark.product(4)
+@pytest.mark.product(2)
 def test_axioms_hold(manifold: fg.Manifold) -> None:
     report = fg.check_manifold(manifold)
     assert report.ok, str(report)
@@ -44,6 +44,7 @@ def test_axioms_hold(manifold: fg.Manifold) -> None:
 
 
 @pytest.mark.parametrize("group", GROUPS[:3], ids=lambda g: g.name)
+@pytest.mark.product(1)
 def test_what_follows_is_exact(group: fg.LieGroup, rng: Generator) -> None:
     """Everything but four functions is derived; against exponentials of matrices, to rounding."""
     x, (d, v) = group.random(rng, (20,)), 0.9 * rng.standard_normal((2, 20, group.dim))
@@ -289,6 +290,7 @@ def test_all_backends_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda m: m.name)
+@pytest.mark.product(2)
 def test_smoothers_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
     chain = Chain(manifold)
     smoother, lag = fg.Incremental(relinearize=0.0, wildfire=0.0), fg.FixedLag(COUNT)

@@ -58,6 +58,7 @@ def follow(world: World, path: Array, tracker: DiscTracker, noise: Array, rng: n
 
 @pytest.mark.parametrize("distance", [0.6, 1.0, 2.0, 3.0])
 @pytest.mark.parametrize("radius", [0.15, 0.2, 0.25])
+@pytest.mark.product(4)
 def test_one_scan_places_a_disc(distance: float, radius: float) -> None:
     """From a single scan at the true pose the centre is right to 0.05 m, whatever the radius."""
     occupancy = hall()
@@ -123,6 +124,7 @@ def test_wide_things_become_several_discs() -> None:
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.2, 2.4, -1.9])
+@pytest.mark.product(2)
 def test_velocity_of_a_mover(heading: float) -> None:
     """One second after it was first seen, the velocity of a mover at 0.3 m/s is right to 0.1 m/s."""
     occupancy = hall()
@@ -161,6 +163,7 @@ def test_mover_that_turns_round_is_followed() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.6, 1.0, 1.5])
+@pytest.mark.product(2)
 def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
     """From where it turns it goes a forearm, at any speed, to where its track thought that it would not be."""
     occupancy, length, wrong = hall(), 2.2, []
@@ -218,6 +221,7 @@ def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
 
 
 @pytest.mark.parametrize("speed", [0.2, 0.5])
+@pytest.mark.product(1)
 def test_one_who_goes_to_and_fro_stays_a_mover(speed: float) -> None:
     occupancy = hall()
     mover = Obstacle(np.array([4.0, 5.5]), 0.2, np.array([4.8, 5.5]), speed)

@@ -170,6 +170,7 @@ def test_no_backend_compiles_after_prepare_however_its_solves_end() -> None:
 
 
 @pytest.mark.parametrize(("what", "coupling"), [("drive", "sequential"), ("drive", "joint"), ("flight", "joint")])
+@pytest.mark.product(1)
 def test_no_tick_compiles_though_solves_fail(what: str, coupling: str) -> None:
     found = said(EPISODE, what, coupling)
     assert isinstance(found, list)

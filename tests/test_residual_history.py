@@ -217,7 +217,7 @@ def test_a_monitor_draws_while_the_solver_goes_on(tmp_path: Path) -> None:
         sizes.append((tmp_path / "live.png").stat().st_size)
         return stop
 
-    solution = SQP().solve(graph, guess, callback=watch)
+    solution = SQP(max_iterations=4).solve(graph, guess, callback=watch)
     assert len(sizes) == len(solution.history) == len(monitor.rows)
     assert sizes[0] > 1000
     figure = monitor.figure()

@@ -48,6 +48,7 @@ def apart(one: PoseGraph, other: PoseGraph) -> float:
     ("seed", "kind"),
     [(0, Kind()), (5, Kind(noise=0.05, tail=0.1)), (0, HEAVY), (6, HEAVY), (0, UNEVEN), (6, UNEVEN), (7, UNEVEN)],
 )
+@pytest.mark.product(3)
 def test_a_clean_drive_keeps_every_closure(seed: int, kind: Kind) -> None:
     """Up to 69 of 100 right closures were given up, for a map 56 m off, CONVERGED."""
     graph, _ = drive(seed, kind)
@@ -59,6 +60,7 @@ def test_a_clean_drive_keeps_every_closure(seed: int, kind: Kind) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["tinyGrid3D.g2o", "smallGrid3D.g2o", "intel.g2o.gz", "M3500.g2o.gz"])
+@pytest.mark.product(2)
 def test_a_published_graph_keeps_every_closure(shared_data: Path, name: str) -> None:
     graph = read_g2o(shared_data / "pose_graphs" / name)
     solution, found, kept = robust(graph, fg.TruncatedLeastSquares(THRESHOLD if graph.group is fg.SE2 else 4.1))
@@ -115,6 +117,7 @@ def test_a_group_that_contradicts_the_others_is_left_out(seed: int, count: int) 
 
 
 @pytest.mark.parametrize("seed", [0, 6, 9])
+@pytest.mark.product(1)
 def test_wrong_odometry_is_found_and_no_start_leads_lower(seed: int) -> None:
     """Each start alone, and its Huber optimum: local descent of the stated objective ends no lower.
 

@@ -150,6 +150,7 @@ def agree(kind: str, residual: str, weights: str, loss: str) -> None:
 @pytest.mark.parametrize("kind", ["incremental", "fixed lag"])
 @pytest.mark.parametrize("loss", LOSSES)
 @pytest.mark.parametrize("residual", RESIDUALS)
+@pytest.mark.product(30)
 def test_every_residual_with_every_loss(kind: str, residual: str, loss: str) -> None:
     agree(kind, residual, "information of factors", loss)
 
