@@ -245,8 +245,8 @@ def test_claims_survive_the_file_and_are_counted() -> None:
     assert claims.restored(json.loads(json.dumps({"code": "now", **asdict(case)}))) == case
     text = claims.render([case])
     assert "- parking 3, ipm: `CONVERGED`, but stationarity is 0.003." in text
-    assert "| alm | 0 / 1 | 0 | - | 0 / 1 / 0 | 1 | 0 |" in text
-    assert "| ipm | 1 / 1 | 1 | 3.00e-03 | 0 / 0 / 0 | 0 | 0 | 1 / 0 / 0 |" in text
+    assert "| alm | 0 / 1 | 0 | 0 | - | 0 / 1 / 0 | 1 | 0 |" in text
+    assert "| ipm | 1 / 1 | 0 | 1 | 3.00e-03 | 0 / 0 / 0 | 0 | 0 | 1 / 0 / 0 |" in text
 
 
 def test_alpha_is_found_between_two_that_were_flown(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -116,7 +116,7 @@ def test_wrong_backends_are_named(monkeypatch: pytest.MonkeyPatch, capsys: pytes
         raise MemoryError("no room")
 
     def slow() -> fg.Solution:
-        for _ in range(20):
+        for _ in range(400):  # which share a workspace
             solve()
         return solve()
 

@@ -2,7 +2,10 @@
 
 from tools.walks import Walk, front, guess
 
-FILES, HAND_OVERS = 48, 168  # four look at a term, sixteen at the guess; two turn threads away, two count them
+FILES, HAND_OVERS = (
+    49,
+    168,
+)  # four look at a term, sixteen at the guess; one names the cache's folder; two turn threads away, two count them
 
 
 def spelled(walk: Walk) -> str:

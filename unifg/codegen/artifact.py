@@ -51,14 +51,14 @@ class Artifact(NamedTuple):
         """The same from bytes.
 
         Raises:
-            ValueError: they are of another form.
+            UnifgError: they are of another form.
         """
         try:
             header, code = struct.unpack_from("<2Q", content)
             first = struct.calcsize("<2Q")
             found = json.loads(content[first : first + header])
-        except struct.error as error:
-            raise ValueError(str(error)) from error
+        except (struct.error, ValueError) as error:
+            raise UnifgError(f"a kept function is of another form: {error}") from error
         return cls(found, content[first + header : first + header + code], content[first + header + code :])
 
 

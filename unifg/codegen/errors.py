@@ -13,6 +13,8 @@ import re
 
 from llvmlite import binding as llvm
 
+from unifg.errors import UnifgError
+
 PREFIX = "unifg_raise_"
 MESSAGES: dict[type[Exception], str] = {
     MemoryError: "a compiled function could not allocate an array",
@@ -56,7 +58,7 @@ def without_errors(text: str) -> str:
     """Code in LLVM's language whose records of errors are symbols from outside.
 
     Raises:
-        KeyError: it raises an error of another class.
+        UnifgError: it raises an error of another class, or one with numbers of its own.
     """
     names = {kind.__name__ for kind in MESSAGES}
     data = {match[1]: match[0] for match in _DATA.finditer(text)}
@@ -65,10 +67,10 @@ def without_errors(text: str) -> str:
     }
     wrong = set(records.values()) - names
     if wrong:
-        raise KeyError(f"raises something else: {data[min(wrong)][-200:]}")
+        raise UnifgError(f"raises something else: {data[min(wrong)][-200:]}")
     text = _DATA.sub("", _RECORD.sub("", text))
     if "@.const.pickledata" in text:
-        raise KeyError("raises errors with numbers of their own, as for slices of other sizes")
+        raise UnifgError("raises errors with numbers of their own, as for slices of other sizes")
     for record in sorted(records, key=len, reverse=True):
         text = re.sub(rf'@"?{re.escape(record)}"?(?![\w.])', f"@{PREFIX}{records[record]}", text)
     declared = [f"@{PREFIX}{name} = external constant {_TYPE}\n" for name in sorted(set(records.values()))]

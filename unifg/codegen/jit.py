@@ -38,6 +38,7 @@ from unifg.codegen.cache_folder import cache_folder, say_not_kept
 from unifg.codegen.compile_counter import tally
 from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.objects import read_sealed, write_sealed
+from unifg.errors import UnifgError
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -157,7 +158,7 @@ class _Cache:
         try:
             artifact = Artifact.unpacked(content[len(made) :])
             return rebuilt(target, artifact, self._py_func, arguments)
-        except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        except (UnifgError, ValueError, KeyError, TypeError, RuntimeError) as error:
             logger.warning("%s cannot be read and is written anew: %s: %s", path, type(error).__name__, error)
             return None
 

@@ -38,6 +38,7 @@ from unifg.atomic_write import replacing
 from unifg.codegen.artifact import header_of
 from unifg.codegen.errors import PREFIX, without_errors
 from unifg.codegen.fingerprint import SHAPES, SHIPPED, fingerprint, parsed
+from unifg.errors import UnifgError
 
 logger = logging.getLogger("unifg")
 
@@ -110,7 +111,7 @@ class Archive:
             member = self._members[key]
             code = self._code[member["first"] : member["end"]]
             if hashlib.sha256(code).hexdigest() != member["sha256"]:
-                raise ValueError(f"member {key[:12]} is not what its digest says")
+                raise UnifgError(f"member {key[:12]} is not what its digest says")
             return member["header"], code.decode()
         except Exception as error:
             self.usable = False
@@ -186,7 +187,7 @@ class Recorder:
         try:
             text = without_errors(self._alone(self._optimised[result.library._final_module.name]))
             wrong = [symbol for symbol in undefined(text) if not OUTSIDE.match(symbol)]
-        except KeyError as error:
+        except UnifgError as error:
             self.left_out[name] = str(error)
             return
         if header is None or wrong:
