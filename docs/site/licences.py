@@ -19,8 +19,8 @@ PAGE = CHECKOUT / "docs" / "reference" / "licences.md"
 USED = ("view", "scenarios", "casadi", "campaign", "mcap", "metis", "bench")
 HEAD = """# Licences
 
-unifg itself is under the [MIT licence](../../LICENSE). It contains no code of others; scenes carry meshcat's viewer inside
-(MIT), with three.js (MIT). What it needs, what its extras add, and what these need in turn on Linux, as the metadata
+unifg itself is under the [MIT licence](../../LICENSE). It contains no code of others; scenes carry meshcat's viewer
+inside (MIT), with three.js (MIT). What it needs, what its extras add, and what these need in turn on Linux, as the metadata
 of the packages says; the page is made by `python docs/site/licences.py`.
 
 | package | version | licence | for |
