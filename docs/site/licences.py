@@ -20,8 +20,8 @@ USED = ("view", "scenarios", "casadi", "campaign", "mcap", "metis", "bench")
 HEAD = """# Licences
 
 unifg itself is under the [MIT licence](../../LICENSE). It contains no code of others; scenes carry meshcat's viewer
-inside (MIT), with three.js (MIT). What it needs, what its extras add, and what these need in turn on Linux, as the metadata
-of the packages says; the page is made by `python docs/site/licences.py`.
+inside (MIT), with three.js (MIT). What it needs, what its extras add, and what these need in turn on Linux, as the
+metadata of the packages says; the page is made by `python docs/site/licences.py`.
 
 | package | version | licence | for |
 |---|---|---|---|
