@@ -774,7 +774,7 @@ class Ahead(Scalar):
         ({"window": None, "coupling": "joint"}, "needs a window"),
         ({"window": line_window(3, replace(LINE, predict=None)), "coupling": "joint"}, "another robot"),
     ],
-    ids=str,
+    ids=lambda value: value if isinstance(value, str) else "-".join(value),
 )
 def test_what_a_loop_refuses(options: dict[str, Any], message: str) -> None:
     with pytest.raises(fg.GraphError, match=message):
