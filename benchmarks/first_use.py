@@ -39,10 +39,12 @@ class Cell:
 
 
 def cells(seeds: Sequence[int]) -> Iterator[Cell]:
-    """The Pythons of this machine."""
+    """The Pythons of this machine that run."""
     named = filter(None, os.environ.get("PYTHONS", "").split(":"))
     on_path = filter(None, (shutil.which(f"python3.{minor}") for minor in range(11, 20)))
-    yield from map(Cell, dict.fromkeys([*named, *on_path]))
+    for python in dict.fromkeys([*named, *on_path]):
+        if subprocess.run([python, "-c", ""], capture_output=True, check=False).returncode == 0:
+            yield Cell(python)
 
 
 def measure(cell: Cell) -> Row:
