@@ -99,22 +99,21 @@ def rebuilt(target: Any, artifact: Artifact, function: FunctionType, arguments: 
 
 
 def finished(
-    target: Any, header: dict[str, Any], text: str, function: FunctionType, arguments: tuple[Any, ...], called: bool
+    target: Any, header: dict[str, Any], text: str, function: FunctionType, arguments: tuple[Any, ...]
 ) -> Artifact:
     """Generate machine code for this processor, and what Python needs to call it.
 
     Args:
         target: context.
-        header: of an artifact.
+        header: of an artifact, and whether it is "called" by Python; others are called through their addresses.
         text: LLVM's language, optimised.
         function: in Python.
         arguments: types.
-        called: by Python; others are called through their addresses.
     """
     codegen = target.codegen()
     module = llvm.parse_assembly(text)
     held: list[Any] = []
-    if called:
+    if header["called"]:
         described, environment = _described_function(header, function, arguments)
         environment.consts.clear()
         wrapper = codegen.create_library("wrapper")

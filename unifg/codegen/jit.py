@@ -121,9 +121,8 @@ class _Cache:
         if (half := precompiled.archive().find(self._shipping_key(signature))) is None:
             return None
         target.refresh()  # wrappers for Python are made here, of Numba's own types
-        header, text = half
         arguments = normalize_signature(signature)[0]
-        made = finished(target, header, text, self._py_func, arguments, header["called"])
+        made = finished(target, *half, self._py_func, arguments)
         found = rebuilt(target, made, self._py_func, arguments)
         self._keep(path, arguments, made)
         tally.generated.append(name)

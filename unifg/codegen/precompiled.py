@@ -185,7 +185,8 @@ class Recorder:
         name = f"{function.__module__}:{function.__qualname__}"
         header = header_of(result)
         try:
-            text = without_errors(self._alone(self._optimised[result.library._final_module.name]))
+            alone, called = self._alone(self._optimised[result.library._final_module.name])
+            text = without_errors(alone)
             wrong = [symbol for symbol in undefined(text) if not OUTSIDE.match(symbol)]
         except UnifgError as error:
             self.left_out[name] = str(error)
@@ -193,15 +194,14 @@ class Recorder:
         if header is None or wrong:
             self.left_out[name] = f"expects {', '.join(wrong)}" if wrong else "its result is of no plain type"
             return
-        called = any(symbol.startswith(WRAPPER) for symbol in self._names)
         self.members[key] = {**header, "called": called}, text
         if digest := _present(name):
             self.functions[name] = digest
 
-    def _alone(self, text: str) -> str:
-        """Code without what Python calls, which each version of it wants otherwise."""
+    def _alone(self, text: str) -> tuple[str, bool]:
+        """Code without what Python calls, which each version of it wants otherwise, and whether there was any."""
         module = llvm.parse_assembly(text)
-        self._names = [function.name for function in module.functions]
+        called = any(function.name.startswith(WRAPPER) for function in module.functions)
         for function in module.functions:
             if function.name.startswith((WRAPPER, "cfunc.")) and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
@@ -209,7 +209,7 @@ class Recorder:
         passes = llvm.create_new_module_pass_manager()
         passes.add_global_dead_code_eliminate_pass()
         passes.run(module, builder)
-        return str(module)
+        return str(module), called
 
     def write(self, path: Path) -> None:
         """Write the archive, and log what is left out of it."""
