@@ -19,6 +19,7 @@ import pytest
 
 from unifg.codegen import cache_folder, jit
 from unifg.codegen.artifact import Artifact
+from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.jit import compiled
 from unifg.codegen.objects import read_sealed, write_sealed
 
@@ -81,7 +82,7 @@ def test_code_whose_header_says_something_else_begins_anew(
     first = compiled(twice)
     assert first(3.0) == 6.0
     (file,) = tmp_path.rglob("*.code")
-    made = first._cache._made((numba.float64,))  # type: ignore[attr-defined]
+    made = first._cache._made((numba.float64,), fingerprint(twice))  # type: ignore[attr-defined]
     content = read_sealed(file)
     assert content is not None and content.startswith(made)
     artifact = Artifact.unpacked(content[len(made) :])

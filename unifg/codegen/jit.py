@@ -112,19 +112,19 @@ class _Cache:
             return None
         self._ready(target)
         name = f"{self._py_func.__module__}.{self._py_func.__qualname__}"
-        path = self._file(signature, target.codegen())
-        found = None if path is None else self._read(path, signature, target)
+        arguments, digest = normalize_signature(signature)[0], fingerprint(self._py_func)
+        path = self._file(arguments, digest, target.codegen())
+        found = None if path is None else self._read(path, arguments, digest, target)
         if found is not None:
             tally.read.append(name)
             tally.files.append(str(path))
             return found
-        if (half := precompiled.archive().find(self._shipping_key(signature))) is None:
+        if (half := precompiled.archive().find(self._shipping_key(arguments, digest))) is None:
             return None
         target.refresh()  # wrappers for Python are made here, of Numba's own types
-        arguments = normalize_signature(signature)[0]
         made = finished(target, *half, self._py_func, arguments)
         found = rebuilt(target, made, self._py_func, arguments)
-        self._keep(path, arguments, made)
+        self._keep(path, self._made(arguments, digest), made)
         tally.generated.append(name)
         return found
 
@@ -139,20 +139,21 @@ class _Cache:
             target.refresh()
 
     def save_overload(self, signature: Any, result: Any) -> None:
+        arguments, digest = normalize_signature(signature)[0], fingerprint(self._py_func)
         if not result.library.has_dynamic_globals and (header := header_of(result)) is not None:
             _, _, (code, linkable) = result.library.serialize_using_object_code()
-            path, arguments = self._file(signature, result.codegen), normalize_signature(signature)[0]
-            self._keep(path, arguments, Artifact(header, code, linkable))
+            path = self._file(arguments, digest, result.codegen)
+            self._keep(path, self._made(arguments, digest), Artifact(header, code, linkable))
         if precompiled.recorder is not None:
-            precompiled.recorder.keep(self._shipping_key(signature), self._py_func, result)
+            precompiled.recorder.keep(self._shipping_key(arguments, digest), self._py_func, result)
 
     def flush(self) -> None:
         """Do nothing: code is found by its fingerprint, so there is nothing to begin anew."""
 
-    def _read(self, path: Path, signature: Any, target: Any) -> Any:
+    def _read(self, path: Path, arguments: tuple[Any, ...], digest: str, target: Any) -> Any:
         """Read the code of the function as it is now; None if a file is of another or cannot be read."""
-        arguments = normalize_signature(signature)[0]
-        if (content := read_sealed(path)) is None or not content.startswith(made := self._made(arguments)):
+        made = self._made(arguments, digest)
+        if (content := read_sealed(path)) is None or not content.startswith(made):
             return None
         try:
             artifact = Artifact.unpacked(content[len(made) :])
@@ -161,45 +162,42 @@ class _Cache:
             logger.warning("%s cannot be read and is written anew: %s: %s", path, type(error).__name__, error)
             return None
 
-    def _keep(self, path: Path | None, arguments: tuple[Any, ...], artifact: Artifact) -> None:
+    def _keep(self, path: Path | None, made: bytes, artifact: Artifact) -> None:
         """Write what Numba keeps of a function, if that is possible."""
         if path is None:
             return
         try:
-            write_sealed(path, self._made(arguments) + artifact.packed())
+            write_sealed(path, made + artifact.packed())
         except OSError as error:  # a full disk
             say_not_kept(f"{path.parent}: {error.strerror}")
             return
         tally.files.append(str(path))
 
-    def _file(self, signature: Any, codegen: Any) -> Path | None:
+    def _file(self, arguments: tuple[Any, ...], digest: str, codegen: Any) -> Path | None:
         """One for each signature and processor; of functions made by another function, one for each that is made."""
         folder, function = cache_folder(), self._py_func
         if folder is None:
             return None
         name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}".replace("<", "").replace(">", "")
-        made = fingerprint(function) if "<" in function.__qualname__ else ""
-        arguments = normalize_signature(signature)[0]
+        made = digest if "<" in function.__qualname__ else ""
         place = function.__module__, function.__code__.co_filename
         parts = (sys.version_info[:2], *place, *map(spelled, arguments), codegen.magic_tuple(), made)
-        digest = hashlib.sha256(repr((*parts, *self._variant())).encode()).hexdigest()[:20]
-        return folder / f"{name}.{digest}.code"
+        number = hashlib.sha256(repr((*parts, *self._variant())).encode()).hexdigest()[:20]
+        return folder / f"{name}.{number}.code"
 
-    def _made(self, arguments: tuple[Any, ...]) -> bytes:
+    def _made(self, arguments: tuple[Any, ...], digest: str) -> bytes:
         """Digest of versions, the types of the arguments, the function and its callees."""
         kinds = " ".join(map(spelled, arguments))
-        stated = f"{numba.__version__} {llvmlite.__version__} {kinds} {fingerprint(self._py_func)}"
+        stated = f"{numba.__version__} {llvmlite.__version__} {kinds} {digest}"
         return hashlib.sha256(stated.encode()).digest()
 
     def _variant(self) -> tuple[str, ...]:
         """Further parts of the key."""
         return ()
 
-    def _shipping_key(self, signature: Any) -> str:
+    def _shipping_key(self, arguments: tuple[Any, ...], digest: str) -> str:
         """Key of the function in an archive that is made elsewhere: no date and no processor."""
-        function = self._py_func
-        arguments, _ = normalize_signature(signature)  # a dispatcher, too, tells functions by their arguments alone
-        parts = (*map(spelled, arguments), *self._variant(), fingerprint(function))
+        parts = (*map(spelled, arguments), *self._variant(), digest)  # a dispatcher, too, tells by arguments alone
         return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 
