@@ -46,6 +46,7 @@ from unifg.problem.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WI
 from unifg.solvers.interior_point.state import (
     CONVERGED,
     LIMIT_REACHED,
+    NO,
     NOT_FINITE,
     STALLED,
     STOPPED,
@@ -269,9 +270,9 @@ def _find_units(
 def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
-    full, gradient, links, multipliers, pairs = parts(address, "full gradient links multipliers pairs")
-    penalties, row_units, rows, scalars, sides = parts(address, "penalties row_units rows scalars sides")
-    terms, units = parts(address, "terms units")
+    full, gradient, heights, links = parts(address, "full gradient heights links")
+    multipliers, pairs, penalties, row_units = parts(address, "multipliers pairs penalties row_units")
+    rows, scalars, sides, terms, units = parts(address, "rows scalars sides terms units")
     now = scalars[0]
     lower, upper = terms.lower, terms.upper
     count = 0
@@ -329,7 +330,13 @@ def begin(address: int) -> None:
     now.theta_small, now.theta_large = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
     now.filtered = now.failures = now.short_steps = 0
     now.delta = now.last_delta = now.step = now.taken = 0.0
+    now.estimated = 0
     run(links[0].measure, (address,))
+    if now.cold == 1 and now.exact == 1 and len(heights):
+        run(links[0].examine, (address,))
+        if now.definite == NO:
+            run(links[0].estimate, (address,))
+            run(links[0].measure, (address,))
 
 
 @linked

@@ -10,12 +10,13 @@ import math
 from unifg.codegen.function_pointers import holds, linked, parts, run
 from unifg.elimination.plan import NEGATIVE
 from unifg.problem.evaluation import add_constraints, times, transposed_times
-from unifg.solvers.interior_point.state import AGAIN, SINGULAR, TRY
+from unifg.solvers.interior_point.state import AGAIN, EXAMINED, NO, SINGULAR, TRY, UNKNOWN, YES
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
 DUAL_SHIFT = 1e-9
 SHORT = 0.01  # length of a step
 LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
+FLAT = 1e-9  # curvature relative to the largest that counts as none
 
 
 @linked
@@ -46,21 +47,15 @@ def direct(address: int) -> None:
             rests[row] += q - p
             shift[n + k] -= p / (penalties[row] - multiplier) + q / (penalties[row] + multiplier)
     # Second derivatives need multipliers, and those of a cold start mean little.
-    exact = now.exact == 1 and now.failures < 2 and (now.iteration > 0 or now.cold == 0)
-    share = 1.0 if exact else 0.0  # of the second derivatives
-    for k in range(normal):
-        data[k] = curvature[k] if share > 0.0 else hessian[k]
-    for k in range(len(entries)):
-        data[normal + k] = constraint_jacobian[entries[k]]
-    add_constraints(terms, constraint_jacobian, row_weights, data)
-    for k in range(len(doubles) // 2):
-        data[doubles[2 * k]] += data[doubles[2 * k + 1]]
+    exact = now.exact == 1 and now.failures < 2 and (now.iteration > 0 or now.cold == 0 or now.estimated == 1)
+    now.share = 1.0 if exact else 0.0
     delta = now.delta if now.failures > 0 else 0.0
     # Less of the second derivatives may mean less curvature, and a step that was cut very short had too little.
     blend = now.taken > SHORT or now.iteration == 0
     now.answer = TRY
     while True:
-        now.gauss_newton = 1 if share == 0.0 else 0
+        now.gauss_newton = 1 if now.share == 0.0 else 0
+        run(links[0].assemble, (address,))
         for k in range(n):
             shift[k] = delta * unit / units[free[k]] ** 2
         factorised = holds(links[0].factor, (plan, data, shift))
@@ -71,12 +66,12 @@ def direct(address: int) -> None:
                 largest = max(largest, abs(step[k]))
             if math.isfinite(largest):
                 break
-        if share > 0.0 and blend:
-            less = 0.5 * share if share > LEAST_SHARE else 0.0
-            for k in range(normal):
-                data[k] += (less - share) * (curvature[k] - hessian[k])
-            share = less
-            continue
+        if now.share > 0.0 and blend:
+            if now.definite == UNKNOWN:
+                run(links[0].examine, (address,))
+            if now.definite == YES:
+                now.share = 0.5 * now.share if now.share > LEAST_SHARE else 0.0
+                continue
         if delta == 0.0:
             last = now.last_delta
             delta = FIRST_SHIFT if last == 0.0 else max(1e-12, last / SHIFT_DECAY)
@@ -91,6 +86,90 @@ def direct(address: int) -> None:
     now.delta = delta
     if delta > 0.0:
         now.last_delta = delta
+
+
+@linked
+def assemble(address: int) -> None:
+    """Write the KKT matrix with a share of the second derivatives, and with what the sides add unless it is examined."""
+    constraint_jacobian, curvature, data = parts(address, "constraint_jacobian curvature data")
+    doubles, entries, hessian, row_weights = parts(address, "doubles entries hessian row_weights")
+    scalars, terms = parts(address, "scalars terms")
+    share, normal = scalars[0].share, len(hessian)
+    for k in range(normal):
+        data[k] = curvature[k] if share == 1.0 else hessian[k]
+        if 0.0 < share < 1.0:
+            data[k] += share * (curvature[k] - hessian[k])
+    for k in range(len(entries)):
+        data[normal + k] = constraint_jacobian[entries[k]]
+    if scalars[0].definite != EXAMINED:
+        add_constraints(terms, constraint_jacobian, row_weights, data)
+    for k in range(len(doubles) // 2):
+        data[doubles[2 * k]] += data[doubles[2 * k + 1]]
+
+
+@linked
+def examine(address: int) -> None:
+    """Test whether the Hessian of Gauss-Newton is definite where the equalities leave freedom.
+
+    Where it is, less of the second derivatives is more curvature. Where it is not, as with a cost that is no square,
+    they are the only curvature of some direction, which would be left to the barrier alone.
+    """
+    data, free, hessian, links, plan = parts(address, "data free hessian links plan")
+    rows, scalars, shift, units = parts(address, "rows scalars shift units")
+    now = scalars[0]
+    share, largest, least = now.share, 0.0, math.inf
+    for entry in hessian:
+        largest = max(largest, abs(entry))
+    for place in free:
+        least = min(least, units[place])
+    now.share, now.definite = 0.0, EXAMINED
+    run(links[0].assemble, (address,))
+    for k in range(len(free)):
+        shift[k] = -FLAT * largest * (least / units[free[k]]) ** 2
+    definite = largest > 0.0 and holds(links[0].factor, (plan, data, shift)) and plan.state[NEGATIVE] == len(rows)
+    now.share, now.definite = share, YES if definite else NO
+
+
+@linked
+def estimate(address: int) -> None:
+    """Multipliers of the equalities by least squares, and with them second derivatives for the first step.
+
+    Without them nothing would bound the step of a cost that is no square. Large ones say little, and are left at zero:
+    Waechter and Biegler 2006, section 3.6.
+    """
+    constraint_jacobian, data, doubles = parts(address, "constraint_jacobian data doubles")
+    entries, free, full, gradient = parts(address, "entries free full gradient")
+    hessian, links, multipliers, plan = parts(address, "hessian links multipliers plan")
+    right, row_units, rows, scalars = parts(address, "right row_units rows scalars")
+    shift, step, terms, units = parts(address, "shift step terms units")
+    now = scalars[0]
+    n, normal, unit = len(free), len(hessian), now.cost_unit
+    for k in range(normal):
+        data[k] = 0.0
+    for k in range(len(entries)):
+        data[normal + k] = constraint_jacobian[entries[k]]
+    for k in range(len(doubles) // 2):
+        data[doubles[2 * k]] += data[doubles[2 * k + 1]]
+    for k in range(len(full)):
+        full[k] = gradient[k]
+    transposed_times(terms, False, constraint_jacobian, multipliers, full)
+    for k in range(n):
+        shift[k] = unit / units[free[k]] ** 2
+        right[k] = -full[free[k]]
+    for k in range(len(rows)):
+        shift[n + k] = -DUAL_SHIFT / unit * row_units[rows[k]] ** 2
+        right[n + k] = 0.0
+    now.estimated = 0
+    if not holds(links[0].factor, (plan, data, shift)):
+        return
+    run(links[0].solve, (plan, right, step))
+    largest = 0.0
+    for k in range(len(rows)):
+        largest = max(largest, abs(step[n + k]) * row_units[rows[k]])
+    if largest <= now.rho:
+        now.estimated = 1
+        for k in range(len(rows)):
+            multipliers[rows[k]] = step[n + k]
 
 
 @linked

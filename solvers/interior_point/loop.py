@@ -159,7 +159,7 @@ def loop(address: int) -> None:
                 return
         if stage == TESTED:
             stage = BENT
-            if now.exact == 1 and (now.iteration > 0 or now.cold == 0):
+            if now.exact == 1 and (now.iteration > 0 or now.cold == 0 or now.estimated == 1):
                 if python:
                     now.answer, now.stage = BEND, BENT
                     return
@@ -226,6 +226,9 @@ def addresses() -> Records:
         "restore": filter_search.restore,
         "accept": filter_search.accept,
         "direct": direction.direct,
+        "assemble": direction.assemble,
+        "examine": direction.examine,
+        "estimate": direction.estimate,
         "steer": direction.steer,
         "advance": advance,
         "renew": renew,

@@ -316,7 +316,7 @@ class Workspace:
             clocked or options.time_limit < np.inf,
         )
         now["keeping"] = max(run.tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
-        now["iteration"], now["kept"], now["raises"] = 0, 0, 0
+        now["iteration"], now["kept"], now["raises"], now["definite"] = 0, 0, 0, state.UNKNOWN
         work.row_units[:] = work.units[:] = 1.0
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
         self.begin_at(run.values.flat, options)

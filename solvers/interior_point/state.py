@@ -45,6 +45,7 @@ NOW = np.dtype(
         ("asked", np.float64),  # penalty at which it was asked whether the violation is the least
         ("paid", np.float64),  # largest violation of a row times its penalty
         ("force", np.float64),  # stationarity in the units of the unknowns
+        ("share", np.float64),  # of the second derivatives in the KKT matrix
         ("cost_unit", np.float64),  # what the objective is measured in
         ("step_tolerance", np.float64),  # norm of a full step below which to stop, once the violation is small enough
         ("violation_tolerance", np.float64),
@@ -59,6 +60,8 @@ NOW = np.dtype(
         ("corrected", np.int64),  # whether the trial is a second-order correction
         ("failures", np.int64),  # line searches in a row that found nothing
         ("gauss_newton", np.int64),  # whether the present direction used the Gauss-Newton Hessian
+        ("definite", np.int64),  # whether the Hessian of Gauss-Newton is, one of the words below
+        ("estimated", np.int64),  # whether a cold start has multipliers by least squares
         ("cold", np.int64),  # whether the start had no multipliers
         ("descent", np.int64),  # whether the last trial was accepted because it lowers the barrier function
         ("elastic", np.int64),  # whether equalities are elastic, as inequalities always are
@@ -106,7 +109,7 @@ PAIR = np.dtype(
 # Addresses of compiled functions.
 FUNCTIONS = "factor solve linearize evaluate curve weigh add_scalars evaluate_scalars retract"
 FUNCTIONS += (
-    " begin measure test bend direct steer advance judge correct restore accept relax increase_penalty renew loop"
+    " begin measure test bend direct assemble examine estimate steer advance judge correct restore accept relax increase_penalty renew loop"
 )
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
@@ -114,6 +117,7 @@ LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE, VIOLATED, STOPPED = range(10)
 # What the loop asks of Python, before it is called again.
 LINEARIZE, BEND, EVALUATE, SHOW = range(10, 14)
+UNKNOWN, YES, NO, EXAMINED = range(4)
 # Where it goes on then.
 MOVED, LINEARIZED, MEASURED, TESTED, BENT, AIMED, EVALUATED = range(7)
 FILTER = 400  # pairs of theta and phi that are remembered
