@@ -43,6 +43,7 @@ from unifg.codegen.function_pointers import linked, parts, run
 from unifg.codegen.jit import compiled
 from unifg.problem.evaluation import transposed_times
 from unifg.problem.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.problem.units import SMALL_FORCES, cost_unit, mean_force
 from unifg.solvers.interior_point.state import (
     CONVERGED,
     LIMIT_REACHED,
@@ -65,7 +66,7 @@ LATE_MU = 1e-3  # the same: largest mu at which a violation is taken seriously
 AT_PENALTY = 0.9  # share of the penalty from which on a multiplier is at it
 SMALL_PULL = 1e-2  # share of the constraints' forces below which the objective's force counts for nothing
 MOST_RAISES = 6  # of penalties, tenfold each
-LARGE_PULL = 1e3  # force of the objective from which on mu and penalties are in proportion to it
+LEAST_PENALTY = 10.0  # times the largest slope of the objective
 FAR = 100.0  # from one: largest entry of a row that calls for other units
 SWEEPS = 8
 BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
@@ -130,8 +131,9 @@ def _split(c: float, rho: float, mu: float) -> tuple[float, float]:
 @linked
 def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
-    constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
-    full, gradient, multipliers, pairs, penalties = parts(address, "full gradient multipliers pairs penalties")
+    constraint_jacobian, constraints, diagonal = parts(address, "constraint_jacobian constraints diagonal")
+    free, full, gradient, hessian = parts(address, "free full gradient hessian")
+    multipliers, ones, pairs, penalties = parts(address, "multipliers ones pairs penalties")
     row_units, rows, scalars, sides, terms = parts(address, "row_units rows scalars sides terms")
     (units,) = parts(address, "units")
     now = scalars[0]
@@ -149,14 +151,13 @@ def measure(address: int) -> None:
     for k in range(len(full)):
         full[k] = gradient[k]
     transposed_times(terms, False, constraint_jacobian, multipliers, full)
-    stationarity = force = violation = paid = complementarity = size = 0.0
+    stationarity = force = violation = paid = complementarity = 0.0
     for column in free:
         if not abs(full[column]) <= stationarity:  # NaN stays
             stationarity = abs(full[column])
         force = max(force, abs(full[column]) * units[column])
     for row in range(len(constraints)):
         value, multiplier = constraints[row], multipliers[row]
-        size += abs(multiplier)
         outside = max(value - upper[row], lower[row] - value)
         if not outside <= violation:
             violation = outside
@@ -174,7 +175,8 @@ def measure(address: int) -> None:
             pz, nz = p * (penalties[row] - multipliers[row]), n * (penalties[row] + multipliers[row])
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
-    scale = max(1.0, size / max(1, len(constraints)) / 100.0)
+    now.size = cost_unit(free, diagonal, hessian, gradient, ones)
+    scale = max(now.size, mean_force(terms, constraint_jacobian, multipliers) / SMALL_FORCES)
     now.scale, now.stationarity, now.violation = scale, stationarity / scale, violation
     now.complementarity, now.gap, now.least, now.most = complementarity / scale, gap, least, most
     now.force, now.paid = force / scale, paid
@@ -182,9 +184,9 @@ def measure(address: int) -> None:
 
 @compiled
 def _error(now: Any) -> float:
-    """Error of the barrier problem."""
+    """Error of the barrier problem, in units of the objective, and so comparable with mu."""
     centring = max(now.most - now.mu, now.mu - now.least) / now.scale
-    error: float = max(max(now.force, now.gap), centring)
+    error: float = max(max(now.force, now.gap), centring) * now.size
     return error
 
 
@@ -270,7 +272,8 @@ def _find_units(
 def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
-    full, gradient, heights, links = parts(address, "full gradient heights links")
+    diagonal, full, gradient, heights = parts(address, "diagonal full gradient heights")
+    hessian, links = parts(address, "hessian links")
     multipliers, pairs, penalties, row_units = parts(address, "multipliers pairs penalties row_units")
     rows, scalars, sides, terms, units = parts(address, "rows scalars sides terms units")
     now = scalars[0]
@@ -288,13 +291,12 @@ def begin(address: int) -> None:
     now.cost_unit = 1.0
     if now.scaling == 1:
         _find_units(terms, constraint_jacobian, row_units, units, penalties, full)
+        now.cost_unit = cost_unit(free, diagonal, hessian, gradient, units)
         pull = 0.0
         for column in free:
             pull = max(pull, abs(gradient[column]) * units[column])
-        if pull > LARGE_PULL:
-            unit = now.cost_unit = pull / LARGE_PULL
-            now.rho *= unit
-            now.mu *= unit
+        now.rho = max(now.rho * now.cost_unit, LEAST_PENALTY * pull)
+        now.mu *= now.cost_unit
     largest = 0.0
     for row in range(len(lower)):
         largest = max(largest, abs(multipliers[row]) * row_units[row])
@@ -311,7 +313,7 @@ def begin(address: int) -> None:
             sides[k].y, sides[k].s, sides[k].e = y, c, 0.0
         run(links[0].measure, (address,))
         error = max(max(now.stationarity, now.violation), now.complementarity)
-        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance)
+        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * now.size
     mu = now.mu
     for k in range(count):
         row = sides[k].row
@@ -362,7 +364,7 @@ def test(address: int) -> None:
         now.answer = CONVERGED
         return
     # With a larger mu, what is active has not been found, and short steps are those towards another problem's answer.
-    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU:
+    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * now.size:
         if now.violation < now.violation_tolerance:
             now.answer = STOPPED
             return
@@ -378,12 +380,12 @@ def test(address: int) -> None:
         return
     if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violation > tolerance:
         run(links[0].relax, (address,))
-    smallest = 0.1 * tolerance
+    smallest = 0.1 * tolerance * now.size
     bound = False
     if _error(now) <= SOLVED * now.mu and now.violation > tolerance:
         # Whether something is violated because its penalty is too low, or because it has to be. With the least mu that
         # is told by a solved problem: a step before, equalities without a penalty may still be on their way.
-        bound = now.mu <= smallest and _error(now) <= tolerance
+        bound = now.mu <= smallest and _error(now) <= tolerance * now.size
         if now.mu <= LATE_MU * min(now.paid, now.rho):
             for k in range(now.sides):
                 bound = bound or (sides[k].y > AT_PENALTY * penalties[sides[k].row] and sides[k].e > tolerance)
@@ -418,8 +420,8 @@ def test(address: int) -> None:
                 return
             run(links[0].increase_penalty, (address,))
     while not bound and _error(now) <= KAPPA * now.mu and now.mu > smallest:
-        less = min(0.2 * now.mu, now.mu**1.5)
-        now.mu = less if less > tolerance else smallest
+        less = min(0.2 * now.mu, now.mu * math.sqrt(now.mu / now.size))
+        now.mu = less if less > tolerance * now.size else smallest
         now.filtered = 0
     cost, lower = now.cost, terms.lower
     phi, theta = merit(now, sides, pairs, penalties, row_units, rows, lower, cost, constraints, 0.0)

@@ -204,7 +204,7 @@ def steer(address: int) -> None:
     slope = 0.0
     for k in range(n):
         slope += gradient[free[k]] * step[k]
-    limit = max(0.99, 1.0 - mu)
+    limit = max(0.99, 1.0 - mu / now.cost_unit)
     primal = dual = 0.0  # inverse step lengths
     for k in range(now.sides):
         s, e, y = sides[k].s, sides[k].e, sides[k].y

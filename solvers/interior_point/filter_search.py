@@ -29,7 +29,7 @@ def judge(address: int) -> None:
     cost, lower = now.trial_cost, terms.lower
     phi_trial, theta_trial = merit(now, sides, pairs, penalties, row_units, rows, lower, cost, constraints, alpha)
     finite = math.isfinite(phi_trial) and math.isfinite(theta_trial)
-    slack = 1e-13 * max(1.0, abs(phi))
+    slack = 1e-13 * max(now.cost_unit, abs(phi))
     switch = slope < 0.0 and alpha * (-slope / now.cost_unit) ** 2.3 > theta**1.1 and theta <= now.theta_small
     armijo = phi_trial <= phi + ARMIJO * alpha * slope + slack
     good = finite and theta_trial <= now.theta_large
@@ -37,7 +37,7 @@ def judge(address: int) -> None:
         if switch:
             good = armijo
         else:
-            good = theta_trial <= (1.0 - GAMMA_THETA) * theta or phi_trial <= phi - GAMMA_PHI * theta + slack
+            good = theta_trial <= (1.0 - GAMMA_THETA) * theta or phi_trial <= phi - GAMMA_PHI * now.cost_unit * theta + slack
             good = good or theta_trial <= 1e-12
     if good:
         for k in range(now.filtered):
@@ -142,7 +142,7 @@ def accept(address: int) -> None:
         sides[k].ds = sides[k].de = 0.0
     if now.descent == 0 and now.filtered < FILTER:
         filter[now.filtered, 0] = (1.0 - GAMMA_THETA) * now.theta
-        filter[now.filtered, 1] = now.phi - GAMMA_PHI * now.theta
+        filter[now.filtered, 1] = now.phi - GAMMA_PHI * now.cost_unit * now.theta
         now.filtered += 1
     now.step, now.taken = alpha * math.sqrt(total), alpha
     now.short_steps = now.short_steps + 1 if alpha < SHORT_STEP else 0

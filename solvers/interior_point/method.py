@@ -259,6 +259,8 @@ class Workspace:
             arrays.rows,
             arrays.entries,
             doubles,
+            program.normal.diagonal,
+            np.ones(program.columns.width),
             np.array([self._unequal(row) for row in program.arrays.fields], dtype=np.int64),
         )
         self._describe()

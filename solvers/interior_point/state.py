@@ -46,7 +46,8 @@ NOW = np.dtype(
         ("paid", np.float64),  # largest violation of a row times its penalty
         ("force", np.float64),  # stationarity in the units of the unknowns
         ("share", np.float64),  # of the second derivatives in the KKT matrix
-        ("cost_unit", np.float64),  # what the objective is measured in
+        ("cost_unit", np.float64),  # what the objective is measured in: its size at the start
+        ("size", np.float64),  # of the objective at the present iterate
         ("step_tolerance", np.float64),  # norm of a full step below which to stop, once the violation is small enough
         ("violation_tolerance", np.float64),
         ("keeping", np.float64),  # violation up to which an iterate counts as one that keeps all constraints
@@ -137,6 +138,8 @@ class Problem(NamedTuple):
         rows: (E,) equality rows.
         entries: entries of the constraint Jacobian behind those of the Hessian in ``Work.data``.
         doubles: (D, 2) places in ``Work.data`` that mean one entry of the matrix: the second is added to the first.
+        diagonal: (n,) places of the diagonal among the entries of the Hessian.
+        ones: (width,) the units of the problem as it is stated.
         unequal: (T,) whether a term has inequality rows.
     """
 
@@ -150,6 +153,8 @@ class Problem(NamedTuple):
     rows: IntArray
     entries: IntArray
     doubles: IntArray
+    diagonal: IntArray
+    ones: Array
     unequal: IntArray
 
 

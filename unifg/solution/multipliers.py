@@ -61,7 +61,8 @@ class Slopes:
         gradient = np.abs(self.gradient[program.columns.free])
         rows, columns = program.constraints.free_rows, program.constraints.free_columns
         entries = np.abs(self.jacobian[program.constraints.free])
-        unknowns, scale, cost = np.ones(program.size), np.ones(len(multipliers)), 1.0
+        unknowns, scale = np.ones(program.size), np.ones(len(multipliers))
+        cost = 1.0 / (float(gradient.max(initial=0.0)) or 1.0)
         for _ in range(PASSES):
             scaled = entries * scale[rows] * unknowns[columns]
             sloped = cost * gradient * unknowns
