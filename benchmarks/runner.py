@@ -99,7 +99,7 @@ PAGES: dict[str, dict[str, float]] = {
         "excluded_pasts": 0.05,
     },
     "control": {"control_cases": 0.4, "own_functions": 0.1, "claims": 0.2},
-    "collection": {"collection": 0.1},
+    "collection": {"collection": 0.1, "cops": 0.05},
     "pose-graphs": {"elimination": 0.1, "incremental": 0.1, "wrong_closures": 4.0},
     "navigation": {"navigation": 0.1, "localisation": 0.15},
     "reliability": {"faults": 0.3},

@@ -70,8 +70,6 @@ class AugmentedLagrangian(Solver):
 
     rehearses = True
 
-    scalar_costs = False
-
     max_iterations: int = 300
     penalty: float | None = None
     penalty_growth: float = 10.0
@@ -101,7 +99,8 @@ class AugmentedLagrangian(Solver):
     def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The primal step at the initial damping, with the penalty that suits the present iterate."""
         rho, weights = self._first_penalties(run, workspace)
-        found = model_step(workspace, lin, run.multipliers, rho * weights, self.damping)
+        scalars = run.program.scalar_part(lin.values)
+        found = model_step(workspace, lin, run.multipliers, rho * weights, self.damping, scalars=scalars)
         return None if found is None else found[0]
 
     def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
@@ -161,7 +160,7 @@ class AugmentedLagrangian(Solver):
         heaviest = LARGEST_PENALTY / min(1.0, float(weights.min(initial=1.0)))
         least = 0.1 * self.tolerance * min(1.0, float(scale.min(initial=1.0)))
         gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
-        exact = self.hessian == "exact" and len(weights) > 0
+        exact = self.hessian == "exact" and (len(weights) > 0 or bool(run.program.scalar_terms))
         first, outer, stuck, last = rho, 0, 0, np.inf
         creeping, beginning, least_yet = 0, run.lin.values, np.inf
         recent: list[float] = []  # violations after the last subproblems

@@ -34,6 +34,7 @@ ROUNDING = 1e-14
 LEAST_SHARE = 0.125  # of the second derivatives, before they are left out
 WELL = 0.75  # of the predicted decrease: a step that brings less is corrected
 CORRECTIONS = 3  # at most, of one trial
+HARDLY_DAMPED = 1.0
 STRAIGHT: Array = np.zeros(0)
 
 
@@ -63,7 +64,7 @@ def damped_step(
     Returns:
         The new values, the tangent step and the number of rejected trials; None when no damping helps.
     """
-    merit = primal.merit(lin, multipliers, penalty)
+    merit, scalars = primal.merit(lin, multipliers, penalty), primal.program.scalar_part(lin.values)
     # Least squares has no unit: what is rounding depends on the cost alone.
     slack = ROUNDING * (merit if primal.program.least_squares else max(1.0, abs(merit)))
     rows = primal.program.constraints
@@ -72,8 +73,9 @@ def damped_step(
     while damping.value <= LARGEST:
         curved = len(bend) > 0 and share > 0.0
         chosen = (bend if share == 1.0 else share * bend) if curved else STRAIGHT
-        found = model_step(primal, lin, multipliers, penalty, damping.value, chosen)
-        if found is None and curved:
+        found = model_step(primal, lin, multipliers, penalty, damping.value, chosen, scalars)
+        # Where a cost is no square, second derivatives may be all the curvature there is: damped rather than left out.
+        if found is None and curved and not (len(scalars[0]) and damping.value < HARDLY_DAMPED):
             damping.share = max(0.5 * share, LEAST_SHARE)
             share = 0.5 * share if share > LEAST_SHARE else 0.0
             continue
@@ -89,7 +91,7 @@ def damped_step(
                     break
                 # What the rows are at the trial, continued along their tangents back to no step.
                 curved_base = evaluation.constraints - rows.times(lin.constraint_jacobian, step)
-                again = model_step(primal, lin, multipliers, penalty, damping.value, chosen, curved_base)
+                again = model_step(primal, lin, multipliers, penalty, damping.value, chosen, scalars, curved_base)
                 if again is None:
                     break
                 moved, there = primal.trial(lin, again[0])
@@ -115,6 +117,7 @@ def model_step(
     penalty: Array,
     damping: float,
     bend: Array = STRAIGHT,
+    scalars: tuple[Array, Array] = (STRAIGHT, STRAIGHT),
     constraints: Array | None = None,
 ) -> tuple[Array, float] | None:
     """Minimise the damped model.
@@ -126,6 +129,7 @@ def model_step(
         penalty: (M,) rho of every row.
         damping: relative to the diagonal of the Hessian at ``lin``.
         bend: (nnz,) second-order terms, in the order of ``CompiledProblem.normal``; empty for none.
+        scalars: of :meth:`CompiledProblem.scalar_part`.
         constraints: (M,) their values in the model where the step is zero; None takes those at ``lin``.
 
     Returns:
@@ -148,6 +152,7 @@ def model_step(
         lin.constraint_jacobian,
         lin.hessian,
         bend,
+        *scalars,
         multipliers,
         penalty,
         damping,
@@ -171,6 +176,8 @@ def minimize(
     constraint_jacobian: Array,
     hessian: Array,
     bend: Array,
+    tilt: Array,
+    bowl: Array,
     multipliers: Array,
     penalty: Array,
     damping: float,
@@ -178,6 +185,13 @@ def minimize(
 ) -> float:
     """Newton's method on the piecewise quadratic; returns the predicted decrease, NaN when a system is singular."""
     curved = len(bend) > 0
+    # Beside squares: what second derivatives add, and costs that are no squares.
+    beyond = curved or len(bowl) > 0
+    quadratic = np.zeros_like(hessian)
+    if curved:
+        quadratic += bend
+    if len(bowl) > 0:
+        quadratic += bowl
     # From where the model begins: a large penalty would multiply the rounding of a small step added to a value of one.
     lower, upper = terms.lower - start_constraints, terms.upper - start_constraints
     residual, constraints = start_residual.copy(), start_constraints - start_constraints
@@ -206,9 +220,11 @@ def minimize(
         copy_to(settled, curvature)
         add_constraints(terms, constraint_jacobian, weights, curvature)
         if newton == 0:
-            _damping(curvature, indptr, damping, added)
+            _damping(curvature, indptr, tilt, damping, added)
         for k in range(len(step)):
             gradient[k] = -full[free[k]] - added[k] * step[k] - bent[k]
+            if len(tilt) > 0:
+                gradient[k] -= tilt[k]
         if not factor(plan, curvature, added) or (curved and plan.state[NEGATIVE] > 0):
             return np.nan
         solve(plan, gradient, move)
@@ -217,9 +233,9 @@ def minimize(
         slope, length = -dot(gradient, move), 1.0
         if not np.isfinite(slope):
             return np.nan
-        if curved:
+        if beyond:
             bent_move[:] = 0.0
-            add_times(indptr, indices, bend, move, bent_move)
+            add_times(indptr, indices, quadratic, move, bent_move)
         while True:
             for k in range(len(step)):
                 here[k] = step[k] + length * move[k]
@@ -231,7 +247,9 @@ def minimize(
             value_here += barrier(constraints_here, lower, upper, multipliers, penalty)
             for k in range(len(step)):
                 value_here += 0.5 * added[k] * here[k] * here[k]
-            if curved:
+            if len(tilt) > 0:
+                value_here += dot(tilt, here)
+            if beyond:
                 bow_here = bow + length * (dot(bent, move) + 0.5 * length * dot(bent_move, move))
                 value_here += bow_here
             if value_here <= value + ARMIJO * length * slope + ROUNDING * abs(value) or length < SHORTEST:
@@ -255,10 +273,13 @@ def minimize(
 
 
 @compiled
-def _damping(curvature: Array, indptr: IntArray, damping: float, added: Array) -> None:
-    """Marquardt's damping of the diagonal, which is last in every column."""
-    largest = 0.0
+def _damping(curvature: Array, indptr: IntArray, tilt: Array, damping: float, added: Array) -> None:
+    """Marquardt's damping of the diagonal, which is last in every column; slopes count where nothing is curved."""
+    largest, steepest = 0.0, 0.0
     for k in range(len(added)):
         largest = max(largest, curvature[indptr[k + 1] - 1])
+    for slope in tilt:
+        steepest = max(steepest, abs(slope))
+    least = max(DIAGONAL_FLOOR * largest, steepest) + 1e-300
     for k in range(len(added)):
-        added[k] = damping * max(curvature[indptr[k + 1] - 1], DIAGONAL_FLOOR * largest + 1e-300)
+        added[k] = damping * max(curvature[indptr[k + 1] - 1], least)

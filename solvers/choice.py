@@ -22,7 +22,6 @@ from unifg.solution.status import Status
 from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
 from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.least_squares import LevenbergMarquardt
-from unifg.solvers.sqp import SQP
 from unifg.typing import Numbers
 
 logger = logging.getLogger("unifg")
@@ -69,29 +68,28 @@ def choose(
     program = idle_problem(graph)
     with program.lock:
         program.bind(data or {})
-        reason, squares = _kind(program)
+        reason = _kind(program)
     options = {"tolerance": tolerance, "time_limit": time_limit, "verbose": verbose}
     point = InteriorPoint(**options)  # type: ignore[arg-type]  # each goes to the field of its name
     if not (program.constraint_terms or program.scalar_terms):
         return Choice(LevenbergMarquardt(**options), point, reason)  # type: ignore[arg-type]
-    other = AugmentedLagrangian if squares else SQP
-    return Choice(point, other(**options), reason)  # type: ignore[arg-type]
+    return Choice(point, AugmentedLagrangian(**options), reason)  # type: ignore[arg-type]
 
 
-def _kind(program: CompiledProblem) -> tuple[str, bool]:
-    """Deciding property in words, and true if all costs are squares."""
+def _kind(program: CompiledProblem) -> str:
+    """Deciding property in words."""
     if program.scalar_terms:
-        return f"the scalar cost '{program.scalar_terms[0].name}'", False
+        return f"the scalar cost '{program.scalar_terms[0].name}'"
     if not program.constraint_terms:
-        return "least squares without constraints", True
+        return "least squares without constraints"
     limited = np.isfinite(program.lower) | np.isfinite(program.upper)
     rows = np.flatnonzero(limited & ~program.equality)
     if len(rows):
-        return f"the inequality '{program.row_name(int(rows[0]))[0]}'", True
+        return f"the inequality '{program.row_name(int(rows[0]))[0]}'"
     equal = np.flatnonzero(program.equality)
     if len(equal):
-        return f"the equality '{program.row_name(int(equal[0]))[0]}'", True
-    return f"the constraint '{program.constraint_terms[0].name}', without limits now", True
+        return f"the equality '{program.row_name(int(equal[0]))[0]}'"
+    return f"the constraint '{program.constraint_terms[0].name}', without limits now"
 
 
 def solve(

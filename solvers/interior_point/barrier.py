@@ -67,6 +67,7 @@ AT_PENALTY = 0.9  # share of the penalty from which on a multiplier is at it
 SMALL_PULL = 1e-2  # share of the constraints' forces below which the objective's force counts for nothing
 MOST_RAISES = 6  # of penalties, tenfold each
 LEAST_PENALTY = 10.0  # times the largest slope of the objective
+WORTH = 0.1  # of a sum of squares at the start: largest first mu
 FAR = 100.0  # from one: largest entry of a row that calls for other units
 SWEEPS = 8
 BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
@@ -151,13 +152,14 @@ def measure(address: int) -> None:
     for k in range(len(full)):
         full[k] = gradient[k]
     transposed_times(terms, False, constraint_jacobian, multipliers, full)
-    stationarity = force = violation = paid = complementarity = 0.0
+    stationarity = force = violation = paid = complementarity = size = 0.0
     for column in free:
         if not abs(full[column]) <= stationarity:  # NaN stays
             stationarity = abs(full[column])
         force = max(force, abs(full[column]) * units[column])
     for row in range(len(constraints)):
         value, multiplier = constraints[row], multipliers[row]
+        size += abs(multiplier)
         outside = max(value - upper[row], lower[row] - value)
         if not outside <= violation:
             violation = outside
@@ -176,16 +178,17 @@ def measure(address: int) -> None:
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
     now.size = cost_unit(free, diagonal, hessian, gradient, ones)
-    scale = max(now.size, mean_force(terms, constraint_jacobian, multipliers) / SMALL_FORCES)
+    scale = max(min(1.0, now.size), size / max(1, len(constraints)) / 100.0)  # no more than that of the KKT test
     now.scale, now.stationarity, now.violation = scale, stationarity / scale, violation
     now.complementarity, now.gap, now.least, now.most = complementarity / scale, gap, least, most
-    now.force, now.paid = force / scale, paid
+    now.forces = max(now.size, mean_force(terms, constraint_jacobian, multipliers) / SMALL_FORCES)
+    now.force, now.paid = force / now.forces, paid
 
 
 @compiled
 def _error(now: Any) -> float:
     """Error of the barrier problem, in units of the objective, and so comparable with mu."""
-    centring = max(now.most - now.mu, now.mu - now.least) / now.scale
+    centring = max(now.most - now.mu, now.mu - now.least) / now.forces
     error: float = max(max(now.force, now.gap), centring) * now.size
     return error
 
@@ -296,7 +299,8 @@ def begin(address: int) -> None:
         for column in free:
             pull = max(pull, abs(gradient[column]) * units[column])
         now.rho = max(now.rho * now.cost_unit, LEAST_PENALTY * pull)
-        now.mu *= now.cost_unit
+        squares = len(heights) == 0 and now.cost > 0.0  # no barrier need be worth as much as they are
+        now.mu *= min(now.cost_unit, WORTH * now.cost) if squares else now.cost_unit
     largest = 0.0
     for row in range(len(lower)):
         largest = max(largest, abs(multipliers[row]) * row_units[row])
@@ -313,7 +317,7 @@ def begin(address: int) -> None:
             sides[k].y, sides[k].s, sides[k].e = y, c, 0.0
         run(links[0].measure, (address,))
         error = max(max(now.stationarity, now.violation), now.complementarity)
-        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * now.size
+        now.mu = max(min(0.1 * error, WARM_MU * now.size), 0.1 * now.tolerance * min(1.0, now.size))
     mu = now.mu
     for k in range(count):
         row = sides[k].row
@@ -380,12 +384,12 @@ def test(address: int) -> None:
         return
     if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violation > tolerance:
         run(links[0].relax, (address,))
-    smallest = 0.1 * tolerance * now.size
+    smallest = 0.1 * tolerance * min(1.0, now.size)
     bound = False
     if _error(now) <= SOLVED * now.mu and now.violation > tolerance:
         # Whether something is violated because its penalty is too low, or because it has to be. With the least mu that
         # is told by a solved problem: a step before, equalities without a penalty may still be on their way.
-        bound = now.mu <= smallest and _error(now) <= tolerance * now.size
+        bound = now.mu <= smallest and _error(now) <= tolerance * max(1.0, now.size)
         if now.mu <= LATE_MU * min(now.paid, now.rho):
             for k in range(now.sides):
                 bound = bound or (sides[k].y > AT_PENALTY * penalties[sides[k].row] and sides[k].e > tolerance)
@@ -421,7 +425,7 @@ def test(address: int) -> None:
             run(links[0].increase_penalty, (address,))
     while not bound and _error(now) <= KAPPA * now.mu and now.mu > smallest:
         less = min(0.2 * now.mu, now.mu * math.sqrt(now.mu / now.size))
-        now.mu = less if less > tolerance * now.size else smallest
+        now.mu = less if less > 10.0 * smallest else smallest
         now.filtered = 0
     cost, lower = now.cost, terms.lower
     phi, theta = merit(now, sides, pairs, penalties, row_units, rows, lower, cost, constraints, 0.0)

@@ -13,7 +13,7 @@ from unifg.problem.evaluation import add_constraints, times, transposed_times
 from unifg.solvers.interior_point.state import AGAIN, EXAMINED, NO, SINGULAR, TRY, UNKNOWN, YES
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
-DUAL_SHIFT = 1e-9
+DUAL_SHIFT = 1e-11
 SHORT = 0.01  # length of a step
 LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
 FLAT = 1e-9  # curvature relative to the largest that counts as none

@@ -36,6 +36,7 @@ NOW = np.dtype(
         ("least", np.float64),  # smallest product of a slack and its multiplier
         ("most", np.float64),  # largest
         ("scale", np.float64),  # of stationarity and complementarity
+        ("forces", np.float64),  # the same whatever the units of the rows
         ("step", np.float64),  # norm of the last step taken
         ("taken", np.float64),  # its length
         ("trial_cost", np.float64),

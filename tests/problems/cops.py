@@ -642,6 +642,10 @@ def landing(steps: int) -> Stated:
     return graph, {x: states, u: np.tile([0.0, 0.0, 8000.0], (steps + 1, 1)), t: [[60.0]]}
 
 
+LEFT_OUT = {
+    "dirichlet, henon, lane-emden": "transition states: a saddle point between given states, not a minimum.",
+    "triangle, tetra": "optimal shapes of meshes, which are data files.",
+}
 PROBLEMS: list[Problem] = [
     Problem("polygon", lambda: polygon(25), -0.77974, mesh="25 corners"),
     Problem("electrons", lambda: electrons(25), 243.813, mesh="25 charges"),

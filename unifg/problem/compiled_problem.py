@@ -427,6 +427,19 @@ class CompiledProblem:
             self._shares = Shares(self.table, self.columns.width, self.normal.nnz, count)
         return self._shares
 
+    def scalar_part(self, values: Values) -> tuple[Array, Array]:
+        """Gradient (n,) and convex part of the Hessian of the scalar costs alone; empty where there are none.
+
+        Args:
+            values: where.
+        """
+        if not self.scalar_terms:
+            return np.zeros(0), np.zeros(0)
+        gradient, hessian = np.zeros(self.columns.width), np.zeros(self.normal.nnz)
+        rest = np.zeros_like(hessian), np.zeros_like(gradient)
+        self._add_scalars(values, np.empty(self.table.scalars), gradient, hessian, *rest)
+        return gradient[self.columns.free], hessian
+
     def _add_scalars(
         self, values: Values, found: Array, gradient: Array, hessian: Array, concavity: Array, rounding: Array
     ) -> float:

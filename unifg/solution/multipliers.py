@@ -22,7 +22,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.typing import Array, IntArray
 
-LARGEST = 1e6
+LARGEST = 1e6  # the least of it: costates of a long chain add up to the square of its rows
 LARGE = 1e3  # of a single row
 LEFT = 1e-3  # of the cost, times the violation that is left
 SUSPICIOUS = 1e3  # in the graph's own units; below it nobody looks
@@ -48,7 +48,11 @@ class Slopes:
         _raise(jacobian, gradient, self.jacobian, self.gradient)
 
     def degenerate(self, lin: Linearization, multipliers: Array, tolerance: float) -> bool:
-        """Test whether multipliers are larger than constraints with a slope ever need.
+        """Test whether multipliers are larger than constraints with a slope ever need; arguments as for `excess`."""
+        return self.excess(lin, multipliers, tolerance) > 0.0
+
+    def excess(self, lin: Linearization, multipliers: Array, tolerance: float) -> float:
+        """Sum of the multipliers where they are larger than constraints with a slope ever need; zero elsewhere.
 
         Args:
             lin: at the answer.
@@ -57,7 +61,7 @@ class Slopes:
         """
         program = self._program
         if not _size(multipliers, self.jacobian, self.gradient, program.columns.free, tolerance) > SUSPICIOUS:
-            return False
+            return 0.0
         gradient = np.abs(self.gradient[program.columns.free])
         rows, columns = program.constraints.free_rows, program.constraints.free_columns
         entries = np.abs(self.jacobian[program.constraints.free])
@@ -74,7 +78,8 @@ class Slopes:
             cost /= np.sqrt(of_cost or 1.0)
         sizes = cost * np.abs(multipliers) / scale
         left = np.abs(multipliers * program.violation(lin.constraints))[sizes > LARGE].sum()
-        return bool(sizes.sum() > LARGEST or left > LEFT * abs(lin.cost))
+        total = float(sizes.sum())
+        return total if total > max(LARGEST, len(sizes) ** 2) or left > LEFT * abs(lin.cost) else 0.0
 
 
 def estimated(program: CompiledProblem, lin: Linearization, tolerance: float) -> Array | None:

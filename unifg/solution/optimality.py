@@ -7,9 +7,7 @@ For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipli
 - complementarity: max |lambda_i| times the distance of g_i to the limit its sign points at; a multiplier
   pointing at a limit that does not exist has the wrong sign and counts as |lambda_i|.
 
-Stationarity and complementarity are divided by the size of the cost (:func:`unifg.problem.units.cost_unit`), or by a
-hundredth of the mean force of the constraints where that is more; so the unit of the cost does not matter. The
-violation is that of the rows as they are stated.
+Stationarity and complementarity are divided by max(1, mean|lambda| / 100); the violation is not scaled.
 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
@@ -42,7 +40,6 @@ from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROWS, WIDTH, TermArrays
-from unifg.problem.units import SMALL_FORCES, cost_unit, mean_force
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
@@ -110,19 +107,18 @@ def optimality(
     measured = _measure(
         program.arrays,
         program.columns.free,
-        program.normal.diagonal,
-        lin.hessian,
         lin.gradient,
         lin.constraints,
         lin.constraint_jacobian,
         multipliers,
     )
-    stationarity, violation, complementarity, scale, worst, finite = measured
+    stationarity, violation, complementarity, worst, finite = measured
     if not finite or not math.isfinite(lin.cost):
         return Optimality(np.inf, np.inf, np.inf, -1, False)
     rounding = 0.0
     if program.differenced:
-        rounding = float(gradient_rounding(program, lin, multipliers).max(initial=0.0)) / scale
+        rounding = float(gradient_rounding(program, lin, multipliers).max(initial=0.0))
+        rounding /= max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
     return Optimality(stationarity, violation, complementarity, worst, True, True, rounding)
 
 
@@ -201,15 +197,13 @@ def _add_rounding(
 def _measure(
     terms: TermArrays,
     free: IntArray,
-    diagonal: IntArray,
-    hessian: Array,
     slope: Array,
     constraints: Array,
     entries: Array,
     multipliers: Array,
-) -> tuple[float, float, float, float, int, bool]:
-    """Stationarity, violation, complementarity, what they are measured in, worst row, and if everything is finite."""
-    stationarity, violation, complementarity = 0.0, 0.0, 0.0
+) -> tuple[float, float, float, int, bool]:
+    """Stationarity, violation, complementarity, worst row, and whether everything is finite."""
+    stationarity, violation, complementarity, size = 0.0, 0.0, 0.0, 0.0
     worst, count, finite = -1, len(constraints), True
     gradient, lower, upper = slope.copy(), terms.lower, terms.upper
     evaluation.transposed_times(terms, False, entries, multipliers, gradient)
@@ -222,6 +216,7 @@ def _measure(
     for row in range(count):
         value, multiplier = constraints[row], multipliers[row]
         finite = finite and math.isfinite(value) and math.isfinite(multiplier)
+        size += abs(multiplier)
         outside = max(max(value - upper[row], lower[row] - value), 0.0)
         if worst < 0 or outside > violation:
             worst, violation = row, outside
@@ -229,9 +224,8 @@ def _measure(
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
-    scale = cost_unit(free, diagonal, hessian, slope, np.ones(len(slope)))
-    scale = max(scale, mean_force(terms, entries, multipliers) / SMALL_FORCES)
-    return stationarity / scale, violation, complementarity / scale, scale, worst, finite
+    scale = max(1.0, size / max(count, 1) / 100.0)
+    return stationarity / scale, violation, complementarity / scale, worst, finite
 
 
 def infeasible_stationary(program: CompiledProblem, lin: Linearization, tolerance: float) -> bool:

@@ -23,12 +23,13 @@ from unifg.problem.by_term import ByTerm
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
 from unifg.problem.linearization import Linearization, all_finite
+from unifg.problem.units import SMALL_FORCES
 from unifg.solution.capabilities import Constraints, require
 from unifg.solution.conditioning import HARDLY
 from unifg.solution.history import HEADER, Deferred, Iteration, factor_norms, line, show
 from unifg.solution.incumbent import Incumbent, Incumbents
 from unifg.solution.multipliers import Slopes, estimated
-from unifg.solution.optimality import infeasible_stationary, optimality, within_bounds
+from unifg.solution.optimality import Optimality, infeasible_stationary, optimality, within_bounds
 from unifg.solution.relative_offset import Factored
 from unifg.solution.solution import AnyGuess, NotConverged, Solution, values_of
 from unifg.solution.status import Status
@@ -425,12 +426,14 @@ class SolveState:
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
-            if self.slopes is not None and self.slopes.degenerate(self.lin, self.multipliers, self.tolerance):
+            if self._excess() > 0.0:
                 status = Status.DEGENERATE
         elif measured.holds(self.tolerance) and not measured.determined:
             status = Status.UNDETERMINED
         elif measured.holds(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.IMPRECISE
+        elif status in (Status.STALLED, Status.ITERATION_LIMIT) and self._lost_slope(measured):
+            status = Status.DEGENERATE
         elif measured.blurred(self.tolerance) and status in (Status.STALLED, Status.ITERATION_LIMIT):
             status = Status.IMPRECISE
         elif status.converged:
@@ -450,6 +453,16 @@ class SolveState:
         )
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
+
+    def _excess(self) -> float:
+        """Sum of multipliers that are larger than constraints with a slope ever need, zero elsewhere."""
+        return 0.0 if self.slopes is None else self.slopes.excess(self.lin, self.multipliers, self.tolerance)
+
+    def _lost_slope(self, measured: Optimality) -> bool:
+        """Test whether a solve without success is one whose KKT numbers hold in proportion to huge multipliers."""
+        if max(measured.violation, measured.complementarity) > self.tolerance:
+            return False
+        return measured.stationarity <= self.tolerance * self._excess() / SMALL_FORCES
 
     def _estimate(self) -> None:
         """Take multipliers that are made of the gradients here, if all KKT numbers are better with them."""

@@ -16,8 +16,8 @@ class Status(Enum):
         "digits of it are known; look at solution.conditioning, add a prior or another measurement."
     )
     DEGENERATE = (
-        "The KKT conditions hold to the tolerance, but only with huge multipliers: constraints have lost their slope "
-        "there, and the point need not be an optimum; state them with a slope where they are met."
+        "The KKT conditions hold, or nearly hold, only with huge multipliers: constraints have lost their slope there, "
+        "and the point need not be an optimum; state them with a slope where they are met."
     )
     STOP_RULE = "The chosen stop rule ended the loop, but the KKT conditions do not hold to the tolerance."
     ITERATION_LIMIT = "The iteration limit was reached before the KKT conditions held; raise max_iterations."

@@ -1,0 +1,117 @@
+"""Costs that are no squares, and problems in other units of their cost."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from problems.control import Unicycle
+from problems.cops import PROBLEMS, Problem, brachistochrone
+from problems.scaled import Units, scaled
+from unifg.problem.units import cost_unit
+from unifg.solvers import AugmentedLagrangian, InteriorPoint
+
+NAMED = {problem.name: problem for problem in PROBLEMS}
+TIMES = ("robot", "steering", "brachistochrone, squared")
+OTHERS = ("chain", "catalyst", "orbit", "electrons", "cam", "rocket", "surface")
+
+
+def solved(problem: Problem, units: Units | None = None) -> fg.Solution:
+    """By the interior point, in other units or as stated."""
+    graph, guess = problem.build()
+    return InteriorPoint().solve(*(scaled(graph, guess, units) if units else (graph, guess)))
+
+
+@pytest.mark.parametrize("name", TIMES + OTHERS)
+def test_costs_without_squares_reach_the_literatures_optimum(name: str) -> None:
+    problem = NAMED[name]
+    graph, guess = problem.build()
+    solution = InteriorPoint(tolerance=1e-8).solve(graph, guess)
+    assert solution.converged
+    assert solution.cost == pytest.approx(problem.best, rel=1e-4)
+    assert solution.iterations <= 100
+
+
+@pytest.mark.parametrize("name", ["brachistochrone", "catalyst", "gas oil"])
+def test_unit_of_the_cost_changes_neither_verdict_nor_path(name: str) -> None:
+    plain = solved(NAMED[name])
+    assert plain.converged
+    for cost in (1e-6, 1e6):
+        other = solved(NAMED[name], Units(cost=cost))
+        assert other.status is plain.status
+        assert abs(other.iterations - plain.iterations) <= 0.2 * plain.iterations + 3
+        assert other.cost / cost == pytest.approx(plain.cost, rel=1e-5)
+
+
+def test_order_of_the_terms_changes_neither_verdict_nor_path() -> None:
+    plain, other = solved(NAMED["orbit"]), solved(NAMED["orbit"], Units(backwards=True))
+    assert plain.converged and other.converged
+    assert abs(other.iterations - plain.iterations) <= 0.2 * plain.iterations + 3
+    assert other.cost == pytest.approx(plain.cost, rel=1e-5)
+
+
+def test_finer_mesh_takes_no_more_iterations() -> None:
+    counts = []
+    for steps in (200, 2000):
+        finer: dict[str, Any] = {
+            "dt": 5.0 / steps, "stage": Unicycle.stage * 50 / steps, "effort": Unicycle.effort * 50 / steps,
+        }  # fmt: skip
+        stated = type("Finer", (Unicycle,), finer)("straight", True, steps).formulation()
+        solution = InteriorPoint().solve(stated.graph, stated.guess)
+        assert solution.converged
+        counts.append(solution.iterations)
+    assert counts[1] <= 1.2 * counts[0] + 3
+
+
+def test_size_of_a_cost_is_a_mean_of_its_curvatures() -> None:
+    free, places, ones = np.arange(3), np.arange(3), np.ones(3)
+
+    def size(hessian: list[float], gradient: list[float], units: Any = ones) -> float:
+        return float(cost_unit(free, places, np.array(hessian), np.array(gradient), units))
+
+    assert size([1.0, 100.0, 0.0], [0.0, 0.0, 0.0]) == pytest.approx(10.0)
+    assert size([1e-12, 1.0, 1.0], [0.0, 0.0, 0.0]) == pytest.approx(1e-4)  # a tiny regularisation
+    assert size([1.0, 1.0, 1.0], [0.0, 1e6, 0.0]) == pytest.approx(1e3)
+    assert size([0.0, 0.0, 0.0], [0.0, -3.0, 1.0]) == pytest.approx(3.0)
+    assert size([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]) == 1.0
+    assert size([1.0, 100.0, 0.0], [0.0, 0.0, 0.0], np.array([1.0, 0.1, 1.0])) == pytest.approx(1.0)
+    assert size([3e200, 5e200, 4e200], [0.0, 0.0, 0.0]) == pytest.approx(60.0 ** (1 / 3) * 1e200)
+
+
+def test_large_constant_weight_keeps_an_active_multiplier_below_the_penalty() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(lambda p: p[:, :1], x, sigma=1e3, name="faint")
+    graph.minimize_scalar(lambda p: p[:, 1], x, name="height")
+    graph.bound(x, lower=[-1.0, 0.0], name="box")
+    solution = InteriorPoint().solve(graph, {x: [[0.5, 2.0]]})
+    assert solution.converged
+    np.testing.assert_allclose(solution[x], [[0.0, 0.0]], atol=1e-3)
+
+
+def test_augmented_lagrangian_takes_costs_without_squares() -> None:
+    graph, guess = brachistochrone(20)
+    expected = InteriorPoint().solve(graph, guess)
+    solution = AugmentedLagrangian().solve(graph, guess)
+    assert solution.converged
+    assert solution.cost == pytest.approx(expected.cost, rel=1e-5)
+
+
+def test_augmented_lagrangian_begins_where_nothing_is_curved() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize_scalar(lambda p: -p[:, 0], x, name="range")
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="disc")
+    solution = AugmentedLagrangian().solve(graph, {x: [[0.0, 0.1]]})
+    assert solution.converged
+    np.testing.assert_allclose(solution[x], [[1.0, 0.0]], atol=1e-4)
+
+
+@pytest.mark.parametrize("function", [np.exp, lambda x: x**3])
+def test_interior_point_names_an_equality_that_loses_its_slope(function: Any) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [-1.0])
+    graph.constrain(function, x, lower=0.0, upper=0.0, name="flat")
+    assert InteriorPoint().solve(graph, {x: [[1.0]]}).status is fg.Status.DEGENERATE
