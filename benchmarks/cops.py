@@ -70,7 +70,7 @@ class Ipopt:
 
 
 def verdict(problem: Problem, solver: Ours | Ipopt) -> str:
-    """How an answer compares with the literature's."""
+    """Comparison of an answer with the literature's."""
     if solver.status not in SOLVED:
         return solver.status
     off = (solver.cost - problem.best) / abs(problem.best)

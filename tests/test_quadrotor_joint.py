@@ -246,7 +246,7 @@ def test_a_solve_that_bends_its_constraints_is_not_believed(past: Past, monkeypa
     controller = past.controller(JointSettings(0.5), control_weight=100.0)
     before = past.estimator.window.history.states.copy()
     loop = controller.loop
-    monkeypatch.setattr(loop, "cold", InteriorPoint(max_iterations=1).prepare(loop.cold.program.graph))
+    monkeypatch.setattr(loop, "cold", InteriorPoint(max_iterations=1, barrier=1e-3).prepare(loop.cold.program.graph))
     plan = controller.plan(past.belief)
     assert plan.status is fg.Status.ITERATION_LIMIT
     assert plan.emergency

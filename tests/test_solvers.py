@@ -42,9 +42,9 @@ IDS += ["kkt", "kkt-full", "kkt-lm", "penalty"]
 
 def takes(solver: fg.Solver, problem: Problem) -> bool:
     """Test whether a backend claims the class of a problem."""
-    if isinstance(solver, SQP | InteriorPoint):
+    if isinstance(solver, SQP | InteriorPoint | AugmentedLagrangian):
         return True
-    if isinstance(solver, AugmentedLagrangian | Penalty):
+    if isinstance(solver, Penalty):
         return not problem.scalar
     if isinstance(solver, KKT):
         return not problem.scalar and bool(problem.build()[0].compile().equality.all())

@@ -122,7 +122,7 @@ class KeeperSettings:
 
 TRACKING = KeeperSettings(
     position=180.0, attitude=5e-3, velocity=2.7, rate=2.9e-5, thrust=8.3e-5, rate_change=1.3e-6, thrust_change=3.7e-5,
-    tolerance=1e-5, settled=True,
+    tolerance=1e-6, settled=True,
 )  # fmt: skip
 """Weights for flights with nothing in the way, found by a search on a flight that appears in no table.
 

@@ -29,7 +29,8 @@ and Biegler, Optim. Methods Softw. 35 (2020).
 
 s y and e z are the same in any unit of a row. Units (`_find_units`) therefore enter only where numbers of different
 rows or unknowns meet: penalties, first slacks, sums of violations, shifts of the diagonals, and the error of a barrier
-problem.
+problem. The objective has a size (`unifg.problem.units`): first mu and penalties are in proportion to it, and so are
+errors that are compared with mu. The KKT test has none, so a large cost is solved to more digits.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ AT_PENALTY = 0.9  # share of the penalty from which on a multiplier is at it
 SMALL_PULL = 1e-2  # share of the constraints' forces below which the objective's force counts for nothing
 MOST_RAISES = 6  # of penalties, tenfold each
 LEAST_PENALTY = 10.0  # times the largest slope of the objective
-WORTH = 0.1  # of a sum of squares at the start: largest first mu
+WORTH = 0.25  # of the cost at the start: largest first mu
 FAR = 100.0  # from one: largest entry of a row that calls for other units
 SWEEPS = 8
 BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
@@ -134,7 +135,7 @@ def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
     constraint_jacobian, constraints, diagonal = parts(address, "constraint_jacobian constraints diagonal")
     free, full, gradient, hessian = parts(address, "free full gradient hessian")
-    multipliers, ones, pairs, penalties = parts(address, "multipliers ones pairs penalties")
+    multipliers, pairs, penalties = parts(address, "multipliers pairs penalties")
     row_units, rows, scalars, sides, terms = parts(address, "row_units rows scalars sides terms")
     (units,) = parts(address, "units")
     now = scalars[0]
@@ -177,7 +178,7 @@ def measure(address: int) -> None:
             pz, nz = p * (penalties[row] - multipliers[row]), n * (penalties[row] + multipliers[row])
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
-    now.size = cost_unit(free, diagonal, hessian, gradient, ones)
+    now.size = cost_unit(free, diagonal, hessian, gradient, units)
     scale = max(min(1.0, now.size), size / max(1, len(constraints)) / 100.0)  # no more than that of the KKT test
     now.scale, now.stationarity, now.violation = scale, stationarity / scale, violation
     now.complementarity, now.gap, now.least, now.most = complementarity / scale, gap, least, most
@@ -299,8 +300,8 @@ def begin(address: int) -> None:
         for column in free:
             pull = max(pull, abs(gradient[column]) * units[column])
         now.rho = max(now.rho * now.cost_unit, LEAST_PENALTY * pull)
-        squares = len(heights) == 0 and now.cost > 0.0  # no barrier need be worth as much as they are
-        now.mu *= min(now.cost_unit, WORTH * now.cost) if squares else now.cost_unit
+        # No barrier need be worth as much as the cost.
+        now.mu *= min(now.cost_unit, WORTH * abs(now.cost)) if now.cost != 0.0 else now.cost_unit
     largest = 0.0
     for row in range(len(lower)):
         largest = max(largest, abs(multipliers[row]) * row_units[row])
@@ -317,7 +318,7 @@ def begin(address: int) -> None:
             sides[k].y, sides[k].s, sides[k].e = y, c, 0.0
         run(links[0].measure, (address,))
         error = max(max(now.stationarity, now.violation), now.complementarity)
-        now.mu = max(min(0.1 * error, WARM_MU * now.size), 0.1 * now.tolerance * min(1.0, now.size))
+        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * min(1.0, now.size)
     mu = now.mu
     for k in range(count):
         row = sides[k].row
@@ -364,11 +365,13 @@ def test(address: int) -> None:
         now.answer = NOT_FINITE
         return
     guessed = now.cold == 1 and now.iteration == 0 and now.sides > 0  # large multipliers hide forces
-    if worst <= tolerance and not guessed:
+    # Tiny units would let a point pass that is none yet.
+    hidden = max(now.force * now.forces / now.scale, now.gap)
+    if max(worst, hidden) <= tolerance and not guessed:
         now.answer = CONVERGED
         return
     # With a larger mu, what is active has not been found, and short steps are those towards another problem's answer.
-    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * now.size:
+    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * min(1.0, now.size):
         if now.violation < now.violation_tolerance:
             now.answer = STOPPED
             return
@@ -389,7 +392,7 @@ def test(address: int) -> None:
     if _error(now) <= SOLVED * now.mu and now.violation > tolerance:
         # Whether something is violated because its penalty is too low, or because it has to be. With the least mu that
         # is told by a solved problem: a step before, equalities without a penalty may still be on their way.
-        bound = now.mu <= smallest and _error(now) <= tolerance * max(1.0, now.size)
+        bound = now.mu <= smallest and _error(now) <= tolerance * now.size
         if now.mu <= LATE_MU * min(now.paid, now.rho):
             for k in range(now.sides):
                 bound = bound or (sides[k].y > AT_PENALTY * penalties[sides[k].row] and sides[k].e > tolerance)

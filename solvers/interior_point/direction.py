@@ -22,14 +22,13 @@ FLAT = 1e-9  # curvature relative to the largest that counts as none
 @linked
 def direct(address: int) -> None:
     """Factorise with the right inertia and find the Newton step and how far it may be taken."""
-    constraint_jacobian, constraints = parts(address, "constraint_jacobian constraints")
-    curvature, data, doubles, entries, free = parts(address, "curvature data doubles entries free")
-    hessian, links, multipliers, pairs, plan = parts(address, "hessian links multipliers pairs plan")
+    constraints, data, free = parts(address, "constraints data free")
+    links, multipliers, pairs, plan = parts(address, "links multipliers pairs plan")
     penalties, rests, row_units, row_weights = parts(address, "penalties rests row_units row_weights")
     rows, scalars, shift, sides, step, terms = parts(address, "rows scalars shift sides step terms")
     (units,) = parts(address, "units")
     now = scalars[0]
-    n, equalities, normal = len(free), len(rows), len(hessian)
+    n, equalities = len(free), len(rows)
     for row in range(len(row_weights)):
         row_weights[row] = 0.0
     for k in range(now.sides):
@@ -90,7 +89,7 @@ def direct(address: int) -> None:
 
 @linked
 def assemble(address: int) -> None:
-    """Write the KKT matrix with a share of the second derivatives, and with what the sides add unless it is examined."""
+    """Write the KKT matrix with a share of the second derivatives, and unless it is examined with the sides."""
     constraint_jacobian, curvature, data = parts(address, "constraint_jacobian curvature data")
     doubles, entries, hessian, row_weights = parts(address, "doubles entries hessian row_weights")
     scalars, terms = parts(address, "scalars terms")

@@ -37,7 +37,10 @@ def judge(address: int) -> None:
         if switch:
             good = armijo
         else:
-            good = theta_trial <= (1.0 - GAMMA_THETA) * theta or phi_trial <= phi - GAMMA_PHI * now.cost_unit * theta + slack
+            good = (
+                theta_trial <= (1.0 - GAMMA_THETA) * theta
+                or phi_trial <= phi - GAMMA_PHI * now.cost_unit * theta + slack
+            )
             good = good or theta_trial <= 1e-12
     if good:
         for k in range(now.filtered):

@@ -260,7 +260,6 @@ class Workspace:
             arrays.entries,
             doubles,
             program.normal.diagonal,
-            np.ones(program.columns.width),
             np.array([self._unequal(row) for row in program.arrays.fields], dtype=np.int64),
         )
         self._describe()

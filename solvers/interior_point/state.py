@@ -110,9 +110,8 @@ PAIR = np.dtype(
 )
 # Addresses of compiled functions.
 FUNCTIONS = "factor solve linearize evaluate curve weigh add_scalars evaluate_scalars retract"
-FUNCTIONS += (
-    " begin measure test bend direct assemble examine estimate steer advance judge correct restore accept relax increase_penalty renew loop"
-)
+FUNCTIONS += " begin measure test bend direct assemble examine estimate steer advance judge correct restore accept"
+FUNCTIONS += " relax increase_penalty renew loop"
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
 # What a call answers.
@@ -140,7 +139,6 @@ class Problem(NamedTuple):
         entries: entries of the constraint Jacobian behind those of the Hessian in ``Work.data``.
         doubles: (D, 2) places in ``Work.data`` that mean one entry of the matrix: the second is added to the first.
         diagonal: (n,) places of the diagonal among the entries of the Hessian.
-        ones: (width,) the units of the problem as it is stated.
         unequal: (T,) whether a term has inequality rows.
     """
 
@@ -155,7 +153,6 @@ class Problem(NamedTuple):
     entries: IntArray
     doubles: IntArray
     diagonal: IntArray
-    ones: Array
     unequal: IntArray
 
 

@@ -17,7 +17,7 @@ from numpy import cos, exp, sin, sqrt
 import unifg as fg
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Family, Selection
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 Stated: TypeAlias = tuple[fg.Graph, dict[fg.Family, Any]]
 
@@ -85,9 +85,7 @@ def polygon(corners: int) -> Stated:
     graph.constrain(lambda a, b: b[:, 1:] - a[:, 1:], p[:-1], p[1:], lower=0.0, name="order")
     graph.bound(p, lower=[0.0, 0.0], upper=[1.0, pi], name="box")
     graph.fix(p[-1], [0.0, pi])
-    graph.minimize_scalar(
-        lambda a, b: -0.5 * a[:, 0] * b[:, 0] * sin(b[:, 1] - a[:, 1]), p[:-1], p[1:], name="area"
-    )
+    graph.minimize_scalar(lambda a, b: -0.5 * a[:, 0] * b[:, 0] * sin(b[:, 1] - a[:, 1]), p[:-1], p[1:], name="area")
     k = np.arange(1.0, corners + 1.0)
     radius = 4.0 * k * (corners + 1.0 - k) / (corners + 1.0) ** 2
     radius[-1] = 0.0
@@ -115,9 +113,7 @@ def chain(steps: int) -> Stated:
         length = sqrt(1.0 + u[:, 0] ** 2)
         return columns(u[:, 0], x[:, 0] * length, length)
 
-    graph.constrain(
-        trapezoid(rate), x[:-1], u[:-1], x[1:], u[1:], 1.0, 1.0 / steps, lower=0.0, upper=0.0, name="shape"
-    )
+    graph.constrain(trapezoid(rate), x[:-1], u[:-1], x[1:], u[1:], 1.0, 1.0 / steps, lower=0.0, upper=0.0, name="shape")
     graph.fix(x[0], [1.0, 0.0, 0.0])
     graph.constrain(lambda end: end[:, [0, 2]], x[-1], lower=[3.0, 4.0], upper=[3.0, 4.0], name="end")
     graph.minimize_scalar(lambda end: end[:, 1], x[-1], name="energy")
@@ -162,16 +158,22 @@ class Collocation:
             end: of the time, which begins at zero.
         """
         self.graph, self.intervals, self.size, self.stages = graph, intervals, size, stages
-        self.h = h = end / intervals
+        self.h = end / intervals
         self.v = graph.variables("v", fg.Rn(size), intervals)
         self.w = graph.variables("w", fg.Rn(size * stages), intervals)
-        last = np.array([1.0 / factorial(k + 1) for k in range(stages)])
+        graph.constrain(
+            lambda v, w, after: self.end(v, w) - after,
+            self.v[:-1],
+            self.w[:-1],
+            self.v[1:],
+            lower=0.0,
+            upper=0.0,
+            name="joined",
+        )
 
-        def joined(v: Any, w: Any, after: Any) -> Any:
-            return v + h * self._weighted(w, last) - after
-
-        graph.constrain(joined, self.v[:-1], self.w[:-1], self.v[1:], lower=0.0, upper=0.0, name="joined")
-        self.end = lambda v, w: v + h * self._weighted(w, last)
+    def end(self, v: Any, w: Any) -> Any:
+        """Values where intervals end."""
+        return v + self.h * self._weighted(w, np.array([1.0 / factorial(k + 1) for k in range(self.stages)]))
 
     def _weighted(self, w: Any, factors: Array) -> Any:
         return sum(f * w[:, k * self.size : (k + 1) * self.size] for k, f in enumerate(factors))
@@ -193,13 +195,11 @@ class Collocation:
 
         self.graph.constrain(defects, self.v, self.w, *parameters, lower=0.0, upper=0.0, name="rates")
 
-    def fit(self, times: Array, measured: Array) -> Array:
+    def fit(self, times: Array, measured: Array) -> IntArray:
         """Sum of squared differences from measurements; returns the interval of each."""
-        at = np.minimum(self.intervals - 1, np.floor(times / self.h).astype(int))
+        at: IntArray = np.minimum(self.intervals - 1, np.floor(times / self.h).astype(int))
         late = times - at * self.h
-        factors = np.array(
-            [[d ** (k + 1) / (factorial(k + 1) * self.h**k) for k in range(self.stages)] for d in late]
-        )
+        factors = np.array([[d ** (k + 1) / (factorial(k + 1) * self.h**k) for k in range(self.stages)] for d in late])
 
         def difference(v: Any, w: Any, factor: Any, z: Any) -> Any:
             m = self.size
@@ -211,7 +211,7 @@ class Collocation:
         self.graph.minimize(difference, self.v[at], self.w[at], fg.each(factors), fg.each(measured), name="fit")
         return at
 
-    def steps(self, at: Array, first: Array, measured: Array) -> dict[fg.Family, Any]:
+    def steps(self, at: IntArray, first: Array, measured: Array) -> dict[fg.Family, Any]:
         """Guess that goes from one measurement to the next."""
         guess = np.empty((self.intervals, self.size))
         guess[: at[0] + 1] = first
@@ -238,9 +238,7 @@ def pinene(intervals: int) -> Stated:
     def rate(y: Any, _: int, p: Any) -> Any:
         a, b, c, d, e = (p[:, k] for k in range(5))
         away = d * y[:, 2] - e * y[:, 4]
-        return columns(
-            -(a + b) * y[:, 0], a * y[:, 0], b * y[:, 0] - (c * y[:, 2] + away), c * y[:, 2], away
-        )
+        return columns(-(a + b) * y[:, 0], a * y[:, 0], b * y[:, 0] - (c * y[:, 2] + away), c * y[:, 2], away)
 
     path.follow(rate, rates)
     at = path.fit(times, measured)
@@ -391,9 +389,7 @@ def glider(steps: int) -> Stated:
         force = 0.5 * 1.13 * 14.0 * speed**2
         drag, lift = (0.034 + 0.069662 * u[:, 0] ** 2) * force, u[:, 0] * force
         along, up = x[:, 2] / speed, rise / speed
-        return columns(
-            x[:, 2], x[:, 3], (-lift * up - drag * along) / 100.0, (lift * along - drag * up) / 100.0 - 9.81
-        )
+        return columns(x[:, 2], x[:, 3], (-lift * up - drag * along) / 100.0, (lift * along - drag * up) / 100.0 - 9.81)
 
     graph = fg.Graph()
     x, u, t = flight(graph, rate, steps, 4, 1)
@@ -490,12 +486,12 @@ def catalyst(intervals: int) -> Stated:
     }  # fmt: skip
 
 
-def grid(graph: fg.Graph, nx: int, ny: int) -> tuple[fg.Family, Array]:
+def grid(graph: fg.Graph, nx: int, ny: int) -> tuple[fg.Family, IntArray]:
     """Heights at (nx + 2) x (ny + 2) nodes, and their numbers."""
     return graph.variables("height", fg.Rn(1), (nx + 2) * (ny + 2)), np.arange((nx + 2) * (ny + 2)).reshape(nx + 2, -1)
 
 
-def triangles(v: fg.Family, at: Array) -> list[tuple[Any, Any, Any, Array]]:
+def triangles(v: fg.Family, at: IntArray) -> list[tuple[Any, Any, Any, IntArray]]:
     """Corner, neighbour along x, neighbour along y, and the corner's x index, of lower and upper triangles."""
     i = np.broadcast_to(np.arange(len(at))[:, None], at.shape)
     lower = v[at[:-1, :-1].ravel()], v[at[1:, :-1].ravel()], v[at[:-1, 1:].ravel()], i[:-1, :-1].ravel()
@@ -503,7 +499,7 @@ def triangles(v: fg.Family, at: Array) -> list[tuple[Any, Any, Any, Array]]:
     return [lower, upper]
 
 
-def edge(at: Array) -> Array:
+def edge(at: IntArray) -> IntArray:
     """Numbers of the nodes on the border."""
     return np.unique(np.concatenate([at[0], at[-1], at[:, 0], at[:, -1]]))
 
@@ -629,9 +625,7 @@ def landing(steps: int) -> Stated:
     x, u, t = flight(graph, rate, steps, 7, 3)
     graph.fix(x[0], [2000.0, 0.0, 1500.0, 100.0, 0.0, -75.0, 1905.0])
     graph.constrain(lambda end: end[:, :6], x[-1], lower=0.0, upper=0.0, name="landed")
-    graph.constrain(
-        lambda u: sqrt((u**2).sum(axis=1))[:, None], u, lower=4972.0, upper=13260.0, name="thrust"
-    )
+    graph.constrain(lambda u: sqrt((u**2).sum(axis=1))[:, None], u, lower=4972.0, upper=13260.0, name="thrust")
     inf = np.inf
     graph.bound(x, lower=[-inf, -inf, 0.0, -inf, -inf, -inf, 1505.0], name="box")
     graph.bound(t, lower=10.0, upper=200.0, name="later")
@@ -712,6 +706,7 @@ def program(stated: Stated) -> tuple[dict[str, Any], dict[str, Any]]:
         elif isinstance(term, ScalarCost):
             cost += sum(found.ravel())
         else:
+            assert isinstance(term, Constraint)
             rows += list(found.ravel())
             least.append(np.broadcast_to(np.asarray(term.lower, dtype=float), found.shape).ravel())
             most.append(np.broadcast_to(np.asarray(term.upper, dtype=float), found.shape).ravel())

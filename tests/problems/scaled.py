@@ -40,7 +40,9 @@ def scaled(graph: fg.Graph, guess: Mapping[Family, Any], units: Units) -> tuple[
         units: what is multiplied.
     """
     result = fg.Graph()
-    families = {family: result.variables(name, family.manifold, family.count) for name, family in graph.families.items()}
+    families = {
+        family: result.variables(name, family.manifold, family.count) for name, family in graph.families.items()
+    }
     for fix in graph.fixes:
         at = families[fix.selection.family][fix.selection.indices]
         result.fix(at, units.unknowns * np.asarray(fix.value), name=fix.name)

@@ -1,4 +1,4 @@
-"""Size of an objective: what stationarity and complementarity are measured in, so that no unit of the cost matters."""
+"""Size of an objective and of the forces of its constraints: units in which a solve goes the same way for any cost."""
 
 from __future__ import annotations
 

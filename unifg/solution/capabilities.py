@@ -33,8 +33,8 @@ def require(program: CompiledProblem, solver: str, constraints: Constraints = "a
     if not scalar_costs and program.scalar_terms:
         name = program.scalar_terms[0].name
         raise BackendError(
-            f"{solver} cannot take the scalar cost '{name}': it is not a square; use InteriorPoint or SQP, or "
-            "state it as a residual"
+            f"{solver} cannot take the scalar cost '{name}': it is not a square; use InteriorPoint, "
+            "AugmentedLagrangian or SQP, or state it as a residual"
         )
     if constraints != "equalities":
         return
