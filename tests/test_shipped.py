@@ -108,6 +108,16 @@ def test_an_archive_for_others_is_left_alone(
     assert precompiled.outdated(archive) == ["archive"]
 
 
+def test_a_numba_without_what_the_digest_reads_is_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    import numba.core.runtime
+
+    present = precompiled.surroundings.__wrapped__
+    assert present() == precompiled.surroundings()
+    monkeypatch.setitem(sys.modules, "numba.core.runtime._nrt_python", None)
+    monkeypatch.delattr(numba.core.runtime, "_nrt_python")
+    assert present().startswith("unknown: ")
+
+
 @pytest.mark.parametrize("content", [None, b"", b"PK nothing of the kind"], ids=["none", "empty", "no archive"])
 def test_an_archive_that_cannot_be_read_is_none(
     archive: Path, tmp_path: Path, content: bytes | None, caplog: pytest.LogCaptureFixture

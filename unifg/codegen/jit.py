@@ -110,6 +110,13 @@ class _Cache:
     def load_overload(self, signature: Any, target: Any) -> Any:
         if precompiled.recorder is not None:
             return None
+        try:
+            return self._found(signature, target)
+        except AttributeError as error:  # Numba does not promise what is used here
+            return _say_unknown(error)
+
+    def _found(self, signature: Any, target: Any) -> Any:
+        """Numba's result for a signature, from the disk or from the archive; None where there is nothing."""
         self._ready(target)
         name = f"{self._py_func.__module__}.{self._py_func.__qualname__}"
         arguments, digest = normalize_signature(signature)[0], fingerprint(self._py_func)
@@ -141,7 +148,10 @@ class _Cache:
     def save_overload(self, signature: Any, result: Any) -> None:
         arguments, digest = normalize_signature(signature)[0], fingerprint(self._py_func)
         if not result.library.has_dynamic_globals and (header := header_of(result)) is not None:
-            _, _, (code, linkable) = result.library.serialize_using_object_code()
+            try:
+                _, _, (code, linkable) = result.library.serialize_using_object_code()
+            except AttributeError as error:
+                return _say_unknown(error)
             path = self._file(arguments, digest, result.codegen)
             self._keep(path, self._made(arguments, digest), Artifact(header, code, linkable))
         if precompiled.recorder is not None:
@@ -199,6 +209,11 @@ class _Cache:
         """Key of the function in an archive that is made elsewhere: no date and no processor."""
         parts = (*map(spelled, arguments), *self._variant(), digest)  # a dispatcher, too, tells by arguments alone
         return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def _say_unknown(error: AttributeError) -> None:
+    """Log, once in a process, that this Numba has no way to keep functions that is known here."""
+    say_not_kept(f"Numba {numba.__version__} is newer than unifg knows ({error})")
 
 
 class _CacheInOrder(_Cache):

@@ -28,11 +28,11 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import numba
 from llvmlite import binding as llvm
-from numba import _helperlib, types
+from numba import types
 from numba.core.bytecode import FunctionIdentity
 from numba.core.registry import cpu_target
-from numba.core.runtime import _nrt_python
 
 from unifg.atomic_write import replacing
 from unifg.codegen.artifact import header_of
@@ -72,7 +72,13 @@ def surroundings() -> str:
     )  # fmt: skip
     stated = [str(context.get_value_type(kind)) for kind in kinds]
     stated += [str(context.call_conv.get_function_type(kind, kinds)) for kind in kinds]
-    stated += [*sorted(vars(_helperlib)["c_helpers"]), *sorted(_nrt_python.c_helpers)]
+    try:
+        from numba import _helperlib
+        from numba.core.runtime import _nrt_python
+
+        stated += [*sorted(vars(_helperlib)["c_helpers"]), *sorted(_nrt_python.c_helpers)]
+    except (ImportError, AttributeError, KeyError) as error:  # a Numba that keeps them elsewhere is another one
+        return f"unknown: {error}"
     return hashlib.sha256(repr(stated).encode()).hexdigest()
 
 
@@ -99,7 +105,10 @@ class Archive:
         different = [f"{name} {kind.get(name)}" for name, present in versions().items() if kind.get(name) != present]
         self.usable = not different
         if different:
-            logger.info("the kernels that come with unifg are of another kind (%s)", ", ".join(different))
+            logger.info(
+                "the kernels that come with unifg are not for Numba %s here (%s): functions are compiled instead",
+                numba.__version__, ", ".join(different),
+            )  # fmt: skip
 
     def find(self, key: str) -> tuple[dict[str, Any], str] | None:
         """Header and code, in LLVM's language, of a function; None where there is nothing."""
