@@ -103,6 +103,23 @@ def test_code_of_other_versions_is_left_alone(
     assert "damaged" not in caplog.text
 
 
+def test_functions_made_under_one_name_have_files_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loops over the elements of two manifolds took each other's file, and were compiled in every process."""
+    monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
+
+    def made(factor: float) -> Callable[[float], float]:
+        def scaled(x: float) -> float:
+            return factor * x
+
+        scaled.__qualname__ = "scaled"
+        return compiled(scaled)
+
+    for known in (False, True):
+        scales = made(2.0), made(3.0)
+        assert [scale(1.0) for scale in scales] == [2.0, 3.0]
+        assert [read_from_cache(scale) for scale in scales] == [known, known]
+
+
 def test_a_file_holds_the_signature_it_is_named_by(twice: Callable[[float], float], tmp_path: Path) -> None:
     assert compiled(twice)(3.0) == 6.0 and compiled(twice)(3) == 6.0
     one, other = tmp_path.rglob("*.code")

@@ -189,7 +189,7 @@ class _Cache:
         if folder is None:
             return None
         name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}".replace("<", "").replace(">", "")
-        made = digest if "<" in function.__qualname__ else ""
+        made = digest if "<" in function.__qualname__ or function.__closure__ else ""
         place = function.__module__, function.__code__.co_filename
         parts = (sys.version_info[:2], *place, *map(spelled, arguments), codegen.magic_tuple(), made)
         number = hashlib.sha256(repr((*parts, *self._variant())).encode()).hexdigest()[:20]
@@ -213,6 +213,9 @@ class _Cache:
 
 def _say_unknown(error: AttributeError) -> None:
     """Log, once in a process, that this Numba has no way to keep functions that is known here."""
+    owner = error.obj if isinstance(error.obj, type) else type(error.obj)
+    if owner.__module__.partition(".")[0] not in ("numba", "llvmlite"):
+        raise error
     say_not_kept(f"Numba {numba.__version__} is newer than unifg knows ({error})")
 
 
