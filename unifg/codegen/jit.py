@@ -18,7 +18,10 @@ What the cache does not have may have come with the library, half compiled (:mod
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
+import os
+import secrets
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,6 +31,7 @@ from typing import Any, TypeVar, cast
 import llvmlite
 import numba
 from numba import types
+from numba.core.bytecode import FunctionIdentity
 from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
 from numba.core.sigutils import normalize_signature
@@ -45,6 +49,21 @@ F = TypeVar("F", bound=Callable[..., Any])
 logger = logging.getLogger("unifg")
 
 LIBERTIES = {"contract", "reassoc", "nsz", "arcp"}
+NUMBERS = 2**40, 2**62  # of functions; those of the archive are smaller
+
+
+def _number_anew() -> None:
+    """Let Numba number functions from where no other process does.
+
+    Symbols consist of names, types and such numbers, and those in files meet in one linker: it takes one function for
+    two that are called alike.
+    """
+    FunctionIdentity._unique_ids = itertools.count(NUMBERS[0] + secrets.randbelow(NUMBERS[1]))
+
+
+_number_anew()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_number_anew)
 
 
 def compiled(function: F) -> F:
@@ -198,7 +217,7 @@ class _Cache:
     def _made(self, arguments: tuple[Any, ...], digest: str) -> bytes:
         """Digest of versions, the types of the arguments, the function and its callees."""
         kinds = " ".join(map(spelled, arguments))
-        stated = f"{numba.__version__} {llvmlite.__version__} {kinds} {digest}"
+        stated = f"{NUMBERS} {numba.__version__} {llvmlite.__version__} {kinds} {digest}"
         return hashlib.sha256(stated.encode()).digest()
 
     def _variant(self) -> tuple[str, ...]:
