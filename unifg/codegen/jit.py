@@ -49,7 +49,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 logger = logging.getLogger("unifg")
 
 LIBERTIES = {"contract", "reassoc", "nsz", "arcp"}
-NUMBERS = 2**40, 2**62  # of functions; those of the archive are smaller
+NUMBERS = 2**40, 2**62  # of functions: the least first one of a process, and how many there are to choose from
 
 
 def _number_anew() -> None:

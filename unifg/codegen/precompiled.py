@@ -31,7 +31,6 @@ from typing import Any
 import numba
 from llvmlite import binding as llvm
 from numba import types
-from numba.core.bytecode import FunctionIdentity
 from numba.core.registry import cpu_target
 
 from unifg.atomic_write import replacing
@@ -44,7 +43,6 @@ logger = logging.getLogger("unifg")
 
 ARCHIVE = SHIPPED
 ABOUT, CODE = "about.json", "code.xz"
-FIRST_NUMBER = 10**9  # of functions in the archive: Numba numbers those of a process from one, and names hold numbers
 WRAPPER = "_ZN7cpython"  # prefix of what Python calls
 OUTSIDE = re.compile(
     rf"llvm\.|NRT_|numba_|{PREFIX}|(a?(sin|cos|tan)h?|atan2|exp2?|expm1|log(10|1p|2)?|sqrt|cbrt|pow|hypot|fmod|floor|ceil|"
@@ -248,8 +246,6 @@ recorder: Recorder | None = None
 def recording() -> Iterator[Recorder]:
     """Compile everything anew meanwhile, and keep it."""
     global recorder
-    numbers = FunctionIdentity._unique_ids
-    FunctionIdentity._unique_ids = iter(range(FIRST_NUMBER, 2 * FIRST_NUMBER))
     recorder = Recorder()
     codegen = recorder._codegen
     codegen._add_module = recorder.watch
@@ -258,4 +254,3 @@ def recording() -> Iterator[Recorder]:
     finally:
         del codegen._add_module
         recorder = None
-        FunctionIdentity._unique_ids = numbers
