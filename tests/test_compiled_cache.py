@@ -23,6 +23,7 @@ from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.jit import compiled
 from unifg.codegen.objects import read_sealed, write_sealed
 
+FORKS = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
 SOURCE = "def twice(x):\n    return 2.0 * x\n"
 
 
@@ -101,6 +102,78 @@ def test_code_of_other_versions_is_left_alone(
     other = compiled(twice)
     assert other(3.0) == 6.0 and not read_from_cache(other)
     assert "damaged" not in caplog.text
+
+
+def test_functions_made_under_one_name_have_files_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loops over the elements of two manifolds took each other's file, and were compiled in every process."""
+    monkeypatch.setattr(jit, "cache_folder", lambda: tmp_path)
+
+    def made(factor: float) -> Callable[[float], float]:
+        def scaled(x: float) -> float:
+            return factor * x
+
+        scaled.__qualname__ = "scaled"
+        return compiled(scaled)
+
+    for known in (False, True):
+        scales = made(2.0), made(3.0)
+        assert [scale(1.0) for scale in scales] == [2.0, 3.0]
+        assert [read_from_cache(scale) for scale in scales] == [known, known]
+
+
+MEET = """
+import os, sys
+import numpy as np
+from unifg.codegen.compile_counter import tally
+from unifg.codegen.jit import in_order
+
+def made(k):
+    @in_order
+    def inner(x, y):
+        s = 0.0
+        for i in range(len(x)):
+            for j in range(len(y)):
+                a = np.sin(x[i] * k) + np.cos(y[j]) * np.exp(-x[i]) + np.arctan2(x[i], y[j])
+                b = np.sin(y[j] * k) + np.cos(x[i]) * np.exp(-y[j]) + np.arctan2(y[j], x[i])
+                if a > b:
+                    s += np.tan(a) * np.sqrt(abs(b)) + np.log1p(abs(a))
+                elif a < -b:
+                    s -= np.tanh(a) * np.cbrt(abs(b)) + np.expm1(-abs(a))
+                else:
+                    s += np.hypot(a, b) + np.sinh(a) + np.cosh(b)
+        return s
+
+    @in_order
+    def outer(x, y):
+        return inner(x, y) + inner(y, x) + inner(x, x) + inner(y, y) + inner(x[1:], y)
+    return outer
+
+def check(k):
+    function, x, y = made(k), np.arange(4.0), np.ones(3)
+    assert abs(function(x, y) - function.py_func(x, y)) < 1e-9, (k, function(x, y), function.py_func(x, y))
+
+for word in sys.argv[2:]:
+    if sys.argv[1] == "fork":
+        child = os.fork()
+        if child == 0:
+            check(float(word))
+            os._exit(0)
+        assert os.waitpid(child, 0)[1] == 0
+    else:
+        check(float(word))
+print(bool(tally.compiled))
+"""
+
+
+@pytest.mark.parametrize("runs", [["here 2", "here 3"], pytest.param(["fork 2 3"], marks=FORKS)], ids=["runs", "forks"])
+def test_what_processes_have_compiled_meets_in_a_third(tmp_path: Path, runs: list[str]) -> None:
+    """Numba numbers the functions of each process from one: two callers took the first one's copy of their callee."""
+    place = {**os.environ, cache_folder.VARIABLE: str(tmp_path)}
+    for run in (*runs, "here 2 3"):
+        command = [sys.executable, "-c", MEET, *run.split()]
+        ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=False)
+        assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.strip() == "False"
 
 
 def test_a_file_holds_the_signature_it_is_named_by(twice: Callable[[float], float], tmp_path: Path) -> None:
@@ -233,3 +306,40 @@ def test_what_is_read_needs_no_compiler_until_a_function_of_ones_own_does() -> N
     for _ in range(2):  # what was generated the first time is read the second time
         ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
     assert ended.returncode == 0, ended.stderr
+
+
+NEWER = """
+import logging, sys
+logging.basicConfig(level=logging.INFO, format="%(message)s")
+import numba
+from numba import _helperlib
+numba.__version__ = "99.0.0"
+_helperlib.c_helpers["numba_of_tomorrow"] = 0
+if "renamed" in sys.argv:
+    import numba.core.runtime
+    from numba.core.compiler import CompileResult
+    del CompileResult._rebuild, numba.core.runtime._nrt_python
+    sys.modules["numba.core.runtime._nrt_python"] = None
+import numpy as np
+import unifg as fg
+from unifg.codegen.compile_counter import tally
+for _ in range(2):
+    assert abs(fg.SE2.compose(np.ones((2, 3)), -np.ones((2, 3)))[:, 2]).max() < 1e-12
+    assert abs(fg.SO2.compose(np.ones((2, 1)), -np.ones((2, 1)))).max() < 1e-12
+print(bool(tally.compiled), bool(tally.generated), bool(tally.read))
+"""
+
+
+def test_a_newer_numba_works_from_sources(tmp_path: Path) -> None:
+    """Its layout is not the archive's, which is said once; what it has renamed the cache does without."""
+
+    def said(*how: str) -> tuple[str, int, int]:
+        place = {**os.environ, cache_folder.VARIABLE: str(tmp_path)}
+        command = [sys.executable, "-c", NEWER, *how]
+        ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=False)
+        assert ended.returncode == 0, ended.stderr
+        return ended.stdout.strip(), ended.stderr.count("not for Numba 99.0.0"), ended.stderr.count("than unifg knows")
+
+    assert said() == ("True False False", 1, 0)
+    assert said() == ("False False True", 0, 0)
+    assert said("renamed") == ("True False False", 0, 1)

@@ -128,6 +128,13 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert broken_links(page) == []
 
 
+def test_the_changelog_is_short() -> None:
+    """A section that grows with every change is read by none: what it gains takes the place of something."""
+    sections = re.split(r"^## ", (CHECKOUT / "CHANGELOG.md").read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    lines = {section.partition("\n")[0]: len(section.strip().splitlines()) for section in sections}
+    assert lines and max(lines.values()) <= 120, lines
+
+
 def test_linked_files_are_in_git() -> None:
     """A link to a file that only exists on the author's disk is broken for everybody else."""
     git = subprocess.run(

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numba
 import numpy as np
 import pytest
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import types
 
+from unifg.elimination import symbolic
 from unifg.elimination.analysis import SLACK
 from unifg.elimination.dense import MANY, subtract_signed
 from unifg.elimination.factorization import Factorization, Ordering
@@ -236,3 +241,12 @@ def test_bad_structure_is_refused(rng: np.random.Generator) -> None:
         Factorization(pattern, label[::-1].copy()).factor(np.zeros(pattern.nnz))
     with pytest.raises(UnifgError, match="permutation of the 9 nodes"):
         Factorization(pattern, label, ordering=np.zeros(9, dtype=np.intp)).factor(np.zeros(pattern.nnz))
+
+
+def test_literals_make_no_functions_of_their_own() -> None:
+    """A count that begins as a literal was passed to callees as one first: each was compiled twice, and half unused."""
+    caller: Any = symbolic._eliminate
+    callees: list[Any] = [symbolic._merge_twins, symbolic._append, symbolic._within]
+    indices = types.Array(types.int64, 1, "C")
+    numba.njit(caller.py_func).compile((*[indices] * 3, types.boolean, *[indices] * 2))
+    assert [len(callee.overloads) for callee in callees] == [1, 1, 1]

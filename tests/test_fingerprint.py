@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import sys
 import time
@@ -138,6 +139,25 @@ def test_a_file_that_has_changed_since_it_was_loaded_says_nothing(
 def viewed(x: Any) -> Any:
     """View three numbers."""
     return calls.vector(x, 0, 3)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("def f(x):\n return math.sin(math.cos(x))", "def f(x):\n return math.cos(math.sin(x))"),
+        ("def f(x):\n return x + math.pi", "def f(x):\n return x + math.tau"),
+        ("def f(x):\n return x + 1.0", "def f(x):\n return x + 2.0"),
+        ("def f(x, y):\n return y", "def f(x, *y):\n return y"),
+    ],
+)
+def test_functions_without_a_file_differ_by_their_names_in_order(one: str, other: str) -> None:
+    """As in a notebook: the bytecode counts names, and says in which place each is used."""
+    found = []
+    for source in (one, one, other):
+        names: dict[str, Any] = {"math": math}
+        exec(source, names)
+        found.append(fingerprint(names["f"]))
+    assert found[0] == found[1] != found[2]
 
 
 def test_flags_and_helpers_of_primitives_count(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -437,13 +437,7 @@ def test_no_other_private_name_of_numba_is_used() -> None:
     assert "getrefcount" not in "".join(path.read_text(encoding="utf-8") for _, path in LIBRARY)
 
 
-def test_numba_is_one_that_the_machine_knows() -> None:
-    """The range of pyproject.toml ends at the newest release that these tests have run on."""
-    from importlib.metadata import version
-
+def test_numba_has_no_expiry_date() -> None:
+    """The tests above name what a newer one has taken away; `test_compiled_cache` shows what becomes of it then."""
     text = (CHECKOUT / "pyproject.toml").read_text(encoding="utf-8")
-    found = re.search(r'"numba>=(\d+)\.(\d+),<(\d+)\.(\d+)"', text)
-    assert found is not None, "pyproject.toml gives numba no range"
-    oldest, beyond = (int(found[1]), int(found[2])), (int(found[3]), int(found[4]))
-    major, minor = (int(part) for part in version("numba").split(".")[:2])
-    assert oldest <= (major, minor) < beyond
+    assert re.search(r'"numba>=\d+\.\d+",', text), "pyproject.toml gives numba a lowest version alone"

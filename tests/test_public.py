@@ -7,6 +7,8 @@ import importlib
 import inspect
 import pkgutil
 import pydoc
+import subprocess
+import sys
 from types import ModuleType
 from typing import Literal, get_origin
 
@@ -49,6 +51,29 @@ def test_dir_lists_what_is_public() -> None:
         if not name.startswith("_") and name not in fg.__all__ and not isinstance(value, ModuleType)
     ]
     assert leaked == []
+
+
+# What `import unifg` need not load: it comes with the first backend, picture or smoother that asks for it.
+LATE = (
+    "scipy", "osqp", "piqp", "qpsolvers", "platformdirs", "matplotlib", "pandas", "casadi", "email", "numba.np.linalg",
+    "unifg.solvers", "unifg.models", "unifg.smoothing", "unifg.plots", "unifg.style", "unifg.view", "unifg.horizon",
+    "unifg.files", "unifg.pose_graphs", "unifg.scenarios", "unifg.precompile",
+)  # fmt: skip
+
+
+def test_the_import_loads_what_a_graph_is_made_of_alone() -> None:
+    script = f"""
+import sys
+import numpy, numba
+there = {{*sys.modules}}
+import unifg as fg
+fg.Graph, fg.solve, fg.SE2
+late = [name for name in {LATE} if name in {{*sys.modules}} - there]
+assert not late, late
+assert fg.FixedLag.__module__ == "unifg.smoothing.fixed_lag" and "unifg.smoothing" in sys.modules
+"""
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120)
+    assert ended.returncode == 0, ended.stderr
 
 
 @pytest.mark.parametrize("room", [room for room in OPEN if room != "unifg.scenarios"])

@@ -10,6 +10,7 @@ solution = fg.solve(graph, {x: np.zeros((2, 3))})
 print(solution.report())
 """
 
+import typing as _typing
 from collections.abc import Callable as _Callable
 from collections.abc import Mapping as _Mapping
 from pathlib import Path as _Path
@@ -48,7 +49,6 @@ from unifg.lie import (
 from unifg.modeling.factors import ManifoldResidual, between, difference, prior
 from unifg.modeling.joint_prior import joint_prior
 from unifg.modeling.variables import Data, Family, Selection, each, shared
-from unifg.smoothing import FixedLag, Incremental
 from unifg.solution.check import Finding, Report
 from unifg.solution.graph import Graph
 from unifg.solution.history import Iteration
@@ -60,6 +60,9 @@ from unifg.solution.solver import Callback as _Callback
 from unifg.solution.solver import Prepared, Solver
 from unifg.solution.status import Status
 from unifg.typing import Numbers as _Numbers
+
+if _typing.TYPE_CHECKING:
+    from unifg.smoothing import FixedLag, Incremental
 
 _HERE = _Path(__file__).resolve().parent
 # Where links are lost (Windows, some archives), a checkout finds its side folders beside this one.
@@ -188,13 +191,17 @@ def warmup(progress: _Callable[[float, str], object] | None = None) -> None:
     perform("library", lambda: list(jobs()), progress)
 
 
-def __getattr__(name: str) -> str:
-    """Version, looked up when it is asked for."""
-    if name != "__version__":
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    from unifg.codegen.cache_folder import version
+def __getattr__(name: str) -> object:
+    """Version and smoothers, looked up when they are asked for: batch solves need neither."""
+    if name == "__version__":
+        from unifg.codegen.cache_folder import version
 
-    return version()
+        return version()
+    if name in ("FixedLag", "Incremental"):
+        from unifg import smoothing
+
+        return getattr(smoothing, name)
+    raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
 def __dir__() -> list[str]:

@@ -11,8 +11,6 @@ from functools import cache
 from pathlib import Path
 from threading import Event
 
-from platformdirs import user_cache_path
-
 logger = logging.getLogger("unifg")
 
 VARIABLE = "UNIFG_CACHE_DIR"
@@ -33,9 +31,11 @@ def cache_folder() -> Path | None:
 
 def place() -> Path:
     """Path of the folder, there or not."""
-    given = os.environ.get(VARIABLE)
-    root = Path(given) if given else user_cache_path("unifg", appauthor=False)
-    return root / version()
+    if given := os.environ.get(VARIABLE):
+        return Path(given) / version()
+    from platformdirs import user_cache_path  # where a folder is named, it is not loaded
+
+    return Path(user_cache_path("unifg", appauthor=False)) / version()
 
 
 def version() -> str:

@@ -70,8 +70,11 @@ def shape_of(code: CodeType) -> Shape:
     found = shapes(code.co_filename).get(f"{code.co_name}:{code.co_firstlineno}")
     if found is not None:
         return found
-    parts = (code.co_code.hex(), *(c if not isinstance(c, CodeType) else shape_of(c).digest for c in code.co_consts))
-    return Shape(hashlib.sha256(repr(parts).encode()).hexdigest(), tuple(sorted(_names(code))))
+    taken = code.co_argcount, code.co_posonlyargcount, code.co_kwonlyargcount, code.co_flags
+    named = code.co_names, code.co_freevars, code.co_cellvars, code.co_exceptiontable
+    constants = (c if not isinstance(c, CodeType) else shape_of(c).digest for c in code.co_consts)
+    stated = repr((code.co_code, *taken, *named, *constants))
+    return Shape(hashlib.sha256(stated.encode()).hexdigest(), tuple(sorted(_names(code))))
 
 
 def shapes(path: str) -> dict[str, Shape]:

@@ -18,7 +18,10 @@ What the cache does not have may have come with the library, half compiled (:mod
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
+import os
+import secrets
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -28,6 +31,7 @@ from typing import Any, TypeVar, cast
 import llvmlite
 import numba
 from numba import types
+from numba.core.bytecode import FunctionIdentity
 from numba.core.registry import cpu_target
 from numba.core.runtime import rtsys
 from numba.core.sigutils import normalize_signature
@@ -45,6 +49,21 @@ F = TypeVar("F", bound=Callable[..., Any])
 logger = logging.getLogger("unifg")
 
 LIBERTIES = {"contract", "reassoc", "nsz", "arcp"}
+NUMBERS = 2**40, 2**62  # of functions: the least first one of a process, and how many there are to choose from
+
+
+def _number_anew() -> None:
+    """Let Numba number functions from where no other process does.
+
+    Symbols consist of names, types and such numbers, and those in files meet in one linker: it takes one function for
+    two that are called alike.
+    """
+    FunctionIdentity._unique_ids = itertools.count(NUMBERS[0] + secrets.randbelow(NUMBERS[1]))
+
+
+_number_anew()
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_number_anew)
 
 
 def compiled(function: F) -> F:
@@ -110,6 +129,13 @@ class _Cache:
     def load_overload(self, signature: Any, target: Any) -> Any:
         if precompiled.recorder is not None:
             return None
+        try:
+            return self._found(signature, target)
+        except AttributeError as error:  # Numba does not promise what is used here
+            return _say_unknown(error)
+
+    def _found(self, signature: Any, target: Any) -> Any:
+        """Numba's result for a signature, from the disk or from the archive; None where there is nothing."""
         self._ready(target)
         name = f"{self._py_func.__module__}.{self._py_func.__qualname__}"
         arguments, digest = normalize_signature(signature)[0], fingerprint(self._py_func)
@@ -141,7 +167,10 @@ class _Cache:
     def save_overload(self, signature: Any, result: Any) -> None:
         arguments, digest = normalize_signature(signature)[0], fingerprint(self._py_func)
         if not result.library.has_dynamic_globals and (header := header_of(result)) is not None:
-            _, _, (code, linkable) = result.library.serialize_using_object_code()
+            try:
+                _, _, (code, linkable) = result.library.serialize_using_object_code()
+            except AttributeError as error:
+                return _say_unknown(error)
             path = self._file(arguments, digest, result.codegen)
             self._keep(path, self._made(arguments, digest), Artifact(header, code, linkable))
         if precompiled.recorder is not None:
@@ -179,7 +208,7 @@ class _Cache:
         if folder is None:
             return None
         name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}".replace("<", "").replace(">", "")
-        made = digest if "<" in function.__qualname__ else ""
+        made = digest if "<" in function.__qualname__ or function.__closure__ else ""
         place = function.__module__, function.__code__.co_filename
         parts = (sys.version_info[:2], *place, *map(spelled, arguments), codegen.magic_tuple(), made)
         number = hashlib.sha256(repr((*parts, *self._variant())).encode()).hexdigest()[:20]
@@ -188,7 +217,7 @@ class _Cache:
     def _made(self, arguments: tuple[Any, ...], digest: str) -> bytes:
         """Digest of versions, the types of the arguments, the function and its callees."""
         kinds = " ".join(map(spelled, arguments))
-        stated = f"{numba.__version__} {llvmlite.__version__} {kinds} {digest}"
+        stated = f"{NUMBERS} {numba.__version__} {llvmlite.__version__} {kinds} {digest}"
         return hashlib.sha256(stated.encode()).digest()
 
     def _variant(self) -> tuple[str, ...]:
@@ -199,6 +228,14 @@ class _Cache:
         """Key of the function in an archive that is made elsewhere: no date and no processor."""
         parts = (*map(spelled, arguments), *self._variant(), digest)  # a dispatcher, too, tells by arguments alone
         return hashlib.sha256(repr(parts).encode()).hexdigest()
+
+
+def _say_unknown(error: AttributeError) -> None:
+    """Log, once in a process, that this Numba has no way to keep functions that is known here."""
+    owner = error.obj if isinstance(error.obj, type) else type(error.obj)
+    if owner.__module__.partition(".")[0] not in ("numba", "llvmlite"):
+        raise error
+    say_not_kept(f"Numba {numba.__version__} is newer than unifg knows ({error})")
 
 
 class _CacheInOrder(_Cache):

@@ -28,11 +28,10 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any
 
+import numba
 from llvmlite import binding as llvm
-from numba import _helperlib, types
-from numba.core.bytecode import FunctionIdentity
+from numba import types
 from numba.core.registry import cpu_target
-from numba.core.runtime import _nrt_python
 
 from unifg.atomic_write import replacing
 from unifg.codegen.artifact import header_of
@@ -44,7 +43,6 @@ logger = logging.getLogger("unifg")
 
 ARCHIVE = SHIPPED
 ABOUT, CODE = "about.json", "code.xz"
-FIRST_NUMBER = 10**9  # of functions in the archive: Numba numbers those of a process from one, and names hold numbers
 WRAPPER = "_ZN7cpython"  # prefix of what Python calls
 OUTSIDE = re.compile(
     rf"llvm\.|NRT_|numba_|{PREFIX}|(a?(sin|cos|tan)h?|atan2|exp2?|expm1|log(10|1p|2)?|sqrt|cbrt|pow|hypot|fmod|floor|ceil|"
@@ -72,7 +70,13 @@ def surroundings() -> str:
     )  # fmt: skip
     stated = [str(context.get_value_type(kind)) for kind in kinds]
     stated += [str(context.call_conv.get_function_type(kind, kinds)) for kind in kinds]
-    stated += [*sorted(vars(_helperlib)["c_helpers"]), *sorted(_nrt_python.c_helpers)]
+    try:
+        from numba import _helperlib
+        from numba.core.runtime import _nrt_python
+
+        stated += [*sorted(vars(_helperlib)["c_helpers"]), *sorted(_nrt_python.c_helpers)]
+    except (ImportError, AttributeError, KeyError) as error:  # a Numba that keeps them elsewhere is another one
+        return f"unknown: {error}"
     return hashlib.sha256(repr(stated).encode()).hexdigest()
 
 
@@ -99,7 +103,10 @@ class Archive:
         different = [f"{name} {kind.get(name)}" for name, present in versions().items() if kind.get(name) != present]
         self.usable = not different
         if different:
-            logger.info("the kernels that come with unifg are of another kind (%s)", ", ".join(different))
+            logger.info(
+                "the kernels that come with unifg are not for Numba %s here (%s): functions are compiled instead",
+                numba.__version__, ", ".join(different),
+            )  # fmt: skip
 
     def find(self, key: str) -> tuple[dict[str, Any], str] | None:
         """Header and code, in LLVM's language, of a function; None where there is nothing."""
@@ -239,8 +246,6 @@ recorder: Recorder | None = None
 def recording() -> Iterator[Recorder]:
     """Compile everything anew meanwhile, and keep it."""
     global recorder
-    numbers = FunctionIdentity._unique_ids
-    FunctionIdentity._unique_ids = iter(range(FIRST_NUMBER, 2 * FIRST_NUMBER))
     recorder = Recorder()
     codegen = recorder._codegen
     codegen._add_module = recorder.watch
@@ -249,4 +254,3 @@ def recording() -> Iterator[Recorder]:
     finally:
         del codegen._add_module
         recorder = None
-        FunctionIdentity._unique_ids = numbers

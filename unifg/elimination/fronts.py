@@ -63,8 +63,7 @@ def eliminate_front(
     Returns:
         -1, or the first pivot that vanished.
     """
-    begin = 0
-    while begin < width:
+    for begin in range(0, width, BLOCK):
         end = begin + BLOCK if begin + BLOCK < width else width
         within = columns if columns <= WIDE else end
         failed = eliminate(numbers, panel, stride, begin, end, within, scale, pivots, signs, first)
@@ -77,7 +76,6 @@ def eliminate_front(
                 numbers, panel + end * (stride + 1), stride, columns - end, panel + begin * stride + end,
                 stride, end - begin, signs, first + begin, 0, width - end,
             )  # fmt: skip
-        begin = end
     subtract_signed(numbers, update, apart, columns - width, panel + width, stride, width, signs, first, 0, rows)
     return -1
 

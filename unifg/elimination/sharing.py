@@ -183,8 +183,7 @@ def _front(plan: Plan, numbers: Address, s: int, counters: Address, phase: int, 
             next_chunk(counters, phase)
         wait_for(counters, phase, 1)
         return phase + 1
-    begin = 0
-    while begin < width:
+    for begin in range(0, width, BLOCK):
         end = begin + BLOCK if begin + BLOCK < width else width
         if first_chunk(counters, phase) == 0:
             failed = eliminate(numbers, panel, stride, begin, end, end, scale, pivots, signs, first)
@@ -217,7 +216,6 @@ def _front(plan: Plan, numbers: Address, s: int, counters: Address, phase: int, 
                 k = next_chunk(counters, phase)
             wait_for(counters, phase, chunks)
             phase += 1
-        begin = end
     chunks = chunks_of(0.5 * rows * rows * width)
     k = first_chunk(counters, phase)
     while k < chunks:

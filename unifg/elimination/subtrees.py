@@ -18,7 +18,7 @@ PARTS = 8
 SHARE = 0.25  # of the work, above which a subtree is split
 WORTH = 2e7  # multiplications below which threads bring nothing
 OVERHEAD = 30.0  # of a scalar of a front, in multiplications
-MANY = 256  # subtrees at most that are split
+MANY = 256  # subtrees at most that are split, and put into order
 
 
 @compiled
@@ -63,16 +63,19 @@ def share_out(fronts: IntArray, parent: IntArray) -> IntArray:
         if jobs == 0:
             return filled(0, 0)
     part, load = filled(count, -1), np.zeros(PARTS)
-    weight = np.empty(jobs)
     for k in range(jobs):
-        weight[k] = -below[job[k]]
-    for k in np.argsort(weight):
+        if k < MANY:  # the heaviest in order; where there are more the rest is too light for its order to matter
+            heaviest = k
+            for other in range(k + 1, jobs):
+                if below[job[other]] > below[job[heaviest]]:
+                    heaviest = other
+            job[k], job[heaviest] = job[heaviest], job[k]
         lightest = 0
         for p in range(PARTS):
             if load[p] < load[lightest]:
                 lightest = p
         part[job[k]] = lightest
-        load[lightest] -= weight[k]
+        load[lightest] += below[job[k]]
     for s in range(count - 1, -1, -1):
         if part[s] < 0:
             above = PARTS if parent[s] < 0 else part[parent[s]]

@@ -225,7 +225,7 @@ def _eliminate(
         for k in range(pointer[e], pointer[e + 1]):
             own[pool[k] + 1] += 1
             heavy[e] += weight[pool[k]]
-    total, stamp, size = 0, 0, np.empty(n, np.int64)  # of each node with those merged
+    total, size = 0, np.empty(n, np.int64)  # of each node with those merged
     for i in range(n):
         own[i + 1] += own[i]
         total += weight[i]
@@ -237,7 +237,8 @@ def _eliminate(
     lists, free = np.empty(4 * len(pool) + n + 16, np.int64), len(pool)
     for k in range(len(pool)):
         lists[k] = pool[k]
-    done, made, remaining, now, listed, lowest = 0, 0, total, -1, 0, 0
+    done = made = stamp = first[0]  # a literal 0 is a type of its own, for which callees would be compiled, too
+    remaining, now, listed, lowest = total, -1, 0, 0
     while done < n:
         while listed == 0:
             now, lowest = now + 1, 0

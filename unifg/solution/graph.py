@@ -11,7 +11,6 @@ import numpy as np
 from unifg.elimination.tree import EliminationTree
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data
-from unifg.plots.factor_graph import draw_graph
 from unifg.problem.compiled_problem import CompiledProblem, compile_graph
 from unifg.solution.check import Report, check_graph
 from unifg.solution.solution import AnyGuess, values_of
@@ -54,6 +53,8 @@ class Graph(Model):
         Raises:
             ViewError: there are no variables.
         """
+        from unifg.plots.factor_graph import draw_graph  # only who draws loads it
+
         return draw_graph(list(self.families.values()), self.terms, self.fixes)
 
     def compile(self) -> CompiledProblem:

@@ -16,7 +16,6 @@ import numpy as np
 
 from unifg.errors import GraphError, UnifgError
 from unifg.modeling.variables import Family
-from unifg.plots.descent import draw_descent
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.typing import Array
@@ -160,6 +159,8 @@ class History(list[Iteration]):
         Raises:
             ViewError: there are no rows.
         """
+        from unifg.plots.descent import draw_descent  # only who draws loads it
+
         kkt = {name: self.column(name) for name in ("stationarity", "violation", "complementarity")}
         return draw_descent(self.column("cost"), kkt | {"step": self.column("step_norm")})
 

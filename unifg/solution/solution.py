@@ -12,7 +12,6 @@ import numpy as np
 
 from unifg.errors import GraphError, UnifgError
 from unifg.modeling.variables import Family, Selection, Variable, as_selection
-from unifg.plots.shown import Shown, apart, draw_shown
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.conditioning import Conditioning, cheap, conditioning
@@ -28,6 +27,8 @@ from unifg.typing import Array, BoolArray, Numbers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from unifg.plots.shown import Shown
 
 
 @dataclass(frozen=True)
@@ -297,11 +298,15 @@ class Solution:
             GraphError: for variables of another graph, or when there are no covariances.
             ViewError: when there is more than fits into one figure.
         """
+        from unifg.plots.shown import draw_shown  # only who draws loads it
+
         selections = [self._selection(variable) for variable in variables or self._program.families]
         parts = [self._shown(selection, marginals) for selection in selections]
         return draw_shown(parts, f"{self.solver}: {self.status.name.lower().replace('_', ' ')}, cost {self.cost:.6g}")
 
     def _shown(self, selection: Selection, marginals: bool) -> Shown:
+        from unifg.plots.shown import Shown, apart
+
         program, family = self._program, selection.family
         everywhere = family.count, family.manifold.storage
         lower, upper = np.full(everywhere, -np.inf), np.full(everywhere, np.inf)
