@@ -252,7 +252,6 @@ def _solve(problem: Problem, work: Work) -> bool:
     copy_to(work.hessian, work.matrix)
     for k in range(len(slope)):
         slope[k] = work.gradient[problem.free[k]]
-        work.step[k] = 0.0
         work.matrix[problem.diagonal[k]] += now.damping / work.columns[k] ** 2
     sides = 0
     for row in range(rows):

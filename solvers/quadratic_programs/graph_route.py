@@ -81,43 +81,46 @@ class GraphRoute:
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve to ``accuracy`` from the step zero and ``multipliers``, and measure."""
         program = self.program
-        equality = qp.lower == qp.upper
-        if not np.array_equal(equality, self.system.held):
-            self.system, self._stacked = program.systems.kkt(equality), None
+        sides, hessian, stacked = self._load(qp)
+        step, dual = np.zeros(program.size), multipliers.copy()
+        if not len(sides[0]):
+            error = self._linear(qp, hessian, dual, step)
+            return QPAnswer(step, dual, self.name, 1, qp_error(qp, step, dual), not error <= RESIDUAL)
+        linear, measured = np.empty(program.constraints.count), np.empty(1)
+        iterations = int(
+            minimize_quadratic(
+                program.arrays, stacked, program.columns.free, hessian, qp.gradient, qp.jacobian, *sides, qp.lower,
+                self.system.held, max(accuracy, TIGHTEST), PATIENCE, step, dual, linear, measured,
+            )
+        )  # fmt: skip
+        error = qp_error(qp, step, dual) if iterations >= 0 else np.inf
+        return QPAnswer(step, dual, self.name, abs(iterations), error, hopeless(measured, dual))
+
+    def complete(self, qp: QP, step: Array, dual: Array, accuracy: float) -> float:
+        """Bring step and multipliers, whose active sides are about right, to ``accuracy``; returns the error."""
+        program, measured = self.program, np.full(1, np.inf)
+        sides, hessian, stacked = self._load(qp)
+        hold_active(
+            program.arrays, stacked, program.columns.free, hessian, qp.gradient, qp.jacobian, *sides, qp.lower,
+            max(accuracy, TIGHTEST), PATIENCE, step, dual, qp.linear(step), measured,
+        )  # fmt: skip
+        return qp_error(qp, step, dual) if measured[0] < np.inf else np.inf
+
+    def _load(self, qp: QP) -> tuple[tuple[IntArray, Array, Array], Array, Stacked]:
+        """Row, sign and limit of the sides, H in the pattern of ``normal``, and the matrix with the equalities."""
+        program, equality = self.program, qp.lower == qp.upper
+        if self._stacked is None or not np.array_equal(equality, self.system.held):
+            self.system = program.systems.kkt(equality)
+            self._stacked = Stacked.of(self.system.arrays)
         below = np.flatnonzero(np.isfinite(qp.lower) & ~equality)
         above = np.flatnonzero(np.isfinite(qp.upper) & ~equality)
-        step, dual = np.zeros(program.size), multipliers.copy()
+        sign = np.repeat([1.0, -1.0], [len(below), len(above)])
+        sides = np.concatenate([below, above]), sign, np.concatenate([qp.lower[below], qp.upper[above]])
         hessian = qp.hessian
         if qp.pattern is not program.normal:
             hessian = np.zeros(program.normal.nnz)
             hessian[program.objective_places] = qp.hessian
-        if not len(below) and not len(above):
-            error = self._linear(qp, hessian, dual, step)
-            return QPAnswer(step, dual, self.name, 1, qp_error(qp, step, dual), not error <= RESIDUAL)
-        self._stacked, measured = self._stacked or Stacked.of(self.system.arrays), np.empty(1)
-        iterations = int(
-            minimize_quadratic(
-                program.arrays,
-                self._stacked,
-                program.columns.free,
-                hessian,
-                qp.gradient,
-                qp.jacobian,
-                np.concatenate([below, above]),
-                np.repeat([1.0, -1.0], [len(below), len(above)]),
-                np.concatenate([qp.lower[below], qp.upper[above]]),
-                qp.lower,
-                equality,
-                max(accuracy, TIGHTEST),
-                PATIENCE,
-                step,
-                dual,
-                np.empty(program.constraints.count),
-                measured,
-            )
-        )
-        error = qp_error(qp, step, dual) if iterations >= 0 else np.inf
-        return QPAnswer(step, dual, self.name, abs(iterations), error, hopeless(measured, dual))
+        return sides, hessian, self._stacked
 
     def _linear(self, qp: QP, hessian: Array, dual: Array, step: Array) -> float:
         """Solve the KKT system: sets ``step``, moves ``dual``, returns the relative residual."""
@@ -189,16 +192,15 @@ def hold_active(
     linear: Array,
     measured: Array,
 ) -> float:
-    """Find the active sides from step zero and `dual`; returns the systems factorised, negative when none of them did.
+    """Find the active sides from `step` and `dual`; returns the systems factorised, negative when none of them did.
 
     Sides that are held come in as squares v^2 W / 2, and y moves by -W v until v vanishes: every matrix has the pattern
     of the equalities alone. What y < 0 pushes inwards is let go, what v < 0 violates is held, and all is solved anew.
-    Sets ``step``, ``dual``, A times the step, and the largest of stationarity, infeasibility and complementarity.
+    Sets ``step``, ``dual``, A times the step, which is given in ``linear``, and the largest of stationarity, infeasibility and complementarity.
     """
     kkt = system.kkt
     n, equalities, sides, count = kkt.size[0], kkt.size[1], len(side_row), len(lower)
     row_terms, weights, move = np.zeros(count), np.zeros(count), np.zeros(count)
-    linear[:] = 0.0
     full, data = np.zeros(len(terms.unknown)), np.empty(len(kkt.plan.slots))
     right, found, shift = np.zeros(n + equalities), np.zeros(n + equalities), np.zeros(n + equalities)
     shift[:n], shift[n:] = SHIFT, -SHIFT
@@ -208,7 +210,7 @@ def hold_active(
     heavy, fine = HEAVY * max(heavy, 1e-3), max(FINER * accuracy, TIGHTEST)
     for k in range(sides):
         y[k] = max(0.0, -side_sign[k] * dual[side_row[k]])
-        held[k] = y[k] > -side_sign[k] * side_limit[k]
+        held[k] = y[k] > side_sign[k] * (linear[side_row[k]] - side_limit[k])
         if not held[k]:
             y[k] = 0.0
     before = sides + 1
@@ -307,6 +309,8 @@ def minimize_quadratic(
         :data:`CONTRADICTED` where there can be none.
     """
     kkt, begun, measured[0] = system.kkt, dual.copy(), np.inf
+    step[:] = 0.0
+    linear[:] = 0.0
     held = hold_active(
         terms, system, free, hessian, gradient, jacobian, side_row, side_sign, side_limit, lower, accuracy,
         patience, step, dual, linear, measured,
