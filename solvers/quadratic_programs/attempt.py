@@ -24,7 +24,7 @@ from unifg.problem.linearization import all_finite
 from unifg.problem.table import TermArrays
 from unifg.solvers.globalize.line_search import SHORTEST
 from unifg.solvers.globalize.merit import ARMIJO
-from unifg.solvers.quadratic_programs.graph_route import PATIENCE, TIGHTEST, Stacked, multiply
+from unifg.solvers.quadratic_programs.graph_route import PATIENCE, TIGHTEST, Stacked, list_sides, multiply
 from unifg.solvers.quadratic_programs.subproblem import largest_residual, leaves_most
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -247,22 +247,16 @@ def attempt(problem: Problem, work: Work) -> None:
 @compiled
 def _solve(problem: Problem, work: Work) -> bool:
     """Answer the subproblem of Gauss-Newton's Hessian on the graph; false where another route has to look at it."""
-    now, terms, rows = work.scalars[0], problem.terms, len(work.dual)
+    now, terms = work.scalars[0], problem.terms
     lower, upper, slope, linear = work.lower, work.upper, work.slope, work.linear
     copy_to(work.hessian, work.matrix)
     for k in range(len(slope)):
         slope[k] = work.gradient[problem.free[k]]
         work.matrix[problem.diagonal[k]] += now.damping / work.columns[k] ** 2
-    sides = 0
-    for row in range(rows):
+    for row in range(len(lower)):
         lower[row], upper[row] = terms.lower[row] - work.constraints[row], terms.upper[row] - work.constraints[row]
         work.dual[row] = work.multipliers[row]
-        if not problem.equality[row]:
-            for sign in (1.0, -1.0):
-                limit = lower[row] if sign > 0.0 else upper[row]
-                if math.isfinite(limit):
-                    work.row[sides], work.sign[sides], work.limit[sides] = row, sign, limit
-                    sides += 1
+    sides = list_sides(lower, upper, work.row, work.sign, work.limit)
     now.error = np.inf
     iterations = number(
         problem.links[MINIMIZE],

@@ -112,10 +112,10 @@ class GraphRoute:
         if self._stacked is None or not np.array_equal(equality, self.system.held):
             self.system = program.systems.kkt(equality)
             self._stacked = Stacked.of(self.system.arrays)
-        below = np.flatnonzero(np.isfinite(qp.lower) & ~equality)
-        above = np.flatnonzero(np.isfinite(qp.upper) & ~equality)
-        sign = np.repeat([1.0, -1.0], [len(below), len(above)])
-        sides = np.concatenate([below, above]), sign, np.concatenate([qp.lower[below], qp.upper[above]])
+        room = 2 * len(equality)
+        row, sign, limit = np.empty(room, np.int64), np.empty(room), np.empty(room)
+        count = list_sides(qp.lower, qp.upper, row, sign, limit)
+        sides = row[:count], sign[:count], limit[:count]
         hessian = qp.hessian
         if qp.pattern is not program.normal:
             hessian = np.zeros(program.normal.nnz)
@@ -135,6 +135,21 @@ class GraphRoute:
         step[:] = found[:n]
         dual[arrays.rows] += found[n:]
         return error
+
+
+@compiled
+def list_sides(lower: Array, upper: Array, row: IntArray, sign: Array, limit: Array) -> int:
+    """Write row, sign and limit of every finite limit of an inequality; returns how many there are."""
+    count = 0
+    for k in range(len(lower)):
+        if lower[k] == upper[k]:
+            continue
+        for lowest in (True, False):
+            border = lower[k] if lowest else upper[k]
+            if math.isfinite(border):
+                row[count], sign[count], limit[count] = k, 1.0 if lowest else -1.0, border
+                count += 1
+    return count
 
 
 def hopeless(measured: Array, dual: Array) -> bool:
@@ -196,7 +211,8 @@ def hold_active(
 
     Sides that are held come in as squares v^2 W / 2, and y moves by -W v until v vanishes: every matrix has the pattern
     of the equalities alone. What y < 0 pushes inwards is let go, what v < 0 violates is held, and all is solved anew.
-    Sets ``step``, ``dual``, A times the step, which is given in ``linear``, and the largest of stationarity, infeasibility and complementarity.
+    Sets ``step``, ``dual``, A times the step, which is given in ``linear``, and ``measured``, the largest of
+    stationarity, infeasibility and complementarity.
     """
     kkt = system.kkt
     n, equalities, sides, count = kkt.size[0], kkt.size[1], len(side_row), len(lower)
