@@ -25,7 +25,7 @@ from unifg.problem.table import TermArrays
 from unifg.solvers.globalize.line_search import SHORTEST
 from unifg.solvers.globalize.merit import ARMIJO
 from unifg.solvers.quadratic_programs.graph_route import PATIENCE, TIGHTEST, Stacked, list_sides, multiply
-from unifg.solvers.quadratic_programs.subproblem import largest_residual, leaves_most
+from unifg.solvers.quadratic_programs.subproblem import leaves_most
 from unifg.typing import Array, BoolArray, IntArray
 
 Records: TypeAlias = NDArray[np.void]
@@ -111,17 +111,13 @@ class Work(NamedTuple):
         bent, bent_dual: the same of a correction.
         taken: (n,) step as tried.
         linear: (M,) A times the step.
-        measured: (1,) error of the graph's answer.
+        measured: (2,) error of the graph's answer, and whether active sides were looked for in vain.
         bend: (M,) by how much constraints bend along the full step.
-        slope, matrix, lower, upper: of the subproblem.
         full: (width,) memory.
-        row: (2 M,) constraint of every side, a finite limit of an inequality row.
-        sign: (2 M,) one for a lower limit, minus one for an upper one.
-        limit: (2 M,) of the linearised row.
         values, constraints, constraint_jacobian, gradient, hessian, weights: at the present iterate.
-        trial, trial_residual, trial_constraints, trial_squares, trial_heights: at a trial.
-        residual, jacobian, next_constraints, next_jacobian, next_gradient, next_hessian: where it was taken.
-        squares, next_weights, norms, heights, concavity: there, as in a linearisation.
+        trial: stored values of a trial.
+        residual, next_constraints, squares, heights: there; all as in a linearisation.
+        jacobian, next_jacobian, next_gradient, next_hessian, next_weights, norms, concavity: there, where it is taken.
     """
 
     scalars: Annotated[Records, NOW, 1]
@@ -135,16 +131,9 @@ class Work(NamedTuple):
     bent_dual: Annotated[Array, "rows"]
     taken: Annotated[Array, "unknowns"]
     linear: Annotated[Array, "rows"]
-    measured: Annotated[Array, 1]
+    measured: Annotated[Array, 2]
     bend: Annotated[Array, "rows"]
-    slope: Annotated[Array, "unknowns"]
-    matrix: Annotated[Array, "normal"]
-    lower: Annotated[Array, "rows"]
-    upper: Annotated[Array, "rows"]
     full: Annotated[Array, "width"]
-    row: Annotated[IntArray, "sides"]
-    sign: Annotated[Array, "sides"]
-    limit: Annotated[Array, "sides"]
     values: Annotated[Array, "stored"]
     constraints: Annotated[Array, "rows"]
     constraint_jacobian: Annotated[Array, "row_entries"]
@@ -152,10 +141,6 @@ class Work(NamedTuple):
     hessian: Annotated[Array, "normal"]
     weights: Annotated[Array, "robust"]
     trial: Annotated[Array, "stored"]
-    trial_residual: Annotated[Array, "residuals"]
-    trial_constraints: Annotated[Array, "rows"]
-    trial_squares: Annotated[Array, "robust"]
-    trial_heights: Annotated[Array, "general"]
     residual: Annotated[Array, "residuals"]
     jacobian: Annotated[Array, "entries"]
     next_constraints: Annotated[Array, "rows"]
@@ -234,7 +219,7 @@ def attempt(problem: Problem, work: Work) -> None:
         first, now.corrected = now.corrected == 0, 2
         if first and now.correcting == 1 and len(work.bend) and _finite(work):
             for row in range(len(work.bend)):
-                work.bend[row] = work.trial_constraints[row] - work.constraints[row] - work.linear[row]
+                work.bend[row] = work.next_constraints[row] - work.constraints[row] - work.linear[row]
             now.answer, now.stage = CORRECT, MISSED
             return
         now.length *= 0.5
@@ -247,40 +232,28 @@ def attempt(problem: Problem, work: Work) -> None:
 @compiled
 def _solve(problem: Problem, work: Work) -> bool:
     """Answer the subproblem of Gauss-Newton's Hessian on the graph; false where another route has to look at it."""
-    now, terms = work.scalars[0], problem.terms
-    lower, upper, slope, linear = work.lower, work.upper, work.slope, work.linear
-    copy_to(work.hessian, work.matrix)
+    now, terms, constraints, linear = work.scalars[0], problem.terms, work.constraints, work.linear
+    slope, matrix = np.empty(len(work.step)), work.hessian.copy()
     for k in range(len(slope)):
         slope[k] = work.gradient[problem.free[k]]
-        work.matrix[problem.diagonal[k]] += now.damping / work.columns[k] ** 2
-    for row in range(len(lower)):
-        lower[row], upper[row] = terms.lower[row] - work.constraints[row], terms.upper[row] - work.constraints[row]
-        work.dual[row] = work.multipliers[row]
-    sides = list_sides(lower, upper, work.row, work.sign, work.limit)
-    now.error = np.inf
+        matrix[problem.diagonal[k]] += now.damping / work.columns[k] ** 2
+    lower, upper, room = terms.lower - constraints, terms.upper - constraints, 2 * len(constraints)
+    copy_to(work.multipliers, work.dual)
+    row, sign, limit = np.empty(room, np.int64), np.empty(room), np.empty(room)
+    sides = list_sides(lower, upper, row, sign, limit)
     iterations = number(
         problem.links[MINIMIZE],
         (
-            terms, problem.system, problem.free, work.matrix, slope, work.constraint_jacobian, work.row[:sides],
-            work.sign[:sides], work.limit[:sides], lower, problem.equality, max(now.accuracy, TIGHTEST), now.patience,
-            work.step, work.dual, linear, work.measured,
+            terms, problem.system, problem.free, matrix, slope, work.constraint_jacobian, row[:sides], sign[:sides],
+            limit[:sides], lower, problem.equality, max(now.accuracy, TIGHTEST), now.patience, work.step, work.dual,
+            linear, work.measured,
         ),
     )  # fmt: skip
-    now.iterations = int(abs(iterations))
     # Where the active sides were not found, those of the next subproblem are looked for with less zeal.
-    now.patience = 1 if work.measured[0] == np.inf else PATIENCE
+    now.iterations, now.patience, now.error = int(abs(iterations)), PATIENCE if work.measured[1] == 0.0 else 1, np.inf
     if not (iterations >= 0.0 and all_finite(work.step) and all_finite(work.dual)):
         return False
     now.error = work.measured[0]
-    if now.error == np.inf:
-        pull, curved = work.full, work.taken
-        pull[:] = 0.0
-        transposed_times(terms, False, work.constraint_jacobian, work.dual, pull)
-        multiply(problem.system.kkt, work.matrix, work.step, curved)
-        for k in range(len(slope)):
-            curved[k] += slope[k] + pull[problem.free[k]]
-        times(terms, False, work.constraint_jacobian, work.step, linear)
-        now.error = largest_residual(curved, linear, lower, upper, work.dual, problem.equality)
     if now.error > 10.0 * now.accuracy:
         return False
     return now.error <= 0.1 * now.tolerance or not leaves_most(linear, lower, upper, 0.1 * now.tolerance)
@@ -345,7 +318,7 @@ def _descends(problem: Problem, work: Work) -> bool:
 @compiled
 def _finite(work: Work) -> bool:
     """Test whether the trial could be evaluated."""
-    return math.isfinite(work.scalars[0].trial_cost) and all_finite(work.trial_constraints)
+    return math.isfinite(work.scalars[0].trial_cost) and all_finite(work.next_constraints)
 
 
 @compiled
@@ -354,9 +327,9 @@ def _accepts(terms: TermArrays, work: Work) -> bool:
     now = work.scalars[0]
     if not _finite(work):
         return False
-    if scaled_violation(work.trial_constraints, terms.lower, terms.upper, work.rows) > now.farthest:
+    if scaled_violation(work.next_constraints, terms.lower, terms.upper, work.rows) > now.farthest:
         return False
-    value = now.trial_cost + scaled_violation(work.trial_constraints, terms.lower, terms.upper, work.penalties)
+    value = now.trial_cost + scaled_violation(work.next_constraints, terms.lower, terms.upper, work.penalties)
     return bool(value <= now.here + ARMIJO * now.length * now.slope + now.slack)
 
 
@@ -374,12 +347,12 @@ def _evaluate(problem: Problem, work: Work) -> None:
     now.trial_cost = number(
         links[VALUE],
         (
-            terms, trial, work.trial_residual, work.trial_constraints, work.trial_squares, work.weights, True,
+            terms, trial, work.residual, work.next_constraints, work.squares, work.weights, True,
             problem.scratch,
         ),
     )  # fmt: skip
     if len(work.heights):
-        now.trial_cost += number(links[SCALARS], (terms, trial, work.trial_heights, problem.scratch))
+        now.trial_cost += number(links[SCALARS], (terms, trial, work.heights, problem.scratch))
 
 
 @compiled

@@ -86,7 +86,7 @@ class GraphRoute:
         if not len(sides[0]):
             error = self._linear(qp, hessian, dual, step)
             return QPAnswer(step, dual, self.name, 1, qp_error(qp, step, dual), not error <= RESIDUAL)
-        linear, measured = np.empty(program.constraints.count), np.empty(1)
+        linear, measured = np.empty(program.constraints.count), np.empty(2)
         iterations = int(
             minimize_quadratic(
                 program.arrays, stacked, program.columns.free, hessian, qp.gradient, qp.jacobian, *sides, qp.lower,
@@ -98,7 +98,7 @@ class GraphRoute:
 
     def complete(self, qp: QP, step: Array, dual: Array, accuracy: float) -> float:
         """Bring step and multipliers, whose active sides are about right, to ``accuracy``; returns the error."""
-        program, measured = self.program, np.full(1, np.inf)
+        program, measured = self.program, np.full(2, np.inf)
         sides, hessian, stacked = self._load(qp)
         hold_active(
             program.arrays, stacked, program.columns.free, hessian, qp.gradient, qp.jacobian, *sides, qp.lower,
@@ -321,10 +321,10 @@ def minimize_quadratic(
 
     Returns:
         The systems factorised, negative where one was singular or the rows contradict each other. ``measured`` is the
-        error of the answer, with A times the step in ``linear``; infinite where it has yet to be measured, and
-        :data:`CONTRADICTED` where there can be none.
+        error of the answer, with A times the step in ``linear``; infinite where the iterations did not suffice, and
+        :data:`CONTRADICTED` where there can be none. Behind it stands one where the active sides did not settle.
     """
-    kkt, begun, measured[0] = system.kkt, dual.copy(), np.inf
+    kkt, begun, measured[0], measured[1] = system.kkt, dual.copy(), np.inf, 0.0
     step[:] = 0.0
     linear[:] = 0.0
     held = hold_active(
@@ -335,6 +335,7 @@ def minimize_quadratic(
         return held
     copy_to(begun, dual)
     step[:] = 0.0
+    measured[1] = 1.0
     n, equalities, sides, count = kkt.size[0], kkt.size[1], len(side_row), len(lower)
     row_terms, weights, move = np.zeros(count), np.zeros(count), np.zeros(count)
     full, data = np.zeros(len(terms.unknown)), np.empty(len(kkt.plan.slots))
@@ -363,6 +364,9 @@ def minimize_quadratic(
         for k in range(n + equalities):
             worst = max(worst, abs(right[k]))
         if worst <= accuracy and iteration > 0:
+            measured[0] = worst
+            for k in range(sides):
+                measured[0] = max(measured[0], y[k] * abs(linear[side_row[k]] - side_limit[k]))
             break
         if _contradict(kkt, free, side_sign, side_limit, lower, y, dual, full, step):
             measured[0] = CONTRADICTED

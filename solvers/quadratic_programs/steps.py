@@ -129,7 +129,7 @@ class Steps:
             elif question == EVALUATE:
                 self._moved = program.retract(lin.values, work.taken)
                 trial = program.evaluate(self._moved, lin.weights)
-                now["trial_cost"], work.trial_constraints[:] = trial.cost, trial.constraints
+                now["trial_cost"], work.next_constraints[:] = trial.cost, trial.constraints
             else:
                 values = program.retract(lin.values, work.taken) if now["full_steps"] else self._moved
                 assert values is not None
@@ -180,7 +180,6 @@ def _empty(program: CompiledProblem) -> Work:
     return empty_work(
         unknowns=program.size,
         rows=table.constraints,
-        sides=2 * table.constraints,
         width=program.columns.width,
         stored=program.columns.stored,
         residuals=table.residuals,
@@ -197,19 +196,19 @@ def _empty(program: CompiledProblem) -> Work:
 def _problem(program: CompiledProblem, work: Work) -> Problem:
     """What attempts share, with the present equalities; compiles what they call."""
     terms, scratch, retraction, free = program.arrays, program.scratch, program.retraction, program.columns.free
-    system = Stacked.of(program.systems.kkt(program.equality).arrays)
+    system, rows = Stacked.of(program.systems.kkt(program.equality).arrays), np.zeros(0, np.int64)
     links = [
         link_like(
-            minimize_quadratic, NUMBER, terms, system, free, work.matrix, work.slope, work.constraint_jacobian,
-            work.row, work.sign, work.limit, work.lower, program.equality, 0.0, PATIENCE, work.step, work.dual,
-            work.linear, work.measured,
+            minimize_quadratic, NUMBER, terms, system, free, work.hessian, work.step, work.constraint_jacobian, rows,
+            work.rows, work.rows, work.rows, program.equality, 0.0, PATIENCE, work.step, work.dual, work.linear,
+            work.measured,
         ),
         link_like(retract_parts, NOTHING, retraction.parts, free, work.taken, work.full, work.values, work.trial),
         link_like(
-            evaluation.evaluate, NUMBER, terms, work.trial, work.trial_residual, work.trial_constraints,
-            work.trial_squares, work.weights, True, scratch,
+            evaluation.evaluate, NUMBER, terms, work.trial, work.residual, work.next_constraints,
+            work.squares, work.weights, True, scratch,
         ),
-        link_like(evaluate_scalars, NUMBER, terms, work.trial, work.trial_heights, scratch),
+        link_like(evaluate_scalars, NUMBER, terms, work.trial, work.heights, scratch),
         link_like(
             evaluation.linearize, NUMBER, terms, work.trial, work.residual, work.jacobian, work.next_constraints,
             work.next_jacobian, work.squares, work.next_weights, work.norms, work.next_gradient, work.next_hessian,
