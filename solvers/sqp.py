@@ -50,9 +50,9 @@ class SQP(Solver):
             with the first and goes on with the second on slow convergence; under a
             ``time_limit`` it stays with the first, for the second has to be compiled.
         qp: "osqp" (called directly, warm-started; what it finds active is completed on the graph), "graph" (active
-            sides, or an interior point, whose systems are eliminated on the graph), "elimination" (Ta's primal and dual linear graphs, for equalities only; a reference, written to be
-            read) or any name qpsolvers knows. A subproblem without inequalities is one linear system: it goes to
-            "graph" unless "elimination" is asked for.
+            sides, or an interior point, whose systems are eliminated on the graph), "elimination" (Ta's primal and dual
+            linear graphs, for equalities only; a reference, written to be read) or any name qpsolvers knows. A
+            subproblem without inequalities is one linear system: it goes to "graph" unless "elimination" is asked for.
         fallback: "piqp" (called directly), "graph" or any name qpsolvers knows: repeats a QP which missed its accuracy.
             None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
         qp_iterations: limit for OSQP before the fallback takes over; None for what thirty iterations of an interior

@@ -94,11 +94,8 @@ def test_contradicting_rows_are_proved_and_no_others(limit: float, contradicts: 
 @pytest.mark.parametrize("case", ["drive", "HS26", "HS29", "HS40"])
 def test_python_in_the_place_of_kernels_changes_nothing(case: str, qp: str, options: dict[str, Any]) -> None:
     """The compiled step asks Python for values and linearisations, and for corrections in both cases."""
-    if case == "drive":
-        stated = Unicycle("behind", True, 20).formulation()
-        graph, guess = stated.graph, stated.guess
-    else:
-        graph, guess = CASES[case].build()
+    stated = Unicycle("behind", True, 20).formulation()
+    graph, guess = CASES[case].build() if case in CASES else (stated.graph, stated.guess)
     found = SQP(qp=qp, **options).prepare(graph).solve(guess)
     with patch.object(CompiledProblem, "fully_compiled", PropertyMock(return_value=False)):
         asked = SQP(qp=qp, **options).prepare(graph).solve(guess)

@@ -61,7 +61,7 @@ def test_missing_curvature_by_hand() -> None:
     step = np.array([0.3, -0.2])
 
     def seen(multiplier: float, step: Array, unit: float) -> float:
-        """By an attempt that takes the step with this multiplier, whatever the merit says of it."""
+        """Missing curvature, by an attempt that takes the step with this multiplier whatever the merit says."""
         steps, dual = Steps(program), np.array([multiplier])
         steps.start(Scaling(program, np.full(2, unit), np.ones(1)), before, dual, 1e-6)
         steps.pose(before, dual, 0.7, 1e-6, True, False)

@@ -68,7 +68,7 @@ POSED, SOLVED, AIMED, EVALUATED, LINEARIZED, MISSED = range(6)
 
 
 class Problem(NamedTuple):
-    """What no iteration changes.
+    """Arrays that no iteration changes.
 
     Attributes:
         links: addresses of compiled functions, in the order of :data:`LINKED`.
@@ -278,7 +278,7 @@ def highest_price(penalties: Array, units: Array) -> float:
 
 @compiled
 def _outside(value: float, lower: float, upper: float) -> float:
-    """By how much a row is violated; NaN stays."""
+    """Violation of a row; NaN stays."""
     above, below = value - upper, lower - value
     return (0.0 if above <= 0.0 else above) + (0.0 if below <= 0.0 else below)
 

@@ -194,7 +194,7 @@ def _empty(program: CompiledProblem) -> Work:
 
 
 def _problem(program: CompiledProblem, work: Work) -> Problem:
-    """What attempts share, with the present equalities; compiles what they call."""
+    """Arrays that attempts share, with the present equalities; compiles the functions that they call."""
     terms, scratch, retraction, free = program.arrays, program.scratch, program.retraction, program.columns.free
     system, rows = Stacked.of(program.systems.kkt(program.equality).arrays), np.zeros(0, np.int64)
     links = [
