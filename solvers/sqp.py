@@ -16,7 +16,6 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.codegen.inner import inner
 from unifg.errors import BackendError
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
@@ -24,12 +23,9 @@ from unifg.solution.capabilities import require
 from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import RestorationTrigger, leave, resume, settle
-from unifg.solvers.globalize.line_search import Taken, search
-from unifg.solvers.globalize.merit import RowPrices
-from unifg.solvers.globalize.norms import largest, norm
+from unifg.solvers.globalize.norms import largest, norm, total
 from unifg.solvers.globalize.slow_convergence import converges_slowly
 from unifg.solvers.quadratic_programs.routes import Subproblems
-from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
 from unifg.typing import Array
 
@@ -38,10 +34,7 @@ FIRST_DAMPING = 1e-3
 DAMPING_GROWTH = 10.0
 DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and damped steps
 SECANT_DECAY = 0.3  # of curvature that was seen along an earlier step
-SECANT_MATTERS = 0.5  # of the known curvature; less only slows convergence down
-SHORTEST_SECANT = 1e-7  # below it, differences of gradients are rounding
 EXACT_DECAY = 0.1  # with the exact Hessian nothing is left to cycle about
-NOISE, ROUNDING = 1e-8, 1e-13  # of the merit: for each unit of the penalty, and relative
 SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
 
@@ -56,10 +49,10 @@ class SQP(Solver):
             which it has the wrong inertia, or along which the merit does not fall, takes Gauss-Newton's. "auto" begins
             with the first and goes on with the second on slow convergence; under a
             ``time_limit`` it stays with the first, for the second has to be compiled.
-        qp: "osqp" (called directly, warm-started), "graph" (an interior point whose systems are eliminated on the
-            graph), "elimination" (Ta's primal and dual linear graphs, for equalities only; a reference, written to be
-            read) or any name qpsolvers knows. A subproblem without inequalities is one linear system: it goes to
-            "graph" unless "elimination" is asked for.
+        qp: "osqp" (called directly, warm-started; what it finds active is completed on the graph), "graph" (active
+            sides, or an interior point, whose systems are eliminated on the graph), "elimination" (Ta's primal and dual
+            linear graphs, for equalities only; a reference, written to be read) or any name qpsolvers knows. A
+            subproblem without inequalities is one linear system: it goes to "graph" unless "elimination" is asked for.
         fallback: "piqp" (called directly), "graph" or any name qpsolvers knows: repeats a QP which missed its accuracy.
             None leaves inaccurate answers as they are, and infeasible subproblems unsolved.
         qp_iterations: limit for OSQP before the fallback takes over; None for what thirty iterations of an interior
@@ -124,8 +117,7 @@ class SQP(Solver):
         within = run.program.within_bounds(run.values)
         if within is not run.values and not self.full_steps:
             run.begin_at(run.program.linearize(within))
-        workspace.start(run.lin)
-        merit = RowPrices(run.program, workspace.scaling.rows, run.multipliers, run.lin)
+        self._begin(run, workspace)
         damping, missing = SMALLEST_DAMPING, 0.0
         failures = 0
         watch = RestorationTrigger()
@@ -133,8 +125,7 @@ class SQP(Solver):
         while run.status is None:
             if turning and converges_slowly(run.history):
                 turning, workspace = False, workspace.curved()
-                workspace.start(run.lin)
-                merit = RowPrices(run.program, workspace.scaling.rows, run.multipliers, run.lin)
+                self._begin(run, workspace)
                 damping, missing = SMALLEST_DAMPING, 0.0
             if watch.calls(run) and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
                 return Status.LOCALLY_INFEASIBLE
@@ -142,67 +133,74 @@ class SQP(Solver):
                 break
             shift = max(damping, missing)
             shift = _bounded(run, workspace, shift) if failures == 0 else shift
-            qp = workspace.subproblem(run.lin, run.multipliers, shift)
-            taken = self._attempt(run, workspace, merit, qp)
-            if taken is None and workspace.distrust():
-                taken = self._attempt(run, workspace, merit, qp)
-            if taken is None and qp.curved_by is not None:
+            qp = workspace.subproblem(run.lin, run.multipliers, shift) if workspace.exact else None
+            answer = self._attempt(run, workspace, shift, qp)
+            if answer is None and workspace.distrust():
+                answer = self._attempt(run, workspace, shift, qp)
+            if answer is None and qp is not None and qp.curved_by is not None:
                 qp = qp.gauss_newton()
-                taken = self._attempt(run, workspace, merit, qp)
+                answer = self._attempt(run, workspace, shift, qp)
             if workspace.elastic_asked and run.infeasible_stationary():
                 if (ending := leave(run)) is not None:
                     return ending
                 continue
-            if taken is None:
+            if answer is None:
                 failures += 1
                 damping = max(100.0 * damping, 1e-4)
                 if failures == FAILURES:
                     if (ending := resume(run, Status.STALLED)) is not None:
                         return ending
                     failures, damping, missing = 0, SMALLEST_DAMPING, 0.0
-                    workspace.start(run.lin)
-                    merit = RowPrices(run.program, workspace.scaling.rows, run.multipliers, run.lin)
+                    self._begin(run, workspace)
                 continue
-            failures = 0
-            answer, after, multipliers, step, length, corrected = taken
-            if qp.curved_by is None:
-                seen = missing_curvature(workspace.scaling, qp, run.lin, after, multipliers, step)
-                missing = max(seen, SECANT_DECAY * missing)
-            else:
-                missing = 0.0
+            failures, now = 0, workspace.steps.now
+            missing = max(now["missing"], SECANT_DECAY * missing) if qp is None or qp.curved_by is None else 0.0
+            length, size = now["length"], norm(workspace.steps.work.taken)
             run.accept(
-                after,
-                multipliers,
-                norm(step),
+                workspace.steps.reached(),
+                workspace.steps.work.multipliers.copy(),
+                size,
                 length,
                 qp=answer.route,
                 qp_iterations=answer.iterations,
                 damping=shift,
-                **({"correction": 1} if corrected else {}),
-                **({"hessian": _kind(qp, answer)} if workspace.exact else {}),
+                **({"correction": 1} if now["corrected"] == 1 else {}),
+                **({"hessian": _kind(qp, answer)} if qp is not None else {}),
             )
-            if run.status is None and norm(step) < self.step_tolerance:
+            if run.status is None and size < self.step_tolerance:
                 if run.optimality.violation < self.violation_tolerance:
                     return Status.STOP_RULE
             damping = _next_damping(workspace.exact, damping, length)
         return None
 
-    def _attempt(
-        self, run: SolveState, workspace: Subproblems, merit: RowPrices, qp: QP
-    ) -> tuple[QPAnswer, Linearization, Array, Array, float, bool] | None:
-        """Solve the subproblem and search along its step; None when there is no answer or no length helps."""
-        accuracy = self._accuracy(run, workspace)
-        answer = workspace.solve(qp, run.multipliers, accuracy)
-        if not np.isfinite(answer.error):
-            return None
-        merit.raise_above(answer.multipliers)
-        found = self._search(run, workspace, merit, qp, answer, accuracy)
-        if found is None:
-            return None
-        multipliers = answer.multipliers if found.dual is None else found.dual
-        if found.length < 1.0:
-            multipliers = run.multipliers + found.length * (multipliers - run.multipliers)
-        return answer, found.reached, multipliers, found.step, found.length, found.dual is not None
+    def _begin(self, run: SolveState, workspace: Subproblems) -> None:
+        """Begin at the present iterate, with nothing learned."""
+        workspace.start(run.lin)
+        workspace.steps.start(workspace.scaling, run.lin, run.multipliers, self.tolerance)
+
+    def _attempt(self, run: SolveState, workspace: Subproblems, shift: float, qp: QP | None) -> QPAnswer | None:
+        """Solve the subproblem and search along its step; None when there is no answer or no length helps.
+
+        Without ``qp`` the subproblem is Gauss-Newton's, and is put together where it is looked at.
+        """
+        steps, accuracy = workspace.steps, self._accuracy(run, workspace)
+        steps.pose(run.lin, run.multipliers, shift, accuracy, self.full_steps, self.second_order_correction)
+        answer, good = steps.on_graph() if qp is None and workspace.compiled and steps.sided else (None, False)
+        if good:
+            workspace.answered()
+        else:
+            qp = workspace.subproblem(run.lin, run.multipliers, shift) if qp is None else qp
+            answer = workspace.solve(qp, run.multipliers, accuracy, answer)
+            if not np.isfinite(answer.error):
+                return None
+            steps.along(answer)
+        assert answer is not None
+
+        def correct(bend: Array) -> QPAnswer | None:
+            given = workspace.subproblem(run.lin, run.multipliers, shift) if qp is None else qp
+            return workspace.correct(given, answer, bend, accuracy)
+
+        return answer if steps.taken(correct) else None
 
     def _accuracy(self, run: SolveState, workspace: Subproblems) -> float:
         """Ask the QP for what the outer iteration can use."""
@@ -210,56 +208,6 @@ class SQP(Solver):
         share = min(1e-3, size) if workspace.exact else 1e-3
         # Where a scaled unit is worth many of the graph's, the test of the graph needs more digits.
         return min(max(share * size, 0.1 * self.tolerance * workspace.scaling.smallest), 1e-4)
-
-    def _search(
-        self, run: SolveState, workspace: Subproblems, merit: RowPrices, qp: QP, answer: QPAnswer, accuracy: float
-    ) -> Taken | None:
-        """Step length."""
-        program, lin = run.program, run.lin
-        if self.full_steps:
-            reached = program.linearize(program.retract(lin.values, answer.step))
-            return Taken(reached, answer.step, 1.0)
-        here, linear = merit.value(lin), qp.linear(answer.step)
-        slope = merit.slope(inner(qp.gradient, answer.step), lin, linear)
-        # The QP meets its conditions to its own accuracy only; what that costs in merit is noise.
-        slack = ROUNDING * max(1.0, abs(here)) + max(NOISE * merit.penalty, min(answer.error, accuracy))
-        if program.least_squares:  # what is rounding depends on the cost alone, whose unit is free
-            slack = ROUNDING * abs(here)
-        if slope > slack:
-            return None
-
-        def correct(bend: Array) -> tuple[Array, Array] | None:
-            corrected = workspace.correct(qp, answer, bend, accuracy)
-            return None if corrected is None else (corrected.step, corrected.multipliers)
-
-        wanted = correct if self.second_order_correction else None
-        return search(lin, answer.step, merit, here, slope, slack, linear, wanted)
-
-
-def missing_curvature(
-    scaling: Scaling, qp: QP, before: Linearization, after: Linearization, multipliers: Array, step: Array
-) -> float:
-    """Curvature of the Lagrangian along a step, by the secant, that the Hessian lacked; zero when it did not matter.
-
-    A Gauss-Newton Hessian leaves out what constraints and residuals bend. Where that is as much as H itself, full steps
-    swing to and fro across the answer: the error is multiplied by 1 - (true curvature) / (that of the subproblem).
-
-    Args:
-        scaling: units in which the length of the step is measured.
-        qp: the subproblem that gave the step.
-        before: linearisation at the start of the step.
-        after: linearisation at its end.
-        multipliers: (M,) at its end.
-        step: (n,) tangent step.
-    """
-    program = scaling.program
-    squared = float(np.square(step / scaling.columns).sum())
-    if squared < SHORTEST_SECANT**2:
-        return 0.0
-    change = program.lagrangian_gradient(after, multipliers) - program.lagrangian_gradient(before, multipliers)
-    known = inner(step, qp.curved(step) - qp.damping * step) / squared
-    missing = inner(step, change[program.columns.free]) / squared - known
-    return missing if missing > SECANT_MATTERS * known else 0.0
 
 
 def _bounded(run: SolveState, workspace: Subproblems, damping: float) -> float:
@@ -278,7 +226,7 @@ def _size(run: SolveState, workspace: Subproblems) -> float:
     """The largest KKT number of the present iterate, in scaled units."""
     program, scaling, measured = run.program, workspace.scaling, run.optimality
     if scaling.neutral:
-        scale = max(1.0, float(np.abs(run.multipliers).mean()) / 100.0) if len(run.multipliers) else 1.0
+        scale = max(1.0, total(run.multipliers) / max(len(run.multipliers), 1) / 100.0)
         return max(scale * measured.stationarity, measured.violation, measured.complementarity)
     gradient = program.lagrangian_gradient(run.lin, run.multipliers)[program.columns.free]
     return max(

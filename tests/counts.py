@@ -45,8 +45,10 @@ def counting() -> Iterator[Count]:
     count = Count()
     solve, ask = Subproblems.solve, OsqpRoute.solve
 
-    def counted(self: Subproblems, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
-        answer = solve(self, qp, multipliers, accuracy)
+    def counted(
+        self: Subproblems, qp: QP, multipliers: Array, accuracy: float, first: QPAnswer | None = None
+    ) -> QPAnswer:
+        answer = solve(self, qp, multipliers, accuracy, first)
         if isinstance(self.first, OsqpRoute):
             count.routes.append(answer.route if np.isfinite(answer.error) else "none")
         return answer

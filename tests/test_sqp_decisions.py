@@ -12,10 +12,10 @@ import unifg as fg
 from problems.known import short_drive
 from unifg.solvers import SQP
 from unifg.solvers.globalize.feasibility_restoration import FALLING, PATIENCE, RestorationTrigger
-from unifg.solvers.globalize.merit import RowPrices
 from unifg.solvers.globalize.slow_convergence import converges_slowly
-from unifg.solvers.quadratic_programs.routes import LEFT, RESTING
-from unifg.solvers.quadratic_programs.subproblem import QPAnswer, subproblem
+from unifg.solvers.quadratic_programs.attempt import highest_price, raise_prices
+from unifg.solvers.quadratic_programs.routes import RESTING
+from unifg.solvers.quadratic_programs.subproblem import LEFT, QPAnswer, subproblem
 from unifg.solvers.sqp import _next_damping
 from unifg.typing import Array
 
@@ -59,22 +59,16 @@ def line(limit: float = -1.0) -> tuple[fg.Graph, fg.Family]:
 
 
 def test_the_highest_price_is_that_of_scaled_rows_and_at_least_one() -> None:
-    graph, x = line()
-    program = graph.compile()
-    lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
-    for multiplier, row, price in ((6.0, 2.0, 3.0), (6.0, 0.5, 12.0), (0.1, 1.0, 1.0)):
-        assert RowPrices(program, np.array([row]), np.array([-multiplier]), lin).penalty == pytest.approx(price)
+    for penalty, row, price in ((6.0, 2.0, 3.0), (6.0, 0.5, 12.0), (0.1, 1.0, 1.0)):
+        assert highest_price(np.array([penalty]), np.array([row])) == pytest.approx(price)
 
 
 def test_prices_stay_above_their_multipliers_and_come_down_slowly() -> None:
-    graph, x = line()
-    program = graph.compile()
-    lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
-    merit = RowPrices(program, np.ones(1), np.array([2.0]), lin)
-    merit.raise_above(np.array([-4.0]))
-    np.testing.assert_allclose(merit.penalties, [4.4])
-    merit.raise_above(np.array([1.0]))
-    np.testing.assert_allclose(merit.penalties, [2.7])
+    penalties = np.array([2.0])
+    raise_prices(penalties, np.array([-4.0]))
+    np.testing.assert_allclose(penalties, [4.4])
+    raise_prices(penalties, np.array([1.0]))
+    np.testing.assert_allclose(penalties, [2.7])
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from problems.control import Unicycle
 from problems.hock_schittkowski import SMALL
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.scaling import Scaling
-from unifg.solvers.quadratic_programs.subproblem import subproblem
-from unifg.solvers.sqp import missing_curvature
+from unifg.solvers.quadratic_programs.steps import Steps
+from unifg.solvers.quadratic_programs.subproblem import QPAnswer
 from unifg.typing import Array
 
 CASES = {case.name: case for case in SMALL}
@@ -59,16 +59,20 @@ def test_missing_curvature_by_hand() -> None:
     program = graph.compile()
     before = program.linearize(program.values_from({x: np.array([[0.6, 0.8]])}))
     step = np.array([0.3, -0.2])
-    after = program.linearize(program.retract(before.values, step))
-    for scaling in (Scaling.none(program), Scaling(program, np.array([4.0, 4.0]), np.ones(1))):
-        unit = float(scaling.metric[0])
+
+    def seen(multiplier: float, step: Array, unit: float) -> float:
+        """Missing curvature, by an attempt that takes the step with this multiplier whatever the merit says."""
+        steps, dual = Steps(program), np.array([multiplier])
+        steps.start(Scaling(program, np.full(2, unit), np.ones(1)), before, dual, 1e-6)
+        steps.pose(before, dual, 0.7, 1e-6, True, False)
+        steps.along(QPAnswer(step, dual, "by hand", 1, 0.0))
+        assert steps.taken(lambda bend: None)
+        return float(steps.now["missing"])
+
+    for unit in (1.0, 4.0):
         for multiplier, missing in ((2.0, 4.0), (0.5, 1.0), (0.1, 0.0), (-0.4, 0.0)):  # less than half does not count
-            qp = subproblem(program, before, 0.7 * scaling.metric)
-            found = missing_curvature(scaling, qp, before, after, np.array([multiplier]), step)
-            assert found * unit == pytest.approx(missing, abs=1e-6)
-    short = program.linearize(program.retract(before.values, 1e-9 * step))
-    qp = subproblem(program, before, 0.0)
-    assert missing_curvature(Scaling.none(program), qp, before, short, np.array([2.0]), 1e-9 * step) == 0.0
+            assert seen(multiplier, step, unit) / unit**2 == pytest.approx(missing, abs=1e-6)
+    assert seen(2.0, 1e-9 * step, 1.0) == 0.0
 
 
 def test_subproblems_on_the_graph_begin_from_the_last_multipliers() -> None:

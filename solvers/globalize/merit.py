@@ -42,63 +42,6 @@ class Merit:
         return np.abs(self.program.violation(constraints))
 
 
-class RowPrices(Merit):
-    """l1 merit: the cost plus a penalty per unit of violation for every row (Powell 1978).
-
-    Attributes:
-        penalties: (M,).
-        farthest: scaled violation that no step may exceed.
-    """
-
-    def __init__(self, program: CompiledProblem, units: Array, multipliers: Array, start: Linearization) -> None:
-        """Start with the penalties the multipliers suggest.
-
-        Args:
-            program: the compiled graph.
-            units: (M,) factors in which rows are compared with each other.
-            multipliers: (M,).
-            start: where the solve begins.
-        """
-        super().__init__(program)
-        self._units = units
-        self.penalties = np.abs(multipliers)
-        self.farthest = FARTHEST * max(1.0, self._size(start.constraints))
-
-    @property
-    def penalty(self) -> float:
-        """The highest penalty in scaled units, at least one."""
-        return float((self.penalties / self._units).max(initial=1.0))
-
-    def raise_above(self, multipliers: Array) -> None:
-        """Keep every penalty above its multiplier."""
-        size = np.abs(multipliers)
-        self.penalties = np.maximum(1.1 * size, 0.5 * (self.penalties + size))
-
-    def value(self, point: Point) -> float:
-        """Merit at a point."""
-        return point.cost + inner(self.penalties, self.outside(point.constraints))
-
-    def slope(self, descent: float, lin: Linearization, linear: Array) -> float:
-        """Upper bound of the merit's derivative along a step.
-
-        Args:
-            descent: derivative of the cost.
-            lin: where.
-            linear: (M,) A times the step.
-        """
-        change = self.outside(lin.constraints + linear) - self.outside(lin.constraints)
-        return descent + inner(self.penalties, change)
-
-    def accepts(self, trial: Point, here: float, slope: float, length: float, slack: float) -> bool:
-        """Armijo's condition, not too far from the constraints: the merit may be unbounded out there."""
-        if not trial.finite or self._size(trial.constraints) > self.farthest:
-            return False
-        return super().accepts(trial, here, slope, length, slack)
-
-    def _size(self, constraints: Array) -> float:
-        return float((self._units * self.outside(constraints)).sum())
-
-
 class OnePrice(Merit):
     """l1 merit with one penalty, which rises until every step is one of descent (Nocedal and Wright, chapter 18).
 

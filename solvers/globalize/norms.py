@@ -25,6 +25,15 @@ def largest(vector: Array) -> float:
 
 
 @compiled
+def total(vector: Array) -> float:
+    """Sum of the absolute numbers."""
+    result = 0.0
+    for number in vector:
+        result += abs(number)
+    return result
+
+
+@compiled
 def _squares(vector: Array) -> float:
     total = 0.0
     for number in vector:

@@ -1,10 +1,10 @@
 """OSQP, called directly: one workspace per structure, updated and warm-started in primal and dual.
 
-OSQP's first-order iterations find the active set soon and digits slowly, so it is asked for the former: two digits of a
-problem brought to one scale (:mod:`unifg.solvers.quadratic_programs.scaling`), then a polish, which solves the linear
-system of the limits found active. An answer that misses its accuracy is taken up where it is with one digit more, until
-the iterations have cost what a few of an interior point would. Equalities weigh three times as much as in OSQP's own
-choice, which is 1000 times the rho of inequalities.
+OSQP's first-order iterations find the active set soon and digits slowly, so it is asked for the former: one digit of a
+problem brought to one scale (:mod:`unifg.solvers.quadratic_programs.scaling`). What it finds active is completed to the
+accuracy asked for on the graph (:mod:`unifg.solvers.quadratic_programs.graph_route`). Where that does not settle,
+OSQP goes on with one digit more and a polish of its own, until its iterations have cost what a few of an interior point
+would. Equalities weigh three times as much as in OSQP's own choice, which is 1000 times the rho of inequalities.
 
 Equal calls give equal answers: rho adapts at fixed iterations, never by the clock, and begins anew with every solve;
 OSQP's own scaling, which would carry digits of one problem into the next, is off. Its test of the duality gap is off
@@ -23,7 +23,8 @@ import numpy as np
 import osqp
 
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.solvers.quadratic_programs.scaling import Scaling
+from unifg.solvers.quadratic_programs.graph_route import GraphRoute
+from unifg.solvers.quadratic_programs.scaling import Packed
 from unifg.solvers.quadratic_programs.subproblem import FINER, QP, QPAnswer, qp_error
 from unifg.typing import Array
 
@@ -31,9 +32,9 @@ INFINITY = 1e20  # OSQP treats larger limits as absent
 TIGHTEST = 1e-13
 RHO, ALPHA = 0.1, 1.8
 EQUALITIES = 2.0  # their rows are so much longer; rho goes with the square
-DIGITS = 1e-2  # accuracy asked for at first
+DIGITS = 1e-1  # accuracy asked for at first, before the graph completes it
 FINEST = 1e-9  # asked of the iterations; what lies beyond is left to the polish
-EVERY = 10  # iterations between looks at it
+EVERY = 5  # iterations between looks at it
 WORTH = 30.0  # iterations of an interior point
 SOLVED = (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE)
 UNFINISHED = osqp.SolverStatus.OSQP_MAX_ITER_REACHED
@@ -60,7 +61,8 @@ class OsqpRoute:
         self._limit = max_iterations
         self._workspace: osqp.OSQP | None = None
         self._adapted = False
-        self._asked = 0.0, 0  # digits and iterations, as the workspace has them
+        self._asked = 0.0, 0, False  # digits, iterations and polish, as the workspace has them
+        self._graph = GraphRoute(program)
 
     @property
     def max_iterations(self) -> int:
@@ -80,49 +82,49 @@ class OsqpRoute:
         nothing = QPAnswer(np.zeros(self.program.size), multipliers, self.name, 0, np.inf)
         if (qp.lower >= INFINITY).any() or (qp.upper <= -INFINITY).any():
             return nothing  # OSQP would print that the limits cross
-        scaling = Scaling.of_subproblem(qp, EQUALITIES)
+        packed = Packed.of(qp, EQUALITIES, INFINITY)
         try:
-            self._update(scaling.scaled(qp))
-            return self._refine(qp, scaling, multipliers, max(FINER * accuracy, TIGHTEST), nothing)
+            self._update(qp, packed)
+            return self._refine(qp, packed, multipliers, max(FINER * accuracy, TIGHTEST), nothing)
         except osqp.OSQPException:  # a matrix so large that its rounding errors are not convex
             self._workspace = None
             return nothing
 
-    def _update(self, qp: QP) -> None:
+    def _update(self, qp: QP, packed: Packed) -> None:
         """Give OSQP the numbers of a scaled problem."""
-        lower, upper = np.maximum(qp.lower, -INFINITY), np.minimum(qp.upper, INFINITY)
         if self._workspace is None:
+            rows = self.program.constraints.matrix(qp.jacobian)
+            rows.data[:] = packed.entries
             self._workspace = osqp.OSQP()
             self._workspace.setup(
-                P=qp.pattern.matrix(qp.hessian),
-                q=qp.gradient,
-                A=self.program.constraints.matrix(qp.jacobian),
-                l=lower,
-                u=upper,
+                P=qp.pattern.matrix(packed.hessian),
+                q=packed.gradient,
+                A=rows,
+                l=packed.lower,
+                u=packed.upper,
                 verbose=False,
                 rho=RHO,
                 alpha=ALPHA,
                 scaling=0,
                 eps_rel=0.0,
                 check_dualgap=False,
-                polishing=bool((qp.lower == qp.upper).any()),
+                polishing=False,
                 adaptive_rho_interval=25,
                 check_termination=EVERY,
             )
-            self._adapted, self._asked = False, (0.0, 0)
+            self._adapted, self._asked = False, (0.0, 0, False)
             return
-        entries = self.program.constraints.compress(qp.jacobian)
-        self._workspace.update(q=qp.gradient, l=lower, u=upper, Px=qp.hessian, Ax=entries)
+        self._workspace.update(q=packed.gradient, l=packed.lower, u=packed.upper, Px=packed.hessian, Ax=packed.entries)
 
-    def _refine(self, qp: QP, scaling: Scaling, multipliers: Array, accuracy: float, best: QPAnswer) -> QPAnswer:
+    def _refine(self, qp: QP, packed: Packed, multipliers: Array, accuracy: float, best: QPAnswer) -> QPAnswer:
         """Ask for more digits until the answer is accurate or the iterations are used up."""
         assert self._workspace is not None
-        digits, spent = DIGITS, 0
-        self._workspace.warm_start(x=np.zeros(self.program.size), y=multipliers / scaling.rows)
+        digits, spent, equalities = DIGITS, 0, bool((qp.lower == qp.upper).any())
+        self._workspace.warm_start(x=np.zeros(self.program.size), y=multipliers / packed.rows)
         while spent < self.max_iterations and digits >= FINEST:
-            asked = digits, self.max_iterations - spent
+            asked = digits, self.max_iterations - spent, equalities and digits < DIGITS
             if asked != self._asked:
-                self._workspace.update_settings(eps_abs=asked[0], max_iter=asked[1])
+                self._workspace.update_settings(eps_abs=asked[0], max_iter=asked[1], polishing=asked[2])
                 self._asked = asked
             result = self._workspace.solve(raise_error=False)
             spent += int(result.info.iter)
@@ -130,7 +132,12 @@ class OsqpRoute:
             status = result.info.status_val
             if status not in (*SOLVED, UNFINISHED):
                 return replace(best, iterations=spent, infeasible=best.infeasible or status in INFEASIBLE)
-            step, dual = scaling.columns * np.array(result.x), scaling.rows * np.array(result.y)
+            step, dual = packed.columns * result.x, packed.rows * result.y
+            if digits == DIGITS:
+                held = step.copy(), dual.copy()
+                error = self._graph.complete(qp, *held, accuracy)
+                if error <= accuracy:
+                    return QPAnswer(*held, self.name, spent, error)
             error = qp_error(qp, step, dual)
             if error < best.error:
                 best = QPAnswer(step, dual, self.name, spent, error)

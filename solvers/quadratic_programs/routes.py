@@ -12,11 +12,19 @@ from unifg.elimination.symmetric import Symmetric
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.capabilities import require
-from unifg.solvers.globalize.norms import largest
 from unifg.solvers.quadratic_programs.exact_hessian import ExactHessian, holds
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute, Polish
 from unifg.solvers.quadratic_programs.scaling import Scaling
-from unifg.solvers.quadratic_programs.subproblem import FINER, QP, QPAnswer, Route, solve_convex, subproblem
+from unifg.solvers.quadratic_programs.steps import Steps
+from unifg.solvers.quadratic_programs.subproblem import (
+    FINER,
+    QP,
+    QPAnswer,
+    Route,
+    leaves_most,
+    solve_convex,
+    subproblem,
+)
 from unifg.solvers.ta.linear_graphs import EliminationRoute
 from unifg.typing import Array
 
@@ -26,7 +34,6 @@ if TYPE_CHECKING:
 GOOD_ENOUGH = 1e-5  # QP error that is always accepted from the fallback
 USABLE = 1e-3  # QP error below which a step may still be tried
 MISSES = 2  # in a row, after which the first route is left out: once, then twice as often with each further miss
-LEFT = 0.3  # share of the violation that a step may leave in the linear model
 RESTING = 4  # subproblems that go straight to the fallback after a step of the first route that led nowhere
 
 
@@ -40,6 +47,7 @@ class Subproblems:
         scaling: units in which subproblems are solved, found at the start of each solve.
         tolerance: of the KKT test.
         elastic_asked: whether the last subproblem went to the elastic route.
+        steps: what is made of their answers.
     """
 
     def __init__(
@@ -72,6 +80,7 @@ class Subproblems:
         self.first = _route(program, "graph" if linear else qp, qp_iterations)
         self.elastic = None if fallback is None else _elastic(program, self.pattern)
         self._polish = Polish(program)
+        self.steps = Steps(program)
         self._scaled = scaling and self.first.name != "elimination"
         self.scaling = self._neutral = Scaling.none(program)
         self._misses = self._resting = 0
@@ -81,6 +90,7 @@ class Subproblems:
         """The same with the Hessian of the Lagrangian, made at the first call."""
         if self._curved is None:
             self._curved = Subproblems(self.program, hessian="exact", tolerance=self.tolerance, **self._options)
+            self._curved.steps = self.steps
         return self._curved
 
     def start(self, lin: Linearization) -> None:
@@ -104,32 +114,51 @@ class Subproblems:
             return subproblem(self.program, lin, damping * self.scaling.metric, self.pattern)
         return self._exact.subproblem(lin, multipliers, damping * self.scaling.metric, self.scaling)
 
-    def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
-        """Try the first route, then the fallback, then the elastic problem."""
+    @property
+    def compiled(self) -> bool:
+        """True if the next subproblem goes to the graph first, in its own units and with Gauss-Newton's Hessian."""
+        return not self.exact and not self._resting and self.first.name == "graph" and self.scaling.neutral
+
+    def answered(self) -> None:
+        """Take note that the first route has answered well."""
+        self.elastic_asked = False
+        self._misses, self._first_answered = 0, True
+
+    def solve(self, qp: QP, multipliers: Array, accuracy: float, first: QPAnswer | None = None) -> QPAnswer:
+        """Try the first route, unless it has given ``first``, then the fallback, then the elastic problem."""
         scaling = self.scaling
         if scaling.neutral:
-            return self._solve(qp, qp.gauss_newton, multipliers, accuracy)
+            return self._solve(qp, qp.gauss_newton, multipliers, accuracy, first)
         scaled, multipliers = scaling.scaled(qp), multipliers / scaling.rows
         answer = self._solve(scaled, lambda: scaling.scaled(qp.gauss_newton()), multipliers, accuracy)
         if FINER * accuracy < answer.error <= USABLE and not self.elastic_asked:
             answer = self._polish(scaled, answer)
         return scaling.unscaled(answer)
 
-    def _solve(self, qp: QP, elastic: Callable[[], QP], multipliers: Array, accuracy: float) -> QPAnswer:
+    def _solve(
+        self,
+        qp: QP,
+        elastic: Callable[[], QP],
+        multipliers: Array,
+        accuracy: float,
+        first: QPAnswer | None = None,
+    ) -> QPAnswer:
         self.elastic_asked = self._first_answered = False
         enough = max(10.0 * accuracy, GOOD_ENOUGH)
         if self.fallback is None or self.elastic is None:
-            answer = solve_convex(self.first, qp, multipliers, accuracy)
+            answer = first or solve_convex(self.first, qp, multipliers, accuracy)
             return answer if holds(qp, answer, enough) else replace(answer, error=np.inf)
         answers = []
         if self._resting:
             self._resting -= 1
         else:
-            answers.append(solve_convex(self.first, qp, multipliers, accuracy))
+            answers.append(first or solve_convex(self.first, qp, multipliers, accuracy))
             if not holds(qp, answers[-1], enough):
                 return replace(answers[-1], error=np.inf)
+            if answers[-1].error == np.inf and not answers[-1].infeasible and qp.curved_by is not None:
+                return answers[-1]  # no system to be had with this curvature: Gauss-Newton's is as good, and cheap
             if answers[-1].error <= 10.0 * accuracy and not self._contradicts(qp, answers[-1]):
-                self._misses, self._first_answered = 0, True
+                self.answered()
                 return answers[-1]
             self._misses += 1
             if self._misses >= MISSES:
@@ -149,9 +178,7 @@ class Subproblems:
         """Test whether an answer leaves most of the violation, as the least error of contradicting rows does."""
         if answer.error <= 0.1 * self.tolerance:  # which is no less than what is left
             return False
-        linear = qp.linear(answer.step)
-        left = largest(np.maximum(linear - qp.upper, 0.0) + np.maximum(qp.lower - linear, 0.0))
-        return left > max(LEFT * largest(np.maximum(-qp.upper, 0.0) + np.maximum(qp.lower, 0.0)), 0.1 * self.tolerance)
+        return bool(leaves_most(qp.linear(answer.step), qp.lower, qp.upper, 0.1 * self.tolerance))
 
     def distrust(self) -> bool:
         """Leave the first route out for a while, after a step of it that led nowhere; whether it gave the last step."""

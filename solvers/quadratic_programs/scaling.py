@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,13 +59,6 @@ class Scaling:
         if not program.least_squares and _modest(columns, rows, program.bound_rows):
             return neutral or cls.none(program)
         return cls(program, columns, rows)
-
-    @classmethod
-    def of_subproblem(cls, qp: QP, equalities: float = 1.0) -> Scaling:
-        """For one quadratic subproblem, with the rows of equalities ``equalities`` times as long."""
-        columns, rows = equilibrate(qp.program, qp.pattern, qp.hessian, qp.jacobian)
-        rows[qp.lower == qp.upper] *= equalities
-        return cls(qp.program, columns, rows)
 
     @cached_property
     def neutral(self) -> bool:
@@ -119,6 +113,72 @@ class Scaling:
         full = np.ones(self.program.columns.width)
         full[self.program.columns.free] = self.columns
         return full
+
+
+class Packed(NamedTuple):
+    """A subproblem in units of its own, for a solver that takes both matrices by columns.
+
+    Attributes:
+        hessian, gradient: entries of H and g.
+        entries: of A by columns.
+        lower, upper: (M,) limits.
+        columns, rows: factors of unknowns and rows.
+    """
+
+    hessian: Array
+    gradient: Array
+    entries: Array
+    lower: Array
+    upper: Array
+    columns: Array
+    rows: Array
+
+    @classmethod
+    def of(cls, qp: QP, equalities: float, infinity: float) -> Packed:
+        """Bring ``qp`` to one scale, with the rows of equalities ``equalities`` times as long.
+
+        Args:
+            qp: the subproblem.
+            equalities: factor of their rows.
+            infinity: what stands for it.
+        """
+        program, constraints, pattern = qp.program, qp.program.constraints, qp.pattern
+        packed = cls(
+            qp.hessian.copy(), qp.gradient.copy(), np.zeros(constraints.nnz), qp.lower.copy(), qp.upper.copy(),
+            *equilibrate(program, pattern, qp.hessian, qp.jacobian),
+        )  # fmt: skip
+        _pack(
+            pattern.indptr, pattern.indices, constraints.free, constraints.free_rows, constraints.free_columns,
+            constraints.slots, qp.jacobian, equalities, infinity, packed,
+        )  # fmt: skip
+        return packed
+
+
+@compiled
+def _pack(
+    indptr: IntArray,
+    indices: IntArray,
+    free: IntArray,
+    free_rows: IntArray,
+    free_columns: IntArray,
+    slots: IntArray,
+    jacobian: Array,
+    equalities: float,
+    infinity: float,
+    packed: Packed,
+) -> None:
+    """Scale all numbers."""
+    columns, rows, lower, upper = packed.columns, packed.rows, packed.lower, packed.upper
+    for row in range(len(rows)):
+        if lower[row] == upper[row]:
+            rows[row] *= equalities
+        lower[row], upper[row] = max(lower[row] * rows[row], -infinity), min(upper[row] * rows[row], infinity)
+    for column in range(len(columns)):
+        packed.gradient[column] *= columns[column]
+        for at in range(indptr[column], indptr[column + 1]):
+            packed.hessian[at] *= columns[indices[at]] * columns[column]
+    for k in range(len(free)):
+        packed.entries[slots[k]] += jacobian[free[k]] * rows[free_rows[k]] * columns[free_columns[k]]
 
 
 def equilibrate(program: CompiledProblem, pattern: Symmetric, hessian: Array, jacobian: Array) -> tuple[Array, Array]:

@@ -22,6 +22,7 @@ from unifg.problem.linearization import Linearization, all_finite
 from unifg.solvers.globalize.norms import largest
 from unifg.typing import Array, BoolArray
 
+LEFT = 0.3  # share of the violation that a step may leave in the linear model
 FINER = 0.01  # than the accuracy asked for: what interior points reach, and OSQP with a polish or not at all
 
 
@@ -179,12 +180,33 @@ def largest_residual(
     return max(max(stationarity / scale, infeasibility), complementarity / scale)
 
 
+@compiled
+def leaves_most(linear: Array, lower: Array, upper: Array, small: float) -> bool:
+    """Test whether a step leaves most of the violation, as the least error of contradicting rows does.
+
+    Args:
+        linear: (M,) A times the step.
+        lower: (M,) limits on it.
+        upper: the same.
+        small: violation that counts as none.
+    """
+    before = after = 0.0
+    for row in range(len(linear)):
+        before = max(before, max(lower[row], 0.0) + max(-upper[row], 0.0))
+        after = max(after, max(lower[row] - linear[row], 0.0) + max(linear[row] - upper[row], 0.0))
+    return after > max(LEFT * before, small)
+
+
 def solve_convex(route: Route, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
     """Let a route that asks for a positive definite H solve ``qp``.
 
     With y the multipliers of the convex problem, H d + A'W(A d - b) + g + A'y = 0 there, so those of ``qp`` are
-    y + W (A d - b): the same, up to the route's own accuracy in A d = b. The error is that of ``qp``.
+    y + W (A d - b): the same, up to the route's own accuracy in A d = b. The error is that of ``qp``. The graph, which
+    eliminates equalities, needs the squares of inequalities alone.
     """
+    if qp.weights is not None and route.name == "graph":
+        weights = np.where(qp.lower == qp.upper, 0.0, qp.weights)
+        qp = replace(qp, weights=weights if weights.any() else None)
     if qp.weights is None:
         return route.solve(qp, multipliers, accuracy)
     finer = accuracy / max(1.0, float(qp.weights.max()))  # errors in A d = b count W times in the multipliers

@@ -178,9 +178,14 @@ class Rows:
         """Start of each column of the compressed matrix."""
         return self._compressed[2]
 
+    @property
+    def slots(self) -> IntArray:
+        """(F,) place of every free entry in the compressed matrix."""
+        return self._compressed[0]
+
     def compress(self, entries: Array) -> Array:
         """Entries by columns (CSC order), repeated ones summed."""
-        return scatter(self._compressed[0], entries[self.free], self.nnz)
+        return scatter(self.slots, entries[self.free], self.nnz)
 
     def matrix(self, entries: Array) -> sp.csc_matrix:
         """The Jacobian over the unknowns as a SciPy matrix."""
