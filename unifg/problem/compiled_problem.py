@@ -301,6 +301,15 @@ class CompiledProblem:
             self.renew_verifications()
         return found
 
+    def broken(self, values: Values) -> bool:
+        """Test whether by a trace an assertion of its function fails at an answer, though the function raises nothing.
+
+        Raises:
+            Exception: of a function whose assertion fails.
+        """
+        with np.errstate(all="ignore"):
+            return any([verification.broken(values) for verification in self.verifications])
+
     def watch_conditions(self) -> None:
         """Compile the comparisons of traces, for :meth:`new_branches` in a loop."""
         self._watching = True

@@ -597,11 +597,12 @@ class Prepared:
         if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
             return solution
         values = solution._lin.values
-        due = slopes or self._solves % EVERY == 0 or self._owed
+        broken = self._broken(run, values)
+        due = slopes or self._solves % EVERY == 0 or self._owed or broken
         if not due and self._of_branches < AT_ONCE + self._solves // LATER and program.new_branches(values, False):
             due = True
             self._of_branches += 1
-        self._owed = due and run.out_of_time  # verified after the next solve that leaves time for it
+        self._owed = due and run.out_of_time and not broken  # verified after the next solve that leaves time for it
         if not due or self._owed:
             return solution
         program.new_branches(values, True)
@@ -613,8 +614,19 @@ class Prepared:
             solution, values = self._finished(again), again.values
             if not solution.finite:
                 break
+            self._broken(again, values)
         solution.checked, solution.mistraced, solution.seconds = solution.finite, mistraced, run.seconds
         return solution
+
+    def _broken(self, run: SolveState, values: Values) -> bool:
+        """Test what traced functions assert; the exception of one that fails is passed on as within a solve."""
+        try:
+            return self.program.broken(values)
+        except Exception as error:
+            run.keep_with(error)
+            if hasattr(error, "reached"):  # which the KKT test would pass: it knows no assertions
+                error.reached.status = Status.INTERRUPTED
+            raise
 
     def verify(self, solution: Solution) -> dict[str, str]:
         """Evaluate traced functions as written at the last answer, with the data of that solve.
