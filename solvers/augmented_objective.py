@@ -111,6 +111,14 @@ class Primal:
         left_out: Array = lagrangian_hessian(self.program, lin, multipliers)
         return left_out if _subtract(left_out, lin.hessian) else np.zeros(0)
 
+    def pull(self, lin: Linearization) -> Array:
+        """(size,) gradient of linear costs over the unknowns; empty where there are none."""
+        program = self.program
+        if not program.scalar_terms:
+            return np.zeros(0)
+        linear: Array = lin.gradient - program.costs.transposed_times(lin.jacobian, lin.residual)
+        return linear[program.columns.free]
+
     def direction(self, curvature: Array, gradient: Array) -> Array | None:
         """Solve H d = -gradient; None when the matrix cannot be factorised."""
         self.damping = 0.0

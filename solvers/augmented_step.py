@@ -148,6 +148,7 @@ def model_step(
         lin.constraint_jacobian,
         lin.hessian,
         bend,
+        primal.pull(lin),
         multipliers,
         penalty,
         damping,
@@ -171,13 +172,14 @@ def minimize(
     constraint_jacobian: Array,
     hessian: Array,
     bend: Array,
+    pull: Array,
     multipliers: Array,
     penalty: Array,
     damping: float,
     step: Array,
 ) -> float:
     """Newton's method on the piecewise quadratic; returns the predicted decrease, NaN when a system is singular."""
-    curved = len(bend) > 0
+    curved, pulled = len(bend) > 0, len(pull) > 0
     # From where the model begins: a large penalty would multiply the rounding of a small step added to a value of one.
     lower, upper = terms.lower - start_constraints, terms.upper - start_constraints
     residual, constraints = start_residual.copy(), start_constraints - start_constraints
@@ -207,8 +209,12 @@ def minimize(
         add_constraints(terms, constraint_jacobian, weights, curvature)
         if newton == 0:
             _damping(curvature, indptr, damping, added)
+            for k in range(len(pull)):  # a linear cost has no curvature: nothing else keeps its step short
+                added[k] = max(added[k], abs(pull[k]))
         for k in range(len(step)):
             gradient[k] = -full[free[k]] - added[k] * step[k] - bent[k]
+            if pulled:
+                gradient[k] -= pull[k]
         if not factor(plan, curvature, added) or (curved and plan.state[NEGATIVE] > 0):
             return np.nan
         solve(plan, gradient, move)
@@ -231,6 +237,8 @@ def minimize(
             value_here += barrier(constraints_here, lower, upper, multipliers, penalty)
             for k in range(len(step)):
                 value_here += 0.5 * added[k] * here[k] * here[k]
+                if pulled:
+                    value_here += pull[k] * here[k]
             if curved:
                 bow_here = bow + length * (dot(bent, move) + 0.5 * length * dot(bent_move, move))
                 value_here += bow_here

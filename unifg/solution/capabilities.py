@@ -12,7 +12,13 @@ from unifg.problem.compiled_problem import CompiledProblem
 Constraints: TypeAlias = Literal["none", "equalities", "all"]
 
 
-def require(program: CompiledProblem, solver: str, constraints: Constraints = "all", scalar_costs: bool = True) -> None:
+def require(
+    program: CompiledProblem,
+    solver: str,
+    constraints: Constraints = "all",
+    scalar_costs: bool = True,
+    linear_costs: bool = True,
+) -> None:
     """Raise unless a graph has no other constraints, switched on, and no other costs than these.
 
     Args:
@@ -20,6 +26,7 @@ def require(program: CompiledProblem, solver: str, constraints: Constraints = "a
         solver: to be named in the error.
         constraints: which may be there.
         scalar_costs: whether costs that are no squares may be there.
+        linear_costs: whether linear ones may be there in any case, such as prices of soft constraints.
 
     Raises:
         BackendError: naming the first constraint or cost that may not.
@@ -30,8 +37,15 @@ def require(program: CompiledProblem, solver: str, constraints: Constraints = "a
             f"{solver} cannot take the constraint '{name}': use InteriorPoint, AugmentedLagrangian or SQP, or "
             "`fg.solve`, which picks; or state it as a cost"
         )
-    if not scalar_costs and program.scalar_terms:
-        name = program.scalar_terms[0].name
+    refused = [] if scalar_costs else [t for t in program.scalar_terms if not (linear_costs and t.straight)]
+    if refused:
+        name = refused[0].name
+        soft = next((own for own, slack in program.soft.items() if name.startswith(slack.family.name)), None)
+        if soft is not None:
+            raise BackendError(
+                f"{solver} cannot take the soft constraint '{soft}', whose price is no square: use InteriorPoint, SQP, "
+                "AugmentedLagrangian or Penalty"
+            )
         raise BackendError(
             f"{solver} cannot take the scalar cost '{name}': it is not a square; use InteriorPoint or SQP, or "
             "state it as a residual"

@@ -18,6 +18,7 @@ from unifg.codegen.inner import inner
 from unifg.errors import BackendError, GraphError
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
+from unifg.modeling.soft import SLACK
 from unifg.modeling.variables import Data
 from unifg.problem.by_term import ByTerm
 from unifg.problem.columns import Values
@@ -61,12 +62,14 @@ class Backend(ABC):
     Attributes:
         constraints: which it takes.
         scalar_costs: whether it takes costs that are no squares.
+        linear_costs: whether it takes linear ones among these in any case; those of soft constraints are.
         rehearses: whether :meth:`Solver.prepare` may take it through small problems of its own
             (:mod:`unifg.solution.warmup_run`).
     """
 
     constraints: ClassVar[Constraints] = "all"
     scalar_costs: ClassVar[bool] = True
+    linear_costs: ClassVar[bool] = False
     rehearses: ClassVar[bool] = False
 
     @property
@@ -175,7 +178,7 @@ class Solver(Backend):
 
     def require(self, program: CompiledProblem) -> None:
         """Raise BackendError when the backend cannot take this class of problem."""
-        require(program, self.name, self.constraints, self.scalar_costs)
+        require(program, self.name, self.constraints, self.scalar_costs, self.linear_costs)
 
     def runs_alone(self, program: CompiledProblem) -> bool:
         """Test whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` if unwatched.
@@ -718,6 +721,8 @@ class Prepared:
         """The same of arrays from anywhere."""
         result = np.zeros(self.program.constraints.count)
         for name, value in given.items():
+            if name not in self._constraints and name.endswith(SLACK):  # of a constraint that was soft
+                continue
             if name not in self._constraints:
                 known = ", ".join(self._constraints) or "none"
                 raise GraphError(f"{what} given for '{name}', which is no constraint (there are: {known})", term=name)
