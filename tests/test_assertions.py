@@ -12,7 +12,9 @@ import unifg as fg
 from asserting import below, decides, edge, nested, newton, perhaps, spread
 from test_derive import curved, evaluated
 from unifg.factors.autodiff.expression import Expression
+from unifg.factors.autodiff.rates import rate
 from unifg.factors.autodiff.rows import traced
+from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.autodiff.symbols import TraceError
 from unifg.lie import Rn
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt
@@ -265,6 +267,20 @@ def test_smoothers_leave_functions_that_assert_to_python() -> None:
     with pytest.raises(AssertionError, match="too far"):
         for guess in ({x: [[0.0]]}, {}, {}, {}):  # it is called where the last update has led
             smoother.update(guess)
+
+
+def test_a_kernel_that_asserts_is_refused() -> None:
+    """Nothing calls it at an answer."""
+    kernel = StatedKernel(below, (Rn(1),), rows=1, name="own")
+    with pytest.raises(TraceError, match="the kernel 'own' asserts something"):
+        _ = kernel.expression
+
+
+def test_a_rate_is_refused_where_its_path_is() -> None:
+    table = RegularGridInterpolator((np.linspace(-1.0, 1.0, 5),), np.linspace(-1.0, 1.0, 5))
+    np.testing.assert_allclose(rate(lambda s, x: table(s + x), np.array([[0.3]])), 1.0)
+    with pytest.raises(ValueError, match="out of bounds"):
+        rate(lambda s, x: table(s + x), np.array([[1.3]]))
 
 
 def test_a_trace_keeps_its_demands_when_it_is_copied() -> None:

@@ -167,6 +167,33 @@ def test_code_grows_with_the_digits_of_the_length_alone() -> None:
     assert times[1] < 5.0 * times[0] + 0.02
 
 
+PLACES, KNOTS = 10, np.linspace(-2.0, 2.0, 7)
+
+
+def of_each(x: Array, tables: Array) -> Array:
+    return np.stack([np.stack([np.interp(x[k, j], KNOTS, tables[k, j]) for j in range(PLACES)]) for k in range(len(x))])
+
+
+@pytest.mark.parametrize("summed", [False, True])
+def test_many_look_ups_are_one_loop(summed: bool) -> None:
+    """In one table, and each in a table among the parameters."""
+
+    def finished(found: Any) -> Any:
+        return found.sum(axis=1, keepdims=True) if summed else found
+
+    points, tables = RNG.uniform(-2.3, 2.3, (40, PLACES)), RNG.normal(size=(40, PLACES, 7))
+    one = traced(lambda x: finished(np.interp(x, X, Y) + WAVE(x)), [Rn(PLACES)])
+    several = traced(lambda x, t: finished(of_each(x, t)), [Rn(PLACES), (PLACES, 7)])
+    for expression, parameters, expected in (
+        (one, np.zeros((1, 0)), np.interp(points, X, Y) + WAVE(points)),
+        (several, tables.reshape(40, -1), of_each(points, tables)),
+    ):
+        found, slopes = evaluated(expression, points, parameters)
+        np.testing.assert_allclose(found, finished(expected), rtol=1e-12, atol=1e-13)
+        ahead, _ = evaluated(expression, points + 1e-7, parameters)
+        np.testing.assert_allclose(slopes.sum(axis=2), (ahead - found) / 1e-7, atol=2e-5)
+
+
 @pytest.mark.parametrize(
     ("function", "words"),
     [
