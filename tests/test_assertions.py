@@ -158,7 +158,7 @@ def test_an_assertion_that_fails_at_an_answer_is_passed_on(solver: fg.Solver) ->
 
 
 def test_python_says_the_same() -> None:
-    """By differences the exception comes from within the solve."""
+    """Without a trace the exception comes from within the solve."""
     graph, x, target = pulled(fg.residual(below, derivatives="differences"))
     with pytest.raises(AssertionError, match="too far") as caught:
         GaussNewton().solve(graph, {x: np.full((N, 1), 0.1)}, data={target: [[0.0], [0.0], [4.0]]})

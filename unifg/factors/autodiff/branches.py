@@ -94,7 +94,7 @@ class _Raised(Exception):
 
 
 def unless_raised(tape: Tape, run: Callable[[], Any]) -> Any:
-    """What a function returns where it raises no exception; the conditions for that stand in ``tape.required``.
+    """Result of a function where it raises no exception; the conditions for that stand in ``tape.required``.
 
     Args:
         tape: it writes on.

@@ -218,7 +218,7 @@ class Interpolator:
         self._original = original
 
     def __getattr__(self, name: str) -> Any:
-        """What the original has: numbers, and other interpolators from its methods."""
+        """Attribute of the original; its derivatives are stand-ins, too."""
         found = getattr(self._original, name)
         if name in ("derivative", "antiderivative"):
             return lambda nu=1: Interpolator(found(nu))
