@@ -71,7 +71,7 @@ class AugmentedLagrangian(Solver):
     rehearses = True
 
     scalar_costs = False
-    linear_costs = True
+    soft = True
 
     max_iterations: int = 300
     penalty: float | None = None

@@ -46,7 +46,7 @@ class Penalty(Solver):
     rehearses = True
 
     scalar_costs = False
-    linear_costs = True
+    soft = True
 
     max_iterations: int = 300
     penalty: float = 1.0

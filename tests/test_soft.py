@@ -367,13 +367,8 @@ def test_what_takes_no_soft_constraint_says_so() -> None:
         graph.compile()
 
 
-def test_a_scalar_cost_that_is_not_linear_is_refused_still() -> None:
+def test_scalar_costs_are_refused_still() -> None:
     graph, x = ring(2.0)
-    graph.minimize_scalar(lambda x: (x**4).sum(axis=1), x, name="quartic")
-    with pytest.raises(fg.BackendError, match="AugmentedLagrangian cannot take the scalar cost 'quartic'"):
+    graph.minimize_scalar(lambda x: x[:, 0] - x[:, 1], x, name="linear")
+    with pytest.raises(fg.BackendError, match="AugmentedLagrangian cannot take the scalar cost 'linear'"):
         AugmentedLagrangian().solve(graph, {x: np.full((N, 2), 0.5)})
-    graph.remove("quartic")
-    graph.minimize_scalar(lambda x: 0.3 * x[:, 0] - x[:, 1], x, name="linear")
-    answers = [solver.solve(graph, {x: np.full((N, 2), 0.5)}) for solver in (AugmentedLagrangian(), InteriorPoint())]
-    assert all(answer.converged for answer in answers)
-    np.testing.assert_allclose(answers[0][x], answers[1][x], atol=1e-5)

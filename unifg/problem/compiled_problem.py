@@ -97,7 +97,8 @@ class CompiledProblem:
             raise GraphError("the graph has no variables: add a family with graph.variables(...)")
         declared = graph._data
         self.graph = graph.snapshot()
-        graph = softened(graph.snapshot())
+        self.soft = {t.name: t.slack for t in self.graph.terms if isinstance(t, Constraint) and t.slack}
+        graph = softened(graph.snapshot()) if self.soft else self.graph
         self.lock = ReentrantLock()
         self.families = list(graph.families.values())
         self.columns = Columns(self.families, graph.fixes)
@@ -142,7 +143,6 @@ class CompiledProblem:
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
         self._binding = Binding(declared, filter(read.__contains__, declared.values()), graph.terms)
         self._vetted = False
-        self.soft = {term.name: term.slack for term in self.graph.terms if isinstance(term, Constraint) and term.slack}
         self._bind_first()
 
     @property

@@ -30,8 +30,6 @@ def softened(graph: Model) -> Model:
     Raises:
         GraphError: a name that slack variables need is taken.
     """
-    if not any(isinstance(term, Constraint) and term.slack is not None for term in graph.terms):
-        return graph
     terms = list[Term]()
     used = {*graph.families, *(term.name for term in graph.terms), *(fix.name for fix in graph.fixes)}
     for term in graph.terms:

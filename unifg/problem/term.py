@@ -236,11 +236,6 @@ class CompiledTerm:
         return f"{how}, its derivatives by differences: {why}"
 
     @property
-    def straight(self) -> bool:
-        """True if it is linear in its variables, by its trace."""
-        return self.trace is not None and self.trace.kernel.linear
-
-    @property
     def batch(self) -> Batch:
         """The term's function and what it is called with at present."""
         shared = [gather.shared for gather in self.gathers]

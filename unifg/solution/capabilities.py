@@ -17,7 +17,7 @@ def require(
     solver: str,
     constraints: Constraints = "all",
     scalar_costs: bool = True,
-    linear_costs: bool = True,
+    soft: bool = True,
 ) -> None:
     """Raise unless a graph has no other constraints, switched on, and no other costs than these.
 
@@ -26,7 +26,7 @@ def require(
         solver: to be named in the error.
         constraints: which may be there.
         scalar_costs: whether costs that are no squares may be there.
-        linear_costs: whether linear ones may be there in any case, such as prices of soft constraints.
+        soft: whether the linear prices of soft constraints may be there in any case.
 
     Raises:
         BackendError: naming the first constraint or cost that may not.
@@ -37,14 +37,14 @@ def require(
             f"{solver} cannot take the constraint '{name}': use InteriorPoint, AugmentedLagrangian or SQP, or "
             "`fg.solve`, which picks; or state it as a cost"
         )
-    refused = [] if scalar_costs else [t for t in program.scalar_terms if not (linear_costs and t.straight)]
-    if refused:
-        name = refused[0].name
-        soft = next((own for own, slack in program.soft.items() if name.startswith(slack.family.name)), None)
-        if soft is not None:
+    for name in [] if scalar_costs else [term.name for term in program.scalar_terms]:
+        stated = next((own for own, slack in program.soft.items() if name.startswith(slack.family.name)), None)
+        if stated is not None and soft:
+            continue
+        if stated is not None:
             raise BackendError(
-                f"{solver} cannot take the soft constraint '{soft}', whose price is no square: use InteriorPoint, SQP, "
-                "AugmentedLagrangian or Penalty"
+                f"{solver} cannot take the soft constraint '{stated}', whose price is no square: use InteriorPoint, "
+                "SQP, AugmentedLagrangian or Penalty"
             )
         raise BackendError(
             f"{solver} cannot take the scalar cost '{name}': it is not a square; use InteriorPoint or SQP, or "

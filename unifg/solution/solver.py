@@ -62,14 +62,14 @@ class Backend(ABC):
     Attributes:
         constraints: which it takes.
         scalar_costs: whether it takes costs that are no squares.
-        linear_costs: whether it takes linear ones among these in any case; those of soft constraints are.
+        soft: whether it takes the linear prices of soft constraints in any case.
         rehearses: whether :meth:`Solver.prepare` may take it through small problems of its own
             (:mod:`unifg.solution.warmup_run`).
     """
 
     constraints: ClassVar[Constraints] = "all"
     scalar_costs: ClassVar[bool] = True
-    linear_costs: ClassVar[bool] = False
+    soft: ClassVar[bool] = False
     rehearses: ClassVar[bool] = False
 
     @property
@@ -178,7 +178,7 @@ class Solver(Backend):
 
     def require(self, program: CompiledProblem) -> None:
         """Raise BackendError when the backend cannot take this class of problem."""
-        require(program, self.name, self.constraints, self.scalar_costs, self.linear_costs)
+        require(program, self.name, self.constraints, self.scalar_costs, self.soft)
 
     def runs_alone(self, program: CompiledProblem) -> bool:
         """Test whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` if unwatched.
