@@ -46,6 +46,7 @@ class Penalty(Solver):
     rehearses = True
 
     scalar_costs = False
+    soft = True
 
     max_iterations: int = 300
     penalty: float = 1.0

@@ -451,7 +451,7 @@ KNOWN = {1.0: 2.0}
         (lambda x: KNOWN[x[0, 0]] * x, "looks up a number that is not known yet in a dictionary"),
         (lambda x: np.linalg.eigh(np.einsum("ni,nj->nij", x, x))[0], r"calls np\.linalg\.eigh; of np\.linalg, norm"),
         (lambda x: np.sort(x, axis=1), r"calls np\.sort, .* write np\.minimum and np\.maximum, or leave it to diff"),
-        (lambda x: np.interp(x, [0.0, 1.0], [2.0, 3.0]), r"np\.interp, .* write a spline"),
+        (lambda x: np.searchsorted([0.0, 1.0], x), r"np\.searchsorted, .* write np\.interp or a spline"),
         (lambda x: Rotation.from_rotvec(x).as_rotvec(), r"test_derive_numpy\.py:\d+: "),
         (lambda x: np.real(np.exp(1j * x)), "makes a complex number"),
         (lambda x: np.add(x, 1.0, where=x > 0.0), r"np\.add with where=; write np\.where"),

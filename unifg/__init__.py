@@ -48,6 +48,7 @@ from unifg.lie import (
 )
 from unifg.modeling.factors import ManifoldResidual, between, difference, prior
 from unifg.modeling.joint_prior import joint_prior
+from unifg.modeling.soft import Soft
 from unifg.modeling.variables import Data, Family, Selection, each, shared
 from unifg.solution.check import Finding, Report
 from unifg.solution.graph import Graph
@@ -111,6 +112,7 @@ __all__ = [
     "Rn",
     "ScenarioError",
     "Selection",
+    "Soft",
     "Solution",
     "Solver",
     "Status",

@@ -11,6 +11,7 @@ import numpy as np
 
 from unifg.codegen.function_pointers import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import copy_to
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
 from unifg.problem import evaluation
@@ -49,15 +50,8 @@ def call(function: int, address: int) -> None:
 
 
 @compiled
-def copy(source: Array, target: Array) -> None:
-    """Copy numbers: slices would do the same and take half a second to compile."""
-    for k in range(len(source)):
-        target[k] = source[k]
-
-
-@compiled
 def fill(target: Array, number: float) -> None:
-    """Set all numbers."""
+    """Set all numbers: a slice would do the same and take half a second to compile."""
     for k in range(len(target)):
         target[k] = number
 
@@ -74,7 +68,7 @@ def advance(address: int) -> None:
     alpha = now.alpha
     for k in range(len(free)):
         move[k] = alpha * step[k]
-    copy(values, trial)
+    copy_to(values, trial)
     fill(spread, 0.0)
     run(links[0].retract, (retraction, free, move, spread, values, trial))
     for place in fixed:  # retractions wrap and renormalise
@@ -117,7 +111,7 @@ def bend(address: int) -> None:
     jacobian, links = parts(address, "jacobian links")
     multipliers, residual, squares, terms = parts(address, "multipliers residual squares terms")
     values, weights = parts(address, "values weights")
-    copy(hessian, curvature)
+    copy_to(hessian, curvature)
     for k in range(len(concavity)):
         curvature[k] += concavity[k]
     run(links[0].curve, (terms, values, residual, weights, multipliers, curvature))
@@ -172,7 +166,7 @@ def loop(address: int) -> None:
         run(links[0].direct if stage == BENT else links[0].judge, (address,))
         stage = AIMED
         if now.answer == ACCEPTED:
-            copy(trial, values)
+            copy_to(trial, values)
             stage = MOVED
         elif now.answer == AGAIN:
             stage = MEASURED

@@ -24,6 +24,7 @@ from unifg.modeling.duplicates import doubles
 from unifg.modeling.elements import on_manifolds
 from unifg.modeling.factors import ManifoldResidual
 from unifg.modeling.probing import rows_of
+from unifg.modeling.soft import Slack, Soft, slack_of
 from unifg.modeling.summary import inventory
 from unifg.modeling.terms import Constraint, Cost, Fix, Parameter, ScalarCost, Term, prepare_arguments
 from unifg.modeling.variables import (
@@ -186,17 +187,29 @@ class Model:
         lower: Parameter = SAME,
         upper: Parameter = SAME,
         active: Any = None,
+        soft: Soft | Parameter | None = None,
         name: str | None = None,
     ) -> str:
         """Require ``lower <= g <= upper``; equal limits make an equality, a limit that is not given is none.
 
         Multipliers are positive at an active upper limit and negative at an active lower one.
 
+        Args:
+            function: batched, returning (n, m).
+            *arguments: as for :meth:`minimize`.
+            lower: scalar, (m,) or (n, m), constant or data; may be infinite.
+            upper: the same.
+            active: (n,) booleans, constant or data; inactive factors keep their place and require nothing.
+            soft: None for limits that must hold. A price w per unit of violation, of the same shapes, for limits that
+                give way where that is cheaper, which above the multiplier of the hard constraint is nowhere; or
+                ``fg.Soft(linear=w, quadratic=q)``. ``solution.slack(name)`` is the violation.
+            name: defaults to the function's name.
+
         Raises:
             GraphError: when there is no limit, a lower limit exceeds its upper limit, or anything is malformed; the
                 graph is as it was.
         """
-        return self._add(self._constraint(name, function, arguments, lower, upper, active))
+        return self._add(self._constraint(name, function, arguments, lower, upper, active, soft))
 
     def bound(
         self,
@@ -204,15 +217,18 @@ class Model:
         *,
         lower: Parameter = SAME,
         upper: Parameter = SAME,
+        soft: Soft | Parameter | None = None,
         name: str | None = None,
     ) -> str:
         """Limit Rn variables, or Rn components of a product, entry by entry; an infinite limit is none.
+
+        ``soft`` is that of :meth:`constrain`.
 
         Raises:
             GraphError: when the variable does not live in Rn, there is no limit, or the limits do not fit; the graph is
                 as it was.
         """
-        return self._add(self._bound(name, (variable,), lower, upper))
+        return self._add(self._bound(name, (variable,), lower, upper, soft))
 
     def fix(self, variable: Variable, value: ArrayLike | Data, *, name: str | None = None) -> str:
         """Give variables a value; they leave the unknowns and ``dual(name)`` is their reaction.
@@ -270,6 +286,7 @@ class Model:
         active: Any = SAME,
         lower: Parameter = SAME,
         upper: Parameter = SAME,
+        soft: Soft | Parameter | None = SAME,
     ) -> None:
         """State a term anew in its place, under its name and of its kind; what is not given stays as it was.
 
@@ -286,6 +303,7 @@ class Model:
             active: None for all.
             lower: as in :meth:`constrain`.
             upper: the same.
+            soft: the same; None makes a soft constraint hard.
 
         Raises:
             GraphError: when there is no such term, it has no such part, or the new one is refused; the graph is as it
@@ -294,7 +312,7 @@ class Model:
         old = self.term(name)
         given = {
             "sigma": sigma, "information": information, "robust": robust, "active": active, "lower": lower,
-            "upper": upper,
+            "upper": upper, "soft": soft,
         }  # fmt: skip
         parts = {key: value for key, value in given.items() if value is not SAME}
         wrong = [key for key in parts if key not in _PARTS[old.kind]]
@@ -389,6 +407,7 @@ class Model:
         lower: Parameter,
         upper: Parameter,
         active: Any,
+        soft: Soft | Parameter | None,
         replaced: bool = False,
     ) -> Constraint:
         with placed(name, arguments):
@@ -399,7 +418,24 @@ class Model:
             lower, upper = _given("a constraint", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
             self._own_data(unique, lower, upper)
-            return Constraint(unique, wrapped, normal, active, count, size, lower, upper, rows=rows)
+            slack = self._slack(unique, wrapped, lower, upper, count, size, soft)
+            return Constraint(unique, wrapped, normal, active, count, size, lower, upper, slack=slack, rows=rows)
+
+    def _slack(
+        self,
+        name: str,
+        wrapped: Residual,
+        lower: Parameter,
+        upper: Parameter,
+        count: int,
+        size: int,
+        soft: Soft | Parameter | None,
+    ) -> Slack | None:
+        if soft is None:
+            return None
+        slack = slack_of(name, soft, lower, upper, count, size, wrapped)
+        self._own_data(name, *slack.soft.data)
+        return slack
 
     def _bound(
         self,
@@ -407,6 +443,7 @@ class Model:
         stated: tuple[Any, ...],
         lower: Parameter,
         upper: Parameter,
+        soft: Soft | Parameter | None,
         replaced: bool = False,
     ) -> Constraint:
         selection = _one_variable("a bound", stated, name)
@@ -423,7 +460,9 @@ class Model:
             lower, upper = _given("a bound", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, count, size)
             self._own_data(unique, lower, upper)
-            return Constraint(unique, wrapped, normal, active, count, size, lower, upper, is_bound=True, rows=rows)
+            slack = self._slack(unique, wrapped, lower, upper, count, size, soft)
+            parts = (unique, wrapped, normal, active, count, size, lower, upper)
+            return Constraint(*parts, is_bound=True, slack=slack, rows=rows)
 
     def _fix(self, name: str | None, stated: tuple[Any, ...], replaced: Fix | None = None) -> Fix:
         if len(stated) != 2:
@@ -454,7 +493,7 @@ class Model:
             kept = {key: parts.get(key, getattr(old, key)) for key in ("sigma", "information", "robust", "active")}
             return self._cost(old.name, function, arguments, **kept, replaced=True)
         if isinstance(old, Constraint):
-            kept = {key: parts.get(key, getattr(old, key)) for key in ("lower", "upper")}
+            kept = {key: parts.get(key, getattr(old, key)) for key in ("lower", "upper", "soft")}
             if old.is_bound:
                 return self._bound(old.name, stated or old.arguments, **kept, replaced=True)
             active = parts.get("active", old.active)
@@ -527,9 +566,9 @@ class Model:
 _PARTS = {
     "cost": ("sigma", "information", "robust", "active"),
     "scalar cost": ("active",),
-    "equality": ("lower", "upper", "active"),
-    "inequality": ("lower", "upper", "active"),
-    "bound": ("lower", "upper"),
+    "equality": ("lower", "upper", "active", "soft"),
+    "inequality": ("lower", "upper", "active", "soft"),
+    "bound": ("lower", "upper", "soft"),
     "fix": (),
 }
 

@@ -6,7 +6,7 @@ Terms that are alike - the same kind and residual, on the same families - share 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import TypeAlias
 
@@ -140,6 +140,8 @@ def weight(term: Term) -> str:
             words.append(_loss(term.robust))
         return ", ".join(words)
     if isinstance(term, Constraint):
+        if term.slack is not None:
+            return f"{weight(replace(term, slack=None))}, soft"
         low, high = _numbers(term.lower), _numbers(term.upper)
         if term.kind == "equality" and low == high:
             return f"= {low}"

@@ -11,6 +11,7 @@ from unifg.errors import GraphError
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import Loss
 from unifg.modeling.duplicates import doubles
+from unifg.modeling.soft import Slack, Soft
 from unifg.modeling.variables import Data, Declared, Family, Selection
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -58,6 +59,8 @@ class Term:
     def shaping(self) -> list[Data]:
         """Data that are no arguments of its function: weights, limits, and which factors are active."""
         given = [getattr(self, name, None) for name in ("active", "sigma", "information", "lower", "upper")]
+        slack: Slack | None = getattr(self, "slack", None)
+        given += slack.soft.data if slack is not None else []
         return list(dict.fromkeys(value for value in given if isinstance(value, Data)))
 
     @property
@@ -105,11 +108,18 @@ class Constraint(Term):
         lower: scalar, (m,) or (n, m); may be -inf.
         upper: same; equal to ``lower`` for an equality.
         is_bound: whether g is the variable itself, whose Jacobian is the identity.
+        slack: of a soft constraint.
     """
 
     lower: Parameter = -np.inf
     upper: Parameter = np.inf
     is_bound: bool = False
+    slack: Slack | None = None
+
+    @property
+    def soft(self) -> Soft | None:
+        """Price of violation; None for a hard constraint."""
+        return None if self.slack is None else self.slack.soft
 
     @property
     def kind(self) -> str:

@@ -35,6 +35,7 @@ from unifg.problem.limits import outside
 from unifg.problem.linearization import Evaluation, Linearization, Rows
 from unifg.problem.retraction import Retraction
 from unifg.problem.scalars import add_scalars, evaluate_scalars
+from unifg.problem.soft_terms import softened
 from unifg.problem.systems import Systems
 from unifg.problem.table import ENTRY, PARAMETER, POSITION, ROW, WIDTH, TermArrays, TermTable
 from unifg.problem.term import CompiledTerm
@@ -84,6 +85,7 @@ class CompiledProblem:
         scratch: memory for compiled loops.
         python_seconds: time spent so far in terms that Python evaluates.
         buffers: memory for linearisations.
+        soft: slack variables of soft constraints, by their names.
         verifications: of the traced terms, once a guess has been read.
         workspaces: of single solves: backend, options, memory.
         turn: held by who binds data, until nobody needs them any more, and while anything is evaluated.
@@ -94,7 +96,9 @@ class CompiledProblem:
         if not graph.families:
             raise GraphError("the graph has no variables: add a family with graph.variables(...)")
         declared = graph._data
-        self.graph = graph = graph.snapshot()
+        self.graph = graph.snapshot()
+        self.soft = {t.name: t.slack for t in self.graph.terms if isinstance(t, Constraint) and t.slack}
+        graph = softened(graph.snapshot()) if self.soft else self.graph
         self.lock = ReentrantLock()
         self.families = list(graph.families.values())
         self.columns = Columns(self.families, graph.fixes)
@@ -266,7 +270,21 @@ class CompiledProblem:
             elif term.trace.moved:
                 term.refresh()
                 self.table.bind([term], self.lower, self.upper)
+        if self.soft:
+            self._start_slacks(values)
         return values
+
+    def _start_slacks(self, values: Values) -> None:
+        """Set slack variables to what the limits of soft constraints are violated by."""
+        for slack in self.soft.values():
+            values[slack.family][:] = 0.0
+        found = self.evaluate(values).constraints
+        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
+            if term.name in self.soft:
+                slack, shape = self.soft[term.name], (term.count, term.size)
+                above, below = found[rows] - self.upper[rows], self.lower[rows] - found[rows]
+                outside = [np.nan_to_num(np.maximum(part, 0.0), posinf=0.0).reshape(shape) for part in (above, below)]
+                values[slack.family][:] = slack.stored(*outside)
 
     def mistraced(self, values: Values, slopes: bool, seed: int) -> dict[str, str]:
         """Leave to Python the terms whose traces are not their functions at an answer.
@@ -300,6 +318,15 @@ class CompiledProblem:
         if found:
             self.renew_verifications()
         return found
+
+    def broken(self, values: Values) -> bool:
+        """Test whether by a trace an assertion of its function fails at an answer, though the function raises nothing.
+
+        Raises:
+            Exception: of a function whose assertion fails.
+        """
+        with np.errstate(all="ignore"):
+            return any([verification.broken(values) for verification in self.verifications])
 
     def watch_conditions(self) -> None:
         """Compile the comparisons of traces, for :meth:`new_branches` in a loop."""

@@ -10,6 +10,7 @@ from unifg.errors import GraphError
 from unifg.lie import LieGroup, Manifold
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.model import Model
+from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Family
 from unifg.problem.columns import Columns, Values
 from unifg.problem.linearization import all_finite
@@ -50,6 +51,8 @@ class GuessReader:
     def _read(self, guess: Mapping[Family, ArrayLike]) -> Values:
         """A copy of values from anywhere."""
         for family in guess:
+            if isinstance(family, SlackFamily):  # whose values are those of the limits' violation
+                continue
             if not isinstance(family, Family) or self._graph.families.get(family.name) is not family:
                 named = isinstance(family, str) and family in self._graph.families
                 hint = ": take the family itself, as graph.variables returned it, not its name" if named else ""
@@ -58,7 +61,7 @@ class GuessReader:
         for family, own in values.items():
             given = guess.get(family)
             if given is None:
-                if not self._columns.all_fixed(family):
+                if not self._columns.all_fixed(family) and not isinstance(family, SlackFamily):
                     raise GraphError(
                         f"the guess has no values for family '{family.name}': give an array of shape {own.shape}",
                         family=family.name,

@@ -409,6 +409,20 @@ class CompiledTerm:
             raise
         return self._masked(self._checked(found))
 
+    def call_as_written(self, values: Values) -> None:
+        """Call a function that was traced, for all factors; its exception is passed on with notes.
+
+        Raises:
+            Exception: of the function.
+        """
+        points = self.points(values)
+        try:
+            self.batch.original(points)
+        except Exception as error:
+            error.add_note("at the answer of a solve, where what the function asserts is tested")
+            self._place(error, points)
+            raise
+
     def _place(self, error: Exception, points: list[Array]) -> None:
         """Say of an error of the user's function which factor raises it."""
         if getattr(error, "index", None) is not None:

@@ -3,6 +3,9 @@
 Values are compared up to rounding. Derivatives are compared with one-sided difference quotients along one random
 direction: the exact slope must lie between them, widened by what two lengths of the step disagree by, so that kinks,
 jumps and noise are no differences.
+
+What a function asserts about its arguments is no part of its trace. At every answer compiled code tests the assertions;
+where one fails, the function itself is called, and raises its exception.
 """
 
 from __future__ import annotations
@@ -36,6 +39,7 @@ class Verification:
     Attributes:
         term: whose trace it is.
         kernel: of the trace; another kernel makes this void.
+        demanding: whether the function asserts something about its arguments.
     """
 
     def __init__(self, term: CompiledTerm) -> None:
@@ -46,6 +50,24 @@ class Verification:
         self._places: IntArray = np.concatenate(places, axis=1)
         self._columns: IntArray = np.concatenate(term.columns, axis=1)
         self._rows, self._slopes = np.empty((term.count, term.size)), np.empty((0, 0, 0))
+        requirements = self.kernel.expression.requirements
+        self.demanding = requirements is not None
+        self._requirements = None if requirements is None else requirements.residual()
+        self._held = np.empty((term.count, 0 if requirements is None else len(requirements.rows)))
+
+    def broken(self, values: Values) -> bool:
+        """Test whether an assertion of the function fails at some factor, active or not.
+
+        Raises:
+            Exception: of the function, which is called if an assertion fails by the trace.
+        """
+        if self._requirements is None:
+            return False
+        self._evaluate(self._requirements.address, values, self._held, NO_SLOPES)
+        if self._held.all():
+            return False
+        self.term.call_as_written(values)
+        return True
 
     def difference(self, values: Values, direction: Array, move: Move, slopes: bool) -> str:
         """Reason for which the trace is not the function at these values; empty where it is.
@@ -74,7 +96,14 @@ class Verification:
                     return f"at factor {int(np.argmax(wrong))} of an answer, what was traced is not what it computes"
             if not slopes or batch.single is not None:  # of one factor, the slopes are those of the source
                 return ""
-            wrong = self._wrong_slopes(batch, values, theirs, direction, move)
+            try:
+                wrong = self._wrong_slopes(batch, values, theirs, direction, move)
+            except GraphError:
+                raise
+            except Exception:
+                if not self.demanding:  # whose assertions may fail beside an answer
+                    raise
+                return ""
         except GraphError:
             raise
         except Exception as error:

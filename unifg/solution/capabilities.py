@@ -12,7 +12,13 @@ from unifg.problem.compiled_problem import CompiledProblem
 Constraints: TypeAlias = Literal["none", "equalities", "all"]
 
 
-def require(program: CompiledProblem, solver: str, constraints: Constraints = "all", scalar_costs: bool = True) -> None:
+def require(
+    program: CompiledProblem,
+    solver: str,
+    constraints: Constraints = "all",
+    scalar_costs: bool = True,
+    soft: bool = True,
+) -> None:
     """Raise unless a graph has no other constraints, switched on, and no other costs than these.
 
     Args:
@@ -20,6 +26,7 @@ def require(program: CompiledProblem, solver: str, constraints: Constraints = "a
         solver: to be named in the error.
         constraints: which may be there.
         scalar_costs: whether costs that are no squares may be there.
+        soft: whether the linear prices of soft constraints may be there in any case.
 
     Raises:
         BackendError: naming the first constraint or cost that may not.
@@ -30,8 +37,15 @@ def require(program: CompiledProblem, solver: str, constraints: Constraints = "a
             f"{solver} cannot take the constraint '{name}': use InteriorPoint, AugmentedLagrangian or SQP, or "
             "`fg.solve`, which picks; or state it as a cost"
         )
-    if not scalar_costs and program.scalar_terms:
-        name = program.scalar_terms[0].name
+    for name in [] if scalar_costs else [term.name for term in program.scalar_terms]:
+        stated = next((own for own, slack in program.soft.items() if name.startswith(slack.family.name)), None)
+        if stated is not None and soft:
+            continue
+        if stated is not None:
+            raise BackendError(
+                f"{solver} cannot take the soft constraint '{stated}', whose price is no square: use InteriorPoint, "
+                "SQP, AugmentedLagrangian or Penalty"
+            )
         raise BackendError(
             f"{solver} cannot take the scalar cost '{name}': it is not a square; use InteriorPoint, "
             "AugmentedLagrangian or SQP, or state it as a residual"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from unifg.errors import GraphError, UnifgError
+from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from unifg.plots.shown import Shown
+
+GIVEN_WAY = 1e-6  # of a slack variable, from which on it is reported
 
 
 @dataclass(frozen=True)
@@ -201,6 +204,18 @@ class Solution:
         known = ", ".join([*multipliers, *self._program.columns.fixed]) or "none"
         raise GraphError(f"no constraint, bound or fix is called '{name}' (there are: {known})", term=name)
 
+    def slack(self, name: str) -> Array:
+        """(n, m) violation of a soft constraint: positive above an upper limit, negative below a lower one.
+
+        Raises:
+            GraphError: when no soft constraint has that name.
+        """
+        soft = self._program.soft
+        if name not in soft:
+            known = ", ".join(soft) or "none"
+            raise GraphError(f"no soft constraint is called '{name}' (there are: {known})", term=name)
+        return soft[name].signed(self._lin.values[soft[name].family].copy())
+
     def shifted(self, *families: Family, by: int = 1) -> Guess:
         """A guess moved ``by`` stages towards the end of the horizon, for the next control tick.
 
@@ -300,7 +315,8 @@ class Solution:
         """
         from unifg.plots.shown import draw_shown  # only who draws loads it
 
-        selections = [self._selection(variable) for variable in variables or self._program.families]
+        stated = [family for family in self._program.families if not isinstance(family, SlackFamily)]
+        selections = [self._selection(variable) for variable in variables or stated]
         parts = [self._shown(selection, marginals) for selection in selections]
         return draw_shown(parts, f"{self.solver}: {self.status.name.lower().replace('_', ' ')}, cost {self.cost:.6g}")
 
@@ -368,6 +384,15 @@ class Solution:
         if self.worst is not None and self.violation > 0.0 and not self.converged:
             name, index = self.worst
             text += f" Largest violation: '{name}', factor {index}."
+        for name in self._program.soft:
+            given_way = np.abs(self.slack(name))
+            rows = int((given_way > GIVEN_WAY).sum())
+            if rows:
+                factor = int(np.argmax(given_way.max(axis=1)))
+                text += (
+                    f" Soft constraint '{name}' gives way in {rows} of {given_way.size} rows, by up to "
+                    f"{given_way.max():.3g} in factor {factor}; that is no violation."
+                )
         if self.in_python > 0.01 * self.seconds:
             names = ", ".join(f"'{name}'" for name in self._program.left_to_python)
             share = 100.0 * self.in_python / self.seconds

@@ -18,6 +18,7 @@ from unifg.codegen.inner import inner
 from unifg.errors import BackendError, GraphError
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
+from unifg.modeling.soft import SLACK
 from unifg.modeling.variables import Data
 from unifg.problem.by_term import ByTerm
 from unifg.problem.columns import Values
@@ -62,12 +63,14 @@ class Backend(ABC):
     Attributes:
         constraints: which it takes.
         scalar_costs: whether it takes costs that are no squares.
+        soft: whether it takes the linear prices of soft constraints in any case.
         rehearses: whether :meth:`Solver.prepare` may take it through small problems of its own
             (:mod:`unifg.solution.warmup_run`).
     """
 
     constraints: ClassVar[Constraints] = "all"
     scalar_costs: ClassVar[bool] = True
+    soft: ClassVar[bool] = False
     rehearses: ClassVar[bool] = False
 
     @property
@@ -176,7 +179,7 @@ class Solver(Backend):
 
     def require(self, program: CompiledProblem) -> None:
         """Raise BackendError when the backend cannot take this class of problem."""
-        require(program, self.name, self.constraints, self.scalar_costs)
+        require(program, self.name, self.constraints, self.scalar_costs, self.soft)
 
     def runs_alone(self, program: CompiledProblem) -> bool:
         """Test whether :meth:`iterate` evaluates the start and ends with :meth:`SolveState.conclude` if unwatched.
@@ -610,11 +613,12 @@ class Prepared:
         if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
             return solution
         values = solution._lin.values
-        due = slopes or self._solves % EVERY == 0 or self._owed
+        broken = self._broken(run, values)
+        due = slopes or self._solves % EVERY == 0 or self._owed or broken
         if not due and self._of_branches < AT_ONCE + self._solves // LATER and program.new_branches(values, False):
             due = True
             self._of_branches += 1
-        self._owed = due and run.out_of_time  # verified after the next solve that leaves time for it
+        self._owed = due and run.out_of_time and not broken  # verified after the next solve that leaves time for it
         if not due or self._owed:
             return solution
         program.new_branches(values, True)
@@ -626,8 +630,19 @@ class Prepared:
             solution, values = self._finished(again), again.values
             if not solution.finite:
                 break
+            self._broken(again, values)
         solution.checked, solution.mistraced, solution.seconds = solution.finite, mistraced, run.seconds
         return solution
+
+    def _broken(self, run: SolveState, values: Values) -> bool:
+        """Test what traced functions assert; the exception of one that fails is passed on as within a solve."""
+        try:
+            return self.program.broken(values)
+        except Exception as error:
+            run.keep_with(error)
+            if hasattr(error, "reached"):  # which the KKT test would pass: it knows no assertions
+                error.reached.status = Status.INTERRUPTED
+            raise
 
     def verify(self, solution: Solution) -> dict[str, str]:
         """Evaluate traced functions as written at the last answer, with the data of that solve.
@@ -719,6 +734,8 @@ class Prepared:
         """The same of arrays from anywhere."""
         result = np.zeros(self.program.constraints.count)
         for name, value in given.items():
+            if name not in self._constraints and name.endswith(SLACK):  # of a constraint that was soft
+                continue
             if name not in self._constraints:
                 known = ", ".join(self._constraints) or "none"
                 raise GraphError(f"{what} given for '{name}', which is no constraint (there are: {known})", term=name)

@@ -6,6 +6,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.locks import ReentrantLock
+from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Family
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.typing import IntArray
@@ -55,8 +56,11 @@ class Shifts:
     def _rows(self, families: tuple[Family, ...], by: int) -> IntArray:
         program = self._program
         places = np.arange(program.constraints.count)
+        first = None
         for term, rows in zip(program.constraint_terms, program.slices, strict=True):
-            first = term.gathers[0].selection
+            selection = term.gathers[0].selection
+            if first is None or not isinstance(selection.family, SlackFamily):  # which move with what they slacken
+                first = selection
             if first.family in families and len(first) == term.count:
                 own = places[rows].reshape(term.count, term.size)
                 places[rows] = own[_later(first.indices.tolist(), by)].ravel()

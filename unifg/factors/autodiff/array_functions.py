@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from unifg.factors.autodiff import masks
 from unifg.factors.autodiff.symbols import (
     INSTEAD,
     UFUNCS,
@@ -26,6 +27,7 @@ from unifg.factors.autodiff.symbols import (
     symbols,
     wrapped,
 )
+from unifg.factors.autodiff.tables import interp
 
 LARGEST = 12  # rows of a linear system, whose elimination is written out
 _Pick = np.frompyfunc(choose, 3, 1)
@@ -272,6 +274,9 @@ TABLE: dict[Any, Callable[..., Any]] = {
     np.piecewise: _piecewise,
     np.nan_to_num: _finite,
     np.round: lambda array, decimals=0: wrapped(_objects(array)).round(decimals),
+    np.interp: interp,
+    np.ndarray.__getitem__: masks.taken,
+    np.ndarray.__setitem__: masks.put,
     np.all: _every,
     np.any: _some,
     np.mean: _mean,
@@ -284,7 +289,7 @@ TABLE |= {
             np.sort, np.argsort, np.argmax, np.argmin, np.median, np.percentile, np.quantile, np.partition, np.unique,
         ),
         "np.where(condition, a, b)": (np.nonzero, np.flatnonzero, np.argwhere, np.extract, np.count_nonzero),
-        "a spline (unifg.models.spline)": (np.interp, np.searchsorted, np.digitize),
+        "np.interp or a spline (unifg.models.spline)": (np.searchsorted, np.digitize),
         "fg.wrap_angle": (np.unwrap,),
     }.items()
     for function in functions

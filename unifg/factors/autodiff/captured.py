@@ -20,6 +20,7 @@ import numpy as np
 
 from unifg.codegen.fingerprint import is_compiled
 from unifg.factors.autodiff.lookup import Lookup
+from unifg.factors.autodiff.tables import LARGEST, fingerprint_of, kind_of, size_of
 from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual
 from unifg.lie import Manifold
@@ -44,6 +45,7 @@ class _Watched:
     arrays: list[tuple[Array, bytes]] = field(default_factory=list)
     functions: list[tuple[FunctionType, tuple[Any, ...]]] = field(default_factory=list)
     containers: list[tuple[Any, tuple[Any, ...]]] = field(default_factory=list)
+    interpolators: list[tuple[Any, tuple[Any, ...]]] = field(default_factory=list)
 
     @property
     def changed(self) -> bool:
@@ -61,6 +63,8 @@ class _Watched:
             present = entries_of(container)
             if len(present) != len(entries) or any(now is not kept for now, kept in zip(present, entries, strict=True)):
                 return True
+        if any(fingerprint_of(interpolator) != content for interpolator, content in self.interpolators):
+            return True
         return any(array.tobytes() != content for array, content in self.arrays)
 
 
@@ -199,6 +203,8 @@ class _Walk:
             return "residual", self.value(value.function, where)
         if isinstance(value, Lookup) and _trusted(type(value).__module__):
             return type(value), value.digest
+        if kind_of(value):
+            return self._interpolator(value, where)
         if isinstance(value, BuiltinFunctionType) and isinstance(value.__self__, ModuleType | type | None):
             module = str(value.__module__)
             if value.__name__ in OUTWARD or not _trusted(module):
@@ -271,6 +277,17 @@ class _Walk:
         self.watched.arrays.append((array, content))
         self.size += array.size
         return array.dtype.str, array.shape, hashlib.blake2b(content, digest_size=16).digest()
+
+    def _interpolator(self, value: Any, where: str) -> Hashable:
+        """An interpolator of SciPy: its numbers, however many, are compared before each solve."""
+        if (size := size_of(value)) > LARGEST:
+            self.refuse(
+                f"{where} has {size} numbers, which would be compared before each solve; unifg.models.spline has "
+                "tables that never change"
+            )
+        content = fingerprint_of(value)
+        self.watched.interpolators.append((value, content))
+        return type(value), hashlib.blake2b(repr(content).encode(), digest_size=16).digest()
 
     def _module(self, module: ModuleType) -> Hashable:
         if module is np.random:

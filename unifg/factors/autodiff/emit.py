@@ -278,17 +278,13 @@ class _Writer:
         elif op == Op.SELECT:
             condition, x, y = self._truth(a), self._number(b), self._number(c)
             self.write(f"{name} = select i1 {condition}, double {x}, double {y}")
-        elif op == Op.GATHER:  # whatever the index is, the number read lies in the tables
-            last, x = number(float(tape.size - 1)), self._number(a)
-            self.write(
-                f"{name}_l = fcmp ogt double {x}, {_ZERO}",
-                f"{name}_m = select i1 {name}_l, double {x}, double {_ZERO}",
-                f"{name}_u = fcmp olt double {name}_m, {last}",
-                f"{name}_k = select i1 {name}_u, double {name}_m, double {last}",
-                f"{name}_i = fptosi double {name}_k to i64",
-                f"{name}_p = getelementptr inbounds double, {POINTER} %data2, i64 {name}_i",
-                f"{name} = load double, {POINTER} {name}_p",
-            )
+        elif op in (Op.GATHER, Op.TAKE):
+            assert op == Op.GATHER or isinstance(c, int)
+            count = tape.size if op == Op.GATHER else int(tape.value[c])  # type: ignore[index]
+            self._read(name, self._number(a), count, "%data2" if op == Op.GATHER else f"{self._values[b]}_p")
+        elif op == Op.SEARCH:
+            assert isinstance(c, int)
+            self._search(name, self._number(a), b, int(tape.value[c]))
         else:
             x, y = self._number(a), "" if b == -1 else self._number(b)
             if op in _INSTRUCTIONS:
@@ -316,6 +312,40 @@ class _Writer:
                 self._called[called] = len(given)
                 self.write(f"{name} = call double @{called}({', '.join(given)})")
         (self._truths if op in _COMPARISONS or op in (Op.AND, Op.OR, Op.NOT) else self._values)[key] = name
+
+    def _read(self, name: str, x: str, count: int, array: str) -> None:
+        """Read the x-th of some numbers; whatever x is, one of them is read."""
+        last = number(float(count - 1))
+        self.write(
+            f"{name}_l = fcmp ogt double {x}, {_ZERO}",
+            f"{name}_m = select i1 {name}_l, double {x}, double {_ZERO}",
+            f"{name}_u = fcmp olt double {name}_m, {last}",
+            f"{name}_k = select i1 {name}_u, double {name}_m, double {last}",
+            f"{name}_i = fptosi double {name}_k to i64",
+            f"{name}_p = getelementptr inbounds double, {POINTER} {array}, i64 {name}_i",
+            f"{name} = load double, {POINTER} {name}_p",
+        )
+
+    def _search(self, name: str, x: str, begin: Key, count: int) -> None:
+        """Bisect increasing numbers: as many steps as their number has binary digits, without a jump."""
+        if isinstance(begin, int) and self._tape.is_constant(begin):
+            array = f"{name}_b"
+            start = int(self._tape.value[begin])
+            self.write(f"{array} = getelementptr inbounds double, {POINTER} %data2, i64 {start}")
+        else:
+            array = f"{self._values[begin]}_p"
+        place, left, step = "0", count - 1, 0
+        while left > 1:
+            half, own = left // 2, f"{name}_{step}"
+            self.write(
+                f"{own}_h = add nuw nsw i64 {place}, {half}",
+                f"{own}_p = getelementptr inbounds double, {POINTER} {array}, i64 {own}_h",
+                f"{own}_v = load double, {POINTER} {own}_p",
+                f"{own}_c = fcmp ole double {own}_v, {x}",
+                f"{own} = select i1 {own}_c, i64 {own}_h, i64 {place}",
+            )
+            place, left, step = own, left - half, step + 1
+        self.write(f"{name} = sitofp i64 {place} to double")
 
     def _solved(self, i: int, rows: list[list[str]]) -> list[str]:
         """Solution of a linear system by elimination with partial pivoting, written out; rows end with b."""

@@ -56,12 +56,14 @@ class Expression:
         rows: node of each row.
         width: number of tangent coordinates.
         name: for messages.
+        required: conditions without which the function raises an exception.
     """
 
     tape: Tape
     rows: tuple[int, ...]
     width: int
     name: str
+    required: tuple[int, ...] = ()
     _natives: dict[str, Native] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -83,6 +85,11 @@ class Expression:
             elif tape.op[i] in (Op.MINIMUM, Op.MAXIMUM):
                 found.append(tape.apply(Op.LESS, tape.a[i], tape.b[i]))
         return Expression(tape, tuple(found), self.width, f"conditions of {self.name}") if found else None
+
+    @cached_property
+    def requirements(self) -> Expression | None:
+        """The required conditions as numbers, 1.0 where they hold; None where there are none."""
+        return Expression(self.tape, self.required, 0, f"requirements of {self.name}") if self.required else None
 
     @cached_property
     def table(self) -> Array:

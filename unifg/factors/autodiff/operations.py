@@ -56,6 +56,8 @@ class Op(IntEnum):
     LIST = auto()  # the list a, and b; a list begins where a is none
     SOLVE = auto()  # all of x in A x = b, for a list of the rows of A and b
     ENTRY = auto()  # the b-th of the solution a
+    SEARCH = auto()  # interval of a, from 0 to c - 2, among c increasing numbers that begin at b
+    TAKE = auto()  # the a-th of c parameters that begin at b
 
 
 UNARY = frozenset(
@@ -65,7 +67,12 @@ UNARY = frozenset(
         Op.RINT, Op.NOT, Op.GATHER,
     }
 )  # fmt: skip
-STEADY = frozenset({Op.SIGN, Op.FLOOR, Op.RINT, Op.LESS, Op.LESS_EQUAL, Op.EQUAL, Op.AND, Op.OR, Op.NOT, Op.GATHER})
+STEADY = frozenset(
+    {
+        Op.SIGN, Op.FLOOR, Op.RINT, Op.LESS, Op.LESS_EQUAL, Op.EQUAL, Op.AND, Op.OR, Op.NOT, Op.GATHER, Op.SEARCH,
+        Op.TAKE,
+    }
+)  # fmt: skip
 """Constant but where they jump: they have no derivatives."""
 GROUPED = frozenset({Op.LIST, Op.SOLVE})
 """Several numbers: their derivatives are those of their entries."""

@@ -36,6 +36,8 @@ def rate(path: Callable[..., Any], *arguments: Any) -> Any:
     with generating:
         tape = Tape()
         nodes, shape = _slopes(tape, Rebound().callable(path), arguments)
+        if not all(tape.evaluate(tape.required, (), ())):
+            path(0.0, *arguments)  # which raises its exception
         return np.reshape(tape.evaluate(nodes, (), ()), shape)
 
 

@@ -19,6 +19,7 @@ from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.manifolds import moved
 from unifg.factors.autodiff.operations import Op
 from unifg.factors.autodiff.symbols import Length, Symbol, Symbols, TraceError, node_of, symbols
+from unifg.factors.autodiff.tables import Interpolator, kind_of
 from unifg.factors.autodiff.tape import Tape
 from unifg.factors.autodiff.trace import Rebound, run
 from unifg.factors.kernel import Argument
@@ -119,9 +120,8 @@ def traced(function: Callable[..., Any], arguments: Sequence[Argument], rows: in
     result = np.asarray(run(function, given, batch.tape, rebound, rows), dtype=object)
     if not single and (result.ndim != 2 or len(result) != 1):
         raise TraceError(f"returns an array of shape {result.shape} for one factor, expected (1, m)")
-    return Expression(
-        batch.tape, tuple(node_of(batch.tape, e) for e in result.ravel()), batch.width, name or "residual"
-    )
+    nodes = tuple(node_of(batch.tape, e) for e in result.ravel())
+    return Expression(batch.tape, nodes, batch.width, name or "residual", tuple(_conjuncts(batch.tape)))
 
 
 def traced_rows(
@@ -149,17 +149,18 @@ def traced_rows(
     """
     inputs = [*given, *(Each(array.shape[1:]) if each else Shared(array.shape) for array, each in reached)]
     batch = _Batch(inputs)
-    found: tuple[int, ...] | None = None
+    found: tuple[tuple[int, ...], tuple[int, ...]] | None = None
     for length in lengths:
         results, used = batch.run(function, length, [array for array, _ in reached], scalar, len(lengths) > 1)
-        rows = [batch.canonical(row, nodes) for row, nodes in enumerate(results)]
+        demands = batch.required(length)
+        rows = [batch.canonical(row, nodes, demands[row]) for row, nodes in enumerate(results)]
         if used:
             raise RowsError("its rows may depend on which factor they belong to, by the length of the batch", 0)
         found = found or rows[0]
         if other := [row for row, nodes in enumerate(rows) if nodes != found]:
             raise RowsError("its rows depend on which factor they belong to", other[0])
     assert found is not None
-    return Expression(batch.common, found, batch.width, name or "residual")
+    return Expression(batch.common, found[0], batch.width, name or "residual", found[1])
 
 
 class _Batch:
@@ -195,6 +196,7 @@ class _Batch:
             rebound.given[id(array)] = numbers
         kept = [(k, a, list(a.flat)) for k, a in enumerate(arrays[:first]) if isinstance(a, Symbols)]
         Length.batch, Length.used = length if any_length else 0, False
+        self.tape.required.clear()
         try:
             result = np.asarray(run(function, arrays[:first], self.tape, rebound), dtype=object)
             used = Length.used
@@ -215,7 +217,7 @@ class _Batch:
         """The argument of one input."""
         part, (start, column) = self.inputs[place], self.starts[place]
         if isinstance(part, Fixed):
-            return part.value
+            return Interpolator(part.value) if kind_of(part.value) else part.value
         if isinstance(part, Shared):
             array = self._parameters(part.shape, [start])
             return array if part.shape else array.item()
@@ -247,8 +249,30 @@ class _Batch:
             array[k] = Symbol(self.tape, self.tape.leaf(Op.PARAMETER, place))
         return array.reshape(shape) if len(firsts) == 1 else array
 
-    def canonical(self, row: int, nodes: Sequence[int]) -> tuple[int, ...]:
-        """Nodes of a row on the tape that all rows share, where its own leaves are those of row 0.
+    def required(self, length: int) -> list[list[int]]:
+        """For every row the conditions about it without which the function raises an exception.
+
+        Raises:
+            TraceError: a condition is about several rows.
+        """
+        tape, found = self.tape, [list[int]() for _ in range(length)]
+        for node in _conjuncts(tape):
+            about = set[int]()
+            for i in tape.live([node]):
+                if tape.op[i] in (Op.VARIABLE, Op.TANGENT, Op.PARAMETER):
+                    owners = self.owners[Op(tape.op[i])]
+                    if not isinstance(self.inputs[owners[tape.a[i] % len(owners)]], Shared | Common):
+                        about.add(tape.a[i] // len(owners))
+            if len(about) > 1:
+                raise TraceError("asserts something about several factors together")
+            for row in about or range(length):
+                found[row].append(node)
+        return found
+
+    def canonical(
+        self, row: int, nodes: Sequence[int], required: Sequence[int] = ()
+    ) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Nodes of a row, and its conditions, on the tape that all rows share, its own leaves those of row 0.
 
         Raises:
             RowsError: it depends on leaves of other rows.
@@ -256,7 +280,7 @@ class _Batch:
         tape, common = self.tape, self.common
         place: dict[int, int] = {}
         mixed: set[int] = set()
-        for i in tape.live(nodes):
+        for i in tape.live([*nodes, *required]):
             op, a, b, c = tape.op[i], tape.a[i], tape.b[i], tape.c[i]
             if op == Op.CONSTANT:
                 place[i] = common.constant(tape.value[i])
@@ -270,4 +294,21 @@ class _Batch:
                 place[i] = common.apply(op, place[a], place[b] if b >= 0 else -1, place[c] if c >= 0 else -1)
         if mixed:
             raise RowsError("its rows depend on rows of other factors", row, frozenset(mixed))
-        return tuple(place[i] for i in nodes)
+        return tuple(place[i] for i in nodes), tuple(sorted({place[i] for i in required}))
+
+
+def _conjuncts(tape: Tape) -> list[int]:
+    """Conditions that all hold if and only if the required ones do: those of a row stand alone then."""
+    found, waiting = dict[int, None](), list(tape.required)
+    while waiting:
+        node = waiting.pop()
+        inner = tape.a[node] if tape.op[node] == Op.NOT else -1
+        if tape.op[node] == Op.AND:
+            waiting += [tape.b[node], tape.a[node]]
+        elif inner >= 0 and tape.op[inner] == Op.OR:
+            waiting += [tape.apply(Op.NOT, tape.b[inner]), tape.apply(Op.NOT, tape.a[inner])]
+        elif inner >= 0 and tape.op[inner] == Op.NOT:
+            waiting.append(tape.a[inner])
+        elif not (tape.is_constant(node) and tape.value[node] != 0.0):
+            found[node] = None
+    return list(found)

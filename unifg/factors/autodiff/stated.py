@@ -9,6 +9,7 @@ from typing import Any, cast
 
 from unifg.factors.autodiff.expression import Expression, generating
 from unifg.factors.autodiff.rows import traced
+from unifg.factors.autodiff.symbols import TraceError
 from unifg.factors.kernel import Kernel
 
 
@@ -46,7 +47,10 @@ class StatedKernel(Kernel):
         with generating:
             found = self.__dict__.get("_expression")
             if found is None:
-                found = self.__dict__["_expression"] = traced(self.function, self.arguments, name=self.name)
+                found = traced(self.function, self.arguments, name=self.name)
+                if found.required:
+                    raise TraceError(f"the kernel '{self.name}' asserts something, which nothing would test")
+                self.__dict__["_expression"] = found
             return cast(Expression, found)
 
     @cached_property

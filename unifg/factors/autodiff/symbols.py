@@ -21,6 +21,7 @@ from unifg.factors.autodiff.operations import Op
 from unifg.factors.autodiff.tape import NUMPY, Tape
 
 INSTEAD = 'leave it to differences: fg.residual(f, derivatives="differences")'
+DECIDES = "asks whether a number holds that is not known yet; write np.where(condition, a, b) for `if`"
 
 
 _OF_TRUTHS = frozenset({Op.AND, Op.OR, Op.NOT})
@@ -67,6 +68,8 @@ def _both(ufunc: str) -> tuple[Any, Any]:
     """The operator that does what a ufunc does, and the same from the right."""
 
     def operator(self: Any, other: Any) -> Any:
+        if isinstance(other, np.lib.mixins.NDArrayOperatorsMixin):  # which knows what to do
+            return NotImplemented
         return each(self, plain(other)) if isinstance(other, np.ndarray) else UFUNCS[ufunc](self, other)
 
     def mirrored(self: Any, other: Any) -> Any:
@@ -81,6 +84,11 @@ def _both(ufunc: str) -> tuple[Any, Any]:
 def _alone(ufunc: str) -> Any:
     """The operator that does what a ufunc of one argument does."""
     return lambda self: UFUNCS[ufunc](self)
+
+
+def is_mask(array: Any) -> bool:
+    """Test whether an array holds truth values."""
+    return bool(array.ndim) and bool(array.size) and is_truth(next(array.flat))
 
 
 class Symbol:
@@ -143,7 +151,7 @@ class Symbol:
         """Ask who follows every way through the code; in other code nobody knows."""
         if self.tape.decide is not None:
             return self.tape.decide(self.node)
-        raise TraceError("asks whether a number holds that is not known yet; write np.where(condition, a, b) for `if`")
+        raise TraceError(DECIDES)
 
     def __float__(self) -> NoReturn:
         """Refuse: the number is not known yet."""
@@ -199,6 +207,8 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         """Do what the ufunc does, entry by entry."""
+        if any(isinstance(item, np.lib.mixins.NDArrayOperatorsMixin) for item in inputs):
+            return NotImplemented
         out = options.pop("out", None)
         if method == "__call__":
             only(f"np.{ufunc.__name__}", options, "where", "dtype", "casting", "order", "subok")
@@ -250,7 +260,10 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
 
     def __getitem__(self, key: Any) -> Any:
         """Take entries; an index must be known."""
-        for part in key if isinstance(key, tuple) else (key,):
+        parts = key if isinstance(key, tuple) else (key,)
+        if parts and isinstance(parts[0], Symbols) and is_mask(parts[0]):
+            return FUNCTIONS[np.ndarray.__getitem__](self, parts)
+        for part in parts:
             if isinstance(part, Symbol | Symbols):
                 raise TraceError("takes entries by a number that is not known yet; write np.where(condition, a, b)")
         first = key[0] if isinstance(key, tuple) and key else key
@@ -260,7 +273,11 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
 
     def __setitem__(self, key: Any, value: Any) -> None:
         """Put entries; an index must be known."""
-        for part in key if isinstance(key, tuple) else (key,):
+        parts = key if isinstance(key, tuple) else (key,)
+        if parts and isinstance(parts[0], Symbols) and is_mask(parts[0]):
+            FUNCTIONS[np.ndarray.__setitem__](self, parts, value)
+            return
+        for part in parts:
             if isinstance(part, Symbol | Symbols):
                 raise TraceError("puts entries by a number that is not known yet; write np.where(condition, a, b)")
         if self.size:  # what is put takes the kind of the array

@@ -51,6 +51,7 @@ class Tape:
         tables: flat arrays that look-ups read, side by side.
         truths: leaves that are truth values.
         decide: settles conditions while code that decides is run, see :mod:`unifg.factors.autodiff.branches`.
+        required: conditions without which the code raises an exception.
     """
 
     def __init__(self) -> None:
@@ -63,6 +64,7 @@ class Tape:
         self.tables: list[Array] = []
         self.truths: set[int] = set()
         self.decide: Callable[[int], bool] | None = None
+        self.required: list[int] = []
         self._found: dict[tuple[int, int, int, int], int] = {}
         self._constants: dict[tuple[float, float], int] = {}
         self.zero = self.constant(0.0)
@@ -91,7 +93,7 @@ class Tape:
         """Start of a flat array among the tables; it is kept once."""
         begin = 0
         for known in self.tables:
-            if known is numbers:
+            if known is numbers or (known.shape == numbers.shape and known.tobytes() == numbers.tobytes()):
                 return begin
             begin += len(known)
         self.tables.append(numbers)
@@ -275,6 +277,12 @@ class Tape:
                 return self.select(condition, b, self.scaled(a, c))
         return self.multiply(a, partial)
 
+    def stretch(self, begin: int, count: int, tables: Array, parameters: Sequence[float]) -> Array:
+        """Numbers that a search or a take reads."""
+        start = int(self.value[begin]) if self.is_constant(begin) else self.a[begin]
+        source = tables if self.is_constant(begin) else np.asarray(parameters, dtype=np.float64)
+        return source[start : start + int(self.value[count])]
+
     # ---------------------------------------------------------------- whole tapes
 
     def live(self, outputs: Iterable[int], ends: Container[int] = ()) -> list[int]:
@@ -338,6 +346,13 @@ class Tape:
                     continue
                 elif op == Op.GATHER:
                     found[i] = float(tables[int(found[a])]) if 0 <= found[a] < len(tables) else np.nan
+                elif op in (Op.SEARCH, Op.TAKE):
+                    among = self.stretch(b, self.c[i], tables, parameters)
+                    below = op == Op.SEARCH and not np.isnan(found[a])
+                    place = int(np.searchsorted(among, found[a], side="right")) - 1 if below else 0
+                    place = place if op == Op.SEARCH else int(np.nan_to_num(found[a]))
+                    place = min(max(place, 0), len(among) - (2 if op == Op.SEARCH else 1))
+                    found[i] = float(place if op == Op.SEARCH else among[place])
                 elif op == Op.SOLVE:
                     matrix, right = self.system(i)
                     numbers = [[found[j] for j in row] for row in matrix], [found[j] for j in right]

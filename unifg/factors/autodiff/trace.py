@@ -23,7 +23,7 @@ import numpy as np
 from unifg.codegen import calls
 from unifg.codegen.fingerprint import is_compiled, source_of
 from unifg.factors.autodiff.array_functions import TABLE
-from unifg.factors.autodiff.branches import every_way
+from unifg.factors.autodiff.branches import every_way, innermost, unless_raised
 from unifg.factors.autodiff.captured import classes_of, entries_of, is_operator
 from unifg.factors.autodiff.groups import wrap
 from unifg.factors.autodiff.manifolds import Symbolic, stated_closed
@@ -45,6 +45,7 @@ from unifg.factors.autodiff.symbols import (
     symbols,
     wrapped,
 )
+from unifg.factors.autodiff.tables import Interpolator, interp, kind_of
 from unifg.factors.autodiff.tape import Tape
 from unifg.factors.kernel import NOTHING, Argument, Kernel
 from unifg.factors.residuals import Residual
@@ -59,7 +60,8 @@ def run(function: Callable[..., Any], arguments: Sequence[Any], tape: Tape, rebo
     """Call a function with symbols.
 
     Args:
-        function: batched, or compiled for one factor; that may decide on values, and is run every way.
+        function: batched; it may raise an exception for some values, and what it demands of them stands in
+            ``tape.required``. Or compiled for one factor; that may decide on values, and is run every way.
         arguments: arrays of symbols, as the function takes them.
         tape: of the symbols.
         rebound: makes functions that take symbols.
@@ -74,7 +76,7 @@ def run(function: Callable[..., Any], arguments: Sequence[Any], tape: Tape, rebo
     try:
         made = rebound.callable(function)
         if not is_compiled(function):
-            result = made(*arguments)
+            result = unless_raised(tape, lambda: made(*arguments))
             rebound.require_untouched()
             return result
 
@@ -94,20 +96,10 @@ def run(function: Callable[..., Any], arguments: Sequence[Any], tape: Tape, rebo
 
 def _line(function: Callable[..., Any]) -> str:
     """The innermost line of the user's own code that was running, or where the function begins."""
+    if (running := innermost(sys.exc_info()[2])) is not None:
+        return f"{running.tb_frame.f_code.co_filename}:{running.tb_lineno}: "
     code = getattr(source_of(function), "__code__", None)
-    trace, own = sys.exc_info()[2], "" if code is None else f"{code.co_filename}:{code.co_firstlineno}: "
-    while trace is not None:
-        code, names = trace.tb_frame.f_code, trace.tb_frame.f_globals
-        package = str(names.get("__name__", "")).partition(".")[0]
-        if package != "unifg" and package not in sys.stdlib_module_names and not _installed(code.co_filename):
-            own = f"{code.co_filename}:{trace.tb_lineno}: "
-        trace = trace.tb_next
-    return own
-
-
-def _installed(path: str) -> bool:
-    """Test whether a file belongs to a package that somebody has installed, or to what is compiled."""
-    return "site-packages" in path or "dist-packages" in path or path.endswith(".pyx")
+    return "" if code is None else f"{code.co_filename}:{code.co_firstlineno}: "
 
 
 class Rebound:
@@ -255,6 +247,8 @@ class Rebound:
             return MATH
         if id(thing) in BORROWED:
             return BORROWED[id(thing)]
+        if kind_of(thing):
+            return Interpolator(thing)
         if isinstance(thing, ManifoldBase | Product):
             return Symbolic(thing, self.callable)
         if isinstance(thing, Residual | Kernel):
@@ -459,7 +453,7 @@ _MAKERS = {
     "array": _array, "asarray": _as_array, "asanyarray": _as_array, "ascontiguousarray": _as_array,
     "zeros": _filled(0.0), "empty": _filled(0.0), "ones": _filled(1.0), "full": _full, "eye": _eye, "identity": _eye,
     "atleast_1d": lambda a: _as_array(a) if np.ndim(a) else _as_array(a).reshape(1),
-    "random": _Refused("np.random"),
+    "random": _Refused("np.random"), "interp": interp,
     **{name: _along(getattr(np, name)) for name in ("arange", "linspace", "indices", "tri", "ndindex", "ndenumerate")},
 }  # fmt: skip
 # The functions of groups, views, and arrays on the stack, as compiled functions of this library call them.
