@@ -270,17 +270,17 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 26_871, "scenarios": 10_301, "benchmarks": 3_972, "tests": 31_024,
-    "docs examples": 1_633, "unifg/factors": 3_730, "unifg/problem": 2_591, "models": 2_237,
-    "unifg/elimination": 2_088, "solvers": 3_963, "unifg/solution": 1_793, "unifg/smoothing": 1_623,
+    "unifg solvers models": 28_220, "scenarios": 10_301, "benchmarks": 4_048, "tests": 32_324,
+    "docs examples": 1_633, "unifg/factors": 4_227, "unifg/problem": 2_761, "models": 2_239,
+    "unifg/elimination": 2_088, "solvers": 4_512, "unifg/solution": 1_838, "unifg/smoothing": 1_625,
     "unifg/lie": 1_579, "unifg/view": 1_404, "unifg/files": 1_010, "unifg/pose_graphs": 1_036,
-    "unifg/horizon": 1_070, "unifg/modeling": 981, "unifg/codegen": 1_052, "unifg/plots": 418,
+    "unifg/horizon": 1_070, "unifg/modeling": 1_044, "unifg/codegen": 1_070, "unifg/plots": 418,
     "scenarios/scenes": 1_274, "scenarios/simulation": 1_150, "scenarios/campaigns": 912,
     "scenarios/quadrotor": 1_749, "scenarios/ground": 1_133, "scenarios/commands": 562,
     "scenarios/logs": 492, "scenarios/perception": 745, "scenarios/planning": 623,
 }  # fmt: skip
 # Nodes of syntax a statement: budgets are not met by denser code.
-DENSITY = {"unifg solvers models": 26_871.0, "scenarios": 10_301.6, "benchmarks": 3_972.9, "tests": 31_024.3}
+DENSITY = {"unifg solvers models": 10.0, "scenarios": 10.6, "benchmarks": 11.9, "tests": 12.3}
 
 
 def sized(folders: str) -> tuple[int, float]:
