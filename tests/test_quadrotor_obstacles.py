@@ -150,7 +150,7 @@ def test_the_hessian_that_is_asked_for_is_used(solver: str) -> None:
     [
         ({"solver": "newton"}, "unknown backend 'newton'"),
         ({"guess": "luck"}, "unknown guess"),
-        ({"solver": "penalty", "general": True}, "scalar cost 'cylinder'"),
+        ({"solver": "penalty", "general": True}, "Penalty has no option 'hessian'"),
     ],
 )
 def test_what_cannot_be_asked_for(wrong: dict[str, Any], words: str) -> None:
