@@ -33,7 +33,7 @@ def test_costs_without_squares_reach_the_literatures_optimum(name: str) -> None:
     assert solution.iterations <= 100
 
 
-@pytest.mark.parametrize(("name", "large"), [("brachistochrone", 1e4), ("catalyst", 10.0), ("gas oil", 1e4)])
+@pytest.mark.parametrize(("name", "large"), [("brachistochrone", 1e4), ("orbit", 1e4), ("gas oil", 1e4)])
 def test_unit_of_the_cost_changes_neither_verdict_nor_path(name: str, large: float) -> None:
     """A large factor asks for digits, since the tolerance stays."""
     plain = solved(NAMED[name])
@@ -74,7 +74,7 @@ def test_size_of_a_cost_is_a_mean_of_its_curvatures() -> None:
     assert size([1.0, 100.0, 0.0], [0.0, 0.0, 0.0]) == pytest.approx(10.0)
     assert size([1e-12, 1.0, 1.0], [0.0, 0.0, 0.0]) == pytest.approx(1e-4)  # a tiny regularisation
     assert size([1.0, 1.0, 1.0], [0.0, 1e6, 0.0]) == pytest.approx(1e3)
-    assert size([0.0, 0.0, 0.0], [0.0, -3.0, 1.0]) == pytest.approx(3.0)
+    assert size([0.0, 0.0, 0.0], [0.0, -3.0, 1.0]) == pytest.approx(12.0**0.5)
     assert size([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]) == 1.0
     assert size([1.0, 100.0, 0.0], [0.0, 0.0, 0.0], np.array([1.0, 0.1, 1.0])) == pytest.approx(1.0)
     assert size([3e200, 5e200, 4e200], [0.0, 0.0, 0.0]) == pytest.approx(60.0 ** (1 / 3) * 1e200)

@@ -15,9 +15,9 @@ SMALL_FORCES = 100.0  # times the cost: multipliers from which on it is they tha
 
 @compiled
 def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Array, units: Array) -> float:
-    """Geometric mean of the curvatures of the cost along the unknowns; its largest slope where nothing is curved.
+    """Geometric mean of the curvatures of the cost along the unknowns.
 
-    Slopes far above the curvatures count, too, and a mean far below the largest curvature does not. One where the cost
+    Where nothing is curved it is that of the largest slope and of the sum of all. Slopes far above the curvatures count, too, and a mean far below the largest curvature does not. One where the cost
     has neither.
 
     Args:
@@ -27,10 +27,11 @@ def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Arra
         gradient: (width,) of the cost.
         units: (width,) of the unknowns.
     """
-    logarithms, product, count, pull, largest = 0.0, 1.0, 0, 0.0, 0.0
+    logarithms, product, count, pull, slopes, largest = 0.0, 1.0, 0, 0.0, 0.0, 0.0
     for k in range(len(free)):
         unit = units[free[k]]
-        pull = max(pull, abs(gradient[free[k]]) * unit)
+        slope = abs(gradient[free[k]]) * unit
+        pull, slopes = max(pull, slope), slopes + slope
         curvature = hessian[diagonal[k]] * unit**2
         if 0.0 < curvature < math.inf:
             largest = max(largest, curvature)
@@ -39,12 +40,12 @@ def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Arra
             if not 1e-100 < product < 1e100:  # one logarithm for many factors
                 logarithms += math.log(product)
                 product = 1.0
-    if not pull < math.inf:
-        pull = 0.0
+    if not slopes < math.inf:
+        pull = slopes = 0.0
     if count > 0:
         mean = math.exp((logarithms + math.log(product)) / count)
         return max(max(mean, LEAST_SHARE * largest), pull / LARGE_PULL)
-    return pull if pull > 0.0 else 1.0
+    return math.sqrt(pull * slopes) if pull > 0.0 else 1.0
 
 
 @compiled
