@@ -17,8 +17,8 @@ SMALL_FORCES = 100.0  # times the cost: multipliers from which on it is they tha
 def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Array, units: Array) -> float:
     """Geometric mean of the curvatures of the cost along the unknowns.
 
-    Where nothing is curved it is that of the largest slope and of the sum of all. Slopes far above the curvatures count, too, and a mean far below the largest curvature does not. One where the cost
-    has neither.
+    Where nothing is curved it is that of the largest slope and of the sum of all. Slopes far above curvatures count,
+    too, and a mean far below the largest curvature does not. One where the cost has neither.
 
     Args:
         free: (n,) columns that are unknown.
