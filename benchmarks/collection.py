@@ -15,7 +15,7 @@ import re
 from collections import Counter
 from importlib.util import find_spec
 
-from benchmarks.report import command, table
+from benchmarks.report import END, command, table
 from benchmarks.runner import RESULTS, Timing
 from problems.collection import (
     BACKENDS,
@@ -65,7 +65,7 @@ def repeated(page: str, seed: str) -> bool:
         seed: of the draw.
     """
     known: dict[tuple[str, str], str] = {}
-    for part in page.split("## Iterations: ")[1:]:
+    for part in page.partition(END)[0].split("## Iterations: ")[1:]:
         head, _, *lines = (
             [word.strip() for word in line.split("|")[1:-1]] for line in part.splitlines() if "|" in line
         )
