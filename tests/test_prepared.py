@@ -114,8 +114,8 @@ def progress(done, text):
         turns.append(pilot.controller._evasion_from(pilot.pose, discs(near, tuple(-0.6 * heading), True)).evades)
     if ticks == 7:  # something is right before the hull
         near = replace(run.world.scan(), ranges=np.full(len(run.world.scan().ranges), 0.2))
-        stopped = pilot.emergency_stop.control(pilot.driven, pilot.driven, near)
-        turns.append(bool(abs(stopped[0]) < abs(pilot.driven[0])))  # it may be on its way back
+        ahead = np.array([0.5, 0.0])  # at this moment the robot may be on its way back
+        turns.append(bool(pilot.emergency_stop.control(ahead, ahead, near)[0] < ahead[0]))
     if ticks == 9:  # the way it came, to let a mover pass
         route._retreat(pilot.pose)
     if pilot.relocated:
