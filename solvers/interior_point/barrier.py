@@ -67,7 +67,7 @@ LATE_MU = 1e-3  # the same: largest mu at which a violation is taken seriously
 AT_PENALTY = 0.9  # share of the penalty from which on a multiplier is at it
 SMALL_PULL = 1e-2  # share of the constraints' forces below which the objective's force counts for nothing
 MOST_RAISES = 6  # of penalties, tenfold each
-LEAST_PENALTY = 100.0  # times the sum of the slopes of the objective
+LEAST_PENALTY = 3.0  # times the largest slope of the objective
 WORTH = 0.25  # of the cost at the start: largest first mu
 FAR = 100.0  # from one: largest entry of a row that calls for other units
 SWEEPS = 8
@@ -296,10 +296,10 @@ def begin(address: int) -> None:
     if now.scaling == 1:
         _find_units(terms, constraint_jacobian, row_units, units, penalties, full)
         now.cost_unit = cost_unit(free, diagonal, hessian, gradient, units)
-        slopes = 0.0
+        pull = 0.0
         for column in free:
-            slopes += abs(gradient[column]) * units[column]
-        now.rho = max(now.rho * now.cost_unit, LEAST_PENALTY * slopes)
+            pull = max(pull, abs(gradient[column]) * units[column])
+        now.rho = max(now.rho * now.cost_unit, LEAST_PENALTY * pull)
         # No barrier need be worth as much as the cost.
         now.mu *= min(now.cost_unit, WORTH * abs(now.cost)) if now.cost != 0.0 else now.cost_unit
     largest = 0.0
