@@ -91,6 +91,23 @@ def test_large_constant_weight_keeps_an_active_multiplier_below_the_penalty() ->
     np.testing.assert_allclose(solution[x], [[0.0, 0.0]], atol=1e-3)
 
 
+def test_a_cost_of_rounding_at_the_start_is_no_measure() -> None:
+    """A guess on the reference costs nothing, or what rounding leaves."""
+    counts = []
+    for offset in (0.0, 1e-14):
+        graph = fg.Graph()
+        x, u = graph.variables("x", fg.Rn(2), 21), graph.variables("u", fg.Rn(2), 20)
+        graph.minimize(fg.prior, u, np.full(2, 0.5 + offset), name="effort")
+        graph.constrain(lambda a, u, b: b - a - 0.1 * u, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")
+        graph.constrain(lambda a: ((a - [0.5, 0.55]) ** 2).sum(axis=1, keepdims=True), x[1:], lower=0.04, name="disc")
+        graph.fix(x[0], np.zeros(2))
+        line = 0.05 * np.arange(21.0)
+        solution = InteriorPoint().solve(graph, {x: np.column_stack([line, line]), u: np.full((20, 2), 0.5)})
+        assert solution.converged
+        counts.append(solution.iterations)
+    assert abs(counts[0] - counts[1]) <= 2
+
+
 def test_augmented_lagrangian_takes_costs_without_squares() -> None:
     graph, guess = brachistochrone(20)
     expected = InteriorPoint().solve(graph, guess)

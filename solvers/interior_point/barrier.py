@@ -69,6 +69,7 @@ SMALL_PULL = 1e-2  # share of the constraints' forces below which the objective'
 MOST_RAISES = 6  # of penalties, tenfold each
 LEAST_PENALTY = 3.0  # times the largest slope of the objective
 WORTH = 0.25  # of the cost at the start: largest first mu
+NOTHING = 1e-3  # of the size of the cost: one that is only rounding
 FAR = 100.0  # from one: largest entry of a row that calls for other units
 SWEEPS = 8
 BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
@@ -300,8 +301,9 @@ def begin(address: int) -> None:
         for column in free:
             pull = max(pull, abs(gradient[column]) * units[column])
         now.rho = max(now.rho * now.cost_unit, LEAST_PENALTY * pull)
-        # No barrier need be worth as much as the cost.
-        now.mu *= min(now.cost_unit, WORTH * abs(now.cost)) if now.cost != 0.0 else now.cost_unit
+        # No barrier need be worth as much as the cost, unless there is none to speak of.
+        worth = WORTH * abs(now.cost)
+        now.mu *= worth if NOTHING * now.cost_unit < worth < now.cost_unit else now.cost_unit
     largest = 0.0
     for row in range(len(lower)):
         largest = max(largest, abs(multipliers[row]) * row_units[row])

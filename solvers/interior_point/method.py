@@ -53,10 +53,11 @@ class InteriorPoint(Solver):
     Attributes:
         max_iterations: Newton steps before giving up.
         hessian: "exact" (of the Lagrangian; Gauss-Newton where its inertia is wrong) or "gauss-newton".
-        barrier: first mu of a cold start; a start with multipliers finds its own.
-        penalty: first rho of the elastic variables; raised when constraints stay violated.
+        barrier: first mu of a cold start, times the size of the cost, at most a quarter of the cost there; a start with
+            multipliers finds its own.
+        penalty: first rho of the elastic variables, times the size of the cost; raised when constraints stay violated.
         scaling: measure rows and unknowns in units that make the largest entries of the constraint Jacobian near one,
-            where they are far from it, and penalties and mu in proportion to a large gradient. Inside only: tolerances
+            where they are far from it, and the cost in its size (:mod:`unifg.problem.units`). Inside only: tolerances
             and multipliers are those of the problem as stated.
         step_tolerance, violation_tolerance: stop rule on the norm of the full step and the largest violation, for
             control loops. A positive step_tolerance switches it on; it does not grant CONVERGED. An infinite one asks
