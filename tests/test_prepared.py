@@ -176,7 +176,7 @@ def test_no_tick_compiles_though_solves_fail(what: str, coupling: str) -> None:
     found = said(EPISODE, what, coupling)
     assert isinstance(found, list)
     emergencies, columns, *new = found
-    assert emergencies >= 3
+    assert emergencies >= 2
     assert new == [[], [], []] and columns == [0] * 16
 
 
