@@ -34,7 +34,7 @@ ROUNDING = 1e-14
 LEAST_SHARE = 0.125  # of the second derivatives, before they are left out
 WELL = 0.75  # of the predicted decrease: a step that brings less is corrected
 CORRECTIONS = 3  # at most, of one trial
-HARDLY_DAMPED = 1.0
+HARDLY_DAMPED = 1.0  # up to which a cost that is no square is damped before its second derivatives are left out
 STRAIGHT: Array = np.zeros(0)
 
 

@@ -47,10 +47,6 @@ class Slopes:
         """Take note of another point."""
         _raise(jacobian, gradient, self.jacobian, self.gradient)
 
-    def degenerate(self, lin: Linearization, multipliers: Array, tolerance: float) -> bool:
-        """Test whether multipliers are larger than constraints with a slope ever need; arguments as for `excess`."""
-        return self.excess(lin, multipliers, tolerance) > 0.0
-
     def excess(self, lin: Linearization, multipliers: Array, tolerance: float) -> float:
         """Sum of the multipliers where they are larger than constraints with a slope ever need; zero elsewhere.
 
