@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import largest
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.typing import Array, IntArray
@@ -104,11 +105,11 @@ def estimated(program: CompiledProblem, lin: Linearization, tolerance: float) ->
 
 
 @compiled
-def raise_slopes(jacobian: Array, gradient: Array, largest: Array, steepest: Array) -> None:
+def raise_slopes(jacobian: Array, gradient: Array, most: Array, steepest: Array) -> None:
     """Keep the numbers of larger magnitude; what is not finite does not count."""
     for k in range(len(jacobian)):
-        if abs(largest[k]) < abs(jacobian[k]) < np.inf:
-            largest[k] = jacobian[k]
+        if abs(most[k]) < abs(jacobian[k]) < np.inf:
+            most[k] = jacobian[k]
     for k in range(len(gradient)):
         if abs(steepest[k]) < abs(gradient[k]) < np.inf:
             steepest[k] = gradient[k]
@@ -117,11 +118,9 @@ def raise_slopes(jacobian: Array, gradient: Array, largest: Array, steepest: Arr
 @compiled
 def size_of(multipliers: Array, jacobian: Array, gradient: Array, free: IntArray, tolerance: float) -> float:
     """Sum of the multipliers times the largest slope of a row, over that of the cost."""
-    total, largest, steepest = 0.0, 0.0, tolerance
+    total, steepest = 0.0, tolerance
     for multiplier in multipliers:
         total += abs(multiplier)
-    for slope in jacobian:
-        largest = max(largest, abs(slope))
     for k in free:
         steepest = max(steepest, abs(gradient[k]))
-    return total * largest / steepest
+    return total * largest(jacobian, 0, len(jacobian)) / steepest
