@@ -106,7 +106,7 @@ class Binding:
         if data.keys() != slots.keys():
             self._take_defaults(data)
         flags = {handle: handle.check(data.get(handle, handle.value)) for handle in self._flags} if self._flags else {}
-        off = self._others or not all_unit(self._coming, self._quaternions)
+        off = self._others or (len(self._quaternions) > 0 and not all_unit(self._coming, self._quaternions))
         for what, handle, manifold, term in self._elements if off else ():
             mask = flags[term.active].astype(bool) if isinstance(term.active, Data) else term.active
             slots[handle][...] = nearest(what, manifold, slots[handle], mask, term.name)

@@ -118,6 +118,7 @@ class CompiledProblem:
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
         self.differenced = self.table.differenced or any(term.trace is None for term in self.scalar_terms)
         self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
+        self._general = [term for term in self.scalar_terms if term.kernel is None]  # that Python evaluates
         self.costs = Rows(self.table, self.cost_terms, True, self.size)
         self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
         self.systems = Systems(self.normal, self.blocks, self.constraints)
@@ -164,11 +165,6 @@ class CompiledProblem:
     def fully_compiled(self) -> bool:
         """True if a compiled loop can do without Python: every term a kernel, every loss and retraction compiled."""
         return not (self.batched or self._general or self.table.weighed) and self.retraction.compiled
-
-    @property
-    def _general(self) -> list[CompiledTerm]:
-        """Scalar costs that Python evaluates."""
-        return [term for term in self.scalar_terms if term.kernel is None]
 
     @property
     def hessian(self) -> Symmetric:
@@ -361,8 +357,8 @@ class CompiledProblem:
         """Leave a term that was traced to Python."""
         self.differenced = True
         self.table.give_up(term)
-        if term.kernel is None and not isinstance(term.term, ScalarCost):
-            self.batched.append(term)
+        if term.kernel is None:
+            (self._general if isinstance(term.term, ScalarCost) else self.batched).append(term)
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from unifg.modeling.variables import Family
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.typing import Array
@@ -56,6 +57,16 @@ class Snapshot(Linearization):
         """Made by :meth:`Memory.copied`."""
         self.cost = cost
         self._program, self._flat, self._parts = program, flat, parts
+
+    @property
+    def stored(self) -> Array:
+        """Stored values of all families."""
+        return self._flat[self._parts["values"]]
+
+    def of(self, family: Family) -> Array:
+        """(count, storage) values of one family, without a look at the others."""
+        part, shape = self._program.columns.place(family)
+        return self.stored[part].reshape(shape)
 
     def __getattr__(self, name: str) -> Any:
         """View an array, once."""

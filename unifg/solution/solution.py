@@ -197,11 +197,10 @@ class Solution:
 
     def __getitem__(self, variable: Variable | str) -> Array:
         """(n, storage) values of a family, by itself or by its name, or of a selection."""
-        values = self._lin.values
-        if isinstance(variable, Family) and variable in values:
-            return values[variable].copy()
+        if isinstance(variable, Family) and variable in self._program.columns.storage:
+            return self._lin.of(variable).copy()
         selection = self._selection(variable)
-        return values[selection.family][selection.indices][:, selection.storage].copy()
+        return self._lin.of(selection.family)[selection.indices][:, selection.storage].copy()
 
     def selections(self, term: str) -> list[Selection]:
         """Variable arguments of a term, in order; one of length 1 is shared by all factors.
@@ -258,12 +257,12 @@ class Solution:
         program = self._program
         stored, rows = program.once(Shifts)(families, by)
         penalties = self._penalties if self._penalties is program.no_penalties else self._penalties.take(rows)
-        arrays = self._lin.values.flat.take(stored), self._multipliers.take(rows), penalties
+        arrays = self._lin.stored.take(stored), self._multipliers.take(rows), penalties
         return Guess.stored(program, arrays)
 
     def flat(self, program: CompiledProblem) -> tuple[Array, Array, Array] | None:
         """Stored values, multipliers (M,) and penalties (M,) in one array each, if it is a solution of this program."""
-        return (self._lin.values.flat, self._multipliers, self._penalties) if self._program is program else None
+        return (self._lin.stored, self._multipliers, self._penalties) if self._program is program else None
 
     def covariance(self, *variables: Variable | str) -> Array:
         """(k, k) joint covariance of the selected variables, in their tangent spaces, in the order given.
@@ -463,7 +462,7 @@ class Solution:
                 )
             variable = self.families[variable]
         selection = as_selection(variable)
-        if selection.family not in self._lin.values:
+        if selection.family not in self._program.columns.storage:
             name = selection.family.name
             hint = ": that of another process has families of its own, by name in solution.families"
             raise GraphError(

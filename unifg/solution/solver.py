@@ -438,17 +438,9 @@ class SolveState:
         where a step or a few of them are all that was asked for: a step of a real-time iteration may raise every merit,
         and would never be taken from a feasible start.
         """
-        status = self.status or reason or Status.STALLED
-        if status is Status.STALLED and self.infeasible_stationary():
-            status = Status.LOCALLY_INFEASIBLE
-        if status is Status.LOCALLY_INFEASIBLE and self.has_been_feasible:
-            status = Status.STALLED
-        if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
-            self._move(within, self.multipliers)
-        returned = self._return_best(status)
-        earlier = status is Status.ITERATION_LIMIT and returned < self.iterations  # the multipliers of a barrier there
-        if (earlier or status in (Status.STALLED, Status.SINGULAR)) and self.optimality.violation <= self.tolerance:
-            self._estimate()
+        status, returned = self.status or reason or Status.STALLED, self.iterations
+        if status not in (Status.CONVERGED, Status.STOP_RULE) or not self.optimality.finite:
+            status, returned = self._without_success(status)
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
@@ -479,6 +471,20 @@ class SolveState:
         )
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
+
+    def _without_success(self, status: Status) -> tuple[Status, int]:
+        """Move to what is returned; returns the ending as it is known now, and the number of that iterate."""
+        if status is Status.STALLED and self.infeasible_stationary():
+            status = Status.LOCALLY_INFEASIBLE
+        if status is Status.LOCALLY_INFEASIBLE and self.has_been_feasible:
+            status = Status.STALLED
+        if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
+            self._move(within, self.multipliers)
+        returned = self._return_best(status)
+        earlier = status is Status.ITERATION_LIMIT and returned < self.iterations  # the multipliers of a barrier there
+        if (earlier or status in (Status.STALLED, Status.SINGULAR)) and self.optimality.violation <= self.tolerance:
+            self._estimate()
+        return status, returned
 
     def _excess(self) -> float:
         """Sum of multipliers that are larger than constraints with a slope ever need, zero elsewhere."""
