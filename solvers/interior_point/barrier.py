@@ -292,10 +292,12 @@ def begin(address: int) -> None:
                     sides[count].sign, sides[count].border = 1.0 - 2.0 * which, limit
                     count += 1
     now.sides, now.elastic = count, 0 if len(rows) else 1
-    now.cost_unit = 1.0
     if now.scaling == 1:
         _find_units(terms, constraint_jacobian, row_units, units, penalties, full)
-        now.cost_unit = cost_unit(free, diagonal, hessian, gradient, units)
+    size = cost_unit(free, diagonal, hessian, gradient, units)
+    now.cost_unit = 1.0
+    if now.scaling == 1:
+        now.cost_unit = size
         pull = 0.0
         for column in free:
             pull = max(pull, abs(gradient[column]) * units[column])
@@ -317,9 +319,13 @@ def begin(address: int) -> None:
             c = sides[k].sign * (constraints[sides[k].row] - sides[k].border)
             y = min(max(-sides[k].sign * multipliers[sides[k].row], 0.0), 0.9 * penalties[sides[k].row])
             sides[k].y, sides[k].s, sides[k].e = y, c, 0.0
-        run(links[0].measure, (address,))
-        error = max(max(now.stationarity, now.violation), now.complementarity)
-        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * min(1.0, now.size)
+        error = 0.0
+        for row in range(len(lower)):
+            error = max(error, max(constraints[row] - upper[row], lower[row] - constraints[row]))
+        if 0.1 * error < WARM_MU:  # else the other numbers make no difference
+            run(links[0].measure, (address,))
+            error = max(max(now.stationarity, now.violation), now.complementarity)
+        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * min(1.0, size)
     mu = now.mu
     for k in range(count):
         row = sides[k].row
