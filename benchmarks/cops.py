@@ -44,6 +44,7 @@ class Ours:
         solution = self._run.solve(self._guess)
         spent = time.thread_time() - begin
         self.status, self.iterations, self.cost = words(solution.status), solution.iterations, solution.cost
+        self.iterations += solution.restoration_steps
         return spent
 
 
@@ -115,8 +116,8 @@ def beside(rounds: int) -> str:
         f"{counts['IPOPT'][0]} of {len(PROBLEMS)}; to another optimum {counts['InteriorPoint'][1]} and "
         f"{counts['IPOPT'][1]}. Where both converge, InteriorPoint takes {mean(iterations)} of IPOPT's iterations and "
         f"{mean(times)} of its time. Tolerance {TOLERANCE:.0e}, median processor times of {rounds} interleaved solves; "
-        "IPOPT's functions run in CasADi's virtual machine. IPOPT's iterations include those of its restoration; the "
-        "one search for a point of least violation that InteriorPoint may begin where it is stuck is in its time only."
+        "IPOPT's functions run in CasADi's virtual machine. Iterations of both include those of their feasibility "
+        "restoration."
     )
     left = "\n".join(f"- {name}: {why}" for name, why in LEFT_OUT.items())
     return f"{said}\n\n{table(head, lines, 5)}\n\nLeft out of COPS 3.0:\n\n{left}"

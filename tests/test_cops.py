@@ -7,10 +7,10 @@ import pytest
 
 import unifg as fg
 from problems.control import Unicycle
-from problems.cops import PROBLEMS, Problem, brachistochrone
+from problems.cops import PROBLEMS, Problem, brachistochrone, electrons
 from problems.scaled import Units, scaled
 from unifg.problem.units import cost_unit
-from unifg.solvers import AugmentedLagrangian, InteriorPoint
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 
 NAMED = {problem.name: problem for problem in PROBLEMS}
 TIMES = ("robot", "steering", "brachistochrone, squared")
@@ -68,8 +68,8 @@ def test_finer_mesh_takes_no_more_iterations() -> None:
 def test_size_of_a_cost_is_a_mean_of_its_curvatures() -> None:
     free, places, ones = np.arange(3), np.arange(3), np.ones(3)
 
-    def size(hessian: list[float], gradient: list[float], units: Any = ones) -> float:
-        return float(cost_unit(free, places, np.array(hessian), np.array(gradient), units))
+    def size(hessian: list[float], gradient: list[float], units: Any = ones, rest: Any = ()) -> float:
+        return float(cost_unit(free, places, np.array(hessian), np.array(rest), np.array(gradient), units))
 
     assert size([1.0, 100.0, 0.0], [0.0, 0.0, 0.0]) == pytest.approx(10.0)
     assert size([1e-12, 1.0, 1.0], [0.0, 0.0, 0.0]) == pytest.approx(1e-4)  # a tiny regularisation
@@ -77,6 +77,7 @@ def test_size_of_a_cost_is_a_mean_of_its_curvatures() -> None:
     assert size([0.0, 0.0, 0.0], [0.0, -3.0, 1.0]) == pytest.approx(12.0**0.5)
     assert size([0.0, 0.0, 0.0], [0.0, 0.0, 0.0]) == 1.0
     assert size([1.0, 100.0, 0.0], [0.0, 0.0, 0.0], np.array([1.0, 0.1, 1.0])) == pytest.approx(1.0)
+    assert size([5.0, 100.0, 0.0], [0.0, 0.0, 0.0], rest=[-6.0, 0.0, 0.0]) == pytest.approx(10.0)
     assert size([3e200, 5e200, 4e200], [0.0, 0.0, 0.0]) == pytest.approx(60.0 ** (1 / 3) * 1e200)
 
 
@@ -133,3 +134,28 @@ def test_interior_point_names_an_equality_that_loses_its_slope(function: Any) ->
     graph.minimize(fg.prior, x, [-1.0])
     graph.constrain(function, x, lower=0.0, upper=0.0, name="flat")
     assert InteriorPoint().solve(graph, {x: [[1.0]]}).status is fg.Status.DEGENERATE
+
+
+def test_hessian_of_an_answer_is_that_of_gauss_newton() -> None:
+    """The loop does without the convex part of each factor where nothing needs it; an answer has it."""
+    graph, guess = electrons(6)
+    for callback in (None, lambda row: None):
+        found = InteriorPoint(tolerance=1e-8).solve(graph, guess, callback=callback)
+        fresh = found._program.linearize(found.values)
+        np.testing.assert_allclose(found._lin.hessian, fresh.hessian, atol=1e-10)
+        np.testing.assert_allclose(found._lin.concavity, fresh.concavity, atol=1e-10)
+        assert np.abs(fresh.concavity).max() > 0.1 and found.iterations <= 60
+
+
+def test_steps_of_restoration_are_counted() -> None:
+    """Two rows that contradict each other: the descent on the violation is no secret of the solver's."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [0.0, 0.0], sigma=1.0)
+    graph.constrain(lambda x: (x**2).sum(axis=1, keepdims=True), x, upper=1.0, name="near")
+    graph.constrain(lambda x: np.exp(x[:, :1]) - x[:, 1:], x, upper=-3.0, name="far")
+    for solver in (InteriorPoint(), SQP()):
+        found = solver.solve(graph, {x: [[3.0, 4.0]]})
+        assert found.status is fg.Status.LOCALLY_INFEASIBLE
+        assert found.restoration_steps > 0 and f"and {found.restoration_steps} steps of restoration" in found.report()
+    assert "restoration" not in InteriorPoint().solve(*electrons(6)).report()

@@ -69,7 +69,7 @@ def nearest(run: SolveState) -> tuple[Linearization, bool]:
     """End of the descent on the violation from the present iterate, and true if nothing near violates less."""
     found = within_bounds(run.program, run.lin)
     if not infeasible_stationary(run.program, found, run.tolerance):
-        found = least_violation(run.program, found, run.tolerance, lambda: run.out_of_time)
+        found = least_violation(run.program, found, run.tolerance, run.begin_restoration_step)
     while infeasible_stationary(run.program, found, run.tolerance):
         lower = _downhill(run, found)
         if lower is None:
@@ -103,7 +103,7 @@ def _downhill(run: SolveState, lin: Linearization) -> Linearization | None:
         start = program.linearize(values)
         if not start.finite or (k == 0 and not _squared(program, start) < (1.0 - LESS) * here):
             continue
-        found = least_violation(program, start, run.tolerance, lambda: run.out_of_time, convex=k > 0)
+        found = least_violation(program, start, run.tolerance, run.begin_restoration_step, convex=k > 0)
         if found.finite and _squared(program, found) < (1.0 - LESS) * here:
             return found
     return None
@@ -137,10 +137,10 @@ def least_violation(
     damping, size = FIRST_DAMPING, np.zeros(program.size)
     for _ in range(STEPS):
         outside = program.violation(lin.constraints)
-        if np.abs(outside).max(initial=0.0) <= tolerance or out_of_time():
+        if np.abs(outside).max(initial=0.0) <= tolerance:
             return lin
         model = ViolationModel(program, lin)
-        if model.stationary(tolerance):
+        if model.stationary(tolerance) or out_of_time():
             return lin
         size = np.maximum(size, model.size)
         while damping <= LARGEST_DAMPING:

@@ -135,8 +135,8 @@ def _split(c: float, rho: float, mu: float) -> tuple[float, float]:
 @linked
 def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
-    constraint_jacobian, constraints, diagonal = parts(address, "constraint_jacobian constraints diagonal")
-    free, full, gradient, hessian = parts(address, "free full gradient hessian")
+    concavity, constraint_jacobian, constraints = parts(address, "concavity constraint_jacobian constraints")
+    diagonal, free, full, gradient, hessian = parts(address, "diagonal free full gradient hessian")
     multipliers, pairs, penalties = parts(address, "multipliers pairs penalties")
     row_units, rows, scalars, sides, terms = parts(address, "row_units rows scalars sides terms")
     (units,) = parts(address, "units")
@@ -180,7 +180,7 @@ def measure(address: int) -> None:
             pz, nz = p * (penalties[row] - multipliers[row]), n * (penalties[row] + multipliers[row])
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
-    now.size = cost_unit(free, diagonal, hessian, gradient, units)
+    now.size = cost_unit(free, diagonal, hessian, concavity, gradient, units)
     scale = max(min(1.0, now.size), size / max(1, len(constraints)) / 100.0)  # no more than that of the KKT test
     now.scale, now.stationarity, now.violation = scale, stationarity / scale, violation
     now.complementarity, now.gap, now.least, now.most = complementarity / scale, gap, least, most
@@ -275,8 +275,8 @@ def _find_units(
 @linked
 def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
-    constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
-    diagonal, full, gradient, heights = parts(address, "diagonal full gradient heights")
+    concavity, constraint_jacobian, constraints = parts(address, "concavity constraint_jacobian constraints")
+    diagonal, free, full, gradient, heights = parts(address, "diagonal free full gradient heights")
     hessian, links = parts(address, "hessian links")
     multipliers, pairs, penalties, row_units = parts(address, "multipliers pairs penalties row_units")
     rows, scalars, sides, terms, units = parts(address, "rows scalars sides terms units")
@@ -294,7 +294,7 @@ def begin(address: int) -> None:
     now.sides, now.elastic = count, 0 if len(rows) else 1
     if now.scaling == 1:
         _find_units(terms, constraint_jacobian, row_units, units, penalties, full)
-    size = cost_unit(free, diagonal, hessian, gradient, units)
+    size = cost_unit(free, diagonal, hessian, concavity, gradient, units)
     now.cost_unit = 1.0
     if now.scaling == 1:
         now.cost_unit = size

@@ -35,6 +35,7 @@ from unifg.solvers.interior_point.state import (
     LINKS,
     MEASURED,
     MOVED,
+    NO,
     SHOW,
     TESTED,
     TRY,
@@ -103,7 +104,8 @@ def renew(address: int) -> None:
     )  # fmt: skip
     if len(heights):
         fill(concavity, 0.0)
-        arrays = terms, values, heights, gradient, hessian, concavity, scratch
+        # Where Gauss-Newton's Hessian is not used, its part of every factor need not be found.
+        arrays = terms, values, heights, gradient, hessian, concavity, scratch, scalars[0].definite != NO
         scalars[0].cost += number(links[0].add_scalars, arrays)
 
 
@@ -133,6 +135,15 @@ def reset(address: int) -> None:
     fill(units, 1.0)
     fill(steepest_gradient, 0.0)
     fill(steepest_jacobian, 0.0)
+
+
+@linked
+def split(address: int) -> None:
+    """Linearise at the present iterate with Gauss-Newton's Hessian, where the loop does without."""
+    links, scalars = parts(address, "links scalars")
+    known, scalars[0].definite = scalars[0].definite, UNKNOWN
+    run(links[0].renew, (address,))
+    scalars[0].definite = known
 
 
 @linked
@@ -241,7 +252,7 @@ def addresses() -> Records:
     links[0]["weigh"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *robust, kinds["hessian"])
     heights, added = kinds["heights"], (kinds["gradient"], kinds["hessian"], kinds["concavity"])
     links[0]["evaluate_scalars"] = link(evaluate_scalars, NUMBER, terms, values, heights, scratch)
-    links[0]["add_scalars"] = link(add_scalars, NUMBER, terms, values, heights, *added, scratch)
+    links[0]["add_scalars"] = link(add_scalars, NUMBER, terms, values, heights, *added, scratch, TRUTH)
     links[0]["retract"] = link(
         retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )
@@ -272,6 +283,7 @@ def addresses() -> Records:
         "loop": loop,
         "reset": reset,
         "conclude": conclude,
+        "split": split,
     }
     for name, function in functions.items():
         links[0][name] = link(function, NOTHING, ADDRESS)

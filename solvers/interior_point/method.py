@@ -348,6 +348,8 @@ class Workspace:
                 self.take(program.linearize(self._values()))
             assert self._taken is not None
             return self._taken
+        if self.now["definite"] == state.NO:
+            self.call("split")
         return self._answer.copied(self.now["cost"])
 
     def judged(self, lin: Linearization, multipliers: Array, tolerance: float) -> Optimality:

@@ -370,8 +370,8 @@ def _linearize(problem: Problem, work: Work) -> None:
     )  # fmt: skip
     if len(work.heights):
         work.concavity[:] = 0.0
-        added = terms, work.trial, work.heights, work.next_gradient, work.next_hessian, work.concavity, problem.scratch
-        now.next_cost += number(links[ADD_SCALARS], added)
+        added = work.heights, work.next_gradient, work.next_hessian, work.concavity, problem.scratch, True
+        now.next_cost += number(links[ADD_SCALARS], (terms, work.trial, *added))
 
 
 @compiled

@@ -208,7 +208,7 @@ def _problem(program: CompiledProblem, work: Work) -> Problem:
         ),
         link_like(
             add_scalars, NUMBER, terms, work.trial, work.heights, work.next_gradient, work.next_hessian, work.concavity,
-            scratch,
+            scratch, True,
         ),
     ]  # fmt: skip
     return Problem(

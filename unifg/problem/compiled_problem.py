@@ -478,7 +478,8 @@ class CompiledProblem:
         self, values: Values, found: Array, gradient: Array, hessian: Array, concavity: Array, rounding: Array
     ) -> float:
         """Add the slopes and second derivatives of costs that are no squares; return what they cost."""
-        cost = float(add_scalars(self.arrays, values.flat, found, gradient, hessian, concavity, self.scratch))
+        arrays = self.arrays, values.flat, found, gradient, hessian, concavity, self.scratch
+        cost = float(add_scalars(*arrays, True))
         if not (general := self._general):
             return cost
         began = perf_counter()

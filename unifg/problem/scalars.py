@@ -35,7 +35,7 @@ from unifg.problem.table import (
 from unifg.typing import Array
 
 SWEEPS = 50  # of rotations; ten are many
-ROUNDING = 1e-12  # of curvature, relative
+ROUNDING = 1e-14  # of curvature, relative
 
 
 @compiled
@@ -60,8 +60,9 @@ def evaluate_scalars(terms: TermArrays, values: Array, found: Array, scratch: Ar
 
 @compiled
 def add_scalars(
-    terms: TermArrays, values: Array, found: Array, gradient: Array, hessian: Array, concavity: Array, scratch: Array
-) -> float:
+    terms: TermArrays, values: Array, found: Array, gradient: Array, hessian: Array, concavity: Array, scratch: Array,
+    split: bool,
+) -> float:  # fmt: skip
     """The same, with slopes added to the gradient and second derivatives to the entries of the normal matrix.
 
     Args:
@@ -72,6 +73,7 @@ def add_scalars(
         hessian: takes what is positive.
         concavity: takes the rest.
         scratch: for the variables of a factor.
+        split: whether the two are told apart; else ``hessian`` takes all.
     """
     columns, positions, sizes = terms.columns, terms.positions, terms.sizes
     widest = 1
@@ -102,7 +104,8 @@ def add_scalars(
                     for e in range(width):
                         a, b = d if keep < 0 else sizes[keep + d], e if keep < 0 else sizes[keep + e]
                         B[d, e] = 0.5 * (S[a, b] + S[b, a])
-                positive_part(B, A, V, C)
+                if split:
+                    positive_part(B, A, V, C)
             call_residual(term[ADDRESS], v, p, table, r, J)
             total += r[0]
             for d in range(width):
@@ -113,8 +116,9 @@ def add_scalars(
                     if where != -1 and term[SECOND] != 0:
                         if where < 0:
                             where, times = -2 - where, 2.0
-                        hessian[where] += times * C[d, e]
-                        concavity[where] += times * (B[d, e] - C[d, e])
+                        convex = C[d, e] if split else B[d, e]
+                        hessian[where] += times * convex
+                        concavity[where] += times * (B[d, e] - convex)
     return total
 
 

@@ -15,8 +15,10 @@ SMALL_FORCES = 100.0  # times the cost: multipliers from which on it is they tha
 
 
 @compiled
-def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Array, units: Array) -> float:
-    """Geometric mean of the curvatures of the cost along the unknowns.
+def cost_unit(
+    free: IntArray, diagonal: IntArray, hessian: Array, concavity: Array, gradient: Array, units: Array
+) -> float:
+    """Geometric mean of the magnitudes of the curvatures of the cost along the unknowns.
 
     Where nothing is curved it is that of the largest slope and of the sum of all. Slopes far above curvatures count,
     too, and a mean far below the largest curvature does not. One where the cost has neither.
@@ -25,6 +27,7 @@ def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Arra
         free: (n,) columns that are unknown.
         diagonal: (n,) places of their curvatures among the entries of the Hessian.
         hessian: entries of that of Gauss-Newton.
+        concavity: what the second derivatives of scalar costs add to them; empty without such costs.
         gradient: (width,) of the cost.
         units: (width,) of the unknowns.
     """
@@ -33,7 +36,8 @@ def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Arra
         unit = units[free[k]]
         slope = abs(gradient[free[k]]) * unit
         pull, slopes = max(pull, slope), slopes + slope
-        curvature = hessian[diagonal[k]] * unit**2
+        curvature = abs(hessian[diagonal[k]] + (concavity[diagonal[k]] if len(concavity) else 0.0))
+        curvature *= unit**2
         if 0.0 < curvature < math.inf:
             steepest = max(steepest, curvature)
             product *= curvature

@@ -86,6 +86,7 @@ class Solution:
         rounding: by how much numerical differentiation may be wrong about the stationarity.
         finite: whether everything could be evaluated there.
         iterations: number of iterations taken.
+        restoration_steps: steps besides, of feasibility restoration: descents on the violation alone.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
         returned: number of the iteration that is returned; 0 for the guess. Not the last one where a limit, a stall or
@@ -98,6 +99,7 @@ class Solution:
     """
 
     in_python = 0.0
+    restoration_steps = 0
     checked = False
     mistraced: Mapping[str, str] = MappingProxyType({})
     picked = ""
@@ -404,9 +406,10 @@ class Solution:
             else f"stationarity {self.stationarity:.1e}, violation {self.violation:.1e}, "
             f"complementarity {self.complementarity:.1e}"
         )
+        besides = f" and {self.restoration_steps} steps of restoration" if self.restoration_steps else ""
         who = f"{self.solver} ({self.picked})" if self.picked else self.solver
         text = (
-            f"{who}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations in "
+            f"{who}: {self.status.value} Cost {self.cost:.6g} after {self.iterations} iterations{besides} in "
             f"{1e3 * self.seconds:.1f} ms; {kkt}."
         )
         if (fit := self.fit) is not None:

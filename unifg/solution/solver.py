@@ -216,6 +216,7 @@ class SolveState:
         status: None while the solve goes on.
         history: rows so far.
         iterations: so far.
+        restoration_steps: of descents on the violation alone so far.
         alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
         tolerance: of the KKT test.
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
@@ -243,7 +244,7 @@ class SolveState:
         self._values: Values | None
         self.lent: Factored | None = None
         self.slopes: Slopes | None = None
-        self.iterations = 0
+        self.iterations = self.restoration_steps = 0
         if solver.verbose:
             show(HEADER)
         self.values, self.multipliers, self.penalties = values, multipliers, program.no_penalties
@@ -427,6 +428,13 @@ class SolveState:
         _ = self.least_violated
         return self._least <= self.tolerance
 
+    def begin_restoration_step(self) -> bool:
+        """Count a step of feasibility restoration; returns whether there is no time for it."""
+        if self.out_of_time:
+            return True
+        self.restoration_steps += 1
+        return False
+
     def infeasible_stationary(self) -> bool:
         """Test whether no nearby point violates the constraints less, though they are violated."""
         return infeasible_stationary(self.program, self.lin, self.tolerance)
@@ -469,6 +477,7 @@ class SolveState:
             self._solver.name,
             returned,
         )
+        solution.restoration_steps = self.restoration_steps
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
 
