@@ -13,6 +13,7 @@ plan = loop.tick(measured={"position": z})
 from unifg.horizon.coupling import COUPLINGS, Coupling
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import History
+from unifg.horizon.multistart import cheapest
 from unifg.horizon.past import Arrival
 from unifg.horizon.receding_horizon import InitialGuesses, RecedingHorizon
 from unifg.horizon.robot import Constant, Robot
@@ -40,6 +41,7 @@ __all__ = [
     "Robot",
     "Term",
     "Window",
+    "cheapest",
 ]
 
 
