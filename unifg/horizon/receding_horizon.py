@@ -162,7 +162,6 @@ class RecedingHorizon:
             )
         self._lock = ReentrantLock()
         self.times = _node_times(times, steps, robot)
-        self._even = bool(np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0))
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
         between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
@@ -255,7 +254,7 @@ class RecedingHorizon:
         for name, value in seen.items():
             window.record(name, value)
         window.estimate(given)
-        return self._plan(window.now(given, last), begin)
+        return self._plan(replace(window.now(given, last), times=self.times), begin)
 
     def plan(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Plan:
         """Plan from a present state (storage,) that is estimated elsewhere.
@@ -315,7 +314,7 @@ class RecedingHorizon:
         )
         stated = {name: self._constant(name, value, known) for name, value in (constants or {}).items()}
         known = {name: values.copy() for name, values in known.items()} | stated
-        return Context(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
+        return Context(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history, self.times)
 
     def _constant(self, name: str, value: ArrayLike, known: Mapping[str, Array]) -> Array:
         """A value (count, storage) of a static."""
@@ -468,20 +467,43 @@ class RecedingHorizon:
         whole steps: by those that a tick is nearest to, on average over the horizon.
         """
         along = *self.tie.along, self.u
-        if self._even:
+        if np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0):
             return solution.shifted(*along)
         joint = len(self.x.family) > self.steps + 1
         whole = 1 if joint else round(self.steps * self.times[1] / self.times[-1])
-        moved, states, controls = solution.shifted(*along, by=whole), solution[self.x], solution[self.u]
-        later = np.minimum(self.times + self.times[1], self.times[-1])
-        step = np.minimum(np.searchsorted(self.times, later + 1e-9 * self.times[1], side="right") - 1, self.steps - 1)
-        share = (later - self.times[step]) / np.diff(self.times)[step]
+        moved = solution.shifted(*along, by=whole)
+        return self._resampled(moved, solution[self.x], solution[self.u], self.times + self.times[1])
+
+    def _resampled(self, guess: Guess, states: Array, controls: Array, at: Array) -> Guess:
+        """A guess with the states and controls of a plan on the nodes of now at other times (N + 1,)."""
+        at = np.minimum(at, self.times[-1])
+        step = np.minimum(np.searchsorted(self.times, at + 1e-9 * self.times[1], side="right") - 1, self.steps - 1)
+        share = (at - self.times[step]) / np.diff(self.times)[step]
         space = self.robot.state
         ahead = space.retract(states[step], share[:, None] * space.local(states[step], states[step + 1]))
-        nodes = moved.values[self.x.family].copy()
+        nodes = guess.values[self.x.family].copy()
         nodes[len(nodes) - self.steps - 1 :] = ahead
-        values = {**moved.values, self.x.family: nodes, self.u: controls[step[:-1]]}
-        return replace(moved, values=values)
+        return replace(guess, values={**guess.values, self.x.family: nodes, self.u: controls[step[:-1]]})
+
+    def set_times(self, times: ArrayLike) -> None:
+        """Move the nodes of the future, from the next tick on; nothing is compiled or analysed again.
+
+        The warm start is interpolated; the plan that is kept stays as it was planned. ``Dynamics`` without a step
+        follow; other terms find the times in ``now.times``.
+
+        Args:
+            times: (N + 1,) from the present on [s], as at the beginning: the first step is as long as a tick.
+
+        Raises:
+            GraphError: when they do not fit; everything is as it was.
+            BackendError: while another thread plans.
+        """
+        with self._alone():
+            found = _node_times(times, self.steps, self.robot)
+            if self.guess is not None:
+                states = self.guess.values[self.x.family][-self.steps - 1 :]
+                self.guess = self._resampled(self.guess, states, self.guess.values[self.u], found)
+            self.times = self.kept.times = found
 
     def _believe(self, solution: Solution, choice: Decision, now: Context[Any]) -> None:
         said = self.tie.believed(solution) if self._believable(solution, choice) else None
