@@ -476,14 +476,9 @@ class RecedingHorizon:
 
     def _resampled(self, guess: Guess, states: Array, controls: Array, at: Array) -> Guess:
         """A guess with the states and controls of a plan on the nodes of now at other times (N + 1,)."""
-        at = np.minimum(at, self.times[-1])
-        step = np.minimum(np.searchsorted(self.times, at + 1e-9 * self.times[1], side="right") - 1, self.steps - 1)
-        share = (at - self.times[step]) / np.diff(self.times)[step]
-        space = self.robot.state
-        ahead = space.retract(states[step], share[:, None] * space.local(states[step], states[step + 1]))
         nodes = guess.values[self.x.family].copy()
-        nodes[len(nodes) - self.steps - 1 :] = ahead
-        return replace(guess, values={**guess.values, self.x.family: nodes, self.u: controls[step[:-1]]})
+        nodes[len(nodes) - self.steps - 1 :], acting = self.robot.between(self.times, states, controls, at)
+        return replace(guess, values={**guess.values, self.x.family: nodes, self.u: acting})
 
     def set_times(self, times: ArrayLike) -> None:
         """Move the nodes of the future, from the next tick on; nothing is compiled or analysed again.
