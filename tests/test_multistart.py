@@ -207,6 +207,11 @@ def test_jumps_are_unusual_changes_with_consequences() -> None:
     assert not jumps({}, answer, answer) and not jumps({}, answer, answer)
     limits = [np.array([np.inf, place]) for place in (1.0, 1.0, 2.0)]
     assert [jumps({goal: limit}, answer, answer) for limit in limits] == [False, False, True]
+    seen = graph.data("seen", np.zeros(2, dtype=bool), each=True)
+    flags = [np.array([place, True]) for place in (False, False, True)]
+    nothing = graph.data("nothing", np.zeros((0, 2)), each=True)
+    found = [jumps({nothing: np.zeros((0, 2)), seen: flag, goal: [0, 0]}, answer, answer) for flag in flags]
+    assert found == [False, False, True]
 
 
 def winding(path: Array, point: Array) -> float:

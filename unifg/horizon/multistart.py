@@ -16,7 +16,7 @@ from unifg.errors import GraphError
 from unifg.modeling.variables import Data
 from unifg.solution.solution import AnyGuess, Solution
 from unifg.solution.solver import Prepared
-from unifg.typing import Array, ArrayLike, Numbers
+from unifg.typing import ArrayLike, Numbers
 
 FEASIBLE = 1e-4  # violation of an answer that counts as a plan
 LEAST_TIME = 1e-4  # [s] a solver is given however late it is
@@ -88,7 +88,7 @@ class Jumps:
 
     def clear(self) -> None:
         """Forget the data of earlier ticks."""
-        self._flat, self._usual = np.zeros(0), np.zeros(0)
+        self._flat, self._usual, self._starts = np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.intp)
 
     def __call__(self, data: Mapping[Data, ArrayLike], solution: Solution, last: Solution | None) -> bool:
         """Test whether a tick is worth more starts, and remember its data.
@@ -98,17 +98,19 @@ class Jumps:
             solution: from the warm start.
             last: of the tick before; None for none.
         """
-        parts = [np.ravel(value) for value in data.values()]
-        sizes = [part.size for part in parts if part.size]
-        flat: Array = np.concatenate(parts).astype(np.float64) if sizes else np.zeros(0)
+        flat = np.concatenate([*data.values()], axis=None, dtype=np.float64) if data else np.zeros(0)
         before, self._flat = self._flat, flat
-        if not len(flat) or len(before) != len(flat):
-            self._usual = np.full(len(sizes), np.inf)
+        if len(before) != len(flat):
+            sizes = [size for size in map(np.size, data.values()) if size]
+            self._starts, self._usual = np.cumsum([0, *sizes[:-1]]), np.full(len(sizes), np.inf)
             return False
-        apart = np.subtract(flat, before, out=np.zeros_like(flat), where=flat != before)  # infinite ones stay alike
-        change = np.maximum.reduceat(np.abs(apart), np.cumsum([0, *sizes[:-1]]))
-        usual = self._usual
-        self._usual = np.maximum(change, np.where(np.isfinite(usual), FADES * usual, 0.0))
+        usual, faded = self._usual, np.where(np.isfinite(self._usual), FADES * self._usual, 0.0)
+        if np.array_equal(flat, before):
+            self._usual = faded
+            return False
+        apart = np.subtract(flat, before, out=np.zeros(len(flat)), where=flat != before)  # infinite ones stay alike
+        change = np.maximum.reduceat(np.abs(apart), self._starts)
+        self._usual = np.maximum(change, faded)
         if last is None or not (change > FAR * usual).any():
             return False
         costs = solution.cost, solution.history[0].cost
