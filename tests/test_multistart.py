@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from benchmarks import moved_goals
 from unifg.horizon import Context, ControlCost, Dynamics, InitialGuesses, RecedingHorizon, Robot, Term, cheapest
 from unifg.horizon.multistart import Jumps
 from unifg.models.detours import detours, headed
@@ -259,13 +258,3 @@ def test_headings_follow_the_path() -> None:
 def test_clearance_of_the_shipped_model_agrees() -> None:
     pose = np.array([[0.3, 0.2, 0.1]])
     np.testing.assert_allclose(clear(pose, DISC, RADIUS), disc_clearance(pose, DISC, RADIUS), atol=1e-9)
-
-
-@pytest.mark.parametrize("seed", [102, 104])
-def test_a_moved_goal_among_discs_costs_no_more_than_with_twenty_starts(seed: int) -> None:
-    row = moved_goals.measure(moved_goals.Cell(seed))
-    assert row["warm, plan"] > 1.5 * row["best"] and row["loop, plan"] <= 1.02 * row["best"]
-    assert row["loop, drive"] <= 1.02 * row["20 starts, drive"] and not row["not solved"]
-    assert row["more"] < 16, "ordinary ticks try one start"
-    text = moved_goals.tables([row])
-    assert "| loop, 20 ms |" in text and "1 fields" in text
