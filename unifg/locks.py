@@ -24,7 +24,7 @@ class ReentrantLock(RLock):  # type: ignore[misc]
 
     def __enter__(self, blocking: bool = True, timeout: float = -1.0) -> bool:
         """Wait for other threads."""
-        super().__enter__(blocking, timeout)
+        self.acquire(blocking, timeout)
         self._depth += 1
         self._holder = get_ident()
         return True
@@ -34,7 +34,7 @@ class ReentrantLock(RLock):  # type: ignore[misc]
         self._depth -= 1
         if self._depth == 0:
             self._holder = 0
-        super().__exit__(*raised)
+        self.release()
 
     @property
     def mine(self) -> bool:

@@ -42,6 +42,7 @@ import numpy as np
 
 from unifg.codegen.function_pointers import linked, parts, run
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import largest
 from unifg.problem.evaluation import transposed_times
 from unifg.problem.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
 from unifg.problem.units import SMALL_FORCES, cost_unit, mean_force
@@ -219,10 +220,8 @@ def _far_from_one(terms: TermArrays, jacobian: Array) -> bool:
             continue
         width, entry = term[WIDTH], term[ENTRY]
         for _ in range(term[COUNT] * term[ROWS]):
-            largest = 0.0
-            for d in range(width):
-                largest = max(largest, abs(jacobian[entry + d]))
-            if not (FAR > largest > 1.0 / FAR or largest == 0.0):
+            size = largest(jacobian, entry, entry + width)
+            if not (FAR > size > 1.0 / FAR or size == 0.0):
                 return True
             entry += width
     return False
@@ -256,15 +255,15 @@ def _find_units(
             for i in range(term[COUNT]):
                 for a in range(m):
                     row = term[ROW] + i * m + a
-                    largest = 0.0
+                    most = 0.0
                     for d in range(width):
                         column = columns[term[COLUMN] + i * width + d]
                         if unknowns[column] >= 0:
                             size = 1.0 if term[KIND] == BOUND else abs(jacobian[entry + (i * m + a) * width + d])
                             size *= units[column] / row_units[row]
-                            largest = max(largest, size)
+                            most = max(most, size)
                             column_size[column] = max(column_size[column], size)
-                    row_size[row] = largest
+                    row_size[row] = most
         for row in range(len(row_size)):
             if 0.0 < row_size[row] < math.inf:
                 row_units[row] *= math.sqrt(row_size[row])
@@ -293,10 +292,12 @@ def begin(address: int) -> None:
                     sides[count].sign, sides[count].border = 1.0 - 2.0 * which, limit
                     count += 1
     now.sides, now.elastic = count, 0 if len(rows) else 1
-    now.cost_unit = 1.0
     if now.scaling == 1:
         _find_units(terms, constraint_jacobian, row_units, units, penalties, full)
-        now.cost_unit = cost_unit(free, diagonal, hessian, gradient, units)
+    size = cost_unit(free, diagonal, hessian, gradient, units)
+    now.cost_unit = 1.0
+    if now.scaling == 1:
+        now.cost_unit = size
         pull = 0.0
         for column in free:
             pull = max(pull, abs(gradient[column]) * units[column])
@@ -304,13 +305,13 @@ def begin(address: int) -> None:
         # No barrier need be worth as much as the cost, unless there is none to speak of.
         worth = WORTH * abs(now.cost)
         now.mu *= worth if NOTHING * now.cost_unit < worth < now.cost_unit else now.cost_unit
-    largest = 0.0
+    most = 0.0
     for row in range(len(lower)):
-        largest = max(largest, abs(multipliers[row]) * row_units[row])
-    warm = largest > 0.0
+        most = max(most, abs(multipliers[row]) * row_units[row])
+    warm = most > 0.0
     now.cold = 0 if warm else 1
-    if largest > 0.5 * now.rho:
-        now.rho = 10.0 * largest
+    if most > 0.5 * now.rho:
+        now.rho = 10.0 * most
     for row in range(len(lower)):
         penalties[row] = now.rho / row_units[row]
     if warm:
@@ -318,9 +319,13 @@ def begin(address: int) -> None:
             c = sides[k].sign * (constraints[sides[k].row] - sides[k].border)
             y = min(max(-sides[k].sign * multipliers[sides[k].row], 0.0), 0.9 * penalties[sides[k].row])
             sides[k].y, sides[k].s, sides[k].e = y, c, 0.0
-        run(links[0].measure, (address,))
-        error = max(max(now.stationarity, now.violation), now.complementarity)
-        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * min(1.0, now.size)
+        error = 0.0
+        for row in range(len(lower)):
+            error = max(error, max(constraints[row] - upper[row], lower[row] - constraints[row]))
+        if 0.1 * error < WARM_MU:  # else the other numbers make no difference
+            run(links[0].measure, (address,))
+            error = max(max(now.stationarity, now.violation), now.complementarity)
+        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * min(1.0, size)
     mu = now.mu
     for k in range(count):
         row = sides[k].row

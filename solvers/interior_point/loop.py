@@ -19,6 +19,8 @@ from unifg.problem.evaluation import LinearArrays
 from unifg.problem.hessian import add_curvature, add_losses
 from unifg.problem.retraction import retract_parts
 from unifg.problem.scalars import add_scalars, evaluate_scalars
+from unifg.solution.multipliers import raise_slopes, size_of
+from unifg.solution.optimality import kkt_numbers
 from unifg.solvers.interior_point import barrier, direction, filter_search
 from unifg.solvers.interior_point.state import (
     ACCEPTED,
@@ -36,6 +38,7 @@ from unifg.solvers.interior_point.state import (
     SHOW,
     TESTED,
     TRY,
+    UNKNOWN,
     Problem,
     Records,
     Work,
@@ -120,6 +123,34 @@ def bend(address: int) -> None:
 
 
 @linked
+def reset(address: int) -> None:
+    """Forget the last solve."""
+    row_units, scalars, units = parts(address, "row_units scalars units")
+    steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
+    now = scalars[0]
+    now.asked, now.iteration, now.kept, now.raises, now.definite = 0.0, 0, 0, 0, UNKNOWN
+    fill(row_units, 1.0)
+    fill(units, 1.0)
+    fill(steepest_gradient, 0.0)
+    fill(steepest_jacobian, 0.0)
+
+
+@linked
+def conclude(address: int) -> None:
+    """Judge the last iterate as every backend is judged."""
+    constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
+    full, gradient, kkt, links, multipliers = parts(address, "full gradient kkt links multipliers")
+    scalars, steepest_gradient, terms = parts(address, "scalars steepest_gradient terms")
+    (steepest_jacobian,) = parts(address, "steepest_jacobian")
+    now = scalars[0]
+    run(links[0].raise_slopes, (constraint_jacobian, gradient, steepest_jacobian, steepest_gradient))
+    arrays = multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
+    now.suspicion = number(links[0].size_of, arrays)
+    judged = terms, free, gradient, constraints, constraint_jacobian, multipliers, full, kkt
+    run(links[0].kkt_numbers, judged)
+
+
+@linked
 def loop(address: int) -> None:
     """Iterate from ``work.values``, which is moved, to one of the endings.
 
@@ -127,7 +158,9 @@ def loop(address: int) -> None:
     numbers if ``assisted``, to show every iterate if ``watched``, and before every direction, where the answer is to
     try it, if ``clocked``.
     """
-    links, scalars, trial, values = parts(address, "links scalars trial values")
+    constraint_jacobian, gradient, links, scalars = parts(address, "constraint_jacobian gradient links scalars")
+    steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
+    trial, values = parts(address, "trial values")
     now = scalars[0]
     python, watched, stage = now.assisted == 1, now.watched == 1, now.stage
     while True:
@@ -138,6 +171,9 @@ def loop(address: int) -> None:
             run(links[0].renew, (address,))
             stage = LINEARIZED
         if stage == LINEARIZED:
+            if now.going_on == 0:
+                arrays = constraint_jacobian, gradient, steepest_jacobian, steepest_gradient
+                run(links[0].raise_slopes, arrays)
             run(links[0].measure if now.going_on == 1 else links[0].begin, (address,))
             now.going_on, stage = 1, MEASURED
             if watched:
@@ -209,6 +245,12 @@ def addresses() -> Records:
     links[0]["retract"] = link(
         retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )
+    rows, gradient, free = kinds["constraint_jacobian"], kinds["gradient"], kinds["free"]
+    links[0]["kkt_numbers"] = link(
+        kkt_numbers, NOTHING, terms, free, gradient, constraints, rows, constraints, gradient, kinds["kkt"]
+    )
+    links[0]["raise_slopes"] = link(raise_slopes, NOTHING, rows, gradient, rows, gradient)
+    links[0]["size_of"] = link(size_of, NUMBER, constraints, rows, gradient, free, NUMBER)
     functions = {
         "begin": barrier.begin,
         "measure": barrier.measure,
@@ -228,6 +270,8 @@ def addresses() -> Records:
         "renew": renew,
         "bend": bend,
         "loop": loop,
+        "reset": reset,
+        "conclude": conclude,
     }
     for name, function in functions.items():
         links[0][name] = link(function, NOTHING, ADDRESS)

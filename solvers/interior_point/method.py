@@ -12,16 +12,18 @@ from typing import Any, Literal
 
 import numpy as np
 
-from unifg.codegen.buffers import Block
 from unifg.codegen.function_pointers import memory
 from unifg.errors import BackendError
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
+from unifg.problem.snapshot import Memory
 from unifg.problem.systems import stacked
 from unifg.problem.table import COST, COUNT, KIND, ROW, ROWS
 from unifg.solution.history import Iteration
+from unifg.solution.multipliers import SUSPICIOUS, Slopes
+from unifg.solution.optimality import Optimality, optimality, read_numbers
 from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
@@ -40,7 +42,6 @@ ENDINGS = {
     state.STOPPED: Status.STOP_RULE,
     state.TRY: Status.TIME_LIMIT,  # there was no time for the step
 }
-ANSWER = ("residual", "jacobian", "constraints", "constraint_jacobian", "gradient", "hessian")  # of `Work`
 NO_ANSWER = -1
 STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
 RESTARTS = 3  # from points that violate less than where the method came to a halt
@@ -125,7 +126,7 @@ class InteriorPoint(Solver):
         reached = run.values, run.multipliers, run.iterations
         run.values, run.multipliers = start, carried
         now = workspace.prepare(run, self, clocked=True)
-        now["assisted"], now["watched"], now["stage"] = not run.program.fully_compiled, 0, state.MOVED
+        now["watched"], now["stage"] = 0, state.MOVED
         while workspace.asks():
             self._note(run, workspace)
         run.values, run.multipliers, run.iterations = reached
@@ -167,13 +168,15 @@ class InteriorPoint(Solver):
     def _attempt(self, run: SolveState, workspace: Workspace) -> Status | None:
         """From where the workspace is to one of the endings."""
         program, work, now = run.program, workspace.work, workspace.now
-        now["assisted"], now["watched"], now["stage"] = not program.fully_compiled, not run.alone, state.LINEARIZED
+        assisted = now["assisted"]
+        now["watched"], now["stage"] = not run.alone, state.LINEARIZED
         if run.alone:
-            if program.fully_compiled:
+            if assisted:
+                workspace.take(program.linearize(program.columns.view(work.values.copy())))
+            elif len(program.fixed_rows()):
                 workspace.call("renew")
             else:
-                workspace.take(program.linearize(program.columns.view(work.values.copy())))
-            run.see(work.constraint_jacobian, work.gradient)
+                now["stage"] = state.MOVED
             run.look_at_fixed(work.constraints)
             if run.status is not None:
                 return None
@@ -202,11 +205,17 @@ class InteriorPoint(Solver):
             interrupted = True  # in compiled code Python learns of it when that is over
         ending = ENDINGS.get(now["answer"], Status.INTERRUPTED)
         if run.alone:
-            lin, iterations = workspace.found(), now["iteration"]
-            log = work.log[: iterations + 1].copy()
+            lin, multipliers, iterations = workspace.found(), work.multipliers.copy(), now["iteration"]
+            history = _history(work.log[: iterations + 1].copy(), lin, run.seconds)
+            workspace.call("conclude")
             if now["kept"] and now["violation"] > run.tolerance:
                 run.begin_at(program.linearize(program.columns.view(work.kept.copy())))
-            run.conclude(lin, work.multipliers.copy(), iterations, _history(log, lin.norms, run.seconds))
+            measured = workspace.judged(lin, multipliers, run.tolerance)
+            sound = ending is Status.STOP_RULE or measured.passes(run.tolerance)
+            slopes = None
+            if not sound or now["suspicion"] > SUSPICIOUS:
+                slopes = Slopes(program, work.steepest_jacobian, work.steepest_gradient)
+            run.conclude(lin, multipliers, iterations, history, measured, slopes)
             if interrupted:
                 run.status = ending if ending is Status.CONVERGED else Status.INTERRUPTED
         return ending
@@ -246,9 +255,9 @@ class Workspace:
             log=iterations + 2,
             data=len(plan.slots),
         )
-        self._answer = Block([len(getattr(self.work, name)) for name in ANSWER])
-        answer: dict[str, Any] = dict(zip(ANSWER, self._answer.arrays, strict=True))
-        self.work = self.work._replace(**answer)
+        self._answer = Memory(program)
+        arrays_of: dict[str, Any] = {name.replace("sizes", "norms"): a for name, a in self._answer.arrays.items()}
+        self.work = self.work._replace(**arrays_of)
         self.problem = Problem(
             np.zeros(1, state.LINKS),
             program.arrays,
@@ -311,15 +320,14 @@ class Workspace:
         work, now, self._taken = self.work, self.now, None
         # The test of least squares has no absolute tolerance.
         now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
-        now["asked"], now["scaling"] = 0.0, bool(options.scaling)
+        now["scaling"], now["assisted"] = bool(options.scaling), not self.program.fully_compiled
         now["step_tolerance"] = options.step_tolerance
         now["violation_tolerance"], now["clocked"] = (
             options.violation_tolerance,
             clocked or options.time_limit < np.inf,
         )
         now["keeping"] = max(run.tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
-        now["iteration"], now["kept"], now["raises"], now["definite"] = 0, 0, 0, state.UNKNOWN
-        work.row_units[:] = work.units[:] = 1.0
+        self.call("reset")
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
         self.begin_at(run.values.flat, options)
         work.multipliers[:] = run.multipliers
@@ -335,28 +343,18 @@ class Workspace:
     def found(self) -> Linearization:
         """The linearisation at the present iterate."""
         program, work = self.program, self.work
-        if not program.fully_compiled:
+        if self.now["assisted"]:
             if self._taken is None or not np.array_equal(self._taken.values.flat, work.values):
                 self.take(program.linearize(self._values()))
             assert self._taken is not None
             return self._taken
-        residual, jacobian, constraints, rows, gradient, hessian = self._answer.copied()
-        return Linearization(
-            self._values(),
-            self.now["cost"],
-            residual,
-            jacobian,
-            constraints,
-            rows,
-            gradient,
-            hessian,
-            program.norms(work.norms, work.heights),
-            work.weights.copy(),
-            work.concavity.copy(),
-            work.squares.copy(),
-            program.by_scalar(work.heights.copy()),
-            np.zeros(program.columns.width if program.scalar_terms else 0),
-        )
+        return self._answer.copied(self.now["cost"])
+
+    def judged(self, lin: Linearization, multipliers: Array, tolerance: float) -> Optimality:
+        """KKT numbers at the last iterate, which compiled code has found unless it does not know them all."""
+        if self.program.differenced:
+            return optimality(self.program, lin, multipliers, tolerance)
+        return read_numbers(self.work.kkt, lin.cost)
 
     def take(self, lin: Linearization) -> None:
         """Copy a linearisation to where the compiled functions look for it."""
@@ -372,7 +370,7 @@ class Workspace:
         return self.program.columns.view(self.work.values.copy())
 
 
-def _history(log: Array, norms: dict[str, float], seconds: float) -> Callable[[], list[Iteration]]:
+def _history(log: Array, lin: Linearization, seconds: float) -> Callable[[], list[Iteration]]:
     """Rows of the compiled loop, made when somebody asks for them; nobody took the time of single iterations."""
 
     def rows() -> list[Iteration]:
@@ -381,7 +379,7 @@ def _history(log: Array, norms: dict[str, float], seconds: float) -> Callable[[]
             cost, stationarity, violation, complementarity, step, length, *details = row
             kkt = stationarity, violation, complementarity
             taken, terms = (seconds, _details(*details)) if number else (0.0, {})
-            own = norms if number == last else {}
+            own = lin.norms if number == last else {}
             made.append(Iteration(number, cost, *kkt, step, length, taken, own, terms))
         return made
 

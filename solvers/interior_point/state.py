@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from unifg.elimination.plan import Plan
 from unifg.problem.table import TermArrays
+from unifg.solution.optimality import NUMBERS
 from unifg.typing import Array, IntArray
 
 Records: TypeAlias = NDArray[np.void]
@@ -51,6 +52,7 @@ NOW = np.dtype(
         ("size", np.float64),  # of the objective at the present iterate
         ("step_tolerance", np.float64),  # norm of a full step below which to stop, once the violation is small enough
         ("violation_tolerance", np.float64),
+        ("suspicion", np.float64),  # size of the multipliers, as :mod:`unifg.solution.multipliers` has it
         ("keeping", np.float64),  # violation up to which an iterate counts as one that keeps all constraints
         ("answer", np.int64),  # of the last call, one of the words below
         ("sides", np.int64),  # how many there are
@@ -111,7 +113,7 @@ PAIR = np.dtype(
 # Addresses of compiled functions.
 FUNCTIONS = "factor solve linearize evaluate curve weigh add_scalars evaluate_scalars retract"
 FUNCTIONS += " begin measure test bend direct assemble examine estimate steer advance judge correct restore accept"
-FUNCTIONS += " relax increase_penalty renew loop"
+FUNCTIONS += " relax increase_penalty renew loop reset conclude kkt_numbers raise_slopes size_of"
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
 # What a call answers.
@@ -177,7 +179,9 @@ class Work(NamedTuple):
         squares, weights: of robust factors, as in a linearisation.
         heights: (K,) values of all scalar costs.
         concavity: as in a linearisation, empty without scalar costs.
-        norms: of the terms; not used, but written.
+        norms: of the terms.
+        steepest_jacobian, steepest_gradient: largest derivatives at starts and at the answer.
+        kkt: numbers at the answer, as the outside judge has them.
         multipliers: (M,) of the rows, positive at an upper limit.
         rests: (M,) residuals of equality rows, with corrections.
         row_weights, row_terms: (M,) what the sides of a row add to the Hessian and to the gradient.
@@ -218,6 +222,9 @@ class Work(NamedTuple):
     heights: Annotated[Array, "general"]
     concavity: Annotated[Array, "concave"]
     norms: Annotated[Array, "terms"]
+    steepest_jacobian: Annotated[Array, "row_entries"]
+    steepest_gradient: Annotated[Array, "width"]
+    kkt: Annotated[Array, NUMBERS]
     multipliers: Annotated[Array, "rows"]
     rests: Annotated[Array, "rows"]
     row_weights: Annotated[Array, "rows"]

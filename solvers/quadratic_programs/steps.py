@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from unifg.codegen.buffers import Block
 from unifg.codegen.function_pointers import NOTHING, NUMBER, link_like
 from unifg.problem import evaluation
 from unifg.problem.columns import Values
@@ -15,6 +14,7 @@ from unifg.problem.compiled_problem import WORTH, CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.retraction import retract_parts
 from unifg.problem.scalars import add_scalars, evaluate_scalars
+from unifg.problem.snapshot import Memory
 from unifg.solvers.globalize.merit import FARTHEST
 from unifg.solvers.interior_point.state import Fields
 from unifg.solvers.quadratic_programs.attempt import (
@@ -37,7 +37,16 @@ from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.subproblem import QPAnswer
 from unifg.typing import Array
 
-REACHED = ("residual", "jacobian", "next_constraints", "next_jacobian", "next_gradient", "next_hessian")
+REACHED = {
+    "values": "trial",
+    "constraints": "next_constraints",
+    "constraint_jacobian": "next_jacobian",
+    "gradient": "next_gradient",
+    "hessian": "next_hessian",
+    "weights": "next_weights",
+    "sizes": "norms",
+}
+"""Names in :class:`Work` of arrays of the linearisation where a step ends; others are called the same there."""
 
 
 class Steps:
@@ -58,8 +67,8 @@ class Steps:
         self._reached: Linearization | None = None
         self._moved: Values | None = None
         self.work = _empty(program)
-        self._answer = Block([len(getattr(self.work, name)) for name in REACHED])
-        arrays: dict[str, Any] = dict(zip(REACHED, self._answer.arrays, strict=True))
+        self._answer = Memory(program)
+        arrays: dict[str, Any] = {REACHED.get(name, name): array for name, array in self._answer.arrays.items()}
         self.work = self.work._replace(**arrays)
         self.now = Fields(self.work.scalars)
         self._problem = _problem(program, self.work)
@@ -139,25 +148,8 @@ class Steps:
 
     def reached(self) -> Linearization:
         """The linearisation where the step ends."""
-        work, program = self.work, self.program
         if not self._assisted:
-            residual, jacobian, constraints, rows, gradient, hessian = self._answer.copied()
-            self._reached = Linearization(
-                program.columns.view(work.trial.copy()),
-                self.now["next_cost"],
-                residual,
-                jacobian,
-                constraints,
-                rows,
-                gradient,
-                hessian,
-                program.norms(work.norms, work.heights),
-                work.next_weights.copy(),
-                work.concavity.copy(),
-                work.squares.copy(),
-                program.by_scalar(work.heights.copy()),
-                np.zeros(program.columns.width if program.scalar_terms else 0),
-            )
+            self._reached = self._answer.copied(self.now["next_cost"])
         assert self._reached is not None
         return self._reached
 

@@ -8,7 +8,7 @@ refer to it, too, so that the memory is free when the lease is gone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import accumulate, pairwise
+from itertools import accumulate
 from weakref import ReferenceType, ref
 
 import numpy as np
@@ -44,23 +44,3 @@ class Buffers:
     def __reduce__(self) -> tuple[type[Buffers], tuple[tuple[int, ...]]]:
         """Pickle the sizes alone."""
         return Buffers, (self._sizes,)
-
-
-class Block:
-    """Arrays that stand side by side in memory, so that one copy is a copy of all.
-
-    Attributes:
-        arrays: of the sizes asked for, all zero at first.
-    """
-
-    def __init__(self, sizes: Sequence[int]) -> None:
-        """Make room."""
-        ends = list(accumulate(sizes, initial=0))
-        self._parts = [slice(*part) for part in pairwise(ends)]
-        self._flat = np.zeros(ends[-1])
-        self.arrays = [self._flat[part] for part in self._parts]
-
-    def copied(self) -> list[Array]:
-        """Copies of the arrays."""
-        flat = self._flat.copy()
-        return [flat[part] for part in self._parts]

@@ -25,7 +25,7 @@ from unifg.lie.elementwise import over_one
 from unifg.lie.manifold import CompiledGroup
 from unifg.lie.series import TINY, c_value, k_slope, k_value, x_cot_x
 from unifg.lie.so2 import wrap
-from unifg.typing import Array, ArrayLike, BoolArray
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 Order: TypeAlias = Literal["wxyz", "xyzw"]
 UNIT = 1e-9  # how far the norm of a valid quaternion may be from 1
@@ -250,6 +250,16 @@ def bend(d: Array, v: Array, out: Array) -> None:
 def normalise(x: Array, out: Array) -> None:
     """Bring a quaternion of any length to unit norm and w >= 0; one without direction gives NaN."""
     write(x[0], x[1], x[2], x[3], out, 0)
+
+
+@compiled
+def all_unit(numbers: Array, starts: IntArray) -> bool:
+    """Test whether all quaternions that start at some places have norm 1 to within 1e-9."""
+    for k in starts:
+        size = math.sqrt(numbers[k] ** 2 + numbers[k + 1] ** 2 + numbers[k + 2] ** 2 + numbers[k + 3] ** 2)
+        if not abs(size - 1.0) < UNIT:
+            return False
+    return True
 
 
 @compiled

@@ -12,7 +12,8 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
-from unifg.modeling.elements import elements_of, nearest, particular
+from unifg.lie.so3 import all_unit
+from unifg.modeling.elements import elements_of, nearest, particular, quaternions_of
 from unifg.modeling.terms import Term
 from unifg.modeling.variables import Data
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
@@ -27,6 +28,8 @@ class Binding:
         present: the value of every datum, an array that keeps its place.
     """
 
+    _others = False  # whether there are elements of manifolds with other conditions than a norm
+
     def __init__(self, known: Mapping[str, Data], used: Iterable[Data], terms: Sequence[Term] = ()) -> None:
         """Make room.
 
@@ -35,7 +38,7 @@ class Binding:
             used: those a program reads.
             terms: that read them; what stands for elements of a manifold there is looked at as such.
         """
-        self._elements = [
+        elements = [
             (f"term '{term.name}': argument {place} of {term.residual.name}", argument, manifold, term)
             for term in terms
             for place, manifold in elements_of(term.residual).items()
@@ -50,6 +53,13 @@ class Binding:
         self._flat, self._coming = np.empty(self._starts[-1]), np.empty(self._starts[-1])
         self._slots = dict(zip(self._numbers, self._views(self._coming), strict=True))
         self.present = dict(zip(self._numbers, self._views(self._flat), strict=True))
+        # Compiled code tests quaternions, and all are looked at where one is not of norm 1.
+        starts, self._elements = [np.zeros(0, dtype=np.int64)], elements
+        for _, handle, manifold, _ in elements:
+            found, own = quaternions_of(manifold), self.place(handle).reshape(-1, manifold.storage)
+            starts += [own[:, start] for start in found or ()]
+            self._others = self._others or found is None
+        self._quaternions = np.concatenate(starts)
         self.present.update({handle: np.empty_like(handle.value) for handle in self._flags})
         self._changed = np.zeros(len(self._numbers), dtype=np.bool_)
         self._all = True
@@ -78,7 +88,7 @@ class Binding:
         )
         self._parameters = parameters
 
-    def take(self, data: Mapping[Data, ArrayLike]) -> list[Data]:
+    def take(self, data: Mapping[Data, ArrayLike]) -> Sequence[Data]:
         """Take new values, defaults for what is not named, and say what is not as it was.
 
         Raises:
@@ -89,20 +99,15 @@ class Binding:
             slot = slots.get(handle)
             if slot is None:
                 self._require(handle, value)
-            elif type(value) is np.ndarray and value.dtype == FLOAT64 and value.shape == handle.value.shape:
+            elif type(value) is np.ndarray and value.shape == slot.shape and value.dtype == FLOAT64:
                 slot[...] = value
             else:
                 slot[...] = handle.check(value)
-        for handle, slot in slots.items():
-            if handle not in data:
-                if handle.value.shape != slot.shape:
-                    raise GraphError(
-                        f"data '{handle.name}' has a default of shape {handle.value.shape} now, but the graph was "
-                        f"compiled for {slot.shape}: declare new data"
-                    )
-                slot[...] = handle.value
-        flags = {handle: handle.check(data.get(handle, handle.value)) for handle in self._flags}
-        for what, handle, manifold, term in self._elements:
+        if data.keys() != slots.keys():
+            self._take_defaults(data)
+        flags = {handle: handle.check(data.get(handle, handle.value)) for handle in self._flags} if self._flags else {}
+        off = self._others or (len(self._quaternions) > 0 and not all_unit(self._coming, self._quaternions))
+        for what, handle, manifold, term in self._elements if off else ():
             mask = flags[term.active].astype(bool) if isinstance(term.active, Data) else term.active
             slots[handle][...] = nearest(what, manifold, slots[handle], mask, term.name)
         count = _renew(
@@ -110,14 +115,27 @@ class Binding:
         )
         if count < 0:
             self._numbers[-1 - count].check(slots[self._numbers[-1 - count]])
-        changed = [h for h, new in zip(self._numbers, self._changed.tolist(), strict=True) if new] if count else []
+        changed = self._numbers
+        if count < len(changed):
+            changed = [h for h, new in zip(changed, self._changed.tolist(), strict=True) if new] if count else []
         for handle, array in flags.items():
             if not np.array_equal(array, self.present[handle]):
                 self.present[handle][...] = array
-                changed.append(handle)
+                changed = [*changed, handle]
         if self._all:
             self._all, changed = False, [*self._numbers, *self._flags]
         return changed
+
+    def _take_defaults(self, data: Mapping[Data, ArrayLike]) -> None:
+        """Take the defaults of what is not named."""
+        for handle, slot in self._slots.items():
+            if handle not in data:
+                if handle.value.shape != slot.shape:
+                    raise GraphError(
+                        f"data '{handle.name}' has a default of shape {handle.value.shape} now, but the graph was "
+                        f"compiled for {slot.shape}: declare new data"
+                    )
+                slot[...] = handle.value
 
     def forget(self) -> None:
         """Count everything as changed next time, as after a value that a term has refused."""

@@ -39,6 +39,10 @@ class Branches:
         self._outcomes = np.empty(max((count for *_, count in watched), default=0))
         self._seen = np.zeros(REMEMBERED * len(watched), dtype=np.uint64)
 
+    def __bool__(self) -> bool:
+        """Test whether there are comparisons."""
+        return len(self._watched) > 0
+
     def new(self, values: Values, verified: bool) -> bool:
         """Test whether the comparisons of a factor come out as those of no factor did at a verified answer.
 
@@ -46,8 +50,6 @@ class Branches:
             values: an answer.
             verified: whether its outcomes are to be remembered.
         """
-        if not len(self._watched):
-            return False
         table, arrays = self._table, self._table.arrays
         return _new_outcomes(
             table.fields, self._watched, arrays.gather, arrays.sizes, arrays.parameters, arrays.active,

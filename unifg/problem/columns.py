@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from math import prod
 from operator import is_
 
 import numpy as np
@@ -70,8 +69,7 @@ class Columns:
             self.offsets[family], self.storage[family] = self.width, self.stored
             self.width += family.count * family.manifold.dim
             self.stored += family.count * family.manifold.storage
-        sizes = {family: (family.count, family.manifold.storage) for family in families}
-        self.parts = [(f, slice(first, first + prod(sizes[f])), sizes[f]) for f, first in self.storage.items()]
+        self.parts = [(family, *self.place(family)) for family in families]
         is_free = np.ones(self.width, dtype=bool)
         self.fixed: dict[str, IntArray] = {}
         for fix in fixes:
@@ -141,6 +139,11 @@ class Columns:
         variable = np.repeat(np.arange(len(sizes)), sizes)
         free = np.bincount(variable[self.free], minlength=len(sizes))
         return variable, np.concatenate([[0], np.cumsum(free)])
+
+    def place(self, family: Family) -> tuple[slice, tuple[int, int]]:
+        """Place of a family among the stored values, and its shape (count, storage)."""
+        first, shape = self.storage[family], (family.count, family.manifold.storage)
+        return slice(first, first + shape[0] * shape[1]), shape
 
     def all_fixed(self, family: Family) -> bool:
         """Test whether nothing of the family is unknown."""

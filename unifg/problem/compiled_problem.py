@@ -87,6 +87,8 @@ class CompiledProblem:
         buffers: memory for linearisations.
         soft: slack variables of soft constraints, by their names.
         verifications: of the traced terms, once a guess has been read.
+        demanding: those of functions that assert something.
+        no_penalties: (M,) zeros, of backends without penalties.
         workspaces: of single solves: backend, options, memory.
         turn: held by who binds data, until nobody needs them any more, and while anything is evaluated.
     """
@@ -116,6 +118,7 @@ class CompiledProblem:
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
         self.differenced = self.table.differenced or any(term.trace is None for term in self.scalar_terms)
         self.batched = [term for term in stacked if term.kernel is None and not term.is_bound]
+        self._general = [term for term in self.scalar_terms if term.kernel is None]  # that Python evaluates
         self.costs = Rows(self.table, self.cost_terms, True, self.size)
         self.constraints = Rows(self.table, self.constraint_terms, False, self.size)
         self.systems = Systems(self.normal, self.blocks, self.constraints)
@@ -133,10 +136,13 @@ class CompiledProblem:
         self._read = GuessReader(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
+        self.no_penalties = np.zeros(self.constraints.count)
+        self.no_penalties.flags.writeable = False
         self._shares: Shares | None = None
         self.buffers = Buffers([*self.table.sizes, self.columns.width, self.normal.nnz])
         self._watched: list[CompiledTerm] = []
         self.verifications: list[Verification] = []
+        self.demanding: list[Verification] = []
         self._watching, self._branches = False, Branches(self.table, (), self.scratch)
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
@@ -161,11 +167,6 @@ class CompiledProblem:
         return not (self.batched or self._general or self.table.weighed) and self.retraction.compiled
 
     @property
-    def _general(self) -> list[CompiledTerm]:
-        """Scalar costs that Python evaluates."""
-        return [term for term in self.scalar_terms if term.kernel is None]
-
-    @property
     def hessian(self) -> Symmetric:
         """Pattern of the Gauss-Newton Hessian of the objective alone."""
         return self._objective[0]
@@ -184,24 +185,28 @@ class CompiledProblem:
             GraphError: on unknown data, a changed shape, NaN, or crossed limits.
         """
         changed = self._binding.take(data)
-        if not changed:
-            return
-        readers = [self._readers[handle] for handle in changed]
-        for term in [term for reader in readers for term in reader.told]:
-            term.forget()
-        if rebound := list(dict.fromkeys(term for reader in readers for term in reader.bound)):
-            try:
-                for term in rebound:
-                    term.bind(self._binding.present)
-                if any(isinstance(term.term, Constraint) for term in rebound):
-                    self._bind_limits()
-            except GraphError:
-                self._binding.forget()
-                raise
-            self.table.bind(rebound, self.lower, self.upper)
-        for handle, reader in zip(changed, readers, strict=True):
+        for handle in changed:
+            reader = self._readers[handle]
+            for term in reader.told:
+                term.forget()
             for fix in reader.fixes:
                 self.retraction.bind(fix, self._binding.present[handle])
+        if self._rebinding:
+            self._rebind([term for handle in changed for term in self._readers[handle].bound])
+
+    def _rebind(self, terms: Sequence[CompiledTerm]) -> None:
+        """Work out anew what terms make of their data."""
+        rebound = list(dict.fromkeys(terms))
+        try:
+            for term in rebound:
+                term.bind(self._binding.present)
+            if any(isinstance(term.term, Constraint) for term in rebound):
+                self._bind_limits()
+        except GraphError:
+            self._binding.forget()
+            raise
+        if rebound:
+            self.table.bind(rebound, self.lower, self.upper)
 
     def _bind_first(self) -> None:
         """Take the defaults, and find out what has to be done when a datum changes."""
@@ -224,6 +229,7 @@ class CompiledProblem:
                 for place in places or ():
                     sources.append(np.broadcast_to(binding.place(handle).reshape(-1, place.shape[1]), place.shape))
                     targets.append(int(term.place[PARAMETER]) + place)
+        self._rebinding = any(reader.bound for reader in self._readers.values())
         binding.carry(sources, targets, self.arrays.parameters)
         for k, fix in enumerate(fixes):
             value = binding.present[fix.value] if isinstance(fix.value, Data) else np.asarray(fix.value)
@@ -242,8 +248,8 @@ class CompiledProblem:
             raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
         self.equality = self.lower == self.upper
 
-    def values_from(self, guess: Mapping[Family, ArrayLike]) -> Values:
-        """Copy and check a guess, and give fixed variables their values.
+    def values_from(self, guess: Mapping[Family, ArrayLike] | Array) -> Values:
+        """Copy and check a guess, by families or as it is stored, and give fixed variables their values.
 
         Raises:
             GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
@@ -326,7 +332,7 @@ class CompiledProblem:
             Exception: of a function whose assertion fails.
         """
         with np.errstate(all="ignore"):
-            return any([verification.broken(values) for verification in self.verifications])
+            return any([verification.broken(values) for verification in self.demanding])
 
     def watch_conditions(self) -> None:
         """Compile the comparisons of traces, for :meth:`new_branches` in a loop."""
@@ -335,7 +341,7 @@ class CompiledProblem:
 
     def new_branches(self, values: Values, verified: bool) -> bool:
         """Test whether comparisons in watched traces come out as at no verified answer; ``verified``: this is one."""
-        return self._branches.new(values, verified)
+        return bool(self._branches) and self._branches.new(values, verified)
 
     def renew_verifications(self) -> None:
         """Keep what verifies the present traces."""
@@ -343,6 +349,7 @@ class CompiledProblem:
         self.verifications = [
             kept.get((term, term.trace.kernel)) or Verification(term) for term in self.terms if term.trace is not None
         ]
+        self.demanding = [known for known in self.verifications if known.demanding]
         if self._watching:
             self._branches = Branches(self.table, [known.term for known in self.verifications], self.scratch)
 
@@ -350,8 +357,8 @@ class CompiledProblem:
         """Leave a term that was traced to Python."""
         self.differenced = True
         self.table.give_up(term)
-        if term.kernel is None and not isinstance(term.term, ScalarCost):
-            self.batched.append(term)
+        if term.kernel is None:
+            (self._general if isinstance(term.term, ScalarCost) else self.batched).append(term)
 
     def retract(self, values: Values, step: Array) -> Values:
         """Move the unknowns by a tangent step; fixed variables stay."""

@@ -14,7 +14,7 @@ from numba import float64, int32, int64, uint8
 
 from unifg.codegen.calls import call_residual, matrix, vector, vector_at
 from unifg.codegen.jit import compiled, inlined
-from unifg.codegen.vectors import Address, address
+from unifg.codegen.vectors import Address, address, lane, load, plus, splat
 from unifg.codegen.waiting import first_chunk, next_chunk, wait_for
 from unifg.codegen.work_queue import arguments_at, arrays, bundle
 from unifg.factors.robust import value_of, weight_of
@@ -444,33 +444,48 @@ def times(
             continue
         m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
         for _ in range(term[COUNT]):
-            for _ in range(m):
-                total = 0.0
-                for d in range(width):
-                    unknown = unknowns[columns[column + d]]
-                    if unknown >= 0:
-                        total += entries[entry + d] * other[unknown]
-                out[row] = total
-                entry += width
-                row += 1
+            for a in range(row, row + m):
+                out[a] = 0.0
+            for d in range(width):  # a sum waits for itself: those of all rows go on together
+                unknown = unknowns[columns[column + d]]
+                if unknown >= 0:
+                    at = entry + d
+                    for a in range(row, row + m):
+                        out[a] += entries[at] * other[unknown]
+                        at += width
+            entry += m * width
+            row += m
             column += width
 
 
 @compiled
 def transposed_times(terms: TermArrays, costs: bool, entries: Array, other: Array, out: Array) -> None:
     """Add J' v to ``out`` over the full tangent space, fixed variables included."""
-    fields, columns = terms.fields, terms.columns
+    fields, columns, numbers = terms.fields, terms.columns, address(entries)
     for t in range(len(fields)):
         term = fields[t]
         if (term[KIND] == COST) != costs:
             continue
         m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
         for _ in range(term[COUNT]):
-            for _ in range(m):
-                scale = other[row]
-                if scale != 0.0:
-                    for d in range(width):
-                        out[columns[column + d]] += scale * entries[entry + d]
-                entry += width
-                row += 1
+            d = 0
+            while d + 3 < width and m > 1:  # four columns at a time, each written once
+                total, at = splat(0.0), entry + d
+                for a in range(row, row + m):
+                    if other[a] != 0.0:
+                        total = plus(total, other[a], load(numbers, at))
+                    at += width
+                for k in range(4):
+                    out[columns[column + d + k]] += lane(total, k)
+                d += 4
+            while d < width:
+                rest, at = 0.0, entry + d
+                for a in range(row, row + m):
+                    if other[a] != 0.0:
+                        rest += other[a] * entries[at]
+                    at += width
+                out[columns[column + d]] += rest
+                d += 1
+            entry += m * width
+            row += m
             column += width

@@ -6,16 +6,19 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
 from unifg.lie import LieGroup, Manifold
+from unifg.lie.so3 import all_unit
 from unifg.modeling.duplicates import doubles
+from unifg.modeling.elements import QUATERNIONS
 from unifg.modeling.model import Model
 from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Family
 from unifg.problem.columns import Columns, Values
 from unifg.problem.linearization import all_finite
 from unifg.problem.retraction import Retraction
-from unifg.typing import ArrayLike
+from unifg.typing import Array, ArrayLike, IntArray
 
 
 class GuessReader:
@@ -27,23 +30,30 @@ class GuessReader:
         self._columns = columns
         self._retraction = retraction
         self._particular: list[tuple[Family, slice, Manifold]] = []
+        starts = [np.zeros(0, dtype=np.int64)]
         for family in columns.families:
+            members = columns.storage[family] + np.arange(family.count) * family.manifold.storage
             for leaf, storage, _ in columns.leaves[family]:
-                if getattr(type(leaf), "is_valid", None) is not LieGroup.is_valid:
+                if isinstance(leaf, QUATERNIONS):
+                    starts.append(members + storage + leaf.storage - 4)
+                elif getattr(type(leaf), "is_valid", None) is not LieGroup.is_valid:
                     self._particular.append((family, slice(storage, storage + leaf.storage), leaf))
+        self._quaternions = np.concatenate(starts)
 
-    def __call__(self, guess: Mapping[Family, ArrayLike]) -> Values:
-        """Copy and check a guess, and give fixed variables their values.
+    def __call__(self, guess: Mapping[Family, ArrayLike] | Array) -> Values:
+        """Copy and check a guess, by families or as it is stored, and give fixed variables their values.
 
         Raises:
             GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
         """
-        if isinstance(guess, Values) and guess.columns is self._columns and guess.intact:
+        if isinstance(guess, np.ndarray):
+            values = Values(self._columns, guess.copy())
+        elif isinstance(guess, Values) and guess.columns is self._columns and guess.intact:
             values = Values(self._columns, guess.flat.copy())
         else:
             values = self._read(guess)
-        self._retraction.fix(values)
-        fine = all_finite(values.flat)
+        fixed = self._retraction
+        fine = _settle(values.flat, fixed.fixed, fixed.fixed_values, self._quaternions)
         if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
             self._name_invalid(values)
         return values
@@ -87,3 +97,11 @@ class GuessReader:
                     family=family.name,
                     index=index,
                 )
+
+
+@compiled
+def _settle(values: Array, fixed: IntArray, fixed_values: Array, quaternions: IntArray) -> bool:
+    """Give fixed variables their values; tell whether all numbers are finite, and quaternions of norm 1."""
+    for k in range(len(fixed)):
+        values[fixed[k]] = fixed_values[k]
+    return all_finite(values) and all_unit(values, quaternions)

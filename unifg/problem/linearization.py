@@ -12,6 +12,7 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.elimination.symmetric import scatter
+from unifg.modeling.variables import Family
 from unifg.problem.columns import Values
 from unifg.problem.evaluation import times, transposed_times
 from unifg.problem.table import COLUMN, COUNT, ROWS, WIDTH, TermTable
@@ -77,6 +78,15 @@ class Linearization:
     squares: Array = field(default_factory=lambda: np.zeros(0))
     scalars: dict[str, Array] = field(default_factory=dict)
     rounding: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def stored(self) -> Array:
+        """Stored values of all families."""
+        return self.values.flat
+
+    def of(self, family: Family) -> Array:
+        """(count, storage) values of one family."""
+        return self.values[family]
 
     @property
     def finite(self) -> bool:

@@ -35,6 +35,7 @@ from unifg.problem.table import (
 from unifg.typing import Array
 
 SWEEPS = 50  # of rotations; ten are many
+ROUNDING = 1e-12  # of curvature, relative
 
 
 @compiled
@@ -135,17 +136,7 @@ def positive_part(S: Array, A: Array, V: Array, out: Array) -> None:
                 definite = False
     if not definite:
         return
-    for d in range(n):  # Cholesky's pivots tell whether anything is to be done
-        for e in range(d + 1):
-            total = A[d, e]
-            for k in range(e):
-                total -= A[d, k] * A[e, k]
-            if e == d:
-                definite = definite and total > 0.0
-                A[d, d] = sqrt(total) if total > 0.0 else 1.0
-            else:
-                A[d, e] = total / A[e, e]
-    if definite:
+    if _semidefinite(S, A):
         return
     for d in range(n):
         for e in range(n):
@@ -166,6 +157,33 @@ def positive_part(S: Array, A: Array, V: Array, out: Array) -> None:
             for d in range(n):
                 for e in range(n):
                     out[d, e] += A[k, k] * V[d, k] * V[e, k]
+
+
+@compiled
+def _semidefinite(S: Array, A: Array) -> bool:
+    """Test by Cholesky's pivots whether a matrix has no negative curvature but for rounding; A is memory.
+
+    A pivot of nothing is in order where its column is nothing, too, as of the energy of an element that may be moved.
+    """
+    for d in range(len(S)):
+        for f in range(d, len(S)):
+            total = S[f, d]
+            for k in range(d):
+                total -= A[f, k] * A[d, k]
+            A[f, d] = total
+        pivot = A[d, d]
+        if pivot > ROUNDING * S[d, d]:
+            root = 1.0 / sqrt(pivot)
+            for f in range(d, len(S)):
+                A[f, d] *= root
+            continue
+        if not pivot >= -ROUNDING * S[d, d]:
+            return False
+        for f in range(d, len(S)):
+            if not abs(A[f, d]) <= ROUNDING * sqrt(abs(S[d, d] * S[f, f])):
+                return False
+            A[f, d] = 0.0
+    return True
 
 
 @compiled

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import largest
 from unifg.problem.table import BOUND, COST, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
 from unifg.typing import Array, IntArray
 
@@ -27,14 +28,14 @@ def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Arra
         gradient: (width,) of the cost.
         units: (width,) of the unknowns.
     """
-    logarithms, product, count, pull, slopes, largest = 0.0, 1.0, 0, 0.0, 0.0, 0.0
+    logarithms, product, count, pull, slopes, steepest = 0.0, 1.0, 0, 0.0, 0.0, 0.0
     for k in range(len(free)):
         unit = units[free[k]]
         slope = abs(gradient[free[k]]) * unit
         pull, slopes = max(pull, slope), slopes + slope
         curvature = hessian[diagonal[k]] * unit**2
         if 0.0 < curvature < math.inf:
-            largest = max(largest, curvature)
+            steepest = max(steepest, curvature)
             product *= curvature
             count += 1
             if not 1e-100 < product < 1e100:  # one logarithm for many factors
@@ -44,7 +45,7 @@ def cost_unit(free: IntArray, diagonal: IntArray, hessian: Array, gradient: Arra
         pull = slopes = 0.0
     if count > 0:
         mean = math.exp((logarithms + math.log(product)) / count)
-        return max(max(mean, LEAST_SHARE * largest), pull / LARGE_PULL)
+        return max(max(mean, LEAST_SHARE * steepest), pull / LARGE_PULL)
     return math.sqrt(pull * slopes) if pull > 0.0 else 1.0
 
 
@@ -60,11 +61,7 @@ def mean_force(terms: TermArrays, entries: Array, multipliers: Array) -> float:
         for _ in range(term[COUNT] * term[ROWS]):
             multiplier = abs(multipliers[row])
             if multiplier > 0.0:
-                largest = 1.0 if term[KIND] == BOUND else 0.0
-                if term[KIND] != BOUND:
-                    for d in range(width):
-                        largest = max(largest, abs(entries[entry + d]))
-                total += multiplier * largest
+                total += multiplier * (1.0 if term[KIND] == BOUND else largest(entries, entry, entry + width))
             row += 1
             entry += width
     return total / max(len(multipliers), 1)

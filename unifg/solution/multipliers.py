@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import largest
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.typing import Array, IntArray
@@ -45,7 +46,7 @@ class Slopes:
 
     def see(self, jacobian: Array, gradient: Array) -> None:
         """Take note of another point."""
-        _raise(jacobian, gradient, self.jacobian, self.gradient)
+        raise_slopes(jacobian, gradient, self.jacobian, self.gradient)
 
     def excess(self, lin: Linearization, multipliers: Array, tolerance: float) -> float:
         """Sum of the multipliers where they are larger than constraints with a slope ever need; zero elsewhere.
@@ -56,7 +57,7 @@ class Slopes:
             tolerance: of the KKT test; a cost whose gradient never exceeded it has no scale.
         """
         program = self._program
-        if not _size(multipliers, self.jacobian, self.gradient, program.columns.free, tolerance) > SUSPICIOUS:
+        if not size_of(multipliers, self.jacobian, self.gradient, program.columns.free, tolerance) > SUSPICIOUS:
             return 0.0
         gradient = np.abs(self.gradient[program.columns.free])
         rows, columns = program.constraints.free_rows, program.constraints.free_columns
@@ -104,24 +105,22 @@ def estimated(program: CompiledProblem, lin: Linearization, tolerance: float) ->
 
 
 @compiled
-def _raise(jacobian: Array, gradient: Array, largest: Array, steepest: Array) -> None:
+def raise_slopes(jacobian: Array, gradient: Array, most: Array, steepest: Array) -> None:
     """Keep the numbers of larger magnitude; what is not finite does not count."""
     for k in range(len(jacobian)):
-        if abs(largest[k]) < abs(jacobian[k]) < np.inf:
-            largest[k] = jacobian[k]
+        if abs(most[k]) < abs(jacobian[k]) < np.inf:
+            most[k] = jacobian[k]
     for k in range(len(gradient)):
         if abs(steepest[k]) < abs(gradient[k]) < np.inf:
             steepest[k] = gradient[k]
 
 
 @compiled
-def _size(multipliers: Array, jacobian: Array, gradient: Array, free: IntArray, tolerance: float) -> float:
+def size_of(multipliers: Array, jacobian: Array, gradient: Array, free: IntArray, tolerance: float) -> float:
     """Sum of the multipliers times the largest slope of a row, over that of the cost."""
-    total, largest, steepest = 0.0, 0.0, tolerance
+    total, steepest = 0.0, tolerance
     for multiplier in multipliers:
         total += abs(multiplier)
-    for slope in jacobian:
-        largest = max(largest, abs(slope))
     for k in free:
         steepest = max(steepest, abs(gradient[k]))
-    return total * largest / steepest
+    return total * largest(jacobian, 0, len(jacobian)) / steepest

@@ -35,6 +35,7 @@ import numpy as np
 
 from unifg.codegen.inner import inner
 from unifg.codegen.jit import compiled
+from unifg.codegen.loops import copy_to
 from unifg.factors.steps import EPSILON, FIRST, step_for
 from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
@@ -43,6 +44,8 @@ from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROW
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
+
+NUMBERS = 5  # that :func:`kkt_numbers` writes
 
 
 class Optimality(NamedTuple):
@@ -104,22 +107,33 @@ def optimality(
             return Optimality(np.inf, np.inf, np.inf, -1, False)
         rounding = _relative_rounding(program, lin, multipliers) if program.differenced else 0.0
         return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding, offset.weakest)
-    measured = _measure(
+    gradient, found = np.empty(len(lin.gradient)), np.empty(NUMBERS)
+    kkt_numbers(
         program.arrays,
         program.columns.free,
         lin.gradient,
         lin.constraints,
         lin.constraint_jacobian,
         multipliers,
+        gradient,
+        found,
     )
-    stationarity, violation, complementarity, worst, finite = measured
-    if not finite or not math.isfinite(lin.cost):
-        return Optimality(np.inf, np.inf, np.inf, -1, False)
+    measured = read_numbers(found, lin.cost)
+    if not measured.finite:
+        return measured
     rounding = 0.0
     if program.differenced:
         rounding = float(gradient_rounding(program, lin, multipliers).max(initial=0.0))
         rounding /= max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
-    return Optimality(stationarity, violation, complementarity, worst, True, True, rounding)
+    return measured._replace(rounding=rounding)
+
+
+def read_numbers(found: Array, cost: float) -> Optimality:
+    """Numbers that :func:`kkt_numbers` has written."""
+    stationarity, violation, complementarity, worst, finite = found.tolist()
+    if finite == 0.0 or not math.isfinite(cost):
+        return Optimality(np.inf, np.inf, np.inf, -1, False)
+    return Optimality(stationarity, violation, complementarity, int(worst), True)
 
 
 def _relative_rounding(program: CompiledProblem, lin: Linearization, multipliers: Array) -> float:
@@ -194,18 +208,32 @@ def _add_rounding(
 
 
 @compiled
-def _measure(
+def kkt_numbers(
     terms: TermArrays,
     free: IntArray,
     slope: Array,
     constraints: Array,
     entries: Array,
     multipliers: Array,
-) -> tuple[float, float, float, int, bool]:
-    """Stationarity, violation, complementarity, worst row, and whether everything is finite."""
+    gradient: Array,
+    found: Array,
+) -> None:
+    """Write stationarity, violation, complementarity, worst row, and whether everything is finite.
+
+    Args:
+        terms: of the program.
+        free: columns that are unknown.
+        slope: (width,) gradient of the objective.
+        constraints: (M,) values.
+        entries: of the constraint Jacobian.
+        multipliers: (M,).
+        gradient: (width,) memory, for the gradient of the Lagrangian.
+        found: (5,) result.
+    """
     stationarity, violation, complementarity, size = 0.0, 0.0, 0.0, 0.0
     worst, count, finite = -1, len(constraints), True
-    gradient, lower, upper = slope.copy(), terms.lower, terms.upper
+    lower, upper = terms.lower, terms.upper
+    copy_to(slope, gradient)
     evaluation.transposed_times(terms, False, entries, multipliers, gradient)
     for k in range(len(free)):
         stationarity = max(stationarity, abs(gradient[free[k]]))
@@ -225,7 +253,8 @@ def _measure(
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
     scale = max(1.0, size / max(count, 1) / 100.0)
-    return stationarity / scale, violation, complementarity / scale, worst, finite
+    found[0], found[1], found[2] = stationarity / scale, violation, complementarity / scale
+    found[3], found[4] = worst, finite
 
 
 def infeasible_stationary(program: CompiledProblem, lin: Linearization, tolerance: float) -> bool:

@@ -49,6 +49,32 @@ class Guess:
     multipliers: Mapping[str, Array] = field(default_factory=dict)
     penalties: Mapping[str, Array] = field(default_factory=dict)
 
+    @classmethod
+    def stored(cls, program: CompiledProblem, arrays: tuple[Array, Array, Array]) -> Guess:
+        """A guess of flat arrays - stored values, multipliers (M,), penalties (M,) - viewed when somebody reads it."""
+        guess = cls.__new__(cls)
+        guess.__dict__["_stored"] = program, arrays
+        return guess
+
+    def flat(self, program: CompiledProblem) -> tuple[Array, Array, Array] | None:
+        """The flat arrays, if it is made of those of this program and nobody has viewed them."""
+        own, arrays = self.__dict__.get("_stored", (None, None))
+        return arrays if own is program else None
+
+    def __getattr__(self, name: str) -> Any:
+        """View the flat arrays."""
+        if name not in ("values", "multipliers", "penalties") or "_stored" not in self.__dict__:
+            raise AttributeError(name)
+        program, (values, multipliers, penalties) = self.__dict__.pop("_stored")
+        self.__dict__["values"] = program.columns.view(values)
+        self.__dict__["multipliers"] = program.by_term(multipliers)
+        self.__dict__["penalties"] = program.by_term(penalties) if penalties.any() else {}
+        return self.__dict__[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickle what is viewed."""
+        return {"values": self.values, "multipliers": self.multipliers, "penalties": self.penalties}
+
 
 class Solution:
     """The final iterate with its KKT numbers.
@@ -172,8 +198,10 @@ class Solution:
 
     def __getitem__(self, variable: Variable | str) -> Array:
         """(n, storage) values of a family, by itself or by its name, or of a selection."""
+        if isinstance(variable, Family) and variable in self._program.columns.storage:
+            return self._lin.of(variable).copy()
         selection = self._selection(variable)
-        return self._lin.values[selection.family][selection.indices][:, selection.storage].copy()
+        return self._lin.of(selection.family)[selection.indices][:, selection.storage].copy()
 
     def selections(self, term: str) -> list[Selection]:
         """Variable arguments of a term, in order; one of length 1 is shared by all factors.
@@ -229,11 +257,13 @@ class Solution:
         """
         program = self._program
         stored, rows = program.once(Shifts)(families, by)
-        return Guess(
-            program.columns.view(self._lin.values.flat[stored]),
-            program.by_term(self._multipliers[rows]),
-            program.by_term(self._penalties[rows]) if self._penalties.any() else {},
-        )
+        penalties = self._penalties if self._penalties is program.no_penalties else self._penalties.take(rows)
+        arrays = self._lin.stored.take(stored), self._multipliers.take(rows), penalties
+        return Guess.stored(program, arrays)
+
+    def flat(self, program: CompiledProblem) -> tuple[Array, Array, Array] | None:
+        """Stored values, multipliers (M,) and penalties (M,) in one array each, if it is a solution of this program."""
+        return (self._lin.stored, self._multipliers, self._penalties) if self._program is program else None
 
     def covariance(self, *variables: Variable | str) -> Array:
         """(k, k) joint covariance of the selected variables, in their tangent spaces, in the order given.
@@ -464,7 +494,7 @@ class Solution:
                 )
             variable = self.families[variable]
         selection = as_selection(variable)
-        if selection.family not in self._lin.values:
+        if selection.family not in self._program.columns.storage:
             name = selection.family.name
             hint = ": that of another process has families of its own, by name in solution.families"
             raise GraphError(

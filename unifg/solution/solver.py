@@ -6,8 +6,8 @@ import logging
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
 from weakref import ReferenceType, ref
@@ -32,7 +32,7 @@ from unifg.solution.incumbent import Incumbent, Incumbents
 from unifg.solution.multipliers import Slopes, estimated
 from unifg.solution.optimality import Optimality, infeasible_stationary, optimality, within_bounds
 from unifg.solution.relative_offset import Factored
-from unifg.solution.solution import AnyGuess, NotConverged, Solution, values_of
+from unifg.solution.solution import AnyGuess, Guess, NotConverged, Solution, values_of
 from unifg.solution.status import Status
 from unifg.solution.warmup_run import rehearse
 from unifg.typing import Array, Numbers
@@ -238,13 +238,15 @@ class SolveState:
         self.status: Status | None = None
         self.incumbents = Incumbents(program)
         self._recall: Callable[[], list[Iteration]] | None = None
-        self._least, self._least_values, self._start = np.inf, values, values
+        self._least, self._start = np.inf, values
+        self._least_at: Linearization | None = None
+        self._values: Values | None
         self.lent: Factored | None = None
         self.slopes: Slopes | None = None
         self.iterations = 0
         if solver.verbose:
             show(HEADER)
-        self.values, self.multipliers, self.penalties = values, multipliers, np.zeros(len(multipliers))
+        self.values, self.multipliers, self.penalties = values, multipliers, program.no_penalties
         self.alone = not (self.watched or solver.search_iterations) and solver.runs_alone(program)
         if not self.alone:
             self.accept(program.linearize(values), multipliers, 0.0, 0.0)
@@ -302,7 +304,13 @@ class SolveState:
         return bool(self._callback or solver.verbose or solver.keep_values or solver.keep_residuals)
 
     def conclude(
-        self, lin: Linearization, multipliers: Array, iterations: int, history: Callable[[], list[Iteration]]
+        self,
+        lin: Linearization,
+        multipliers: Array,
+        iterations: int,
+        history: Callable[[], list[Iteration]],
+        measured: Optimality,
+        slopes: Slopes | None,
     ) -> None:
         """Make ``lin`` the last iterate of a solve that ran alone.
 
@@ -311,18 +319,24 @@ class SolveState:
             multipliers: (M,) there.
             iterations: how many there were.
             history: makes their rows when somebody asks for them.
+            measured: KKT numbers there.
+            slopes: along the way; None after a success, and with multipliers of a size that nobody asks about.
         """
-        self.iterations, self._recall = iterations, history
-        self._move(lin, multipliers)
+        self.iterations, self._recall, self.slopes = iterations, history, slopes
+        self._settle(lin, multipliers, measured, slopes is not None)
         self.status = self._decide()
 
     def _move(self, lin: Linearization, multipliers: Array) -> None:
-        self.lin, self.values, self.multipliers = lin, lin.values, multipliers
         self.see(lin.constraint_jacobian, lin.gradient)
-        self.optimality = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
-        if self.optimality.violation < self._least:
-            self._least, self._least_values = self.optimality.violation, lin.values
-        if self.optimality.finite:
+        measured = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
+        self._settle(lin, multipliers, measured, True)
+
+    def _settle(self, lin: Linearization, multipliers: Array, measured: Optimality, candidate: bool) -> None:
+        """Make an iterate the present one; a ``candidate`` may be returned if the solve ends without success."""
+        self.lin, self._values, self.multipliers, self.optimality = lin, None, multipliers, measured
+        if measured.violation < self._least:
+            self._least, self._least_at = measured.violation, lin
+        if candidate and measured.finite:
             self.consider(lin.cost, lin.constraints.copy(), lin.values.flat, multipliers)
 
     def see(self, jacobian: Array, gradient: Array) -> None:
@@ -395,8 +409,17 @@ class SolveState:
             outside = self.program.violation(self.program.evaluate(self._start).constraints)
             size = float(np.abs(outside).max(initial=0.0))
             if size < self._least:
-                self._least, self._least_values = size, self._start
-        return self._least_values
+                self._least, self._least_at = size, None
+        return self._start if self._least_at is None else self._least_at.values
+
+    @property
+    def values(self) -> Values:
+        """Values at the present iterate."""
+        return self.lin.values if self._values is None else self._values
+
+    @values.setter
+    def values(self, values: Values) -> None:
+        self._values = values
 
     @property
     def has_been_feasible(self) -> bool:
@@ -415,17 +438,9 @@ class SolveState:
         where a step or a few of them are all that was asked for: a step of a real-time iteration may raise every merit,
         and would never be taken from a feasible start.
         """
-        status = self.status or reason or Status.STALLED
-        if status is Status.STALLED and self.infeasible_stationary():
-            status = Status.LOCALLY_INFEASIBLE
-        if status is Status.LOCALLY_INFEASIBLE and self.has_been_feasible:
-            status = Status.STALLED
-        if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
-            self._move(within, self.multipliers)
-        returned = self._return_best(status)
-        earlier = status is Status.ITERATION_LIMIT and returned < self.iterations  # the multipliers of a barrier there
-        if (earlier or status in (Status.STALLED, Status.SINGULAR)) and self.optimality.violation <= self.tolerance:
-            self._estimate()
+        status, returned = self.status or reason or Status.STALLED, self.iterations
+        if status not in (Status.CONVERGED, Status.STOP_RULE) or not self.optimality.finite:
+            status, returned = self._without_success(status)
         measured = self.optimality
         if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
@@ -457,6 +472,20 @@ class SolveState:
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
 
+    def _without_success(self, status: Status) -> tuple[Status, int]:
+        """Move to what is returned; returns the ending as it is known now, and the number of that iterate."""
+        if status is Status.STALLED and self.infeasible_stationary():
+            status = Status.LOCALLY_INFEASIBLE
+        if status is Status.LOCALLY_INFEASIBLE and self.has_been_feasible:
+            status = Status.STALLED
+        if status is Status.LOCALLY_INFEASIBLE and (within := within_bounds(self.program, self.lin)) is not self.lin:
+            self._move(within, self.multipliers)
+        returned = self._return_best(status)
+        earlier = status is Status.ITERATION_LIMIT and returned < self.iterations  # the multipliers of a barrier there
+        if (earlier or status in (Status.STALLED, Status.SINGULAR)) and self.optimality.violation <= self.tolerance:
+            self._estimate()
+        return status, returned
+
     def _excess(self) -> float:
         """Sum of multipliers that are larger than constraints with a slope ever need, zero elsewhere."""
         return 0.0 if self.slopes is None else self.slopes.excess(self.lin, self.multipliers, self.tolerance)
@@ -486,6 +515,8 @@ class SolveState:
     def _return_best(self, status: Status) -> int:
         """Go back to the best iterate where the ending asks for it; returns the number of what is returned."""
         if not self.returns_best(status):
+            return self.iterations
+        if not self.incumbents:  # a success of the method that the KKT test does not confirm
             return self.iterations
         best = self.incumbents.best
         if best.values is not self.values.flat or best.multipliers is not self.multipliers:
@@ -562,13 +593,15 @@ class Prepared:
             Exception: of a function of the user's. It is passed on with notes on term, factor and variable; where an
                 iterate had been reached, its attribute ``reached`` is the solution until then.
         """
-        with self._alone():
+        self._enter()
+        try:
             return self._solve(guess, data, duals, check, callback)
+        finally:
+            self._leave()
 
-    @contextmanager
-    def _alone(self) -> Iterator[None]:
-        """Hold the locks of this solver and of its graph; refuse other threads, and calls from within a solve."""
-        if not self._lock.acquire(blocking=False):
+    def _enter(self) -> None:
+        """Take the locks of this solver and of its graph; refuse other threads, and calls from within a solve."""
+        if not self._lock.acquire(False):
             raise BackendError(f"this prepared {self.solver.name} is at work in another thread: prepare one for each")
         try:
             if self.program.lock.mine:
@@ -576,10 +609,15 @@ class Prepared:
                     f"this prepared {self.solver.name} is asked for a solve from within a solve of its graph, whose "
                     f"data and memory it shares: call {self.solver.name}.solve(graph, ...) there"
                 )
-            with self.program.lock:
-                yield
-        finally:
+            self.program.lock.__enter__()
+        except BaseException:
             self._lock.release()
+            raise
+
+    def _leave(self) -> None:
+        """Let others have the locks."""
+        self.program.lock.__exit__()
+        self._lock.release()
 
     def _solve(
         self,
@@ -592,12 +630,22 @@ class Prepared:
         program = self.program
         program.bind(data or {})
         self._say_if_stale()
-        values = program.values_from(values_of(guess))
-        carried = {} if isinstance(guess, Mapping) else guess.multipliers
-        multipliers = self._stacked("multipliers", {**carried, **duals} if duals else carried)
+        stored = guess.flat(program) if isinstance(guess, Guess | Solution) and not duals else None
+        if stored is not None:
+            flat, multipliers, penalties = stored
+            values, multipliers = program.values_from(flat), multipliers.copy()
+            self._require_finite("multipliers", multipliers)
+            self._require_finite("penalties", penalties)
+        else:
+            values = program.values_from(values_of(guess))
+            carried: Mapping[str, Numbers] = {}
+            penalties = program.no_penalties
+            if not isinstance(guess, Mapping):
+                carried = guess.multipliers
+                penalties = self._stacked("penalties", guess.penalties) if guess.penalties else penalties
+            multipliers = self._stacked("multipliers", {**carried, **duals} if duals else carried)
         run = SolveState(self.solver, program, values, multipliers, callback)
-        if not isinstance(guess, Mapping) and guess.penalties:
-            run.penalties = self._stacked("penalties", guess.penalties)
+        run.penalties = penalties
         solution = self._verified(self._finished(run), run, callback)
         self._last = ref(solution)
         if check and not solution.converged:
@@ -613,7 +661,7 @@ class Prepared:
         if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
             return solution
         values = solution._lin.values
-        broken = self._broken(run, values)
+        broken = bool(program.demanding) and self._broken(run, values)
         due = slopes or self._solves % EVERY == 0 or self._owed or broken
         if not due and self._of_branches < AT_ONCE + self._solves // LATER and program.new_branches(values, False):
             due = True
@@ -660,8 +708,11 @@ class Prepared:
         """
         if self._last is None or solution is not self._last():
             raise BackendError("only the last solution can be verified: the data of others are not kept")
-        with self._alone():
+        self._enter()
+        try:
             found = self.program.mistraced(solution._lin.values, True, self._solves)
+        finally:
+            self._leave()
         solution.checked, solution.mistraced, self._owed = not found, {**solution.mistraced, **found}, False
         return found
 
@@ -674,7 +725,8 @@ class Prepared:
         if run.status is None:
             self.allocate()
             try:
-                run.search(self._workspace)
+                if self.solver.search_iterations:
+                    run.search(self._workspace)
                 reason = self.solver.iterate(run, self._workspace)
             except KeyboardInterrupt:
                 if not run.incumbents:
@@ -725,10 +777,14 @@ class Prepared:
             result = given.flat.copy()
         else:
             result = self._read(what, given)
-        if given and not all_finite(result):
-            name = self.program.row_name(int(np.flatnonzero(~np.isfinite(result))[0]))[0]
-            raise GraphError(f"{what} of '{name}' are not finite", term=name)
+        if given:
+            self._require_finite(what, result)
         return result
+
+    def _require_finite(self, what: str, given: Array) -> None:
+        if not all_finite(given):
+            name = self.program.row_name(int(np.flatnonzero(~np.isfinite(given))[0]))[0]
+            raise GraphError(f"{what} of '{name}' are not finite", term=name)
 
     def _read(self, what: str, given: Mapping[str, Numbers]) -> Array:
         """The same of arrays from anywhere."""
