@@ -10,6 +10,7 @@ __all__ = [
     "bicycle",
     "cart_pole",
     "clearances",
+    "detours",
     "distance_map",
     "inertial",
     "interpolation",

@@ -20,6 +20,7 @@ from benchmarks import (
     gtsam_peer,
     horizon_and_velocity,
     marginals,
+    moved_goals,
     own_functions,
     pose_graphs,
     runner,
@@ -265,3 +266,13 @@ def test_flights_are_compared_seed_by_seed() -> None:
     one: Any = some(0.1, 0.5, 0.9)
     assert horizon_and_velocity.paired(one, one, "error") == "-"
     assert horizon_and_velocity.paired(some(0.102, 0.502, 0.902), one, "error") == "+2 (+2 .. +2)"
+
+
+@pytest.mark.parametrize("seed", [102, 104])
+def test_a_moved_goal_among_discs_costs_no_more_than_with_twenty_starts(seed: int) -> None:
+    row = moved_goals.measure(moved_goals.Cell(seed))
+    assert row["warm, plan"] > 1.5 * row["best"] and row["loop, plan"] <= 1.02 * row["best"]
+    assert row["loop, drive"] <= 1.02 * row["20 starts, drive"] and not row["not solved"]
+    assert row["more"] < 16, "ordinary ticks try one start"
+    text = moved_goals.tables([row])
+    assert "| loop, 20 ms |" in text and "1 fields" in text

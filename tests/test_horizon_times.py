@@ -10,6 +10,9 @@ import pytest
 
 import unifg as fg
 from test_horizon import Goal
+from unifg.codegen.compile_counter import counting
+from unifg.elimination import factorization
+from unifg.errors import GraphError
 from unifg.horizon import (
     Context,
     ControlCost,
@@ -21,6 +24,7 @@ from unifg.horizon import (
     Term,
     Window,
 )
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array, ArrayLike
 
@@ -169,3 +173,71 @@ def test_times_that_do_not_fit_are_refused(times: ArrayLike, robot: Robot, why: 
     terms: list[Term] = [Dynamics(motion, np.diff(TIMES)), Goal()]
     with pytest.raises(fg.GraphError, match=why):
         RecedingHorizon(robot, 6, terms, times=times, solver=InteriorPoint())
+
+
+def moving(**options: Any) -> RecedingHorizon:
+    """A loop whose node times may change, with costs of the states in proportion to the steps before them."""
+
+    class Weighed:
+        def state(self, graph: fg.Graph, x: Any, u: Any) -> None:
+            share = graph.data("share", np.ones((len(u), 1)), each=True)
+            graph.minimize(lambda x, share: np.sqrt(share) * (x - TARGET), x[1:], share, sigma=0.3, name="goal")
+
+        def data(self, now: Context[Any]) -> dict[str, Array]:
+            return {"share": np.diff(now.times)[:, None]}
+
+    terms: list[Term] = [Dynamics(motion), Weighed(), ControlCost(sigma=[1.0], change=[2.0])]
+    return RecedingHorizon(CART, 6, terms, solver=InteriorPoint(tolerance=1e-9), **{"times": TIMES} | options)
+
+
+LATER = np.array([0.0, 0.1, 0.3, 0.6, 0.9, 1.4, 2.2])
+
+
+def test_new_times_are_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is compiled, traced or ordered again, and the plan is that of a loop that began with these times."""
+    loop, fresh = moving(), moving(times=LATER)
+    state = np.array([0.0, 0.4])
+    first, expected = loop.plan(state, TARGET), fresh.plan(state, TARGET)
+    program, made = loop.warm.program, []
+    for owner, name in ((factorization, "analyse"), (CompiledProblem, "__init__")):
+        monkeypatch.setattr(owner, name, lambda *_, **__: made.append(1))
+    loop.set_times(LATER)
+    loop.applied = np.zeros(1)
+    with counting() as counts:
+        found = loop.plan(state, TARGET)
+    assert not counts.everything and not made and loop.warm.program is program
+    np.testing.assert_allclose(found.controls, expected.controls, atol=1e-6)
+    assert np.abs(found.controls - first.controls).max() > 1e-2
+    for k, length in enumerate(np.diff(LATER)):
+        np.testing.assert_allclose(found.states[k + 1], flows(found.states[k], found.controls[k], length), atol=1e-8)
+    with pytest.raises(GraphError, match="first step must be as long as a tick"):
+        loop.set_times(2.0 * LATER)
+    assert np.array_equal(loop.times, LATER)
+
+
+def test_new_times_interpolate_the_warm_start_and_leave_the_kept_plan() -> None:
+    judge = Refusing(LastPlanThenBrake(CART, keep=0.55), range(2, 9))
+    loop = moving(judge=judge)
+    plan = loop.plan(np.array([0.0, 0.4]), TARGET)
+    before = loop.guess
+    assert before is not None
+    loop.set_times(LATER)
+    guess = loop.guess
+    assert guess is not None and guess.multipliers is before.multipliers
+    nodes = before.values[loop.x.family]
+    expected = np.column_stack([np.interp(LATER, TIMES, column) for column in nodes.T])
+    np.testing.assert_allclose(guess.values[loop.x.family], expected, atol=1e-12)
+    np.testing.assert_array_equal(guess.values[loop.u], before.values[loop.u][[0, 1, 2, 3, 4, 5]])
+    kept = loop.plan(plan.states[1], TARGET)
+    assert kept.source == "kept"
+    acting = [1, 2, 3, 4, 4, 5]  # what acts at 0.1, 0.2, 0.4, 0.7, 1.0 and 1.5 s of the plan
+    np.testing.assert_array_equal(kept.controls, plan.controls[acting])
+    for k, length in enumerate(np.diff(LATER)):
+        np.testing.assert_allclose(kept.states[k + 1], flows(kept.states[k], kept.controls[k], length), atol=1e-12)
+    loop.abandon()
+    assert not len(loop.kept.left())
+
+
+def test_a_past_needs_a_step_of_its_own() -> None:
+    with pytest.raises(GraphError, match="the past needs the step of 'dynamics'"):
+        Window(CART, 3, [Dynamics(motion)], start=np.zeros(2), sigma=1.0)

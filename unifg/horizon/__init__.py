@@ -13,6 +13,8 @@ plan = loop.tick(measured={"position": z})
 from unifg.horizon.coupling import COUPLINGS, Coupling
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import History
+from unifg.horizon.mesh import MeshPlan, plan_on_mesh
+from unifg.horizon.multistart import cheapest
 from unifg.horizon.past import Arrival
 from unifg.horizon.receding_horizon import InitialGuesses, RecedingHorizon
 from unifg.horizon.robot import Constant, Robot
@@ -34,12 +36,15 @@ __all__ = [
     "LastPlan",
     "LastPlanThenBrake",
     "Measurement",
+    "MeshPlan",
     "Plan",
     "RecedingHorizon",
     "Resetting",
     "Robot",
     "Term",
     "Window",
+    "cheapest",
+    "plan_on_mesh",
 ]
 
 

@@ -57,7 +57,8 @@ class LastPlan:
     Attributes:
         controls: (N, m), within their limits.
         states: (N + 1, storage).
-        times: (N + 1,) of the nodes from the begin of a plan [s]; 0, 1, ..., N in ticks where the horizon has none.
+        times: (N + 1,) of the nodes of the horizon [s]; 0, 1, ..., N in ticks where it has none.
+        planned: (N + 1,) the same when the plan was made.
         age: time since then, in the unit of ``times``; that of the last node when nothing is left of it.
         least, most: limits (m,) of the controls.
         excess: by how much the plan exceeded them.
@@ -66,30 +67,30 @@ class LastPlan:
     def __init__(self, times: Array, robot: Robot, limits: tuple[Array, Array]) -> None:
         """Begin with nothing."""
         self.least, self.most = limits
-        self.times = times
+        self.times = self.planned = times
         self.controls = np.zeros((len(times) - 1, robot.control.storage))
         self.states = np.tile(robot.state.identity(), (len(times), 1))
         self.clear()
 
     @property
     def lengths(self) -> Array:
-        """(N,) lengths of the steps, in the unit of ``times``."""
+        """(N,) lengths of the steps of the horizon, in the unit of ``times``."""
         return np.diff(self.times)
 
     def clear(self) -> None:
         """Let nothing be left."""
         self.controls[:] = 0.0
-        self.age, self.excess = float(self.times[-1]), 0.0
+        self.age, self.excess = float(self.planned[-1]), 0.0
 
     def store(self, controls: Array, states: Array) -> None:
         """Keep a new plan (N, m), (N + 1, storage)."""
         self.excess = float(np.maximum(controls - self.most, self.least - controls).max(initial=0.0))
-        self.controls, self.states, self.age = controls.copy(), states.copy(), 0.0
+        self.controls, self.states, self.age, self.planned = controls.copy(), states.copy(), 0.0, self.times
 
     def left(self) -> Array:
         """(k, m) controls that are left of the plan, for the first k steps from now on."""
         begins = self.age + self.times[:-1] + 1e-9 * self.times[1]  # so much late that rounding chooses no earlier step
-        acting = np.searchsorted(self.times, begins[begins < self.times[-1]], side="right") - 1
+        acting = np.searchsorted(self.planned, begins[begins < self.planned[-1]], side="right") - 1
         rest: Array = self.controls[acting]
         return rest
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import time as clocks
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from unifg.errors import BackendError, GraphError
 from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
+from unifg.horizon.multistart import LEAST_TIME, Jumps, cheapest
 from unifg.horizon.robot import Robot, numbers
 from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.window import Window
@@ -28,7 +30,7 @@ from unifg.typing import Array, ArrayLike
 
 TIMES = 100_000  # ticks whose times are kept
 CLOSE = 1e-4  # a plan may bend constraints more, but noise of the past is as small as that
-LEAST_TIME = 1e-4  # [s] a solver is given however late it is
+RESERVE = 0.1  # share of the deadline that more starts leave free
 
 
 @dataclass(frozen=True)
@@ -39,11 +41,16 @@ class InitialGuesses:
         cold: ``cold(now)`` gives states (N + 1, storage) and controls (N, m); None: stay, with the control zero.
         after_failure: the same after a solve whose plan was refused; None for ``cold``.
         carry: ``carry(guess, now)`` what of a shifted last answer still holds; None for all of it.
+        others: ``others(now)`` more states and controls, for instance one pair for each side of an obstacle. They and
+            the cold guess are tried where there is no last answer, and beside the warm start where data have jumped
+            (:class:`unifg.horizon.multistart.Jumps`). Without any, ``lambda now: ()``, the cold guess alone is; None
+            for one start in every tick.
     """
 
     cold: Callable[[Context[Any]], tuple[Array, Array]] | None = None
     after_failure: Callable[[Context[Any]], tuple[Array, Array]] | None = None
     carry: Callable[[Guess, Context[Any]], Guess] | None = None
+    others: Callable[[Context[Any]], Iterable[tuple[Array, Array]]] | None = None
 
 
 class RecedingHorizon:
@@ -77,6 +84,7 @@ class RecedingHorizon:
         statuses: how often solves ended in what way.
         sources: how often what was applied; "late" counts plans that came after the deadline.
         rescues: how often the second backend had a plan when the first had none.
+        more_starts: how many were tried beside the first of a tick.
         milliseconds: wall-clock times of the last ticks [ms].
     """
 
@@ -122,7 +130,9 @@ class RecedingHorizon:
             limits: least and greatest controls (m,), to which plans are clipped, infinite where there are none; one
                 number holds for all, None for no limits.
             judge: decides what is applied; by default :class:`unifg.horizon.LastPlanThenBrake`.
-            starts: where solves begin that have no last answer to go on from.
+            starts: where solves begin that have no last answer to go on from, and what is tried beside the warm start
+                when the goal has moved. The cheapest feasible plan is kept; what the deadline leaves no time for is
+                tried in the next tick.
             believable: whether what a joint solve says of the present is believed; by default when its plan is
                 applied and bends no constraint by more than ``CLOSE``.
             deadline: for a tick [s]: the solver is given what is left of it; a plan that comes later is not applied.
@@ -152,18 +162,18 @@ class RecedingHorizon:
             )
         self._lock = ReentrantLock()
         self.times = _node_times(times, steps, robot)
-        self._even = bool(np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0))
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
         between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
         graph = Graph()
         self.tie: PresentCoupling = self._tied(graph, pull)
         self.x, self.u = self.tie.ahead, graph.variables("u", robot.control, steps)
-        before = len(graph.terms)
+        before, tied = len(graph.terms), handles_of(graph)
         for term in self._terms:
             term.state(graph, self.x, self.u)
         weigh(graph.terms[before:], control_weight)
         self._handles, self._families = handles_of(graph), dict(graph.families)
+        self._said = [handle for name, handle in self._handles.items() if name not in tied]
         backends = solver, cold or solver, second or solver
         timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in backends]
         self._limits = [own.time_limit for own in timed]
@@ -175,11 +185,14 @@ class RecedingHorizon:
         self._believable = believable or _close
         self.statuses: Counter[Status] = Counter()
         self.sources: Counter[str] = Counter()
-        self.rescues = 0
+        self.rescues = self.more_starts = 0
+        self._jumps = Jumps()
+        self._tried: int | None = None  # of the starts of a search that has not ended
         self.milliseconds: deque[float] = deque(maxlen=TIMES)
         self.guess: Guess | None = None
         self.solution: Solution | None = None
-        self._solved_by, self._verification_time = self.warm, 0.0
+        self._solved_by: Prepared | None = self.warm
+        self._verification_time = 0.0
         self.sent: Array = np.zeros((delay, robot.control.storage))
         self.lagging, self.failed = 0, False
         self._believe_nothing()
@@ -241,7 +254,7 @@ class RecedingHorizon:
         for name, value in seen.items():
             window.record(name, value)
         window.estimate(given)
-        return self._plan(window.now(given, last), begin)
+        return self._plan(replace(window.now(given, last), times=self.times), begin)
 
     def plan(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Plan:
         """Plan from a present state (storage,) that is estimated elsewhere.
@@ -262,8 +275,8 @@ class RecedingHorizon:
     def idle(self, seconds: float = np.inf) -> dict[str, str]:
         """Verify the last solution by the functions as written, while nothing is due: after the control was applied.
 
-        Nothing is done without a solution, for a verified one, and where the last verification took longer than
-        ``seconds``.
+        Nothing is done without a solution, for a verified one, for one of several starts, and where the last
+        verification took longer than ``seconds``.
 
         Args:
             seconds: until the next tick.
@@ -275,10 +288,11 @@ class RecedingHorizon:
             BackendError: while another thread plans.
         """
         with self._alone():
-            if self.solution is None or self.solution.checked or self._verification_time > seconds:
+            run = self._solved_by
+            if self.solution is None or run is None or self.solution.checked or self._verification_time > seconds:
                 return {}
             begin = self._clock()
-            found = self._solved_by.verify(self.solution)
+            found = run.verify(self.solution)
             self._verification_time = self._clock() - begin
             return found
 
@@ -300,7 +314,7 @@ class RecedingHorizon:
         )
         stated = {name: self._constant(name, value, known) for name, value in (constants or {}).items()}
         known = {name: values.copy() for name, values in known.items()} | stated
-        return Context(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history)
+        return Context(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history, self.times)
 
     def _constant(self, name: str, value: ArrayLike, known: Mapping[str, Array]) -> Array:
         """A value (count, storage) of a static."""
@@ -320,10 +334,12 @@ class RecedingHorizon:
         if np.isfinite(self._deadline):
             limit = self._limits[0 if run is self.warm else 1]
             run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
-        solution, rescued = run.solve(self.tie.begin(guess, now), data=data), False
+        first, rescued = run.solve(self.tie.begin(guess, now), data=data), False
+        solution = self._search(first, now, data, begin)
         if self.second is not None and self._refuses(solution, now):
             solution, rescued = self._ask(self.second, solution, now, data, begin)
-        self.solution, self._solved_by = solution, self.second if rescued and self.second else run
+        self.solution = solution
+        self._solved_by = self.second if rescued else run if solution is first else None
         self.statuses[solution.status] += 1
         choice = self.decide(solution, now, late=self._clock() - begin > self._deadline)
         self._believe(solution, choice, present)
@@ -335,6 +351,31 @@ class RecedingHorizon:
             choice.controls, choice.states, solution.status, solution.iterations, choice.source, self.kept.excess,
             elapsed, rescued,
         )  # fmt: skip
+
+    def _search(self, first: Solution, now: Context[Any], data: dict[Data, ArrayLike], begin: float) -> Solution:
+        """Cheapest answer of the first start and of more, in ticks that are worth them."""
+        others = self.starts.others
+        if others is None:
+            return first
+        jumped = self._jumps({handle: data[handle] for handle in self._said if handle in data}, first, self.solution)
+        if self.guess is None:  # the cold start was the first one, unless that of a failure was
+            self._tried = 0 if self.failed and self.starts.after_failure is not None else 1
+        elif jumped:
+            self._tried = 0
+        left = (1.0 - RESERVE) * self._deadline - (self._clock() - begin)
+        if self._tried is None or left <= 0.0:
+            return first
+        self.cold.solver.time_limit = self._limits[1]
+        starts = self._untried(chain([(self.starts.cold or self._stay)(now)], others(now)), now)
+        return cheapest(self.cold, starts, data=data, seconds=left, incumbent=first, clock=self._clock)
+
+    def _untried(self, starts: Iterable[tuple[Array, Array]], now: Context[Any]) -> Iterator[Guess]:
+        """Starts of a search that have not been tried yet."""
+        for states, controls in islice(starts, self._tried, None):
+            self._tried = (self._tried or 0) + 1
+            self.more_starts += 1
+            yield self.tie.begin(self.guess_of(states, controls, now), now)
+        self._tried = None
 
     def _refuses(self, solution: Solution, now: Context[Any]) -> bool:
         """Test whether the judge would have something else applied than the plan."""
@@ -426,20 +467,38 @@ class RecedingHorizon:
         whole steps: by those that a tick is nearest to, on average over the horizon.
         """
         along = *self.tie.along, self.u
-        if self._even:
+        if np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0):
             return solution.shifted(*along)
         joint = len(self.x.family) > self.steps + 1
         whole = 1 if joint else round(self.steps * self.times[1] / self.times[-1])
-        moved, states, controls = solution.shifted(*along, by=whole), solution[self.x], solution[self.u]
-        later = np.minimum(self.times + self.times[1], self.times[-1])
-        step = np.minimum(np.searchsorted(self.times, later + 1e-9 * self.times[1], side="right") - 1, self.steps - 1)
-        share = (later - self.times[step]) / np.diff(self.times)[step]
-        space = self.robot.state
-        ahead = space.retract(states[step], share[:, None] * space.local(states[step], states[step + 1]))
-        nodes = moved.values[self.x.family].copy()
-        nodes[len(nodes) - self.steps - 1 :] = ahead
-        values = {**moved.values, self.x.family: nodes, self.u: controls[step[:-1]]}
-        return replace(moved, values=values)
+        moved = solution.shifted(*along, by=whole)
+        return self._resampled(moved, solution[self.x], solution[self.u], self.times + self.times[1])
+
+    def _resampled(self, guess: Guess, states: Array, controls: Array, at: Array) -> Guess:
+        """A guess with the states and controls of a plan on the nodes of now at other times (N + 1,)."""
+        nodes = guess.values[self.x.family].copy()
+        nodes[len(nodes) - self.steps - 1 :], acting = self.robot.between(self.times, states, controls, at)
+        return replace(guess, values={**guess.values, self.x.family: nodes, self.u: acting})
+
+    def set_times(self, times: ArrayLike) -> None:
+        """Move the nodes of the future, from the next tick on; nothing is compiled or analysed again.
+
+        The warm start is interpolated; the plan that is kept stays as it was planned. ``Dynamics`` without a step
+        follow; other terms find the times in ``now.times``.
+
+        Args:
+            times: (N + 1,) from the present on [s], as at the beginning: the first step is as long as a tick.
+
+        Raises:
+            GraphError: when they do not fit; everything is as it was.
+            BackendError: while another thread plans.
+        """
+        with self._alone():
+            found = _node_times(times, self.steps, self.robot)
+            if self.guess is not None:
+                states = self.guess.values[self.x.family][-self.steps - 1 :]
+                self.guess = self._resampled(self.guess, states, self.guess.values[self.u], found)
+            self.times = self.kept.times = found
 
     def _believe(self, solution: Solution, choice: Decision, now: Context[Any]) -> None:
         said = self.tie.believed(solution) if self._believable(solution, choice) else None
@@ -465,7 +524,8 @@ class RecedingHorizon:
         """Drop the warm start and the plan that is kept."""
         self.forget()
         self.kept.clear()
-        self.lagging = 0
+        self._jumps.clear()
+        self.lagging, self._tried = 0, None
 
     def reset(self, start: ArrayLike | None = None, sigma: ArrayLike | None = None) -> None:
         """Forget the plan that is kept, the past, and what terms keep; counts of statuses and times stay.

@@ -145,6 +145,21 @@ class Robot:
             states.append(self.predicted(states[-1], control, None if lengths is None else float(lengths[k])))
         return np.array(states)
 
+    def between(self, times: Array, states: Array, controls: Array, at: Array) -> tuple[Array, Array]:
+        """States and controls of a plan on other nodes: along geodesics, and what acts after each node but the last.
+
+        Args:
+            times: (N + 1,) of the plan.
+            states: (N + 1, storage).
+            controls: (N, m), each held for a step.
+            at: (M + 1,) times of the other nodes; beyond its end the plan rests.
+        """
+        at = np.minimum(at, times[-1])
+        step = np.minimum(np.searchsorted(times, at + 1e-9 * times[1], side="right") - 1, len(controls) - 1)
+        share = (at - times[step]) / np.diff(times)[step]
+        ahead = self.state.retract(states[step], share[:, None] * self.state.local(states[step], states[step + 1]))
+        return ahead, controls[step[:-1]]
+
 
 def numbers(value: ArrayLike, shape: tuple[int, ...], what: str, *, finite: bool = True, family: str = "") -> Array:
     """An array of that shape.

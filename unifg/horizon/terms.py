@@ -36,6 +36,7 @@ class Context(Generic[G]):
         last: (m,) control that was applied last, before the horizon begins.
         constants: (count, storage) values by the past alone, by name.
         history: what was done and measured; None without a window.
+        times: (N + 1,) of the nodes of the future from the present on [s]; empty for a window.
     """
 
     given: G
@@ -43,6 +44,7 @@ class Context(Generic[G]):
     last: Array
     constants: Mapping[str, Array] = field(default_factory=dict)
     history: History | None = None
+    times: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def past(self) -> History:
@@ -157,14 +159,15 @@ class Dynamics:
 
     Attributes:
         residual: ``residual(x, u, x_next, h)`` or, with constants, ``residual(x, u, s_1, ..., x_next, h)``: (n, m).
-        step: h [s], for all steps or (N,) for each.
+        step: h [s], for all steps or (N,) for each; None in a horizon for those between its node times, which may then
+            change from tick to tick.
         sigma: (m,) standard deviations of the process noise; None where the model holds exactly.
         constants: names of families of one member that the residual takes, too.
         name: of the term, and with "past" added where the controls are those that were applied.
     """
 
     residual: AnyResidual
-    step: ArrayLike
+    step: ArrayLike | None = None
     sigma: ArrayLike | None = None
     constants: tuple[str, ...] = ()
     name: str = "dynamics"
@@ -172,7 +175,12 @@ class Dynamics:
     def state(self, graph: Graph, x: Selection, u: Any) -> None:
         """Add a cost or an equality for every step."""
         shared = _shared(graph, self.constants, self.name)
-        arguments, name = (x[:-1], u, *shared, x[1:], self.step), self.name
+        step: Any = self.step
+        if step is None:
+            if isinstance(u, Data):
+                raise GraphError(f"the past needs the step of '{self.name}': give it a length [s]", term=self.name)
+            step = graph.data(f"{self.name}: step", np.ones(len(u)), each=True)
+        arguments, name = (x[:-1], u, *shared, x[1:], step), self.name
         if isinstance(u, Data):
             name = f"past {name}"
         if self.sigma is not None:
@@ -181,8 +189,8 @@ class Dynamics:
             graph.constrain(self.residual, *arguments, lower=0.0, upper=0.0, name=name)
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """None of its own."""
-        return {}
+        """Lengths of the steps, where they may change."""
+        return {} if self.step is not None else {f"{self.name}: step": np.diff(now.times)}
 
 
 @dataclass(frozen=True)

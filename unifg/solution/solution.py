@@ -18,6 +18,7 @@ from unifg.problem.linearization import Linearization
 from unifg.solution.conditioning import Conditioning, cheap, conditioning
 from unifg.solution.covariance import Covariances
 from unifg.solution.fit import Fit, fit_of
+from unifg.solution.gains import feedback_gains
 from unifg.solution.history import HEADER, FactorNorms, History, Iteration, factor_norms, line
 from unifg.solution.marginal import Variables, information, marginal_prior
 from unifg.solution.optimality import Optimality
@@ -312,6 +313,37 @@ class Solution:
     @cached_property
     def _covariances(self) -> Covariances:
         return Covariances(self._program, self._lin, self._equality | self._held())
+
+    def gains(
+        self, states: Variable | str | Sequence[Variable | str], controls: Variable | str | Sequence[Variable | str]
+    ) -> Array:
+        """(N, m, d) feedback gains: to first order, ``du[k] = K[k] @ dx[k]`` is optimal where a state deviates by dx.
+
+        Deviations are in the tangent spaces, x [+] dx with right perturbation. All that is earlier than a state is
+        held, the control before it included. Active inequalities, whose multiplier outweighs the distance to the limit,
+        are held as equalities and the others left out, so that gains of a control at its limit are zero. Each stage
+        takes one factorisation, with the Hessian of the Lagrangian.
+
+        Args:
+            states: those the controls act on, ``x`` or ``x[:-1]``, or several families side by side; one more than
+                there are controls is left out. They may be fixed, as the first one of a horizon is.
+            controls: ``u``, or several families side by side.
+
+        Raises:
+            GraphError: when the solve did not converge, data have been bound since, the numbers differ, or a gain does
+                not exist.
+        """
+        if not self.converged:
+            raise GraphError(f"gains need a solution that is CONVERGED, this one is {self.status.name}")
+        x, u = (
+            [self._selection(v) for v in ([named] if isinstance(named, Variable | str) else named)]
+            for named in (states, controls)
+        )
+        if all(len(s) == len(u[0]) + 1 for s in x):
+            x = [s[:-1] for s in x]
+        if len({len(s) for s in (*x, *u)}) > 1:
+            raise GraphError(f"gains: {[len(s) for s in x]} states for {[len(s) for s in u]} controls: give as many")
+        return feedback_gains(self._program, self._lin, self._multipliers, self._equality | self._held(), x, u)
 
     def information(self, terms: Sequence[str], *variables: Variable) -> Array:
         """(d, d) information of the named costs over the selected variables; see :mod:`unifg.solution.marginal`."""
