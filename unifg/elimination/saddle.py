@@ -29,6 +29,7 @@ from unifg.typing import Array, IntArray
 SHIFT = 1e-12  # on the diagonal of the equilibrated matrix
 SAFE_SHIFT = 2.0**-24  # not lost beside its own inverse; leaves more to refinement
 ACCURATE = 1e-8  # residual above which a factorisation with the small shift counts as spoilt by rounding
+EXACT = 1e-15  # residual that refinement strives for
 SWEEPS, NEAR = 4, 4.0
 CORRECTIONS = 12
 
@@ -83,27 +84,28 @@ class SaddlePoint:
         factorization.adopt(bool(success))
         return bool(success)
 
-    def solve(self, right: Array) -> tuple[Array, float]:
+    def solve(self, right: Array, enough: float = EXACT) -> tuple[Array, float]:
         """Solve the system that was factorised, without its shift.
 
         Args:
             right: (n,).
+            enough: residual at which refinement ends.
 
         Returns:
             (n,) solution and its residual, relative to max (|K| |x| + |right|), both of the equilibrated system; the
             larger one of the unknowns' rows and of the multipliers' rows, each relative to its own size: multipliers
             that blow up do not hide that constraints contradict each other.
         """
-        out, error = self._refine(right)
+        out, error = self._refine(right, enough)
         if error <= ACCURATE or self._shift == SAFE_SHIFT:
             return out, error
         if not self._factor(SAFE_SHIFT):
             self._factor(SHIFT)
             return out, error
-        again, less = self._refine(right)
+        again, less = self._refine(right, enough)
         return (again, less) if less < error else (out, error)
 
-    def _refine(self, right: Array) -> tuple[Array, float]:
+    def _refine(self, right: Array, enough: float) -> tuple[Array, float]:
         out = np.empty(len(right))
         error = substitution.refine(
             self.factorization.plan,
@@ -112,7 +114,7 @@ class SaddlePoint:
             self.scale,
             self.unknowns,
             out,
-            1e-15,
+            enough,
             CORRECTIONS,
         )
         return out, float(error)

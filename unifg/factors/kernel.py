@@ -156,9 +156,13 @@ class Kernel:
 
     def jacobian(self, *arguments: Any) -> list[Array]:
         """One (n, m, d_k) array per variable argument."""
-        blocks = self._run(arguments, True)[1]
+        return self.both(*arguments)[1]
+
+    def both(self, *arguments: Any) -> tuple[Array, list[Array]]:
+        """Residuals and Jacobian at once."""
+        residual, blocks = self._run(arguments, True)
         ends = np.cumsum([manifold.dim for manifold in self.manifolds])
-        return np.split(blocks, ends[:-1], axis=2)
+        return residual, np.split(blocks, ends[:-1], axis=2)
 
     def second_derivatives(self, weights: Array, *arguments: Any) -> Array:
         """(n, D, D) Hessians of weights' r, weights (n, m), of a kernel that comes with them or is linear."""

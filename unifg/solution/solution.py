@@ -12,7 +12,7 @@ import numpy as np
 
 from unifg.errors import GraphError, UnifgError
 from unifg.modeling.soft import SlackFamily
-from unifg.modeling.variables import Family, Selection, Variable, as_selection
+from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.conditioning import Conditioning, cheap, conditioning
@@ -23,6 +23,7 @@ from unifg.solution.history import HEADER, FactorNorms, History, Iteration, fact
 from unifg.solution.marginal import Variables, information, marginal_prior
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
+from unifg.solution.sensitivity import Named, Sensitivities, Wrt
 from unifg.solution.status import Status
 from unifg.solution.warm_start import Shifts
 from unifg.typing import Array, BoolArray, Numbers
@@ -90,6 +91,7 @@ class Solution:
         restoration_steps: steps besides, of feasibility restoration: descents on the violation alone.
         seconds: wall-clock time of the solve.
         solver: name of the backend.
+        tolerance: of the KKT test of the solve.
         returned: number of the iteration that is returned; 0 for the guess. Not the last one where a limit, a stall or
             an interruption ended the solve and an earlier iterate has less cost plus price times violation.
         in_python: seconds of them spent in residuals that Python evaluates, see ``graph.check``.
@@ -99,6 +101,7 @@ class Solution:
         mistraced: terms left to Python by that check, and the reasons; the solve was repeated without their traces.
     """
 
+    tolerance = 1e-6
     in_python = 0.0
     restoration_steps = 0
     checked = False
@@ -345,6 +348,58 @@ class Solution:
             raise GraphError(f"gains: {[len(s) for s in x]} states for {[len(s) for s in u]} controls: give as many")
         return feedback_gains(self._program, self._lin, self._multipliers, self._equality | self._held(), x, u)
 
+    def sensitivity(self, of: Named | Sequence[Named], wrt: Wrt | Sequence[Wrt]) -> Array:
+        """(k, K) derivatives of a solution, of every row of ``of`` with respect to every coordinate of ``wrt``.
+
+        Variables and elements of manifolds in tangent coordinates, with right perturbation. Active inequalities, whose
+        multiplier outweighs the distance to the limit, are held; so is the set of what a truncated loss leaves out. The
+        first question takes one factorisation, each column or row one solve; forward or adjoint, whatever is less.
+
+        Args:
+            of: families and members ``x[-1]``, constraints by name for their multipliers, ``"cost"``; one or several,
+                whose rows are stacked.
+            wrt: data and fixed variables, by themselves or by name. Data may be arguments of terms, what variables are
+                fixed at, sigmas, information matrices, limits, prices.
+
+        Raises:
+            GraphError: when the solve did not converge, data have been bound since, a row is weakly active (slack and
+                scaled multiplier both below 10 times the root of the tolerance), the reduced Hessian is singular or
+                indefinite, multipliers are not unique, or a function has a kink.
+        """
+        asked = [of] if isinstance(of, Variable | str) else of
+        return self._sensitivities.matrix([self._part(part) for part in asked], _listed(wrt))
+
+    def gradient(self, of: Mapping[Named, Numbers] | str, wrt: Wrt | Sequence[Wrt]) -> Array | list[Array]:
+        """Gradient of a scalar, by one solve: of the cost, or of a weighted sum of whatever :meth:`sensitivity` takes.
+
+        For a loss of the solution, ``{x: slope}`` with the slope (n, d) of the loss along the tangent coordinates.
+
+        Args:
+            of: ``"cost"``, or weights, which broadcast to (n, d) of variables, (n, m) of multipliers.
+            wrt: as for :meth:`sensitivity`.
+
+        Returns:
+            An array in the shape of the data, elements of manifolds by tangent coordinates; one for each of several.
+
+        Raises:
+            GraphError: as :meth:`sensitivity`.
+        """
+        weights = {of: 1.0} if isinstance(of, str) else of
+        parts = {self._part(part): np.asarray(given, dtype=np.float64) for part, given in weights.items()}
+        found = self._sensitivities.gradient(parts, _listed(wrt))
+        return found[0] if isinstance(wrt, Data | Variable | str) else found
+
+    def _part(self, named: Named) -> Selection | str:
+        """A selection, or the name of a constraint or the cost."""
+        return named if isinstance(named, str) and named not in self.families else self._selection(named)
+
+    @cached_property
+    def _sensitivities(self) -> Sensitivities:
+        if not self.converged:
+            raise GraphError(f"sensitivity: needs a solution that is CONVERGED, this one is {self.status.name}")
+        active = self._equality | self._held()
+        return Sensitivities(self._program, self._lin, self._multipliers, active, self.tolerance)
+
     def information(self, terms: Sequence[str], *variables: Variable) -> Array:
         """(d, d) information of the named costs over the selected variables; see :mod:`unifg.solution.marginal`."""
         columns = np.concatenate([self._program.columns.of(as_selection(v)).ravel() for v in variables])
@@ -478,7 +533,7 @@ class Solution:
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle with the history, and without factorisations, which are found again where somebody asks."""
-        kept = {name: value for name, value in self.__dict__.items() if name != "_covariances"}
+        kept = {name: value for name, value in self.__dict__.items() if name not in ("_covariances", "_sensitivities")}
         return {**kept, "_history": self.history}
 
     def _held(self) -> BoolArray:
@@ -504,6 +559,11 @@ class Solution:
                 f"family '{name}' is not part of this solution{hint if name in self.families else ''}", family=name
             )
         return selection
+
+
+def _listed(wrt: Wrt | Sequence[Wrt]) -> Sequence[Wrt]:
+    """One or several, as several."""
+    return [wrt] if isinstance(wrt, Data | Variable | str) else wrt
 
 
 class NotConverged(UnifgError, RuntimeError):

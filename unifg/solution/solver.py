@@ -477,7 +477,7 @@ class SolveState:
             self._solver.name,
             returned,
         )
-        solution.restoration_steps = self.restoration_steps
+        solution.restoration_steps, solution.tolerance = self.restoration_steps, self.tolerance
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
 

@@ -1,0 +1,325 @@
+"""Derivatives of a solution: what a small change of data does to it, by the implicit function theorem.
+
+At a solution the KKT conditions hold as equations, those of active inequalities with them, and keep holding while a
+parameter p moves (A. V. Fiacco, "Introduction to Sensitivity and Stability Analysis in Nonlinear Programming", 1983):
+
+    [H  A'] [dx]       [d grad L]
+    [A  0 ] [dl]  =  - [d g     ] ,
+
+H being the Hessian of the Lagrangian, A the active rows, and the right-hand side what p changes at a fixed point
+(:mod:`unifg.problem.parameters`). Dx is a right perturbation. The cost changes as the Lagrangian does. The matrix is
+factorised once; each column of ``wrt``, or each row of ``of``, is one solve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.factors.robust import form_of
+from unifg.modeling.terms import Cost
+from unifg.modeling.variables import Data, Selection, Variable, as_selection
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.linearization import Linearization
+from unifg.problem.parameters import Parameter, datum, fixed, parts_of
+from unifg.problem.systems import fill
+from unifg.solution.covariance import SOLVED
+from unifg.solution.gains import SAME
+from unifg.typing import Array, BoolArray, IntArray
+
+COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
+REPLACED = "sensitivity: the data of this solution have been replaced since; ask before the next solve"
+ENOUGH = 1e-12  # residual of a solve
+WEAK = 10.0  # times the root of the tolerance: slack and multiplier of a row that may be active or not
+Named = Variable | str
+Of = Named | Sequence[Named]
+Wrt = Data | Variable | str
+
+
+class Sensitivities:
+    """The factorised KKT matrix at a solution, to be asked repeatedly."""
+
+    def __init__(
+        self, program: CompiledProblem, lin: Linearization, multipliers: Array, active: BoolArray, tolerance: float
+    ) -> None:
+        """Factorise.
+
+        Args:
+            program: the compiled graph, with the data of the solution bound.
+            lin: linearisation at the solution.
+            multipliers: (M,) there.
+            active: (M,) rows that hold as equalities.
+            tolerance: of the solve.
+
+        Raises:
+            GraphError: when the data have been replaced, rows are weakly active, or the reduced Hessian is not positive
+                definite.
+        """
+        self._program, self._multipliers = program, multipliers
+        for term in program.cost_terms:
+            if isinstance(term.term, Cost) and form_of(term.term.robust) is None:
+                raise GraphError(
+                    f"sensitivity: the loss of term '{term.name}' has formulas of its own, and no second derivative: "
+                    "use a loss that ships",
+                    term=term.name,
+                )
+        with program.lock:
+            here = self._here = program.linearize(program.columns.values(lin.values))
+            self._present = {handle: value.copy() for handle, value in program._binding.present.items()}
+            scale = 1.0 + np.abs(lin.gradient).max(initial=0.0)
+            pairs = (here.gradient / scale, lin.gradient / scale), (here.constraints, lin.constraints)
+            if not all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in (*pairs, (here.cost, lin.cost))):
+                raise GraphError(REPLACED)
+            hessian = lagrangian_hessian(program, here, multipliers)
+        held = active.copy()
+        held[program.fixed_rows()] = False
+        self._require_strict(held, tolerance)
+        n, self._system = program.size, program.systems.kkt(np.ones(len(held), dtype=bool))
+        pattern = self._system.pattern
+        entries = np.zeros(pattern.nnz)
+        fill(self._system.arrays, hessian, here.constraint_jacobian, entries)
+        out = np.concatenate([np.zeros(n, dtype=bool), ~held])
+        self._number = np.where(held, n + np.arange(len(held)), -1)
+        data = np.where(out[pattern.indices] | out[pattern.columns], 0.0, entries)
+        data[pattern.diagonal[out]] = -1.0
+        if not self._system.saddle.factor(data):
+            raise GraphError("sensitivity: the Hessian is not finite at the solution")
+        self._dependent = self._probe(out)
+
+    def _require_strict(self, held: BoolArray, tolerance: float) -> None:
+        """Raise for the weakest row that may be active or not."""
+        program, least = self._program, WEAK * float(np.sqrt(tolerance))
+        force = np.abs(self._multipliers)
+        force = force / max(1.0, float(force.mean()) / 100.0) if len(force) else force
+        g = self._here.constraints
+        slack = np.minimum(np.abs(g - program.lower), np.abs(g - program.upper))
+        size = np.where(program.equality, np.inf, np.maximum(slack, force))
+        size[program.fixed_rows()] = np.inf
+        if len(size) and (worst := int(np.argmin(size))) >= 0 and size[worst] < least:
+            term, factor, place = self._place(worst)
+            raise GraphError(
+                f"sensitivity: {place} is weakly active, its slack {slack[worst]:.1e} and its multiplier "
+                f"{force[worst]:.1e} both below {least:.1e}: on either side of the present data the derivative is "
+                "another. Solve with a smaller tolerance if one of them is not that small, else ask at other data",
+                term=term,
+                index=factor,
+            )
+
+    def _probe(self, out: BoolArray) -> str:
+        """Solve for random numbers: what is left of them is what the matrix is singular in.
+
+        Returns:
+            Description of a row that depends on others, empty where there is none.
+
+        Raises:
+            GraphError: the reduced Hessian is singular or indefinite.
+        """
+        program, system, n = self._program, self._system, self._program.size
+        right = np.random.default_rng(0).standard_normal(len(out)) / system.saddle.scale
+        right[out] = 0.0
+        solution, _ = system.saddle.solve(right)
+        rest = np.abs(system.saddle.residual(solution, right))
+        if not rest[:n].max(initial=0.0) <= SOLVED:
+            family, index = program.columns.name(int(program.columns.free[np.argmax(rest[:n])]))
+            raise GraphError(
+                f"sensitivity: the reduced Hessian is singular: {family}[{index}] can move without the costs or the "
+                "active constraints noticing; add a prior or fix something",
+                family=family,
+                index=index,
+            )
+        if system.factorization.inertia != (n, len(out) - n, 0):
+            raise GraphError(
+                "sensitivity: the reduced Hessian is indefinite: the solution is no strict local minimum, and what "
+                "becomes of it when data change is not determined; start elsewhere"
+            )
+        dependent = rest[n:].max(initial=0.0) > SOLVED
+        return self._place(int(np.argmax(rest[n:])))[2] if dependent else ""
+
+    def _place(self, row: int) -> tuple[str, int, str]:
+        """Term and factor of a constraint row, and the words for it."""
+        term, factor = self._program.row_name(row)
+        rows, (_, m) = next((rows, shape) for name, rows, shape in self._program.places if name == term)
+        return term, factor, f"'{term}', factor {factor}, row {(row - rows.start) % m},"
+
+    def matrix(self, of: Sequence[Selection | str], wrt: Sequence[Wrt]) -> Array:
+        """(k, K) derivatives; arguments and errors as of :meth:`unifg.Solution.sensitivity`."""
+        places, columns = (np.concatenate(part) for part in zip(*map(self._rows, of), strict=True))
+        change = self._change(wrt)
+        result = np.zeros((len(places), change.count))
+        result[places == HEIGHT] = change.heights
+        of_fixed = change.numbers[:, columns] * (columns >= 0) - (columns < 0)
+        which, row = np.nonzero(of_fixed >= 0)
+        result[row, of_fixed[which, row]] = 1.0
+        asked = np.flatnonzero(places >= 0)
+        if self._forward(places[asked]) or change.count <= len(asked):
+            for j in range(change.count if len(asked) else 0):
+                result[asked, j] = self._solved(change.column(j, self._system.pattern.size))[places[asked]]
+            return result
+        right = np.zeros(self._system.pattern.size)
+        for i in asked:
+            right[places[i]] = 1.0
+            result[i] = change.pulled(self._solved(right))
+            right[places[i]] = 0.0
+        return result
+
+    def gradient(self, of: Mapping[Selection | str, Array], wrt: Sequence[Wrt]) -> list[Array]:
+        """Gradients of a weighted sum; arguments and errors as of :meth:`unifg.Solution.gradient`."""
+        change, right = self._change(wrt), np.zeros(self._system.pattern.size)
+        total = np.zeros(change.count)
+        asked = []
+        for what, weights in of.items():
+            places, columns = self._rows(what)
+            given = np.broadcast_to(weights, self._shape(what)).ravel()
+            np.add.at(right, places[places >= 0], given[places >= 0])
+            asked.append(places[places >= 0])
+            if (places == HEIGHT).any():
+                total += given * change.heights
+            for numbers in change.numbers:
+                own = np.where(columns < 0, -1, numbers[columns])
+                np.add.at(total, own[own >= 0], given[own >= 0])
+        if self._forward(np.concatenate(asked)):
+            size = self._system.pattern.size
+            total += [self._solved(change.column(j, size)) @ right for j in range(change.count)]
+        elif right.any():
+            total += change.pulled(self._solved(right))
+        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in change.shapes)])
+        return [total[a:b].reshape(shape) for a, b, shape in zip(ends[:-1], ends[1:], change.shapes, strict=True)]
+
+    def _forward(self, places: IntArray) -> bool:
+        """Test whether columns are the only way, because active gradients depend on each other.
+
+        Raises:
+            GraphError: multipliers are asked for, which are not unique then.
+        """
+        if self._dependent and (places >= self._program.size).any():
+            raise GraphError(
+                f"sensitivity: {self._dependent} has a gradient that depends on those of other active rows, and "
+                "multipliers are not unique: state each condition once, or ask for values"
+            )
+        return bool(self._dependent)
+
+    def _rows(self, of: Selection | str) -> tuple[IntArray, IntArray]:
+        """Places (k,) in the KKT system, or `HEIGHT`, or -1 for none; full tangent columns (k,), or -1."""
+        program = self._program
+        if not isinstance(of, str):
+            columns = program.columns.of(of).ravel()
+            return program.columns.unknown[columns], columns
+        rows = [rows for name, rows, _ in program.places if name == of]
+        if not rows and of != COST:
+            known = ", ".join([*(name for name, _, _ in program.places), COST])
+            raise GraphError(f"sensitivity: no family or constraint is called '{of}' (there are: {known})", term=of)
+        places = self._number[rows[0]] if rows else np.array([HEIGHT])
+        return places, np.full(len(places), -1)
+
+    def _shape(self, of: Selection | str) -> tuple[int, ...]:
+        """Shape of the weights of what is asked for."""
+        if not isinstance(of, str):
+            return len(of), of.manifold.dim
+        return next((shape for name, _, shape in self._program.places if name == of), ())
+
+    def _parameter(self, wrt: Wrt) -> Parameter:
+        program = self._program
+        declared, families = program.graph._data, {family.name: family for family in program.families}
+        if isinstance(wrt, str):
+            if wrt not in declared and wrt not in families:
+                known = ", ".join([*declared, *families])
+                raise GraphError(f"sensitivity: no data or family is called '{wrt}' (there are: {known})")
+            wrt = declared.get(wrt) or families[wrt]
+        if not isinstance(wrt, Data):
+            return fixed(program, as_selection(wrt))
+        if declared.get(wrt.name) is not wrt:
+            raise GraphError(f"data {wrt!r} does not belong to this graph")
+        return datum(program, wrt)
+
+    def _change(self, wrt: Sequence[Wrt]) -> Change:
+        """What parameters do to the KKT conditions.
+
+        Raises:
+            GraphError: the data of this solution have been replaced, or a parameter has no derivative.
+        """
+        program, given = self._program, [self._parameter(one) for one in wrt]
+        unknown, parts = program.columns.unknown, []
+        starts = dict(zip(program.constraint_terms, (rows.start for rows in program.slices), strict=True))
+        offset = 0
+        height, offsets = [], []
+        with program.lock:
+            if any(not np.array_equal(program._binding.present[h], value) for h, value in self._present.items()):
+                raise GraphError(REPLACED)
+            for parameter in given:
+                for number, part in parts_of(program, self._here.values, self._multipliers, parameter):
+                    term = program.terms[number]
+                    places = unknown[np.concatenate(term.columns, axis=1)[part.factors]]
+                    if part.rows.shape[1]:
+                        rows = starts[term] + part.factors[:, None] * term.size + np.arange(term.size)
+                        places = np.concatenate([places, self._number[rows]], axis=1)
+                    values = np.concatenate([part.slopes, part.rows], axis=1)
+                    numbers = np.where(part.numbers < 0, -1, part.numbers + offset)
+                    parts.append(
+                        [
+                            np.broadcast_to(a, values.shape).ravel()
+                            for a in (places[:, :, None], numbers[:, None], values)
+                        ]
+                    )
+                    height.append((numbers.ravel(), part.heights.ravel()))
+                offsets.append(offset)
+                offset += int(np.prod(parameter.shape))
+        rows, numbers, values = map(np.concatenate, zip(*parts, strict=True)) if parts else (np.zeros(0, int),) * 3
+        kept = (rows >= 0) & (numbers >= 0) & (values != 0.0)
+        order = np.flatnonzero(kept)[np.argsort(numbers[kept], kind="stable")]
+        heights = np.zeros(offset)
+        for own, value in height:
+            np.add.at(heights, own[own >= 0], value[own >= 0])
+        moved = [np.where(p.numbers < 0, -1, p.numbers + first) for p, first in zip(given, offsets, strict=True)]
+        return Change([p.shape for p in given], rows[order], numbers[order], values[order], heights, np.array(moved))
+
+    def _solved(self, right: Array) -> Array:
+        """The solution for a right-hand side.
+
+        Raises:
+            GraphError: there is none.
+        """
+        saddle = self._system.saddle
+        solution, _ = saddle.solve(right, ENOUGH)
+        if not np.abs(saddle.residual(solution, right)).max() <= SOLVED * np.abs(saddle.scale * right).max(initial=0.0):
+            what = f": {self._dependent} depends on other active rows" if self._dependent else ""
+            raise GraphError(
+                f"sensitivity: after a change of the data the active constraints contradict each other{what}"
+            )
+        return solution
+
+
+@dataclass(frozen=True)
+class Change:
+    """What parameters do to the KKT conditions, entry by entry, ordered by parameter.
+
+    Attributes:
+        shapes: of the coordinates of each parameter.
+        rows, coordinates, values: of the entries.
+        heights: (K,) derivatives of the Lagrangian.
+        numbers: (parameters, width) coordinate of each full tangent column, -1 for none.
+    """
+
+    shapes: list[tuple[int, ...]]
+    rows: IntArray
+    coordinates: IntArray
+    values: Array
+    heights: Array
+    numbers: IntArray
+
+    @property
+    def count(self) -> int:
+        """Coordinates of all parameters."""
+        return len(self.heights)
+
+    def column(self, number: int, size: int) -> Array:
+        """(size,) right-hand side for one coordinate."""
+        first, last = np.searchsorted(self.coordinates, [number, number + 1])
+        return np.asarray(np.bincount(self.rows[first:last], -self.values[first:last], size), dtype=np.float64)
+
+    def pulled(self, adjoint: Array) -> Array:
+        """(K,) derivatives, of the solution for the rows that are asked for."""
+        return np.asarray(np.bincount(self.coordinates, -self.values * adjoint[self.rows], self.count), dtype=np.float64)
