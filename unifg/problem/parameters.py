@@ -2,9 +2,9 @@
 
 Of each term r and J are known exactly, and their derivatives with respect to an argument p are taken from central
 differences of these first-order quantities at a fixed point, at four points (error h^4, h = 1e-4 of the number); where
-steps of h and 2 h disagree, something has a kink or a jump there, and nothing is returned. What weights, losses, limits
-and multipliers make of r and J is derived by hand. With M = W'W, s = r'M r, w = rho'(s), b = rho''(s) and u = w M r a
-cost has the gradient J'u, and
+steps of h and 2 h disagree in slope or curvature, there is a kink or a jump, and nothing is returned. What weights,
+losses, limits and multipliers make of r and J is derived by hand. With M = W'W, s = r'M r, w = rho'(s), b = rho''(s)
+and u = w M r a cost has the gradient J'u, and
 
     d(J'u) = dJ'u + J'du,    du = w (M dr + dM r) + b (2 r'M dr + r'dM r) M r.
 
@@ -34,7 +34,7 @@ from unifg.typing import Array, BoolArray, IntArray
 STEP, SMALL = 1e-4, 1e-4  # of a number; numbers are no smaller than this part of the largest
 SMOOTH = 1e-3  # relative difference of slopes from two steps above which there is a kink
 ROUNDING = 1e-9  # of r and J: slopes below this over the step are noise
-TIMES = np.array([1.0, -1.0, 2.0, -2.0])
+TIMES = np.array([0.0, 1.0, -1.0, 2.0, -2.0])
 LONGEST = 20_000  # factors in one call
 
 
@@ -173,11 +173,11 @@ def _moved(
         steps = np.eye(len(rows) * dim).reshape(-1, len(rows), dim)
         own = np.broadcast_to(np.arange(len(steps)), (term.count, len(steps)))
     steps = steps * (_lengths(rows) if isinstance(manifold, Rn) else STEP)
-    chunk, found = max(1, LONGEST // (4 * len(factors))), []
+    chunk, found = max(1, LONGEST // (len(TIMES) * len(factors))), []
     for first in range(0, len(steps), chunk):
         part = steps[first : first + chunk]
         moves = (TIMES[:, None, None] * part[:, None]).reshape(-1, dim)
-        many = np.broadcast_to(rows, (4 * len(part), *rows.shape)).reshape(-1, manifold.storage)
+        many = np.broadcast_to(rows, (len(TIMES) * len(part), *rows.shape)).reshape(-1, manifold.storage)
         there = np.asarray(manifold.retract(many, moves)).reshape(-1, *base.shape)
         length = part.max(axis=2)
         length = length[:, factors] if each else np.broadcast_to(length.max(axis=1)[:, None], (len(part), term.count))
@@ -207,16 +207,18 @@ def _lengths(rows: Array) -> Array:
 
 
 def _slope(term: CompiledTerm, factors: IntArray, name: str, found: Array, length: Array) -> Array:
-    """(K, n, ...) derivatives from (4 K, n, ...) values at `TIMES` of (K, n) steps.
+    """(K, n, ...) derivatives from (5 K, n, ...) values at `TIMES` of (K, n) steps.
 
     Raises:
         GraphError: two steps disagree.
     """
-    found = found.reshape(len(length), 4, *found.shape[1:])
-    step = length.reshape(*length.shape, *[1] * (found.ndim - 3))
-    near, far = (found[:, 0] - found[:, 1]) / (2.0 * step), (found[:, 2] - found[:, 3]) / (4.0 * step)
+    at, *beside = np.moveaxis(found.reshape(len(length), len(TIMES), *found.shape[1:]), 1, 0)
+    step = length.reshape(*length.shape, *[1] * (at.ndim - 2))
+    ahead, behind, two_ahead, two_behind = beside
+    near, far = (ahead - behind) / (2.0 * step), (two_ahead - two_behind) / (4.0 * step)
+    bent = (two_ahead + two_behind + 6.0 * at - 4.0 * (ahead + behind)) / (4.0 * step)  # zero where it is smooth
     doubt = SMOOTH * np.abs(near).max(initial=0.0) + ROUNDING * np.abs(found).max(initial=0.0) / step
-    wrong = np.argwhere(~(np.abs(near - far) <= doubt))
+    wrong = np.argwhere(~(np.maximum(np.abs(near - far), np.abs(bent)) <= doubt))
     for index in factors[wrong[:, 1]].tolist():
         if term.active is None or term.active[index]:
             raise GraphError(

@@ -74,10 +74,11 @@ class Sensitivities:
             pairs = (here.gradient / scale, lin.gradient / scale), (here.constraints, lin.constraints)
             if not all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in (*pairs, (here.cost, lin.cost))):
                 raise GraphError(REPLACED)
-            hessian = lagrangian_hessian(program, here, multipliers)
-        held = active.copy()
-        held[program.fixed_rows()] = False
-        self._require_strict(held, tolerance)
+            self._require_strict(tolerance)
+            held = active.copy()
+            held[program.fixed_rows()] = False
+            self._multipliers = np.where(held, multipliers, 0.0)
+            hessian = lagrangian_hessian(program, here, self._multipliers)
         n, self._system = program.size, program.systems.kkt(np.ones(len(held), dtype=bool))
         pattern = self._system.pattern
         entries = np.zeros(pattern.nnz)
@@ -90,7 +91,7 @@ class Sensitivities:
             raise GraphError("sensitivity: the Hessian is not finite at the solution")
         self._dependent = self._probe(out)
 
-    def _require_strict(self, held: BoolArray, tolerance: float) -> None:
+    def _require_strict(self, tolerance: float) -> None:
         """Raise for the weakest row that may be active or not."""
         program, least = self._program, WEAK * float(np.sqrt(tolerance))
         force = np.abs(self._multipliers)
@@ -121,8 +122,11 @@ class Sensitivities:
         program, system, n = self._program, self._system, self._program.size
         right = np.random.default_rng(0).standard_normal(len(out)) / system.saddle.scale
         right[out] = 0.0
-        solution, _ = system.saddle.solve(right)
-        rest = np.abs(system.saddle.residual(solution, right))
+        rest = self._left(right)
+        singular = not rest.max(initial=0.0) <= SOLVED
+        if singular:  # multipliers that dependent rows leave open may be too large to see the unknowns beside them
+            of_unknowns = self._left(np.where(np.arange(len(out)) < n, right, 0.0))
+            rest[:n] = of_unknowns[:n]
         if not rest[:n].max(initial=0.0) <= SOLVED:
             family, index = program.columns.name(int(program.columns.free[np.argmax(rest[:n])]))
             raise GraphError(
@@ -136,8 +140,12 @@ class Sensitivities:
                 "sensitivity: the reduced Hessian is indefinite: the solution is no strict local minimum, and what "
                 "becomes of it when data change is not determined; start elsewhere"
             )
-        dependent = rest[n:].max(initial=0.0) > SOLVED
-        return self._place(int(np.argmax(rest[n:])))[2] if dependent else ""
+        return self._place(int(np.argmax(rest[n:])))[2] if singular else ""
+
+    def _left(self, right: Array) -> Array:
+        """Magnitudes of what a solve leaves of a right-hand side."""
+        solution, _ = self._system.saddle.solve(right, ENOUGH)
+        return np.abs(self._system.saddle.residual(solution, right))
 
     def _place(self, row: int) -> tuple[str, int, str]:
         """Term and factor of a constraint row, and the words for it."""
@@ -166,28 +174,23 @@ class Sensitivities:
             right[places[i]] = 0.0
         return result
 
-    def gradient(self, of: Mapping[Selection | str, Array], wrt: Sequence[Wrt]) -> list[Array]:
-        """Gradients of a weighted sum; arguments and errors as of :meth:`unifg.Solution.gradient`."""
-        change, right = self._change(wrt), np.zeros(self._system.pattern.size)
-        total = np.zeros(change.count)
-        asked = []
+    def gradient(self, of: Mapping[Selection | str, Array], wrt: Wrt) -> Array:
+        """Gradient of a weighted sum; arguments and errors as of :meth:`unifg.Solution.gradient`."""
+        change, right = self._change([wrt]), np.zeros(self._system.pattern.size)
+        total, places = np.zeros(change.count), np.zeros(0, dtype=np.intp)
         for what, weights in of.items():
             places, columns = self._rows(what)
             given = np.broadcast_to(weights, self._shape(what)).ravel()
             np.add.at(right, places[places >= 0], given[places >= 0])
-            asked.append(places[places >= 0])
-            if (places == HEIGHT).any():
+            if places[0] == HEIGHT:
                 total += given * change.heights
-            for numbers in change.numbers:
-                own = np.where(columns < 0, -1, numbers[columns])
-                np.add.at(total, own[own >= 0], given[own >= 0])
-        if self._forward(np.concatenate(asked)):
-            size = self._system.pattern.size
-            total += [self._solved(change.column(j, size)) @ right for j in range(change.count)]
+            own = np.where(columns < 0, -1, change.numbers[0, columns])
+            np.add.at(total, own[own >= 0], given[own >= 0])
+        if self._forward(np.flatnonzero(right)):
+            total += [self._solved(change.column(j, len(right))) @ right for j in range(change.count)]
         elif right.any():
             total += change.pulled(self._solved(right))
-        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in change.shapes)])
-        return [total[a:b].reshape(shape) for a, b, shape in zip(ends[:-1], ends[1:], change.shapes, strict=True)]
+        return total.reshape(change.shape)
 
     def _forward(self, places: IntArray) -> bool:
         """Test whether columns are the only way, because active gradients depend on each other.
@@ -274,7 +277,7 @@ class Sensitivities:
         for own, value in height:
             np.add.at(heights, own[own >= 0], value[own >= 0])
         moved = [np.where(p.numbers < 0, -1, p.numbers + first) for p, first in zip(given, offsets, strict=True)]
-        return Change([p.shape for p in given], rows[order], numbers[order], values[order], heights, np.array(moved))
+        return Change(given[0].shape, rows[order], numbers[order], values[order], heights, np.array(moved))
 
     def _solved(self, right: Array) -> Array:
         """The solution for a right-hand side.
@@ -297,13 +300,13 @@ class Change:
     """What parameters do to the KKT conditions, entry by entry, ordered by parameter.
 
     Attributes:
-        shapes: of the coordinates of each parameter.
+        shape: of the coordinates, where there is one parameter.
         rows, coordinates, values: of the entries.
         heights: (K,) derivatives of the Lagrangian.
         numbers: (parameters, width) coordinate of each full tangent column, -1 for none.
     """
 
-    shapes: list[tuple[int, ...]]
+    shape: tuple[int, ...]
     rows: IntArray
     coordinates: IntArray
     values: Array
@@ -322,4 +325,6 @@ class Change:
 
     def pulled(self, adjoint: Array) -> Array:
         """(K,) derivatives, of the solution for the rows that are asked for."""
-        return np.asarray(np.bincount(self.coordinates, -self.values * adjoint[self.rows], self.count), dtype=np.float64)
+        return np.asarray(
+            np.bincount(self.coordinates, -self.values * adjoint[self.rows], self.count), dtype=np.float64
+        )

@@ -367,27 +367,27 @@ class Solution:
                 indefinite, multipliers are not unique, or a function has a kink.
         """
         asked = [of] if isinstance(of, Variable | str) else of
-        return self._sensitivities.matrix([self._part(part) for part in asked], _listed(wrt))
+        by = [wrt] if isinstance(wrt, Data | Variable | str) else wrt
+        return self._sensitivities.matrix([self._part(part) for part in asked], by)
 
-    def gradient(self, of: Mapping[Named, Numbers] | str, wrt: Wrt | Sequence[Wrt]) -> Array | list[Array]:
+    def gradient(self, of: Mapping[Named, Numbers] | str, wrt: Wrt) -> Array:
         """Gradient of a scalar, by one solve: of the cost, or of a weighted sum of whatever :meth:`sensitivity` takes.
 
         For a loss of the solution, ``{x: slope}`` with the slope (n, d) of the loss along the tangent coordinates.
 
         Args:
             of: ``"cost"``, or weights, which broadcast to (n, d) of variables, (n, m) of multipliers.
-            wrt: as for :meth:`sensitivity`.
+            wrt: a datum, or fixed variables.
 
         Returns:
-            An array in the shape of the data, elements of manifolds by tangent coordinates; one for each of several.
+            An array in the shape of the data; elements of manifolds by tangent coordinates.
 
         Raises:
             GraphError: as :meth:`sensitivity`.
         """
         weights = {of: 1.0} if isinstance(of, str) else of
         parts = {self._part(part): np.asarray(given, dtype=np.float64) for part, given in weights.items()}
-        found = self._sensitivities.gradient(parts, _listed(wrt))
-        return found[0] if isinstance(wrt, Data | Variable | str) else found
+        return self._sensitivities.gradient(parts, wrt)
 
     def _part(self, named: Named) -> Selection | str:
         """A selection, or the name of a constraint or the cost."""
@@ -559,11 +559,6 @@ class Solution:
                 f"family '{name}' is not part of this solution{hint if name in self.families else ''}", family=name
             )
         return selection
-
-
-def _listed(wrt: Wrt | Sequence[Wrt]) -> Sequence[Wrt]:
-    """One or several, as several."""
-    return [wrt] if isinstance(wrt, Data | Variable | str) else wrt
 
 
 class NotConverged(UnifgError, RuntimeError):
