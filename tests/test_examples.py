@@ -285,3 +285,44 @@ def test_live_view(run: Run) -> None:
     gaps = np.linalg.norm(driven[:, None, :2] - ran["discs"][:, :2], axis=2) - ran["discs"][:, 2]
     assert 0.15 - 1e-3 < gaps.min() < 0.2
     assert "Live" in (ran.folder / "live_view.html").read_text(encoding="utf-8")
+
+
+def test_first_order_tick(run: Run) -> None:
+    """The corrected tick is nearer to the full one by far, except where the plan changes sides."""
+    ran = run("first_order_tick")
+    uncorrected, corrected = ran["table"][:, 2:4].T
+    assert np.median(corrected) < 0.05 * np.median(uncorrected) and (corrected < uncorrected).mean() > 0.95
+    assert np.median(ran["table"][:, 4]) < 100.0, "microseconds"
+    gaps = np.linalg.norm(ran["table"][:, :2] - [2.6, -0.1], axis=1) - 0.3
+    assert gaps.min() > -0.05
+
+
+def test_influential_measurements(run: Run) -> None:
+    ran = run("influential_measurements")
+    for moved, foretold, true in ran["results"].values():
+        assert moved > 0.05 and np.linalg.norm(foretold - true) < 0.1 * np.linalg.norm(true)
+    assert ran["moved"].max() > 20.0 * np.median(ran["moved"])
+
+
+def test_learned_weights(run: Run) -> None:
+    """The gradient is that of the drive, and it leads down."""
+    ran = run("learned_weights")
+    costs = [cost for cost, *_ in ran["runs"]]
+    assert costs[-1] < 0.9 * costs[0] and len(costs) == 21
+    drive, logs, h = ran["drive"], np.array([0.1, -0.2, 0.3]), 1e-5
+    for k, slope in enumerate(drive(np.exp(logs))[1]):
+        step = h * np.eye(3)[k]
+        assert (drive(np.exp(logs + step))[0] - drive(np.exp(logs - step))[0]) / (2.0 * h) == pytest.approx(
+            slope, rel=1e-5
+        )
+
+
+def test_learned_noise(run: Run) -> None:
+    """On drives that were not seen it is as good as with the sigmas that they were made with."""
+    ran = run("learned_noise")
+    assert ran["costs"][-1] < 0.25 * ran["costs"][0]
+    total, sigmas = 0.0, ran["sigmas"]
+    for truth, data in ran["drives"][6:]:
+        known = {**data, sigmas[0]: ran["noise"], sigmas[1]: np.full(2, ran["gps"])}
+        total += float(((ran["run"].solve({ran["x"]: truth}, data=known)[ran["x"]] - truth)[:, :2] ** 2).sum())
+    assert ran["costs"][-1] < 1.05 * np.sqrt(total / 360)

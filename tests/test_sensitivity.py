@@ -27,7 +27,7 @@ CASES = list(dict.fromkeys([*problems(), *sixteen()]))
 
 
 def vector(solution: fg.Solution, of: list[Any], origin: fg.Solution) -> Array:
-    """What is asked for, values as steps from those of the origin."""
+    """Numbers that are asked for, values as steps from those of the origin."""
     parts = []
     for one in of:
         if isinstance(one, str):

@@ -39,7 +39,7 @@ LONGEST = 20_000  # factors in one call
 
 
 class Parameter(NamedTuple):
-    """What derivatives are taken by.
+    """A datum or fixed variables, by which derivatives are taken.
 
     Attributes:
         name: for messages.
@@ -57,7 +57,7 @@ class Parameter(NamedTuple):
 
 
 class Part(NamedTuple):
-    """What one argument, weight or limit of a term does.
+    """Effect of one argument, weight or limit of a term.
 
     Attributes:
         factors: (n,) that it moves.

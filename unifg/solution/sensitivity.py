@@ -1,4 +1,4 @@
-"""Derivatives of a solution: what a small change of data does to it, by the implicit function theorem.
+"""Derivatives of a solution with respect to its data, by the implicit function theorem.
 
 At a solution the KKT conditions hold as equations, those of active inequalities with them, and keep holding while a
 parameter p moves (A. V. Fiacco, "Introduction to Sensitivity and Stability Analysis in Nonlinear Programming", 1983):
@@ -21,7 +21,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.factors.robust import form_of
 from unifg.modeling.terms import Cost
-from unifg.modeling.variables import Data, Selection, Variable, as_selection
+from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
@@ -29,14 +29,14 @@ from unifg.problem.parameters import Parameter, datum, fixed, parts_of
 from unifg.problem.systems import fill
 from unifg.solution.covariance import SOLVED
 from unifg.solution.gains import SAME
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
 REPLACED = "sensitivity: the data of this solution have been replaced since; ask before the next solve"
 ENOUGH = 1e-12  # residual of a solve
 WEAK = 10.0  # times the root of the tolerance: slack and multiplier of a row that may be active or not
 Named = Variable | str
-Of = Named | Sequence[Named]
+Weights = Mapping[Family, Numbers] | Mapping[Selection, Numbers] | Mapping[str, Numbers] | Mapping[Named, Numbers]
 Wrt = Data | Variable | str
 
 
@@ -239,7 +239,7 @@ class Sensitivities:
         return datum(program, wrt)
 
     def _change(self, wrt: Sequence[Wrt]) -> Change:
-        """What parameters do to the KKT conditions.
+        """Derivatives of the KKT conditions by parameters.
 
         Raises:
             GraphError: the data of this solution have been replaced, or a parameter has no derivative.
@@ -297,7 +297,7 @@ class Sensitivities:
 
 @dataclass(frozen=True)
 class Change:
-    """What parameters do to the KKT conditions, entry by entry, ordered by parameter.
+    """Change of the KKT conditions by parameters, entry by entry, ordered by parameter.
 
     Attributes:
         shape: of the coordinates, where there is one parameter.

@@ -23,7 +23,7 @@ from unifg.solution.history import HEADER, FactorNorms, History, Iteration, fact
 from unifg.solution.marginal import Variables, information, marginal_prior
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
-from unifg.solution.sensitivity import Named, Sensitivities, Wrt
+from unifg.solution.sensitivity import Named, Sensitivities, Weights, Wrt
 from unifg.solution.status import Status
 from unifg.solution.warm_start import Shifts
 from unifg.typing import Array, BoolArray, Numbers
@@ -370,7 +370,7 @@ class Solution:
         by = [wrt] if isinstance(wrt, Data | Variable | str) else wrt
         return self._sensitivities.matrix([self._part(part) for part in asked], by)
 
-    def gradient(self, of: Mapping[Named, Numbers] | str, wrt: Wrt) -> Array:
+    def gradient(self, of: Weights | str, wrt: Wrt) -> Array:
         """Gradient of a scalar, by one solve: of the cost, or of a weighted sum of whatever :meth:`sensitivity` takes.
 
         For a loss of the solution, ``{x: slope}`` with the slope (n, d) of the loss along the tangent coordinates.
