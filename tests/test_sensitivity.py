@@ -439,7 +439,15 @@ def test_data_that_have_been_replaced_are_noticed() -> None:
     refused(first, "have been replaced")
     np.testing.assert_allclose(later.sensitivity("x", p), np.diag([2.4, 3.0]), rtol=1e-9)
     run.solve({x: np.zeros((1, 2))}, data={p: [1.3, 1.5]})
-    refused(later, "have been replaced")
+    np.testing.assert_array_equal(later.gradient("cost", p), 0.0)  # what has been asked is known
+    again = run.solve({x: np.zeros((1, 2))}, data={p: [1.2, 1.5]})
+    np.testing.assert_allclose(again.sensitivity("x", p), later.sensitivity("x", p), rtol=1e-9)
+    q = graph.data("q", 0.0)
+    graph.minimize_scalar(lambda x, q: q * ((x - 1.44) ** 2).sum(axis=1), x, q, name="bent, and flat at the answer")
+    own = InteriorPoint(tolerance=TIGHT).prepare(graph)
+    flat = own.solve({x: np.ones((1, 2))}, data={p: [1.2, 1.2], q: 0.0})
+    own.solve(flat, data={p: [1.2, 1.2], q: 3.0})
+    refused(flat, "have been replaced")
 
 
 def test_fixed_variables_and_several_questions_at_once() -> None:

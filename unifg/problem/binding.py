@@ -26,6 +26,7 @@ class Binding:
 
     Attributes:
         present: the value of every datum, an array that keeps its place.
+        edition: how often some of them have been replaced by others.
     """
 
     _others = False  # whether there are elements of manifolds with other conditions than a norm
@@ -62,7 +63,7 @@ class Binding:
         self._quaternions = np.concatenate(starts)
         self.present.update({handle: np.empty_like(handle.value) for handle in self._flags})
         self._changed = np.zeros(len(self._numbers), dtype=np.bool_)
-        self._all = True
+        self._all, self.edition = True, 0
         self.carry([], [], np.empty(0))
 
     def _views(self, flat: Array) -> list[Array]:
@@ -122,6 +123,7 @@ class Binding:
             if not np.array_equal(array, self.present[handle]):
                 self.present[handle][...] = array
                 changed = [*changed, handle]
+        self.edition += len(changed) > 0
         if self._all:
             self._all, changed = False, [*self._numbers, *self._flags]
         return changed

@@ -157,6 +157,11 @@ class CompiledProblem:
         return self.table.arrays
 
     @property
+    def data_edition(self) -> int:
+        """Number of the present data; two of the same number are the same."""
+        return self._binding.edition
+
+    @property
     def left_to_python(self) -> list[str]:
         """Names of the terms that Python evaluates."""
         return [term.name for term in self.batched + self.scalar_terms if term.trace is None]

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
 from unifg.factors.differences import scalar_slopes, slopes
 from unifg.factors.robust import bend_of, form_of
@@ -181,10 +182,11 @@ def _moved(
         there = np.asarray(manifold.retract(many, moves)).reshape(-1, *base.shape)
         length = part.max(axis=2)
         length = length[:, factors] if each else np.broadcast_to(length.max(axis=1)[:, None], (len(part), term.count))
-        found.append([_slope(term, factors, name, f, length) for f in _evaluated(term, factors, points, place, there)])
-    residual, jacobian = (np.moveaxis(np.concatenate(f), 0, -1) for f in zip(*found, strict=True))
+        values_there, jacobians = _evaluated(term, factors, points, place, there)
+        r, J = values_there[0], jacobians[0]  # at the point itself
+        found.append([_slope(term, factors, name, f, length) for f in (values_there, jacobians)])
+    residual, jacobian = found[0] if len(found) == 1 else (np.concatenate(f, axis=-1) for f in zip(*found, strict=True))
     if isinstance(term.term, Cost):
-        r, J = (f[0] for f in _evaluated(term, factors, points, place, base[None]))
         return _of_cost(term, factors, own, J, r, jacobian, residual, np.zeros((1, 1, 1, 1)))
     forces = forces[factors]
     rows = residual if isinstance(term.term, Constraint) else residual[:, :0]
@@ -207,27 +209,52 @@ def _lengths(rows: Array) -> Array:
 
 
 def _slope(term: CompiledTerm, factors: IntArray, name: str, found: Array, length: Array) -> Array:
-    """(K, n, ...) derivatives from (5 K, n, ...) values at `TIMES` of (K, n) steps.
+    """(n, ..., K) derivatives from (5 K, n, ...) values at `TIMES` of (K, n) steps.
 
     Raises:
         GraphError: two steps disagree.
     """
-    at, *beside = np.moveaxis(found.reshape(len(length), len(TIMES), *found.shape[1:]), 1, 0)
-    step = length.reshape(*length.shape, *[1] * (at.ndim - 2))
-    ahead, behind, two_ahead, two_behind = beside
-    near, far = (ahead - behind) / (2.0 * step), (two_ahead - two_behind) / (4.0 * step)
-    bent = (two_ahead + two_behind + 6.0 * at - 4.0 * (ahead + behind)) / (4.0 * step)  # zero where it is smooth
-    doubt = SMOOTH * np.abs(near).max(initial=0.0) + ROUNDING * np.abs(found).max(initial=0.0) / step
-    wrong = np.argwhere(~(np.maximum(np.abs(near - far), np.abs(bent)) <= doubt))
-    for index in factors[wrong[:, 1]].tolist():
-        if term.active is None or term.active[index]:
-            raise GraphError(
-                f"sensitivity: term '{term.name}' has a kink or a jump near the present '{name}' (factor {index}), and "
-                "no derivative there: smooth the function, or ask elsewhere",
-                term=term.name,
-                index=index,
-            )
-    return np.asarray((4.0 * near - far) / 3.0)
+    out, wanted = np.empty((*found.shape[1:], len(length))), np.ones(len(factors), dtype=bool)
+    if term.active is not None:
+        wanted = term.active[factors]
+    shape = len(length), len(TIMES), len(factors), -1
+    wrong = slopes_of(found.reshape(shape), np.ascontiguousarray(length), wanted, out.reshape(*shape[2:], len(length)))
+    if wrong >= 0:
+        index = int(factors[wrong])
+        raise GraphError(
+            f"sensitivity: term '{term.name}' has a kink or a jump near the present '{name}' (factor {index}), and no "
+            "derivative there: smooth the function, or ask elsewhere",
+            term=term.name,
+            index=index,
+        )
+    return out
+
+
+@compiled
+def slopes_of(found: Array, length: Array, wanted: BoolArray, out: Array) -> int:
+    """Write (n, w, K) derivatives from (K, 5, n, w) values; the first factor with a kink or a jump, -1 for none."""
+    count, _, factors, width = found.shape
+    steepest = largest = 0.0
+    for k in range(count):
+        for i in range(factors):
+            h = length[k, i]
+            for c in range(width):
+                near = (found[k, 1, i, c] - found[k, 2, i, c]) / (2.0 * h)
+                far = (found[k, 3, i, c] - found[k, 4, i, c]) / (4.0 * h)
+                out[i, c, k] = (4.0 * near - far) / 3.0
+                if wanted[i]:
+                    steepest, largest = max(steepest, abs(near)), max(largest, abs(found[k, 0, i, c]))
+    for k in range(count):
+        for i in range(factors):
+            h, doubt = length[k, i], SMOOTH * steepest + ROUNDING * largest / length[k, i]
+            for c in range(width):
+                ahead, behind = found[k, 1, i, c], found[k, 2, i, c]
+                two_ahead, two_behind = found[k, 3, i, c], found[k, 4, i, c]
+                turned = abs((ahead - behind) / (2.0 * h) - (two_ahead - two_behind) / (4.0 * h))
+                bent = abs(two_ahead + two_behind + 6.0 * found[k, 0, i, c] - 4.0 * (ahead + behind)) / (4.0 * h)
+                if wanted[i] and not (turned <= doubt and bent <= doubt):
+                    return i
+    return -1
 
 
 def _has_rows(term: CompiledTerm, points: list[Array], place: int) -> bool:
@@ -246,7 +273,8 @@ def _evaluated(
         rows, slot = kernel.rows_of(term._for_kernel(points)), term._inputs.index(place)
         own = there.reshape(times, *rows[slot].shape)
         own = own[:, factors] if own.shape[1] > 1 else np.repeat(own, len(factors), axis=1)
-        given = [np.tile(row[factors], (times, *[1] * (row.ndim - 1))) if len(row) > 1 else row for row in rows]
+        chosen = np.tile(factors, times)
+        given = [row[chosen] if len(row) > 1 else row for row in rows]
         given[slot] = own.reshape(-1, *own.shape[2:])
         variable = [
             term._inputs[k] in term._places for k, a in enumerate(kernel.arguments) if not isinstance(a, int | tuple)

@@ -187,6 +187,12 @@ class KktSystem:
             self.loaded = data
         return True
 
+    def without(self, entries: Array, out: BoolArray) -> Array:
+        """Entries of the matrix with rows of the identity, negative for multipliers, in the place of some (size,)."""
+        data = np.empty_like(entries)
+        leave_out(self.pattern.indptr, self.pattern.indices, entries, out, self._structure.unknowns, data)
+        return data
+
     @cached_property
     def arrays(self) -> KktArrays:
         """For compiled code."""
@@ -219,6 +225,16 @@ def fill(kkt: KktArrays, hessian: Array, constraint_jacobian: Array, data: Array
         data[kkt.normal[k]] = hessian[k]
     for k in range(len(kkt.entries)):
         data[kkt.places[k]] += constraint_jacobian[kkt.entries[k]]
+
+
+@compiled
+def leave_out(indptr: IntArray, indices: IntArray, entries: Array, out: BoolArray, unknowns: int, data: Array) -> None:
+    """Write the entries of a matrix without some rows and columns, which become those of the identity."""
+    for column in range(len(out)):
+        for k in range(indptr[column], indptr[column + 1]):
+            data[k] = 0.0 if out[column] or out[indices[k]] else entries[k]
+        if out[column]:
+            data[indptr[column + 1] - 1] = 1.0 if column < unknowns else -1.0
 
 
 @compiled

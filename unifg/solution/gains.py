@@ -111,9 +111,7 @@ def _gain(
     rows, columns = number[program.constraints.free_rows], program.constraints.free_columns
     out[n:] = True
     out[rows[(rows >= 0) & ~out[columns]]] = False  # rows that nothing later is part of say nothing about it
-    data = np.where(out[pattern.indices] | out[pattern.columns], 0.0, entries)
-    data[pattern.diagonal[out]] = np.where(np.flatnonzero(out) < n, 1.0, -1.0)
-    if not system.saddle.factor(data):
+    if not system.saddle.factor(system.without(entries, out)):
         return None
     free, gain = control >= 0, np.zeros((len(control), len(state)))
     for j, column in enumerate((*state, *control[free])):

@@ -33,6 +33,7 @@ from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
 REPLACED = "sensitivity: the data of this solution have been replaced since; ask before the next solve"
+LINEARIZED = "cost", "gradient", "hessian", "constraints", "constraint_jacobian"
 ENOUGH = 1e-12  # residual of a solve
 WEAK = 10.0  # times the root of the tolerance: slack and multiplier of a row that may be active or not
 Named = Variable | str
@@ -44,7 +45,14 @@ class Sensitivities:
     """The factorised KKT matrix at a solution, to be asked repeatedly."""
 
     def __init__(
-        self, program: CompiledProblem, lin: Linearization, multipliers: Array, active: BoolArray, tolerance: float
+        self,
+        program: CompiledProblem,
+        lin: Linearization,
+        multipliers: Array,
+        active: BoolArray,
+        tolerance: float,
+        edition: int,
+        limits: tuple[Array, Array],
     ) -> None:
         """Factorise.
 
@@ -54,6 +62,8 @@ class Sensitivities:
             multipliers: (M,) there.
             active: (M,) rows that hold as equalities.
             tolerance: of the solve.
+            edition: number of its data.
+            limits: of the constraints, (M,) each.
 
         Raises:
             GraphError: when the data have been replaced, rows are weakly active, or the reduced Hessian is not positive
@@ -67,37 +77,42 @@ class Sensitivities:
                     "use a loss that ships",
                     term=term.name,
                 )
+        self._lin, self._edition, self._limits, self._changes = lin, edition, limits, dict[tuple[Wrt, ...], Change]()
         with program.lock:
-            here = self._here = program.linearize(program.columns.values(lin.values))
-            self._present = {handle: value.copy() for handle, value in program._binding.present.items()}
-            scale = 1.0 + np.abs(lin.gradient).max(initial=0.0)
-            pairs = (here.gradient / scale, lin.gradient / scale), (here.constraints, lin.constraints)
-            if not all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in (*pairs, (here.cost, lin.cost))):
-                raise GraphError(REPLACED)
+            self._require_data()
             self._require_strict(tolerance)
             held = active.copy()
             held[program.fixed_rows()] = False
             self._multipliers = np.where(held, multipliers, 0.0)
-            hessian = lagrangian_hessian(program, here, self._multipliers)
+            hessian = lagrangian_hessian(program, lin, self._multipliers)
         n, self._system = program.size, program.systems.kkt(np.ones(len(held), dtype=bool))
-        pattern = self._system.pattern
-        entries = np.zeros(pattern.nnz)
-        fill(self._system.arrays, hessian, here.constraint_jacobian, entries)
+        entries = np.zeros(self._system.pattern.nnz)
+        fill(self._system.arrays, hessian, lin.constraint_jacobian, entries)
         out = np.concatenate([np.zeros(n, dtype=bool), ~held])
         self._number = np.where(held, n + np.arange(len(held)), -1)
-        data = np.where(out[pattern.indices] | out[pattern.columns], 0.0, entries)
-        data[pattern.diagonal[out]] = -1.0
-        if not self._system.saddle.factor(data):
+        if not self._system.saddle.factor(self._system.without(entries, out)):
             raise GraphError("sensitivity: the Hessian is not finite at the solution")
         self._dependent = self._probe(out)
+
+    def _require_data(self) -> None:
+        """Raise unless the present data are those of the solution: their number, or what they make of its values."""
+        program, lin = self._program, self._lin
+        if self._edition == program.data_edition:
+            return
+        here = program.linearize(program.columns.values(lin.values))
+        pairs = [(getattr(here, name), getattr(lin, name)) for name in LINEARIZED]
+        pairs += zip((program.lower, program.upper), self._limits, strict=True)
+        if not all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in pairs):
+            raise GraphError(REPLACED)
+        self._edition = program.data_edition
 
     def _require_strict(self, tolerance: float) -> None:
         """Raise for the weakest row that may be active or not."""
         program, least = self._program, WEAK * float(np.sqrt(tolerance))
         force = np.abs(self._multipliers)
         force = force / max(1.0, float(force.mean()) / 100.0) if len(force) else force
-        g = self._here.constraints
-        slack = np.minimum(np.abs(g - program.lower), np.abs(g - program.upper))
+        g = self._lin.constraints
+        slack = np.minimum(*(np.abs(g - limit) for limit in self._limits))
         size = np.where(program.equality, np.inf, np.maximum(slack, force))
         size[program.fixed_rows()] = np.inf
         if len(size) and (worst := int(np.argmin(size))) >= 0 and size[worst] < least:
@@ -244,16 +259,17 @@ class Sensitivities:
         Raises:
             GraphError: the data of this solution have been replaced, or a parameter has no derivative.
         """
+        if tuple(wrt) in self._changes:
+            return self._changes[tuple(wrt)]
         program, given = self._program, [self._parameter(one) for one in wrt]
         unknown, parts = program.columns.unknown, []
         starts = dict(zip(program.constraint_terms, (rows.start for rows in program.slices), strict=True))
         offset = 0
         height, offsets = [], []
         with program.lock:
-            if any(not np.array_equal(program._binding.present[h], value) for h, value in self._present.items()):
-                raise GraphError(REPLACED)
+            self._require_data()
             for parameter in given:
-                for number, part in parts_of(program, self._here.values, self._multipliers, parameter):
+                for number, part in parts_of(program, self._lin.values, self._multipliers, parameter):
                     term = program.terms[number]
                     places = unknown[np.concatenate(term.columns, axis=1)[part.factors]]
                     if part.rows.shape[1]:
@@ -277,7 +293,9 @@ class Sensitivities:
         for own, value in height:
             np.add.at(heights, own[own >= 0], value[own >= 0])
         moved = [np.where(p.numbers < 0, -1, p.numbers + first) for p, first in zip(given, offsets, strict=True)]
-        return Change(given[0].shape, rows[order], numbers[order], values[order], heights, np.array(moved))
+        change = Change(given[0].shape, rows[order], numbers[order], values[order], heights, np.array(moved))
+        self._changes[tuple(wrt)] = change
+        return change
 
     def _solved(self, right: Array) -> Array:
         """The solution for a right-hand side.
