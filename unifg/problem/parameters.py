@@ -61,14 +61,12 @@ class Part(NamedTuple):
     """Effect of one argument, weight or limit of a term.
 
     Attributes:
-        factors: (n,) that it moves.
         numbers: (n, k) coordinates of the parameter; -1 for none.
         slopes: (n, D, k) of the gradient of the Lagrangian by the term's columns.
         rows: (n, m, k) of the constraints less their limits.
         heights: (n, k) of the Lagrangian.
     """
 
-    factors: IntArray
     numbers: IntArray
     slopes: Array
     rows: Array
@@ -120,7 +118,7 @@ def fixed(program: CompiledProblem, selection: Selection) -> Parameter:
 def parts_of(
     program: CompiledProblem, values: Values, multipliers: Array, wrt: Parameter
 ) -> Iterator[tuple[int, Part]]:
-    """Parts of all terms that a parameter moves, each with the number of its term.
+    """Parts of all terms that a datum moves, each with the number of its term; fixed variables are no part of this.
 
     Args:
         program: the compiled graph, with its data bound.
@@ -131,74 +129,56 @@ def parts_of(
     Raises:
         GraphError: naming a term that has no derivative there.
     """
-    starts = iter(program.slices)
-    for number, term in enumerate(program.terms):
+    starts, handle = iter(program.slices), wrt.handle
+    for number, term in enumerate(program.terms if handle is not None else ()):
         own = next(starts) if isinstance(term.term, Constraint) else None
         forces = np.ones((term.count, 1)) if own is None else multipliers[own].reshape(term.count, term.size)
-        selections = iter(term.columns)
         for place, argument in enumerate(term.term.arguments):
-            if isinstance(argument, Selection):
-                numbers = wrt.numbers[next(selections)]
-                if not term.is_bound and (numbers >= 0).any():
-                    yield number, _moved(term, values, forces, place, argument.manifold, numbers, wrt.name)
-            elif isinstance(argument, Data) and argument is wrt.handle and place in term._inputs:
-                yield number, _moved(term, values, forces, place, wrt.manifold, None, wrt.name)
-        if wrt.handle is None or wrt.handle not in term.term.shaping:
+            if argument is wrt.handle and place in term._inputs:
+                yield number, _moved(term, values, forces, place, wrt)
+        if handle is None or handle not in term.term.shaping:
             continue
         if isinstance(term.term, Cost):
-            yield number, _weighed(term, values, wrt.handle)
+            yield number, _weighed(term, values, handle)
         elif own is not None:
-            yield number, _limited(term, forces, program.equality[own].reshape(forces.shape), wrt.handle)
+            yield number, _limited(term, forces, program.equality[own].reshape(forces.shape), handle)
 
 
-def _moved(
-    term: CompiledTerm,
-    values: Values,
-    forces: Array,
-    place: int,
-    manifold: Manifold | None,
-    numbers: IntArray | None,
-    name: str,
-) -> Part:
+def _moved(term: CompiledTerm, values: Values, forces: Array, place: int, wrt: Parameter) -> Part:
     """The part of an argument of a term's function."""
     points = term.points(values)
     base = np.asarray(term._batched.fill(points)[place], dtype=np.float64)
-    each = numbers is not None or _has_rows(term, points, place)
-    factors = np.arange(term.count) if numbers is None else np.flatnonzero((numbers >= 0).any(axis=1))
-    manifold = manifold or Rn(base.size // (term.count if each else 1))
+    each = _has_rows(term, points, place)
+    manifold = wrt.manifold or Rn(base.size // (term.count if each else 1))
     rows, dim = base.reshape(-1, manifold.storage), manifold.dim
+    own = np.arange(len(rows) * dim).reshape(-1, dim if each else len(rows) * dim)
     if each:
         steps = np.broadcast_to(np.eye(dim)[:, None], (dim, len(rows), dim))
-        own = np.arange(len(rows) * dim).reshape(-1, dim) if numbers is None else numbers[factors]
     else:
-        steps = np.eye(len(rows) * dim).reshape(-1, len(rows), dim)
-        own = np.broadcast_to(np.arange(len(steps)), (term.count, len(steps)))
+        steps, own = np.eye(len(rows) * dim).reshape(-1, len(rows), dim), np.repeat(own, term.count, axis=0)
     steps = steps * (_lengths(rows) if isinstance(manifold, Rn) else STEP)
-    chunk, found = max(1, LONGEST // (len(TIMES) * len(factors))), []
+    chunk, found = max(1, LONGEST // (len(TIMES) * term.count)), []
     for first in range(0, len(steps), chunk):
         part = steps[first : first + chunk]
         moves = (TIMES[:, None, None] * part[:, None]).reshape(-1, dim)
         many = np.broadcast_to(rows, (len(TIMES) * len(part), *rows.shape)).reshape(-1, manifold.storage)
         there = np.asarray(manifold.retract(many, moves)).reshape(-1, *base.shape)
         length = part.max(axis=2)
-        length = length[:, factors] if each else np.broadcast_to(length.max(axis=1)[:, None], (len(part), term.count))
-        values_there, jacobians = _evaluated(term, factors, points, place, there)
+        length = length if each else np.repeat(length.max(axis=1)[:, None], term.count, axis=1)
+        values_there, jacobians = _evaluated(term, points, place, there)
         r, J = values_there[0], jacobians[0]  # at the point itself
-        found.append([_slope(term, factors, name, f, length) for f in (values_there, jacobians)])
+        found.append([_slope(term, wrt.name, f, length) for f in (values_there, jacobians)])
     residual, jacobian = found[0] if len(found) == 1 else (np.concatenate(f, axis=-1) for f in zip(*found, strict=True))
     if isinstance(term.term, Cost):
-        return _of_cost(term, factors, own, J, r, jacobian, residual, np.zeros((1, 1, 1, 1)))
-    forces = forces[factors]
-    rows = residual if isinstance(term.term, Constraint) else residual[:, :0]
+        return _of_cost(term, own, J, r, jacobian, residual, np.zeros((1, 1, 1, 1)))
+    limited = residual if isinstance(term.term, Constraint) else residual[:, :0]
     height = np.einsum("nmk,nm->nk", residual, forces)
-    return _part(term, factors, own, np.einsum("nmdk,nm->ndk", jacobian, forces), rows, height)
+    return _part(term, own, np.einsum("nmdk,nm->ndk", jacobian, forces), limited, height)
 
 
-def _part(term: CompiledTerm, factors: IntArray, numbers: IntArray, *made: Array) -> Part:
+def _part(term: CompiledTerm, numbers: IntArray, *made: Array) -> Part:
     """A part, without what factors that are not active do."""
-    if term.active is not None:
-        made = tuple(np.where(term.active[factors].reshape(-1, *[1] * (a.ndim - 1)), a, 0.0) for a in made)
-    return Part(factors, numbers, *made)
+    return Part(numbers, *map(term._masked, made))
 
 
 def _lengths(rows: Array) -> Array:
@@ -208,19 +188,17 @@ def _lengths(rows: Array) -> Array:
     return STEP * np.minimum(size, np.sqrt(size))
 
 
-def _slope(term: CompiledTerm, factors: IntArray, name: str, found: Array, length: Array) -> Array:
+def _slope(term: CompiledTerm, name: str, found: Array, length: Array) -> Array:
     """(n, ..., K) derivatives from (5 K, n, ...) values at `TIMES` of (K, n) steps.
 
     Raises:
         GraphError: two steps disagree.
     """
-    out, wanted = np.empty((*found.shape[1:], len(length))), np.ones(len(factors), dtype=bool)
-    if term.active is not None:
-        wanted = term.active[factors]
-    shape = len(length), len(TIMES), len(factors), -1
-    wrong = slopes_of(found.reshape(shape), np.ascontiguousarray(length), wanted, out.reshape(*shape[2:], len(length)))
-    if wrong >= 0:
-        index = int(factors[wrong])
+    out, (count, factors) = np.empty((*found.shape[1:], len(length))), length.shape
+    wanted = np.ones(factors, dtype=bool) if term.active is None else term.active
+    shape = count, len(TIMES), factors, -1
+    index = slopes_of(found.reshape(shape), np.ascontiguousarray(length), wanted, out.reshape(*shape[2:], count))
+    if index >= 0:
         raise GraphError(
             f"sensitivity: term '{term.name}' has a kink or a jump near the present '{name}' (factor {index}), and no "
             "derivative there: smooth the function, or ask elsewhere",
@@ -264,16 +242,14 @@ def _has_rows(term: CompiledTerm, points: list[Array], place: int) -> bool:
     return len(term.kernel.rows_of(term._for_kernel(points))[term._inputs.index(place)]) == term.count > 1
 
 
-def _evaluated(
-    term: CompiledTerm, factors: IntArray, points: list[Array], place: int, there: Array
-) -> tuple[Array, Array]:
-    """(T, n, m) values and (T, n, m, D) Jacobians of n factors of a term, for T values (T, ...) of an argument."""
+def _evaluated(term: CompiledTerm, points: list[Array], place: int, there: Array) -> tuple[Array, Array]:
+    """(T, n, m) values and (T, n, m, D) Jacobians of a term, for T values (T, ...) of an argument."""
     times, count, m, kernel = len(there), term.count, term.size, term.kernel
     if kernel is not None:
         rows, slot = kernel.rows_of(term._for_kernel(points)), term._inputs.index(place)
         own = there.reshape(times, *rows[slot].shape)
-        own = own[:, factors] if own.shape[1] > 1 else np.repeat(own, len(factors), axis=1)
-        chosen = np.tile(factors, times)
+        own = own if own.shape[1] == count else np.repeat(own, count, axis=1)
+        chosen = np.tile(np.arange(count), times)
         given = [row[chosen] if len(row) > 1 else row for row in rows]
         given[slot] = own.reshape(-1, *own.shape[2:])
         variable = [
@@ -281,7 +257,7 @@ def _evaluated(
         ]
         r, blocks = kernel.both(*given)
         J = np.concatenate([block for block, kept in zip(blocks, variable, strict=True) if kept], axis=2)
-        return r.reshape(times, len(factors), m), J.reshape(times, len(factors), m, -1)
+        return r.reshape(times, count, m), J.reshape(times, count, m, -1)
     residual, jacobian = np.empty((times, count, m)), np.empty((times, count, m, sum(term.dims)))
     kept = term._arguments
     try:
@@ -301,12 +277,11 @@ def _evaluated(
     finally:
         term._arguments = kept
         term._bind_batched(term._batched)
-    return residual[:, factors], jacobian[:, factors]
+    return residual, jacobian
 
 
 def _of_cost(
     term: CompiledTerm,
-    factors: IntArray,
     numbers: IntArray,
     J: Array,
     r: Array,
@@ -322,7 +297,7 @@ def _of_cost(
         M = resolve(cost.information, term._data)
     elif cost.sigma is not None:
         M = np.eye(m) / np.square(np.broadcast_to(resolve(cost.sigma, term._data), (term.count, m)))[:, None]
-    M = np.broadcast_to(M, (term.count, m, m))[factors]
+    M = np.broadcast_to(M, (term.count, m, m))
     Mr = np.einsum("nab,nb->na", M, r)
     squared, form = np.einsum("na,na->n", r, Mr), form_of(cost.robust)
     assert form is not None
@@ -335,7 +310,7 @@ def _of_cost(
     du += b[:, None, None] * Mr[:, :, None] * moved[:, None]
     slopes = np.einsum("nmdk,nm->ndk", jacobian, w[:, None] * Mr) + np.einsum("nmd,nmk->ndk", J, du)
     empty = np.zeros((len(r), 0, numbers.shape[1]))
-    return _part(term, factors, numbers, slopes, empty, 0.5 * w[:, None] * moved)
+    return _part(term, numbers, slopes, empty, 0.5 * w[:, None] * moved)
 
 
 def _weighed(term: CompiledTerm, values: Values, handle: Data) -> Part:
@@ -352,7 +327,7 @@ def _weighed(term: CompiledTerm, values: Values, handle: Data) -> Part:
         sigma, numbers = np.broadcast_to(present, (n, m)), np.broadcast_to(own, (n, m))
         metric = -2.0 * alone * sigma[:, None, None] ** -3.0
     J, r = np.concatenate(term.jacobians(values), axis=2), term.residual(values)
-    return _of_cost(term, np.arange(n), numbers, J, r, np.zeros((1, 1, 1, 1)), np.zeros((n, m, 1)), metric)
+    return _of_cost(term, numbers, J, r, np.zeros((1, 1, 1, 1)), np.zeros((n, m, 1)), metric)
 
 
 def _limited(term: CompiledTerm, forces: Array, equality: BoolArray, handle: Data) -> Part:
@@ -376,4 +351,4 @@ def _limited(term: CompiledTerm, forces: Array, equality: BoolArray, handle: Dat
     there = both | (forces > 0.0 if constraint.upper is handle else forces < 0.0)
     rows = -np.eye(m)[None] * there[:, :, None]
     D = sum(term.dims)
-    return _part(term, np.arange(n), numbers, np.zeros((n, D, m)), rows, np.einsum("nmk,nm->nk", rows, forces))
+    return _part(term, numbers, np.zeros((n, D, m)), rows, np.einsum("nmk,nm->nk", rows, forces))

@@ -48,11 +48,9 @@ def feedback_gains(
         states: N members of each family.
         controls: N members of each family.
     """
-    twin = _unfixed(program, states)
+    columns = np.concatenate([program.columns.of(selection).ravel() for selection in states])
     with program.lock:
-        present = {handle: value.copy() for handle, value in program._binding.present.items()}
-    twin.bind({handle: value for handle, value in present.items() if handle in twin._binding.present})
-    here = twin.linearize(twin.columns.values(lin.values))
+        twin, here = unfixed(program, columns, lin)
     numbers = np.append(here.constraints, here.cost), np.append(lin.constraints, lin.cost)
     if not np.allclose(*numbers, rtol=SAME, atol=SAME):
         raise GraphError("gains: the data of this solution have been replaced since; ask before the next solve")
@@ -81,17 +79,23 @@ def feedback_gains(
     return np.array(found)
 
 
-def _unfixed(program: CompiledProblem, states: Sequence[Selection]) -> CompiledProblem:
-    """The problem with the states unknown that it fixes, found once."""
-    columns = program.columns
-    ours = np.concatenate([columns.of(selection).ravel() for selection in states])
-    dropped = frozenset(name for name, part in columns.fixed.items() if np.isin(part, ours).any())
+def unfixed(program: CompiledProblem, columns: IntArray, lin: Linearization) -> tuple[CompiledProblem, Linearization]:
+    """The problem with the variables unknown that it fixes, found once; and how it is linearised, with the same data.
+
+    Args:
+        program: the compiled graph, with its data bound.
+        columns: full tangent columns that are not to be fixed.
+        lin: where.
+    """
+    dropped = frozenset(name for name, part in program.columns.fixed.items() if np.isin(part, columns).any())
     known = program.once(_known)
     if dropped not in known:
         graph = program.graph.snapshot()
         graph.fixes = [fix for fix in graph.fixes if fix.name not in dropped]
         known[dropped] = CompiledProblem(graph)
-    return known[dropped]
+    twin = known[dropped]
+    twin.bind({handle: value for handle, value in program._binding.present.items() if handle in twin._binding.present})
+    return twin, twin.linearize(twin.columns.values(lin.values))
 
 
 def _known(_: CompiledProblem) -> dict[frozenset[str], CompiledProblem]:

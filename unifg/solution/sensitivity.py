@@ -28,7 +28,7 @@ from unifg.problem.linearization import Linearization
 from unifg.problem.parameters import Parameter, datum, fixed, parts_of
 from unifg.problem.systems import fill
 from unifg.solution.covariance import SOLVED
-from unifg.solution.gains import SAME
+from unifg.solution.gains import SAME, unfixed
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
@@ -262,40 +262,49 @@ class Sensitivities:
         if tuple(wrt) in self._changes:
             return self._changes[tuple(wrt)]
         program, given = self._program, [self._parameter(one) for one in wrt]
-        unknown, parts = program.columns.unknown, []
+        unknown, ends = program.columns.unknown, np.cumsum([0, *(int(np.prod(one.shape)) for one in given)])
         starts = dict(zip(program.constraint_terms, (rows.start for rows in program.slices), strict=True))
-        offset = 0
-        height, offsets = [], []
+        heights, moved = np.zeros(ends[-1]), np.array([one.numbers for one in given])
+        parts = [(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros(0))]
         with program.lock:
             self._require_data()
-            for parameter in given:
-                for number, part in parts_of(program, self._lin.values, self._multipliers, parameter):
+            for first, one in zip(ends[:-1], given, strict=True):
+                if (one.numbers >= 0).any():
+                    gradient = program.lagrangian_gradient(self._lin, self._multipliers)
+                    np.add.at(heights, first + one.numbers[one.numbers >= 0], gradient[one.numbers >= 0])
+                    parts += [(rows, numbers + first, values) for rows, numbers, values in self._of_fixed(one.numbers)]
+                for number, part in parts_of(program, self._lin.values, self._multipliers, one):
                     term = program.terms[number]
-                    places = unknown[np.concatenate(term.columns, axis=1)[part.factors]]
+                    places = unknown[np.concatenate(term.columns, axis=1)]
                     if part.rows.shape[1]:
-                        rows = starts[term] + part.factors[:, None] * term.size + np.arange(term.size)
+                        rows = starts[term] + np.arange(term.count * term.size).reshape(term.count, -1)
                         places = np.concatenate([places, self._number[rows]], axis=1)
                     values = np.concatenate([part.slopes, part.rows], axis=1)
-                    numbers = np.where(part.numbers < 0, -1, part.numbers + offset)
-                    parts.append(
-                        [
-                            np.broadcast_to(a, values.shape).ravel()
-                            for a in (places[:, :, None], numbers[:, None], values)
-                        ]
-                    )
-                    height.append((numbers.ravel(), part.heights.ravel()))
-                offsets.append(offset)
-                offset += int(np.prod(parameter.shape))
-        rows, numbers, values = map(np.concatenate, zip(*parts, strict=True)) if parts else (np.zeros(0, int),) * 3
-        kept = (rows >= 0) & (numbers >= 0) & (values != 0.0)
-        order = np.flatnonzero(kept)[np.argsort(numbers[kept], kind="stable")]
-        heights = np.zeros(offset)
-        for own, value in height:
-            np.add.at(heights, own[own >= 0], value[own >= 0])
-        moved = [np.where(p.numbers < 0, -1, p.numbers + first) for p, first in zip(given, offsets, strict=True)]
-        change = Change(given[0].shape, rows[order], numbers[order], values[order], heights, np.array(moved))
+                    numbers = part.numbers + first
+                    spread = [np.broadcast_to(a, values.shape).ravel() for a in (places[:, :, None], numbers[:, None])]
+                    parts.append((spread[0], spread[1], values.ravel()))
+                    np.add.at(heights, numbers, part.heights)
+        rows, numbers, values = map(np.concatenate, zip(*parts, strict=True))
+        kept = np.flatnonzero((rows >= 0) & (values != 0.0))
+        order = kept[np.argsort(numbers[kept], kind="stable")]
+        moved = np.where(moved < 0, -1, moved + ends[:-1, None])
+        change = Change(given[0].shape, rows[order], numbers[order], values[order], heights, moved)
         self._changes[tuple(wrt)] = change
         return change
+
+    def _of_fixed(self, numbers: IntArray) -> list[tuple[IntArray, IntArray, Array]]:
+        """Rows, numbers and values of the KKT matrix in the columns of fixed variables, which (width,) numbers name."""
+        program, lin, unknown = self._program, self._lin, self._program.columns.unknown
+        twin, here = unfixed(program, np.flatnonzero(numbers >= 0), lin)
+        hessian = lagrangian_hessian(twin, here, self._multipliers)
+        ends = [twin.columns.free[part] for part in (twin.normal.indices, twin.normal.columns)]
+        found = []
+        for row, column in (ends, ends[::-1]):
+            own = np.flatnonzero((numbers[column] >= 0) & (unknown[row] >= 0))
+            found.append((unknown[row[own]], numbers[column[own]], hessian[own]))
+        own = np.flatnonzero(numbers[program.constraints.columns] >= 0)
+        places = self._number[program.constraints.rows[own]]
+        return [*found, (places, numbers[program.constraints.columns[own]], lin.constraint_jacobian[own])]
 
     def _solved(self, right: Array) -> Array:
         """The solution for a right-hand side.
