@@ -18,7 +18,7 @@ from unifg.pose_graphs import manhattan, sphere
 from unifg.problem.parameters import datum
 from unifg.scenarios.flight import FlightSettings
 from unifg.scenarios.quadrotor.flight_joint import JointSettings
-from unifg.solvers import SQP, InteriorPoint, LevenbergMarquardt
+from unifg.solvers import SQP, GraduatedNonConvexity, InteriorPoint, LevenbergMarquardt
 from unifg.solvers.names import TABLE, backend
 from unifg.typing import Array
 
@@ -183,6 +183,7 @@ PARAMETERS: dict[str, Callable[[fg.Graph, fg.Family], Any]] = {
         place, x[1:3], g.data("p", AT[1:3], each=True), lower=0.0, upper=0.0, name="g"
     ),
     "price": lambda g, x: g.constrain(place, x[2], AT[2], lower=1.0, soft=g.data("p", 0.4), name="g"),
+    "soft limit": lambda g, x: g.constrain(place, x[2], AT[2], lower=g.data("p", 1.0), soft=0.1, name="g"),
     "fix": lambda g, x: (g.fix(x[2], g.data("p", [1.0, 0.5, 0.4])), g.minimize(place, x, AT, sigma=0.4)),
     "fix and argument": lambda g, x: (
         p := g.data("p", [1.0, 0.5, 0.4]), g.fix(x[2], p), g.minimize(fg.prior, x[4], p, sigma=0.4)
@@ -251,6 +252,25 @@ def test_measurements_of_a_pose_graph(space: bool, loss: Any) -> None:
     judge = Judge(InteriorPoint(tolerance=TIGHT), graph, {x: made.truth})
     judge.agrees([x, "cost"], measured, 4)
     judge.agrees([x[-1]], sigma, 2)
+
+
+def test_graduated_non_convexity_keeps_what_it_believes() -> None:
+    made = manhattan(60, seed=1, outliers=0.2)
+    edges = made.pose_graph.edges
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 60)
+    graph.fix(x[0], made.pose_graph.poses[0])
+    measured = graph.data("measured", edges.measured, each=True)
+    loss = fg.TruncatedLeastSquares(5.0)
+    graph.minimize(fg.between, x[edges.first], x[edges.second], measured, sigma=[0.05, 0.05, 0.02], robust=loss)
+    solution = GraduatedNonConvexity(solver=LevenbergMarquardt(tolerance=TIGHT)).solve(
+        graph, {x: made.truth}, check=True
+    )
+    found = solution.sensitivity(x, measured).reshape(len(x), 3, -1, 3)
+    wrong = np.flatnonzero(made.outliers)
+    assert len(wrong) and not found[:, :, wrong].any(), "what is left out moves nothing"
+    own = Judge(LevenbergMarquardt(tolerance=TIGHT), graph, solution)
+    own.agrees([x, "cost"], measured, 2)
 
 
 def past_and_future() -> tuple[fg.Graph, fg.Family, fg.Family, dict[fg.Family, Array]]:

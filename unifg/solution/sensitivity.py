@@ -18,8 +18,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.elimination.saddle import EXACT
 from unifg.errors import GraphError
 from unifg.factors.robust import form_of
+from unifg.locks import ReentrantLock
 from unifg.modeling.terms import Cost
 from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
@@ -34,7 +36,7 @@ from unifg.typing import Array, BoolArray, IntArray, Numbers
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
 REPLACED = "sensitivity: the data of this solution have been replaced since; ask before the next solve"
 LINEARIZED = "cost", "gradient", "hessian", "constraints", "constraint_jacobian"
-ENOUGH = 1e-12  # residual of a solve
+ENOUGH = 1e-10  # residual of most solves
 WEAK = 10.0  # times the root of the tolerance: slack and multiplier of a row that may be active or not
 Named = Variable | str
 Weights = Mapping[Family, Numbers] | Mapping[Selection, Numbers] | Mapping[str, Numbers] | Mapping[Named, Numbers]
@@ -69,7 +71,7 @@ class Sensitivities:
             GraphError: when the data have been replaced, rows are weakly active, or the reduced Hessian is not positive
                 definite.
         """
-        self._program, self._multipliers = program, multipliers
+        self._program, self._multipliers, self._lock = program, multipliers, ReentrantLock()
         for term in program.cost_terms:
             if isinstance(term.term, Cost) and form_of(term.term.robust) is None:
                 raise GraphError(
@@ -137,12 +139,11 @@ class Sensitivities:
         program, system, n = self._program, self._system, self._program.size
         right = np.random.default_rng(0).standard_normal(len(out)) / system.saddle.scale
         right[out] = 0.0
-        rest = self._left(right)
-        singular = not rest.max(initial=0.0) <= SOLVED
+        rest = self._tried(right)[1]
+        singular = not rest.max(initial=0.0) <= 1.0
         if singular:  # multipliers that dependent rows leave open may be too large to see the unknowns beside them
-            of_unknowns = self._left(np.where(np.arange(len(out)) < n, right, 0.0))
-            rest[:n] = of_unknowns[:n]
-        if not rest[:n].max(initial=0.0) <= SOLVED:
+            rest[:n] = self._tried(np.where(np.arange(len(out)) < n, right, 0.0))[1][:n]
+        if not rest[:n].max(initial=0.0) <= 1.0:
             family, index = program.columns.name(int(program.columns.free[np.argmax(rest[:n])]))
             raise GraphError(
                 f"sensitivity: the reduced Hessian is singular: {family}[{index}] can move without the costs or the "
@@ -157,10 +158,17 @@ class Sensitivities:
             )
         return self._place(int(np.argmax(rest[n:])))[2] if singular else ""
 
-    def _left(self, right: Array) -> Array:
-        """Magnitudes of what a solve leaves of a right-hand side."""
-        solution, _ = self._system.saddle.solve(right, ENOUGH)
-        return np.abs(self._system.saddle.residual(solution, right))
+    def _tried(self, right: Array) -> tuple[Array, Array]:
+        """A solution, refined no more than it needs, and what it leaves of every row, in multiples of what it may."""
+        saddle = self._system.saddle
+        solution, rest, most = right, right, SOLVED * float(np.abs(saddle.scale * right).max(initial=0.0)) or 1.0
+        for enough in (ENOUGH, EXACT):
+            with self._lock:
+                solution, _ = saddle.solve(right, enough)
+                rest = np.abs(saddle.residual(solution, right)) / most
+            if rest.max(initial=0.0) <= 1.0:
+                break
+        return solution, rest
 
     def _place(self, row: int) -> tuple[str, int, str]:
         """Term and factor of a constraint row, and the words for it."""
@@ -312,9 +320,8 @@ class Sensitivities:
         Raises:
             GraphError: there is none.
         """
-        saddle = self._system.saddle
-        solution, _ = saddle.solve(right, ENOUGH)
-        if not np.abs(saddle.residual(solution, right)).max() <= SOLVED * np.abs(saddle.scale * right).max(initial=0.0):
+        solution, rest = self._tried(right)
+        if not rest.max() <= 1.0:
             what = f": {self._dependent} depends on other active rows" if self._dependent else ""
             raise GraphError(
                 f"sensitivity: after a change of the data the active constraints contradict each other{what}"

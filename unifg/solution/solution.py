@@ -92,7 +92,6 @@ class Solution:
         seconds: wall-clock time of the solve.
         solver: name of the backend.
         tolerance: of the KKT test of the solve.
-        data: number of the data that were bound; see :class:`unifg.problem.binding.Binding`.
         returned: number of the iteration that is returned; 0 for the guess. Not the last one where a limit, a stall or
             an interruption ended the solve and an earlier iterate has less cost plus price times violation.
         in_python: seconds of them spent in residuals that Python evaluates, see ``graph.check``.
@@ -102,7 +101,7 @@ class Solution:
         mistraced: terms left to Python by that check, and the reasons; the solve was repeated without their traces.
     """
 
-    tolerance, data = 1e-6, -1
+    tolerance, _edition = 1e-6, -1
     in_python = 0.0
     restoration_steps = 0
     checked = False
@@ -399,7 +398,7 @@ class Solution:
         if not self.converged:
             raise GraphError(f"sensitivity: needs a solution that is CONVERGED, this one is {self.status.name}")
         active = self._equality | self._held()
-        given = self._multipliers, active, self.tolerance, self.data, (self._lower, self._upper)
+        given = self._multipliers, active, self.tolerance, self._edition, (self._lower, self._upper)
         return Sensitivities(self._program, self._lin, *given)
 
     def information(self, terms: Sequence[str], *variables: Variable) -> Array:
@@ -536,7 +535,7 @@ class Solution:
     def __getstate__(self) -> dict[str, Any]:
         """Pickle with the history, and without factorisations, which are found again where somebody asks."""
         kept = {name: value for name, value in self.__dict__.items() if name not in ("_covariances", "_sensitivities")}
-        return {**kept, "_history": self.history, "data": -1}
+        return {**kept, "_history": self.history, "_edition": -1}
 
     def _held(self) -> BoolArray:
         """Inequalities that are active: the multiplier outweighs the distance to its limit."""

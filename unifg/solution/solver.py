@@ -478,7 +478,7 @@ class SolveState:
             returned,
         )
         solution.restoration_steps, solution.tolerance = self.restoration_steps, self.tolerance
-        solution.data = self.program.data_edition
+        solution._edition = self.program.data_edition
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
 
