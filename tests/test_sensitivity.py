@@ -109,6 +109,24 @@ def test_control_cases(problem: Problem) -> None:
     judge.agrees(of, stated.graph._data["end" if isinstance(problem, Unicycle) else "end p"], 2)
 
 
+@pytest.mark.parametrize("problem", CASES, ids=lambda p: p.title)
+@pytest.mark.parametrize("name", ["sqp", "alm"])
+@pytest.mark.product(6)
+def test_control_cases_by_the_answers_of_other_backends(name: str, problem: Problem) -> None:
+    """Derivatives at their answers are those at the interior point's, which was judged above."""
+    stated = problem.formulation()
+    start = problem.manifold.retract(problem.start[None], np.full((1, problem.manifold.dim), 0.01))[0]
+    data = {stated._start: start}
+    solution = backend(name, tolerance=1e-9).prepare(stated.graph).solve(stated.guess, data=data, check=True)
+    reference = InteriorPoint(tolerance=TIGHT).prepare(stated.graph).solve(solution, data=data, check=True)
+    try:
+        found, expected = (one.sensitivity([stated.x, stated.u, "cost"], "start") for one in (solution, reference))
+    except fg.GraphError as error:
+        assert "weakly active" in str(error)
+        return
+    assert (np.linalg.norm(found - expected, axis=0) <= 1e-5 * np.linalg.norm(expected, axis=0)).all()
+
+
 def walk(state: Callable[..., Any]) -> tuple[fg.Graph, fg.Family]:
     """Five poses that are drawn to places, with whatever is stated besides."""
     graph = fg.Graph()
@@ -447,6 +465,21 @@ def test_kinks_flags_losses_and_names_are_refused() -> None:
     refused(solution, r"called 'y' \(there are: cost\)", "y", "q")
     refused(solution, "does not belong", "x", fg.Graph().data("p", 1.0))
     refused(point(lambda g, x: g.minimize(fg.prior, x, g.data("p", [0.0, 1.0]), robust=Own(), name="own")), "'own'")
+
+
+def test_rows_between_fixed_variables_say_nothing() -> None:
+    """Neither that they are weakly active, nor that they depend on others."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 2)
+    p = graph.data("p", [1.0, 2.0])
+    graph.fix(x[0], p)
+    graph.constrain(lambda x: x, x[0], lower=[1.0, 2.0], upper=[1.0, 9.0], name="kept")
+    graph.minimize(fg.difference, x[0], x[1])
+    graph.constrain(lambda x, y: y - 2.0 * x, x[0], x[1], lower=0.0, upper=0.0, name="twice")
+    solution = InteriorPoint(tolerance=1e-8).solve(graph, {x: np.ones((2, 2))}, check=True)
+    expected = np.vstack([2.0 * np.eye(2), np.zeros((2, 2)), -np.eye(2), [[1.0, 2.0]]])
+    found = solution.sensitivity([x[1], "kept", "twice", "cost"], p)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
 def test_data_that_have_been_replaced_are_noticed() -> None:

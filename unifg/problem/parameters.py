@@ -130,7 +130,7 @@ def parts_of(
         GraphError: naming a term that has no derivative there.
     """
     starts, handle = iter(program.slices), wrt.handle
-    for number, term in enumerate(program.terms if handle is not None else ()):
+    for number, term in enumerate(program.terms if handle is not None and handle.value.size else ()):
         own = next(starts) if isinstance(term.term, Constraint) else None
         forces = np.ones((term.count, 1)) if own is None else multipliers[own].reshape(term.count, term.size)
         for place, argument in enumerate(term.term.arguments):
