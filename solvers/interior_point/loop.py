@@ -9,6 +9,7 @@ from functools import cache
 
 import numpy as np
 
+from unifg.codegen.clock import seconds
 from unifg.codegen.function_pointers import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
 from unifg.codegen.jit import compiled
 from unifg.codegen.loops import copy_to
@@ -131,6 +132,7 @@ def reset(address: int) -> None:
     steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
     now = scalars[0]
     now.asked, now.iteration, now.kept, now.raises, now.definite = 0.0, 0, 0, 0, UNKNOWN
+    now.evaluating = now.solving = now.judging = 0.0
     fill(row_units, 1.0)
     fill(units, 1.0)
     fill(steepest_gradient, 0.0)
@@ -154,11 +156,13 @@ def conclude(address: int) -> None:
     scalars, steepest_gradient, terms = parts(address, "scalars steepest_gradient terms")
     (steepest_jacobian,) = parts(address, "steepest_jacobian")
     now = scalars[0]
+    began = seconds(now.clock)
     run(links[0].raise_slopes, (constraint_jacobian, gradient, steepest_jacobian, steepest_gradient))
     arrays = multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
     judged = terms, free, gradient, constraints, constraint_jacobian, multipliers, full, kkt
     run(links[0].kkt_numbers, judged)
+    now.judging += seconds(now.clock) - began
 
 
 @linked
@@ -179,7 +183,9 @@ def loop(address: int) -> None:
             if python:
                 now.answer, now.stage = LINEARIZE, LINEARIZED
                 return
+            began = seconds(now.clock)
             run(links[0].renew, (address,))
+            now.evaluating += seconds(now.clock) - began
             stage = LINEARIZED
         if stage == LINEARIZED:
             if now.going_on == 0:
@@ -204,13 +210,22 @@ def loop(address: int) -> None:
                 if python:
                     now.answer, now.stage = BEND, BENT
                     return
+                began = seconds(now.clock)
                 run(links[0].bend, (address,))
+                now.evaluating += seconds(now.clock) - began
         if stage == AIMED:
             if python:
                 now.answer, now.stage = EVALUATE, EVALUATED
                 return
+            began = seconds(now.clock)
             run(links[0].advance, (address,))
-        run(links[0].direct if stage == BENT else links[0].judge, (address,))
+            now.evaluating += seconds(now.clock) - began
+        if stage == BENT:
+            began = seconds(now.clock)
+            run(links[0].direct, (address,))
+            now.solving += seconds(now.clock) - began
+        else:
+            run(links[0].judge, (address,))
         stage = AIMED
         if now.answer == ACCEPTED:
             copy_to(trial, values)

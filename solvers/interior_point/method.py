@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
 
+from unifg.codegen.clock import clock
 from unifg.codegen.function_pointers import memory
 from unifg.errors import BackendError
 from unifg.problem.columns import Values
@@ -112,6 +114,8 @@ class InteriorPoint(Solver):
         start, carried = run.values, run.multipliers
         reason = self._iterate(run, workspace)
         now = workspace.now
+        if now["clock"]:
+            run.parts = now["evaluating"], now["solving"], now["judging"], workspace.compiled
         if run.alone and not now["clocked"] and run.returns_best(run.status or reason):
             self._replay(run, workspace, start, carried)
         if self.step_tolerance > 0.0 and now["kept"] and run.optimality.violation > now["keeping"]:
@@ -222,7 +226,13 @@ class InteriorPoint(Solver):
 
 
 class Workspace:
-    """Memory kept between solves of one structure."""
+    """Memory kept between solves of one structure.
+
+    Attributes:
+        compiled: seconds of the solve in compiled code, but for the test of the answer.
+    """
+
+    compiled = 0.0
 
     def __init__(self, program: CompiledProblem) -> None:
         """Analyse the KKT matrix and compile."""
@@ -276,6 +286,7 @@ class Workspace:
         self.problem.links[:] = addresses()
         self._held = program.equality
         self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)
+        self.now["clock"] = clock()
 
     def _unequal(self, term: IntArray) -> bool:
         """Test whether a row of the table is a term with inequality rows."""
@@ -294,7 +305,9 @@ class Workspace:
     def asks(self) -> bool:
         """Run the loop up to an ending, a question, or something to show; answer a question; whether it goes on."""
         program, work, now = self.program, self.work, self.now
+        began = perf_counter()
         self.call("loop")
+        self.compiled += perf_counter() - began
         answer = now["answer"]
         if answer == state.LINEARIZE:
             self.take(program.linearize(self._values()))
@@ -317,7 +330,7 @@ class Workspace:
         if len(self.work.log) < options.max_iterations + 2:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))
             self._describe()
-        work, now, self._taken = self.work, self.now, None
+        work, now, self._taken, self.compiled = self.work, self.now, None, 0.0
         # The test of least squares has no absolute tolerance.
         now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
         now["scaling"], now["assisted"] = bool(options.scaling), not self.program.fully_compiled

@@ -217,6 +217,8 @@ class SolveState:
         history: rows so far.
         iterations: so far.
         restoration_steps: of descents on the violation alone so far.
+        parts: seconds of a compiled loop in evaluation, linear systems and the test of the answer, and of all of the
+            loop; None where nobody took them.
         alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
         tolerance: of the KKT test.
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
@@ -245,6 +247,7 @@ class SolveState:
         self.lent: Factored | None = None
         self.slopes: Slopes | None = None
         self.iterations = self.restoration_steps = 0
+        self.parts: tuple[float, float, float, float] | None = None
         if solver.verbose:
             show(HEADER)
         self.values, self.multipliers, self.penalties = values, multipliers, program.no_penalties
@@ -477,7 +480,7 @@ class SolveState:
             self._solver.name,
             returned,
         )
-        solution.restoration_steps = self.restoration_steps
+        solution.restoration_steps, solution._parts = self.restoration_steps, self.parts
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
 
@@ -746,6 +749,8 @@ class Prepared:
                 raise
             if run.alone and not run.iterations:
                 self._refuse_not_finite(run)
+            if self.single:  # it may have compiled, and loaded what was
+                run.parts = None
         return run.finish(reason)
 
     @property
