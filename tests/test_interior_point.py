@@ -474,7 +474,9 @@ def test_the_time_of_a_solve_is_told_by_its_parts(monkeypatch: pytest.MonkeyPatc
     assert found.times["evaluation"] > found.times["judge"] and found.times["linear systems"] > found.times["judge"]
     assert re.search(r"Of the time: evaluation \d+ %, linear systems \d+ %", found.report())
     assert "Of the time" not in repr(found) and pickle.loads(pickle.dumps(found)).times == found.times
-    assert SQP().solve(stated.graph, stated.guess).times == InteriorPoint().solve(stated.graph, stated.guess).times == {}
+    assert (
+        SQP().solve(stated.graph, stated.guess).times == InteriorPoint().solve(stated.graph, stated.guess).times == {}
+    )
     prepared._workspace.now["clock"] = 0  # a system without that clock
     found = prepared.solve(stated.guess)
     assert found.times == {} and "Of the time" not in found.report()
