@@ -482,3 +482,20 @@ def test_the_time_of_a_solve_is_told_by_its_parts(monkeypatch: pytest.MonkeyPatc
     assert found.times == {} and "Of the time" not in found.report()
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
     assert clock.__wrapped__() == 0
+
+
+def test_a_tick_of_one_step_leaves_second_derivatives_out() -> None:
+    """They pay where steps converge; a solve to the answer, and a cold one, have them."""
+    stated = Unicycle("straight", True, 20).formulation()
+    plain = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
+    first = plain.solve(stated.guess)
+    tick = InteriorPoint(tolerance=1e-4, step_tolerance=np.inf).prepare(stated.graph)
+    shifted = first.shifted(stated.x, stated.u)
+    rows: list[fg.Iteration] = []
+    tick.solve(shifted, callback=rows.append)
+    assert rows[1].details["gauss_newton"] == 1
+    plain.solve(shifted, callback=rows.append)
+    assert "gauss_newton" not in rows[-1].details
+    cold: list[fg.Iteration] = []
+    tick.solve(stated.guess, callback=cold.append)
+    assert "gauss_newton" in cold[1].details and "gauss_newton" not in cold[2].details

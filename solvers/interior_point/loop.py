@@ -5,6 +5,7 @@ It runs without Python where it can, and asks for what only Python can do.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
@@ -46,6 +47,8 @@ from unifg.solvers.interior_point.state import (
     Work,
 )
 from unifg.typing import Array
+
+FEW = 5  # steps of a tick
 
 
 @compiled
@@ -175,7 +178,7 @@ def loop(address: int) -> None:
     """
     constraint_jacobian, gradient, links, scalars = parts(address, "constraint_jacobian gradient links scalars")
     steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
-    trial, values = parts(address, "trial values")
+    heights, trial, values = parts(address, "heights trial values")
     now = scalars[0]
     python, watched, stage = now.assisted == 1, now.watched == 1, now.stage
     while True:
@@ -206,7 +209,12 @@ def loop(address: int) -> None:
                 return
         if stage == TESTED:
             stage = BENT
-            if now.exact == 1 and (now.iteration > 0 or now.cold == 0 or now.estimated == 1):
+            # Second derivatives need multipliers, and those of a cold start mean little. They pay where steps converge,
+            # not in the first few of a tick that ends with the first plan that keeps the constraints.
+            few = now.step_tolerance == math.inf and now.iteration < FEW and len(heights) == 0
+            known = now.cold == 0 or now.iteration > 0 or now.estimated == 1
+            now.bending = 1 if now.exact == 1 and known and not (few and now.cold == 0) else 0
+            if now.bending == 1:
                 if python:
                     now.answer, now.stage = BEND, BENT
                     return

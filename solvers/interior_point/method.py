@@ -64,7 +64,8 @@ class InteriorPoint(Solver):
             and multipliers are those of the problem as stated.
         step_tolerance, violation_tolerance: stop rule on the norm of the full step and the largest violation, for
             control loops. A positive step_tolerance switches it on; it does not grant CONVERGED. An infinite one asks
-            for a single step, and more of them only as long as constraints are violated. With the rule on, a solve
+            for a single step, and more of them only as long as constraints are violated; from a start with multipliers
+            the first few leave second derivatives out, which pay only where steps converge. With the rule on, a solve
             that runs out of time or iterations hands back the last iterate that kept the constraints, if one did.
         restoration: whether, where it is stuck without ever having kept the constraints, the nearest point of least
             violation is looked for, from which to go on or to say LOCALLY_INFEASIBLE. It can take a hundred times as
@@ -102,7 +103,7 @@ class InteriorPoint(Solver):
     def search_step(self, run: SolveState, workspace: Workspace, lin: Linearization) -> Array | None:
         """The first step of a solve from there, by Gauss-Newton, as far as slacks and multipliers stay positive."""
         now = workspace.prepare(run, self)
-        now["exact"] = 0
+        now["bending"] = 0
         workspace.take(lin)
         workspace.call("begin")
         workspace.call("direct")

@@ -62,7 +62,8 @@ NOW = np.dtype(
         ("sides", np.int64),  # how many there are
         ("iteration", np.int64),
         ("limit", np.int64),
-        ("exact", np.int64),  # whether to use second derivatives
+        ("exact", np.int64),  # whether to use second derivatives where they pay
+        ("bending", np.int64),  # whether the present step does
         ("filtered", np.int64),  # pairs in the filter
         ("trials", np.int64),
         ("corrected", np.int64),  # whether the trial is a second-order correction
