@@ -25,7 +25,7 @@ from unifg.modeling.model import Model
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
-from unifg.problem.binding import Binding
+from unifg.problem.binding import Binding, Carried
 from unifg.problem.branches import Branches
 from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
@@ -53,12 +53,10 @@ class Reader(NamedTuple):
     Attributes:
         bound: terms that have to work something out from it.
         told: terms whose kernels find it among their parameters, already renewed.
-        fixes: numbers of the fixes whose values it is.
     """
 
     bound: list[CompiledTerm]
     told: list[CompiledTerm]
-    fixes: list[int]
 
 
 class CompiledProblem:
@@ -83,6 +81,7 @@ class CompiledProblem:
         batched: terms without a kernel, evaluated by NumPy.
         retraction: moves all variables.
         scratch: memory for compiled loops.
+        rebinds: whether something else than numbers for kernels and fixed variables is made of data.
         python_seconds: time spent so far in terms that Python evaluates.
         buffers: memory for linearisations.
         soft: slack variables of soft constraints, by their names.
@@ -186,12 +185,9 @@ class CompiledProblem:
         """
         changed = self._binding.take(data)
         for handle in changed:
-            reader = self._readers[handle]
-            for term in reader.told:
+            for term in self._readers[handle].told:
                 term.forget()
-            for fix in reader.fixes:
-                self.retraction.bind(fix, self._binding.present[handle])
-        if self._rebinding:
+        if self.rebinds:
             self._rebind([term for handle in changed for term in self._readers[handle].bound])
 
     def _rebind(self, terms: Sequence[CompiledTerm]) -> None:
@@ -210,7 +206,7 @@ class CompiledProblem:
 
     def _bind_first(self) -> None:
         """Take the defaults, and find out what has to be done when a datum changes."""
-        binding, fixes = self._binding, self.graph.fixes
+        binding, retraction = self._binding, self.retraction
         binding.take({})
         for term in self.terms:
             if term.data:
@@ -220,7 +216,7 @@ class CompiledProblem:
         self._readers: dict[Data, Reader] = {}
         sources, targets = [], []
         for handle in binding.present:
-            reader = self._readers[handle] = Reader([], [], [k for k, f in enumerate(fixes) if f.value is handle])
+            reader = self._readers[handle] = Reader([], [])
             for term in self.terms:
                 if handle not in term.data:
                     continue
@@ -229,11 +225,17 @@ class CompiledProblem:
                 for place in places or ():
                     sources.append(np.broadcast_to(binding.place(handle).reshape(-1, place.shape[1]), place.shape))
                     targets.append(int(term.place[PARAMETER]) + place)
-        self._rebinding = any(reader.bound for reader in self._readers.values())
-        binding.carry(sources, targets, self.arrays.parameters)
-        for k, fix in enumerate(fixes):
-            value = binding.present[fix.value] if isinstance(fix.value, Data) else np.asarray(fix.value)
-            self.retraction.bind(k, value)
+        self.rebinds = any(reader.bound for reader in self._readers.values())
+        moved = Carried.of(sources, targets, self.arrays.parameters)
+        sources, targets = [], []
+        for fix, places in zip(self.graph.fixes, retraction.places, strict=True):
+            if isinstance(fix.value, Data):
+                sources.append(np.broadcast_to(binding.place(fix.value), places.shape))
+                targets.append(places)
+                retraction.fixed_values[places] = binding.present[fix.value]
+            else:
+                retraction.fixed_values[places] = np.asarray(fix.value)
+        binding.carry(moved, Carried.of(sources, targets, retraction.fixed_values))
 
     def by_term(self, stacked: Array) -> ByTerm:
         """(M,) numbers of the constraint rows, viewed as (n, m) of every term."""
