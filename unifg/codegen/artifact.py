@@ -95,10 +95,10 @@ def rebuilt(target: Any, artifact: Artifact, function: FunctionType, arguments: 
     described, environment = _described_function(artifact.header, function, arguments)
     if not environment.consts:
         environment.consts.extend(_dtype(held) for held in artifact.header["held"])
-    library = (artifact.header["symbol"], "object", (artifact.code, artifact.linkable))
+    library: tuple[Any, ...] = artifact.header["symbol"], "object", (artifact.code, artifact.linkable)
     if artifact.header["use"] == LINKED:
         target = target.subtarget(codegen=linked_code)
-        library = (artifact.header["symbol"], "bitcode", artifact.linkable)
+        library = artifact.header["symbol"], "bitcode", artifact.linkable
     signature = described.restype(*arguments)
     return CompileResult._rebuild(target, library, described, environment, signature, False, (), "", (), ())
 

@@ -28,7 +28,7 @@ class _LinkedCode(JITCPUCodegen):  # type: ignore[misc]
 
     def __init__(self, codegen: JITCPUCodegen) -> None:
         """Share all settings of another one."""
-        vars(self).update(vars(codegen))
+        self.__dict__.update(vars(codegen))
 
     def _add_module(self, module: Any) -> None:
         """Hand nothing to the engine, which would generate machine code."""
@@ -57,6 +57,7 @@ class _Pipeline(Compiler):  # type: ignore[misc]
         self._use = use()
 
     def compile_extra(self, func: FunctionType) -> Any:
+        """Compile a function."""
         self.state.flags.no_cpython_wrapper = self._use < PYTHON
         if self._use == LINKED:
             self.state.library = linked_code().create_library(func.__qualname__)
@@ -72,11 +73,12 @@ class UseDispatcher(CPUDispatcher):  # type: ignore[misc]
 
     def __init__(self, py_func: FunctionType, locals: Any = None, targetoptions: Any = None) -> None:
         """Compile nothing yet."""
+        self.use: int = ADDRESS
         super().__init__(py_func, locals, targetoptions, partial(_Pipeline, lambda: self.use))
-        self.use = ADDRESS
         self._ready: dict[tuple[Any, ...], int] = {}
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
+        """Compile for a compiled caller."""
         with self._used(LINKED):
             return super().get_call_template(args, kws)
 
@@ -85,6 +87,7 @@ class UseDispatcher(CPUDispatcher):  # type: ignore[misc]
             return super()._compile_for_args(*args, **kws)
 
     def compile(self, sig: Any) -> Any:
+        """Compile for the present use, unless that has been done."""
         with global_compiler_lock:
             arguments = tuple(normalize_signature(sig)[0])
             if self._ready.get(arguments, self.use) < self.use:
@@ -92,6 +95,7 @@ class UseDispatcher(CPUDispatcher):  # type: ignore[misc]
             return super().compile(sig)
 
     def add_overload(self, cres: Any) -> None:
+        """Keep what was compiled for the present use."""
         arguments = tuple(cres.signature.args)
         if self.use == PYTHON:
             super().add_overload(cres)

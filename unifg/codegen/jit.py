@@ -86,7 +86,9 @@ def in_order(function: F) -> F:
 
 def _cached(function: F, cache: type[_Cache], liberties: set[str] | bool) -> F:
     options = {"error_model": "numpy", "fastmath": liberties, "nogil": True, "nopython": True, "boundscheck": None}
-    dispatcher = UseDispatcher(function, targetoptions={**options, "no_cfunc_wrapper": True})  # no callers in C
+    dispatcher = UseDispatcher(
+        cast(FunctionType, function), targetoptions={**options, "no_cfunc_wrapper": True}
+    )  # no callers in C
     dispatcher._cache = cache(dispatcher)
     return cast(F, dispatcher)
 
