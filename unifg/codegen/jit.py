@@ -42,7 +42,7 @@ from unifg.codegen.artifact import Artifact, finished, header_of, rebuilt
 from unifg.codegen.cache_folder import cache_folder, say_not_kept
 from unifg.codegen.compile_counter import tally
 from unifg.codegen.dispatcher import LINKED, UseDispatcher
-from unifg.codegen.fingerprint import fingerprint
+from unifg.codegen.fingerprint import fingerprint, uncovered
 from unifg.codegen.objects import read_sealed, write_sealed
 from unifg.errors import UnifgError
 
@@ -99,7 +99,9 @@ def inlined(function: F) -> F:
 
 
 def written(function: str, lines: Sequence[str], names: dict[str, Any], what: str) -> Callable[..., None]:
-    """Compile a function that is put together as source; every operation as it is written, and no cache on disk.
+    """Compile a function that is put together as source; every operation as it is written.
+
+    It is kept on disk unless it calls something that no fingerprint covers.
 
     Args:
         function: its name there.
@@ -107,9 +109,13 @@ def written(function: str, lines: Sequence[str], names: dict[str, Any], what: st
         names: what the source knows; the function joins them.
         what: it is for, shown in tracebacks.
     """
+    names["__name__"] = __name__
     exec(compile("\n".join(lines), f"<{function} of {what}>", "exec"), names)
-    dispatcher = numba.njit(error_model="numpy", fastmath=False)(names[function])
-    return cast(Callable[..., None], dispatcher)
+    made = names[function]
+    if not (unknown := uncovered(made)):
+        return cast(Callable[..., None], in_order(made))
+    logger.info("'%s' is compiled in every process: it uses '%s', whose code has no fingerprint", what, unknown)
+    return cast(Callable[..., None], numba.njit(error_model="numpy", fastmath=False)(made))
 
 
 def processor() -> str:
@@ -217,8 +223,8 @@ class _Cache:
         if folder is None:
             return None
         name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}".replace("<", "").replace(">", "")
-        made = digest if "<" in function.__qualname__ or function.__closure__ else ""
         place = function.__module__, function.__code__.co_filename
+        made = digest if "<" in function.__qualname__ + place[1] or function.__closure__ else ""
         parts = (sys.version_info[:2], *place, *map(spelled, arguments), codegen.magic_tuple(), made)
         number = hashlib.sha256(repr((*parts, *self._variant())).encode()).hexdigest()[:20]
         return folder / f"{name}.{number}.code"
