@@ -405,6 +405,7 @@ BELOW_THE_SURFACE = {
     "_add_module": "numba.core.codegen:JITCPUCodegen",
     "_tm": "numba.core.codegen:JITCPUCodegen",
     "_cache": "numba.core.dispatcher:Dispatcher",
+    "_compile_for_args": "numba.core.dispatcher:_DispatcherBase",
     "_getvalue": "numba.core.cgutils:_StructProxy",
     "_helperlib": "numba",
     "_nrt_python": "numba.core.runtime",

@@ -245,8 +245,13 @@ def loop(address: int) -> None:
 
 
 @cache
-def addresses() -> Records:
-    """Compile everything for the arrays that ``memory`` has seen, and say where it stands."""
+def addresses(robust: bool, general: bool) -> Records:
+    """Compile everything for the arrays that ``memory`` has seen, and say where it stands.
+
+    Args:
+        robust: what robust losses need as well.
+        general: what costs that are no squares need as well.
+    """
     problem, work = memory.kind
     kinds = {**dict(zip(Problem._fields, problem, strict=True)), **dict(zip(Work._fields, work, strict=True))}
     values, residual, constraints, vector = (kinds[name] for name in ("values", "residual", "constraints", "step"))
@@ -271,11 +276,13 @@ def addresses() -> Records:
     links[0]["curve"] = link(
         add_curvature, NOTHING, terms, values, residual, kinds["weights"], constraints, kinds["hessian"]
     )
-    robust = kinds["squares"], kinds["weights"]
-    links[0]["weigh"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *robust, kinds["hessian"])
-    heights, added = kinds["heights"], (kinds["gradient"], kinds["hessian"], kinds["concavity"])
-    links[0]["evaluate_scalars"] = link(evaluate_scalars, NUMBER, terms, values, heights, scratch)
-    links[0]["add_scalars"] = link(add_scalars, NUMBER, terms, values, heights, *added, scratch, TRUTH)
+    if robust:
+        norms = kinds["squares"], kinds["weights"]
+        links[0]["weigh"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *norms, kinds["hessian"])
+    if general:
+        heights, added = kinds["heights"], (kinds["gradient"], kinds["hessian"], kinds["concavity"])
+        links[0]["evaluate_scalars"] = link(evaluate_scalars, NUMBER, terms, values, heights, scratch)
+        links[0]["add_scalars"] = link(add_scalars, NUMBER, terms, values, heights, *added, scratch, TRUTH)
     links[0]["retract"] = link(
         retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )

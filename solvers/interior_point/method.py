@@ -284,7 +284,7 @@ class Workspace:
             np.array([self._unequal(row) for row in program.arrays.fields], dtype=np.int64),
         )
         self._describe()
-        self.problem.links[:] = addresses()
+        self.problem.links[:] = addresses(table.weights > 0, table.scalars > 0)
         self._held = program.equality
         self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)
         self.now["clock"] = clock()

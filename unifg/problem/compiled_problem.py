@@ -228,13 +228,13 @@ class CompiledProblem:
         self.rebinds = any(reader.bound for reader in self._readers.values())
         moved = Carried.of(sources, targets, self.arrays.parameters)
         sources, targets = [], []
-        for fix, places in zip(self.graph.fixes, retraction.places, strict=True):
+        for fix, where in zip(self.graph.fixes, retraction.places, strict=True):
             if isinstance(fix.value, Data):
-                sources.append(np.broadcast_to(binding.place(fix.value), places.shape))
-                targets.append(places)
-                retraction.fixed_values[places] = binding.present[fix.value]
+                sources.append(np.broadcast_to(binding.place(fix.value), where.shape))
+                targets.append(where)
+                retraction.fixed_values[where] = binding.present[fix.value]
             else:
-                retraction.fixed_values[places] = np.asarray(fix.value)
+                retraction.fixed_values[where] = np.asarray(fix.value)
         binding.carry(moved, Carried.of(sources, targets, retraction.fixed_values))
 
     def by_term(self, stacked: Array) -> ByTerm:
