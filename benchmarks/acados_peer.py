@@ -52,6 +52,7 @@ class Acados:
         plan: states and controls from which it begins.
         answer: states and controls of the last solve.
         status: of the last solve, in words.
+        iterations: of the last solve; those of the subproblem for a single one.
     """
 
     def __init__(
@@ -68,59 +69,55 @@ class Acados:
         """
         import casadi as ca
 
-        made = interface()
-        self.problem, n = problem, problem.horizon
+        made, n, self.problem = interface(), problem.horizon, problem
         self.plan: Any = problem.guess()
         self.answer: Any = self.plan
-        self.status = ""
+        self.status, self.iterations = "", 0
         error, gap = MODELS[problem.robot]
-        ocp, model = made.AcadosOcp(), made.AcadosModel()
-        numbers = f"{problem.blocked:d}_{n}_{soft:d}{single:d}_{steps}"
-        model.name = f"{problem.robot}_{problem.instance}_{numbers}".replace("-", "_")
-        size, controls = len(problem.start), len(problem.effort)
+        size, controls, count = len(problem.start), len(problem.effort), len(problem.discs)
         x, u, reference = ca.SX.sym("x", size), ca.SX.sym("u", controls), ca.SX.sym("reference", size)
-        model.x, model.u, model.p = x, u, reference
-        model.disc_dyn_expr = -gap(x, u, ca.DM.zeros(size), problem.dt)
-        off = error(x, reference)
-        model.cost_y_expr = model.cost_y_expr_0 = ca.vertcat(off, u)
-        model.cost_y_expr_e = off
-        ocp.model, ocp.dims.N, ocp.parameter_values = model, n, problem.reference()[0][0]
-        cost, limits, options = ocp.cost, ocp.constraints, ocp.solver_options
-        cost.cost_type = cost.cost_type_0 = cost.cost_type_e = "NONLINEAR_LS"
-        cost.W = cost.W_0 = block_diag(np.diag(problem.stage), np.diag(problem.effort)) / problem.dt
-        cost.W_e = np.diag(problem.terminal)
-        cost.yref = cost.yref_0 = np.zeros(off.shape[0] + controls)
-        cost.yref_e = np.zeros(off.shape[0])
-        limits.x0, limits.idxbu = problem.start, np.arange(controls)
-        limits.lbu, limits.ubu = problem.lower, problem.upper
-        if count := len(problem.discs):
-            near = x[: problem.axes]
-            rows = [ca.sumsqr(near - disc[:-1]) - disc[-1] ** 2 for disc in problem.discs]
-            model.con_h_expr = model.con_h_expr_e = ca.vertcat(*rows)
-            limits.lh = limits.lh_e = np.zeros(count)
-            limits.uh = limits.uh_e = np.full(count, 1e6)
-            if soft:
-                limits.idxsh = limits.idxsh_e = np.arange(count)
-                cost.zl = cost.zu = np.full(count, SOFT / problem.dt)
-                cost.Zl = cost.Zu = np.full(count, 1.0 / problem.dt)
-                cost.zl_e = cost.zu_e = np.full(count, SOFT)
-                cost.Zl_e = cost.Zu_e = np.ones(count)
-        options.tf, options.integrator_type, options.hessian_approx = n * problem.dt, "DISCRETE", "GAUSS_NEWTON"
-        options.nlp_solver_type, options.nlp_solver_max_iter = "SQP_RTI" if single else "SQP", 200
-        options.globalization = "FIXED_STEP" if steps == "full" else "MERIT_BACKTRACKING"
-        options.globalization_use_SOC = int(steps == "corrected")
-        options.levenberg_marquardt = 0.1 if steps == "corrected" and not soft else 0.0  # else it cycles
-        options.qp_solver, options.qp_solver_cond_N = "PARTIAL_CONDENSING_HPIPM", n // 5
-        options.hpipm_mode, options.qp_solver_warm_start = "SPEED_ABS" if single and not soft else "SPEED", 1
-        options.qp_solver_iter_max, options.qp_tol = 100, 0.1 * tolerance
-        options.nlp_solver_tol_stat = options.nlp_solver_tol_eq = tolerance
-        options.nlp_solver_tol_ineq = options.nlp_solver_tol_comp = tolerance
-        options.ext_fun_compile_flags = " ".join(FLAGS[:2])
+        off, one = error(x, reference), np.ones(count)
+        name = f"{problem.robot}_{problem.instance}_{count}_{n}_{soft:d}{single:d}_{steps}".replace("-", "_")
+        model = {
+            "name": name, "x": x, "u": u, "p": reference, "disc_dyn_expr": -gap(x, u, ca.DM.zeros(size), problem.dt),
+            "cost_y_expr": ca.vertcat(off, u), "cost_y_expr_0": ca.vertcat(off, u), "cost_y_expr_e": off,
+        }  # fmt: skip
+        running = block_diag(np.diag(problem.stage), np.diag(problem.effort)) / problem.dt
+        zero = np.zeros(len(running))
+        cost: dict[str, Any] = {f"cost_type{where}": "NONLINEAR_LS" for where in ("", "_0", "_e")}
+        cost |= {"W": running, "W_0": running, "W_e": np.diag(problem.terminal)}
+        cost |= {"yref": zero, "yref_0": zero, "yref_e": zero[:-controls]}
+        limits = {"x0": problem.start, "idxbu": np.arange(controls), "lbu": problem.lower, "ubu": problem.upper}
+        if count:
+            rows = [ca.sumsqr(x[: problem.axes] - disc[:-1]) - disc[-1] ** 2 for disc in problem.discs]
+            model |= {"con_h_expr": ca.vertcat(*rows), "con_h_expr_e": ca.vertcat(*rows)}
+            limits |= {"lh": 0.0 * one, "lh_e": 0.0 * one, "uh": 1e6 * one, "uh_e": 1e6 * one}
+        for where, scale in (("", 1.0 / problem.dt), ("_e", 1.0)) if soft else ():
+            limits[f"idxsh{where}"] = np.arange(count)
+            cost |= {f"{side}{where}": SOFT * scale * one for side in ("zl", "zu")}
+            cost |= {f"{side}{where}": scale * one for side in ("Zl", "Zu")}
+        options = {
+            "tf": n * problem.dt, "integrator_type": "DISCRETE", "hessian_approx": "GAUSS_NEWTON",
+            "nlp_solver_type": "SQP_RTI" if single else "SQP", "nlp_solver_max_iter": 200,
+            "qp_solver": "PARTIAL_CONDENSING_HPIPM", "qp_solver_cond_N": n // 5, "qp_solver_iter_max": 100,
+            "hpipm_mode": "SPEED_ABS" if single and not soft else "SPEED", "qp_solver_warm_start": 1,
+            "qp_tol": 0.1 * tolerance, "globalization": "FIXED_STEP" if steps == "full" else "MERIT_BACKTRACKING",
+            "globalization_use_SOC": int(steps == "corrected"),
+            # Without it hard constraints let corrected steps cycle.
+            "levenberg_marquardt": 0.1 if steps == "corrected" and not soft else 0.0,
+            "ext_fun_compile_flags": " ".join(FLAGS[:2]),
+            **{f"nlp_solver_tol_{kind}": tolerance for kind in ("stat", "eq", "ineq", "comp")},
+        }  # fmt: skip
         LIBRARIES.mkdir(parents=True, exist_ok=True)
-        ocp.code_export_directory = str(LIBRARIES / model.name)
+        ocp, folder = made.AcadosOcp(), str(LIBRARIES / name)
+        own = {"model": made.AcadosModel(), "parameter_values": problem.start, "code_export_directory": folder}
+        parts = (ocp, own), (ocp.dims, {"N": n}), (ocp.cost, cost), (ocp.constraints, limits)
+        for part, values in (*parts, (ocp.solver_options, options), (own["model"], model)):
+            for field, value in values.items():
+                setattr(part, field, value)
         with contextlib.chdir(LIBRARIES), contextlib.redirect_stdout(io.StringIO()):
-            self._solver = made.AcadosOcpSolver(ocp, json_file=f"{model.name}.json", verbose=False)
-        self._solve = getattr(self._solver.shared_lib, f"{model.name}_acados_solve")
+            self._solver = made.AcadosOcpSolver(ocp, json_file=f"{name}.json", verbose=False)
+        self._solve = getattr(self._solver.shared_lib, f"{name}_acados_solve")
         self._solve.argtypes, self._solve.restype = [ctypes.c_void_p], ctypes.c_int
         self._counted = "qp_iter" if single else "sqp_iter"
 
@@ -143,11 +140,6 @@ class Acados:
             seconds = self._from(states, controls, state, index)
         return Tick(self.answer[1][0], 1e3 * seconds, self.iterations, self.status)
 
-    @property
-    def iterations(self) -> int:
-        """Of the last solve; those of the subproblem for a single one."""
-        return int(self._solver.get_stats(self._counted)[-1])
-
     def _from(self, states: Array, controls: Array, state: Array, first: int) -> float:
         """Solve closed-loop step ``first`` from a guess; seconds of the call that solves.
 
@@ -157,17 +149,14 @@ class Acados:
         wanted, cruise = self.problem.reference(first)
         zero = np.zeros(len(self.problem.stage))
         for k in range(n + 1):
-            solver.set(k, "x", states[k])
-            solver.set(k, "p", wanted[k])
+            given = {"x": states[k], "p": wanted[k]} | ({"u": controls[k]} if k < n else {})
+            for name, value in (given | ({} if k else {"lbx": state, "ubx": state})).items():
+                solver.set(k, name, value)
             if k < n:
-                solver.set(k, "u", controls[k])
                 solver.cost_set(k, "yref", np.append(zero, cruise[k]))
-        for name in ("lbx", "ubx"):
-            solver.set(0, name, state)
         begin = time.thread_time()
         status = int(self._solve(solver.capsule))
         spent = time.thread_time() - begin
-        self.status = STATUS[status]
-        found = [[solver.get(k, name) for k in range(n + last)] for name, last in (("x", 1), ("u", 0))]
-        self.answer = np.array(found[0]), np.array(found[1])
+        self.status, self.iterations = STATUS[status], int(solver.get_stats(self._counted)[-1])
+        self.answer = [np.array([solver.get(k, name) for k in range(m)]) for name, m in (("x", n + 1), ("u", n))]
         return min(spent, float(solver.get_stats("time_tot")[0]))

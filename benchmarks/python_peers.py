@@ -7,6 +7,7 @@ is measured and left out, so nothing is held against these solvers that a compil
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -17,115 +18,93 @@ from problems.control import Problem
 from unifg.typing import Array
 
 R = TypeVar("R")
+Solved = tuple[Array, Array, bool, int]
+"""States, controls, whether the solver says that it converged, and iterations, 0 where it does not tell."""
 
 
-class Functions:
-    """A robot's dynamics and its derivatives, and the time spent in them.
-
-    Attributes:
-        step: next state of a state and a control, a function of casadi.
-        inside: seconds since the last solve began.
-    """
-
-    def __init__(self, problem: Problem) -> None:
-        """Differentiate."""
-        import casadi as ca
-
-        x, u = ca.SX.sym("x", len(problem.start)), ca.SX.sym("u", len(problem.effort))
-        after = -MODELS[problem.robot][1](x, u, ca.DM.zeros(x.shape[0]), problem.dt)
-        self.step: Any = ca.Function("step", [x, u], [after])
-        self._slope: Any = ca.Function("slope", [x, u], [ca.jacobian(after, ca.vertcat(x, u))])
-        self.inside = 0.0
-
-    def slope(self, x: Array, u: Array) -> Array:
-        """(n, n + m) derivative of a step."""
-        return np.array(self._slope(x, u))
-
-    def clocked(self, action: Callable[[], R]) -> R:
-        """Result of an action whose time is left out."""
-        begin = time.thread_time()
-        result = action()
-        self.inside += time.thread_time() - begin
-        return result
-
-
-class Called:
+class Called(ABC):
     """A solver that calls functions in Python.
 
     Attributes:
         problem: to be solved.
         answer: states and controls of the last solve.
         status: of the last solve, in words.
-        iterations: of the last solve; 0 where the solver tells none.
+        iterations: of the last solve; 0 where the solver does not tell.
         inside: share of the last solve that was spent in Python's functions.
+        step, slope: next state of a state and a control and its derivative, functions of casadi.
     """
 
     def __init__(self, problem: Problem, tolerance: float) -> None:
-        """Begin at the cold guess."""
-        self.problem = problem
+        """Differentiate."""
+        import casadi as ca
+
+        x, u = ca.SX.sym("x", len(problem.start)), ca.SX.sym("u", len(problem.effort))
+        after = -MODELS[problem.robot][1](x, u, ca.DM.zeros(x.shape[0]), problem.dt)
+        self.step: Any = ca.Function("step", [x, u], [after])
+        self.slope: Any = ca.Function("slope", [x, u], [ca.jacobian(after, ca.vertcat(x, u))])
+        self.problem, self.status, self.iterations, self.inside, self._seconds = problem, "", 0, 0.0, 0.0
         self.answer: Any = problem.guess()
-        self.status, self.iterations, self.inside, self._functions = "", 0, 0.0, Functions(problem)
         self._solve = self._built(tolerance)
 
     def __call__(self) -> float:
         """Solve from the cold guess; seconds outside Python's functions."""
-        self._functions.inside = 0.0
-        begin = time.thread_time()
-        self._solve()
+        self._seconds, begin = 0.0, time.thread_time()
+        *self.answer, done, self.iterations = self._solve()
         spent = time.thread_time() - begin
-        self.inside = self._functions.inside / spent
-        return spent - self._functions.inside
+        self.status, self.inside = "converged" if done else "failed", self._seconds / spent
+        return spent - self._seconds
 
-    def _built(self, tolerance: float) -> Callable[[], None]:
-        raise NotImplementedError
+    def clocked(self, action: Callable[[], R]) -> R:
+        """Result of an action whose time is left out."""
+        begin = time.thread_time()
+        result = action()
+        self._seconds += time.thread_time() - begin
+        return result
+
+    @abstractmethod
+    def _built(self, tolerance: float) -> Callable[[], Solved]:
+        """The whole solve."""
 
 
 class Snopt(Called):
     """SNOPT on the direct transcription, its dynamics differentiated by casadi, obstacles as formulas in drake."""
 
-    def _built(self, tolerance: float) -> Callable[[], None]:
+    def _built(self, tolerance: float) -> Callable[[], Solved]:
         from pydrake import autodiffutils, math
         from pydrake.solvers import MathematicalProgram, SnoptSolver, SolverOptions
 
-        problem, functions, n = self.problem, self._functions, self.problem.horizon
-        size, program = len(problem.start), MathematicalProgram()
-        x = program.NewContinuousVariables(n + 1, size, "x")
-        u = program.NewContinuousVariables(n, len(problem.effort), "u")
-        wanted, cruise = problem.reference()
+        p, n, size, program = self.problem, self.problem.horizon, len(self.problem.start), MathematicalProgram()
+        x, u = program.NewContinuousVariables(n + 1, size), program.NewContinuousVariables(n, len(p.effort))
+        wanted, cruise = p.reference()
 
-        def defect(z: Any) -> Any:
-            def gap() -> Any:
-                plain = z if z.dtype == float else autodiffutils.ExtractValue(z).ravel()
-                after, now, control = np.split(plain, [size, 2 * size])
-                value = after - np.array(functions.step(now, control)).ravel()
-                if z.dtype == float:
-                    return value
-                slope = np.hstack([np.eye(size), -functions.slope(now, control)])
-                return autodiffutils.InitializeAutoDiff(value, slope @ autodiffutils.ExtractGradient(z)).ravel()
+        def gap(z: Any) -> Any:
+            plain = z if z.dtype == float else autodiffutils.ExtractValue(z).ravel()
+            after, now, control = np.split(plain, [size, 2 * size])
+            value = after - np.array(self.step(now, control)).ravel()
+            if z.dtype == float:
+                return value
+            slope = np.hstack([np.eye(size), -np.array(self.slope(now, control))])
+            return autodiffutils.InitializeAutoDiff(value, slope @ autodiffutils.ExtractGradient(z)).ravel()
 
-            return functions.clocked(gap)
-
-        program.AddBoundingBoxConstraint(problem.start, problem.start, x[0])
+        program.AddBoundingBoxConstraint(p.start, p.start, x[0])
+        program.AddBoundingBoxConstraint(np.tile(p.lower, (n, 1)), np.tile(p.upper, (n, 1)), u)
         for k in range(n):
             row = np.concatenate([x[k + 1], x[k], u[k]])
-            program.AddConstraint(defect, lb=np.zeros(size), ub=np.zeros(size), vars=row)
-            program.AddBoundingBoxConstraint(problem.lower, problem.upper, u[k])
-            program.AddQuadraticErrorCost(np.diag(problem.stage) / 2, wanted[k], x[k])
-            program.AddQuadraticErrorCost(np.diag(problem.effort) / 2, cruise[k], u[k])
-            near = x[k + 1, : problem.axes]
-            if rows := [((near - disc[:-1]) ** 2).sum() - disc[-1] ** 2 for disc in problem.discs]:
-                program.AddConstraint(math.ge(np.array(rows), np.zeros(len(rows))))
-        program.AddQuadraticErrorCost(np.diag(problem.terminal) / 2, wanted[n], x[n])
-        guess, options = np.zeros(program.num_vars()), SolverOptions()
-        for variables, values in zip((x, u), problem.guess(), strict=True):
-            program.SetDecisionVariableValueInVector(variables, values, guess)
+            program.AddConstraint(lambda z: self.clocked(lambda: gap(z)), np.zeros(size), np.zeros(size), row)
+            program.AddQuadraticErrorCost(np.diag(p.stage) / 2, wanted[k], x[k])
+            program.AddQuadraticErrorCost(np.diag(p.effort) / 2, cruise[k], u[k])
+            for disc in p.discs:
+                near = x[k + 1, : p.axes] - disc[:-1]
+                program.AddConstraint(math.ge((near**2).sum(keepdims=True), disc[-1:] ** 2))
+        program.AddQuadraticErrorCost(np.diag(p.terminal) / 2, wanted[n], x[n])
+        options = SolverOptions()
         for name in ("optimality", "feasibility"):
             options.SetOption(SnoptSolver.id(), f"Major {name} tolerance", tolerance)
 
-        def solve() -> None:
-            result = SnoptSolver().Solve(program, guess, options)
-            self.answer = result.GetSolution(x), result.GetSolution(u).reshape(u.shape)  # a column comes flat
-            self.status = "converged" if result.is_success() else result.get_solution_result().name[1:]
+        def solve() -> Solved:
+            result = SnoptSolver().Solve(program, np.concatenate([part.ravel() for part in p.guess()]), options)
+            found = (result.GetSolution(part).reshape(part.shape) for part in (x, u))  # a column comes flat
+            return *found, result.is_success(), 0
 
         return solve
 
@@ -133,46 +112,45 @@ class Snopt(Called):
 class Crocoddyl(Called):
     """Box-FDDP, with an action model in Python."""
 
-    def _built(self, tolerance: float) -> Callable[[], None]:
+    def _built(self, tolerance: float) -> Callable[[], Solved]:
         import crocoddyl
 
-        problem, functions, n = self.problem, self._functions, self.problem.horizon
-        wanted, cruise = problem.reference()
+        solver, p, (wanted, cruise) = self, self.problem, self.problem.reference()
 
         class Model(crocoddyl.ActionModelAbstract):  # type: ignore[misc]
             def __init__(self, k: int) -> None:
-                state = crocoddyl.StateVector(len(problem.start))
-                crocoddyl.ActionModelAbstract.__init__(self, state, len(problem.effort), 1)
-                self.wanted, self.cruise = wanted[k], cruise[min(k, n - 1)]
-                self.weights = problem.stage if k < n else problem.terminal
-                self.u_lb, self.u_ub = problem.lower, problem.upper
+                state = crocoddyl.StateVector(len(p.start))
+                crocoddyl.ActionModelAbstract.__init__(self, state, len(p.effort), 1)
+                self.wanted, self.cruise = wanted[k], cruise[min(k, p.horizon - 1)]
+                self.weights = p.stage if k < p.horizon else p.terminal
+                self.u_lb, self.u_ub = p.lower, p.upper
 
             def calc(self, data: Any, x: Array, u: Array | None = None) -> None:
-                functions.clocked(lambda: self.values(data, x, u))
+                solver.clocked(lambda: self.values(data, x, u))
 
             def calcDiff(self, data: Any, x: Array, u: Array | None = None) -> None:
-                functions.clocked(lambda: self.slopes(data, x, u))
+                solver.clocked(lambda: self.slopes(data, x, u))
 
             def values(self, data: Any, x: Array, u: Array | None) -> None:
                 data.cost, data.xnext = 0.5 * self.weights @ (x - self.wanted) ** 2, x.copy()
                 if u is not None:
-                    data.cost += 0.5 * problem.effort @ (u - self.cruise) ** 2
-                    data.xnext = np.array(functions.step(x, u)).ravel()
+                    data.cost += 0.5 * p.effort @ (u - self.cruise) ** 2
+                    data.xnext = np.array(solver.step(x, u)).ravel()
 
             def slopes(self, data: Any, x: Array, u: Array | None) -> None:
                 data.Lx, data.Lxx = self.weights * (x - self.wanted), np.diag(self.weights)
                 if u is not None:
-                    data.Lu, data.Luu = problem.effort * (u - self.cruise), np.diag(problem.effort)
-                    data.Fx, data.Fu = np.hsplit(functions.slope(x, u), [len(x)])
+                    data.Lu, data.Luu = p.effort * (u - self.cruise), np.diag(p.effort)
+                    data.Fx, data.Fu = np.hsplit(np.array(solver.slope(x, u)), [len(x)])
 
-        shooting = crocoddyl.ShootingProblem(problem.start, [Model(k) for k in range(n)], Model(n))
-        states, controls = (list(part) for part in problem.guess())
+        stages = [Model(k) for k in range(p.horizon + 1)]
+        shooting = crocoddyl.ShootingProblem(p.start, stages[:-1], stages[-1])
 
-        def solve() -> None:
-            solver = crocoddyl.SolverBoxFDDP(shooting)
-            solver.th_stop = tolerance**2  # of squares
-            done = solver.solve(states, controls, 200, False)
-            self.answer, self.iterations = (np.array(solver.xs), np.array(solver.us)), solver.iter
-            self.status = "converged" if done else "iteration limit"
+        def solve() -> Solved:
+            states, controls = (list(part) for part in p.guess())
+            ddp = crocoddyl.SolverBoxFDDP(shooting)
+            ddp.th_stop = tolerance**2  # of squares
+            done = ddp.solve(states, controls, 200, False)
+            return np.array(ddp.xs), np.array(ddp.us), done, ddp.iter
 
         return solve
