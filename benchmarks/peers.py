@@ -287,7 +287,7 @@ def graph_part(rounds: int) -> Found:
 
     case = cases()[0]
     graph, _, guess = case.pose_graph.graph()
-    contestants: dict[str, Contestant] = {name: Ours(one, graph, guess) for name, one in backends("lm", "gn").items()}
+    contestants: dict[str, Contestant] = {one.name: Ours(one, graph, guess) for one in backends("lm", "gn").values()}
     contestants["jaxls"] = jaxls_peer.pose_graph(case.pose_graph)
     return {case.name: cold(contestants, lambda found: (0.0, case.pose_graph.with_poses(found).chi2()), rounds)}
 
@@ -296,9 +296,9 @@ def constrained_part(rounds: int) -> Found:
     """Control problems with jaxls' augmented Lagrangian."""
     from benchmarks import jaxls_peer
 
-    found, ours = {}, backends("ipm", "alm", tolerance=TOLERANCE)
+    found, ours = {}, backends("ipm", "alm", tolerance=TOLERANCE).values()
     for problem in problems()[0], problems()[2]:
-        contestants: dict[str, Contestant] = {name: on(problem, solver) for name, solver in ours.items()}
+        contestants: dict[str, Contestant] = {one.name: on(problem, one) for one in ours}
         contestants["jaxls"] = jaxls_peer.augmented(problem)
         found[problem.title] = cold(contestants, partial(judge, problem), rounds)
     return found
@@ -322,7 +322,10 @@ def rendered(found: Found, ours: Iterable[str], of: Of, shares: str, shown_as: O
                 ratios.append((title, name, *cells))
             times = (number(what(one.times)) for what in shown_as.values())
             share = "-" if np.isnan(one.inside) else f"{100.0 * one.inside:.0f} %"
-            judged, iterated = one.refused(best(results)) or "accepted", f"{one.iterations:.3g}".replace("nan", "-")
+            judged, iterated = (
+                one.refused(best(results)) or "accepted",
+                f"{one.iterations or np.nan:.3g}".replace("nan", "-"),
+            )
             facts.append((title, name, judged, iterated, *times, share, f"{one.violation:.1e}", f"{one.cost:.6g}"))
     heads = [f"{mine}{what}" for mine in names for what in of]
     every = ("problem", "solver", "judged", "iterations", *shown_as, shares, "violation", "cost")
@@ -346,8 +349,12 @@ def each(measure: Callable[[Problem, int], Results], rounds: int) -> Found:
 PARTS: dict[str, Callable[[int], str]] = {
     "Ticks": lambda rounds: rendered(each(loops, rounds), LOOPS, TAILS, "compiled", TICKS),
     "Cold solves": lambda rounds: rendered(each(colds, rounds), COLD, WHOLE, "left out", MEDIAN),
-    "Pose graph": lambda rounds: rendered(graph_part(rounds), ("lm", "gn"), WHOLE, "left out", MEDIAN),
-    "Constraints in jaxls": lambda n: rendered(constrained_part(n), ("ipm", "alm"), WHOLE, "left out", MEDIAN),
+    "Pose graph": lambda rounds: rendered(
+        graph_part(rounds), ("LevenbergMarquardt", "GaussNewton"), WHOLE, "left out", MEDIAN
+    ),
+    "Constraints in jaxls": lambda n: rendered(
+        constrained_part(n), ("InteriorPoint", "AugmentedLagrangian"), WHOLE, "left out", MEDIAN
+    ),
     "Machine": lambda rounds: machine(),
 }
 """Sections of the page by heading, each made in a process of its own."""

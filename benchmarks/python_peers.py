@@ -54,12 +54,16 @@ class Called(ABC):
         self.status, self.inside = "converged" if done else "failed", self._seconds / spent
         return spent - self._seconds
 
-    def clocked(self, action: Callable[[], R]) -> R:
-        """Result of an action whose time is left out."""
-        begin = time.thread_time()
-        result = action()
-        self._seconds += time.thread_time() - begin
-        return result
+    def clocked(self, function: Callable[..., R]) -> Callable[..., R]:
+        """The function, its time left out."""
+
+        def timed(*given: Any) -> R:
+            begin = time.thread_time()
+            result = function(*given)
+            self._seconds += time.thread_time() - begin
+            return result
+
+        return timed
 
     @abstractmethod
     def _built(self, tolerance: float) -> Callable[[], Solved]:
@@ -90,7 +94,7 @@ class Snopt(Called):
         program.AddBoundingBoxConstraint(np.tile(p.lower, (n, 1)), np.tile(p.upper, (n, 1)), u)
         for k in range(n):
             row = np.concatenate([x[k + 1], x[k], u[k]])
-            program.AddConstraint(lambda z: self.clocked(lambda: gap(z)), np.zeros(size), np.zeros(size), row)
+            program.AddConstraint(self.clocked(gap), np.zeros(size), np.zeros(size), row)
             program.AddQuadraticErrorCost(np.diag(p.stage) / 2, wanted[k], x[k])
             program.AddQuadraticErrorCost(np.diag(p.effort) / 2, cruise[k], u[k])
             for disc in p.discs:
@@ -98,11 +102,13 @@ class Snopt(Called):
                 program.AddConstraint(math.ge((near**2).sum(keepdims=True), disc[-1:] ** 2))
         program.AddQuadraticErrorCost(np.diag(p.terminal) / 2, wanted[n], x[n])
         options = SolverOptions()
+        for variables, values in zip((x, u), p.guess(), strict=True):
+            program.SetInitialGuess(variables, values)
         for name in ("optimality", "feasibility"):
             options.SetOption(SnoptSolver.id(), f"Major {name} tolerance", tolerance)
 
         def solve() -> Solved:
-            result = SnoptSolver().Solve(program, np.concatenate([part.ravel() for part in p.guess()]), options)
+            result = SnoptSolver().Solve(program, None, options)
             found = (result.GetSolution(part).reshape(part.shape) for part in (x, u))  # a column comes flat
             return *found, result.is_success(), 0
 
@@ -125,19 +131,15 @@ class Crocoddyl(Called):
                 self.weights = p.stage if k < p.horizon else p.terminal
                 self.u_lb, self.u_ub = p.lower, p.upper
 
+            @solver.clocked
             def calc(self, data: Any, x: Array, u: Array | None = None) -> None:
-                solver.clocked(lambda: self.values(data, x, u))
-
-            def calcDiff(self, data: Any, x: Array, u: Array | None = None) -> None:
-                solver.clocked(lambda: self.slopes(data, x, u))
-
-            def values(self, data: Any, x: Array, u: Array | None) -> None:
                 data.cost, data.xnext = 0.5 * self.weights @ (x - self.wanted) ** 2, x.copy()
                 if u is not None:
                     data.cost += 0.5 * p.effort @ (u - self.cruise) ** 2
                     data.xnext = np.array(solver.step(x, u)).ravel()
 
-            def slopes(self, data: Any, x: Array, u: Array | None) -> None:
+            @solver.clocked
+            def calcDiff(self, data: Any, x: Array, u: Array | None = None) -> None:
                 data.Lx, data.Lxx = self.weights * (x - self.wanted), np.diag(self.weights)
                 if u is not None:
                     data.Lu, data.Luu = p.effort * (u - self.cruise), np.diag(p.effort)
