@@ -28,7 +28,7 @@ from benchmarks.control_peers import MODELS
 from benchmarks.own_functions import Way
 from benchmarks.pose_graphs import cases
 from benchmarks.report import CHECKOUT, machine, table, words
-from benchmarks.runner import Unavailable
+from benchmarks.runner import Timing, Unavailable
 from benchmarks.timing import interleave, number, pin, ratio, shown
 from problems.cart_pole import CartPole
 from problems.control import Driver, Problem, Quadrotor, Stated, Tick, Unicycle
@@ -360,35 +360,33 @@ PARTS: dict[str, Callable[[int], str]] = {
 """Sections of the page by heading, each made in a process of its own."""
 
 
-@dataclass(frozen=True)
-class Page:
-    """The page.
+def tables(rounds: int) -> str:
+    """Every part, measured in the peers' environment.
 
-    Attributes:
-        rounds: of times.
+    Raises:
+        Unavailable: it has not been built.
     """
+    if not (HOME / "ready").is_file():
+        raise Unavailable(f"{HOME.name} with the peers is not there: build it with `make peers`")
+    texts, command = [], [str(HOME / "bin" / "python"), "-m", "benchmarks.peers"]
+    with tempfile.TemporaryDirectory() as folder:
+        for heading in tqdm(PARTS, unit="part"):
+            path = Path(folder) / "text.md"  # solvers write what they like to the standard output
+            given = [heading, str(rounds), str(path)]
+            subprocess.run([*command, *given], cwd=CHECKOUT, stdout=subprocess.DEVNULL, check=True)
+            texts.append(f"### {heading}\n\n{path.read_text(encoding='utf-8')}")
+    return "\n\n".join(texts)
 
-    rounds: int = 7
+
+class Page(Timing):
+    """The page: packages and machine are those of the processes that measure."""
 
     def run(self, name: str, chosen: argparse.Namespace) -> str:
-        """Measure every part in the peers' environment; the tables.
-
-        Raises:
-            Unavailable: it has not been built.
-        """
-        if not (HOME / "ready").is_file():
-            raise Unavailable(f"{HOME.name} with the peers is not there: build it with `make peers`")
-        texts, command = [], [str(HOME / "bin" / "python"), "-m", "benchmarks.peers"]
-        with tempfile.TemporaryDirectory() as folder:
-            for heading in tqdm(PARTS, unit="part"):
-                path = Path(folder) / "text.md"  # solvers write what they like to the standard output
-                given = [heading, str(chosen.rounds or self.rounds), str(path)]
-                subprocess.run([*command, *given], cwd=CHECKOUT, stdout=subprocess.DEVNULL, check=True)
-                texts.append(f"### {heading}\n\n{path.read_text(encoding='utf-8')}")
-        return "\n\n".join(texts)
+        """Measure everything; the tables."""
+        return self.tables(chosen.rounds or self.rounds)
 
 
-STUDY = Page()
+STUDY = Page(tables, 7)
 
 if __name__ == "__main__":
     pin()
