@@ -23,6 +23,7 @@ from unifg.problem.linearization import Linearization
 from unifg.problem.snapshot import Memory
 from unifg.problem.systems import stacked
 from unifg.problem.table import COST, COUNT, KIND, ROW, ROWS
+from unifg.solution.batch import Outcomes
 from unifg.solution.history import Iteration
 from unifg.solution.multipliers import SUSPICIOUS, Slopes
 from unifg.solution.optimality import Optimality, optimality, read_numbers
@@ -30,6 +31,7 @@ from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
 from unifg.solvers.interior_point import state
+from unifg.solvers.interior_point.each import solve_each
 from unifg.solvers.interior_point.loop import addresses, call
 from unifg.solvers.interior_point.state import Fields, Problem, empty_work
 from unifg.typing import Array, IntArray
@@ -96,13 +98,29 @@ class InteriorPoint(Solver):
         """Test whether the loop may make the whole solve; that of least squares is tested outside, at every step."""
         return not program.least_squares
 
+    def solves_each(self, program: CompiledProblem) -> bool:
+        """Test whether one compiled call may solve many instances."""
+        return self.runs_alone(program) and self.time_limit == np.inf and program.numbers_only
+
+    def solve_each(self, workspace: Workspace, rows: Array, guesses: Array, duals: Array) -> Outcomes:
+        """Solve many instances, which differ in numbers alone."""
+        found, multipliers, numbers = workspace.solve_each(self, rows, guesses, duals)
+        answers, finite, sized = numbers[:, 0].astype(int), numbers[:, 7] > 0.0, numbers[:, 3] <= SUSPICIOUS
+        passed = (numbers[:, 4:7] <= self.tolerance).all(axis=1) & finite & sized
+        stopped = (answers == state.STOPPED) & finite & ~passed
+        statuses = [
+            Status.CONVERGED if good else Status.STOP_RULE if over else None
+            for good, over in zip(passed.tolist(), stopped.tolist(), strict=True)
+        ]
+        return Outcomes(statuses, found, multipliers, numbers[:, 2], numbers[:, 1].astype(np.int64), numbers[:, 4:7])
+
     def workspace(self, program: CompiledProblem) -> Workspace:
         """Structure of the KKT matrix."""
         return Workspace(program)
 
     def search_step(self, run: SolveState, workspace: Workspace, lin: Linearization) -> Array | None:
         """The first step of a solve from there, by Gauss-Newton, as far as slacks and multipliers stay positive."""
-        now = workspace.prepare(run, self)
+        now = workspace.prepare(self, run.values.flat, run.multipliers)
         now["bending"] = 0
         workspace.take(lin)
         workspace.call("begin")
@@ -130,7 +148,7 @@ class InteriorPoint(Solver):
         """Take note of all iterates of a solve without success, which nobody has looked at: up to its first restart."""
         reached = run.values, run.multipliers, run.iterations
         run.values, run.multipliers = start, carried
-        now = workspace.prepare(run, self, clocked=True)
+        now = workspace.prepare(self, run.values.flat, run.multipliers, clocked=True)
         now["watched"], now["stage"] = 0, state.MOVED
         while workspace.asks():
             self._note(run, workspace)
@@ -144,7 +162,7 @@ class InteriorPoint(Solver):
             run.consider(now["cost"], work.constraints.copy(), work.values.copy(), work.multipliers.copy())
 
     def _iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
-        now = workspace.prepare(run, self)
+        now = workspace.prepare(self, run.values.flat, run.multipliers)
         restarts = 0
         while True:
             reason = self._attempt(run, workspace)
@@ -322,7 +340,7 @@ class Workspace:
             work.trial_constraints[:] = found.constraints
         return answer in (state.TRY, state.LINEARIZE, state.BEND, state.EVALUATE, state.SHOW)
 
-    def prepare(self, run: SolveState, options: InteriorPoint, clocked: bool = False) -> Fields:
+    def prepare(self, options: InteriorPoint, values: Array, multipliers: Array, clocked: bool = False) -> Fields:
         """Set up one solve with the present data, ``clocked`` to come back before every step; returns the scalars."""
         if self.program.equality is not self._held:  # which is a new array when limits have changed
             if not np.array_equal(self.program.equality, self.system.held):
@@ -333,19 +351,38 @@ class Workspace:
             self._describe()
         work, now, self._taken, self.compiled = self.work, self.now, None, 0.0
         # The test of least squares has no absolute tolerance.
-        now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
+        tolerance = options.tolerance
+        now["tolerance"] = 0.0 if self.program.least_squares else tolerance
         now["scaling"], now["assisted"] = bool(options.scaling), not self.program.fully_compiled
         now["step_tolerance"] = options.step_tolerance
         now["violation_tolerance"], now["clocked"] = (
             options.violation_tolerance,
             clocked or options.time_limit < np.inf,
         )
-        now["keeping"] = max(run.tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
+        now["keeping"] = max(tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         self.call("reset")
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
-        self.begin_at(run.values.flat, options)
-        work.multipliers[:] = run.multipliers
+        self.begin_at(values, options)
+        work.multipliers[:] = multipliers
         return now
+
+    def solve_each(
+        self, options: InteriorPoint, rows: Array, guesses: Array, duals: Array
+    ) -> tuple[Array, Array, Array]:
+        """Solve many instances in one compiled call, see :mod:`unifg.solvers.interior_point.each`."""
+        program, work, count = self.program, self.work, len(rows)
+        now = self.prepare(options, guesses[0], duals[0])
+        now["watched"] = 0
+        sizes = len(work.values), len(work.multipliers), 8
+        found, multipliers, numbers = (np.zeros((count, size)) for size in sizes)
+        functions = np.array([self._links[name] for name in ("reset", "loop", "conclude")])
+        carried, retraction = program.carried, program.retraction
+        solve_each(
+            functions, self._address, work.scalars, options.barrier, options.penalty, rows, carried[:3],
+            (*carried[3:], retraction.fixed), program.reader.quaternions, guesses, duals, work.values,
+            work.multipliers, work.kkt, found, multipliers, numbers,
+        )  # fmt: skip
+        return found, multipliers, numbers
 
     def begin_at(self, values: Array, options: InteriorPoint) -> None:
         """Go on from other values, about whose multipliers nothing is known."""

@@ -80,6 +80,7 @@ class CompiledProblem:
         differenced: whether some derivative comes from differences, which round.
         batched: terms without a kernel, evaluated by NumPy.
         retraction: moves all variables.
+        reader: of guesses.
         scratch: memory for compiled loops.
         rebinds: whether something else than numbers for kernels and fixed variables is made of data.
         python_seconds: time spent so far in terms that Python evaluates.
@@ -132,7 +133,7 @@ class CompiledProblem:
         for term, rows in zip(self.constraint_terms, self.slices, strict=True):
             self.bound_rows[rows] = term.is_bound
         self.retraction = Retraction(self.columns, graph.fixes)
-        self._read = GuessReader(graph, self.columns, self.retraction)
+        self.reader = GuessReader(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
         self.no_penalties = np.zeros(self.constraints.count)
@@ -164,6 +165,25 @@ class CompiledProblem:
     def fully_compiled(self) -> bool:
         """True if a compiled loop can do without Python: every term a kernel, every loss and retraction compiled."""
         return not (self.batched or self._general or self.table.weighed) and self.retraction.compiled
+
+    @property
+    def numbers_only(self) -> bool:
+        """True if instances with other data differ in numbers that compiled loops read, and Python has no part."""
+        python = self.rebinds or self.soft or self.differenced or self.demanding or self._branches
+        return self.fully_compiled and not (python or self.reader.particular or len(self.fixed_rows()))
+
+    @property
+    def carried(self) -> tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]:
+        """Where numbers of data go, see :class:`unifg.problem.binding.Binding`."""
+        return self._binding.carried
+
+    def rows_of_data(self, data: Mapping[Data, Array], count: int) -> Array | None:
+        """(count, D) numbers of all data of many instances; None where more than finite numbers is asked for."""
+        return self._binding.rows(data, count)
+
+    def forget_data(self) -> None:
+        """Count all data as changed at the next :meth:`bind`."""
+        self._binding.forget()
 
     @property
     def hessian(self) -> Symmetric:
@@ -256,7 +276,7 @@ class CompiledProblem:
         Raises:
             GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
         """
-        values = self._read(guess)
+        values = self.reader(guess)
         if not self._vetted:
             for term in self.terms:
                 term.require_clean(values)
