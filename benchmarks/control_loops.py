@@ -10,7 +10,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from benchmarks.cold import PEERS, runnable
-from benchmarks.report import listing, table
+from benchmarks.report import listing
 from problems.control import Driver, Problem, Quadrotor, Tick, Unicycle
 from unifg.solvers.names import backend
 from unifg.typing import Array
@@ -19,20 +19,6 @@ STEPS = 100
 TOLERANCE = 1e-4
 SINGLE = "sqp, 1 iteration"
 SAFE = "ipm, safe"  # one iteration, and more only while the plan violates the constraints
-# Time of a step of acados (one SQP iteration, default options) over that of a converged step of IPOPT, measured
-# elsewhere, both on one machine.
-ACADOS = {
-    "unicycle straight, N = 50": 0.124,
-    "unicycle straight, discs, N = 50": 0.100,
-    "unicycle behind, N = 50": 0.124,
-    "unicycle behind, discs, N = 50": 0.088,
-    "quadrotor figure8, N = 20": 0.040,
-    "quadrotor figure8, spheres, N = 20": 0.068,
-    "quadrotor goto, N = 20": 0.044,
-    "quadrotor goto, spheres, N = 20": 0.050,
-    "quadrotor figure8, N = 50": 0.051,
-    "quadrotor figure8, spheres, N = 50": 0.090,
-}
 CONTACT = 1e-4  # depth in an obstacle [m]
 OURS = ("ipm", SAFE, "sqp", SINGLE, "alm", "alm, new penalties")
 
@@ -168,28 +154,3 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
         f"constraints to {CONTACT:g} (`step_tolerance=np.inf, violation_tolerance={CONTACT:g}`)."
     )
     return "\n\n".join([listing(["closed loop", "solver"], rows, columns), notes])
-
-
-def render_single(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
-    """Safe ticks of the interior point and single iterations of SQP, beside acados."""
-    lines = []
-    for problem, loops in results.items():
-        name = problem.title
-        if "ipopt" not in loops or name not in ACADOS:
-            continue
-        yardstick, singles = float(np.median(loops["ipopt"].times)), [loops[single] for single in (SAFE, SINGLE)]
-        times = [float(np.median(drive.times)) / yardstick for drive in singles]
-        deepest = " / ".join(f"{1e3 * max(drive.penetration, 0.0):.4f} mm" for drive in singles)
-        lines.append(
-            (
-                name, f"{ACADOS[name]:.3f}", f"{times[0]:.2f}", f"{times[0] / ACADOS[name]:.1f}",
-                f"{np.mean(loops[SAFE].iterations):.1f}", f"{times[1]:.2f}",
-                " / ".join(f"{drive.cost:.5g}" for drive in singles), f"{loops['ipm'].cost:.5g}",
-                deepest if len(problem.discs) else "none to hit",
-            )
-        )  # fmt: skip
-    head = (
-        "closed loop", "acados, times IPOPT", "safe, times IPOPT", "safe / acados", "its iterations",
-        "sqp, times IPOPT", "cost: safe / sqp", "converged", "deepest in an obstacle: safe / sqp",
-    )  # fmt: skip
-    return table(head, lines)
