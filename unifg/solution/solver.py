@@ -717,7 +717,8 @@ class Prepared:
         if stored is not None:
             flat, multipliers, penalties = stored
             self._require_finite("multipliers", multipliers)
-            self._require_finite("penalties", penalties)
+            if penalties is not program.no_penalties:
+                self._require_finite("penalties", penalties)
             return program.values_from(flat), multipliers.copy(), penalties
         values = program.values_from(values_of(guess))
         carried: Mapping[str, Numbers] = {}
