@@ -305,7 +305,7 @@ def addresses(robust: bool, general: bool) -> Records:
         "direct": direction.direct,
         "assemble": direction.assemble,
         "examine": direction.examine,
-        "estimate": direction.estimate,
+        **({"estimate": direction.estimate, "split": split} if general else {}),
         "steer": direction.steer,
         "advance": advance,
         "renew": renew,
@@ -313,7 +313,6 @@ def addresses(robust: bool, general: bool) -> Records:
         "loop": loop,
         "reset": reset,
         "conclude": conclude,
-        "split": split,
     }
     for name, function in functions.items():
         links[0][name] = link(function, NOTHING, ADDRESS)

@@ -399,7 +399,7 @@ class Workspace:
                 self.take(program.linearize(self._values()))
             assert self._taken is not None
             return self._taken
-        if self.now["definite"] == state.NO:
+        if self.now["definite"] == state.NO and program.scalar_terms:
             self.call("split")
         return self._answer.copied(self.now["cost"])
 
