@@ -15,11 +15,8 @@ from problems.control import Problem, Quadrotor, Unicycle
 from unifg.solvers import InteriorPoint
 
 COUNT = 1000
-CASES: tuple[Problem, ...] = (
-    Unicycle("straight", False, 20),
-    Unicycle("straight", True, 20),
-    Quadrotor("goto", False, 20),
-)
+UNICYCLES = Unicycle("straight", False, 20), Unicycle("straight", True, 20)
+CASES: tuple[Problem, ...] = (*UNICYCLES, Quadrotor("goto", False, 20))
 
 
 def measure(case: Problem, rounds: int, count: int = COUNT) -> tuple[str, ...]:
