@@ -15,6 +15,7 @@
 #   make release-check    the same, and fail for kernels that are out of date
 #   make kernels  compile everything anew into unifg/codegen/kernels.zip, which spares a first use most of it (minutes)
 #   make mutants  change decisions one at a time and see whether a test notices (hours; FILES='scenarios/ground/drive_past.py')
+#   make peers    build .venv-peers with acados, drake, crocoddyl and jaxls, and measure docs/results/peers.md (ten minutes)
 #   make first-use  time README's first example in a new environment of every Python that is found (minutes)
 #   make examples run all scripts of examples/ and draw the pictures of docs/guide/examples.md again
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
@@ -37,7 +38,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # Matrices here are small: more threads per process only make the processes wait for each other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 
-.PHONY: first-use docs kernels performance notebooks help demo test test-all fuzz test-lowest processes lint style types mypy pyright bench results sample release-build release-kernels release-check mutants fences clean offsets examples
+.PHONY: first-use peers docs kernels performance notebooks help demo test test-all fuzz test-lowest processes lint style types mypy pyright bench results sample release-build release-kernels release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
 help:
@@ -85,6 +86,9 @@ results: $(VENV)/ready-bench
 	@test -n "$(PAGE)" || { $(BIN)/python -m benchmarks; echo "Choose: make results PAGE=name"; exit 2; }
 	$(BIN)/python -m benchmarks $(PAGE)
 
+peers: $(VENV)-peers/ready
+	$(VENV)-peers/bin/python -m benchmarks peers
+
 first-use: $(VENV)/ready
 	$(BIN)/python -m benchmarks first-use --fresh
 
@@ -125,7 +129,7 @@ fences: $(VENV)/ready
 	$(BIN)/python docs/check_shell_fences.py
 
 clean:
-	rm -rf $(VENV) $(VENV)-lowest out build dist unifg.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov
+	rm -rf $(VENV) $(VENV)-lowest $(VENV)-peers out build dist unifg.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # Each file marks one finished installation; a change of pyproject.toml repeats it.
@@ -174,4 +178,11 @@ $(VENV)/ready-docs: $(VENV)/ready
 $(VENV)/ready-bench: $(VENV)/ready
 	@echo "Installing the packages we compare with into $(VENV)"
 	@$(PIP) install --editable ".[scenarios,test,bench]"
+	@touch $@
+
+# An environment of its own: none of the packages belongs to what is tested, and some of them are large.
+$(VENV)-peers/ready: pyproject.toml
+	@echo "Building $(VENV)-peers with the solvers we compare with (once, a minute or two; needs gcc)"
+	@$(PYTHON) -m venv $(VENV)-peers
+	@$(VENV)-peers/bin/python -m pip --disable-pip-version-check --quiet install --editable ".[scenarios,test,peers]"
 	@touch $@

@@ -78,7 +78,7 @@ def tables(rounds: int) -> str:
     """Cold solves, closed loops and random starts."""
     results = {problem: cold.measure(problem, SOLVERS, RULES, rounds) for problem in tqdm(problems(), unit="case")}
     loops = {problem: control_loops.drive(problem) for problem in tqdm(control_loops.cases(), unit="loop")}
-    parts = [render(results, rounds), control_loops.render_single(loops), control_loops.render(loops), starts(STARTS)]
+    parts = [render(results, rounds), control_loops.render(loops), starts(STARTS)]
     return "\n\n".join(parts)
 
 

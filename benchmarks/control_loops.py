@@ -10,31 +10,17 @@ from typing import Protocol, TypeAlias
 import numpy as np
 
 from benchmarks.cold import PEERS, runnable
-from benchmarks.report import listing, table
+from benchmarks.report import listing
 from problems.control import Driver, Problem, Quadrotor, Tick, Unicycle
 from unifg.solvers.names import backend
 from unifg.typing import Array
 
 STEPS = 100
 TOLERANCE = 1e-4
-SINGLE = ("ipm, 1 iteration", "sqp, 1 iteration")
+SINGLE = "sqp, 1 iteration"
 SAFE = "ipm, safe"  # one iteration, and more only while the plan violates the constraints
-# Time of a step of acados (one SQP iteration, default options) over that of a converged step of IPOPT, measured
-# elsewhere, both on one machine.
-ACADOS = {
-    "unicycle straight, N = 50": 0.124,
-    "unicycle straight, discs, N = 50": 0.100,
-    "unicycle behind, N = 50": 0.124,
-    "unicycle behind, discs, N = 50": 0.088,
-    "quadrotor figure8, N = 20": 0.040,
-    "quadrotor figure8, spheres, N = 20": 0.068,
-    "quadrotor goto, N = 20": 0.044,
-    "quadrotor goto, spheres, N = 20": 0.050,
-    "quadrotor figure8, N = 50": 0.051,
-    "quadrotor figure8, spheres, N = 50": 0.090,
-}
 CONTACT = 1e-4  # depth in an obstacle [m]
-OURS = ("ipm", SINGLE[0], SAFE, "sqp", SINGLE[1], "alm", "alm, new penalties")
+OURS = ("ipm", SAFE, "sqp", SINGLE, "alm", "alm, new penalties")
 
 
 def cases() -> list[Problem]:
@@ -90,7 +76,7 @@ def contestant(problem: Problem, name: str) -> Contestant:
         from benchmarks.control_peers import WARM, ControlPeer
 
         return ControlPeer(problem, short, how == "compiled", tol=TOLERANCE, **WARM[short])
-    options: dict[str, float] = {"max_iterations": 1} if name in SINGLE else {}
+    options: dict[str, float] = {"max_iterations": 1} if name == SINGLE else {}
     if name == SAFE:
         options = {"step_tolerance": np.inf, "violation_tolerance": CONTACT}
     solver = backend(short, tolerance=TOLERANCE, **options)
@@ -115,7 +101,7 @@ def race(problem: Problem, who: Mapping[str, Contestant]) -> dict[str, Drive]:
                 found.penetration = max(found.penetration, problem.penetration(states[name]))
             tick = driver.control(states[name], index)
             controls[name] = tick.control
-            if tick.status != "converged" and name not in SINGLE and (name, tick.status) != (SAFE, "stop rule"):
+            if tick.status != "converged" and name != SINGLE and (name, tick.status) != (SAFE, "stop rule"):
                 found.failures[tick.status] += 1
             if index:  # the cold solve is no step of the loop
                 found.times.append(tick.milliseconds)
@@ -163,34 +149,8 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
         "repeated (fatrop takes no multipliers); the augmented Lagrangian's penalties too, unless it chooses new ones. "
         "Where nothing can be hit the plant is disturbed. Cost: sum of the stage costs of the states and controls that "
         "happened. Penetration: deepest state of the plant in an obstacle, negative is a clearance. Repeated: the same "
-        "solve once more, at once; the first time the other solvers have just used the caches. One iteration: the "
-        "solver is stopped after a single one in every step. Safe: it is stopped at the first iterate that keeps the "
+        "solve once more, at once; the first time the other solvers have just used the caches. One iteration: SQP "
+        "is stopped after a single one in every step. Safe: it is stopped at the first iterate that keeps the "
         f"constraints to {CONTACT:g} (`step_tolerance=np.inf, violation_tolerance={CONTACT:g}`)."
     )
     return "\n\n".join([listing(["closed loop", "solver"], rows, columns), notes])
-
-
-def render_single(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
-    """One iteration a step, beside acados."""
-    lines = []
-    for problem, loops in results.items():
-        name = problem.title
-        if "ipopt" not in loops or name not in ACADOS:
-            continue
-        yardstick, singles = float(np.median(loops["ipopt"].times)), [loops[single] for single in (*SINGLE, SAFE)]
-        times = [float(np.median(drive.times)) / yardstick for drive in singles]
-        deepest = " / ".join(f"{1e3 * max(drive.penetration, 0.0):.4f} mm" for drive in singles)
-        lines.append(
-            (
-                name, f"{ACADOS[name]:.3f}", f"{times[0]:.2f}", f"{times[0] / ACADOS[name]:.1f}", f"{times[1]:.2f}",
-                f"{times[2]:.2f}", f"{np.mean(loops[SAFE].iterations):.1f}",
-                " / ".join(f"{drive.cost:.5g}" for drive in singles), f"{loops['ipm'].cost:.5g}",
-                deepest if len(problem.discs) else "none to hit",
-            )
-        )  # fmt: skip
-    head = (
-        "closed loop", "acados, times IPOPT", "ipm, times IPOPT", "ipm / acados", "sqp, times IPOPT",
-        "safe, times IPOPT", "its iterations", "cost: ipm / sqp / safe", "converged",
-        "deepest in an obstacle: ipm / sqp / safe",
-    )  # fmt: skip
-    return table(head, lines)

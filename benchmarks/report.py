@@ -23,7 +23,10 @@ Words = TypeVar("Words", bound=tuple[str, ...])
 CHECKOUT = Path(__file__).resolve().parent.parent
 OUT = CHECKOUT / "out" / "benchmarks"
 CAMPAIGNS = CHECKOUT / "benchmarks" / "campaigns"
-PACKAGES = ("numpy", "scipy", "numba", "osqp", "piqp", "casadi", "gtsam", "pymunk")
+PACKAGES = (
+    "numpy", "scipy", "numba", "osqp", "piqp", "casadi", "gtsam", "pymunk", "comma-deps-acados", "drake", "crocoddyl",
+    "almond-jaxls", "jax",
+)  # fmt: skip
 
 
 def command(doc: str | None) -> argparse.ArgumentParser:

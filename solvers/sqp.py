@@ -114,9 +114,9 @@ class SQP(Solver):
     def iterate(self, run: SolveState, workspace: Subproblems) -> Status | None:
         """Iterate to convergence."""
         # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
-        within = run.program.within_bounds(run.values)
-        if within is not run.values and not self.full_steps:
-            run.begin_at(run.program.linearize(within))
+        program = run.program
+        if not self.full_steps and program.violation(run.lin.constraints)[program.bound_rows].any():
+            run.begin_at(program.linearize(program.within_bounds(run.values)))
         self._begin(run, workspace)
         damping, missing = SMALLEST_DAMPING, 0.0
         failures = 0

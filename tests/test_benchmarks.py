@@ -19,6 +19,7 @@ from benchmarks import (
     elimination,
     gtsam_peer,
     horizon_and_velocity,
+    many_instances,
     marginals,
     moved_goals,
     own_functions,
@@ -276,3 +277,9 @@ def test_a_moved_goal_among_discs_costs_no_more_than_with_twenty_starts(seed: in
     assert row["more"] < 16, "ordinary ticks try one start"
     text = moved_goals.tables([row])
     assert "| loop, 20 ms |" in text and "1 fields" in text
+
+
+def test_many_instances_are_beside_a_loop() -> None:
+    row = many_instances.measure(many_instances.UNICYCLES[0], rounds=1, count=4)
+    assert row[:2] == ("unicycle straight, N = 20", "4 of 4") and len(row) == 6
+    assert min(map(float, row[2:])) > 0.0

@@ -19,6 +19,7 @@ import pytest
 
 from unifg.codegen import cache_folder, jit
 from unifg.codegen.artifact import Artifact
+from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON
 from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.jit import compiled
 from unifg.codegen.objects import read_sealed, write_sealed
@@ -174,6 +175,40 @@ def test_what_processes_have_compiled_meets_in_a_third(tmp_path: Path, runs: lis
         ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=False)
         assert ended.returncode == 0, ended.stderr
     assert ended.stdout.strip() == "False"
+
+
+def test_functions_are_made_ready_no_further_than_they_are_used(
+    twice: Callable[[float], float], tmp_path: Path
+) -> None:
+    """A callee has neither machine code nor a wrapper; asked for more it is compiled again, and then serves all."""
+
+    def uses() -> list[tuple[int, bool]]:
+        found = [read_sealed(path) or b"" for path in sorted(tmp_path.rglob("*twice*.code"))]
+        return [(part.header["use"], bool(part.code)) for part in (Artifact.unpacked(item[32:]) for item in found)]
+
+    callee: Any = compiled(twice)
+    assert adding(callee, 1.0)(3.0) == 7.0 and uses() == [(LINKED, False)]
+    callee.compile((numba.float64,))
+    assert uses() == [(ADDRESS, True)]
+    assert callee(3.0) == 6.0 and uses() == [(PYTHON, True)]
+    again: Any = compiled(twice)
+    assert adding(again, 1.0)(3.0) == 7.0 and again(3.0) == 6.0 and read_from_cache(again)
+    assert uses() == [(PYTHON, True)], "what serves more is not overwritten by what serves less"
+
+
+def test_code_that_callers_link_is_read_without_machine_code(twice: Callable[[float], float], tmp_path: Path) -> None:
+    for offset in (1.0, 2.0):
+        callee: Any = compiled(twice)
+        assert adding(callee, offset)(3.0) == 6.0 + offset
+    assert read_from_cache(callee)
+
+
+def adding(callee: Callable[[float], float], offset: float) -> Callable[[float], float]:
+    @compiled
+    def caller(x: float) -> float:
+        return callee(x) + offset
+
+    return caller
 
 
 def test_a_file_holds_the_signature_it_is_named_by(twice: Callable[[float], float], tmp_path: Path) -> None:

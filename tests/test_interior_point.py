@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
 import pickle
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -14,6 +16,7 @@ import unifg as fg
 from own_manifolds import S2, SphereManifold
 from problems.control import Quadrotor, Unicycle
 from problems.known import short_drive
+from unifg.codegen.clock import clock
 from unifg.factors.robust import Loss
 from unifg.models import avoidance, quadrotor
 from unifg.problem.columns import Values
@@ -459,3 +462,40 @@ def test_a_shifted_guess_is_what_it_shows() -> None:
     other_graph = Unicycle("straight", False, 20).formulation()
     with pytest.raises(fg.GraphError, match="no family of this graph"):
         InteriorPoint().prepare(other_graph.graph).solve(first.shifted(stated.x, stated.u))
+
+
+def test_the_time_of_a_solve_is_told_by_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    stated = Quadrotor("figure8", True, 20).formulation()
+    prepared = InteriorPoint().prepare(stated.graph)
+    prepared.solve(stated.guess)
+    found = prepared.solve(stated.guess)
+    assert list(found.times) == ["evaluation", "linear systems", "search", "judge", "Python"]
+    assert min(found.times.values()) > 0.0 and sum(found.times.values()) == pytest.approx(found.seconds)
+    assert found.times["evaluation"] > found.times["judge"] and found.times["linear systems"] > found.times["judge"]
+    assert re.search(r"Of the time: evaluation \d+ %, linear systems \d+ %", found.report())
+    assert "Of the time" not in repr(found) and pickle.loads(pickle.dumps(found)).times == found.times
+    assert (
+        SQP().solve(stated.graph, stated.guess).times == InteriorPoint().solve(stated.graph, stated.guess).times == {}
+    )
+    prepared._workspace.now["clock"] = 0  # a system without that clock
+    found = prepared.solve(stated.guess)
+    assert found.times == {} and "Of the time" not in found.report()
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: object())
+    assert clock.__wrapped__() == 0
+
+
+def test_a_tick_of_one_step_leaves_second_derivatives_out() -> None:
+    """They pay where steps converge; a solve to the answer, and a cold one, have them."""
+    stated = Unicycle("straight", True, 20).formulation()
+    plain = InteriorPoint(tolerance=1e-4).prepare(stated.graph)
+    first = plain.solve(stated.guess)
+    tick = InteriorPoint(tolerance=1e-4, step_tolerance=np.inf).prepare(stated.graph)
+    shifted = first.shifted(stated.x, stated.u)
+    rows: list[fg.Iteration] = []
+    tick.solve(shifted, callback=rows.append)
+    assert rows[1].details["gauss_newton"] == 1
+    plain.solve(shifted, callback=rows.append)
+    assert "gauss_newton" not in rows[-1].details
+    cold: list[fg.Iteration] = []
+    tick.solve(stated.guess, callback=cold.append)
+    assert "gauss_newton" in cold[1].details and "gauss_newton" not in cold[2].details

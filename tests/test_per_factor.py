@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.codegen.cache_folder import VARIABLE
 from unifg.solvers import AugmentedLagrangian, GaussNewton
 from unifg.typing import Array
 
@@ -118,3 +123,81 @@ def test_differences_reach_every_component_of_a_product() -> None:
 def test_the_number_of_rows_must_be_told() -> None:
     with pytest.raises(fg.GraphError, match="rows="):
         fg.residual(relative)
+
+
+KEPT = """
+import logging, sys
+import numba, numpy as np
+import unifg as fg
+from unifg.codegen.compile_counter import tally
+from unifg.solvers import GaussNewton
+from outside import scaled, helper
+logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
+OFFSET = 0.5
+
+def made(weight):
+    @numba.njit
+    def residual(x, r):
+        r[0] = weight * scaled(x[0]) - OFFSET
+    return residual
+
+@numba.njit
+def unknown(x, r):
+    r[0] = helper(x[0])
+
+graph = fg.Graph()
+x = graph.variables("x", fg.Rn(1), 1)
+graph.minimize(fg.residual(unknown if "unknown" in sys.argv else made(2.0), rows=1, derivatives="differences"), x)
+solution = GaussNewton().solve(graph, {x: np.ones((1, 1))})
+print("compiled", len(tally.compiled), round(float(solution[x][0, 0]), 9))
+"""
+OUTSIDE = """
+import numba
+from numba.extending import register_jitable
+
+@numba.njit
+def scaled(x):
+    return 2.0 * x
+
+@register_jitable
+def helper(x):
+    return x - 3.0
+"""
+CHANGES = {
+    "a comment": ("OFFSET = 0.5", "OFFSET = 0.5  # [m]", 0.125),
+    "a captured number": ("made(2.0)", "made(4.0)", 0.0625),
+    "a global constant": ("OFFSET = 0.5", "OFFSET = 1.5", 0.375),
+    "the formula": ("- OFFSET", "+ OFFSET", -0.125),
+    "a callee in another file": ("2.0 * x", "4.0 * x", 0.0625),
+}
+
+
+def solved(folder: Path, *arguments: str) -> tuple[str, int, float]:
+    """Output of a process that solves with a function of its user, compiled functions, and the solution."""
+    place = {**os.environ, VARIABLE: str(folder / "cache"), "PYTHONPATH": os.pathsep.join((str(folder), *sys.path))}
+    command = [sys.executable, str(folder / "program.py"), *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=True)
+    found = ended.stdout.split()
+    return ended.stdout, int(found[-2]), float(found[-1])
+
+
+def test_a_differenced_function_is_compiled_once_on_a_machine(tmp_path: Path) -> None:
+    """A second process compiles nothing; a change of what the function computes is seen, one of a comment is not."""
+    (tmp_path / "program.py").write_text(KEPT, encoding="utf-8")
+    (tmp_path / "outside.py").write_text(OUTSIDE, encoding="utf-8")
+    assert solved(tmp_path)[1] > 0
+    assert solved(tmp_path)[1:] == (0, 0.125)
+    for change, (before, after, value) in CHANGES.items():
+        for name, source in (("program.py", KEPT), ("outside.py", OUTSIDE)):
+            (tmp_path / name).write_text(source.replace(before, after), encoding="utf-8")
+        _, count, answer = solved(tmp_path)
+        assert answer == value and (count == 0) == (change == "a comment"), change
+
+
+def test_a_function_that_no_fingerprint_covers_is_compiled_anew_and_named(tmp_path: Path) -> None:
+    (tmp_path / "program.py").write_text(KEPT, encoding="utf-8")
+    for number in (3.0, 4.0):
+        (tmp_path / "outside.py").write_text(OUTSIDE.replace("3.0", str(number)), encoding="utf-8")
+        output, count, answer = solved(tmp_path, "unknown")
+        assert count > 0 and answer == number
+        assert output.count("is compiled in every process: it uses 'helper'") == 1

@@ -495,6 +495,11 @@ def test_data_that_have_been_replaced_are_noticed() -> None:
     np.testing.assert_array_equal(later.gradient("cost", p), 0.0)  # what has been asked is known
     again = run.solve({x: np.zeros((1, 2))}, data={p: [1.2, 1.5]})
     np.testing.assert_allclose(again.sensitivity("x", p), later.sensitivity("x", p), rtol=1e-9)
+    many = LevenbergMarquardt(tolerance=TIGHT).prepare(graph)
+    single = many.solve({x: np.zeros((1, 2))}, data={p: [1.0, 1.5]})
+    batch = many.solve_many({x: np.zeros((1, 2))}, data={p: np.array([[1.0, 1.5], [1.1, 1.5], [1.2, 1.5]])})
+    refused(single, "have been replaced")
+    np.testing.assert_allclose(batch.solution(1).sensitivity("x", p), np.diag([2.2, 3.0]), rtol=1e-9)
     q = graph.data("q", 0.0)
     graph.minimize_scalar(lambda x, q: q * ((x - 1.44) ** 2).sum(axis=1), x, q, name="bent, and flat at the answer")
     own = InteriorPoint(tolerance=TIGHT).prepare(graph)

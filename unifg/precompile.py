@@ -209,7 +209,7 @@ def _drive() -> None:
         graph.constrain(walls, x, lower=0.1, name="walls")
         graph.bound(u, lower=-1.0, upper=1.0, name="limits")
         start = unicycle.rollout(np.zeros(3), np.full((steps, 2), 0.5), dt)
-        solver.solve(graph, {x: start, u: np.full((steps, 2), 0.5)})
+        solver.prepare(graph).solve_many([{x: start, u: np.full((steps, 2), 0.5)}] * 2)
 
 
 def _integrate() -> None:

@@ -45,9 +45,7 @@ def direct(address: int) -> None:
             p, q, multiplier = pairs[k].p, pairs[k].n, multipliers[row]
             rests[row] += q - p
             shift[n + k] -= p / (penalties[row] - multiplier) + q / (penalties[row] + multiplier)
-    # Second derivatives need multipliers, and those of a cold start mean little.
-    exact = now.exact == 1 and now.failures < 2 and (now.iteration > 0 or now.cold == 0 or now.estimated == 1)
-    now.share = 1.0 if exact else 0.0
+    now.share = 1.0 if now.bending == 1 and now.failures < 2 else 0.0
     delta = now.delta if now.failures > 0 else 0.0
     # Less of the second derivatives may mean less curvature, and a step that was cut very short had too little.
     blend = now.taken > SHORT or now.iteration == 0

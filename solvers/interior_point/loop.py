@@ -5,10 +5,12 @@ It runs without Python where it can, and asks for what only Python can do.
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import numpy as np
 
+from unifg.codegen.clock import seconds
 from unifg.codegen.function_pointers import ADDRESS, NOTHING, NUMBER, TRUTH, link, linked, memory, number, parts, run
 from unifg.codegen.jit import compiled
 from unifg.codegen.loops import copy_to
@@ -45,6 +47,8 @@ from unifg.solvers.interior_point.state import (
     Work,
 )
 from unifg.typing import Array
+
+FEW = 5  # steps of a tick
 
 
 @compiled
@@ -131,6 +135,7 @@ def reset(address: int) -> None:
     steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
     now = scalars[0]
     now.asked, now.iteration, now.kept, now.raises, now.definite = 0.0, 0, 0, 0, UNKNOWN
+    now.evaluating = now.solving = now.judging = 0.0
     fill(row_units, 1.0)
     fill(units, 1.0)
     fill(steepest_gradient, 0.0)
@@ -154,11 +159,13 @@ def conclude(address: int) -> None:
     scalars, steepest_gradient, terms = parts(address, "scalars steepest_gradient terms")
     (steepest_jacobian,) = parts(address, "steepest_jacobian")
     now = scalars[0]
+    began = seconds(now.clock)
     run(links[0].raise_slopes, (constraint_jacobian, gradient, steepest_jacobian, steepest_gradient))
     arrays = multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
     judged = terms, free, gradient, constraints, constraint_jacobian, multipliers, full, kkt
     run(links[0].kkt_numbers, judged)
+    now.judging += seconds(now.clock) - began
 
 
 @linked
@@ -171,7 +178,7 @@ def loop(address: int) -> None:
     """
     constraint_jacobian, gradient, links, scalars = parts(address, "constraint_jacobian gradient links scalars")
     steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
-    trial, values = parts(address, "trial values")
+    heights, trial, values = parts(address, "heights trial values")
     now = scalars[0]
     python, watched, stage = now.assisted == 1, now.watched == 1, now.stage
     while True:
@@ -179,7 +186,9 @@ def loop(address: int) -> None:
             if python:
                 now.answer, now.stage = LINEARIZE, LINEARIZED
                 return
+            began = seconds(now.clock)
             run(links[0].renew, (address,))
+            now.evaluating += seconds(now.clock) - began
             stage = LINEARIZED
         if stage == LINEARIZED:
             if now.going_on == 0:
@@ -200,17 +209,31 @@ def loop(address: int) -> None:
                 return
         if stage == TESTED:
             stage = BENT
-            if now.exact == 1 and (now.iteration > 0 or now.cold == 0 or now.estimated == 1):
+            # Second derivatives need multipliers, and those of a cold start mean little. They pay where steps converge,
+            # not in the first few of a tick that ends with the first plan that keeps the constraints.
+            few = now.step_tolerance == math.inf and now.iteration < FEW and len(heights) == 0
+            known = now.cold == 0 or now.iteration > 0 or now.estimated == 1
+            now.bending = 1 if now.exact == 1 and known and not (few and now.cold == 0) else 0
+            if now.bending == 1:
                 if python:
                     now.answer, now.stage = BEND, BENT
                     return
+                began = seconds(now.clock)
                 run(links[0].bend, (address,))
+                now.evaluating += seconds(now.clock) - began
         if stage == AIMED:
             if python:
                 now.answer, now.stage = EVALUATE, EVALUATED
                 return
+            began = seconds(now.clock)
             run(links[0].advance, (address,))
-        run(links[0].direct if stage == BENT else links[0].judge, (address,))
+            now.evaluating += seconds(now.clock) - began
+        if stage == BENT:
+            began = seconds(now.clock)
+            run(links[0].direct, (address,))
+            now.solving += seconds(now.clock) - began
+        else:
+            run(links[0].judge, (address,))
         stage = AIMED
         if now.answer == ACCEPTED:
             copy_to(trial, values)
@@ -222,8 +245,13 @@ def loop(address: int) -> None:
 
 
 @cache
-def addresses() -> Records:
-    """Compile everything for the arrays that ``memory`` has seen, and say where it stands."""
+def addresses(robust: bool, general: bool) -> Records:
+    """Compile everything for the arrays that ``memory`` has seen, and say where it stands.
+
+    Args:
+        robust: what robust losses need as well.
+        general: what costs that are no squares need as well.
+    """
     problem, work = memory.kind
     kinds = {**dict(zip(Problem._fields, problem, strict=True)), **dict(zip(Work._fields, work, strict=True))}
     values, residual, constraints, vector = (kinds[name] for name in ("values", "residual", "constraints", "step"))
@@ -248,11 +276,13 @@ def addresses() -> Records:
     links[0]["curve"] = link(
         add_curvature, NOTHING, terms, values, residual, kinds["weights"], constraints, kinds["hessian"]
     )
-    robust = kinds["squares"], kinds["weights"]
-    links[0]["weigh"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *robust, kinds["hessian"])
-    heights, added = kinds["heights"], (kinds["gradient"], kinds["hessian"], kinds["concavity"])
-    links[0]["evaluate_scalars"] = link(evaluate_scalars, NUMBER, terms, values, heights, scratch)
-    links[0]["add_scalars"] = link(add_scalars, NUMBER, terms, values, heights, *added, scratch, TRUTH)
+    if robust:
+        norms = kinds["squares"], kinds["weights"]
+        links[0]["weigh"] = link(add_losses, NOTHING, terms, residual, kinds["jacobian"], *norms, kinds["hessian"])
+    if general:
+        heights, added = kinds["heights"], (kinds["gradient"], kinds["hessian"], kinds["concavity"])
+        links[0]["evaluate_scalars"] = link(evaluate_scalars, NUMBER, terms, values, heights, scratch)
+        links[0]["add_scalars"] = link(add_scalars, NUMBER, terms, values, heights, *added, scratch, TRUTH)
     links[0]["retract"] = link(
         retract_parts, NOTHING, kinds["retraction"], kinds["free"], vector, kinds["spread"], values, values
     )
@@ -275,7 +305,7 @@ def addresses() -> Records:
         "direct": direction.direct,
         "assemble": direction.assemble,
         "examine": direction.examine,
-        "estimate": direction.estimate,
+        **({"estimate": direction.estimate, "split": split} if general else {}),
         "steer": direction.steer,
         "advance": advance,
         "renew": renew,
@@ -283,7 +313,6 @@ def addresses() -> Records:
         "loop": loop,
         "reset": reset,
         "conclude": conclude,
-        "split": split,
     }
     for name, function in functions.items():
         links[0][name] = link(function, NOTHING, ADDRESS)

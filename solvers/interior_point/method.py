@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
 
+from unifg.codegen.clock import clock
 from unifg.codegen.function_pointers import memory
 from unifg.errors import BackendError
 from unifg.problem.columns import Values
@@ -21,6 +23,7 @@ from unifg.problem.linearization import Linearization
 from unifg.problem.snapshot import Memory
 from unifg.problem.systems import stacked
 from unifg.problem.table import COST, COUNT, KIND, ROW, ROWS
+from unifg.solution.batch import Outcomes
 from unifg.solution.history import Iteration
 from unifg.solution.multipliers import SUSPICIOUS, Slopes
 from unifg.solution.optimality import Optimality, optimality, read_numbers
@@ -28,6 +31,7 @@ from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
 from unifg.solvers.interior_point import state
+from unifg.solvers.interior_point.each import solve_each
 from unifg.solvers.interior_point.loop import addresses, call
 from unifg.solvers.interior_point.state import Fields, Problem, empty_work
 from unifg.typing import Array, IntArray
@@ -62,7 +66,8 @@ class InteriorPoint(Solver):
             and multipliers are those of the problem as stated.
         step_tolerance, violation_tolerance: stop rule on the norm of the full step and the largest violation, for
             control loops. A positive step_tolerance switches it on; it does not grant CONVERGED. An infinite one asks
-            for a single step, and more of them only as long as constraints are violated. With the rule on, a solve
+            for a single step, and more of them only as long as constraints are violated; from a start with multipliers
+            the first few leave second derivatives out, which pay only where steps converge. With the rule on, a solve
             that runs out of time or iterations hands back the last iterate that kept the constraints, if one did.
         restoration: whether, where it is stuck without ever having kept the constraints, the nearest point of least
             violation is looked for, from which to go on or to say LOCALLY_INFEASIBLE. It can take a hundred times as
@@ -93,14 +98,30 @@ class InteriorPoint(Solver):
         """Test whether the loop may make the whole solve; that of least squares is tested outside, at every step."""
         return not program.least_squares
 
+    def solves_each(self, program: CompiledProblem) -> bool:
+        """Test whether one compiled call may solve many instances."""
+        return self.runs_alone(program) and self.time_limit == np.inf and program.numbers_only
+
+    def solve_each(self, workspace: Workspace, rows: Array, guesses: Array, duals: Array) -> Outcomes:
+        """Solve many instances, which differ in numbers alone."""
+        found, multipliers, numbers = workspace.solve_each(self, rows, guesses, duals)
+        answers, finite, sized = numbers[:, 0].astype(int), numbers[:, 7] > 0.0, numbers[:, 3] <= SUSPICIOUS
+        passed = (numbers[:, 4:7] <= self.tolerance).all(axis=1) & finite & sized
+        stopped = (answers == state.STOPPED) & finite & ~passed
+        statuses = [
+            Status.CONVERGED if good else Status.STOP_RULE if over else None
+            for good, over in zip(passed.tolist(), stopped.tolist(), strict=True)
+        ]
+        return Outcomes(statuses, found, multipliers, numbers[:, 2], numbers[:, 1].astype(np.int64), numbers[:, 4:7])
+
     def workspace(self, program: CompiledProblem) -> Workspace:
         """Structure of the KKT matrix."""
         return Workspace(program)
 
     def search_step(self, run: SolveState, workspace: Workspace, lin: Linearization) -> Array | None:
         """The first step of a solve from there, by Gauss-Newton, as far as slacks and multipliers stay positive."""
-        now = workspace.prepare(run, self)
-        now["exact"] = 0
+        now = workspace.prepare(self, run.values.flat, run.multipliers)
+        now["bending"] = 0
         workspace.take(lin)
         workspace.call("begin")
         workspace.call("direct")
@@ -112,6 +133,8 @@ class InteriorPoint(Solver):
         start, carried = run.values, run.multipliers
         reason = self._iterate(run, workspace)
         now = workspace.now
+        if now["clock"]:
+            run.parts = now["evaluating"], now["solving"], now["judging"], workspace.compiled
         if run.alone and not now["clocked"] and run.returns_best(run.status or reason):
             self._replay(run, workspace, start, carried)
         if self.step_tolerance > 0.0 and now["kept"] and run.optimality.violation > now["keeping"]:
@@ -125,7 +148,7 @@ class InteriorPoint(Solver):
         """Take note of all iterates of a solve without success, which nobody has looked at: up to its first restart."""
         reached = run.values, run.multipliers, run.iterations
         run.values, run.multipliers = start, carried
-        now = workspace.prepare(run, self, clocked=True)
+        now = workspace.prepare(self, run.values.flat, run.multipliers, clocked=True)
         now["watched"], now["stage"] = 0, state.MOVED
         while workspace.asks():
             self._note(run, workspace)
@@ -139,7 +162,7 @@ class InteriorPoint(Solver):
             run.consider(now["cost"], work.constraints.copy(), work.values.copy(), work.multipliers.copy())
 
     def _iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
-        now = workspace.prepare(run, self)
+        now = workspace.prepare(self, run.values.flat, run.multipliers)
         restarts = 0
         while True:
             reason = self._attempt(run, workspace)
@@ -222,7 +245,13 @@ class InteriorPoint(Solver):
 
 
 class Workspace:
-    """Memory kept between solves of one structure."""
+    """Memory kept between solves of one structure.
+
+    Attributes:
+        compiled: seconds of the solve in compiled code, but for the test of the answer.
+    """
+
+    compiled = 0.0
 
     def __init__(self, program: CompiledProblem) -> None:
         """Analyse the KKT matrix and compile."""
@@ -273,9 +302,10 @@ class Workspace:
             np.array([self._unequal(row) for row in program.arrays.fields], dtype=np.int64),
         )
         self._describe()
-        self.problem.links[:] = addresses()
+        self.problem.links[:] = addresses(table.weights > 0, table.scalars > 0)
         self._held = program.equality
         self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)
+        self.now["clock"] = clock()
 
     def _unequal(self, term: IntArray) -> bool:
         """Test whether a row of the table is a term with inequality rows."""
@@ -294,7 +324,9 @@ class Workspace:
     def asks(self) -> bool:
         """Run the loop up to an ending, a question, or something to show; answer a question; whether it goes on."""
         program, work, now = self.program, self.work, self.now
+        began = perf_counter()
         self.call("loop")
+        self.compiled += perf_counter() - began
         answer = now["answer"]
         if answer == state.LINEARIZE:
             self.take(program.linearize(self._values()))
@@ -308,7 +340,7 @@ class Workspace:
             work.trial_constraints[:] = found.constraints
         return answer in (state.TRY, state.LINEARIZE, state.BEND, state.EVALUATE, state.SHOW)
 
-    def prepare(self, run: SolveState, options: InteriorPoint, clocked: bool = False) -> Fields:
+    def prepare(self, options: InteriorPoint, values: Array, multipliers: Array, clocked: bool = False) -> Fields:
         """Set up one solve with the present data, ``clocked`` to come back before every step; returns the scalars."""
         if self.program.equality is not self._held:  # which is a new array when limits have changed
             if not np.array_equal(self.program.equality, self.system.held):
@@ -317,21 +349,40 @@ class Workspace:
         if len(self.work.log) < options.max_iterations + 2:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))
             self._describe()
-        work, now, self._taken = self.work, self.now, None
+        work, now, self._taken, self.compiled = self.work, self.now, None, 0.0
         # The test of least squares has no absolute tolerance.
-        now["tolerance"] = 0.0 if run.program.least_squares else run.tolerance
+        tolerance = options.tolerance
+        now["tolerance"] = 0.0 if self.program.least_squares else tolerance
         now["scaling"], now["assisted"] = bool(options.scaling), not self.program.fully_compiled
         now["step_tolerance"] = options.step_tolerance
         now["violation_tolerance"], now["clocked"] = (
             options.violation_tolerance,
             clocked or options.time_limit < np.inf,
         )
-        now["keeping"] = max(run.tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
+        now["keeping"] = max(tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         self.call("reset")
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
-        self.begin_at(run.values.flat, options)
-        work.multipliers[:] = run.multipliers
+        self.begin_at(values, options)
+        work.multipliers[:] = multipliers
         return now
+
+    def solve_each(
+        self, options: InteriorPoint, rows: Array, guesses: Array, duals: Array
+    ) -> tuple[Array, Array, Array]:
+        """Solve many instances in one compiled call, see :mod:`unifg.solvers.interior_point.each`."""
+        program, work, count = self.program, self.work, len(rows)
+        now = self.prepare(options, guesses[0], duals[0])
+        now["watched"] = 0
+        sizes = len(work.values), len(work.multipliers), 8
+        found, multipliers, numbers = (np.zeros((count, size)) for size in sizes)
+        functions = np.array([self._links[name] for name in ("reset", "loop", "conclude")])
+        carried, retraction = program.carried, program.retraction
+        solve_each(
+            functions, self._address, work.scalars, options.barrier, options.penalty, rows, carried[:3],
+            (*carried[3:], retraction.fixed), program.reader.quaternions, guesses, duals, work.values,
+            work.multipliers, work.kkt, found, multipliers, numbers,
+        )  # fmt: skip
+        return found, multipliers, numbers
 
     def begin_at(self, values: Array, options: InteriorPoint) -> None:
         """Go on from other values, about whose multipliers nothing is known."""
@@ -348,7 +399,7 @@ class Workspace:
                 self.take(program.linearize(self._values()))
             assert self._taken is not None
             return self._taken
-        if self.now["definite"] == state.NO:
+        if self.now["definite"] == state.NO and program.scalar_terms:
             self.call("split")
         return self._answer.copied(self.now["cost"])
 

@@ -54,11 +54,16 @@ NOW = np.dtype(
         ("violation_tolerance", np.float64),
         ("suspicion", np.float64),  # size of the multipliers, as :mod:`unifg.solution.multipliers` has it
         ("keeping", np.float64),  # violation up to which an iterate counts as one that keeps all constraints
+        ("evaluating", np.float64),  # seconds of the solve in terms and their derivatives
+        ("solving", np.float64),  # in linear systems
+        ("judging", np.float64),  # in the KKT test of the answer
+        ("clock", np.int64),  # address of the clock, 0 for none
         ("answer", np.int64),  # of the last call, one of the words below
         ("sides", np.int64),  # how many there are
         ("iteration", np.int64),
         ("limit", np.int64),
-        ("exact", np.int64),  # whether to use second derivatives
+        ("exact", np.int64),  # whether to use second derivatives where they pay
+        ("bending", np.int64),  # whether the present step does
         ("filtered", np.int64),  # pairs in the filter
         ("trials", np.int64),
         ("corrected", np.int64),  # whether the trial is a second-order correction

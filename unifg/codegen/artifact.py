@@ -20,6 +20,7 @@ from numba.core.lowering import Environment
 from numba.core.runtime import rtsys
 from numba.np.numpy_support import as_dtype, from_dtype
 
+from unifg.codegen.dispatcher import LINKED, PYTHON, linked_code
 from unifg.errors import UnifgError
 
 LINKED_MANY_TIMES = "linkonce_odr"
@@ -32,8 +33,8 @@ class Artifact(NamedTuple):
     """A compiled function.
 
     Attributes:
-        header: its symbol, names of its environment and arguments, its result and what the environment holds.
-        code: object code.
+        header: its symbol, names of its environment and arguments, its result, what the environment holds and the use.
+        code: object code; none for functions that callers link.
         linkable: bitcode for functions that call it.
     """
 
@@ -62,11 +63,12 @@ class Artifact(NamedTuple):
         return cls(found, content[first + header : first + header + code], content[first + header + code :])
 
 
-def header_of(result: Any) -> dict[str, Any] | None:
+def header_of(result: Any, use: int) -> dict[str, Any] | None:
     """Header of what Numba has compiled; None where its types or its environment have no plain form."""
     described, environment = result.fndesc, result.environment
     try:
         return {
+            "use": use,
             "symbol": described.mangled_name,
             "name": described.unique_name,
             "environment": described.env_name,
@@ -93,27 +95,31 @@ def rebuilt(target: Any, artifact: Artifact, function: FunctionType, arguments: 
     described, environment = _described_function(artifact.header, function, arguments)
     if not environment.consts:
         environment.consts.extend(_dtype(held) for held in artifact.header["held"])
-    library = (artifact.header["symbol"], "object", (artifact.code, artifact.linkable))
+    library: tuple[Any, ...] = artifact.header["symbol"], "object", (artifact.code, artifact.linkable)
+    if artifact.header["use"] == LINKED:
+        target = target.subtarget(codegen=linked_code)
+        library = artifact.header["symbol"], "bitcode", artifact.linkable
     signature = described.restype(*arguments)
     return CompileResult._rebuild(target, library, described, environment, signature, False, (), "", (), ())
 
 
 def finished(
-    target: Any, header: dict[str, Any], text: str, function: FunctionType, arguments: tuple[Any, ...]
+    target: Any, header: dict[str, Any], text: str, function: FunctionType, arguments: tuple[Any, ...], use: int
 ) -> Artifact:
-    """Generate machine code for this processor, and what Python needs to call it.
+    """Generate what a use needs: machine code for this processor, and what Python calls.
 
     Args:
         target: context.
-        header: of an artifact, and whether it is "called" by Python; others are called through their addresses.
+        header: of an artifact.
         text: LLVM's language, optimised.
         function: in Python.
         arguments: types.
+        use: of the function.
     """
     codegen = target.codegen()
     module = llvm.parse_assembly(text)
     held: list[Any] = []
-    if header["called"]:
+    if use == PYTHON:
         described, environment = _described_function(header, function, arguments)
         environment.consts.clear()
         wrapper = codegen.create_library("wrapper")
@@ -127,7 +133,8 @@ def finished(
     for defined in shared.functions:
         if not defined.is_declaration and defined.linkage == llvm.Linkage.external:
             defined.linkage = LINKED_MANY_TIMES
-    return Artifact({**header, "held": held}, codegen._tm.emit_object(module), shared.as_bitcode())
+    code = b"" if use == LINKED else codegen._tm.emit_object(module)
+    return Artifact({**header, "held": held, "use": use}, code, shared.as_bitcode())
 
 
 def _described_function(

@@ -16,7 +16,7 @@ import zipfile
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from types import CodeType, FunctionType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -26,6 +26,8 @@ from numba.core.dispatcher import Dispatcher
 SHIPPED, SHAPES = Path(__file__).with_name("kernels.zip"), "shapes.json"
 _CONSTANTS = (int, float, complex, str, tuple, np.ndarray, np.generic, np.dtype, types.Type)
 _FOREIGN = ("numpy", "math", "numba", "llvmlite")
+_COVERED = (*_FOREIGN, "unifg")  # packages whose functions are known by their versions, or looked into
+_KNOWN = (type(None), ModuleType, BuiltinFunctionType)
 _GENERATORS = "unifg.codegen."  # functions of these modules are looked at though they are not compiled
 _IGNORED = {"type_params", "type_comment", "kind", "ctx", "annotation", "returns", "decorator_list"}
 
@@ -63,6 +65,25 @@ def fingerprint(function: Any) -> str:
     for part in sorted(_parts(function, set())):
         digest.update(part.encode())
     return digest.hexdigest()
+
+
+def uncovered(function: Any) -> str:
+    """Name of something that a compiled function reaches and its fingerprint does not cover; empty if there is none."""
+    return next(_uncovered(function, set()), "")
+
+
+def _uncovered(function: Any, seen: set[int]) -> Iterator[str]:
+    python = source_of(function)
+    if id(python) in seen:
+        return
+    seen.add(id(python))
+    for name, found in _reached(python, shape_of(python.__code__).names):
+        parts = found if isinstance(found, tuple) else (found,)
+        owner = str(getattr(found, "__module__", None) or type(found).__module__).partition(".")[0]
+        if is_compiled(found):
+            yield from _uncovered(found, seen)
+        elif owner not in _COVERED and not all(isinstance(part, (*_KNOWN, *_CONSTANTS)) for part in parts):
+            yield name
 
 
 def shape_of(code: CodeType) -> Shape:

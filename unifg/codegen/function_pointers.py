@@ -33,10 +33,9 @@ class _LinkedCache(_Cache):
 
 
 def linked(function: F) -> F:
-    """Compile for calls through an address only: nothing in Python can call the result."""
+    """Compile for calls through an address, by which it finds its arrays."""
     dispatcher: Any = compiled(function)
-    dispatcher._cache = _LinkedCache(function)
-    dispatcher.targetoptions["no_cpython_wrapper"] = True
+    dispatcher._cache = _LinkedCache(dispatcher)
     return cast(F, dispatcher)
 
 

@@ -27,6 +27,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FunctionType
 from typing import Any, TypeVar, cast
+from weakref import proxy
 
 import llvmlite
 import numba
@@ -40,7 +41,8 @@ from unifg.codegen import precompiled
 from unifg.codegen.artifact import Artifact, finished, header_of, rebuilt
 from unifg.codegen.cache_folder import cache_folder, say_not_kept
 from unifg.codegen.compile_counter import tally
-from unifg.codegen.fingerprint import fingerprint
+from unifg.codegen.dispatcher import LINKED, UseDispatcher
+from unifg.codegen.fingerprint import fingerprint, uncovered
 from unifg.codegen.objects import read_sealed, write_sealed
 from unifg.errors import UnifgError
 
@@ -83,9 +85,11 @@ def in_order(function: F) -> F:
 
 
 def _cached(function: F, cache: type[_Cache], liberties: set[str] | bool) -> F:
-    dispatcher = numba.njit(error_model="numpy", fastmath=liberties, nogil=True)(function)
-    dispatcher._cache = cache(function)
-    dispatcher.targetoptions["no_cfunc_wrapper"] = True  # for callers in C
+    options = {"error_model": "numpy", "fastmath": liberties, "nogil": True, "nopython": True, "boundscheck": None}
+    dispatcher = UseDispatcher(
+        cast(FunctionType, function), targetoptions={**options, "no_cfunc_wrapper": True}
+    )  # no callers in C
+    dispatcher._cache = cache(dispatcher)
     return cast(F, dispatcher)
 
 
@@ -95,7 +99,9 @@ def inlined(function: F) -> F:
 
 
 def written(function: str, lines: Sequence[str], names: dict[str, Any], what: str) -> Callable[..., None]:
-    """Compile a function that is put together as source; every operation as it is written, and no cache on disk.
+    """Compile a function that is put together as source; every operation as it is written.
+
+    It is kept on disk unless it calls something that no fingerprint covers.
 
     Args:
         function: its name there.
@@ -103,9 +109,13 @@ def written(function: str, lines: Sequence[str], names: dict[str, Any], what: st
         names: what the source knows; the function joins them.
         what: it is for, shown in tracebacks.
     """
+    names["__name__"] = __name__
     exec(compile("\n".join(lines), f"<{function} of {what}>", "exec"), names)
-    dispatcher = numba.njit(error_model="numpy", fastmath=False)(names[function])
-    return cast(Callable[..., None], dispatcher)
+    made = names[function]
+    if not (unknown := uncovered(made)):
+        return cast(Callable[..., None], in_order(made))
+    logger.info("'%s' is compiled in every process: it uses '%s', whose code has no fingerprint", what, unknown)
+    return cast(Callable[..., None], numba.njit(error_model="numpy", fastmath=False)(made))
 
 
 def processor() -> str:
@@ -116,9 +126,9 @@ def processor() -> str:
 class _Cache:
     """Compiled functions that Numba asks for: in files found by fingerprints, and in the archive of the library."""
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, dispatcher: UseDispatcher) -> None:
         """Touch nothing."""
-        self._py_func: FunctionType = function
+        self._dispatcher, self._py_func = proxy(dispatcher), cast(FunctionType, dispatcher.py_func)
 
     @property
     def cache_path(self) -> str | None:
@@ -148,7 +158,7 @@ class _Cache:
         if (half := precompiled.archive().find(self._shipping_key(arguments, digest))) is None:
             return None
         target.refresh()  # wrappers for Python are made here, of Numba's own types
-        made = finished(target, *half, self._py_func, arguments)
+        made = finished(target, *half, self._py_func, arguments, self._dispatcher.use)
         found = rebuilt(target, made, self._py_func, arguments)
         self._keep(path, self._made(arguments, digest), made)
         tally.generated.append(name)
@@ -166,9 +176,12 @@ class _Cache:
 
     def save_overload(self, signature: Any, result: Any) -> None:
         arguments, digest = normalize_signature(signature)[0], fingerprint(self._py_func)
-        if not result.library.has_dynamic_globals and (header := header_of(result)) is not None:
+        use = self._dispatcher.use
+        if not result.library.has_dynamic_globals and (header := header_of(result, use)) is not None:
             try:
-                _, _, (code, linkable) = result.library.serialize_using_object_code()
+                code, linkable = b"", result.library._get_module_for_linking().as_bitcode()
+                if use > LINKED:
+                    _, _, (code, _) = result.library.serialize_using_object_code()
             except AttributeError as error:
                 return _say_unknown(error)
             path = self._file(arguments, digest, result.codegen)
@@ -186,6 +199,8 @@ class _Cache:
             return None
         try:
             artifact = Artifact.unpacked(content[len(made) :])
+            if artifact.header["use"] < self._dispatcher.use:
+                return None
             return rebuilt(target, artifact, self._py_func, arguments)
         except (UnifgError, ValueError, KeyError, TypeError, RuntimeError) as error:
             logger.warning("%s cannot be read and is written anew: %s: %s", path, type(error).__name__, error)
@@ -208,8 +223,8 @@ class _Cache:
         if folder is None:
             return None
         name = f"{function.__module__.rpartition('.')[2]}.{function.__qualname__}".replace("<", "").replace(">", "")
-        made = digest if "<" in function.__qualname__ or function.__closure__ else ""
         place = function.__module__, function.__code__.co_filename
+        made = digest if "<" in function.__qualname__ + place[1] or function.__closure__ else ""
         parts = (sys.version_info[:2], *place, *map(spelled, arguments), codegen.magic_tuple(), made)
         number = hashlib.sha256(repr((*parts, *self._variant())).encode()).hexdigest()[:20]
         return folder / f"{name}.{number}.code"

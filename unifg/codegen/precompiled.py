@@ -35,6 +35,7 @@ from numba.core.registry import cpu_target
 
 from unifg.atomic_write import replacing
 from unifg.codegen.artifact import header_of
+from unifg.codegen.dispatcher import LINKED
 from unifg.codegen.errors import PREFIX, without_errors
 from unifg.codegen.fingerprint import SHAPES, SHIPPED, fingerprint, parsed
 from unifg.errors import UnifgError
@@ -190,10 +191,10 @@ class Recorder:
     def keep(self, key: str, function: FunctionType, result: Any) -> None:
         """Add a function: its key, and what Numba made of it."""
         name = f"{function.__module__}:{function.__qualname__}"
-        header = header_of(result)
+        header, module = header_of(result, LINKED), result.library._final_module
         try:
-            alone, called = self._alone(self._optimised[result.library._final_module.name])
-            text = without_errors(alone)
+            # What is linked alone is generated for no processor.
+            text = without_errors(self._alone(self._optimised.get(module.name) or str(module)))
             wrong = [symbol for symbol in undefined(text) if not OUTSIDE.match(symbol)]
         except UnifgError as error:
             self.left_out[name] = str(error)
@@ -201,14 +202,13 @@ class Recorder:
         if header is None or wrong:
             self.left_out[name] = f"expects {', '.join(wrong)}" if wrong else "its result is of no plain type"
             return
-        self.members[key] = {**header, "called": called}, text
+        self.members[key] = header, text
         if digest := _present(name):
             self.functions[name] = digest
 
-    def _alone(self, text: str) -> tuple[str, bool]:
-        """Code without what Python calls, which each version of it wants otherwise, and whether there was any."""
+    def _alone(self, text: str) -> str:
+        """Code without what Python calls, which each version of it wants otherwise."""
         module = llvm.parse_assembly(text)
-        called = any(function.name.startswith(WRAPPER) for function in module.functions)
         for function in module.functions:
             if function.name.startswith((WRAPPER, "cfunc.")) and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
@@ -216,7 +216,7 @@ class Recorder:
         passes = llvm.create_new_module_pass_manager()
         passes.add_global_dead_code_eliminate_pass()
         passes.run(module, builder)
-        return str(module), called
+        return str(module)
 
     def write(self, path: Path) -> None:
         """Write the archive, and log what is left out of it."""

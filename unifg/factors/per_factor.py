@@ -7,7 +7,6 @@ from central differences along the right perturbation of every variable, in comp
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Hashable, Iterator, Sequence
 from functools import lru_cache
 from math import prod
@@ -38,8 +37,6 @@ from unifg.factors.steps import (
 )
 from unifg.lie import Manifold
 from unifg.lie.functions import functions_of
-
-logger = logging.getLogger("unifg")
 
 
 def per_factor(
@@ -119,7 +116,6 @@ def _compiled(
         lines += _attached(call, slots, rows)
     else:
         lines += _differences(call, slots, rows, at, name, names)
-    logger.info("compiling the residual '%s', once in this process", name)
     kernel = written("kernel", lines, names, name)
     return Kernel(kernel, cast(tuple[Manifold | int, ...], arguments), rows, name=name, differenced=jacobian is None)
 

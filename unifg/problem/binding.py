@@ -7,12 +7,13 @@ where the loops over terms read them; Python hears only of data that something m
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
-from unifg.lie.so3 import all_unit
+from unifg.lie.so3 import UNIT, all_unit
 from unifg.modeling.elements import elements_of, nearest, particular, quaternions_of
 from unifg.modeling.terms import Term
 from unifg.modeling.variables import Data
@@ -21,14 +22,37 @@ from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 FLOAT64 = np.dtype(np.float64)
 
 
+class Carried(NamedTuple):
+    """Numbers of data that are copied to an array.
+
+    Attributes:
+        sources: (n,) places as :meth:`Binding.place` gives them.
+        targets: (n,) where in the array.
+        array: the array.
+    """
+
+    sources: IntArray
+    targets: IntArray
+    array: Array
+
+    @classmethod
+    def of(cls, sources: list[IntArray], targets: list[IntArray], array: Array) -> Carried:
+        """Put parts together."""
+        none = np.zeros(0, dtype=np.int64)
+        flat = [np.concatenate([none, *(part.ravel() for part in parts)]) for parts in (sources, targets)]
+        return cls(flat[0].astype(np.int64), flat[1].astype(np.int64), array)
+
+
 class Binding:
     """Copies of all data that nobody else writes to.
 
     Attributes:
         present: the value of every datum, an array that keeps its place.
         edition: how often some of them have been replaced by others.
+        carried: sources, targets and array of what is copied to parameters, and to fixed variables.
     """
 
+    carried: tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]
     _others = False  # whether there are elements of manifolds with other conditions than a norm
 
     def __init__(self, known: Mapping[str, Data], used: Iterable[Data], terms: Sequence[Term] = ()) -> None:
@@ -64,7 +88,7 @@ class Binding:
         self.present.update({handle: np.empty_like(handle.value) for handle in self._flags})
         self._changed = np.zeros(len(self._numbers), dtype=np.bool_)
         self._all, self.edition = True, 0
-        self.carry([], [], np.empty(0))
+        self.carry(Carried.of([], [], np.empty(0)), Carried.of([], [], np.empty(0)))
 
     def _views(self, flat: Array) -> list[Array]:
         bounds = zip(self._numbers, self._starts[:-1], self._starts[1:], strict=True)
@@ -75,19 +99,24 @@ class Binding:
         first = int(self._starts[self._numbers.index(handle)])
         return first + np.arange(handle.value.size).reshape(handle.value.shape)
 
-    def carry(self, sources: list[IntArray], targets: list[IntArray], parameters: Array) -> None:
-        """Have numbers copied to ``parameters`` from now on, whenever data are taken.
+    def carry(self, parameters: Carried, fixed: Carried) -> None:
+        """Have numbers copied to parameters and fixed variables from now on, whenever data are taken."""
+        self.carried = *parameters, *fixed
 
-        Args:
-            sources: (n,) places as :meth:`place` gives them.
-            targets: (n,) where in ``parameters``.
-            parameters: the array.
+    def rows(self, data: Mapping[Data, Array], count: int) -> Array | None:
+        """(count, D) numbers of all data, with one value for each of many instances, as :meth:`take` would hold them.
+
+        Defaults stand for what is not named. None where something else has to be looked at than finite numbers and
+        quaternions of norm 1.
         """
-        none = np.zeros(0, dtype=np.int64)
-        self._sources, self._targets = (
-            np.concatenate([none, *(part.ravel() for part in parts)]).astype(np.int64) for parts in (sources, targets)
-        )
-        self._parameters = parameters
+        if self._others or self._flags or not data.keys() <= self._slots.keys():
+            return None
+        rows = np.empty((count, len(self._flat)))
+        for handle, first, last in zip(self._numbers, self._starts[:-1], self._starts[1:], strict=True):
+            rows[:, first:last] = np.asarray(data.get(handle, handle.value), dtype=np.float64).reshape(-1, last - first)
+        quaternions = rows[:, self._quaternions[:, None] + np.arange(4)]
+        off = np.abs(np.linalg.norm(quaternions, axis=2) - 1.0) >= UNIT
+        return None if np.isnan(rows).any() or off.any() else rows
 
     def take(self, data: Mapping[Data, ArrayLike]) -> Sequence[Data]:
         """Take new values, defaults for what is not named, and say what is not as it was.
@@ -111,9 +140,7 @@ class Binding:
         for what, handle, manifold, term in self._elements if off else ():
             mask = flags[term.active].astype(bool) if isinstance(term.active, Data) else term.active
             slots[handle][...] = nearest(what, manifold, slots[handle], mask, term.name)
-        count = _renew(
-            self._coming, self._flat, self._starts, self._changed, self._sources, self._targets, self._parameters
-        )
+        count = _renew(self._coming, self._flat, self._starts, self._changed, *self.carried)
         if count < 0:
             self._numbers[-1 - count].check(slots[self._numbers[-1 - count]])
         changed = self._numbers
@@ -141,7 +168,7 @@ class Binding:
 
     def forget(self) -> None:
         """Count everything as changed next time, as after a value that a term has refused."""
-        self._all = True
+        self._all, self.edition = True, self.edition + 1
 
     def _require(self, handle: Data, value: ArrayLike) -> None:
         """Look at the value of what no kernel parameter is: flags, and data that no term uses."""
@@ -159,6 +186,9 @@ def _renew(
     sources: IntArray,
     targets: IntArray,
     parameters: Array,
+    fixed_sources: IntArray,
+    fixed_targets: IntArray,
+    fixed: Array,
 ) -> int:
     """Number of data that have changed; -1 - k without any change when the k-th holds NaN."""
     for k in range(len(changed)):
@@ -176,4 +206,6 @@ def _renew(
         count += 1 if new else 0
     for p in range(len(sources)):
         parameters[targets[p]] = present[sources[p]]
+    for p in range(len(fixed_sources)):
+        fixed[fixed_targets[p]] = present[fixed_sources[p]]
     return count

@@ -25,7 +25,7 @@ from unifg.modeling.model import Model
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
-from unifg.problem.binding import Binding
+from unifg.problem.binding import Binding, Carried
 from unifg.problem.branches import Branches
 from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
@@ -53,12 +53,10 @@ class Reader(NamedTuple):
     Attributes:
         bound: terms that have to work something out from it.
         told: terms whose kernels find it among their parameters, already renewed.
-        fixes: numbers of the fixes whose values it is.
     """
 
     bound: list[CompiledTerm]
     told: list[CompiledTerm]
-    fixes: list[int]
 
 
 class CompiledProblem:
@@ -82,7 +80,9 @@ class CompiledProblem:
         differenced: whether some derivative comes from differences, which round.
         batched: terms without a kernel, evaluated by NumPy.
         retraction: moves all variables.
+        reader: of guesses.
         scratch: memory for compiled loops.
+        rebinds: whether something else than numbers for kernels and fixed variables is made of data.
         python_seconds: time spent so far in terms that Python evaluates.
         buffers: memory for linearisations.
         soft: slack variables of soft constraints, by their names.
@@ -133,7 +133,7 @@ class CompiledProblem:
         for term, rows in zip(self.constraint_terms, self.slices, strict=True):
             self.bound_rows[rows] = term.is_bound
         self.retraction = Retraction(self.columns, graph.fixes)
-        self._read = GuessReader(graph, self.columns, self.retraction)
+        self.reader = GuessReader(graph, self.columns, self.retraction)
         self._names = [term.name for term in stacked]
         self.scratch = np.empty(self.table.scratch)
         self.no_penalties = np.zeros(self.constraints.count)
@@ -172,6 +172,25 @@ class CompiledProblem:
         return not (self.batched or self._general or self.table.weighed) and self.retraction.compiled
 
     @property
+    def numbers_only(self) -> bool:
+        """True if instances with other data differ in numbers that compiled loops read, and Python has no part."""
+        python = self.rebinds or self.soft or self.differenced or self.demanding or self._branches
+        return self.fully_compiled and not (python or self.reader.particular or len(self.fixed_rows()))
+
+    @property
+    def carried(self) -> tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]:
+        """Where numbers of data go, see :class:`unifg.problem.binding.Binding`."""
+        return self._binding.carried
+
+    def rows_of_data(self, data: Mapping[Data, Array], count: int) -> Array | None:
+        """(count, D) numbers of all data of many instances; None where more than finite numbers is asked for."""
+        return self._binding.rows(data, count)
+
+    def forget_data(self) -> None:
+        """Count all data as changed at the next :meth:`bind`."""
+        self._binding.forget()
+
+    @property
     def hessian(self) -> Symmetric:
         """Pattern of the Gauss-Newton Hessian of the objective alone."""
         return self._objective[0]
@@ -191,12 +210,9 @@ class CompiledProblem:
         """
         changed = self._binding.take(data)
         for handle in changed:
-            reader = self._readers[handle]
-            for term in reader.told:
+            for term in self._readers[handle].told:
                 term.forget()
-            for fix in reader.fixes:
-                self.retraction.bind(fix, self._binding.present[handle])
-        if self._rebinding:
+        if self.rebinds:
             self._rebind([term for handle in changed for term in self._readers[handle].bound])
 
     def _rebind(self, terms: Sequence[CompiledTerm]) -> None:
@@ -215,7 +231,7 @@ class CompiledProblem:
 
     def _bind_first(self) -> None:
         """Take the defaults, and find out what has to be done when a datum changes."""
-        binding, fixes = self._binding, self.graph.fixes
+        binding, retraction = self._binding, self.retraction
         binding.take({})
         for term in self.terms:
             if term.data:
@@ -225,7 +241,7 @@ class CompiledProblem:
         self._readers: dict[Data, Reader] = {}
         sources, targets = [], []
         for handle in binding.present:
-            reader = self._readers[handle] = Reader([], [], [k for k, f in enumerate(fixes) if f.value is handle])
+            reader = self._readers[handle] = Reader([], [])
             for term in self.terms:
                 if handle not in term.data:
                     continue
@@ -234,11 +250,17 @@ class CompiledProblem:
                 for place in places or ():
                     sources.append(np.broadcast_to(binding.place(handle).reshape(-1, place.shape[1]), place.shape))
                     targets.append(int(term.place[PARAMETER]) + place)
-        self._rebinding = any(reader.bound for reader in self._readers.values())
-        binding.carry(sources, targets, self.arrays.parameters)
-        for k, fix in enumerate(fixes):
-            value = binding.present[fix.value] if isinstance(fix.value, Data) else np.asarray(fix.value)
-            self.retraction.bind(k, value)
+        self.rebinds = any(reader.bound for reader in self._readers.values())
+        moved = Carried.of(sources, targets, self.arrays.parameters)
+        sources, targets = [], []
+        for fix, where in zip(self.graph.fixes, retraction.places, strict=True):
+            if isinstance(fix.value, Data):
+                sources.append(np.broadcast_to(binding.place(fix.value), where.shape))
+                targets.append(where)
+                retraction.fixed_values[where] = binding.present[fix.value]
+            else:
+                retraction.fixed_values[where] = np.asarray(fix.value)
+        binding.carry(moved, Carried.of(sources, targets, retraction.fixed_values))
 
     def by_term(self, stacked: Array) -> ByTerm:
         """(M,) numbers of the constraint rows, viewed as (n, m) of every term."""
@@ -259,7 +281,7 @@ class CompiledProblem:
         Raises:
             GraphError: naming the family and index of what is missing, misshapen, NaN or off its manifold.
         """
-        values = self._read(guess)
+        values = self.reader(guess)
         if not self._vetted:
             for term in self.terms:
                 term.require_clean(values)

@@ -22,14 +22,19 @@ from unifg.typing import Array, ArrayLike, IntArray
 
 
 class GuessReader:
-    """Reads guesses for the families of a graph."""
+    """Reads guesses for the families of a graph.
+
+    Attributes:
+        quaternions: places where quaternions start among stored values.
+        particular: other parts of families whose points are not all finite numbers.
+    """
 
     def __init__(self, graph: Model, columns: Columns, retraction: Retraction) -> None:
         """Find the parts of the families that need more of a look than whether they are finite."""
         self._graph = graph
         self._columns = columns
         self._retraction = retraction
-        self._particular: list[tuple[Family, slice, Manifold]] = []
+        self.particular: list[tuple[Family, slice, Manifold]] = []
         starts = [np.zeros(0, dtype=np.int64)]
         for family in columns.families:
             members = columns.storage[family] + np.arange(family.count) * family.manifold.storage
@@ -37,8 +42,8 @@ class GuessReader:
                 if isinstance(leaf, QUATERNIONS):
                     starts.append(members + storage + leaf.storage - 4)
                 elif getattr(type(leaf), "is_valid", None) is not LieGroup.is_valid:
-                    self._particular.append((family, slice(storage, storage + leaf.storage), leaf))
-        self._quaternions = np.concatenate(starts)
+                    self.particular.append((family, slice(storage, storage + leaf.storage), leaf))
+        self.quaternions = np.concatenate(starts)
 
     def __call__(self, guess: Mapping[Family, ArrayLike] | Array) -> Values:
         """Copy and check a guess, by families or as it is stored, and give fixed variables their values.
@@ -53,8 +58,8 @@ class GuessReader:
         else:
             values = self._read(guess)
         fixed = self._retraction
-        fine = _settle(values.flat, fixed.fixed, fixed.fixed_values, self._quaternions)
-        if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self._particular)):
+        fine = _settle(values.flat, fixed.fixed, fixed.fixed_values, self.quaternions)
+        if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self.particular)):
             self._name_invalid(values)
         return values
 

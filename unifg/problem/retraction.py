@@ -20,6 +20,7 @@ class Retraction:
     Attributes:
         parts: one row per component of a family, for :func:`retract_parts`.
         fixed, fixed_values: stored numbers that do not move, and what they are.
+        places: of the values of each fix among ``fixed_values``.
     """
 
     def __init__(self, columns: Columns, fixes: Sequence[Fix]) -> None:
@@ -53,17 +54,15 @@ class Retraction:
         self.fixed: IntArray = np.concatenate([np.zeros(0, dtype=np.int64), *(place.ravel() for place in places)])
         self.fixed_values = np.zeros(len(self.fixed))
         ends = np.cumsum([0, *(place.size for place in places)]).tolist()
-        own = [self.fixed_values[first:last] for first, last in pairwise(ends)]
-        self._views = [part.reshape(place.shape) for part, place in zip(own, places, strict=True)]
+        self.places = [
+            np.arange(first, last).reshape(place.shape)
+            for (first, last), place in zip(pairwise(ends), places, strict=True)
+        ]
 
     @property
     def compiled(self) -> bool:
         """True if every family has a compiled retraction."""
         return not self._python
-
-    def bind(self, which: int, value: Array) -> None:
-        """Take the present value of one fix."""
-        self._views[which][...] = value
 
     def fix(self, values: Values) -> None:
         """Write the values of fixed variables."""

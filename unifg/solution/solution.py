@@ -103,6 +103,7 @@ class Solution:
 
     tolerance, _edition = 1e-6, -1
     in_python = 0.0
+    _parts: tuple[float, float, float, float] | None = None
     restoration_steps = 0
     checked = False
     mistraced: Mapping[str, str] = MappingProxyType({})
@@ -479,9 +480,25 @@ class Solution:
         """
         return conditioning(self._program, self._lin) if self._program.least_squares else None
 
+    @property
+    def times(self) -> dict[str, float]:
+        """Seconds of the solve by its parts; empty where the backend's loop does not take them, and of single solves.
+
+        "evaluation" of terms and derivatives, "linear systems", "search": tests of iterates and steps; "judge": the
+        KKT test of the answer; "Python": all that is not compiled.
+        """
+        if self._parts is None:
+            return {}
+        evaluation, systems, judge, compiled = self._parts
+        parts = {"evaluation": evaluation, "linear systems": systems, "search": compiled - evaluation - systems}
+        return {**parts, "judge": judge, "Python": self.seconds - compiled - judge}
+
     def report(self) -> str:
-        """The status sentence with the numbers behind it."""
+        """The status sentence with the numbers behind it, and the times of the parts."""
         text = self._told()
+        if self.times:
+            shares = (f"{name} {100.0 * part / self.seconds:.0f} %" for name, part in self.times.items())
+            text += f" Of the time: {', '.join(shares)}."
         if self.finite and self._program.least_squares and cheap(self._program) and self.conditioning is not None:
             text += f" {self.conditioning.sentence()}"
         return text

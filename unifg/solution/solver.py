@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeAlias
@@ -25,6 +25,7 @@ from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
 from unifg.problem.linearization import Linearization, all_finite
 from unifg.problem.units import SMALL_FORCES
+from unifg.solution.batch import SAMPLED, Batch, Outcomes, solve_batch
 from unifg.solution.capabilities import Constraints, require
 from unifg.solution.conditioning import HARDLY
 from unifg.solution.history import HEADER, Deferred, Iteration, factor_norms, line, show
@@ -188,6 +189,21 @@ class Solver(Backend):
         """
         return False
 
+    def solves_each(self, program: CompiledProblem) -> bool:
+        """Test whether :meth:`solve_each` may be asked; instances then differ in numbers alone."""
+        return False
+
+    def solve_each(self, workspace: Any, rows: Array, guesses: Array, duals: Array) -> Outcomes:
+        """Solve many instances in compiled code.
+
+        Args:
+            workspace: of the backend.
+            rows: (K, D) numbers of all data of each.
+            guesses: (K or 1, S) stored values.
+            duals: (K or 1, M) multipliers.
+        """
+        raise NotImplementedError
+
     @abstractmethod
     def workspace(self, program: CompiledProblem) -> Any:
         """Memory that the backend keeps between solves of one structure."""
@@ -217,6 +233,8 @@ class SolveState:
         history: rows so far.
         iterations: so far.
         restoration_steps: of descents on the violation alone so far.
+        parts: seconds of a compiled loop in evaluation, linear systems and the test of the answer, and of all of the
+            loop; None where nobody took them.
         alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
         tolerance: of the KKT test.
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
@@ -245,6 +263,7 @@ class SolveState:
         self.lent: Factored | None = None
         self.slopes: Slopes | None = None
         self.iterations = self.restoration_steps = 0
+        self.parts: tuple[float, float, float, float] | None = None
         if solver.verbose:
             show(HEADER)
         self.values, self.multipliers, self.penalties = values, multipliers, program.no_penalties
@@ -477,8 +496,8 @@ class SolveState:
             self._solver.name,
             returned,
         )
-        solution.restoration_steps, solution.tolerance = self.restoration_steps, self.tolerance
-        solution._edition = self.program.data_edition
+        solution.restoration_steps, solution._parts = self.restoration_steps, self.parts
+        solution.tolerance, solution._edition = self.tolerance, self.program.data_edition
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
 
@@ -583,6 +602,7 @@ class Prepared:
         self._solves, self._owed, self._of_branches = 0, False, 0
         self._last: ReferenceType[Solution] | None = None
         self._lock = ReentrantLock()
+        self._twins: list[Prepared] = []
         self._constraints = {
             t.name: (t, rows) for t, rows in zip(program.constraint_terms, program.slices, strict=True)
         }
@@ -607,6 +627,48 @@ class Prepared:
         try:
             return self._solve(guess, data, duals, check, callback)
         finally:
+            self._leave()
+
+    def solve_many(
+        self, guesses: AnyGuess | Sequence[AnyGuess], *, data: Mapping[Data, Numbers] | None = None, threads: int = 1
+    ) -> Batch:
+        """Solve many instances of the graph, with the statuses that :meth:`solve` has.
+
+        Args:
+            guesses: one for all, or one for each.
+            data: (K, ...) one value for each instance of every datum named; others keep their defaults.
+            threads: solve at once; each but the first compiles the graph for itself, once.
+
+        Raises:
+            GraphError: numbers of instances or shapes do not fit, and as of :meth:`solve`.
+        """
+        return solve_batch(self, guesses, data or {}, threads)
+
+    def twins(self, count: int) -> list[Prepared]:
+        """Prepared solvers of the same graph that belong to other threads; made once."""
+        while len(self._twins) < count:
+            twin = Prepared(self.solver, CompiledProblem(self.program.graph), self._graph)
+            twin.program.table.require_second()
+            self._twins.append(twin)
+        return self._twins[:count]
+
+    def solve_part(self, guesses: tuple[Array, Array], data: Mapping[Data, Array], count: int) -> Outcomes | None:
+        """Some instances in one compiled call; None where single solves have to look at their data or answers."""
+        self._enter()
+        try:
+            rows = self.program.rows_of_data(data, count)
+            if rows is None:
+                return None
+            self.allocate()
+            found = self.solver.solve_each(self._workspace, rows, *guesses)
+            for k in range(SAMPLED - 1, count, SAMPLED):
+                self.program.forget_data()
+                self.program.bind({handle: value[k] for handle, value in data.items()})
+                if self.program.mistraced(self.program.columns.view(found.values[k]), False, k):
+                    return None
+            return found
+        finally:
+            self.program.forget_data()
             self._leave()
 
     def _enter(self) -> None:
@@ -640,20 +702,7 @@ class Prepared:
         program = self.program
         program.bind(data or {})
         self._say_if_stale()
-        stored = guess.flat(program) if isinstance(guess, Guess | Solution) and not duals else None
-        if stored is not None:
-            flat, multipliers, penalties = stored
-            values, multipliers = program.values_from(flat), multipliers.copy()
-            self._require_finite("multipliers", multipliers)
-            self._require_finite("penalties", penalties)
-        else:
-            values = program.values_from(values_of(guess))
-            carried: Mapping[str, Numbers] = {}
-            penalties = program.no_penalties
-            if not isinstance(guess, Mapping):
-                carried = guess.multipliers
-                penalties = self._stacked("penalties", guess.penalties) if guess.penalties else penalties
-            multipliers = self._stacked("multipliers", {**carried, **duals} if duals else carried)
+        values, multipliers, penalties = self.read(guess, duals)
         run = SolveState(self.solver, program, values, multipliers, callback)
         run.penalties = penalties
         solution = self._verified(self._finished(run), run, callback)
@@ -661,6 +710,24 @@ class Prepared:
         if check and not solution.converged:
             raise NotConverged(solution)
         return solution
+
+    def read(self, guess: AnyGuess, duals: Mapping[str, Numbers] | None = None) -> tuple[Values, Array, Array]:
+        """Values, multipliers (M,) and penalties (M,) of a guess, checked; fixed variables have their values."""
+        program = self.program
+        stored = guess.flat(program) if isinstance(guess, Guess | Solution) and not duals else None
+        if stored is not None:
+            flat, multipliers, penalties = stored
+            self._require_finite("multipliers", multipliers)
+            if penalties is not program.no_penalties:
+                self._require_finite("penalties", penalties)
+            return program.values_from(flat), multipliers.copy(), penalties
+        values = program.values_from(values_of(guess))
+        carried: Mapping[str, Numbers] = {}
+        penalties = program.no_penalties
+        if not isinstance(guess, Mapping):
+            carried = guess.multipliers
+            penalties = self._stacked("penalties", guess.penalties) if guess.penalties else penalties
+        return values, self._stacked("multipliers", {**carried, **duals} if duals else carried), penalties
 
     def _verified(self, solution: Solution, run: SolveState, callback: Callback | None) -> Solution:
         """Evaluate traced functions as written at an answer, and solve again without the traces that differ."""
@@ -747,6 +814,8 @@ class Prepared:
                 raise
             if run.alone and not run.iterations:
                 self._refuse_not_finite(run)
+            if self.single:  # it may have compiled, and loaded what was
+                run.parts = None
         return run.finish(reason)
 
     @property
@@ -779,7 +848,7 @@ class Prepared:
 
     def __getstate__(self) -> dict[str, Any]:
         """Workspaces hold compiled objects that do not pickle; they are rebuilt on first use."""
-        return {**self.__dict__, "_workspace": None, "_last": None}
+        return {**self.__dict__, "_workspace": None, "_last": None, "_twins": []}
 
     def _stacked(self, what: str, given: Mapping[str, Numbers]) -> Array:
         """(M,) multipliers or penalties, zero where none are given."""

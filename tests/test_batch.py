@@ -1,0 +1,117 @@
+"""Many instances of one graph by one compiled call, and by single solves where it cannot be."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from problems.control import Quadrotor, Stated, Unicycle
+from unifg.solution.batch import Batch
+from unifg.solvers import SQP, InteriorPoint
+from unifg.typing import Array
+
+COUNT = 130
+
+
+def instances(case: Unicycle | Quadrotor, count: int, far: float = 0.1) -> tuple[Stated, list[dict[fg.Data, Array]]]:
+    """A stated case, and the data of it from starts beside its own."""
+    stated, rng = case.formulation(), np.random.default_rng(0)
+    spread = far * np.ones(case.manifold.dim)
+    starts = case.manifold.retract(np.tile(case.start, (count, 1)), spread * rng.standard_normal((count, len(spread))))
+    return stated, [stated.data(start, 0) for start in starts]
+
+
+def stacked(each: list[dict[fg.Data, Array]]) -> dict[fg.Data, Array]:
+    """One array for all instances of every datum."""
+    return {handle: np.stack([data[handle] for data in each]) for handle in each[0]}
+
+
+def assert_same(batch: Batch, singles: list[fg.Solution], family: fg.Family) -> None:
+    assert batch.statuses == [found.status for found in singles]
+    assert batch.iterations.tolist() == [found.iterations for found in singles]
+    np.testing.assert_array_equal(batch.cost, [found.cost for found in singles])
+    np.testing.assert_array_equal(batch[family], [found[family] for found in singles])
+    np.testing.assert_array_equal(batch.violation, [found.violation for found in singles])
+    np.testing.assert_array_equal(batch.stationarity, [found.stationarity for found in singles])
+
+
+@pytest.mark.parametrize("case", [Unicycle("straight", True, 20), Quadrotor("goto", False, 20)], ids=str)
+@pytest.mark.parametrize("options", [{}, {"step_tolerance": np.inf}, {"max_iterations": 9}], ids=str)
+def test_instances_are_solved_as_one_by_one(case: Unicycle | Quadrotor, options: dict[str, Any]) -> None:
+    stated, each = instances(case, COUNT if case.robot == "unicycle" else 20)
+    prepared = InteriorPoint(tolerance=1e-4, **options).prepare(stated.graph)
+    first = prepared.solve(stated.guess)
+    for guess in (stated.guess, first.shifted(stated.x, stated.u)):
+        singles = [prepared.solve(guess, data=data) for data in each]
+        assert_same(prepared.solve_many(guess, data=stacked(each)), singles, stated.x)
+        assert_same(prepared.solve_many([guess] * len(each), data=stacked(each), threads=2), singles, stated.u)
+    again = prepared.solve(stated.guess)  # with its own data again
+    assert again.cost == first.cost and again.iterations == first.iterations
+
+
+def test_one_instance_as_a_solution() -> None:
+    stated, each = instances(Unicycle("straight", False, 20), 12)
+    prepared = InteriorPoint().prepare(stated.graph)
+    batch = prepared.solve_many(stated.guess, data=stacked(each))
+    assert batch.converged and len(batch) == 12
+    found = batch.solution(7)
+    assert found.converged and found.iterations <= 1
+    np.testing.assert_allclose(found[stated.x], batch[stated.x][7], atol=1e-6)
+    assert found.multipliers.keys() == {"dynamics", "limits"}
+
+
+def test_what_compiled_code_leaves_is_solved_as_usual() -> None:
+    """Other backends, a time limit, and data that single solves refuse."""
+    stated, each = instances(Quadrotor("goto", False, 20), 6)
+    for solver in (InteriorPoint(), SQP(qp="graph"), InteriorPoint(time_limit=10.0)):
+        prepared = solver.prepare(stated.graph)
+        batch = prepared.solve_many(stated.guess, data=stacked(each))
+        singles = [prepared.solve(stated.guess, data=data) for data in each]
+        assert_same(batch, singles, stated.x)
+    start = next(handle for handle in each[3] if handle.name == "start")
+    prepared = InteriorPoint().prepare(stated.graph)
+    for place, number, why in ((0, np.nan, "data 'start' contains NaN"), (4, 0.9, r"state\[0\] is not on Product")):
+        wrong = stacked(each)
+        wrong[start][3, place] = number
+        with pytest.raises(fg.GraphError, match=why):
+            prepared.solve_many(stated.guess, data=wrong)
+
+
+def test_limits_as_data_are_solved_as_usual() -> None:
+    graph = fg.Graph()
+    x, top = graph.variables("x", fg.Rn(1), 1), graph.data("top", [1.0])
+    graph.minimize(fg.prior, x, [3.0], sigma=1.0)
+    graph.bound(x, upper=top, name="top")
+    prepared = InteriorPoint().prepare(graph)
+    batch = prepared.solve_many({x: [[0.0]]}, data={top: [[0.5], [1.5], [9.0]]})
+    np.testing.assert_allclose(batch[x].ravel(), [0.5, 1.5, 3.0], atol=1e-6)
+
+
+def test_an_infeasible_instance_has_its_own_status() -> None:
+    graph = fg.Graph()
+    x, place = graph.variables("x", fg.Rn(2), 1), graph.data("place", [0.0, 0.0])
+    graph.minimize(lambda x, p: x - p, x, place, sigma=1.0)
+    graph.constrain(lambda x, p: ((x - p) ** 2).sum(axis=1, keepdims=True), x, place, upper=1.0, name="near")
+    graph.bound(x, lower=0.0, name="quadrant")
+    prepared = InteriorPoint().prepare(graph)
+    batch = prepared.solve_many({x: [[0.5, 0.5]]}, data={place: [[1.0, 1.0], [-3.0, 0.0], [0.2, 0.1]]})
+    assert [status.name for status in batch.statuses] == ["CONVERGED", "LOCALLY_INFEASIBLE", "CONVERGED"]
+    assert not batch.converged
+
+
+def test_what_does_not_fit_is_refused() -> None:
+    stated, each = instances(Unicycle("straight", False, 20), 3)
+    prepared, data = InteriorPoint().prepare(stated.graph), stacked(each)
+    start = next(handle for handle in data if handle.name == "start")
+    with pytest.raises(fg.GraphError, match=r"data 'start' of many instances has shape \(3,\), expected \(K, 3\)"):
+        prepared.solve_many(stated.guess, data={start: each[0][start]})
+    with pytest.raises(fg.GraphError, match=r"is given for \d instances, others for \d"):
+        prepared.solve_many(stated.guess, data={**data, start: data[start][:2]})
+    with pytest.raises(fg.GraphError, match="2 guesses are given for 3 instances"):
+        prepared.solve_many([stated.guess] * 2, data=data)
+    with pytest.raises(fg.GraphError, match="solve_many of what"):
+        prepared.solve_many(stated.guess)
+    assert len(prepared.solve_many([])) == 0

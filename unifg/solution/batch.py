@@ -1,0 +1,172 @@
+"""Many instances of one graph: other data, other guesses, one structure.
+
+Where the backend's whole loop is compiled (:meth:`unifg.solution.solver.Solver.solve_each`), instances run one after
+the other without Python, and threads run at once. What such a loop does not end with success is solved again as usual,
+and so are all instances of a graph that Python has a part in. Statuses are therefore those of single solves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import repeat
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.modeling.variables import Data, Family
+from unifg.solution.solution import AnyGuess, Guess, Solution
+from unifg.solution.status import Status
+from unifg.typing import Array, IntArray, Numbers
+
+if TYPE_CHECKING:
+    from unifg.solution.solver import Prepared
+
+SAMPLED = 100  # one answer in so many is verified by the functions as written, as in a loop
+
+
+class Outcomes(NamedTuple):
+    """Answers of instances that compiled code has solved.
+
+    Attributes:
+        statuses: None where an instance is to be solved as usual.
+        values: (K, S) stored ones.
+        multipliers: (K, M).
+        cost: (K,).
+        iterations: (K,).
+        measured: (K, 3) stationarity, violation, complementarity.
+    """
+
+    statuses: list[Status | None]
+    values: Array
+    multipliers: Array
+    cost: Array
+    iterations: IntArray
+    measured: Array
+
+
+class Batch:
+    """Answers of many instances.
+
+    Attributes:
+        statuses: of each.
+        cost, stationarity, violation, complementarity: (K,) as of a solution.
+        iterations: (K,).
+        multipliers: (K, M) of all constraint rows.
+    """
+
+    def __init__(self, prepared: Prepared, data: Mapping[Data, Array], count: int) -> None:
+        """Make room; filled by :meth:`unifg.solution.solver.Prepared.solve_many`."""
+        program = prepared.program
+        self._prepared, self._data = prepared, data
+        self.statuses: list[Status] = [Status.INTERRUPTED] * count
+        self.values, self.multipliers = np.empty((count, program.columns.stored)), np.empty((count, len(program.lower)))
+        self.cost, self.stationarity, self.violation, self.complementarity = np.empty((4, count))
+        self.iterations: IntArray = np.zeros(count, dtype=np.int64)
+
+    def __len__(self) -> int:
+        """Number of instances."""
+        return len(self.statuses)
+
+    def __getitem__(self, family: Family) -> Array:
+        """(K, count, storage) values of a family."""
+        part, shape = self._prepared.program.columns.place(family)
+        return self.values[:, part].reshape(len(self), *shape).copy()
+
+    @property
+    def converged(self) -> bool:
+        """True if all have."""
+        return all(status.converged for status in self.statuses)
+
+    def data_of(self, index: int) -> dict[Data, Array]:
+        """The data of one instance."""
+        return {handle: given[index] for handle, given in self._data.items()}
+
+    def solution(self, index: int) -> Solution:
+        """A solution with all that belongs to it, by a solve from the answer of an instance."""
+        program = self._prepared.program
+        arrays = self.values[index].copy(), self.multipliers[index].copy(), program.no_penalties
+        return self._prepared.solve(Guess.stored(program, arrays), data=self.data_of(index))
+
+    def solve_part(self, worker: Prepared, part: IntArray, guesses: tuple[Array, Array]) -> IntArray:
+        """Have a worker solve some instances; returns those that are left to single solves."""
+        own = [array[part] if len(array) > 1 else array for array in guesses]
+        data = {handle: given[part] for handle, given in self._data.items()}
+        found = worker.solve_part((own[0], own[1]), data, len(part))
+        if found is None:
+            return part
+        solved = np.array([status is not None for status in found.statuses], dtype=bool)
+        for index, status in zip(part[solved].tolist(), filter(None, found.statuses), strict=True):
+            self.statuses[index] = status
+        done = part[solved]
+        self.values[done], self.multipliers[done] = found.values[solved], found.multipliers[solved]
+        self.cost[done], self.iterations[done] = found.cost[solved], found.iterations[solved]
+        self.stationarity[done], self.violation[done], self.complementarity[done] = found.measured[solved].T
+        left: IntArray = part[~solved]
+        return left
+
+    def take(self, index: int, solution: Solution) -> None:
+        """Write the answer of an instance."""
+        self.statuses[index], self.iterations[index] = solution.status, solution.iterations
+        self.values[index], self.multipliers[index] = solution._lin.stored, solution._multipliers
+        self.cost[index], self.stationarity[index] = solution.cost, solution.stationarity
+        self.violation[index], self.complementarity[index] = solution.violation, solution.complementarity
+
+
+def stacked_data(data: Mapping[Data, Numbers]) -> tuple[dict[Data, Array], int | None]:
+    """Data with one value for each instance, and the number of instances; None without data.
+
+    Raises:
+        GraphError: numbers of instances, or shapes, differ.
+    """
+    found: dict[Data, Array] = {}
+    count: int | None = None
+    for handle, given in data.items():
+        array = np.asarray(given)
+        if array.shape[1:] != handle.value.shape:
+            raise GraphError(
+                f"data '{handle.name}' of many instances has shape {array.shape}, expected (K, "
+                f"{', '.join(map(str, handle.value.shape))}): one value of shape {handle.value.shape} for each"
+            )
+        if count not in (None, len(array)):
+            raise GraphError(f"data '{handle.name}' is given for {len(array)} instances, others for {count}")
+        found[handle], count = array, len(array)
+    return found, count
+
+
+def flat_guesses(prepared: Prepared, guesses: AnyGuess | Sequence[AnyGuess]) -> tuple[Array, Array]:
+    """(K or 1, S) stored values and (K or 1, M) multipliers of guesses, one for each instance or one for all."""
+    rows = [prepared.read(guess) for guess in (guesses if isinstance(guesses, Sequence) else [guesses])]
+    return np.stack([values.flat for values, *_ in rows]), np.stack([multipliers for _, multipliers, _ in rows])
+
+
+def solve_batch(
+    prepared: Prepared,
+    guesses: AnyGuess | Sequence[AnyGuess],
+    data: Mapping[Data, Numbers],
+    threads: int,
+) -> Batch:
+    """All instances; arguments and errors as for :meth:`unifg.solution.solver.Prepared.solve_many`."""
+    given, count = stacked_data(data)
+    if isinstance(guesses, Sequence):
+        if count not in (None, len(guesses)):
+            raise GraphError(f"{len(guesses)} guesses are given for {count} instances: give as many, or a single one")
+        count = len(guesses)
+    if count is None:
+        raise GraphError("solve_many of what? Give data with a value for each instance, or a list of guesses")
+    batch = Batch(prepared, given, count)
+    each = guesses if isinstance(guesses, Sequence) else [guesses] * count
+    if count == 0:
+        return batch
+    batch.take(0, prepared.solve(each[0], data=batch.data_of(0)))  # verified, as a first answer is
+    left = np.arange(1, count)
+    if prepared.solver.solves_each(prepared.program) and count > 1:
+        stored = flat_guesses(prepared, guesses)
+        workers = [prepared, *prepared.twins(min(threads, count - 1) - 1)]
+        parts = [left[k :: len(workers)] for k in range(len(workers))]
+        with ThreadPoolExecutor(len(workers)) as pool:
+            left = np.sort(np.concatenate(list(pool.map(batch.solve_part, workers, parts, repeat(stored)))))
+    for index in left.tolist():
+        batch.take(index, prepared.solve(each[index], data=batch.data_of(index)))
+    return batch
