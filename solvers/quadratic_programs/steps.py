@@ -49,6 +49,7 @@ from unifg.solvers.quadratic_programs.loop import (
     SECONDS,
     SHOWN,
     VIOLATION,
+    arrays,
     forget,
     loop,
 )
@@ -88,19 +89,25 @@ class Steps:
         self._moved: Values | None = None
         self.work = _empty(program)
         self._answer = Memory(program)
-        arrays: dict[str, Any] = {REACHED.get(name, name): array for name, array in self._answer.arrays.items()}
-        self.work = self.work._replace(**arrays)
+        reached: dict[str, Any] = {REACHED.get(name, name): array for name, array in self._answer.arrays.items()}
+        self.work = self.work._replace(**reached)
         self.now = Fields(self.work.scalars)
         self.now["clock"] = clock()
         self._log = self.work.log.reshape(LOGGED, -1)
-        self._problem = _problem(program, self.work)
+        self._describe()
+
+    def _describe(self) -> None:
+        """Tell compiled code where the arrays are, with the present equalities."""
+        self._problem = _problem(self.program, self.work)
+        self._words = arrays.describe((self._problem, self.work))
+        self._address = self._words.ctypes.data
 
     def prepare(self, tolerance: float, full_steps: bool, correcting: bool) -> None:
         """Begin a solve with the present data."""
         program, now = self.program, self.now
         if program.equality is not self._held:  # which is a new array when limits have changed
             if not np.array_equal(program.equality, self._problem.equality):
-                self._problem = _problem(program, self.work)
+                self._describe()
             self._held = program.equality
         now["assisted"] = self._assisted = program.large or not program.fully_compiled
         now["tolerance"], now["least_squares"] = tolerance, program.least_squares
@@ -250,7 +257,7 @@ class Steps:
     def _go(self, stage: int, alone: bool = False) -> None:
         """Run the compiled loop from a stage, ``alone`` beyond the step."""
         self.now["stage"], self.now["alone"] = stage, alone
-        loop(self._problem, self.work)
+        loop(self._address)
 
 
 def _history(program: CompiledProblem, known: list[Iteration], log: Array, seconds: float) -> list[Iteration]:
