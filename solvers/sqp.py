@@ -89,14 +89,13 @@ class SQP(Solver):
             require(program, f"{self.name}(qp='elimination')", "equalities")
 
     def runs_alone(self, program: CompiledProblem) -> bool:
-        """Test whether the compiled loop may begin the solve."""
-        return self._runs_alone(program) and not len(program.fixed_rows())
+        """Test whether the compiled loop may begin the solve, and go on where it is the graph that answers."""
+        return self._known(program) and not len(program.fixed_rows())
 
-    def _runs_alone(self, program: CompiledProblem) -> bool:
-        """Test whether it may go on from one iterate to the next."""
-        asked = self.qp == "graph" and self.hessian != "exact" and self.time_limit == np.inf
-        known = program.fully_compiled and not (program.differenced or program.large)
-        return asked and known and not program.equality.all()
+    def _known(self, program: CompiledProblem) -> bool:
+        """Test whether compiled code knows all that an iterate is judged by."""
+        python = program.large or program.differenced or program.least_squares
+        return program.fully_compiled and self.time_limit == np.inf and not python
 
     def workspace(self, program: CompiledProblem) -> Subproblems:
         """QP workspaces."""
@@ -121,13 +120,13 @@ class SQP(Solver):
         """Iterate to convergence."""
         program, steps, watch, failures = run.program, workspace.steps, RestorationTrigger(), 0
         now, turning = steps.now, self.hessian == "auto" and self.time_limit == np.inf and self.qp != "elimination"
-        alone = not run.watched and self._runs_alone(program)
+        alone = program.sided and (run.alone or (not run.watched and self._known(program)))
         steps.prepare(self.tolerance, self.full_steps, self.second_order_correction)
         now["step_tolerance"], now["violation_tolerance"] = self.step_tolerance, self.violation_tolerance
         now["limit"] = self.max_iterations
         if run.alone:
             workspace.begin()
-            budget = _budget(watch, 1 if turning else 0)
+            budget = _budget(watch, 1 if turning else 0) if alone and workspace.compiled else 0
             _noted(run, workspace, watch, 1, steps.begin_alone(run, budget, workspace.scaled))
         else:
             # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
@@ -205,7 +204,7 @@ class SQP(Solver):
         steps, accuracy = workspace.steps, self._accuracy(run, workspace)
         curved = qp is not None and qp.curved_by is not None
         steps.pose(run.lin, run.multipliers, shift, accuracy, workspace.exact, curved)
-        answer, good = steps.on_graph() if qp is None and workspace.compiled and steps.sided else (None, False)
+        answer, good = steps.on_graph() if qp is None and workspace.compiled and run.program.sided else (None, False)
         if good:
             workspace.answered()
         else:

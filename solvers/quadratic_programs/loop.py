@@ -52,9 +52,10 @@ def loop(address: int) -> None:
     """Go on at a stage of an attempt; alone, go on with further ones until Python has to look."""
     problem, work = found(address)
     now = work.scalars[0]
-    if now.stage == UNBEGUN and not _begin(problem, work):
-        now.answer = STARTED
-        return
+    if now.stage == UNBEGUN:
+        now.answer = TAKEN if _begin(problem, work) else STARTED
+        if now.answer == STARTED or now.budget == 0:
+            return
     while True:
         if now.alone == 1:
             size = kkt_size(work.kkt[0], work.kkt[1], work.kkt[2], work.multipliers)

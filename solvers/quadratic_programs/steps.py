@@ -94,6 +94,9 @@ class Steps:
         self.now = Fields(self.work.scalars)
         self.now["clock"] = clock()
         self._log = self.work.log.reshape(LOGGED, -1)
+        sizes = NUMBERED + len(self.work.norms) + len(self.work.heights), len(self.work.values), len(self.work.dual)
+        ends = np.cumsum([*sizes, sizes[2]]).tolist()
+        self._parts = tuple(map(slice, ends[:-1], ends[1:]))
         self._describe()
 
     def _describe(self) -> None:
@@ -119,11 +122,6 @@ class Steps:
         work.columns[:], work.rows[:] = scaling.columns, scaling.rows
         forget(self.program.arrays, work.scalars, work.rows, work.penalties, multipliers, lin.constraints)
 
-    @property
-    def sided(self) -> bool:
-        """True if there are inequalities: without them a subproblem is one linear system, which is refined."""
-        return len(self._problem.system.kkt.rows) < len(self.work.dual)
-
     def pose(
         self, lin: Linearization, multipliers: Array, damping: float, accuracy: float, exact: bool, curved: bool
     ) -> None:
@@ -145,7 +143,13 @@ class Steps:
             work.gradient[:], work.hessian[:], work.weights[:] = lin.gradient, lin.hessian, lin.weights
 
     def begin_alone(self, run: SolveState, budget: int, scaling: bool) -> list[float]:
-        """Begin a solve at the values of ``run``, of which nothing is known, and go on as :meth:`go_on_alone`."""
+        """Begin a solve at the values of ``run``, of which nothing is known, and go on as :meth:`go_on_alone`.
+
+        Args:
+            run: the solve.
+            budget: 0 to begin only.
+            scaling: whether to come back where the problem needs units of its own.
+        """
         self.work.trial[:], self.work.multipliers[:] = run.values.flat, run.multipliers
         self.now["scaling"] = scaling
         return self._run_alone(run, UNBEGUN, budget)
@@ -181,25 +185,26 @@ class Steps:
         self.pending = answer not in (TAKEN, STOPPED, STARTED)
         if not count:
             return []
-        log = self._log[:count].copy()
-        stored = NUMBERED + len(work.norms) + len(work.heights)
-        ends = stored + len(work.values), stored + len(work.values) + len(work.constraints)
-        measured = read_numbers(work.kkt, log[-1, COST])
+        log, (values, constraints, multipliers) = self._log[:count].copy(), self._parts
+        heads, last, number = log[:, :NUMBERED].tolist(), log[-1], len(run.history) - 1
+        measured = read_numbers(work.kkt, heads[-1][COST])
         if not measured.holds(run.tolerance):
-            for number, row in zip(_numbers(run, log), log[:-1], strict=False):
-                values, constraints, multipliers = row[stored : ends[0]], row[ends[0] : ends[1]], row[ends[1] :]
-                run.pass_by(number, row[VIOLATION], row[COST], constraints, values, multipliers)
+            for head, row in zip(heads[:-1], log, strict=False):
+                number += int(head[SHOWN])  # what is not shown takes the place of the one before
+                run.pass_by(
+                    number, head[VIOLATION], head[COST], row[constraints], row[values], row[multipliers]
+                )
         if self.pending and answer != SOLVE:  # there is a trial in the place of the iterate
-            lin = program.linearize(program.columns.view(log[-1, stored : ends[0]]))
+            lin = program.linearize(program.columns.view(last[values]))
         else:
-            lin = self._answer.copied(float(log[-1, COST]))
+            lin = self._answer.copied(heads[-1][COST])
         self._present, self._reached = (lin, None) if self.pending else (None, lin)
         run.see(work.steepest_jacobian, work.steepest_gradient)
         history = partial(_history, program, run.history, log, run.seconds)
-        run.conclude(lin, log[-1, ends[1] :], now["iteration"], history, measured, run.slopes)
+        run.conclude(lin, last[multipliers], now["iteration"], history, measured, run.slopes)
         if run.status is None:
             run.go_on()
-        return [row[VIOLATION] for row in log if row[BEGUN]]
+        return [head[VIOLATION] for head in heads if head[BEGUN]]
 
     def on_graph(self) -> tuple[QPAnswer, bool]:
         """Solve the subproblem on the graph and go on; false where another route has to look at the answer first.
@@ -271,12 +276,6 @@ def _history(program: CompiledProblem, known: list[Iteration], log: Array, secon
         norms = program.norms(sizes, heights)
         made.append(Iteration(len(made), *numbers, taken, norms, details if made else {}))
     return made
-
-
-def _numbers(run: SolveState, log: Array) -> list[int]:
-    """Numbers of the iterates in the log, of which those that are not shown take the place of the one before."""
-    first = len(run.history) - 1
-    return [first + int(k) for k in np.cumsum(log[:, SHOWN])]
 
 
 def _empty(program: CompiledProblem) -> Work:

@@ -70,6 +70,7 @@ class CompiledProblem:
         normal: pattern of the Gauss-Newton Hessian of the objective plus A'A.
         blocks: (size,) the variable that every unknown belongs to.
         lower, upper: (M,) limits with the present data.
+        equality, sided: (M,) whether a row's are the same, and whether those of some row are not.
         cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
         slices: rows of each constraint term.
         places: name, rows and shape of each constraint term.
@@ -249,6 +250,7 @@ class CompiledProblem:
             name, index = self.row_name(int(crossed[0]))
             raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
         self.equality = self.lower == self.upper
+        self.sided = not self.equality.all()
 
     def values_from(self, guess: Mapping[Family, ArrayLike] | Array) -> Values:
         """Copy and check a guess, by families or as it is stored, and give fixed variables their values.

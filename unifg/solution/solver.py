@@ -339,9 +339,9 @@ class SolveState:
         """Make an iterate the present one; a ``candidate`` may be returned if the solve ends without success."""
         self.lin, self._values, self.multipliers, self.optimality = lin, None, multipliers, measured
         if measured.violation < self._least:
-            self._least, self._least_at = measured.violation, lin.values.flat
+            self._least, self._least_at = measured.violation, lin.stored
         if candidate and measured.finite:
-            self.consider(lin.cost, lin.constraints.copy(), lin.values.flat, multipliers)
+            self.consider(lin.cost, lin.constraints.copy(), lin.stored, multipliers)
 
     def pass_by(
         self, number: int, violation: float, cost: float, constraints: Array, values: Array, multipliers: Array
@@ -545,7 +545,7 @@ class SolveState:
         if not self.incumbents:  # a success of the method that the KKT test does not confirm
             return self.iterations
         best = self.incumbents.best
-        if best.values is not self.values.flat or best.multipliers is not self.multipliers:
+        if best.values is not self.lin.stored or best.multipliers is not self.multipliers:
             self._move(self.program.linearize(self.program.columns.view(best.values)), best.multipliers)
         return best.number
 
