@@ -18,7 +18,6 @@ from unifg.solvers.quadratic_programs.routes import RESTING
 from unifg.solvers.quadratic_programs.subproblem import LEFT, QPAnswer, subproblem
 from unifg.typing import Array
 
-
 TOLERANCE = 1e-6
 
 

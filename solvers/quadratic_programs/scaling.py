@@ -137,9 +137,7 @@ class Patterns(NamedTuple):
     def of(cls, program: CompiledProblem, pattern: Symmetric) -> Patterns:
         """Those of a program, with the Hessian's own."""
         rows = program.constraints
-        return cls(
-            pattern.indptr, pattern.indices, rows.free, rows.free_rows, rows.free_columns, program.bound_rows
-        )
+        return cls(pattern.indptr, pattern.indices, rows.free, rows.free_rows, rows.free_columns, program.bound_rows)
 
 
 class Packed(NamedTuple):
@@ -223,9 +221,7 @@ def equilibrate(program: CompiledProblem, pattern: Symmetric, hessian: Array, ja
 
 
 @compiled
-def find_units(
-    patterns: Patterns, hessian: Array, jacobian: Array, column_factors: Array, row_factors: Array
-) -> bool:
+def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_factors: Array, row_factors: Array) -> bool:
     """Write factors by Ruiz' passes, and rounding; true where no factor, but for those of bounds, is large or small.
 
     Entries that are not finite do not count.

@@ -191,9 +191,7 @@ class Steps:
         if not measured.holds(run.tolerance):
             for head, row in zip(heads[:-1], log, strict=False):
                 number += int(head[SHOWN])  # what is not shown takes the place of the one before
-                run.pass_by(
-                    number, head[VIOLATION], head[COST], row[constraints], row[values], row[multipliers]
-                )
+                run.pass_by(number, head[VIOLATION], head[COST], row[constraints], row[values], row[multipliers])
         if self.pending and answer != SOLVE:  # there is a trial in the place of the iterate
             lin = program.linearize(program.columns.view(last[values]))
         else:
@@ -269,12 +267,16 @@ def _history(program: CompiledProblem, known: list[Iteration], log: Array, secon
     """Rows of a solve, those ``known`` before the log, which was read ``seconds`` after the solve began."""
     made, terms = list(known), len(program.arrays.fields)
     for row in log[log[:, SHOWN] == 1.0]:
-        sizes, heights = np.split(row[NUMBERED : NUMBERED + terms + program.table.scalars], [terms])
-        details: dict[str, Any] = {"qp": "graph", "qp_iterations": int(row[ITERATIONS]), "damping": float(row[DAMPING])}
-        taken = seconds - float(log[-1, SECONDS] - row[SECONDS])
-        numbers = row[COST : LENGTH + 1].tolist()
-        norms = program.norms(sizes, heights)
-        made.append(Iteration(len(made), *numbers, taken, norms, details if made else {}))
+        head, (sizes, heights) = (
+            row.tolist(),
+            np.split(row[NUMBERED : NUMBERED + terms + program.table.scalars], [terms]),
+        )
+        head = row[:NUMBERED].tolist()
+        cost, stationarity, violation, complementarity, size, length = head[COST : LENGTH + 1]
+        taken, norms = seconds - (log[-1, SECONDS] - head[SECONDS]), program.norms(sizes, heights)
+        details: dict[str, Any] = {"qp": "graph", "qp_iterations": int(head[ITERATIONS]), "damping": head[DAMPING]}
+        kkt = stationarity, violation, complementarity
+        made.append(Iteration(len(made), cost, *kkt, size, length, float(taken), norms, details if made else {}))
     return made
 
 

@@ -22,7 +22,8 @@ def clip(values: Array, places: IntArray, rows: IntArray, lower: Array, upper: A
         values: stored ones.
         places: (B,) of those with a bound.
         rows: (B,) constraint row of each.
-        lower, upper: (M,) limits.
+        lower: (M,) limits.
+        upper: the same.
     """
     for k in range(len(places)):
         value, row = values[places[k]], rows[k]
