@@ -7,6 +7,10 @@ step. The Hessian is that of Gauss-Newton or of the Lagrangian (:mod:`unifg.solv
 or the second where the first creeps: a constraint that bends as much as what it is weighed against, as the distance
 from a small sphere does, makes Gauss-Newton's steps converge linearly, by a few percent each at worst.
 ``max_iterations=1`` is the real-time iteration.
+
+A solve whose terms are all compiled begins in compiled code, and with ``qp="graph"`` goes on there from step to step
+(:mod:`unifg.solvers.quadratic_programs.loop`). :meth:`SQP.iterate` does what is unusual, and all of a solve that
+somebody watches or that has a time limit.
 """
 
 from __future__ import annotations
@@ -121,9 +125,8 @@ class SQP(Solver):
         program, steps, watch, failures = run.program, workspace.steps, RestorationTrigger(), 0
         now, turning = steps.now, self.hessian == "auto" and self.time_limit == np.inf and self.qp != "elimination"
         alone = program.sided and (run.alone or (not run.watched and self._known(program)))
-        steps.prepare(self.tolerance, self.full_steps, self.second_order_correction)
-        now["step_tolerance"], now["violation_tolerance"] = self.step_tolerance, self.violation_tolerance
-        now["limit"] = self.max_iterations
+        rule = self.step_tolerance, self.violation_tolerance
+        steps.prepare(self.tolerance, self.full_steps, self.second_order_correction, self.max_iterations, rule)
         if run.alone:
             workspace.begin()
             budget = _budget(watch, 1 if turning else 0) if alone and workspace.compiled else 0
@@ -187,8 +190,8 @@ class SQP(Solver):
                 **({"correction": 1} if now["corrected"] == 1 else {}),
                 **({"hessian": _kind(qp, answer)} if qp is not None else {}),
             )
-            if rests(now["size"], run.optimality.violation, self.step_tolerance, self.violation_tolerance):
-                now["answer"] = STOPPED
+            if run.status is None and rests(now["size"], run.optimality.violation, *rule):
+                return Status.STOP_RULE
         return None
 
     def _begin(self, run: SolveState, workspace: Subproblems) -> None:

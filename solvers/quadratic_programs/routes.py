@@ -95,19 +95,19 @@ class Subproblems:
         return self._curved
 
     def start(self, lin: Linearization) -> None:
-        """Begin a new solve at ``lin``, in units that suit it.
+        """Begin a new solve at ``lin``, in units that suit it; errors as of :meth:`begin`."""
+        self.begin()
+        if self.scaled:
+            self.scaling = Scaling.of(self.program, lin, self._neutral)
+
+    def begin(self) -> None:
+        """Begin a new solve in the graph's units: the first route is trusted again, nothing of the last one is left.
 
         Raises:
             BackendError: when new data made inequalities that the first route cannot take.
         """
-        self.begin()
-        if self.scaled:
-            self.scaling = Scaling.of(self.program, lin, self._neutral)
         if self.first.name == "elimination":
             require(self.program, "SQP(qp='elimination')", "equalities")
-
-    def begin(self) -> None:
-        """Begin a new solve in the graph's units: the first route is trusted again, nothing of the last one is left."""
         self._misses = self._resting = 0
         self.scaling = self._neutral
         for route in (self.first, self.fallback, self.elastic):

@@ -105,8 +105,23 @@ class Steps:
         self._words = arrays.describe((self._problem, self.work))
         self._address = self._words.ctypes.data
 
-    def prepare(self, tolerance: float, full_steps: bool, correcting: bool) -> None:
-        """Begin a solve with the present data."""
+    def prepare(
+        self,
+        tolerance: float,
+        full_steps: bool,
+        correcting: bool,
+        limit: int = 0,
+        stop: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Begin a solve with the present data.
+
+        Args:
+            tolerance: of the KKT test.
+            full_steps: whether every step is taken in full.
+            correcting: whether to ask for second-order corrections.
+            limit: iterations before giving up.
+            stop: norm of a step, and violation, below which to stop.
+        """
         program, now = self.program, self.now
         if program.equality is not self._held:  # which is a new array when limits have changed
             if not np.array_equal(program.equality, self._problem.equality):
@@ -114,7 +129,8 @@ class Steps:
             self._held = program.equality
         now["assisted"] = self._assisted = program.large or not program.fully_compiled
         now["tolerance"], now["least_squares"] = tolerance, program.least_squares
-        now["full_steps"], now["correcting"], now["logged"], self.pending = full_steps, correcting, 0, False
+        now["full_steps"], now["correcting"], now["limit"], self.pending = full_steps, correcting, limit, False
+        now["step_tolerance"], now["violation_tolerance"] = stop
 
     def start(self, scaling: Scaling, lin: Linearization, multipliers: Array) -> None:
         """Begin at ``lin`` with nothing learned, with the penalties that the multipliers suggest."""
@@ -267,10 +283,7 @@ def _history(program: CompiledProblem, known: list[Iteration], log: Array, secon
     """Rows of a solve, those ``known`` before the log, which was read ``seconds`` after the solve began."""
     made, terms = list(known), len(program.arrays.fields)
     for row in log[log[:, SHOWN] == 1.0]:
-        head, (sizes, heights) = (
-            row.tolist(),
-            np.split(row[NUMBERED : NUMBERED + terms + program.table.scalars], [terms]),
-        )
+        sizes, heights, _ = np.split(row[NUMBERED:], [terms, terms + program.table.scalars])
         head = row[:NUMBERED].tolist()
         cost, stationarity, violation, complementarity, size, length = head[COST : LENGTH + 1]
         taken, norms = seconds - (log[-1, SECONDS] - head[SECONDS]), program.norms(sizes, heights)
