@@ -7,6 +7,10 @@ step. The Hessian is that of Gauss-Newton or of the Lagrangian (:mod:`unifg.solv
 or the second where the first creeps: a constraint that bends as much as what it is weighed against, as the distance
 from a small sphere does, makes Gauss-Newton's steps converge linearly, by a few percent each at worst.
 ``max_iterations=1`` is the real-time iteration.
+
+A solve whose terms are all compiled begins in compiled code, and with ``qp="graph"`` goes on there from step to step
+(:mod:`unifg.solvers.quadratic_programs.loop`). :meth:`SQP.iterate` does what is unusual, and all of a solve that
+somebody watches or that has a time limit.
 """
 
 from __future__ import annotations
@@ -23,19 +27,15 @@ from unifg.solution.capabilities import require
 from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import RestorationTrigger, leave, resume, settle
-from unifg.solvers.globalize.norms import largest, norm, total
-from unifg.solvers.globalize.slow_convergence import converges_slowly
+from unifg.solvers.globalize.norms import largest
+from unifg.solvers.globalize.slow_convergence import PATIENCE, converges_slowly
+from unifg.solvers.quadratic_programs.attempt import LOGGED, SMALLEST_DAMPING, STARTED, STOPPED
+from unifg.solvers.quadratic_programs.loop import kkt_size, rests, useful_accuracy
 from unifg.solvers.quadratic_programs.routes import Subproblems
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
 from unifg.typing import Array
 
 FAILURES = 4  # damped attempts at one step before giving up
-FIRST_DAMPING = 1e-3
-DAMPING_GROWTH = 10.0
-DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and damped steps
-SECANT_DECAY = 0.3  # of curvature that was seen along an earlier step
-EXACT_DECAY = 0.1  # with the exact Hessian nothing is left to cycle about
-SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
 
 @dataclass(kw_only=True)
@@ -92,6 +92,15 @@ class SQP(Solver):
         if self.qp == "elimination":
             require(program, f"{self.name}(qp='elimination')", "equalities")
 
+    def runs_alone(self, program: CompiledProblem) -> bool:
+        """Test whether the compiled loop may begin the solve, and go on where it is the graph that answers."""
+        return self._known(program) and not len(program.fixed_rows())
+
+    def _known(self, program: CompiledProblem) -> bool:
+        """Test whether compiled code knows all that an iterate is judged by."""
+        python = program.large or program.differenced or program.least_squares
+        return program.fully_compiled and self.time_limit == np.inf and not python
+
     def workspace(self, program: CompiledProblem) -> Subproblems:
         """QP workspaces."""
         return Subproblems(
@@ -113,25 +122,41 @@ class SQP(Solver):
 
     def iterate(self, run: SolveState, workspace: Subproblems) -> Status | None:
         """Iterate to convergence."""
-        # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
-        program = run.program
-        if not self.full_steps and program.violation(run.lin.constraints)[program.bound_rows].any():
-            run.begin_at(program.linearize(program.within_bounds(run.values)))
-        self._begin(run, workspace)
-        damping, missing = SMALLEST_DAMPING, 0.0
-        failures = 0
-        watch = RestorationTrigger()
-        turning = self.hessian == "auto" and self.time_limit == np.inf and self.qp != "elimination"
+        program, steps, watch, failures = run.program, workspace.steps, RestorationTrigger(), 0
+        now, turning = steps.now, self.hessian == "auto" and self.time_limit == np.inf and self.qp != "elimination"
+        alone = program.sided and (run.alone or (not run.watched and self._known(program)))
+        rule = self.step_tolerance, self.violation_tolerance
+        steps.prepare(self.tolerance, self.full_steps, self.second_order_correction, self.max_iterations, rule)
+        if run.alone:
+            workspace.begin()
+            budget = _budget(watch, 1 if turning else 0) if alone and workspace.compiled else 0
+            _noted(run, workspace, watch, 1, steps.begin_alone(run, budget, workspace.scaled))
+        else:
+            # Bounds are linear: once they hold they hold along every step, and leave the line search to the rest.
+            if not self.full_steps and program.violation(run.lin.constraints)[program.bound_rows].any():
+                run.begin_at(program.linearize(program.within_bounds(run.values)))
+            now["answer"] = STARTED
+        if now["answer"] == STARTED and run.status is None:
+            self._begin(run, workspace)
         while run.status is None:
-            if turning and converges_slowly(run.history):
-                turning, workspace = False, workspace.curved()
-                self._begin(run, workspace)
-                damping, missing = SMALLEST_DAMPING, 0.0
-            if watch.calls(run) and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
-                return Status.LOCALLY_INFEASIBLE
-            if run.status is not None:
-                break
-            shift = max(damping, missing)
+            if now["answer"] == STOPPED:
+                return Status.STOP_RULE
+            if not steps.pending:
+                if turning and converges_slowly(run.history):
+                    turning, workspace = False, workspace.curved()
+                    self._begin(run, workspace)
+                calls = watch.calls(run.optimality.violation, run.tolerance)
+                if calls and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
+                    return Status.LOCALLY_INFEASIBLE
+                if run.status is not None:
+                    break
+                if alone and workspace.compiled:
+                    rows = len(run.history)
+                    begun = steps.go_on_alone(run, _budget(watch, rows if turning else 0))
+                    failures = 0 if _noted(run, workspace, watch, rows, begun) else failures
+                    if not steps.pending:
+                        continue
+            shift = max(now["next_damping"], now["missing"])
             shift = _bounded(run, workspace, shift) if failures == 0 else shift
             qp = workspace.subproblem(run.lin, run.multipliers, shift) if workspace.exact else None
             answer = self._attempt(run, workspace, shift, qp)
@@ -146,37 +171,33 @@ class SQP(Solver):
                 continue
             if answer is None:
                 failures += 1
-                damping = max(100.0 * damping, 1e-4)
+                now["next_damping"] = max(100.0 * now["next_damping"], 1e-4)
                 if failures == FAILURES:
                     if (ending := resume(run, Status.STALLED)) is not None:
                         return ending
-                    failures, damping, missing = 0, SMALLEST_DAMPING, 0.0
+                    failures = 0
                     self._begin(run, workspace)
                 continue
-            failures, now = 0, workspace.steps.now
-            missing = max(now["missing"], SECANT_DECAY * missing) if qp is None or qp.curved_by is None else 0.0
-            length, size = now["length"], norm(workspace.steps.work.taken)
+            failures = 0
             run.accept(
-                workspace.steps.reached(),
-                workspace.steps.work.multipliers.copy(),
-                size,
-                length,
+                steps.reached(),
+                steps.work.multipliers.copy(),
+                now["size"],
+                now["length"],
                 qp=answer.route,
                 qp_iterations=answer.iterations,
                 damping=shift,
                 **({"correction": 1} if now["corrected"] == 1 else {}),
                 **({"hessian": _kind(qp, answer)} if qp is not None else {}),
             )
-            if run.status is None and size < self.step_tolerance:
-                if run.optimality.violation < self.violation_tolerance:
-                    return Status.STOP_RULE
-            damping = _next_damping(workspace.exact, damping, length)
+            if run.status is None and rests(now["size"], run.optimality.violation, *rule):
+                return Status.STOP_RULE
         return None
 
     def _begin(self, run: SolveState, workspace: Subproblems) -> None:
         """Begin at the present iterate, with nothing learned."""
         workspace.start(run.lin)
-        workspace.steps.start(workspace.scaling, run.lin, run.multipliers, self.tolerance)
+        workspace.steps.start(workspace.scaling, run.lin, run.multipliers)
 
     def _attempt(self, run: SolveState, workspace: Subproblems, shift: float, qp: QP | None) -> QPAnswer | None:
         """Solve the subproblem and search along its step; None when there is no answer or no length helps.
@@ -184,8 +205,9 @@ class SQP(Solver):
         Without ``qp`` the subproblem is Gauss-Newton's, and is put together where it is looked at.
         """
         steps, accuracy = workspace.steps, self._accuracy(run, workspace)
-        steps.pose(run.lin, run.multipliers, shift, accuracy, self.full_steps, self.second_order_correction)
-        answer, good = steps.on_graph() if qp is None and workspace.compiled and steps.sided else (None, False)
+        curved = qp is not None and qp.curved_by is not None
+        steps.pose(run.lin, run.multipliers, shift, accuracy, workspace.exact, curved)
+        answer, good = steps.on_graph() if qp is None and workspace.compiled and run.program.sided else (None, False)
         if good:
             workspace.answered()
         else:
@@ -203,11 +225,30 @@ class SQP(Solver):
         return answer if steps.taken(correct) else None
 
     def _accuracy(self, run: SolveState, workspace: Subproblems) -> float:
-        """Ask the QP for what the outer iteration can use."""
-        size = _size(run, workspace)
-        share = min(1e-3, size) if workspace.exact else 1e-3
-        # Where a scaled unit is worth many of the graph's, the test of the graph needs more digits.
-        return min(max(share * size, 0.1 * self.tolerance * workspace.scaling.smallest), 1e-4)
+        """Accuracy to ask of the QP."""
+        return useful_accuracy(workspace.exact, _size(run, workspace), self.tolerance, workspace.scaling.smallest)
+
+
+def _budget(watch: RestorationTrigger, rows: int) -> int:
+    """Steps until Python's rules may ask for something, which need ``rows`` of the history; 0 where none does."""
+    return max(1, min(watch.left, LOGGED - 2, PATIENCE + 1 - rows if rows else LOGGED))
+
+
+def _noted(run: SolveState, workspace: Subproblems, watch: RestorationTrigger, rows: int, begun: list[float]) -> bool:
+    """Take note of what a compiled loop has done since there were ``rows``; whether it has taken a step.
+
+    Args:
+        run: the solve.
+        workspace: its subproblems, which the graph has answered.
+        watch: sees the iterates, for which it would not have called.
+        rows: of the history before; at least that of the start.
+        begun: violations of those from which another step was looked for.
+    """
+    for violation in begun:
+        watch.calls(violation, run.tolerance)
+    if stepped := run.iterations >= rows:
+        workspace.answered()
+    return stepped
 
 
 def _bounded(run: SolveState, workspace: Subproblems, damping: float) -> float:
@@ -215,19 +256,11 @@ def _bounded(run: SolveState, workspace: Subproblems, damping: float) -> float:
     return max(min(damping, _size(run, workspace)), SMALLEST_DAMPING) if workspace.exact else damping
 
 
-def _next_damping(exact: bool, damping: float, length: float) -> float:
-    """A shortened step means curvature that H does not know: damp, and forget it slowly."""
-    if length < 1.0:
-        return max(DAMPING_GROWTH * damping, FIRST_DAMPING)
-    return max((EXACT_DECAY if exact else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
-
-
 def _size(run: SolveState, workspace: Subproblems) -> float:
     """The largest KKT number of the present iterate, in scaled units."""
     program, scaling, measured = run.program, workspace.scaling, run.optimality
     if scaling.neutral:
-        scale = max(1.0, total(run.multipliers) / max(len(run.multipliers), 1) / 100.0)
-        return max(scale * measured.stationarity, measured.violation, measured.complementarity)
+        return kkt_size(*measured[:3], run.multipliers)
     gradient = program.lagrangian_gradient(run.lin, run.multipliers)[program.columns.free]
     return max(
         largest(scaling.columns * gradient),

@@ -13,40 +13,36 @@ from problems.known import short_drive
 from unifg.solvers import SQP
 from unifg.solvers.globalize.feasibility_restoration import FALLING, PATIENCE, RestorationTrigger
 from unifg.solvers.globalize.slow_convergence import converges_slowly
-from unifg.solvers.quadratic_programs.attempt import highest_price, raise_prices
+from unifg.solvers.quadratic_programs.attempt import highest_price, next_damping, raise_prices
 from unifg.solvers.quadratic_programs.routes import RESTING
 from unifg.solvers.quadratic_programs.subproblem import LEFT, QPAnswer, subproblem
-from unifg.solvers.sqp import _next_damping
 from unifg.typing import Array
 
-
-def seen(violation: float) -> Any:
-    """A run whose iterate violates its constraints by so much."""
-    return SimpleNamespace(optimality=SimpleNamespace(violation=violation), tolerance=1e-6)
+TOLERANCE = 1e-6
 
 
 def test_a_violation_that_does_not_fall_is_looked_at_ever_more_seldom() -> None:
     watch = RestorationTrigger()
-    assert not watch.calls(seen(1.0))
-    calls = [watch.calls(seen(1.0)) for _ in range(7 * PATIENCE)]
+    assert not watch.calls(1.0, TOLERANCE)
+    calls = [watch.calls(1.0, TOLERANCE) for _ in range(7 * PATIENCE)]
     assert [k + 1 for k, called in enumerate(calls) if called] == [PATIENCE, 3 * PATIENCE, 7 * PATIENCE]
 
 
 @pytest.mark.parametrize("violation", [0.9 * FALLING, 1e-7])
 def test_a_violation_that_falls_or_is_none_begins_the_wait_anew(violation: float) -> None:
     watch = RestorationTrigger()
-    watch.calls(seen(1.0))
-    assert not any(watch.calls(seen(1.0)) for _ in range(PATIENCE - 1))
-    assert not watch.calls(seen(violation))
-    assert not any(watch.calls(seen(1.0)) for _ in range(PATIENCE - 1))
-    assert watch.calls(seen(1.0))
+    watch.calls(1.0, TOLERANCE)
+    assert not any(watch.calls(1.0, TOLERANCE) for _ in range(PATIENCE - 1))
+    assert not watch.calls(violation, TOLERANCE)
+    assert not any(watch.calls(1.0, TOLERANCE) for _ in range(PATIENCE - 1))
+    assert watch.calls(1.0, TOLERANCE)
 
 
 def test_falling_by_little_at_a_time_is_not_falling() -> None:
     watch, violation = RestorationTrigger(), 1.0
-    watch.calls(seen(violation))
+    watch.calls(violation, TOLERANCE)
     shrinking = violation * 0.999 ** np.arange(PATIENCE)
-    assert [watch.calls(seen(float(value))) for value in shrinking][-1]
+    assert [watch.calls(float(value), TOLERANCE) for value in shrinking][-1]
 
 
 def line(limit: float = -1.0) -> tuple[fg.Graph, fg.Family]:
@@ -119,8 +115,8 @@ def test_a_solve_creeps_where_ten_iterations_leave_a_tenth_after_twenty(pace: fl
 
 
 def test_damping_grows_with_shortened_steps_and_fades_with_full_ones() -> None:
-    first = _next_damping(False, 1e-12, 0.5)
-    assert _next_damping(False, first, 0.25) > 2.0 * first
-    fading = _next_damping(False, first, 1.0)
+    first = next_damping(False, 1e-12, 0.5)
+    assert next_damping(False, first, 0.25) > 2.0 * first
+    fading = next_damping(False, first, 1.0)
     assert 0.05 * first < fading < first
-    assert _next_damping(True, first, 1.0) < fading, "or convergence would be linear"
+    assert next_damping(True, first, 1.0) < fading, "or convergence would be linear"

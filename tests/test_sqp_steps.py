@@ -63,8 +63,9 @@ def test_missing_curvature_by_hand() -> None:
     def seen(multiplier: float, step: Array, unit: float) -> float:
         """Missing curvature, by an attempt that takes the step with this multiplier whatever the merit says."""
         steps, dual = Steps(program), np.array([multiplier])
-        steps.start(Scaling(program, np.full(2, unit), np.ones(1)), before, dual, 1e-6)
-        steps.pose(before, dual, 0.7, 1e-6, True, False)
+        steps.prepare(1e-6, True, False)
+        steps.start(Scaling(program, np.full(2, unit), np.ones(1)), before, dual)
+        steps.pose(before, dual, 0.7, 1e-6, False, False)
         steps.along(QPAnswer(step, dual, "by hand", 1, 0.0))
         assert steps.taken(lambda bend: None)
         return float(steps.now["missing"])

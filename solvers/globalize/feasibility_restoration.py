@@ -174,10 +174,14 @@ class RestorationTrigger:
         self._patience, self._waited = PATIENCE, 0
         self._least = np.inf
 
-    def calls(self, run: SolveState) -> bool:
+    @property
+    def left(self) -> int:
+        """Iterations that may follow before it can be time, at least one."""
+        return self._patience - self._waited
+
+    def calls(self, violation: float, tolerance: float) -> bool:
         """Test whether it is time; asked once an iteration, and after every call half as often."""
-        violation = run.optimality.violation
-        if violation <= run.tolerance or violation < FALLING * self._least:
+        if violation <= tolerance or violation < FALLING * self._least:
             self._least, self._waited = min(violation, self._least), 0
             return False
         self._waited += 1

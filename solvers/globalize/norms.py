@@ -10,12 +10,13 @@ from unifg.codegen.jit import compiled
 from unifg.typing import Array
 
 
+@compiled
 def norm(step: Array) -> float:
     """Euclidean norm, without waking the threads of a BLAS, and of steps whose squares overflow too."""
     squares = _squares(step)
     if 1e-200 < squares < 1e200:
         return math.sqrt(squares)
-    size = largest(step)
+    size = _largest(step)
     return size if not 0.0 < size < np.inf else size * math.sqrt(_squares(step / size))
 
 

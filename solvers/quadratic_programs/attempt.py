@@ -22,9 +22,12 @@ from unifg.codegen.loops import copy_to, dot
 from unifg.problem.evaluation import times, transposed_times
 from unifg.problem.linearization import all_finite
 from unifg.problem.table import TermArrays
+from unifg.solution.optimality import NUMBERS
 from unifg.solvers.globalize.line_search import SHORTEST
 from unifg.solvers.globalize.merit import ARMIJO
+from unifg.solvers.globalize.norms import norm
 from unifg.solvers.quadratic_programs.graph_route import PATIENCE, TIGHTEST, Stacked, list_sides, multiply
+from unifg.solvers.quadratic_programs.scaling import Patterns
 from unifg.solvers.quadratic_programs.subproblem import leaves_most
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -58,13 +61,34 @@ NOW = np.dtype(
         ("slope", np.float64),  # bound of its derivative along the step
         ("slack", np.float64),  # what counts as rounding
         ("length", np.float64),  # share of the step under trial
-        ("missing", np.float64),  # curvature seen along the step that the Hessian lacked
+        ("size", np.float64),  # norm of the step as taken
+        ("missing", np.float64),  # curvature seen along the last steps that the Hessian lacked
+        ("next_damping", np.float64),  # that the lengths of the last steps suggest
+        ("exact", np.int64),  # whether Hessians are those of the Lagrangian
+        ("curved", np.int64),  # whether that of the present subproblem is
+        ("alone", np.int64),  # whether to go on after a step: what follows is for that
+        ("budget", np.int64),  # steps after which Python has a look
+        ("iteration", np.int64),
+        ("limit", np.int64),  # iterations before giving up
+        ("logged", np.int64),  # iterates in the log
+        ("scaling", np.int64),  # whether units may be needed
+        ("step_tolerance", np.float64),
+        ("violation_tolerance", np.float64),
+        ("clock", np.int64),  # address of the clock, 0 for none
     ]
 )
 # What a call answers.
-TAKEN, REFUSED, SOLVE, CORRECT, EVALUATE, LINEARIZE = range(6)
+TAKEN, REFUSED, SOLVE, CORRECT, EVALUATE, LINEARIZE, STARTED, STOPPED = range(8)
 # Where it goes on then.
-POSED, SOLVED, AIMED, EVALUATED, LINEARIZED, MISSED = range(6)
+POSED, SOLVED, AIMED, EVALUATED, LINEARIZED, MISSED, UNBEGUN = range(7)
+LOGGED = 24  # iterates that the log holds
+
+FIRST_DAMPING = 1e-3
+DAMPING_GROWTH = 10.0
+DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and damped steps
+SECANT_DECAY = 0.3  # of curvature that was seen along an earlier step
+EXACT_DECAY = 0.1  # with the exact Hessian nothing is left to cycle about
+SMALLEST_DAMPING = 1e-9  # keeps H positive definite without showing in the step
 
 
 class Problem(NamedTuple):
@@ -81,6 +105,9 @@ class Problem(NamedTuple):
         fixed: places of stored values that stay.
         fixed_values: what they are.
         scratch: memory of the loops over terms.
+        bounded: places of stored values with a bound.
+        bounds: the row of each of them.
+        units: patterns that units are found from.
     """
 
     links: IntArray
@@ -93,10 +120,13 @@ class Problem(NamedTuple):
     fixed: IntArray
     fixed_values: Array
     scratch: Array
+    bounded: IntArray
+    bounds: IntArray
+    units: Patterns
 
 
-LINKED = ("minimize", "retract", "evaluate", "evaluate_scalars", "linearize", "add_scalars")
-MINIMIZE, RETRACT, VALUE, SCALARS, LINEAR, ADD_SCALARS = range(len(LINKED))
+LINKED = ("minimize", "retract", "evaluate", "evaluate_scalars", "linearize", "add_scalars", "find_units")
+MINIMIZE, RETRACT, VALUE, SCALARS, LINEAR, ADD_SCALARS, FIND_UNITS = range(len(LINKED))
 
 
 class Work(NamedTuple):
@@ -118,6 +148,9 @@ class Work(NamedTuple):
         trial: stored values of a trial.
         residual, next_constraints, squares, heights: there; all as in a linearisation.
         jacobian, next_jacobian, next_gradient, next_hessian, next_weights, norms, concavity: there, where it is taken.
+        kkt: numbers of the iterate that was logged last, as the outside judge has them.
+        steepest_jacobian, steepest_gradient: largest derivatives at iterates that were logged.
+        log: iterates of a loop that runs alone, see :mod:`unifg.solvers.quadratic_programs.loop`.
     """
 
     scalars: Annotated[Records, NOW, 1]
@@ -152,6 +185,10 @@ class Work(NamedTuple):
     norms: Annotated[Array, "terms"]
     heights: Annotated[Array, "general"]
     concavity: Annotated[Array, "concave"]
+    kkt: Annotated[Array, NUMBERS]
+    steepest_jacobian: Annotated[Array, "row_entries"]
+    steepest_gradient: Annotated[Array, "width"]
+    log: Annotated[Array, "log"]
 
 
 def empty_work(**sizes: int) -> Work:
@@ -208,7 +245,7 @@ def attempt(problem: Problem, work: Work) -> None:
                 if now.assisted == 1:
                     now.answer, now.stage = LINEARIZE, LINEARIZED
                     return
-                _linearize(problem, work)
+                linearize(problem, work)
         if stage == LINEARIZED:
             stage = MISSED
             sound = math.isfinite(now.next_cost) and all_finite(work.next_gradient)
@@ -356,7 +393,7 @@ def _evaluate(problem: Problem, work: Work) -> None:
 
 
 @compiled
-def _linearize(problem: Problem, work: Work) -> None:
+def linearize(problem: Problem, work: Work) -> None:
     """Linearise where the trial is."""
     now, links, terms = work.scalars[0], problem.links, problem.terms
     work.next_gradient[:] = 0.0
@@ -376,7 +413,7 @@ def _linearize(problem: Problem, work: Work) -> None:
 
 @compiled
 def _take(problem: Problem, work: Work) -> None:
-    """Multipliers at the end of the step, and the curvature that the Hessian lacked along it."""
+    """Multipliers at the end of the step, and what it says about the Hessian of the next one."""
     now, terms = work.scalars[0], problem.terms
     for row in range(len(work.multipliers)):
         found = work.bent_dual[row] if now.corrected == 1 else work.dual[row]
@@ -393,7 +430,18 @@ def _take(problem: Problem, work: Work) -> None:
     seen = -now.length * dot(work.linear, work.multipliers)
     for k in range(len(work.taken)):
         seen += work.taken[k] * change[problem.free[k]]
-    now.missing = missing_curvature(seen, dot(work.taken, curved), work.taken, work.columns)
+    lacked = missing_curvature(seen, dot(work.taken, curved), work.taken, work.columns)
+    now.missing = max(lacked, SECANT_DECAY * now.missing) if now.curved == 0 else 0.0
+    now.next_damping = next_damping(now.exact == 1, now.next_damping, now.length)
+    now.size = norm(work.taken)
+
+
+@compiled
+def next_damping(exact: bool, damping: float, length: float) -> float:
+    """A shortened step means curvature that H does not know: damp, and forget it slowly."""
+    if length < 1.0:
+        return max(DAMPING_GROWTH * damping, FIRST_DAMPING)
+    return max((EXACT_DECAY if exact else DAMPING_DECAY) * damping, SMALLEST_DAMPING)
 
 
 @compiled

@@ -46,6 +46,7 @@ class Subproblems:
         pattern: of the Hessians.
         scaling: units in which subproblems are solved, found at the start of each solve.
         tolerance: of the KKT test.
+        scaled: whether that is looked for.
         elastic_asked: whether the last subproblem went to the elastic route.
         steps: what is made of their answers.
     """
@@ -81,7 +82,7 @@ class Subproblems:
         self.elastic = None if fallback is None else _elastic(program, self.pattern)
         self._polish = Polish(program)
         self.steps = Steps(program)
-        self._scaled = scaling and self.first.name != "elimination"
+        self.scaled = scaling and self.first.name != "elimination"
         self.scaling = self._neutral = Scaling.none(program)
         self._misses = self._resting = 0
         self._first_answered = False
@@ -94,19 +95,24 @@ class Subproblems:
         return self._curved
 
     def start(self, lin: Linearization) -> None:
-        """Begin a new solve at ``lin``: the first route is trusted again, and nothing of the last one is left.
+        """Begin a new solve at ``lin``, in units that suit it; errors as of :meth:`begin`."""
+        self.begin()
+        if self.scaled:
+            self.scaling = Scaling.of(self.program, lin, self._neutral)
+
+    def begin(self) -> None:
+        """Begin a new solve in the graph's units: the first route is trusted again, nothing of the last one is left.
 
         Raises:
             BackendError: when new data made inequalities that the first route cannot take.
         """
+        if self.first.name == "elimination":
+            require(self.program, "SQP(qp='elimination')", "equalities")
         self._misses = self._resting = 0
+        self.scaling = self._neutral
         for route in (self.first, self.fallback, self.elastic):
             if route is not None:
                 route.begin()
-        if self._scaled:
-            self.scaling = Scaling.of(self.program, lin, self._neutral)
-        if self.first.name == "elimination":
-            require(self.program, "SQP(qp='elimination')", "equalities")
 
     def subproblem(self, lin: Linearization, multipliers: Array, damping: float) -> QP:
         """The quadratic model at an iterate."""

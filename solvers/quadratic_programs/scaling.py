@@ -55,8 +55,10 @@ class Scaling:
             lin: where.
             neutral: factors of one, to be returned again; new ones by default.
         """
-        columns, rows = equilibrate(program, program.normal, lin.hessian, lin.constraint_jacobian)
-        if not program.least_squares and _modest(columns, rows, program.bound_rows):
+        columns, rows = np.empty(program.size), np.empty(program.constraints.count)
+        patterns = Patterns.of(program, program.normal)
+        modest = find_units(patterns, lin.hessian, lin.constraint_jacobian, columns, rows)
+        if modest and not program.least_squares:
             return neutral or cls.none(program)
         return cls(program, columns, rows)
 
@@ -113,6 +115,29 @@ class Scaling:
         full = np.ones(self.program.columns.width)
         full[self.program.columns.free] = self.columns
         return full
+
+
+class Patterns(NamedTuple):
+    """Patterns of a Hessian and of the constraint Jacobian.
+
+    Attributes:
+        indptr, indices: of the Hessian by columns, upper triangle.
+        free, rows, columns: place in evaluation order, row and unknown of every entry of the Jacobian.
+        of_bounds: (M,) which rows bound an unknown.
+    """
+
+    indptr: IntArray
+    indices: IntArray
+    free: IntArray
+    rows: IntArray
+    columns: IntArray
+    of_bounds: BoolArray
+
+    @classmethod
+    def of(cls, program: CompiledProblem, pattern: Symmetric) -> Patterns:
+        """Those of a program, with the Hessian's own."""
+        rows = program.constraints
+        return cls(pattern.indptr, pattern.indices, rows.free, rows.free_rows, rows.free_columns, program.bound_rows)
 
 
 class Packed(NamedTuple):
@@ -190,29 +215,20 @@ def equilibrate(program: CompiledProblem, pattern: Symmetric, hessian: Array, ja
         hessian: its entries, upper triangle.
         jacobian: entries of A in evaluation order.
     """
-    constraints = program.constraints
-    columns, rows = np.ones(program.size), np.ones(constraints.count)
-    _equilibrate(
-        pattern.indptr, pattern.indices, hessian, constraints.free, constraints.free_rows, constraints.free_columns,
-        program.bound_rows, jacobian, columns, rows,
-    )  # fmt: skip
+    columns, rows = np.empty(program.size), np.empty(program.constraints.count)
+    find_units(Patterns.of(program, pattern), hessian, jacobian, columns, rows)
     return columns, rows
 
 
 @compiled
-def _equilibrate(
-    indptr: IntArray,
-    indices: IntArray,
-    hessian: Array,
-    free: IntArray,
-    rows: IntArray,
-    columns: IntArray,
-    of_bounds: BoolArray,
-    jacobian: Array,
-    column_factors: Array,
-    row_factors: Array,
-) -> None:
-    """Ruiz' passes, and rounding; entries that are not finite do not count."""
+def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_factors: Array, row_factors: Array) -> bool:
+    """Write factors by Ruiz' passes, and rounding; true where no factor, but for those of bounds, is large or small.
+
+    Entries that are not finite do not count.
+    """
+    indptr, indices, free, rows, columns, of_bounds = patterns
+    column_factors[:] = 1.0
+    row_factors[:] = 1.0
     of_columns, of_rows = np.empty(len(column_factors)), np.empty(len(row_factors))
     entries = np.empty(len(indices) + len(free))  # but zeros, which a fixed pattern has many of: those of H, then of A
     firsts, seconds = np.empty(len(entries), dtype=np.int64), np.empty(len(entries), dtype=np.int64)
@@ -257,16 +273,11 @@ def _equilibrate(
     for k in range(len(free)):
         if of_bounds[rows[k]]:
             row_factors[rows[k]] = 1.0 / column_factors[columns[k]]
-
-
-@compiled
-def _modest(columns: Array, rows: Array, of_bounds: BoolArray) -> bool:
-    """Test whether no factor, but for those of bounds, is large or small."""
-    for factor in columns:
+    for factor in column_factors:
         if not 1.0 / MODEST <= factor <= MODEST:
             return False
-    for row in range(len(rows)):
-        if not of_bounds[row] and not 1.0 / MODEST <= rows[row] <= MODEST:
+    for row in range(len(row_factors)):
+        if not of_bounds[row] and not 1.0 / MODEST <= row_factors[row] <= MODEST:
             return False
     return True
 

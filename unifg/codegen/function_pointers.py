@@ -28,15 +28,23 @@ NOTHING, TRUTH, NUMBER, ADDRESS = types.void, types.boolean, types.float64, type
 class _LinkedCache(_Cache):
     """A cache that also asks for what addresses of arrays mean."""
 
+    def __init__(self, dispatcher: Any, arrays: Memory) -> None:
+        super().__init__(dispatcher)
+        self._arrays = arrays
+
     def _variant(self) -> tuple[str, ...]:
-        return *super()._variant(), spelled(memory.kind)
+        return *super()._variant(), spelled(self._arrays.kind)
 
 
-def linked(function: F) -> F:
-    """Compile for calls through an address, by which it finds its arrays."""
-    dispatcher: Any = compiled(function)
-    dispatcher._cache = _LinkedCache(dispatcher)
-    return cast(F, dispatcher)
+def linked_to(arrays: Memory) -> Callable[[F], F]:
+    """Compile for calls with an address, by which the function finds its arrays."""
+
+    def decorate(function: F) -> F:
+        dispatcher: Any = compiled(function)
+        dispatcher._cache = _LinkedCache(dispatcher, arrays)
+        return cast(F, dispatcher)
+
+    return decorate
 
 
 def link(function: Callable[..., Any], result: Any, *arguments: Any) -> int:
@@ -129,6 +137,21 @@ def _words(part: Any) -> list[int]:
 
 
 memory = Memory()
+linked = linked_to(memory)
+
+
+def all_of(arrays: Memory) -> Any:
+    """Function for compiled code: everything that is described at an address."""
+
+    def primitive(typing: Any, where: Any) -> Any:
+        kind = arrays.kind
+
+        def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            return builder.load(builder.inttoptr(values[0], context.get_value_type(kind).as_pointer()))
+
+        return kind(types.int64), generate
+
+    return _primitive(primitive)
 
 
 @_primitive

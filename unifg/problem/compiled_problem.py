@@ -31,7 +31,7 @@ from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
 from unifg.problem.evaluation import LinearArrays
 from unifg.problem.guess import GuessReader
-from unifg.problem.limits import outside
+from unifg.problem.limits import clip, outside
 from unifg.problem.linearization import Evaluation, Linearization, Rows
 from unifg.problem.retraction import Retraction
 from unifg.problem.scalars import add_scalars, evaluate_scalars
@@ -70,6 +70,7 @@ class CompiledProblem:
         normal: pattern of the Gauss-Newton Hessian of the objective plus A'A.
         blocks: (size,) the variable that every unknown belongs to.
         lower, upper: (M,) limits with the present data.
+        equality, sided: (M,) whether a row's are the same, and whether those of some row are not.
         cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
         slices: rows of each constraint term.
         places: name, rows and shape of each constraint term.
@@ -274,6 +275,7 @@ class CompiledProblem:
             name, index = self.row_name(int(crossed[0]))
             raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
         self.equality = self.lower == self.upper
+        self.sided = not self.equality.all()
 
     def values_from(self, guess: Mapping[Family, ArrayLike] | Array) -> Values:
         """Copy and check a guess, by families or as it is stored, and give fixed variables their values.
@@ -394,14 +396,24 @@ class CompiledProblem:
     def within_bounds(self, values: Values) -> Values:
         """The nearest values that respect every bound of an unknown; ``values`` itself when all do."""
         moved = Values(self.columns, values.flat.copy())
-        for term in self.constraint_terms:
-            if not term.is_bound:
-                continue
-            selection = term.gathers[0].selection
-            part = moved[selection.family][selection.indices, selection.storage]
-            moved[selection.family][selection.indices, selection.storage] = np.clip(part, term.lower, term.upper)
+        clip(moved.flat, self.bounded, np.flatnonzero(self.bound_rows), self.lower, self.upper)
         self.retraction.fix(moved)
         return values if np.array_equal(moved.flat, values.flat) else moved
+
+    @cached_property
+    def bounded(self) -> IntArray:
+        """Places of stored values with a bound, in the order of their rows."""
+        places, found = self.columns.view(np.arange(self.columns.stored, dtype=np.float64)), [np.zeros(0)]
+        for term in self.constraint_terms:
+            if term.is_bound:
+                selection = term.gathers[0].selection
+                found.append(places[selection.family][selection.indices, selection.storage].ravel())
+        return np.concatenate(found).astype(np.int64)
+
+    @property
+    def large(self) -> bool:
+        """True if linearising is worth more than one thread."""
+        return self.table.entries + self.table.constraint_entries > WORTH
 
     # ---------------------------------------------------------------- evaluation
 
@@ -482,7 +494,7 @@ class CompiledProblem:
     def _shared(self) -> Shares | None:
         """Shares of the factors for every thread, where that is worth it."""
         count = threads()
-        if count == 1 or self.table.entries + self.table.constraint_entries <= WORTH:
+        if count == 1 or not self.large:
             return None
         if self._shares is None or self._shares.count != count:
             self._shares = Shares(self.table, self.columns.width, self.normal.nnz, count)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -58,7 +59,7 @@ class Snapshot(Linearization):
         self.cost = cost
         self._program, self._flat, self._parts = program, flat, parts
 
-    @property
+    @cached_property
     def stored(self) -> Array:
         """Stored values of all families."""
         return self._flat[self._parts["values"]]
@@ -78,7 +79,7 @@ class Snapshot(Linearization):
     def _made(self, name: str) -> Any:
         program = self._program
         if (part := self._parts.get(name)) is not None:
-            return program.columns.view(self._flat[part]) if name == "values" else self._flat[part]
+            return program.columns.view(self.stored) if name == "values" else self._flat[part]
         if name == "norms":
             return program.norms(self.sizes, self.heights)
         if name == "scalars":

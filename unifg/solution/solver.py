@@ -258,7 +258,7 @@ class SolveState:
         self.incumbents = Incumbents(program)
         self._recall: Callable[[], list[Iteration]] | None = None
         self._least, self._start = np.inf, values
-        self._least_at: Linearization | None = None
+        self._least_at: Array | None = None
         self._values: Values | None
         self.lent: Factored | None = None
         self.slopes: Slopes | None = None
@@ -355,9 +355,23 @@ class SolveState:
         """Make an iterate the present one; a ``candidate`` may be returned if the solve ends without success."""
         self.lin, self._values, self.multipliers, self.optimality = lin, None, multipliers, measured
         if measured.violation < self._least:
-            self._least, self._least_at = measured.violation, lin
+            self._least, self._least_at = measured.violation, lin.stored
         if candidate and measured.finite:
-            self.consider(lin.cost, lin.constraints.copy(), lin.values.flat, multipliers)
+            self.consider(lin.cost, lin.constraints.copy(), lin.stored, multipliers)
+
+    def pass_by(
+        self, number: int, violation: float, cost: float, constraints: Array, values: Array, multipliers: Array
+    ) -> None:
+        """Take note of an iterate that a solve has left behind; all as of :meth:`consider`, finite."""
+        self.iterations = number
+        if violation < self._least:
+            self._least, self._least_at = violation, values
+        self.consider(cost, constraints, values, multipliers)
+
+    def go_on(self) -> None:
+        """Go on with :meth:`accept` after :meth:`conclude`, which has told of a part of the solve only."""
+        assert self._recall is not None
+        self.history, self._recall, self.alone = self._recall(), None, False
 
     def see(self, jacobian: Array, gradient: Array) -> None:
         """Take note of slopes of constraints and cost, as of :class:`unifg.solution.multipliers.Slopes`."""
@@ -430,7 +444,7 @@ class SolveState:
             size = float(np.abs(outside).max(initial=0.0))
             if size < self._least:
                 self._least, self._least_at = size, None
-        return self._start if self._least_at is None else self._least_at.values
+        return self._start if self._least_at is None else self.program.columns.view(self._least_at)
 
     @property
     def values(self) -> Values:
@@ -548,7 +562,7 @@ class SolveState:
         if not self.incumbents:  # a success of the method that the KKT test does not confirm
             return self.iterations
         best = self.incumbents.best
-        if best.values is not self.values.flat or best.multipliers is not self.multipliers:
+        if best.values is not self.lin.stored or best.multipliers is not self.multipliers:
             self._move(self.program.linearize(self.program.columns.view(best.values)), best.multipliers)
         return best.number
 
