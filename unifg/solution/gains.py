@@ -27,6 +27,7 @@ from unifg.problem.systems import KktSystem, fill
 from unifg.solution.covariance import SOLVED
 from unifg.typing import Array, BoolArray, IntArray
 
+REPLACED = "the data of this solution have been replaced since; ask before the next solve"
 SAME = 1e-8  # relative difference of costs and constraints that belong to the same data
 
 
@@ -51,9 +52,6 @@ def feedback_gains(
     columns = np.concatenate([program.columns.of(selection).ravel() for selection in states])
     with program.lock:
         twin, here = unfixed(program, columns, lin)
-    numbers = np.append(here.constraints, here.cost), np.append(lin.constraints, lin.cost)
-    if not np.allclose(*numbers, rtol=SAME, atol=SAME):
-        raise GraphError("gains: the data of this solution have been replaced since; ask before the next solve")
     system = twin.systems.kkt(held)
     entries = np.zeros(system.pattern.nnz)
     fill(system.arrays, lagrangian_hessian(twin, here, multipliers), here.constraint_jacobian, entries)
@@ -85,7 +83,10 @@ def unfixed(program: CompiledProblem, columns: IntArray, lin: Linearization) -> 
     Args:
         program: the compiled graph, with its data bound.
         columns: full tangent columns that are not to be fixed.
-        lin: where.
+        lin: linearisation of a solution.
+
+    Raises:
+        GraphError: the data of the solution have been replaced.
     """
     dropped = frozenset(name for name, part in program.columns.fixed.items() if np.isin(part, columns).any())
     known = program.once(_known)
@@ -95,7 +96,11 @@ def unfixed(program: CompiledProblem, columns: IntArray, lin: Linearization) -> 
         known[dropped] = CompiledProblem(graph)
     twin = known[dropped]
     twin.bind({handle: value for handle, value in program._binding.present.items() if handle in twin._binding.present})
-    return twin, twin.linearize(twin.columns.values(lin.values))
+    here = twin.linearize(twin.columns.values(lin.values))
+    numbers = np.append(here.constraints, here.cost), np.append(lin.constraints, lin.cost)
+    if not np.allclose(*numbers, rtol=SAME, atol=SAME):
+        raise GraphError(REPLACED)
+    return twin, here
 
 
 def _known(_: CompiledProblem) -> dict[frozenset[str], CompiledProblem]:

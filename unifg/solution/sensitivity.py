@@ -30,11 +30,10 @@ from unifg.problem.linearization import Linearization
 from unifg.problem.parameters import Parameter, datum, fixed, parts_of
 from unifg.problem.systems import fill
 from unifg.solution.covariance import SOLVED
-from unifg.solution.gains import SAME, unfixed
+from unifg.solution.gains import REPLACED, SAME, unfixed
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
-REPLACED = "sensitivity: the data of this solution have been replaced since; ask before the next solve"
 LINEARIZED = "cost", "gradient", "hessian", "constraints", "constraint_jacobian"
 ENOUGH = 1e-10  # residual of most solves
 WEAK = 10.0  # times the root of the tolerance: slack and multiplier of a row that may be active or not
@@ -178,6 +177,8 @@ class Sensitivities:
 
     def matrix(self, of: Sequence[Selection | str], wrt: Sequence[Wrt]) -> Array:
         """(k, K) derivatives; arguments and errors as of :meth:`unifg.Solution.sensitivity`."""
+        if not (of and wrt):
+            raise GraphError("sensitivity() of what? Name families, members or constraints, and data")
         places, columns = (np.concatenate(part) for part in zip(*map(self._rows, of), strict=True))
         change = self._change(wrt)
         result = np.zeros((len(places), change.count))
@@ -200,12 +201,17 @@ class Sensitivities:
     def gradient(self, of: Mapping[Selection | str, Array], wrt: Wrt) -> Array:
         """Gradient of a weighted sum; arguments and errors as of :meth:`unifg.Solution.gradient`."""
         change, right = self._change([wrt]), np.zeros(self._system.pattern.size)
-        total, places = np.zeros(change.count), np.zeros(0, dtype=np.intp)
+        total = np.zeros(change.count)
         for what, weights in of.items():
             places, columns = self._rows(what)
-            given = np.broadcast_to(weights, self._shape(what)).ravel()
+            try:
+                given = np.broadcast_to(weights, shape := self._shape(what)).ravel()
+            except ValueError:
+                raise GraphError(
+                    f"gradient: weights of {what!r} have shape {weights.shape}, expected {shape}"
+                ) from None
             np.add.at(right, places[places >= 0], given[places >= 0])
-            if places[0] == HEIGHT:
+            if (places == HEIGHT).any():
                 total += given * change.heights
             own = np.where(columns < 0, -1, change.numbers[0, columns])
             np.add.at(total, own[own >= 0], given[own >= 0])
