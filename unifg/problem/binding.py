@@ -7,7 +7,7 @@ where the loops over terms read them; Python hears only of data that something m
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import TypeAlias
 
 import numpy as np
 
@@ -22,25 +22,8 @@ from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 FLOAT64 = np.dtype(np.float64)
 
 
-class Carried(NamedTuple):
-    """Numbers of data that are copied to an array.
-
-    Attributes:
-        sources: (n,) places as :meth:`Binding.place` gives them.
-        targets: (n,) where in the array.
-        array: the array.
-    """
-
-    sources: IntArray
-    targets: IntArray
-    array: Array
-
-    @classmethod
-    def of(cls, sources: list[IntArray], targets: list[IntArray], array: Array) -> Carried:
-        """Put parts together."""
-        none = np.zeros(0, dtype=np.int64)
-        flat = [np.concatenate([none, *(part.ravel() for part in parts)]) for parts in (sources, targets)]
-        return cls(flat[0].astype(np.int64), flat[1].astype(np.int64), array)
+Moved: TypeAlias = tuple[list[IntArray], list[IntArray], Array]
+"""Places as :meth:`Binding.place` gives them, places in an array, and the array."""
 
 
 class Binding:
@@ -88,7 +71,7 @@ class Binding:
         self.present.update({handle: np.empty_like(handle.value) for handle in self._flags})
         self._changed = np.zeros(len(self._numbers), dtype=np.bool_)
         self._all, self.edition = True, 0
-        self.carry(Carried.of([], [], np.empty(0)), Carried.of([], [], np.empty(0)))
+        self.carry(([], [], np.empty(0)), ([], [], np.empty(0)))
 
     def _views(self, flat: Array) -> list[Array]:
         bounds = zip(self._numbers, self._starts[:-1], self._starts[1:], strict=True)
@@ -99,9 +82,14 @@ class Binding:
         first = int(self._starts[self._numbers.index(handle)])
         return first + np.arange(handle.value.size).reshape(handle.value.shape)
 
-    def carry(self, parameters: Carried, fixed: Carried) -> None:
+    def carry(self, parameters: Moved, fixed: Moved) -> None:
         """Have numbers copied to parameters and fixed variables from now on, whenever data are taken."""
-        self.carried = *parameters, *fixed
+        none = np.zeros(0, dtype=np.int64)
+        flat = [
+            np.concatenate([none, *(part.ravel() for part in parts)]).astype(np.int64)
+            for parts in (*parameters[:2], *fixed[:2])
+        ]
+        self.carried = flat[0], flat[1], parameters[2], flat[2], flat[3], fixed[2]
 
     def rows(self, data: Mapping[Data, Array], count: int) -> Array | None:
         """(count, D) numbers of all data, with one value for each of many instances, as :meth:`take` would hold them.

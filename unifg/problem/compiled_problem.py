@@ -25,7 +25,7 @@ from unifg.modeling.model import Model
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
-from unifg.problem.binding import Binding, Carried
+from unifg.problem.binding import Binding
 from unifg.problem.branches import Branches
 from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
@@ -180,7 +180,7 @@ class CompiledProblem:
 
     @property
     def carried(self) -> tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]:
-        """Where numbers of data go, see :class:`unifg.problem.binding.Binding`."""
+        """Places where numbers of data go, see :class:`unifg.problem.binding.Binding`."""
         return self._binding.carried
 
     def rows_of_data(self, data: Mapping[Data, Array], count: int) -> Array | None:
@@ -252,7 +252,7 @@ class CompiledProblem:
                     sources.append(np.broadcast_to(binding.place(handle).reshape(-1, place.shape[1]), place.shape))
                     targets.append(int(term.place[PARAMETER]) + place)
         self.rebinds = any(reader.bound for reader in self._readers.values())
-        moved = Carried.of(sources, targets, self.arrays.parameters)
+        moved = sources, targets, self.arrays.parameters
         sources, targets = [], []
         for fix, where in zip(self.graph.fixes, retraction.places, strict=True):
             if isinstance(fix.value, Data):
@@ -261,7 +261,7 @@ class CompiledProblem:
                 retraction.fixed_values[where] = binding.present[fix.value]
             else:
                 retraction.fixed_values[where] = np.asarray(fix.value)
-        binding.carry(moved, Carried.of(sources, targets, retraction.fixed_values))
+        binding.carry(moved, (sources, targets, retraction.fixed_values))
 
     def by_term(self, stacked: Array) -> ByTerm:
         """(M,) numbers of the constraint rows, viewed as (n, m) of every term."""

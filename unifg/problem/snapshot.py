@@ -15,6 +15,8 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.typing import Array
 
+MADE = ("norms", "scalars", "rounding")  # of other arrays
+
 
 class Memory:
     """Arrays of one linearisation that compiled code writes to, side by side.
@@ -71,7 +73,7 @@ class Snapshot(Linearization):
 
     def __getattr__(self, name: str) -> Any:
         """View an array, once."""
-        if name.startswith("_"):
+        if name not in MADE and name not in self.__dict__.get("_parts", ()):
             raise AttributeError(name)
         found = self.__dict__[name] = self._made(name)
         return found
@@ -84,9 +86,7 @@ class Snapshot(Linearization):
             return program.norms(self.sizes, self.heights)
         if name == "scalars":
             return program.by_scalar(self.heights)
-        if name == "rounding":
-            return np.zeros(program.columns.width if program.scalar_terms else 0)
-        raise AttributeError(name)
+        return np.zeros(program.columns.width if program.scalar_terms else 0)
 
     def __reduce__(self) -> tuple[type[Linearization], tuple[Any, ...]]:
         """Pickle plain arrays: views of one array would become arrays of their own."""

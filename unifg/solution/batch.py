@@ -10,18 +10,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import repeat
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from unifg.errors import GraphError
 from unifg.modeling.variables import Data, Family
+from unifg.problem.columns import Values
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution.solution import AnyGuess, Guess, Solution
 from unifg.solution.status import Status
 from unifg.typing import Array, IntArray, Numbers
-
-if TYPE_CHECKING:
-    from unifg.solution.solver import Prepared
 
 SAMPLED = 100  # one answer in so many is verified by the functions as written, as in a loop
 
@@ -46,6 +45,33 @@ class Outcomes(NamedTuple):
     measured: Array
 
 
+class Worker(Protocol):
+    """Prepared solver of one thread, :class:`unifg.solution.solver.Prepared`."""
+
+    program: CompiledProblem
+
+    @property
+    def solves_each(self) -> bool:
+        """True if :meth:`solve_part` may be asked."""
+        ...
+
+    def solve(self, guess: AnyGuess, *, data: Mapping[Data, Numbers] | None = None) -> Solution:
+        """Solve one instance."""
+        ...
+
+    def read(self, guess: AnyGuess) -> tuple[Values, Array, Array]:
+        """Values, multipliers and penalties of a guess."""
+        ...
+
+    def twins(self, count: int) -> Sequence[Worker]:
+        """Workers of other threads."""
+        ...
+
+    def solve_part(self, guesses: tuple[Array, Array], data: Mapping[Data, Array], count: int) -> Outcomes | None:
+        """Some instances in one compiled call, or None."""
+        ...
+
+
 class Batch:
     """Answers of many instances.
 
@@ -56,7 +82,7 @@ class Batch:
         multipliers: (K, M) of all constraint rows.
     """
 
-    def __init__(self, prepared: Prepared, data: Mapping[Data, Array], count: int) -> None:
+    def __init__(self, prepared: Worker, data: Mapping[Data, Array], count: int) -> None:
         """Make room; filled by :meth:`unifg.solution.solver.Prepared.solve_many`."""
         program = prepared.program
         self._prepared, self._data = prepared, data
@@ -89,7 +115,7 @@ class Batch:
         arrays = self.values[index].copy(), self.multipliers[index].copy(), program.no_penalties
         return self._prepared.solve(Guess.stored(program, arrays), data=self.data_of(index))
 
-    def solve_part(self, worker: Prepared, part: IntArray, guesses: tuple[Array, Array]) -> IntArray:
+    def solve_part(self, worker: Worker, part: IntArray, guesses: tuple[Array, Array]) -> IntArray:
         """Have a worker solve some instances; returns those that are left to single solves."""
         own = [array[part] if len(array) > 1 else array for array in guesses]
         data = {handle: given[part] for handle, given in self._data.items()}
@@ -135,14 +161,14 @@ def stacked_data(data: Mapping[Data, Numbers]) -> tuple[dict[Data, Array], int |
     return found, count
 
 
-def flat_guesses(prepared: Prepared, guesses: AnyGuess | Sequence[AnyGuess]) -> tuple[Array, Array]:
+def flat_guesses(prepared: Worker, guesses: AnyGuess | Sequence[AnyGuess]) -> tuple[Array, Array]:
     """(K or 1, S) stored values and (K or 1, M) multipliers of guesses, one for each instance or one for all."""
     rows = [prepared.read(guess) for guess in (guesses if isinstance(guesses, Sequence) else [guesses])]
     return np.stack([values.flat for values, *_ in rows]), np.stack([multipliers for _, multipliers, _ in rows])
 
 
 def solve_batch(
-    prepared: Prepared,
+    prepared: Worker,
     guesses: AnyGuess | Sequence[AnyGuess],
     data: Mapping[Data, Numbers],
     threads: int,
@@ -161,7 +187,7 @@ def solve_batch(
         return batch
     batch.take(0, prepared.solve(each[0], data=batch.data_of(0)))  # verified, as a first answer is
     left = np.arange(1, count)
-    if prepared.solver.solves_each(prepared.program) and count > 1:
+    if prepared.solves_each and count > 1:
         stored = flat_guesses(prepared, guesses)
         workers = [prepared, *prepared.twins(min(threads, count - 1) - 1)]
         parts = [left[k :: len(workers)] for k in range(len(workers))]

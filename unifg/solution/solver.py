@@ -658,6 +658,11 @@ class Prepared:
         """
         return solve_batch(self, guesses, data or {}, threads)
 
+    @property
+    def solves_each(self) -> bool:
+        """True if :meth:`solve_part` may be asked."""
+        return self.solver.solves_each(self.program)
+
     def twins(self, count: int) -> list[Prepared]:
         """Prepared solvers of the same graph that belong to other threads; made once."""
         while len(self._twins) < count:
