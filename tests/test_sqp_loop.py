@@ -92,6 +92,15 @@ def kink() -> Stated:
     return graph, {x: np.full((1, 1), 1e-40)}
 
 
+def endless() -> Stated:
+    """A cost without a lower bound."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)
+    graph.bound(x, lower=1.0)
+    return graph, {x: np.full((1, 1), 2.0)}
+
+
 def units() -> Stated:
     """A length in units of a micrometre beside one in kilometres."""
     graph = fg.Graph()
@@ -120,6 +129,7 @@ RUNS: dict[str, tuple[Callable[[], Stated], dict[str, Any], set[int]]] = {
     "apart": (apart, {}, set()),
     "missed": (missed, {}, {CORRECT}),
     "missed by Gauss-Newton": (missed, {"hessian": "gauss-newton"}, {CORRECT}),
+    "endless": (endless, {}, {TAKEN}),
     "kink": (kink, {"second_order_correction": False}, {REFUSED}),
     "units": (units, {}, {STARTED}),
     "units left": (units, {"scaling": False}, {TAKEN}),
@@ -134,17 +144,34 @@ RUNS: dict[str, tuple[Callable[[], Stated], dict[str, Any], set[int]]] = {
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_a_solve_takes_the_steps_of_a_watched_one(name: str, answers: list[int]) -> None:
+def test_a_solve_takes_the_steps_of_a_watched_one(
+    name: str, answers: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     build, options, asked = RUNS[name]
     graph, guess = build()
     prepared = SQP(**{"qp": "graph", **options}).prepare(graph)
     answers.clear()
+    violations: list[float] = []
+    calls = RestorationTrigger.calls
+
+    def noted(self: RestorationTrigger, violation: float, tolerance: float) -> bool:
+        violations.append(violation)
+        return calls(self, violation, tolerance)
+
+    def learned() -> tuple[Any, ...]:
+        """What the trigger has seen since, and what is known of the routes."""
+        routes, found = prepared._workspace, tuple(violations)
+        violations.clear()
+        return found, routes._first_answered, routes._misses, routes._resting, routes.elastic_asked
+
+    monkeypatch.setattr(RestorationTrigger, "calls", noted)
     for _ in range(2):  # nothing is left of the first
         solution = prepared.solve(guess)
         assert asked <= set(answers)
         answers.clear()
+        known = learned()
         watched = prepared.solve(guess, callback=lambda row: None)
-        assert not answers
+        assert not answers and learned() == known
         assert solution.status is watched.status and solution.iterations == watched.iterations
         assert solution.restoration_steps == watched.restoration_steps
         np.testing.assert_array_equal(solution._lin.stored, watched._lin.stored)
@@ -172,6 +199,7 @@ def test_the_cases_end_as_they_are_meant_to() -> None:
         assert solved(name).status is fg.Status.LOCALLY_INFEASIBLE
     assert any("correction" in row.details for row in solved("correction").history)
     assert solved("drive, rest").status is fg.Status.STOP_RULE
+    assert solved("endless").status is fg.Status.UNBOUNDED
     assert solved("kink").iterations == 0
 
 
