@@ -13,12 +13,23 @@ import unifg as fg
 from problems.control import Quadrotor, Unicycle
 from problems.hock_schittkowski import SMALL
 from unifg.errors import GraphError
+from unifg.solution.solver import SolveState
 from unifg.solvers import SQP
 from unifg.solvers.globalize import slow_convergence
 from unifg.solvers.globalize.feasibility_restoration import FALLING, PATIENCE, RestorationTrigger
 from unifg.solvers.quadratic_programs import steps as steps_of_sqp
-from unifg.solvers.quadratic_programs.attempt import CORRECT, LOGGED, REFUSED, SOLVE, STARTED, STOPPED, TAKEN
+from unifg.solvers.quadratic_programs.attempt import (
+    CORRECT,
+    LOGGED,
+    REFUSED,
+    SMALLEST_DAMPING,
+    SOLVE,
+    STARTED,
+    STOPPED,
+    TAKEN,
+)
 from unifg.solvers.quadratic_programs.loop import kkt_size, loop, rests, useful_accuracy
+from unifg.solvers.quadratic_programs.routes import Subproblems
 from unifg.solvers.quadratic_programs.steps import Steps
 from unifg.solvers.sqp import _budget
 
@@ -164,6 +175,13 @@ def test_a_solve_takes_the_steps_of_a_watched_one(
         violations.clear()
         return found, routes._first_answered, routes._misses, routes._resting, routes.elastic_asked
 
+    def finished(self: SolveState, reason: fg.Status | None) -> fg.Solution:
+        runs.append(self)
+        return finish(self, reason)
+
+    runs: list[SolveState] = []
+    finish = SolveState.finish
+    monkeypatch.setattr(SolveState, "finish", finished)
     monkeypatch.setattr(RestorationTrigger, "calls", noted)
     for _ in range(2):  # nothing is left of the first
         solution = prepared.solve(guess)
@@ -178,6 +196,13 @@ def test_a_solve_takes_the_steps_of_a_watched_one(
         for term, found in watched.multipliers.items():
             np.testing.assert_array_equal(solution.multipliers[term], found)
         assert len(solution.history) == len(watched.history)
+        mine, theirs = runs[-2:]
+        assert mine.slopes is not None and theirs.slopes is not None
+        np.testing.assert_array_equal(mine.slopes.jacobian, theirs.slopes.jacobian)
+        np.testing.assert_array_equal(mine.slopes.gradient, theirs.slopes.gradient)
+        if not solution.converged:
+            assert mine.has_been_feasible == theirs.has_been_feasible
+            np.testing.assert_array_equal(mine.least_violated.flat, theirs.least_violated.flat)
         for row, other in zip(solution.history, watched.history, strict=True):
             names = vars(other).keys() - {"seconds", "deferred"}
             assert {name: getattr(row, name) for name in names} == {name: getattr(other, name) for name in names}
@@ -201,6 +226,28 @@ def test_the_cases_end_as_they_are_meant_to() -> None:
     assert solved("drive, rest").status is fg.Status.STOP_RULE
     assert solved("endless").status is fg.Status.UNBOUNDED
     assert solved("kink").iterations == 0
+
+
+def test_failures_count_in_a_row_and_damp_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two steps are refused, with one that is taken between them; the start is feasible, so there is nothing to restore."""
+    graph, guess = CASES["HS12"].build()
+    prepared = SQP(qp="graph").prepare(graph)
+    usual, go, runs = prepared.solve(guess), Steps._go, iter(range(100))
+
+    def refused(self: Steps, stage: int, alone: bool = False) -> None:
+        if alone and next(runs) in (1, 3):
+            self.now["answer"] = REFUSED
+        else:
+            go(self, stage, alone)
+
+    monkeypatch.setattr(Steps, "_go", refused)
+    monkeypatch.setattr(Subproblems, "distrust", lambda self: False)
+    monkeypatch.setattr("unifg.solvers.sqp.FAILURES", 2)
+    monkeypatch.setattr("unifg.solvers.sqp.LOGGED", 3)  # Python has a look after every step
+    solution = prepared.solve(guess)
+    assert solution.converged and solution.cost == pytest.approx(usual.cost, rel=1e-6)
+    first, second, third = (float(row.details["damping"]) for row in solution.history[1:4])
+    assert second >= max(100.0 * SMALLEST_DAMPING, 1e-4) > first and third >= 50.0 * second
 
 
 def test_one_call_makes_a_solve(answers: list[int]) -> None:
