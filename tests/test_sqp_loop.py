@@ -229,7 +229,7 @@ def test_the_cases_end_as_they_are_meant_to() -> None:
 
 
 def test_failures_count_in_a_row_and_damp_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two steps are refused, with one that is taken between them; the start is feasible, so there is nothing to restore."""
+    """Two steps are refused, one is taken between them; the start is feasible, so there is nothing to restore."""
     graph, guess = CASES["HS12"].build()
     prepared = SQP(qp="graph").prepare(graph)
     usual, go, runs = prepared.solve(guess), Steps._go, iter(range(100))
