@@ -170,7 +170,7 @@ def test_a_solve_takes_the_steps_of_a_watched_one(
         return calls(self, violation, tolerance)
 
     def learned() -> tuple[Any, ...]:
-        """What the trigger has seen since, and what is known of the routes."""
+        """Violations that the trigger has seen since, and what is known of the routes."""
         routes, found = prepared._workspace, tuple(violations)
         violations.clear()
         return found, routes._first_answered, routes._misses, routes._resting, routes.elastic_asked
