@@ -13,12 +13,23 @@ import unifg as fg
 from problems.control import Quadrotor, Unicycle
 from problems.hock_schittkowski import SMALL
 from unifg.errors import GraphError
+from unifg.solution.solver import SolveState
 from unifg.solvers import SQP
 from unifg.solvers.globalize import slow_convergence
 from unifg.solvers.globalize.feasibility_restoration import FALLING, PATIENCE, RestorationTrigger
 from unifg.solvers.quadratic_programs import steps as steps_of_sqp
-from unifg.solvers.quadratic_programs.attempt import CORRECT, LOGGED, REFUSED, SOLVE, STARTED, STOPPED, TAKEN
+from unifg.solvers.quadratic_programs.attempt import (
+    CORRECT,
+    LOGGED,
+    REFUSED,
+    SMALLEST_DAMPING,
+    SOLVE,
+    STARTED,
+    STOPPED,
+    TAKEN,
+)
 from unifg.solvers.quadratic_programs.loop import kkt_size, loop, rests, useful_accuracy
+from unifg.solvers.quadratic_programs.routes import Subproblems
 from unifg.solvers.quadratic_programs.steps import Steps
 from unifg.solvers.sqp import _budget
 
@@ -92,6 +103,15 @@ def kink() -> Stated:
     return graph, {x: np.full((1, 1), 1e-40)}
 
 
+def endless() -> Stated:
+    """A cost without a lower bound."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)
+    graph.bound(x, lower=1.0)
+    return graph, {x: np.full((1, 1), 2.0)}
+
+
 def units() -> Stated:
     """A length in units of a micrometre beside one in kilometres."""
     graph = fg.Graph()
@@ -120,6 +140,7 @@ RUNS: dict[str, tuple[Callable[[], Stated], dict[str, Any], set[int]]] = {
     "apart": (apart, {}, set()),
     "missed": (missed, {}, {CORRECT}),
     "missed by Gauss-Newton": (missed, {"hessian": "gauss-newton"}, {CORRECT}),
+    "endless": (endless, {}, {TAKEN}),
     "kink": (kink, {"second_order_correction": False}, {REFUSED}),
     "units": (units, {}, {STARTED}),
     "units left": (units, {"scaling": False}, {TAKEN}),
@@ -134,23 +155,54 @@ RUNS: dict[str, tuple[Callable[[], Stated], dict[str, Any], set[int]]] = {
 
 
 @pytest.mark.parametrize("name", RUNS)
-def test_a_solve_takes_the_steps_of_a_watched_one(name: str, answers: list[int]) -> None:
+def test_a_solve_takes_the_steps_of_a_watched_one(
+    name: str, answers: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     build, options, asked = RUNS[name]
     graph, guess = build()
     prepared = SQP(**{"qp": "graph", **options}).prepare(graph)
     answers.clear()
+    violations: list[float] = []
+    calls = RestorationTrigger.calls
+
+    def noted(self: RestorationTrigger, violation: float, tolerance: float) -> bool:
+        violations.append(violation)
+        return calls(self, violation, tolerance)
+
+    def learned() -> tuple[Any, ...]:
+        """Violations that the trigger has seen since, and what is known of the routes."""
+        routes, found = prepared._workspace, tuple(violations)
+        violations.clear()
+        return found, routes._first_answered, routes._misses, routes._resting, routes.elastic_asked
+
+    def finished(self: SolveState, reason: fg.Status | None) -> fg.Solution:
+        runs.append(self)
+        return finish(self, reason)
+
+    runs: list[SolveState] = []
+    finish = SolveState.finish
+    monkeypatch.setattr(SolveState, "finish", finished)
+    monkeypatch.setattr(RestorationTrigger, "calls", noted)
     for _ in range(2):  # nothing is left of the first
         solution = prepared.solve(guess)
         assert asked <= set(answers)
         answers.clear()
+        known = learned()
         watched = prepared.solve(guess, callback=lambda row: None)
-        assert not answers
+        assert not answers and learned() == known
         assert solution.status is watched.status and solution.iterations == watched.iterations
         assert solution.restoration_steps == watched.restoration_steps
         np.testing.assert_array_equal(solution._lin.stored, watched._lin.stored)
         for term, found in watched.multipliers.items():
             np.testing.assert_array_equal(solution.multipliers[term], found)
         assert len(solution.history) == len(watched.history)
+        mine, theirs = runs[-2:]
+        assert mine.slopes is not None and theirs.slopes is not None
+        np.testing.assert_array_equal(mine.slopes.jacobian, theirs.slopes.jacobian)
+        np.testing.assert_array_equal(mine.slopes.gradient, theirs.slopes.gradient)
+        if not solution.converged:
+            assert mine.has_been_feasible == theirs.has_been_feasible
+            np.testing.assert_array_equal(mine.least_violated.flat, theirs.least_violated.flat)
         for row, other in zip(solution.history, watched.history, strict=True):
             names = vars(other).keys() - {"seconds", "deferred"}
             assert {name: getattr(row, name) for name in names} == {name: getattr(other, name) for name in names}
@@ -172,7 +224,30 @@ def test_the_cases_end_as_they_are_meant_to() -> None:
         assert solved(name).status is fg.Status.LOCALLY_INFEASIBLE
     assert any("correction" in row.details for row in solved("correction").history)
     assert solved("drive, rest").status is fg.Status.STOP_RULE
+    assert solved("endless").status is fg.Status.UNBOUNDED
     assert solved("kink").iterations == 0
+
+
+def test_failures_count_in_a_row_and_damp_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two steps are refused, one is taken between them; the start is feasible, so there is nothing to restore."""
+    graph, guess = CASES["HS12"].build()
+    prepared = SQP(qp="graph").prepare(graph)
+    usual, go, runs = prepared.solve(guess), Steps._go, iter(range(100))
+
+    def refused(self: Steps, stage: int, alone: bool = False) -> None:
+        if alone and next(runs) in (1, 3):
+            self.now["answer"] = REFUSED
+        else:
+            go(self, stage, alone)
+
+    monkeypatch.setattr(Steps, "_go", refused)
+    monkeypatch.setattr(Subproblems, "distrust", lambda self: False)
+    monkeypatch.setattr("unifg.solvers.sqp.FAILURES", 2)
+    monkeypatch.setattr("unifg.solvers.sqp.LOGGED", 3)  # Python has a look after every step
+    solution = prepared.solve(guess)
+    assert solution.converged and solution.cost == pytest.approx(usual.cost, rel=1e-6)
+    first, second, third = (float(row.details["damping"]) for row in solution.history[1:4])
+    assert second >= max(100.0 * SMALLEST_DAMPING, 1e-4) > first and third >= 50.0 * second
 
 
 def test_one_call_makes_a_solve(answers: list[int]) -> None:

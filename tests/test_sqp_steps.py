@@ -9,6 +9,7 @@ import unifg as fg
 from problems.control import Unicycle
 from problems.hock_schittkowski import SMALL
 from unifg.solvers import SQP
+from unifg.solvers.quadratic_programs.attempt import SECANT_DECAY
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.steps import Steps
 from unifg.solvers.quadratic_programs.subproblem import QPAnswer
@@ -60,12 +61,13 @@ def test_missing_curvature_by_hand() -> None:
     before = program.linearize(program.values_from({x: np.array([[0.6, 0.8]])}))
     step = np.array([0.3, -0.2])
 
-    def seen(multiplier: float, step: Array, unit: float) -> float:
+    def seen(multiplier: float, step: Array, unit: float, curved: bool = False, before_that: float = 0.0) -> float:
         """Missing curvature, by an attempt that takes the step with this multiplier whatever the merit says."""
         steps, dual = Steps(program), np.array([multiplier])
         steps.prepare(1e-6, True, False)
         steps.start(Scaling(program, np.full(2, unit), np.ones(1)), before, dual)
-        steps.pose(before, dual, 0.7, 1e-6, False, False)
+        steps.now["missing"] = before_that
+        steps.pose(before, dual, 0.7, 1e-6, False, curved)
         steps.along(QPAnswer(step, dual, "by hand", 1, 0.0))
         assert steps.taken(lambda bend: None)
         return float(steps.now["missing"])
@@ -74,6 +76,8 @@ def test_missing_curvature_by_hand() -> None:
         for multiplier, missing in ((2.0, 4.0), (0.5, 1.0), (0.1, 0.0), (-0.4, 0.0)):  # less than half does not count
             assert seen(multiplier, step, unit) / unit**2 == pytest.approx(missing, abs=1e-6)
     assert seen(2.0, 1e-9 * step, 1.0) == 0.0
+    assert seen(2.0, step, 1.0, before_that=20.0) == pytest.approx(20.0 * SECANT_DECAY), "which fades"
+    assert seen(2.0, step, 1.0, curved=True, before_that=20.0) == 0.0, "the Lagrangian's own Hessian lacks nothing"
 
 
 def test_subproblems_on_the_graph_begin_from_the_last_multipliers() -> None:
