@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
+from weakref import ReferenceType, ref
 
 import numpy as np
 
@@ -43,6 +44,27 @@ class Carried(NamedTuple):
         return cls(flat[0].astype(np.int64), flat[1].astype(np.int64), array)
 
 
+class Snapshot:
+    """Values that all data of a binding had at some time, copied when they are replaced and somebody holds this."""
+
+    __slots__ = ("__weakref__", "_binding", "_copies")
+
+    def __init__(self, binding: Binding | None, copies: tuple[Array, list[Array]] | None = None) -> None:
+        """Stand for the present values of a binding, or for copies."""
+        self._binding, self._copies = binding, copies
+
+    def copies(self) -> tuple[Array, list[Array]]:
+        """Numbers of all data side by side, and flags."""
+        if self._binding is not None:
+            self._binding, self._copies = None, self._binding.copies()
+        assert self._copies is not None
+        return self._copies
+
+    def __reduce__(self) -> tuple[type[Snapshot], tuple[None, tuple[Array, list[Array]]]]:
+        """Pickle the copies."""
+        return Snapshot, (None, self.copies())
+
+
 class Binding:
     """Copies of all data that nobody else writes to.
 
@@ -52,6 +74,7 @@ class Binding:
     """
 
     carried: tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]
+    _held: ReferenceType[Snapshot] | None = None
     _others = False  # whether there are elements of manifolds with other conditions than a norm
 
     def __init__(self, known: Mapping[str, Data], used: Iterable[Data], terms: Sequence[Term] = ()) -> None:
@@ -89,6 +112,23 @@ class Binding:
         self._all = True
         self.carry(Carried.of([], [], np.empty(0)), Carried.of([], [], np.empty(0)))
 
+    def snapshot(self) -> Snapshot:
+        """Present values, for who may ask for them after they have been replaced."""
+        held = None if self._held is None else self._held()
+        if held is None:
+            held = Snapshot(self)
+            self._held = ref(held)
+        return held
+
+    def copies(self) -> tuple[Array, list[Array]]:
+        """Copies of the present numbers and flags."""
+        return self._flat.copy(), [self.present[handle].copy() for handle in self._flags] if self._flags else []
+
+    def named(self, snapshot: Snapshot) -> dict[Data, Array]:
+        """Values of all data in a snapshot."""
+        numbers, flags = snapshot.copies()
+        return dict(zip([*self._numbers, *self._flags], [*self._views(numbers), *flags], strict=True))
+
     def _views(self, flat: Array) -> list[Array]:
         bounds = zip(self._numbers, self._starts[:-1], self._starts[1:], strict=True)
         return [flat[first:last].reshape(handle.value.shape) for handle, first, last in bounds]
@@ -123,6 +163,10 @@ class Binding:
         Raises:
             GraphError: on unknown data, a changed shape, NaN, or elements off their manifold; nothing has changed then.
         """
+        if self._held is not None:
+            if (held := self._held()) is not None:
+                held.copies()
+            self._held = None
         slots = self._slots
         for handle, value in data.items():
             slot = slots.get(handle)

@@ -25,7 +25,7 @@ from unifg.modeling.model import Model
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
-from unifg.problem.binding import Binding, Carried
+from unifg.problem.binding import Binding, Carried, Snapshot
 from unifg.problem.branches import Branches
 from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
@@ -189,6 +189,15 @@ class CompiledProblem:
                 term.forget()
         if self.rebinds:
             self._rebind([term for handle in changed for term in self._readers[handle].bound])
+
+    def snapshot(self) -> Snapshot:
+        """Present values of all data, copied as soon as they are replaced if the snapshot is still held."""
+        return self._binding.snapshot()
+
+    def data_of(self, snapshot: Snapshot) -> dict[Data, Array]:
+        """Values of all data in a snapshot."""
+        with self.lock:
+            return self._binding.named(snapshot)
 
     def _rebind(self, terms: Sequence[CompiledTerm]) -> None:
         """Work out anew what terms make of their data."""

@@ -24,6 +24,7 @@ from unifg.solution.marginal import Variables, information, marginal_prior
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.status import Status
+from unifg.solution.verify import Verified, verified
 from unifg.solution.warm_start import Shifts
 from unifg.typing import Array, BoolArray, Numbers
 
@@ -122,7 +123,7 @@ class Solution:
         returned: int,
     ) -> None:
         """Assembled by :class:`unifg.Solver`."""
-        self._program = program
+        self._program, self._data = program, program.snapshot()
         self._lin = linearization
         self._multipliers, self._penalties = multipliers, penalties
         self._equality = program.equality
@@ -436,6 +437,19 @@ class Solution:
         evaluation, systems, judge, compiled = self._parts
         parts = {"evaluation": evaluation, "linear systems": systems, "search": compiled - evaluation - systems}
         return {**parts, "judge": judge, "Python": self.seconds - compiled - judge}
+
+    def verify(self, tolerance: float = 1e-6) -> Verified:
+        """Check the answer by the functions as they were written, independently of the compiled graph and its engine.
+
+        Values, multipliers and cost are taken as claims: all residuals, limits, manifolds and fixed variables are
+        looked at with the data of that solve, slopes are central differences with error bounds, and multipliers are
+        also made anew; see :mod:`unifg.solution.verify`. It never raises for a bad answer. What functions read beyond
+        their arguments is read as it is now.
+
+        Args:
+            tolerance: of violation, stationarity and complementarity, as that of the solver.
+        """
+        return verified(self, self._program, self._program.data_of(self._data), tolerance)
 
     def report(self) -> str:
         """The status sentence with the numbers behind it, and the times of the parts."""

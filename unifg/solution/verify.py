@@ -1,0 +1,299 @@
+"""``solution.verify()``: an answer judged anew, by the functions as they were written.
+
+They are evaluated by :mod:`unifg.solution.as_written`. Of the solve, only values, multipliers and cost are taken, as
+claims. Multipliers are also made anew: those that minimise |grad f + A' lambda|^2 + sum (s lambda)^2 over multipliers
+of the right signs, with s the distance of a row from its limit, so that both stationarity and complementarity are as
+small as any multipliers make them. The signs are found by block principal pivoting (Kim and Park, SIAM J. Sci. Comput.
+33, 2011), over a sparse LU of SciPy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from unifg.modeling.terms import Constraint
+from unifg.modeling.variables import Data
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.solution.as_written import WrittenTerm, moved_fix, off_manifold
+from unifg.typing import Array, IntArray
+
+if TYPE_CHECKING:
+    import scipy.sparse as sp
+
+    from unifg.solution.solution import Solution
+
+ROUNDS = 30  # of pivoting
+FAR = 1e12  # a row so far from its limit has no multiplier
+DAMPING = 1e-13  # relative, of the rows that depend on each other
+NOTHING = 1e-10  # of the largest slope: a multiplier is not worth it
+COST = 1e-8  # relative difference of costs
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """KKT numbers with some multipliers.
+
+    Attributes:
+        stationarity: as that of a solution: scaled, and of least squares the relative offset.
+        bound: by how much differences may be wrong about it.
+        complementarity: scaled.
+        variable: family and member with the largest slope; None where nothing is unknown.
+        row: of the largest complementarity, -1 without constraints.
+    """
+
+    stationarity: float
+    bound: float
+    complementarity: float
+    variable: tuple[str, int] | None
+    row: int
+
+    def fails(self, tolerance: float) -> bool:
+        """Test whether a number exceeds the tolerance beyond doubt."""
+        return not max(self.stationarity - self.bound, self.complementarity) <= tolerance
+
+
+@dataclass(frozen=True)
+class Verified:
+    """Outcome of an independent check; true where it passes.
+
+    Attributes:
+        verdict: "passes", "fails", or "undecided" where differences cannot tell.
+        sentence: the reason, with the place.
+        cost: found anew; NaN where it could not be evaluated.
+        violation: largest distance of a row outside its limits.
+        worst: term, factor and row of it; None without constraints.
+        claimed: KKT numbers with the multipliers of the solution.
+        least: those with the multipliers made anew.
+        multipliers: (n, m) made anew, by the names of the terms.
+    """
+
+    verdict: str
+    sentence: str
+    cost: float = np.nan
+    violation: float = np.nan
+    worst: tuple[str, int, int] | None = None
+    claimed: Numbers | None = None
+    least: Numbers | None = None
+    multipliers: dict[str, Array] | None = None
+
+    def __bool__(self) -> bool:
+        """Test whether the answer passes."""
+        return self.verdict == "passes"
+
+    def __str__(self) -> str:
+        """Verdict and reason."""
+        return f"{self.verdict}: {self.sentence}"
+
+
+class Conditions:
+    """KKT conditions of a graph at an answer, with all slopes found by differences.
+
+    Attributes:
+        cost: objective.
+        g, lower, upper: (M,) constraint rows and their limits.
+        rows: term, factor and row of a constraint row, by its number.
+    """
+
+    def __init__(self, program: CompiledProblem, terms: list[WrittenTerm]) -> None:
+        """Evaluate costs and constraints, without slopes."""
+        self._program, self._terms = program, terms
+        self._own = [t for t in terms if isinstance(t.term, Constraint)]
+        self._costs = [(t, *t.cost()) for t in terms if not isinstance(t.term, Constraint)]
+        self.cost = float(sum(values.sum() for _, values, _, _ in self._costs))
+        limits = [t.limits() for t in self._own]
+        none = np.zeros(0)
+        self.g = np.concatenate([none, *(t.rows.ravel() for t in self._own)])
+        self.lower, self.upper = (np.concatenate([none, *(pair[k].ravel() for pair in limits)]) for k in (0, 1))
+        outside = np.maximum(np.maximum(self.g - self.upper, self.lower - self.g), 0.0)
+        self.violation, self.worst = float(outside.max(initial=0.0)), int(outside.argmax()) if len(outside) else -1
+
+    def place(self, row: int) -> tuple[str, int, int]:
+        """Term, factor and row of a constraint row."""
+        for name, rows, (_, size) in self._program.places:
+            if row < rows.stop:
+                return name, *divmod(row - rows.start, size)
+        raise IndexError(row)
+
+    def differentiate(self) -> None:
+        """Find gradient, Jacobian of the constraints and, of least squares, the Gauss-Newton matrix."""
+        import scipy.sparse as sp  # slow to load
+
+        columns, program = self._program.columns, self._program
+        size = columns.width
+        self.gradient, self._doubt = np.zeros(size), np.zeros(size)
+        blocks: list[tuple[Array, IntArray]] = []
+        squares = 0.0
+        for term, _, force, weights in self._costs:
+            slopes, doubt = term.slopes()
+            np.add.at(self.gradient, term.columns, np.einsum("nmd,nm->nd", slopes, force))
+            rounding = np.abs(weights).sum(axis=2) * term.rounding
+            squares += float((rounding * term.rounding).sum())
+            doubtful = np.einsum("nmd,nm->nd", doubt, np.abs(force)) + np.einsum("nmd,nm->nd", np.abs(slopes), rounding)
+            np.add.at(self._doubt, term.columns, doubtful)
+            if program.least_squares:
+                blocks.append((np.einsum("nad,nab,nbe->nde", slopes, weights, slopes), term.columns))
+        self._rounding = float(np.sqrt(squares))
+        found = [(*t.slopes(), t.columns) for t in self._own]
+        at, parts = 0, []
+        for slopes, doubt, own in found:
+            count, rows, _ = slopes.shape
+            numbers = np.broadcast_to(at + np.arange(count * rows).reshape(count, rows, 1), slopes.shape)
+            parts.append((slopes, doubt, numbers, np.broadcast_to(own[:, None, :], slopes.shape)))
+            at += count * rows
+        joined = [np.concatenate([np.zeros(0), *(part[k].ravel() for part in parts)]) for k in range(4)]
+        where = joined[2].astype(int), joined[3].astype(int)
+        self.A, self._doubts = (sp.csr_matrix((joined[k], where), (at, size))[:, columns.free] for k in (0, 1))
+        self.gradient, self._doubt = self.gradient[columns.free], self._doubt[columns.free]
+        if program.least_squares:
+            entries = np.concatenate([block.ravel() for block, _ in blocks])
+            rows = np.concatenate([np.broadcast_to(c[:, :, None], b.shape).ravel() for b, c in blocks])
+            across = np.concatenate([np.broadcast_to(c[:, None, :], b.shape).ravel() for b, c in blocks])
+            self.H = sp.csc_matrix((entries, (rows, across)), (size, size))[columns.free][:, columns.free]
+
+    def numbers(self, multipliers: Array) -> Numbers:
+        """KKT numbers with these multipliers (M,)."""
+        slope, doubt = self.gradient + self.A.T @ multipliers, self._doubt + self._doubts.T @ np.abs(multipliers)
+        scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
+        stationarity, bound = (float(np.abs(part).max(initial=0.0)) / scale for part in (slope, doubt))
+        if self._program.least_squares and len(slope):
+            stationarity, bound = self._offset(slope, doubt)
+        limit = np.where(multipliers > 0.0, self.upper, self.lower)
+        slack = np.where(np.isfinite(limit), np.abs(self.g - np.where(np.isfinite(limit), limit, 0.0)), 1.0)
+        wrong = np.where(self.lower != self.upper, np.abs(multipliers) * slack, 0.0)
+        columns = self._program.columns
+        at = columns.name(int(columns.free[np.abs(slope).argmax()])) if len(slope) else None
+        row = int(wrong.argmax()) if len(wrong) else -1
+        return Numbers(stationarity, bound, float(wrong.max(initial=0.0)) / scale, at, row)
+
+    def _offset(self, slope: Array, doubt: Array) -> tuple[float, float]:
+        """Relative offset of least squares, and by how much it may be wrong."""
+        import scipy.sparse as sp
+        import scipy.sparse.linalg as spl
+
+        diagonal = np.where(self.H.diagonal() > 0.0, self.H.diagonal(), 1.0)
+        length = float(np.sqrt(sum((t.rows * force).sum() for t, _, force, _ in self._costs)))  # as losses weigh
+        if length <= self._rounding:  # everything fits
+            return 0.0, 0.0
+        step = spl.splu((self.H + DAMPING * sp.diags(diagonal)).tocsc()).solve(slope)
+        bound = float(np.linalg.norm(doubt / np.sqrt(diagonal)))
+        return float(np.sqrt(max(slope @ step, 0.0))) / length, bound / length
+
+    def multipliers(self) -> Array:
+        """(M,) multipliers that balance the gradient best, with their signs."""
+        import scipy.sparse as sp
+        import scipy.sparse.linalg as spl
+
+        count, size = self.A.shape
+        multipliers = np.zeros(count)
+        if not count:
+            return multipliers
+        equality = self.lower == self.upper
+        above, below = self.upper - self.g, self.g - self.lower
+        sign = np.where(equality, 0.0, np.where(above <= below, 1.0, -1.0))
+        slack = np.where(equality, 0.0, np.minimum(np.abs(above), np.abs(below)))
+        candidate = np.isfinite(slack)
+        free, A = candidate.copy(), self.A.tocoo()
+        held = np.minimum(slack, FAR) ** 2 + DAMPING * np.maximum(_squares(A), 1e-12)
+        right = np.append(-self.gradient, multipliers)
+        both, own = np.arange(size + count), size + np.arange(count)
+        places = np.concatenate([both, size + A.row, A.col]), np.concatenate([both, A.col, size + A.row])
+        matrix = sp.csc_matrix((np.concatenate([np.ones(size + count), A.data, A.data]), places))
+        diagonal = np.flatnonzero(matrix.indices == np.repeat(both, np.diff(matrix.indptr)))[size:]
+        for _ in range(ROUNDS):  # of [[I, A'], [A, -s^2]] [rest; multipliers] = [-gradient; 0]
+            matrix.data[diagonal] = -np.where(free, held, FAR**2)
+            found = spl.splu(matrix).solve(right)
+            multipliers, pull = np.where(free, found[own], 0.0), sign * (self.A @ found[:size])
+            wrong = (free & (sign * multipliers < 0.0)) | (
+                candidate & ~free & (pull > NOTHING * np.abs(self.gradient).max())
+            )
+            if not wrong.any():
+                break
+            free ^= wrong
+        return np.where(sign * multipliers < 0.0, 0.0, multipliers)
+
+
+def _squares(matrix: sp.coo_matrix) -> Array:
+    """(M,) sums of squares of the rows."""
+    return np.bincount(matrix.row, matrix.data**2, matrix.shape[0])
+
+
+def verified(solution: Solution, program: CompiledProblem, data: dict[Data, Array], tolerance: float) -> Verified:
+    """Check an answer; see :meth:`unifg.Solution.verify`.
+
+    Args:
+        solution: whose values, multipliers and cost are looked at.
+        program: the graph as it was solved, soft constraints with their slacks.
+        data: of that solve.
+        tolerance: of all numbers.
+    """
+    values, multipliers = solution.values, solution._multipliers
+    place = off_manifold(values)
+    if place is not None:
+        return Verified("fails", f"{place[0]}[{place[1]}] is no point of its manifold")
+    terms: list[WrittenTerm] = []
+    for compiled in program.terms:
+        try:
+            with np.errstate(all="ignore"):
+                terms.append(WrittenTerm(compiled.term, program.columns, values, data))
+        except Exception as error:  # of the user's function, at an answer that may be anything
+            return Verified("fails", f"term '{compiled.name}' raises {type(error).__name__}: {error}")
+        bad = ~np.isfinite(terms[-1].rows).all(axis=1)
+        if bad.any():
+            return Verified("fails", f"term '{compiled.name}', factor {int(bad.argmax())} is not finite")
+    here = Conditions(program, terms)
+    worst = here.place(here.worst) if here.worst >= 0 else None
+    measured: dict[str, Any] = {"cost": here.cost, "violation": here.violation, "worst": worst}
+    for fix in program.graph.fixes:
+        if (far := moved_fix(fix, values, data)) > tolerance:
+            return Verified("fails", f"what '{fix.name}' fixes is {far:.3g} away from its value", **measured)
+    try:
+        with np.errstate(all="ignore"):
+            here.differentiate()
+            made = here.multipliers()
+            claimed, least = here.numbers(multipliers), here.numbers(made)
+    except Exception as error:  # a function may raise beside an answer, and SciPy at a singular matrix
+        return Verified("undecided", f"slopes cannot be found: {type(error).__name__}: {error}", **measured)
+    measured |= {"claimed": claimed, "least": least, "multipliers": dict(program.by_term(made))}
+    verdict, sentence = _judged(here, solution, worst, claimed, least, made, tolerance)
+    return Verified(verdict, sentence, **measured)
+
+
+def _judged(
+    here: Conditions,
+    solution: Solution,
+    worst: tuple[str, int, int] | None,
+    claimed: Numbers,
+    least: Numbers,
+    made: Array,
+    tolerance: float,
+) -> tuple[str, str]:
+    """Verdict, and the sentence that gives its reason."""
+    if worst is not None and not here.violation <= tolerance:
+        name, factor, row = worst
+        return "fails", f"term '{name}', factor {factor}, row {row} is {here.violation:.3g} outside its limits"
+    if not abs(here.cost - solution.cost) <= COST * max(1.0, abs(here.cost)):
+        return "fails", f"the cost is {here.cost:.9g} where the solution says {solution.cost:.9g}"
+    if claimed.fails(tolerance) and not least.fails(tolerance):
+        name, factor, row = here.place(int(np.abs(made - solution._multipliers).argmax()))
+        return "fails", (
+            f"the values pass, the multipliers do not: with them stationarity is {claimed.stationarity:.3g} and "
+            f"complementarity {claimed.complementarity:.3g}; farthest from what they should be is that of '{name}', "
+            f"factor {factor}, row {row}"
+        )
+    if claimed.fails(tolerance):
+        if claimed.stationarity - claimed.bound > tolerance and claimed.variable is not None:
+            family, member = claimed.variable
+            known = f"{claimed.stationarity:.3g} (known to {claimed.bound:.1g})"
+            return "fails", f"the cost can still fall: stationarity is {known}, most at {family}[{member}]"
+        name, factor, row = here.place(claimed.row)
+        return "fails", f"complementarity is {claimed.complementarity:.3g} in '{name}', factor {factor}, row {row}"
+    numbers = (
+        f"violation {here.violation:.1e}, stationarity {claimed.stationarity:.1e} (known to {claimed.bound:.1e}), "
+        f"complementarity {claimed.complementarity:.1e}"
+    )
+    if claimed.bound > tolerance:
+        return "undecided", f"differences cannot tell stationarity to {tolerance:.1g}: {numbers}"
+    return "passes", numbers
