@@ -10,6 +10,7 @@ import pytest
 from numba import njit
 
 import unifg as fg
+from unifg.modeling.variables import Data
 from unifg.models import unicycle
 from unifg.solvers import (
     SQP,
@@ -24,7 +25,7 @@ from unifg.typing import Array
 CONSTRAINED = (InteriorPoint(), SQP(), SQP(hessian="exact"), AugmentedLagrangian(tolerance=1e-7))
 
 
-@njit
+@njit  # type: ignore[untyped-decorator]
 def _range(pose: Array, tree: Array, far: float, r: Array) -> None:
     r[0] = np.sqrt((pose[0] - tree[0]) ** 2 + (pose[1] - tree[1]) ** 2) - far
 
@@ -45,7 +46,7 @@ def _in_python(pose: Array) -> Array:
     return np.array([[float(f"{p[2]:.17g}")] for p in pose])  # no trace can stand for it
 
 
-def control() -> tuple[fg.Graph, dict[Any, Any], fg.modeling.variables.Data]:
+def control() -> tuple[fg.Graph, dict[Any, Any], Data]:
     """A unicycle's plan: kernels, a NumPy function, bounds, a scalar cost, a soft and a fixed part, data."""
     graph = fg.Graph()
     x, u = graph.variables("x", fg.SE2, 21), graph.variables("u", fg.Rn(2), 20)
@@ -180,7 +181,7 @@ def test_a_moved_landmark_is_named() -> None:
 def test_a_function_that_raises_is_named_and_nothing_is_raised() -> None:
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(1), 2)
-    broken = []
+    broken: list[int] = []
 
     def own(x: Array) -> Array:
         if broken:

@@ -7,7 +7,7 @@ where the loops over terms read them; Python hears only of data that something m
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import ReferenceType, ref
 
 import numpy as np
@@ -47,22 +47,19 @@ class Carried(NamedTuple):
 class Snapshot:
     """Values that all data of a binding had at some time, copied when they are replaced and somebody holds this."""
 
-    __slots__ = ("__weakref__", "_binding", "_copies")
-
-    def __init__(self, binding: Binding | None, copies: tuple[Array, list[Array]] | None = None) -> None:
-        """Stand for the present values of a binding, or for copies."""
-        self._binding, self._copies = binding, copies
+    __slots__ = ("__weakref__", "binding", "numbers")
+    binding: Binding | None
+    numbers: tuple[Array, list[Array]]
 
     def copies(self) -> tuple[Array, list[Array]]:
         """Numbers of all data side by side, and flags."""
-        if self._binding is not None:
-            self._binding, self._copies = None, self._binding.copies()
-        assert self._copies is not None
-        return self._copies
+        if self.binding is not None:
+            self.numbers, self.binding = self.binding.copies(), None
+        return self.numbers
 
-    def __reduce__(self) -> tuple[type[Snapshot], tuple[None, tuple[Array, list[Array]]]]:
+    def __getstate__(self) -> tuple[None, dict[str, Any]]:
         """Pickle the copies."""
-        return Snapshot, (None, self.copies())
+        return None, {"binding": None, "numbers": self.copies()}
 
 
 class Binding:
@@ -116,8 +113,8 @@ class Binding:
         """Present values, for who may ask for them after they have been replaced."""
         held = None if self._held is None else self._held()
         if held is None:
-            held = Snapshot(self)
-            self._held = ref(held)
+            held = Snapshot()
+            held.binding, self._held = self, ref(held)
         return held
 
     def copies(self) -> tuple[Array, list[Array]]:
@@ -165,7 +162,7 @@ class Binding:
         """
         if self._held is not None:
             if (held := self._held()) is not None:
-                held.copies()
+                held.numbers, held.binding = self.copies(), None
             self._held = None
         slots = self._slots
         for handle, value in data.items():

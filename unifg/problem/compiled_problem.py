@@ -89,6 +89,7 @@ class CompiledProblem:
         demanding: those of functions that assert something.
         no_penalties: (M,) zeros, of backends without penalties.
         workspaces: of single solves: backend, options, memory.
+        snapshot: of the present values of all data, copied as soon as they are replaced if it is still held.
         turn: held by who binds data, until nobody needs them any more, and while anything is evaluated.
     """
 
@@ -147,6 +148,7 @@ class CompiledProblem:
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
         self._binding = Binding(declared, filter(read.__contains__, declared.values()), graph.terms)
+        self.snapshot = self._binding.snapshot
         self._vetted = False
         self._bind_first()
 
@@ -189,10 +191,6 @@ class CompiledProblem:
                 term.forget()
         if self.rebinds:
             self._rebind([term for handle in changed for term in self._readers[handle].bound])
-
-    def snapshot(self) -> Snapshot:
-        """Present values of all data, copied as soon as they are replaced if the snapshot is still held."""
-        return self._binding.snapshot()
 
     def data_of(self, snapshot: Snapshot) -> dict[Data, Array]:
         """Values of all data in a snapshot."""

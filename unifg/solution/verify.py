@@ -212,12 +212,13 @@ class Conditions:
             if not wrong.any():
                 break
             free ^= wrong
-        return np.where(sign * multipliers < 0.0, 0.0, multipliers)
+        signed: Array = np.where(sign * multipliers < 0.0, 0.0, multipliers)
+        return signed
 
 
 def _squares(matrix: sp.coo_matrix) -> Array:
     """(M,) sums of squares of the rows."""
-    return np.bincount(matrix.row, matrix.data**2, matrix.shape[0])
+    return np.asarray(np.bincount(matrix.row, matrix.data**2, matrix.shape[0]), dtype=np.float64)
 
 
 def verified(solution: Solution, program: CompiledProblem, data: dict[Data, Array], tolerance: float) -> Verified:
