@@ -20,8 +20,8 @@ from unifg.problem.term import resolve
 from unifg.problem.traced import has_rows
 from unifg.typing import Array, BoolArray, IntArray
 
-STEP = 1e-4  # the longer of two steps [m, rad, ...]
-EPSILON = 8.0 * float(np.finfo(np.float64).eps)
+STEP = 6e-5  # the longer of two steps [m, rad, ...]
+EPSILON = 2.0 * float(np.finfo(np.float64).eps)
 BEND = 1e-5  # of a squared norm, by which the slope of a robust loss is found
 
 

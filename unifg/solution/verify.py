@@ -9,8 +9,9 @@ small as any multipliers make them. The signs are found by block principal pivot
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,14 +22,14 @@ from unifg.solution.as_written import WrittenTerm, moved_fix, off_manifold
 from unifg.typing import Array, IntArray
 
 if TYPE_CHECKING:
-    import scipy.sparse as sp
-
     from unifg.solution.solution import Solution
 
 ROUNDS = 30  # of pivoting
 FAR = 1e12  # a row so far from its limit has no multiplier
 DAMPING = 1e-13  # relative, of the rows that depend on each other
 NOTHING = 1e-10  # of the largest slope: a multiplier is not worth it
+FITS = 10.0  # times the rounding of the variables: residuals that are nothing else
+SYMMETRIC = "MMD_AT_PLUS_A"  # ordering
 COST = 1e-8  # relative difference of costs
 
 
@@ -88,13 +89,37 @@ class Verified:
         return f"{self.verdict}: {self.sentence}"
 
 
+class Entries(NamedTuple):
+    """Entries of a matrix over the unknowns; those of the same place add up.
+
+    Attributes:
+        numbers, errors: (E,) each with the bound of its error.
+        rows, columns: (E,) places.
+    """
+
+    numbers: Array
+    errors: Array
+    rows: IntArray
+    columns: IntArray
+
+    @classmethod
+    def of(cls, parts: Sequence[tuple[Array, Array, IntArray, IntArray]]) -> Entries:
+        """Join arrays that broadcast; negative places are those of fixed variables, and left out."""
+        flat = [[np.zeros(0), np.zeros(0), np.zeros(0, np.intp), np.zeros(0, np.intp)]]
+        flat += [[array.ravel() for array in np.broadcast_arrays(*part)] for part in parts]
+        numbers, errors, rows, columns = (np.concatenate(arrays) for arrays in zip(*flat, strict=True))
+        known = (rows >= 0) & (columns >= 0)
+        return cls(numbers[known], errors[known], rows[known], columns[known])
+
+
 class Conditions:
     """KKT conditions of a graph at an answer, with all slopes found by differences.
 
     Attributes:
         cost: objective.
         g, lower, upper: (M,) constraint rows and their limits.
-        rows: term, factor and row of a constraint row, by its number.
+        gradient: (size,) of the objective, after :meth:`differentiate`.
+        violation, worst: largest distance of a row outside its limits, and the row; -1 without constraints.
     """
 
     def __init__(self, program: CompiledProblem, terms: list[WrittenTerm]) -> None:
@@ -119,43 +144,32 @@ class Conditions:
 
     def differentiate(self) -> None:
         """Find gradient, Jacobian of the constraints and, of least squares, the Gauss-Newton matrix."""
-        import scipy.sparse as sp  # slow to load
-
-        columns, program = self._program.columns, self._program
-        size = columns.width
-        self.gradient, self._doubt = np.zeros(size), np.zeros(size)
-        blocks: list[tuple[Array, IntArray]] = []
-        squares = 0.0
+        unknown, size = self._program.columns.unknown, self._program.size
+        slope, doubtful, blocks, squares = np.zeros(size + 1), np.zeros(size + 1), [], 0.0  # the last, of what is fixed
         for term, _, force, weights in self._costs:
             slopes, doubt = term.slopes()
-            np.add.at(self.gradient, term.columns, np.einsum("nmd,nm->nd", slopes, force))
+            own = unknown[term.columns]
+            np.add.at(slope, own, np.einsum("nmd,nm->nd", slopes, force))
             rounding = np.abs(weights).sum(axis=2) * term.rounding
             squares += float((rounding * term.rounding).sum())
-            doubtful = np.einsum("nmd,nm->nd", doubt, np.abs(force)) + np.einsum("nmd,nm->nd", np.abs(slopes), rounding)
-            np.add.at(self._doubt, term.columns, doubtful)
-            if program.least_squares:
-                blocks.append((np.einsum("nad,nab,nbe->nde", slopes, weights, slopes), term.columns))
-        self._rounding = float(np.sqrt(squares))
-        found = [(*t.slopes(), t.columns) for t in self._own]
-        at, parts = 0, []
-        for slopes, doubt, own in found:
-            count, rows, _ = slopes.shape
-            numbers = np.broadcast_to(at + np.arange(count * rows).reshape(count, rows, 1), slopes.shape)
-            parts.append((slopes, doubt, numbers, np.broadcast_to(own[:, None, :], slopes.shape)))
-            at += count * rows
-        joined = [np.concatenate([np.zeros(0), *(part[k].ravel() for part in parts)]) for k in range(4)]
-        where = joined[2].astype(int), joined[3].astype(int)
-        self.A, self._doubts = (sp.csr_matrix((joined[k], where), (at, size))[:, columns.free] for k in (0, 1))
-        self.gradient, self._doubt = self.gradient[columns.free], self._doubt[columns.free]
-        if program.least_squares:
-            entries = np.concatenate([block.ravel() for block, _ in blocks])
-            rows = np.concatenate([np.broadcast_to(c[:, :, None], b.shape).ravel() for b, c in blocks])
-            across = np.concatenate([np.broadcast_to(c[:, None, :], b.shape).ravel() for b, c in blocks])
-            self.H = sp.csc_matrix((entries, (rows, across)), (size, size))[columns.free][:, columns.free]
+            np.add.at(doubtful, own, np.einsum("nmd,nm->nd", doubt, np.abs(force)))
+            np.add.at(doubtful, own, np.einsum("nmd,nm->nd", np.abs(slopes), rounding))
+            if self._program.least_squares:
+                square = np.einsum("nad,nab,nbe->nde", slopes, weights, slopes)
+                blocks.append((square, square, own[:, :, None], own[:, None, :]))
+        self.gradient, self._doubt, self._rounding = slope[:size], doubtful[:size], float(np.sqrt(squares))
+        self._hessian, at, parts = Entries.of(blocks), 0, []
+        for term in self._own:
+            numbers = at + np.arange(term.rows.size).reshape(*term.rows.shape, 1)
+            parts.append((*term.slopes(), numbers, unknown[term.columns][:, None, :]))
+            at += term.rows.size
+        self._jacobian = Entries.of(parts)
 
     def numbers(self, multipliers: Array) -> Numbers:
         """KKT numbers with these multipliers (M,)."""
-        slope, doubt = self.gradient + self.A.T @ multipliers, self._doubt + self._doubts.T @ np.abs(multipliers)
+        A, size = self._jacobian, self._program.size
+        slope = self.gradient + np.bincount(A.columns, A.numbers * multipliers[A.rows], size)
+        doubt = self._doubt + np.bincount(A.columns, A.errors * np.abs(multipliers[A.rows]), size)
         scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
         stationarity, bound = (float(np.abs(part).max(initial=0.0)) / scale for part in (slope, doubt))
         if self._program.least_squares and len(slope):
@@ -173,11 +187,13 @@ class Conditions:
         import scipy.sparse as sp
         import scipy.sparse.linalg as spl
 
-        diagonal = np.where(self.H.diagonal() > 0.0, self.H.diagonal(), 1.0)
         length = float(np.sqrt(sum((t.rows * force).sum() for t, _, force, _ in self._costs)))  # as losses weigh
-        if length <= self._rounding:  # everything fits
+        if length <= FITS * self._rounding:  # everything fits
             return 0.0, 0.0
-        step = spl.splu((self.H + DAMPING * sp.diags(diagonal)).tocsc()).solve(slope)
+        H = self._hessian
+        matrix = sp.csc_matrix((H.numbers, (H.rows, H.columns)))
+        diagonal = np.where(matrix.diagonal() > 0.0, matrix.diagonal(), 1.0)
+        step = spl.splu((matrix + DAMPING * sp.diags(diagonal)).tocsc(), SYMMETRIC).solve(slope)
         bound = float(np.linalg.norm(doubt / np.sqrt(diagonal)))
         return float(np.sqrt(max(slope @ step, 0.0))) / length, bound / length
 
@@ -186,7 +202,7 @@ class Conditions:
         import scipy.sparse as sp
         import scipy.sparse.linalg as spl
 
-        count, size = self.A.shape
+        A, count, size = self._jacobian, len(self.g), self._program.size
         multipliers = np.zeros(count)
         if not count:
             return multipliers
@@ -195,17 +211,20 @@ class Conditions:
         sign = np.where(equality, 0.0, np.where(above <= below, 1.0, -1.0))
         slack = np.where(equality, 0.0, np.minimum(np.abs(above), np.abs(below)))
         candidate = np.isfinite(slack)
-        free, A = candidate.copy(), self.A.tocoo()
-        held = np.minimum(slack, FAR) ** 2 + DAMPING * np.maximum(_squares(A), 1e-12)
+        free = candidate.copy()
+        held = np.minimum(slack, FAR) ** 2 + DAMPING * np.maximum(np.bincount(A.rows, A.numbers**2, count), 1e-12)
         right = np.append(-self.gradient, multipliers)
         both, own = np.arange(size + count), size + np.arange(count)
-        places = np.concatenate([both, size + A.row, A.col]), np.concatenate([both, A.col, size + A.row])
-        matrix = sp.csc_matrix((np.concatenate([np.ones(size + count), A.data, A.data]), places))
+        places = np.concatenate([both, size + A.rows, A.columns]), np.concatenate([both, A.columns, size + A.rows])
+        matrix = sp.csc_matrix((np.concatenate([np.ones(size + count), A.numbers, A.numbers]), places))
         diagonal = np.flatnonzero(matrix.indices == np.repeat(both, np.diff(matrix.indptr)))[size:]
         for _ in range(ROUNDS):  # of [[I, A'], [A, -s^2]] [rest; multipliers] = [-gradient; 0]
             matrix.data[diagonal] = -np.where(free, held, FAR**2)
-            found = spl.splu(matrix).solve(right)
-            multipliers, pull = np.where(free, found[own], 0.0), sign * (self.A @ found[:size])
+            found = spl.splu(matrix, SYMMETRIC).solve(right)
+            multipliers, pull = (
+                np.where(free, found[own], 0.0),
+                sign * np.bincount(A.rows, A.numbers * found[A.columns], count),
+            )
             wrong = (free & (sign * multipliers < 0.0)) | (
                 candidate & ~free & (pull > NOTHING * np.abs(self.gradient).max())
             )
@@ -214,11 +233,6 @@ class Conditions:
             free ^= wrong
         signed: Array = np.where(sign * multipliers < 0.0, 0.0, multipliers)
         return signed
-
-
-def _squares(matrix: sp.coo_matrix) -> Array:
-    """(M,) sums of squares of the rows."""
-    return np.asarray(np.bincount(matrix.row, matrix.data**2, matrix.shape[0]), dtype=np.float64)
 
 
 def verified(solution: Solution, program: CompiledProblem, data: dict[Data, Array], tolerance: float) -> Verified:
