@@ -9,20 +9,17 @@ small as any multipliers make them. The signs are found by block principal pivot
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from unifg.modeling.terms import Constraint
-from unifg.modeling.variables import Data
+from unifg.modeling.variables import Data, Family
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution.as_written import WrittenTerm, moved_fix, off_manifold
 from unifg.typing import Array, IntArray
-
-if TYPE_CHECKING:
-    from unifg.solution.solution import Solution
 
 ROUNDS = 30  # of pivoting
 FAR = 1e12  # a row so far from its limit has no multiplier
@@ -194,7 +191,7 @@ class Conditions:
         matrix = sp.csc_matrix((H.numbers, (H.rows, H.columns)))
         diagonal = np.where(matrix.diagonal() > 0.0, matrix.diagonal(), 1.0)
         step = spl.splu((matrix + DAMPING * sp.diags(diagonal)).tocsc(), SYMMETRIC).solve(slope)
-        bound = float(np.linalg.norm(doubt / np.sqrt(diagonal)))
+        bound = float(np.sqrt((doubt**2 / diagonal).sum()))
         return float(np.sqrt(max(slope @ step, 0.0))) / length, bound / length
 
     def multipliers(self) -> Array:
@@ -235,16 +232,24 @@ class Conditions:
         return signed
 
 
-def verified(solution: Solution, program: CompiledProblem, data: dict[Data, Array], tolerance: float) -> Verified:
+def verified(
+    program: CompiledProblem,
+    values: Mapping[Family, Array],
+    multipliers: Array,
+    cost: float,
+    data: Mapping[Data, Array],
+    tolerance: float,
+) -> Verified:
     """Check an answer; see :meth:`unifg.Solution.verify`.
 
     Args:
-        solution: whose values, multipliers and cost are looked at.
         program: the graph as it was solved, soft constraints with their slacks.
+        values: of the answer.
+        multipliers: (M,) of the answer.
+        cost: as the solution has it.
         data: of that solve.
         tolerance: of all numbers.
     """
-    values, multipliers = solution.values, solution._multipliers
     place = off_manifold(values)
     if place is not None:
         return Verified("fails", f"{place[0]}[{place[1]}] is no point of its manifold")
@@ -272,27 +277,20 @@ def verified(solution: Solution, program: CompiledProblem, data: dict[Data, Arra
     except Exception as error:  # a function may raise beside an answer, and SciPy at a singular matrix
         return Verified("undecided", f"slopes cannot be found: {type(error).__name__}: {error}", **measured)
     measured |= {"claimed": claimed, "least": least, "multipliers": dict(program.by_term(made))}
-    verdict, sentence = _judged(here, solution, worst, claimed, least, made, tolerance)
+    if not abs(here.cost - cost) <= COST * max(1.0, abs(cost)) and here.violation <= tolerance:
+        return Verified("fails", f"the cost is {here.cost:.9g} where the solution says {cost:.9g}", **measured)
+    apart = int(np.abs(made - multipliers).argmax()) if len(made) else -1
+    verdict, sentence = _judged(here, claimed, least, apart, tolerance)
     return Verified(verdict, sentence, **measured)
 
 
-def _judged(
-    here: Conditions,
-    solution: Solution,
-    worst: tuple[str, int, int] | None,
-    claimed: Numbers,
-    least: Numbers,
-    made: Array,
-    tolerance: float,
-) -> tuple[str, str]:
-    """Verdict, and the sentence that gives its reason."""
-    if worst is not None and not here.violation <= tolerance:
-        name, factor, row = worst
+def _judged(here: Conditions, claimed: Numbers, least: Numbers, apart: int, tolerance: float) -> tuple[str, str]:
+    """Verdict, and the sentence that gives its reason; ``apart`` is the row whose two multipliers differ most."""
+    if not here.violation <= tolerance:
+        name, factor, row = here.place(here.worst)
         return "fails", f"term '{name}', factor {factor}, row {row} is {here.violation:.3g} outside its limits"
-    if not abs(here.cost - solution.cost) <= COST * max(1.0, abs(here.cost)):
-        return "fails", f"the cost is {here.cost:.9g} where the solution says {solution.cost:.9g}"
     if claimed.fails(tolerance) and not least.fails(tolerance):
-        name, factor, row = here.place(int(np.abs(made - solution._multipliers).argmax()))
+        name, factor, row = here.place(apart)
         return "fails", (
             f"the values pass, the multipliers do not: with them stationarity is {claimed.stationarity:.3g} and "
             f"complementarity {claimed.complementarity:.3g}; farthest from what they should be is that of '{name}', "
