@@ -115,24 +115,20 @@ class WrittenTerm:
         squared = np.einsum("na,na->n", weighted, r)
         if term.robust is None:
             return 0.5 * squared, weighted, weights
-        if term.robust.held:  # its weight is no function of the residual
-            slope = term.robust.weight(squared)
-            return 0.5 * slope * squared, slope[:, None] * weighted, slope[:, None, None] * weights
-        ahead, behind = (term.robust.value(squared * (1.0 + sign * BEND)) for sign in (1.0, -1.0))
-        nearer = term.robust.value(squared * (1.0 + 0.5 * BEND)) - term.robust.value(squared * (1.0 - 0.5 * BEND))
-        room = np.where(squared > 0.0, BEND * squared, 1.0)
-        slope = np.where(squared > 0.0, (4.0 * nearer - 0.5 * (ahead - behind)) / (3.0 * room), 1.0)
-        cost = np.where(self.active, 0.5 * term.robust.value(squared), 0.0)
+        loss, weight = term.robust, term.robust.weight(squared)
+        value = (lambda s: weight * s) if loss.held else loss.value  # a held weight is no function of the residual
+        ahead, behind = value(squared * (1.0 + BEND)), value(squared * (1.0 - BEND))
+        slope = np.where(squared > 0.0, (ahead - behind) / np.where(squared > 0.0, 2.0 * BEND * squared, 1.0), 1.0)
+        cost = np.where(self.active, 0.5 * value(squared), 0.0)
         return cost, slope[:, None] * weighted, slope[:, None, None] * weights
 
     def limits(self) -> tuple[Array, Array]:
         """(n, m) lower and upper limits of a constraint; none where a factor is inactive."""
         term = self.term
         assert isinstance(term, Constraint)
-        shape, counts = self.rows.shape, self.active[:, None]
-        lower = np.broadcast_to(resolve(term.lower, self._data), shape)
-        upper = np.broadcast_to(resolve(term.upper, self._data), shape)
-        return np.where(counts, lower, -np.inf), np.where(counts, upper, np.inf)
+        stated = [resolve(limit, self._data) for limit in (term.lower, term.upper)]
+        lower, upper = (np.broadcast_to(limit, self.rows.shape) for limit in stated)
+        return np.where(self.active[:, None], lower, -np.inf), np.where(self.active[:, None], upper, np.inf)
 
 
 def off_manifold(values: Mapping[Family, Array]) -> tuple[str, int] | None:

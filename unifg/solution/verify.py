@@ -210,7 +210,7 @@ class Conditions:
         candidate = np.isfinite(slack)
         free = candidate.copy()
         held = np.minimum(slack, FAR) ** 2 + DAMPING * np.maximum(np.bincount(A.rows, A.numbers**2, count), 1e-12)
-        right = np.append(-self.gradient, multipliers)
+        right, worth = np.append(-self.gradient, multipliers), NOTHING * float(np.abs(self.gradient).max(initial=0.0))
         both, own = np.arange(size + count), size + np.arange(count)
         places = np.concatenate([both, size + A.rows, A.columns]), np.concatenate([both, A.columns, size + A.rows])
         matrix = sp.csc_matrix((np.concatenate([np.ones(size + count), A.numbers, A.numbers]), places))
@@ -218,13 +218,9 @@ class Conditions:
         for _ in range(ROUNDS):  # of [[I, A'], [A, -s^2]] [rest; multipliers] = [-gradient; 0]
             matrix.data[diagonal] = -np.where(free, held, FAR**2)
             found = spl.splu(matrix, SYMMETRIC).solve(right)
-            multipliers, pull = (
-                np.where(free, found[own], 0.0),
-                sign * np.bincount(A.rows, A.numbers * found[A.columns], count),
-            )
-            wrong = (free & (sign * multipliers < 0.0)) | (
-                candidate & ~free & (pull > NOTHING * np.abs(self.gradient).max())
-            )
+            multipliers = np.where(free, found[own], 0.0)
+            gain = sign * np.bincount(A.rows, A.numbers * found[A.columns], count)
+            wrong = np.where(free, sign * multipliers < 0.0, candidate & (gain > worth))
             if not wrong.any():
                 break
             free ^= wrong
