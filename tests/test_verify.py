@@ -118,6 +118,36 @@ def test_a_perfect_fit_passes() -> None:
     assert GaussNewton().solve(graph, {x: np.zeros((3, 3))}, check=True).verify()
 
 
+def test_a_perfect_fit_at_zero_passes() -> None:
+    """Where variables are zero, they have no size that rounding could be measured by."""
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph.minimize(lambda a, b: 3.0 * a - b, x, y, sigma=0.5)
+    graph.minimize(fg.prior, x, [0.0])
+    graph.minimize(fg.prior, y, [0.0])
+    solution = GaussNewton().solve(graph, {x: [[1.0]], y: [[1.0]]}, check=True)
+    solution._lin.values.flat[:] = 1e-17, -2e-17
+    solution.cost = 0.0
+    assert solution.verify()
+
+
+@njit  # type: ignore[untyped-decorator]
+def _turned(x: Array, matrix: Array, r: Array) -> None:
+    for i in range(2):
+        r[i] = matrix[i, 0] * x[0] + matrix[i, 1] * x[1]
+
+
+@pytest.mark.parametrize("count", [3, 2])
+def test_a_function_of_one_factor_takes_matrices_that_all_share(count: int) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), count)
+    graph.minimize(fg.prior, x, [1.0, 2.0])
+    matrix = np.array([[0.0, -1.0], [1.0, 0.0]])
+    graph.constrain(fg.residual(_turned, rows=2), x, fg.shared(matrix), lower=-1.0, upper=0.5, name="turned")
+    found = InteriorPoint().solve(graph, {x: np.zeros((count, 2))}, check=True).verify()
+    assert found, str(found)
+
+
 def spoiled(solution: fg.Solution, family: str, member: int, column: int, by: float) -> str:
     """Sentence about an answer with one number moved."""
     solution._lin.values[solution.families[family]][member, column] += by
@@ -258,3 +288,19 @@ def test_slopes_that_differences_cannot_tell_are_undecided() -> None:
     assert found.verdict == "undecided" and not found
     assert "differences cannot tell stationarity to 1e-07" in found.sentence
     assert found.claimed is not None and abs(6e-7 - found.claimed.stationarity) < found.claimed.bound
+
+
+@pytest.mark.parametrize("beside", [0.0, 1e-5, 2e-5, 3e-5, 5e-5])
+def test_a_kink_is_undecided(beside: float) -> None:
+    """At a kink there is no slope, and beside it steps reach across: the bound tells, wherever it lies."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [2.0])
+    graph.constrain(lambda x: np.maximum(x, 3.0 * x - 2.0), x, upper=1.0 - beside, name="bent")
+    solution = InteriorPoint(tolerance=1e-9).solve(graph, {x: [[0.5]]})
+    solution._lin.values.flat[:] = 1.0 - beside
+    solution._multipliers[:] = 1.0 + beside  # with the slope of the left side
+    solution.cost = 0.5 * (1.0 + beside) ** 2
+    found = solution.verify()
+    assert found.verdict == "undecided" and found.claimed is not None
+    assert found.claimed.stationarity <= found.claimed.bound

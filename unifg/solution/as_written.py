@@ -22,6 +22,7 @@ from unifg.typing import Array, BoolArray, IntArray
 
 STEP = 6e-5  # the longer of two steps [m, rad, ...]
 EPSILON = 2.0 * float(np.finfo(np.float64).eps)
+NOISE = 20.0  # roundings in second differences
 BEND = 1e-5  # of a squared norm, by which the slope of a robust loss is found
 
 
@@ -57,14 +58,14 @@ class WrittenTerm:
         self.active: BoolArray = np.ones(n, dtype=bool) if mask is None else mask.astype(bool)
         self.rows = self._rows(self._arguments)
         sizes = [np.abs(self._arguments[k]).max(axis=1, keepdims=True) for k in self._places]
-        self.rounding = EPSILON * np.max(sizes, axis=0)
+        self.rounding = EPSILON * np.maximum(1.0, np.max(sizes, axis=0))  # of zero, that of a number of order one
 
     def _rows(self, arguments: list[Any]) -> Array:
         """(n, m) rows for some arguments."""
         own, n = self.term.residual, self.term.count
         if own.rows:
             each = [
-                k in self._places or has_rows(a, declared)
+                k in self._places or (has_rows(a, declared) and len(a) == n)
                 for k, (a, declared) in enumerate(zip(arguments, self.term.rows, strict=True))
             ]
             found = np.zeros((n, own.rows))
@@ -76,25 +77,24 @@ class WrittenTerm:
         return np.where(self.active[:, None], np.array(own.function(*given)).reshape(n, -1), 0.0)
 
     def slopes(self) -> tuple[Array, Array]:
-        """(n, m, D) derivatives along right perturbations, and bounds of their errors."""
+        """(n, m, D) derivatives along right perturbations, and bounds of their errors.
+
+        A kink at the point itself makes both quotients alike. It shows in second differences, which are there
+        proportional to the step, and to its square where a function is smooth.
+        """
         found = []
         for place, chosen in zip(self._places, self.term.selections, strict=True):
-            point = self._arguments[place]
+            point, before, after = self._arguments[place], self._arguments[:place], self._arguments[place + 1 :]
             for step in np.eye(chosen.manifold.dim):
-                pair = []
-                for length in (STEP, 0.5 * STEP):
-                    ahead, behind = (
-                        self._rows(
-                            [*self._arguments[:place], chosen.manifold.retract(point, s * length * step),
-                             *self._arguments[place + 1 :]]
-                        )
-                        for s in (1.0, -1.0)
-                    )  # fmt: skip
-                    pair.append((ahead - behind) / (2.0 * length))
-                found.append(pair)
-        long, short = (np.stack(quotients, axis=2) for quotients in zip(*found, strict=True))
-        rounding = (self.rounding + EPSILON * np.abs(self.rows))[:, :, None] / STEP * np.maximum(1.0, np.abs(short))
-        return (4.0 * short - long) / 3.0, np.abs(long - short) + np.where(short == 0.0, 0.0, rounding)
+                moved = [chosen.manifold.retract(point, length * step) for length in (STEP, -STEP, STEP / 2, -STEP / 2)]
+                found.append([self._rows([*before, there, *after]) for there in moved])
+        ahead, behind, near, nearly = (np.stack(rows, axis=2) for rows in zip(*found, strict=True))
+        here = self.rows[:, :, None]
+        long, short = (ahead - behind) / (2.0 * STEP), (near - nearly) / STEP
+        rounding = (self.rounding[:, :, None] + EPSILON * np.abs(here)) / STEP * np.maximum(1.0, np.abs(short))
+        kink = np.abs(4.0 * (near - here + (nearly - here)) - (ahead - here + (behind - here))) / STEP
+        doubt = np.abs(long - short) + np.maximum(kink - NOISE * rounding, 0.0) + np.where(short == 0.0, 0.0, rounding)
+        return (4.0 * short - long) / 3.0, doubt
 
     def cost(self) -> tuple[Array, Array, Array]:
         """(n,) what each factor costs, (n, m) its derivatives with respect to the rows, (n, m, m) those of squares.

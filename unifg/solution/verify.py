@@ -25,7 +25,7 @@ ROUNDS = 30  # of pivoting
 FAR = 1e12  # a row so far from its limit has no multiplier
 DAMPING = 1e-13  # relative, of the rows that depend on each other
 NOTHING = 1e-10  # of the largest slope: a multiplier is not worth it
-FITS = 10.0  # times the rounding of the variables: residuals that are nothing else
+FITS = 100.0  # times the rounding of the variables: residuals that are nothing else
 SYMMETRIC = "MMD_AT_PLUS_A"  # ordering
 COST = 1e-8  # relative difference of costs
 
