@@ -7,8 +7,8 @@ where the loops over terms read them; Python hears only of data that something m
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
-from weakref import ReferenceType, ref
+from typing import NamedTuple, Protocol
+from weakref import ReferenceType
 
 import numpy as np
 
@@ -44,22 +44,10 @@ class Carried(NamedTuple):
         return cls(flat[0].astype(np.int64), flat[1].astype(np.int64), array)
 
 
-class Snapshot:
-    """Values that all data of a binding had at some time, copied when they are replaced and somebody holds this."""
+class Holder(Protocol):
+    """Solution that keeps the data it was found with, once they are replaced."""
 
-    __slots__ = ("__weakref__", "binding", "numbers")
-    binding: Binding | None
-    numbers: tuple[Array, list[Array]]
-
-    def copies(self) -> tuple[Array, list[Array]]:
-        """Numbers of all data side by side, and flags."""
-        if self.binding is not None:
-            self.numbers, self.binding = self.binding.copies(), None
-        return self.numbers
-
-    def __getstate__(self) -> tuple[None, dict[str, Any]]:
-        """Pickle the copies."""
-        return None, {"binding": None, "numbers": self.copies()}
+    _data: bytes | None
 
 
 class Binding:
@@ -68,10 +56,11 @@ class Binding:
     Attributes:
         present: the value of every datum, an array that keeps its place.
         carried: sources, targets and array of what is copied to parameters, and to fixed variables.
+        holder: to whom the present values belong; it gets a copy when they are replaced, if it is still there.
     """
 
     carried: tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]
-    _held: ReferenceType[Snapshot] | None = None
+    holder: ReferenceType[Holder] | None = None
     _others = False  # whether there are elements of manifolds with other conditions than a norm
 
     def __init__(self, known: Mapping[str, Data], used: Iterable[Data], terms: Sequence[Term] = ()) -> None:
@@ -109,22 +98,17 @@ class Binding:
         self._all = True
         self.carry(Carried.of([], [], np.empty(0)), Carried.of([], [], np.empty(0)))
 
-    def snapshot(self) -> Snapshot:
-        """Present values, for who may ask for them after they have been replaced."""
-        held = None if self._held is None else self._held()
-        if held is None:
-            held = Snapshot()
-            held.binding, self._held = self, ref(held)
-        return held
+    def kept(self) -> bytes:
+        """Present numbers side by side, and flags after them; bytes are copied faster than small arrays."""
+        return self._flat.tobytes() + b"".join(self.present[handle].tobytes() for handle in self._flags)
 
-    def copies(self) -> tuple[Array, list[Array]]:
-        """Copies of the present numbers and flags."""
-        return self._flat.copy(), [self.present[handle].copy() for handle in self._flags] if self._flags else []
-
-    def named(self, snapshot: Snapshot) -> dict[Data, Array]:
-        """Values of all data in a snapshot."""
-        numbers, flags = snapshot.copies()
-        return dict(zip([*self._numbers, *self._flags], [*self._views(numbers), *flags], strict=True))
+    def named(self, kept: bytes) -> dict[Data, Array]:
+        """Values of all data, of what :meth:`kept` has returned."""
+        found, at = {}, 0
+        for handle, own in self.present.items():
+            found[handle] = np.frombuffer(kept, own.dtype, own.size, at).reshape(own.shape)
+            at += own.nbytes
+        return found
 
     def _views(self, flat: Array) -> list[Array]:
         bounds = zip(self._numbers, self._starts[:-1], self._starts[1:], strict=True)
@@ -160,10 +144,10 @@ class Binding:
         Raises:
             GraphError: on unknown data, a changed shape, NaN, or elements off their manifold; nothing has changed then.
         """
-        if self._held is not None:
-            if (held := self._held()) is not None:
-                held.numbers, held.binding = self.copies(), None
-            self._held = None
+        if self.holder is not None:
+            if (holder := self.holder()) is not None:
+                holder._data = self.kept() if self._flags else self._flat.tobytes()
+            self.holder = None
         slots = self._slots
         for handle, value in data.items():
             slot = slots.get(handle)

@@ -50,8 +50,8 @@ def feedback_gains(
     """
     twin = _unfixed(program, states)
     with program.lock:
-        present = {handle: value.copy() for handle, value in program._binding.present.items()}
-    twin.bind({handle: value for handle, value in present.items() if handle in twin._binding.present})
+        present = {handle: value.copy() for handle, value in program.binding.present.items()}
+    twin.bind({handle: value for handle, value in present.items() if handle in twin.binding.present})
     here = twin.linearize(twin.columns.values(lin.values))
     numbers = np.append(here.constraints, here.cost), np.append(lin.constraints, lin.cost)
     if not np.allclose(*numbers, rtol=SAME, atol=SAME):

@@ -8,6 +8,7 @@ from functools import cached_property
 from html import escape
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
+from weakref import ref
 
 import numpy as np
 
@@ -102,6 +103,7 @@ class Solution:
         mistraced: terms left to Python by that check, and the reasons; the solve was repeated without their traces.
     """
 
+    _data: bytes | None = None  # once they are replaced, or asked for
     in_python = 0.0
     _parts: tuple[float, float, float, float] | None = None
     restoration_steps = 0
@@ -125,7 +127,7 @@ class Solution:
         returned: int,
     ) -> None:
         """Assembled by :class:`unifg.Solver`."""
-        self._program, self._data = program, program.snapshot()
+        self._program, program.binding.holder = program, ref(self)
         self._lin = linearization
         self._multipliers, self._penalties = multipliers, penalties
         self._equality = program.equality
@@ -450,9 +452,14 @@ class Solution:
 
         Args:
             tolerance: of violation, stationarity and complementarity, as that of the solver.
+
+        Raises:
+            GraphError: for a solution that was not returned: another one has taken its place, and its data.
         """
-        program = self._program
-        return verified(program, self.values, self._multipliers, self.cost, program.data_of(self._data), tolerance)
+        program, data = self._program, self._program.data_of(self)
+        if data is None:
+            raise GraphError("verify: the data of this solution were replaced; verify what the solve returned")
+        return verified(program, self.values, self._multipliers, self.cost, data, tolerance)
 
     def report(self) -> str:
         """The status sentence with the numbers behind it, and the times of the parts."""
@@ -539,6 +546,7 @@ class Solution:
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickle with the history, and without factorisations, which are found again where somebody asks."""
+        self._program.data_of(self)
         kept = {name: value for name, value in self.__dict__.items() if name != "_covariances"}
         return {**kept, "_history": self.history}
 
