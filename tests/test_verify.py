@@ -119,7 +119,7 @@ def test_a_perfect_fit_passes() -> None:
 
 
 def test_a_perfect_fit_at_zero_passes() -> None:
-    """Where variables are zero, they have no size that rounding could be measured by."""
+    """Variables that are zero have no size that rounding could be measured by."""
     graph = fg.Graph()
     x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
     graph.minimize(lambda a, b: 3.0 * a - b, x, y, sigma=0.5)

@@ -121,7 +121,7 @@ class Conditions:
 
     def __init__(self, program: CompiledProblem, terms: list[WrittenTerm]) -> None:
         """Evaluate costs and constraints, without slopes."""
-        self._program, self._terms = program, terms
+        self._program = program
         self._own = [t for t in terms if isinstance(t.term, Constraint)]
         self._costs = [(t, *t.cost()) for t in terms if not isinstance(t.term, Constraint)]
         self.cost = float(sum(values.sum() for _, values, _, _ in self._costs))
@@ -134,10 +134,8 @@ class Conditions:
 
     def place(self, row: int) -> tuple[str, int, int]:
         """Term, factor and row of a constraint row."""
-        for name, rows, (_, size) in self._program.places:
-            if row < rows.stop:
-                return name, *divmod(row - rows.start, size)
-        raise IndexError(row)
+        name, rows, (_, size) = next(part for part in self._program.places if row < part[1].stop)
+        return name, *divmod(row - rows.start, size)
 
     def differentiate(self) -> None:
         """Find gradient, Jacobian of the constraints and, of least squares, the Gauss-Newton matrix."""
@@ -276,8 +274,7 @@ def verified(
     if not abs(here.cost - cost) <= COST * max(1.0, abs(cost)) and here.violation <= tolerance:
         return Verified("fails", f"the cost is {here.cost:.9g} where the solution says {cost:.9g}", **measured)
     apart = int(np.abs(made - multipliers).argmax()) if len(made) else -1
-    verdict, sentence = _judged(here, claimed, least, apart, tolerance)
-    return Verified(verdict, sentence, **measured)
+    return Verified(*_judged(here, claimed, least, apart, tolerance), **measured)
 
 
 def _judged(here: Conditions, claimed: Numbers, least: Numbers, apart: int, tolerance: float) -> tuple[str, str]:
