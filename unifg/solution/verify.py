@@ -188,9 +188,12 @@ class Conditions:
         H = self._hessian
         matrix = sp.csc_matrix((H.numbers, (H.rows, H.columns)))
         diagonal = np.where(matrix.diagonal() > 0.0, matrix.diagonal(), 1.0)
-        step = spl.splu((matrix + DAMPING * sp.diags(diagonal)).tocsc(), SYMMETRIC).solve(slope)
-        bound = float(np.sqrt((doubt**2 / diagonal).sum()))
-        return float(np.sqrt(max(slope @ step, 0.0))) / length, bound / length
+        factors = spl.splu((matrix + DAMPING * sp.diags(diagonal)).tocsc(), SYMMETRIC)
+        step = factors.solve(slope)
+        along = doubt * np.sign(step)  # errors add up in the direction of least curvature, where the step is longest
+        lengths = (slope * step).sum(), max((along * factors.solve(along)).sum(), (doubt**2 / diagonal).sum())
+        offset, bound = (float(np.sqrt(max(square, 0.0))) / length for square in lengths)
+        return offset, bound
 
     def multipliers(self) -> Array:
         """(M,) multipliers that balance the gradient best, with their signs."""
