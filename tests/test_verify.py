@@ -309,11 +309,12 @@ def test_a_kink_is_undecided(beside: float) -> None:
     assert found.claimed.stationarity <= found.claimed.bound
 
 
-def test_a_direction_without_curvature_is_undecided() -> None:
+@pytest.mark.parametrize("solver", [SQP(hessian="exact"), AugmentedLagrangian()], ids=lambda s: s.name)
+def test_a_direction_without_curvature_is_undecided(solver: fg.Solver) -> None:
     """Jennrich and Sampson: both unknowns are alike at the optimum, so that no row tells them apart."""
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(2), 1)
     k = np.arange(1.0, 11.0)
     graph.minimize(lambda x: 2.0 + 2.0 * k - np.exp(k * x[:, :1]) - np.exp(k * x[:, 1:]), x, name="sums")
-    solution = SQP(hessian="exact").solve(graph, {x: [[0.3, 0.4]]}, check=True)
+    solution = solver.solve(graph, {x: [[0.3, 0.4]]}, check=True)
     assert solution.verify().verdict == "undecided"

@@ -25,6 +25,7 @@ ROUNDS = 30  # of pivoting
 FAR = 1e12  # a row so far from its limit has no multiplier
 DAMPING = 1e-13  # relative, of the rows that depend on each other
 NOTHING = 1e-10  # of the largest slope: a multiplier is not worth it
+FLAT = 1e-11  # curvature, relative to the diagonal, of a direction of which differences say nothing
 FITS = 100.0  # times the rounding of the variables: residuals that are nothing else
 SYMMETRIC = "MMD_AT_PLUS_A"  # ordering
 COST = 1e-8  # relative difference of costs
@@ -186,14 +187,14 @@ class Conditions:
         if length <= FITS * self._rounding:  # everything fits
             return 0.0, 0.0
         H = self._hessian
-        matrix = sp.csc_matrix((H.numbers, (H.rows, H.columns)))
-        diagonal = np.where(matrix.diagonal() > 0.0, matrix.diagonal(), 1.0)
-        factors = spl.splu((matrix + DAMPING * sp.diags(diagonal)).tocsc(), SYMMETRIC)
-        step = factors.solve(slope)
-        along = doubt * np.sign(step)  # errors add up in the direction of least curvature, where the step is longest
-        lengths = (slope * step).sum(), max((along * factors.solve(along)).sum(), (doubt**2 / diagonal).sum())
-        offset, bound = (float(np.sqrt(max(square, 0.0))) / length for square in lengths)
-        return offset, bound
+        scale = np.sqrt(np.bincount(H.rows, np.where(H.rows == H.columns, H.numbers, 0.0), len(slope)))
+        scale = np.where(scale > 0.0, scale, 1.0)
+        matrix = sp.csc_matrix((H.numbers / scale[H.rows] / scale[H.columns], (H.rows, H.columns)))
+        factors = spl.splu((matrix + DAMPING * sp.identity(len(slope))).tocsc(), SYMMETRIC)
+        square = ((slope / scale) * factors.solve(slope / scale)).sum()
+        bound = float(np.sqrt(((doubt / scale) ** 2).sum())) / length
+        flat = np.abs(factors.U.diagonal()).min() < FLAT  # some step is as long as errors make it
+        return float(np.sqrt(max(square, 0.0))) / length, np.inf if flat else bound
 
     def multipliers(self) -> Array:
         """(M,) multipliers that balance the gradient best, with their signs."""
