@@ -342,7 +342,7 @@ def test_a_joint_graph_of_a_quadrotor() -> None:
     planned = controller.loop.solution
     assert planned is not None
     program = planned._program
-    data = {handle: value.copy() for handle, value in program._binding.present.items()}
+    data = {handle: value.copy() for handle, value in program.binding.present.items()}
     judge = Judge(InteriorPoint(tolerance=TIGHT), program.graph, planned, data)
     families = [family for family in program.families if ":" not in family.name]
     moving = {

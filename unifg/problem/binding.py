@@ -7,7 +7,8 @@ where the loops over terms read them; Python hears only of data that something m
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import TypeAlias
+from typing import Protocol, TypeAlias
+from weakref import ReferenceType
 
 import numpy as np
 
@@ -26,6 +27,12 @@ Moved: TypeAlias = tuple[list[IntArray], list[IntArray], Array]
 """Places as :meth:`Binding.place` gives them, places in an array, and the array."""
 
 
+class Holder(Protocol):
+    """Solution that keeps the data it was found with, once they are replaced."""
+
+    _data: bytes | None
+
+
 class Binding:
     """Copies of all data that nobody else writes to.
 
@@ -33,9 +40,11 @@ class Binding:
         present: the value of every datum, an array that keeps its place.
         edition: how often some of them have been replaced by others.
         carried: sources, targets and array of what is copied to parameters, and to fixed variables.
+        holder: to whom the present values belong; it gets a copy when they are replaced, if it is still there.
     """
 
     carried: tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]
+    holder: ReferenceType[Holder] | None = None
     _others = False  # whether there are elements of manifolds with other conditions than a norm
 
     def __init__(self, known: Mapping[str, Data], used: Iterable[Data], terms: Sequence[Term] = ()) -> None:
@@ -72,6 +81,18 @@ class Binding:
         self._changed = np.zeros(len(self._numbers), dtype=np.bool_)
         self._all, self.edition = True, 0
         self.carry(([], [], np.empty(0)), ([], [], np.empty(0)))
+
+    def kept(self) -> bytes:
+        """Present numbers side by side, and flags after them; bytes are copied faster than small arrays."""
+        return self._flat.tobytes() + b"".join(self.present[handle].tobytes() for handle in self._flags)
+
+    def named(self, kept: bytes) -> dict[Data, Array]:
+        """Values of all data, of what :meth:`kept` has returned."""
+        found, at = {}, 0
+        for handle, own in self.present.items():
+            found[handle] = np.frombuffer(kept, own.dtype, own.size, at).reshape(own.shape)
+            at += own.nbytes
+        return found
 
     def _views(self, flat: Array) -> list[Array]:
         bounds = zip(self._numbers, self._starts[:-1], self._starts[1:], strict=True)
@@ -112,6 +133,10 @@ class Binding:
         Raises:
             GraphError: on unknown data, a changed shape, NaN, or elements off their manifold; nothing has changed then.
         """
+        if self.holder is not None:
+            if (holder := self.holder()) is not None:
+                holder._data = self.kept() if self._flags else self._flat.tobytes()
+            self.holder = None
         slots = self._slots
         for handle, value in data.items():
             slot = slots.get(handle)

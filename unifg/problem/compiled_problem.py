@@ -25,7 +25,7 @@ from unifg.modeling.model import Model
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
-from unifg.problem.binding import Binding
+from unifg.problem.binding import Binding, Holder
 from unifg.problem.branches import Branches
 from unifg.problem.by_term import ByTerm, Places
 from unifg.problem.columns import Columns, Values
@@ -91,6 +91,7 @@ class CompiledProblem:
         demanding: those of functions that assert something.
         no_penalties: (M,) zeros, of backends without penalties.
         workspaces: of single solves: backend, options, memory.
+        binding: the present values of all data.
         turn: held by who binds data, until nobody needs them any more, and while anything is evaluated.
     """
 
@@ -148,7 +149,7 @@ class CompiledProblem:
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
-        self._binding = Binding(declared, filter(read.__contains__, declared.values()), graph.terms)
+        self.binding = Binding(declared, filter(read.__contains__, declared.values()), graph.terms)
         self._vetted = False
         self._bind_first()
 
@@ -160,7 +161,7 @@ class CompiledProblem:
     @property
     def data_edition(self) -> int:
         """Number of the present data; two of the same number are the same."""
-        return self._binding.edition
+        return self.binding.edition
 
     @property
     def left_to_python(self) -> list[str]:
@@ -181,15 +182,15 @@ class CompiledProblem:
     @property
     def carried(self) -> tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]:
         """Places where numbers of data go, see :class:`unifg.problem.binding.Binding`."""
-        return self._binding.carried
+        return self.binding.carried
 
     def rows_of_data(self, data: Mapping[Data, Array], count: int) -> Array | None:
         """(count, D) numbers of all data of many instances; None where more than finite numbers is asked for."""
-        return self._binding.rows(data, count)
+        return self.binding.rows(data, count)
 
     def forget_data(self) -> None:
         """Count all data as changed at the next :meth:`bind`."""
-        self._binding.forget()
+        self.binding.forget()
 
     @property
     def hessian(self) -> Symmetric:
@@ -209,30 +210,37 @@ class CompiledProblem:
         Raises:
             GraphError: on unknown data, a changed shape, NaN, or crossed limits.
         """
-        changed = self._binding.take(data)
+        changed = self.binding.take(data)
         for handle in changed:
             for term in self._readers[handle].told:
                 term.forget()
         if self.rebinds:
             self._rebind([term for handle in changed for term in self._readers[handle].bound])
 
+    def data_of(self, holder: Holder) -> dict[Data, Array] | None:
+        """Values of all data that a solution was found with; None where they were replaced by way of another one."""
+        with self.lock:
+            if holder._data is None and self.binding.holder is not None and self.binding.holder() is holder:
+                holder._data, self.binding.holder = self.binding.kept(), None
+            return None if holder._data is None else self.binding.named(holder._data)
+
     def _rebind(self, terms: Sequence[CompiledTerm]) -> None:
         """Work out anew what terms make of their data."""
         rebound = list(dict.fromkeys(terms))
         try:
             for term in rebound:
-                term.bind(self._binding.present)
+                term.bind(self.binding.present)
             if any(isinstance(term.term, Constraint) for term in rebound):
                 self._bind_limits()
         except GraphError:
-            self._binding.forget()
+            self.binding.forget()
             raise
         if rebound:
             self.table.bind(rebound, self.lower, self.upper)
 
     def _bind_first(self) -> None:
         """Take the defaults, and find out what has to be done when a datum changes."""
-        binding, retraction = self._binding, self.retraction
+        binding, retraction = self.binding, self.retraction
         binding.take({})
         for term in self.terms:
             if term.data:

@@ -151,7 +151,7 @@ def _undetermined(program: CompiledProblem, values: Values) -> list[Finding]:
         if not len(loose) and factorization.factor(scaled):
             if factorization.pivots().min() > PIVOT_TOLERANCE:
                 return []
-            loose = np.flatnonzero(np.abs(_null_direction(factorization, program.size)) > 0.1)
+            loose = np.flatnonzero(np.abs(null_direction(factorization, program.size)) > 0.1)
     members: dict[str, list[int]] = {}
     for column in loose.tolist():
         family, member = program.columns.name(int(program.columns.free[column]))
@@ -160,7 +160,7 @@ def _undetermined(program: CompiledProblem, values: Values) -> list[Finding]:
     return [
         Finding(
             "undetermined",
-            f"{_listed(family, found)} can move at the guess without any cost or constraint noticing to first order; "
+            f"{listed(family, found)} can move at the guess without any cost or constraint noticing to first order; "
             "add a prior or fix something",
             None,
             family,
@@ -170,13 +170,13 @@ def _undetermined(program: CompiledProblem, values: Values) -> list[Finding]:
     ]
 
 
-def _listed(family: str, members: list[int]) -> str:
+def listed(family: str, members: list[int]) -> str:
     """A few members by name, and how many there are."""
     names = ", ".join(f"{family}[{member}]" for member in members[:3])
     return names if len(members) <= 3 else f"{names}, ... ({len(members)} members)"
 
 
-def _null_direction(factorization: Factorization, size: int) -> Array:
+def null_direction(factorization: Factorization, size: int) -> Array:
     """Direction of least curvature by inverse iteration, largest entry 1."""
     vector = np.random.default_rng(0).normal(size=size)
     for _ in range(3):

@@ -95,7 +95,7 @@ def unfixed(program: CompiledProblem, columns: IntArray, lin: Linearization) -> 
         graph.fixes = [fix for fix in graph.fixes if fix.name not in dropped]
         known[dropped] = CompiledProblem(graph)
     twin = known[dropped]
-    twin.bind({handle: value for handle, value in program._binding.present.items() if handle in twin._binding.present})
+    twin.bind({handle: value for handle, value in program.binding.present.items() if handle in twin.binding.present})
     here = twin.linearize(twin.columns.values(lin.values))
     numbers = np.append(here.constraints, here.cost), np.append(lin.constraints, lin.cost)
     if not np.allclose(*numbers, rtol=SAME, atol=SAME):

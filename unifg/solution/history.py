@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from html import escape
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -163,6 +164,14 @@ class History(list[Iteration]):
 
         kkt = {name: self.column(name) for name in ("stationarity", "violation", "complementarity")}
         return draw_descent(self.column("cost"), kkt | {"step": self.column("step_norm")})
+
+    def __str__(self) -> str:
+        """Table with a line for every row."""
+        return "\n".join([HEADER, *map(line, self)])
+
+    def _repr_html_(self) -> str:
+        """The table, for notebooks."""
+        return f"<pre>{escape(str(self))}</pre>"
 
     def column(self, name: str) -> Array:
         """(k,) numbers of one attribute of all rows."""

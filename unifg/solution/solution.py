@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from html import escape
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
+from weakref import ref
 
 import numpy as np
 
@@ -17,14 +19,16 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.conditioning import Conditioning, cheap, conditioning
 from unifg.solution.covariance import Covariances
+from unifg.solution.explain import disagreeing, holding, slow, violated, weak
 from unifg.solution.fit import Fit, fit_of
 from unifg.solution.gains import feedback_gains
-from unifg.solution.history import HEADER, FactorNorms, History, Iteration, factor_norms, line
+from unifg.solution.history import FactorNorms, History, Iteration, factor_norms
 from unifg.solution.marginal import Variables, information, marginal_prior
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.sensitivity import Named, Sensitivities, Weights, Wrt
 from unifg.solution.status import Status
+from unifg.solution.verify import Verified, verified
 from unifg.solution.warm_start import Shifts
 from unifg.typing import Array, BoolArray, Numbers
 
@@ -102,6 +106,7 @@ class Solution:
     """
 
     tolerance, _edition = 1e-6, -1
+    _data: bytes | None = None  # once they are replaced, or asked for
     in_python = 0.0
     _parts: tuple[float, float, float, float] | None = None
     restoration_steps = 0
@@ -125,7 +130,7 @@ class Solution:
         returned: int,
     ) -> None:
         """Assembled by :class:`unifg.Solver`."""
-        self._program = program
+        self._program, program.binding.holder = program, ref(self)
         self._lin = linearization
         self._multipliers, self._penalties = multipliers, penalties
         self._equality = program.equality
@@ -493,6 +498,25 @@ class Solution:
         parts = {"evaluation": evaluation, "linear systems": systems, "search": compiled - evaluation - systems}
         return {**parts, "judge": judge, "Python": self.seconds - compiled - judge}
 
+    def verify(self, tolerance: float = 1e-6) -> Verified:
+        """Check the answer by the functions as they were written, independently of the compiled graph and its engine.
+
+        Values, multipliers and cost are taken as claims: all residuals, limits, manifolds and fixed variables are
+        looked at with the data of that solve, slopes are central differences with error bounds, and multipliers are
+        also made anew; see :mod:`unifg.solution.verify`. It never raises for a bad answer. What functions read beyond
+        their arguments is read as it is now.
+
+        Args:
+            tolerance: of violation, stationarity and complementarity, as that of the solver.
+
+        Raises:
+            GraphError: for a solution that was not returned: another one has taken its place, and its data.
+        """
+        program, data = self._program, self._program.data_of(self)
+        if data is None:
+            raise GraphError("verify: the data of this solution were replaced; verify what the solve returned")
+        return verified(program, self.values, self._multipliers, self.cost, data, tolerance)
+
     def report(self) -> str:
         """The status sentence with the numbers behind it, and the times of the parts."""
         text = self._told()
@@ -522,15 +546,7 @@ class Solution:
         if self.worst is not None and self.violation > 0.0 and not self.converged:
             name, index = self.worst
             text += f" Largest violation: '{name}', factor {index}."
-        for name in self._program.soft:
-            given_way = np.abs(self.slack(name))
-            rows = int((given_way > GIVEN_WAY).sum())
-            if rows:
-                factor = int(np.argmax(given_way.max(axis=1)))
-                text += (
-                    f" Soft constraint '{name}' gives way in {rows} of {given_way.size} rows, by up to "
-                    f"{given_way.max():.3g} in factor {factor}; that is no violation."
-                )
+        text += "".join(f" {sentence}" for sentence in self._gave_way())
         if self.in_python > 0.01 * self.seconds:
             names = ", ".join(f"'{name}'" for name in self._program.left_to_python)
             share = 100.0 * self.in_python / self.seconds
@@ -541,16 +557,52 @@ class Solution:
             text += f" {self.verdict.sentence(self.cost)}"
         return text
 
+    def _gave_way(self) -> list[str]:
+        """A sentence on each soft constraint that gives way."""
+        found = []
+        for name in self._program.soft:
+            given_way = np.abs(self.slack(name))
+            if rows := int((given_way > GIVEN_WAY).sum()):
+                factor = int(np.argmax(given_way.max(axis=1)))
+                found.append(
+                    f"Soft constraint '{name}' gives way in {rows} of {given_way.size} rows, by up to "
+                    f"{given_way.max():.3g} in factor {factor}; that is no violation."
+                )
+        return found
+
+    def explain(self) -> str:
+        """Sentences, one a line, on what shapes this solution and what it took.
+
+        The backend and why it was picked; the status; constraints that hold the solution, with what a unit of loosening
+        saves; soft ones that give way; measurements that disagree with their weights, of least squares; the direction
+        that is hardly determined; terms left to Python. One factorisation, where it is cheap.
+        """
+        program, held = self._program, self._equality | self._held()
+        sentences = [f"{self.solver} was {self.picked or 'chosen by name'}.", self.status.value]
+        if not self.converged:
+            sentences += violated(program, self.worst, self.violation)
+        sentences += [*holding(program, self._multipliers, self._equality, held), *self._gave_way()]
+        if self.converged and (fit := self.fit) is not None:
+            sentences += disagreeing(program, fit)
+        sentences += weak(program, self._lin, held)
+        return "\n".join([*sentences, *slow(program, self._lin, self.seconds, self.in_python, self.times)])
+
     def table(self) -> str:
         """The history as a table."""
-        return "\n".join([HEADER, *map(line, self.history)])
+        return str(self.history)
 
     def __repr__(self) -> str:
         """The report, of what costs nothing."""
         return f"<Solution {self._told()}>"
 
+    def _repr_html_(self) -> str:
+        """The same and the history, for notebooks."""
+        rows = f"<details><summary>{self.iterations} iterations</summary>{self.history._repr_html_()}</details>"
+        return f"<p>{escape(self._told())}</p>{rows}"
+
     def __getstate__(self) -> dict[str, Any]:
         """Pickle with the history, and without factorisations, which are found again where somebody asks."""
+        self._program.data_of(self)
         kept = {name: value for name, value in self.__dict__.items() if name not in ("_covariances", "_sensitivities")}
         return {**kept, "_history": self.history, "_edition": -1}
 

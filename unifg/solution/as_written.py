@@ -1,0 +1,148 @@
+"""Terms evaluated as they were written: the user's functions, weights, losses and limits, called by NumPy.
+
+No trace, no compiled problem and no linear algebra of the engine takes part, so that a mistake in one of these shows.
+Slopes are central differences of two step lengths, extrapolated (Richardson); what the two disagree by, and rounding,
+bounds their error. Every factor reads arguments of its own, so that one call moves the same argument of all factors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from unifg.factors.autodiff.derived import in_python
+from unifg.modeling.terms import Constraint, Cost, Fix, ScalarCost, Term
+from unifg.modeling.variables import Data, Family, Selection
+from unifg.problem.columns import Columns
+from unifg.problem.term import resolve
+from unifg.problem.traced import has_rows
+from unifg.typing import Array, BoolArray, IntArray
+
+STEP = 6e-5  # the longer of two steps [m, rad, ...]
+EPSILON = 2.0 * float(np.finfo(np.float64).eps)
+NOISE = 20.0  # roundings in second differences
+BEND = 1e-5  # of a squared norm, by which the slope of a robust loss is found
+
+
+class WrittenTerm:
+    """One term at an answer.
+
+    Attributes:
+        term: as stated.
+        columns: (n, D) tangent coordinates of its variables, numbered over all variables.
+        active: (n,) factors that count.
+        rows: (n, m) residuals, not whitened; (n, 1) values of a scalar cost; zero where inactive.
+        rounding: (n, 1) of the variables of each factor.
+    """
+
+    def __init__(self, term: Term, columns: Columns, values: Mapping[Family, Array], data: Mapping[Data, Array]):
+        """Evaluate the term.
+
+        Args:
+            term: as stated.
+            columns: numbering of the tangent coordinates.
+            values: (count, storage) of each family.
+            data: values of data; defaults stand for others.
+        """
+        self.term, self._data, n = term, data, term.count
+        self._arguments = [resolve(a, data) if isinstance(a, Data) else a for a in term.arguments]
+        self._places = [k for k, a in enumerate(term.arguments) if isinstance(a, Selection)]
+        for k, chosen in zip(self._places, term.selections, strict=True):
+            point = values[chosen.family][chosen.indices][:, chosen.storage]
+            self._arguments[k] = np.array(np.broadcast_to(point, (n, point.shape[1])))
+        own = [columns.of(chosen) for chosen in term.selections]
+        self.columns: IntArray = np.concatenate([np.broadcast_to(c, (n, c.shape[1])) for c in own], axis=1)
+        mask = resolve(term.active, data) if isinstance(term.active, Data) else term.active
+        self.active: BoolArray = np.ones(n, dtype=bool) if mask is None else mask.astype(bool)
+        self.rows = self._rows(self._arguments)
+        sizes = [np.abs(self._arguments[k]).max(axis=1, keepdims=True) for k in self._places]
+        self.rounding = EPSILON * np.maximum(1.0, np.max(sizes, axis=0))  # of zero, that of a number of order one
+
+    def _rows(self, arguments: list[Any]) -> Array:
+        """(n, m) rows for some arguments."""
+        own, n = self.term.residual, self.term.count
+        if own.rows:
+            each = [
+                k in self._places or (has_rows(a, declared) and len(a) == n)
+                for k, (a, declared) in enumerate(zip(arguments, self.term.rows, strict=True))
+            ]
+            found = np.zeros((n, own.rows))
+            for i in np.flatnonzero(self.active):
+                given = [np.array(a[i] if row else a) for a, row in zip(arguments, each, strict=True)]
+                found[i] = in_python(own.function, [a if a.ndim else float(a) for a in given], own.rows)
+            return found
+        given = [a.copy() if k in self._places else a for k, a in enumerate(arguments)]  # it may write into them
+        return np.where(self.active[:, None], np.array(own.function(*given)).reshape(n, -1), 0.0)
+
+    def slopes(self) -> tuple[Array, Array]:
+        """(n, m, D) derivatives along right perturbations, and bounds of their errors.
+
+        A kink at the point itself makes both quotients alike. It shows in second differences, which are there
+        proportional to the step, and to its square where a function is smooth.
+        """
+        found = []
+        for place, chosen in zip(self._places, self.term.selections, strict=True):
+            point, before, after = self._arguments[place], self._arguments[:place], self._arguments[place + 1 :]
+            for step in np.eye(chosen.manifold.dim):
+                moved = [chosen.manifold.retract(point, length * step) for length in (STEP, -STEP, STEP / 2, -STEP / 2)]
+                found.append([self._rows([*before, there, *after]) for there in moved])
+        ahead, behind, near, nearly = (np.stack(rows, axis=2) for rows in zip(*found, strict=True))
+        here = self.rows[:, :, None]
+        long, short = (ahead - behind) / (2.0 * STEP), (near - nearly) / STEP
+        rounding = (self.rounding[:, :, None] + EPSILON * np.abs(here)) / STEP * np.maximum(1.0, np.abs(short))
+        kink = np.abs(4.0 * (near - here + (nearly - here)) - (ahead - here + (behind - here))) / STEP
+        doubt = np.abs(long - short) + np.maximum(kink - NOISE * rounding, 0.0) + np.where(short == 0.0, 0.0, rounding)
+        return (4.0 * short - long) / 3.0, doubt
+
+    def cost(self) -> tuple[Array, Array, Array]:
+        """(n,) what each factor costs, (n, m) its derivatives with respect to the rows, (n, m, m) those of squares.
+
+        The last is the Gauss-Newton matrix of a factor, by its rows.
+        """
+        term, r = self.term, self.rows
+        n, m = r.shape
+        if isinstance(term, ScalarCost):
+            return r[:, 0], np.where(self.active[:, None], 1.0, 0.0), np.zeros((n, 1, 1))
+        assert isinstance(term, Cost)
+        weights = np.broadcast_to(np.eye(m), (n, m, m))
+        if term.sigma is not None:
+            weights = weights / np.broadcast_to(resolve(term.sigma, self._data), (n, m))[:, :, None] ** 2
+        if term.information is not None:
+            weights = np.broadcast_to(resolve(term.information, self._data), (n, m, m))
+        weighted = np.einsum("nab,nb->na", weights, r)
+        squared = np.einsum("na,na->n", weighted, r)
+        if term.robust is None:
+            return 0.5 * squared, weighted, weights
+        loss, weight = term.robust, term.robust.weight(squared)
+        value = (lambda s: weight * s) if loss.held else loss.value  # a held weight is no function of the residual
+        ahead, behind = value(squared * (1.0 + BEND)), value(squared * (1.0 - BEND))
+        slope = np.where(squared > 0.0, (ahead - behind) / np.where(squared > 0.0, 2.0 * BEND * squared, 1.0), 1.0)
+        cost = np.where(self.active, 0.5 * value(squared), 0.0)
+        return cost, slope[:, None] * weighted, slope[:, None, None] * weights
+
+    def limits(self) -> tuple[Array, Array]:
+        """(n, m) lower and upper limits of a constraint; none where a factor is inactive."""
+        term = self.term
+        assert isinstance(term, Constraint)
+        stated = [resolve(limit, self._data) for limit in (term.lower, term.upper)]
+        lower, upper = (np.broadcast_to(limit, self.rows.shape) for limit in stated)
+        return np.where(self.active[:, None], lower, -np.inf), np.where(self.active[:, None], upper, np.inf)
+
+
+def off_manifold(values: Mapping[Family, Array]) -> tuple[str, int] | None:
+    """Family and index of the first member that is no point of its manifold."""
+    for family, points in values.items():
+        wrong = np.flatnonzero(~(family.manifold.is_valid(points) & np.isfinite(points).all(axis=1)))
+        if len(wrong):
+            return family.name, int(wrong[0])
+    return None
+
+
+def moved_fix(fix: Fix, values: Mapping[Family, Array], data: Mapping[Data, Array]) -> float:
+    """Largest difference of fixed variables from the value they are fixed at."""
+    chosen = fix.selection
+    here = values[chosen.family][chosen.indices][:, chosen.storage]
+    value = resolve(fix.value, data)
+    return float(np.abs(here - value).max(initial=0.0))
