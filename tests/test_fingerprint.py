@@ -16,9 +16,10 @@ import pytest
 
 from unifg.codegen import calls, loops
 from unifg.codegen import fingerprint as room
-from unifg.codegen.fingerprint import fingerprint
+from unifg.codegen.fingerprint import _parts, fingerprint, is_compiled
 from unifg.codegen.jit import compiled, in_order
 from unifg.codegen.loops import dot
+from unifg.solvers import SQP, InteriorPoint
 
 PLACES = {
     "helper.py": "def number(value):\n    return 2 * value\n",
@@ -36,6 +37,7 @@ import numpy as np
 from numba.extending import intrinsic
 from unifg.codegen.jit import compiled
 from unifg.codegen.loops import dot
+from unifg.solvers import SQP, InteriorPoint
 from between import near
 FACTOR = 3.0
 TABLE = np.arange(3.0)
@@ -187,3 +189,13 @@ def test_files_that_came_with_the_archive_are_not_parsed(monkeypatch: pytest.Mon
     monkeypatch.setattr(room, "archived", lambda: table)
     room._shapes.cache_clear()
     assert room.shapes(str(loops.__file__)) == expected != {}
+
+
+def test_no_shipped_function_has_an_address_in_its_fingerprint() -> None:
+    """It would be another one in every process: compiled anew each time, and never found in the archive."""
+    assert InteriorPoint().name and SQP().name  # their modules are there
+    modules = [module for name, module in sys.modules.items() if name.startswith("unifg.")]
+    functions = [found for module in modules for found in vars(module).values() if is_compiled(found)]
+    assert len(functions) > 200
+    for function in functions:
+        assert [part for part in _parts(function, set()) if " at 0x" in part] == [], function

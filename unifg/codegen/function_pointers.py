@@ -110,6 +110,10 @@ class Memory:
         """Nothing is described yet."""
         self.kind: Any = None
 
+    def __repr__(self) -> str:
+        """The same in every process, since fingerprints of functions have it; the kind is a part of their keys."""
+        return "Memory"
+
     def describe(self, arrays: Any) -> IntArray:
         """(words,) what Numba would keep in memory; without owner, so that nobody counts references.
 
