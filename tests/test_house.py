@@ -270,9 +270,9 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 30_098, "scenarios": 10_301, "benchmarks": 4_627, "tests": 33_985,
-    "docs examples": 1_776, "unifg/factors": 4_227, "unifg/problem": 3_128, "models": 2_269,
-    "unifg/elimination": 2_089, "solvers": 4_841, "unifg/solution": 2_739, "unifg/smoothing": 1_625,
+    "unifg solvers models": 30_088, "scenarios": 10_301, "benchmarks": 4_627, "tests": 33_985,
+    "docs examples": 1_776, "unifg/factors": 4_227, "unifg/problem": 3_122, "models": 2_269,
+    "unifg/elimination": 2_089, "solvers": 4_841, "unifg/solution": 2_735, "unifg/smoothing": 1_625,
     "unifg/lie": 1_585, "unifg/view": 1_404, "unifg/files": 1_010, "unifg/pose_graphs": 1_036,
     "unifg/horizon": 1_201, "unifg/modeling": 1_044, "unifg/codegen": 1_183, "unifg/plots": 418,
     "scenarios/scenes": 1_274, "scenarios/simulation": 1_150, "scenarios/campaigns": 912,

@@ -376,7 +376,7 @@ class Workspace:
         sizes = len(work.values), len(work.multipliers), 8
         found, multipliers, numbers = (np.zeros((count, size)) for size in sizes)
         functions = np.array([self._links[name] for name in ("reset", "loop", "conclude")])
-        carried, retraction = program.carried, program.retraction
+        carried, retraction = program.binding.carried, program.retraction
         solve_each(
             functions, self._address, work.scalars, options.barrier, options.penalty, rows, carried[:3],
             (*carried[3:], retraction.fixed), program.reader.quaternions, guesses, duals, work.values,

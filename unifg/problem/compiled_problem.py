@@ -159,11 +159,6 @@ class CompiledProblem:
         return self.table.arrays
 
     @property
-    def data_edition(self) -> int:
-        """Number of the present data; two of the same number are the same."""
-        return self.binding.edition
-
-    @property
     def left_to_python(self) -> list[str]:
         """Names of the terms that Python evaluates."""
         return [term.name for term in self.batched + self.scalar_terms if term.trace is None]
@@ -178,19 +173,6 @@ class CompiledProblem:
         """True if instances with other data differ in numbers that compiled loops read, and Python has no part."""
         python = self.rebinds or self.soft or self.differenced or self.demanding or self._branches
         return self.fully_compiled and not (python or self.reader.particular or len(self.fixed_rows()))
-
-    @property
-    def carried(self) -> tuple[IntArray, IntArray, Array, IntArray, IntArray, Array]:
-        """Places where numbers of data go, see :class:`unifg.problem.binding.Binding`."""
-        return self.binding.carried
-
-    def rows_of_data(self, data: Mapping[Data, Array], count: int) -> Array | None:
-        """(count, D) numbers of all data of many instances; None where more than finite numbers is asked for."""
-        return self.binding.rows(data, count)
-
-    def forget_data(self) -> None:
-        """Count all data as changed at the next :meth:`bind`."""
-        self.binding.forget()
 
     @property
     def hessian(self) -> Symmetric:
@@ -624,12 +606,16 @@ class CompiledProblem:
         """Pickle the graph: addresses of machine code mean nothing elsewhere, nor do views of arrays."""
         return compile_graph, (self.graph,)
 
+    def row_place(self, row: int) -> tuple[str, int, int]:
+        """Term, factor and row of the factor of a constraint row."""
+        for name, rows, (_, size) in self.places:
+            if rows.start <= row < rows.stop:
+                return name, *divmod(row - rows.start, size)
+        raise GraphError(f"row {row} belongs to no constraint", index=row)
+
     def row_name(self, row: int) -> tuple[str, int]:
         """Term and factor of a constraint row."""
-        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
-            if rows.start <= row < rows.stop:
-                return term.name, (row - rows.start) // term.size
-        raise GraphError(f"row {row} belongs to no constraint", index=row)
+        return self.row_place(row)[:2]
 
     def cost_rows(self, names: Sequence[str]) -> BoolArray:
         """(C,) whether each cost row belongs to one of the named terms.

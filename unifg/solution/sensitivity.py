@@ -98,14 +98,14 @@ class Sensitivities:
     def _require_data(self) -> None:
         """Raise unless the present data are those of the solution: their number, or what they make of its values."""
         program, lin = self._program, self._lin
-        if self._edition == program.data_edition:
+        if self._edition == program.binding.edition:
             return
         here = program.linearize(program.columns.values(lin.values))
         pairs = [(getattr(here, name), getattr(lin, name)) for name in LINEARIZED]
         pairs += zip((program.lower, program.upper), self._limits, strict=True)
         if not all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in pairs):
             raise GraphError(REPLACED)
-        self._edition = program.data_edition
+        self._edition = program.binding.edition
 
     def _require_strict(self, tolerance: float) -> None:
         """Raise for the weakest row that may be active or not."""
@@ -171,9 +171,8 @@ class Sensitivities:
 
     def _place(self, row: int) -> tuple[str, int, str]:
         """Term and factor of a constraint row, and the words for it."""
-        term, factor = self._program.row_name(row)
-        rows, (_, m) = next((rows, shape) for name, rows, shape in self._program.places if name == term)
-        return term, factor, f"'{term}', factor {factor}, row {(row - rows.start) % m},"
+        term, factor, own = self._program.row_place(row)
+        return term, factor, f"'{term}', factor {factor}, row {own},"
 
     def matrix(self, of: Sequence[Selection | str], wrt: Sequence[Wrt]) -> Array:
         """(k, K) derivatives; arguments and errors as of :meth:`unifg.Solution.sensitivity`."""

@@ -511,7 +511,7 @@ class SolveState:
             returned,
         )
         solution.restoration_steps, solution._parts = self.restoration_steps, self.parts
-        solution.tolerance, solution._edition = self.tolerance, self.program.data_edition
+        solution.tolerance, solution._edition = self.tolerance, self.program.binding.edition
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
 
@@ -675,19 +675,19 @@ class Prepared:
         """Some instances in one compiled call; None where single solves have to look at their data or answers."""
         self._enter()
         try:
-            rows = self.program.rows_of_data(data, count)
+            rows = self.program.binding.rows(data, count)
             if rows is None:
                 return None
             self.allocate()
             found = self.solver.solve_each(self._workspace, rows, *guesses)
             for k in range(SAMPLED - 1, count, SAMPLED):
-                self.program.forget_data()
+                self.program.binding.forget()
                 self.program.bind({handle: value[k] for handle, value in data.items()})
                 if self.program.mistraced(self.program.columns.view(found.values[k]), False, k):
                     return None
             return found
         finally:
-            self.program.forget_data()
+            self.program.binding.forget()
             self._leave()
 
     def _enter(self) -> None:

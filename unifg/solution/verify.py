@@ -114,6 +114,7 @@ class Conditions:
     """KKT conditions of a graph at an answer, with all slopes found by differences.
 
     Attributes:
+        program: the graph.
         cost: objective.
         g, lower, upper: (M,) constraint rows and their limits.
         gradient: (size,) of the objective, after :meth:`differentiate`.
@@ -122,7 +123,7 @@ class Conditions:
 
     def __init__(self, program: CompiledProblem, terms: list[WrittenTerm]) -> None:
         """Evaluate costs and constraints, without slopes."""
-        self._program = program
+        self.program = program
         self._own = [t for t in terms if isinstance(t.term, Constraint)]
         self._costs = [(t, *t.cost()) for t in terms if not isinstance(t.term, Constraint)]
         self.cost = float(sum(values.sum() for _, values, _, _ in self._costs))
@@ -133,14 +134,9 @@ class Conditions:
         outside = np.maximum(np.maximum(self.g - self.upper, self.lower - self.g), 0.0)
         self.violation, self.worst = float(outside.max(initial=0.0)), int(outside.argmax()) if len(outside) else -1
 
-    def place(self, row: int) -> tuple[str, int, int]:
-        """Term, factor and row of a constraint row."""
-        name, rows, (_, size) = next(part for part in self._program.places if row < part[1].stop)
-        return name, *divmod(row - rows.start, size)
-
     def differentiate(self) -> None:
         """Find gradient, Jacobian of the constraints and, of least squares, the Gauss-Newton matrix."""
-        unknown, size = self._program.columns.unknown, self._program.size
+        unknown, size = self.program.columns.unknown, self.program.size
         slope, doubtful, blocks, squares = np.zeros(size + 1), np.zeros(size + 1), [], 0.0  # the last, of what is fixed
         for term, _, force, weights in self._costs:
             slopes, doubt = term.slopes()
@@ -150,7 +146,7 @@ class Conditions:
             squares += float((rounding * term.rounding).sum())
             np.add.at(doubtful, own, np.einsum("nmd,nm->nd", doubt, np.abs(force)))
             np.add.at(doubtful, own, np.einsum("nmd,nm->nd", np.abs(slopes), rounding))
-            if self._program.least_squares:
+            if self.program.least_squares:
                 square = np.einsum("nad,nab,nbe->nde", slopes, weights, slopes)
                 blocks.append((square, square, own[:, :, None], own[:, None, :]))
         self.gradient, self._doubt, self._rounding = slope[:size], doubtful[:size], float(np.sqrt(squares))
@@ -163,17 +159,17 @@ class Conditions:
 
     def numbers(self, multipliers: Array) -> Numbers:
         """KKT numbers with these multipliers (M,)."""
-        A, size = self._jacobian, self._program.size
+        A, size = self._jacobian, self.program.size
         slope = self.gradient + np.bincount(A.columns, A.numbers * multipliers[A.rows], size)
         doubt = self._doubt + np.bincount(A.columns, A.errors * np.abs(multipliers[A.rows]), size)
         scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
         stationarity, bound = (float(np.abs(part).max(initial=0.0)) / scale for part in (slope, doubt))
-        if self._program.least_squares and len(slope):
+        if self.program.least_squares and len(slope):
             stationarity, bound = self._offset(slope, doubt)
         limit = np.where(multipliers > 0.0, self.upper, self.lower)
         slack = np.where(np.isfinite(limit), np.abs(self.g - np.where(np.isfinite(limit), limit, 0.0)), 1.0)
         wrong = np.where(self.lower != self.upper, np.abs(multipliers) * slack, 0.0)
-        columns = self._program.columns
+        columns = self.program.columns
         at = columns.name(int(columns.free[np.abs(slope).argmax()])) if len(slope) else None
         row = int(wrong.argmax()) if len(wrong) else -1
         return Numbers(stationarity, bound, float(wrong.max(initial=0.0)) / scale, at, row)
@@ -201,7 +197,7 @@ class Conditions:
         import scipy.sparse as sp
         import scipy.sparse.linalg as spl
 
-        A, count, size = self._jacobian, len(self.g), self._program.size
+        A, count, size = self._jacobian, len(self.g), self.program.size
         multipliers = np.zeros(count)
         if not count:
             return multipliers
@@ -262,7 +258,7 @@ def verified(
         if bad.any():
             return Verified("fails", f"term '{compiled.name}', factor {int(bad.argmax())} is not finite")
     here = Conditions(program, terms)
-    worst = here.place(here.worst) if here.worst >= 0 else None
+    worst = program.row_place(here.worst) if here.worst >= 0 else None
     measured: dict[str, Any] = {"cost": here.cost, "violation": here.violation, "worst": worst}
     for fix in program.graph.fixes:
         if (far := moved_fix(fix, values, data)) > tolerance:
@@ -284,10 +280,10 @@ def verified(
 def _judged(here: Conditions, claimed: Numbers, least: Numbers, apart: int, tolerance: float) -> tuple[str, str]:
     """Verdict, and the sentence that gives its reason; ``apart`` is the row whose two multipliers differ most."""
     if not here.violation <= tolerance:
-        name, factor, row = here.place(here.worst)
+        name, factor, row = here.program.row_place(here.worst)
         return "fails", f"term '{name}', factor {factor}, row {row} is {here.violation:.3g} outside its limits"
     if claimed.fails(tolerance) and not least.fails(tolerance):
-        name, factor, row = here.place(apart)
+        name, factor, row = here.program.row_place(apart)
         return "fails", (
             f"the values pass, the multipliers do not: with them stationarity is {claimed.stationarity:.3g} and "
             f"complementarity {claimed.complementarity:.3g}; farthest from what they should be is that of '{name}', "
@@ -298,7 +294,7 @@ def _judged(here: Conditions, claimed: Numbers, least: Numbers, apart: int, tole
             family, member = claimed.variable
             known = f"{claimed.stationarity:.3g} (known to {claimed.bound:.1g})"
             return "fails", f"the cost can still fall: stationarity is {known}, most at {family}[{member}]"
-        name, factor, row = here.place(claimed.row)
+        name, factor, row = here.program.row_place(claimed.row)
         return "fails", f"complementarity is {claimed.complementarity:.3g} in '{name}', factor {factor}, row {row}"
     numbers = (
         f"violation {here.violation:.1e}, stationarity {claimed.stationarity:.1e} (known to {claimed.bound:.1e}), "
