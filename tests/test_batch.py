@@ -115,3 +115,29 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(fg.GraphError, match="solve_many of what"):
         prepared.solve_many(stated.guess)
     assert len(prepared.solve_many([])) == 0
+
+
+def test_huge_multipliers_are_no_success() -> None:
+    """A row without a slope at its answer: its KKT numbers hold in proportion to its multiplier alone."""
+    graph = fg.Graph()
+    x, value = graph.variables("x", fg.Rn(1), 1), graph.data("value", [1.0])
+    graph.minimize(fg.prior, x, [3.0], sigma=1.0)
+    graph.constrain(lambda x, p: np.exp(x) - p, x, value, lower=0.0, upper=0.0, name="power")
+    prepared = InteriorPoint().prepare(graph)
+    batch = prepared.solve_many({x: [[0.5]]}, data={value: [[1.0], [0.0], [2.0]]})
+    singles = [prepared.solve({x: [[0.5]]}, data={value: [number]}) for number in (1.0, 0.0, 2.0)]
+    assert_same(batch, singles, x)
+    assert [status.name for status in batch.statuses] == ["CONVERGED", "DEGENERATE", "CONVERGED"]
+
+
+def test_data_off_their_manifold_are_refused_as_by_single_solves() -> None:
+    graph = fg.Graph()
+    x, seen = graph.variables("x", fg.SO3, 1), graph.data("seen", [1.0, 0.0, 0.0, 0.0])
+    graph.minimize(fg.prior, x, seen, sigma=1.0)
+    graph.constrain(lambda x: x[:, 3:], x, lower=-0.5, upper=0.5, name="tilt")
+    given = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+    prepared = InteriorPoint().prepare(graph)
+    assert prepared.solve_many({x: given[:1]}, data={seen: given}).converged
+    given[2, 1] = 0.5
+    with pytest.raises(fg.GraphError, match="is not on SO3"):
+        prepared.solve_many({x: given[:1]}, data={seen: given})

@@ -270,7 +270,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 30_088, "scenarios": 10_301, "benchmarks": 4_627, "tests": 33_985,
+    "unifg solvers models": 30_088, "scenarios": 10_301, "benchmarks": 4_627, "tests": 34_006,
     "docs examples": 1_776, "unifg/factors": 4_227, "unifg/problem": 3_122, "models": 2_269,
     "unifg/elimination": 2_089, "solvers": 4_841, "unifg/solution": 2_735, "unifg/smoothing": 1_625,
     "unifg/lie": 1_585, "unifg/view": 1_404, "unifg/files": 1_010, "unifg/pose_graphs": 1_036,
