@@ -25,6 +25,7 @@ VEHICLE = quadrotor.Parameters(1.3, (0.3, 0.2, 0.5), (0.4, -0.3), 0.2)
 # Off the solution: the second derivatives hold where the defects, those of the attitude among them, are large.
 REACHED = quadrotor.STATE.retract(quadrotor.step(STATES, THRUST, 0.3, VEHICLE), RNG.standard_normal((4, 9)))
 DISCS = RNG.standard_normal((3, 2)), np.array([0.1, 0.2, 0.3])
+SPREAD = RNG.standard_normal((4, 6))
 PLACES, MARKS = (fg.Rn(3), STATES[:, :3]), (fg.Rn(2), RNG.standard_normal((4, 2)))
 
 # residual, (manifold, values) or parameter per argument, largest difference allowed
@@ -66,6 +67,12 @@ CASES: dict[str, tuple[Residual, list[tuple[Manifold, Array] | Array | float], f
         [(fg.Rn(1), MARKS[1][:, :1]), (fg.Rn(1), MARKS[1][:, 1:]), (fg.Rn(1), MARKS[1][:, 1:]), 1.0, 0.1],
         1e-6,
     ),
+    "prior in the plane": (fg.prior.on(SE2), [(SE2, POSES), POSES[::-1]], 1e-6),
+    "prior of attitudes": (fg.prior.on(fg.SO3), [(fg.SO3, STATES[:, 3:7]), STATES[::-1, 3:7]], 1e-6),
+    "prior of a pose": (
+        fg.prior.on(fg.SE3), [(fg.SE3, fg.SE3.exp(SPREAD)), fg.SE3.exp(SPREAD[::-1])], 1e-6,
+    ),
+    "prior of a product": (fg.prior.on(quadrotor.STATE), [(quadrotor.STATE, STATES), STATES[::-1]], 1e-6),
     "tilt": (landmarks.tilt, [(fg.SO3, STATES[:, 3:7]), RNG.standard_normal(3)], 1e-6),
 }  # fmt: skip
 

@@ -24,7 +24,7 @@ CENTRAL = (
     ("unifg/lie/se3.py", "log"),
     ("unifg/factors/robust.py", "weight_of"),
     ("unifg/factors/whitening.py", "whiten"),
-    ("unifg/problem/evaluation.py", "linearize_share"),
+    ("unifg/problem/evaluation.py", "linearize"),
     ("unifg/problem/hessian.py", "add_curvature"),
     ("unifg/elimination/fronts.py", "factor"),
     ("unifg/elimination/substitution.py", "solve"),

@@ -103,7 +103,7 @@ def renew(address: int) -> None:
         links[0].linearize,
         (
             terms, values, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms, gradient,
-            hessian, scratch,
+            hessian, scratch, 0, 1,
         ),
     )  # fmt: skip
     if len(heights):
@@ -260,7 +260,7 @@ def addresses(robust: bool, general: bool) -> Records:
     links = np.zeros(1, LINKS)
     links[0]["factor"] = link(factor, TRUTH, kinds["plan"], kinds["data"], vector)
     links[0]["solve"] = link(solve, NOTHING, kinds["plan"], vector, vector)
-    links[0]["linearize"] = link(evaluation.linearize, NUMBER, terms, values, *linearized, scratch)
+    links[0]["linearize"] = link(evaluation.linearize, NUMBER, terms, values, *linearized, scratch, ADDRESS, ADDRESS)
     links[0]["evaluate"] = link(
         evaluation.evaluate,
         NUMBER,

@@ -18,7 +18,7 @@ from unifg.codegen.function_pointers import memory
 from unifg.errors import BackendError
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.hessian import lagrangian_hessian, require_second
 from unifg.problem.linearization import Linearization
 from unifg.problem.snapshot import Memory
 from unifg.problem.systems import stacked
@@ -302,6 +302,7 @@ class Workspace:
             np.array([self._unequal(row) for row in program.arrays.fields], dtype=np.int64),
         )
         self._describe()
+        require_second(program)
         self.problem.links[:] = addresses(table.weights > 0, table.scalars > 0)
         self._held = program.equality
         self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)

@@ -403,6 +403,7 @@ def linearize(problem: Problem, work: Work) -> None:
         (
             terms, work.trial, work.residual, work.jacobian, work.next_constraints, work.next_jacobian, work.squares,
             work.next_weights, work.norms, work.next_gradient, work.next_hessian, problem.scratch,
+            0, 1,
         ),
     )  # fmt: skip
     if len(work.heights):

@@ -333,7 +333,7 @@ def _problem(program: CompiledProblem, work: Work) -> Problem:
         link_like(
             evaluation.linearize, NUMBER, terms, work.trial, work.residual, work.jacobian, work.next_constraints,
             work.next_jacobian, work.squares, work.next_weights, work.norms, work.next_gradient, work.next_hessian,
-            scratch,
+            scratch, 0, 1,
         ),
         link_like(
             add_scalars, NUMBER, terms, work.trial, work.heights, work.next_gradient, work.next_hessian, work.concavity,

@@ -110,6 +110,31 @@ def _deviation(group: LieGroup, functions: Functions) -> Callable[..., None]:
     return kernel
 
 
+def _deviation_second(group: LieGroup, functions: Functions) -> Callable[..., None]:
+    """Write what moves J'w of the same: the slope of Jr^-1(r)' w along r, times Jr^-1(r) (eq. 79)."""
+    dim = group.dim
+    deviation, inverse_jacobian, bend = functions.log_between, functions.right_jacobian_inverse, functions.bend
+
+    @compiled
+    def second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
+        r, unit, J, slope = local_vector(dim), local_vector(dim), local_matrix(dim, dim), local_matrix(dim, dim)
+        deviation(p, v, r)
+        inverse_jacobian(r, J)
+        for c in range(dim):
+            for k in range(dim):
+                unit[k] = 1.0 if k == c else 0.0
+                S[c, k] = 0.0
+            bend(r, unit, slope)
+            for j in range(dim):
+                weighted = 0.0
+                for i in range(dim):
+                    weighted += w[i] * slope[i, j]
+                for k in range(dim):
+                    S[c, k] += weighted * J[j, k]
+
+    return second
+
+
 # ---------------------------------------------------------------- vectors
 
 
@@ -181,7 +206,13 @@ class _Relative(_Batched):
 
 @cache
 def _complete(
-    manifold: Hashable, name: str, arguments: tuple[Any, ...], vectors: Callable[..., None], groups: Any, batched: Any
+    manifold: Hashable,
+    name: str,
+    arguments: tuple[Any, ...],
+    vectors: Callable[..., None],
+    groups: Any,
+    batched: Any,
+    seconds: Any = None,
 ) -> Residual:
     """The kernel for vectors, for groups with compiled functions, or the batched function for all others."""
     assert isinstance(manifold, Manifold)
@@ -189,7 +220,8 @@ def _complete(
     if isinstance(manifold, Rn):
         made = residual(Kernel(vectors, arguments, manifold.dim, name=name, linear=True))
     elif isinstance(manifold, LieGroup) and functions is not None:
-        made = residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name))
+        second = seconds and seconds(manifold, functions)
+        made = residual(Kernel(groups(manifold, functions), arguments, manifold.dim, name=name, second=second))
     elif functions is not None and not isinstance(manifold, LieGroup):
         made = _by_differences(manifold, functions, name)
     else:
@@ -213,7 +245,13 @@ def _by_differences(manifold: Manifold, functions: Functions, name: str) -> Resi
 
 def _build_prior(manifold: Manifold) -> Residual:
     return _complete(
-        cast(Hashable, manifold), "prior", (manifold, (manifold.storage,)), _vector_deviation, _deviation, _Prior
+        cast(Hashable, manifold),
+        "prior",
+        (manifold, (manifold.storage,)),
+        _vector_deviation,
+        _deviation,
+        _Prior,
+        _deviation_second,
     )
 
 

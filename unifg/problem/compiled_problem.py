@@ -469,7 +469,7 @@ class CompiledProblem:
                 cost = _linearize_at_once(shares, terms, values.flat, out._replace(hessian=room))
             else:
                 gradient[:], hessian[:] = 0.0, 0.0
-                cost = evaluation.linearize(terms, values.flat, *out, self.scratch)
+                cost = evaluation.linearize(terms, values.flat, *out, self.scratch, 0, 1)
             if table.weighed:
                 for loss, part in table.weighed:
                     weights[part] = loss.weight(squares[part])

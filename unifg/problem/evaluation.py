@@ -13,13 +13,13 @@ from typing import NamedTuple
 from numba import float64, int32, int64, uint8
 
 from unifg.codegen.calls import call_residual, matrix, vector, vector_at
+from unifg.codegen.function_pointers import run
 from unifg.codegen.jit import compiled, inlined
 from unifg.codegen.vectors import Address, address, lane, load, plus, splat
 from unifg.codegen.waiting import first_chunk, next_chunk, wait_for
 from unifg.codegen.work_queue import arguments_at, arrays, bundle
 from unifg.factors.robust import value_of, weight_of
 from unifg.factors.whitening import FULL, whiten
-from unifg.problem.pose_pairs import PLANE, SPACE, add_plane, add_space, whiten_plane, whiten_space
 from unifg.problem.table import (
     ACTIVE,
     ADDRESS,
@@ -36,6 +36,8 @@ from unifg.problem.table import (
     KIND,
     LOSS,
     LOSS_AT,
+    PAIR_ADDING,
+    PAIR_WHITENING,
     PAIRED,
     PARAMETER,
     PARAMETERS,
@@ -179,12 +181,21 @@ def evaluate(
 
 
 @compiled
-def linearize_share(
+def linearize(
     terms: TermArrays, values: Array, residual: Array, jacobian: Array, constraints: Array, constraint_jacobian: Array,
     squares: Array, weights: Array, norms: Array, gradient: Array, hessian: Array, scratch: Array, share: int,
     shares: int,
 ) -> float:  # fmt: skip
-    """Do what :func:`linearize` does with one of several shares of the factors of every term, counted from 0."""
+    """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
+
+    Factors whose loss is Python stop after whitening, see :func:`weigh`. Arrays from ``residual`` to ``hessian`` are
+    those of :class:`LinearArrays`, which as a record would count references to each of them; ``scratch`` holds a
+    factor's variables, then J with all its columns for terms that keep only some. One of several ``shares`` of the
+    factors of every term is done, counted from 0.
+
+    Returns:
+        The cost of all these factors but those whose loss is Python.
+    """
     fields, gather, sizes, parameters = terms.fields, terms.gather, terms.sizes, terms.parameters
     whiteners, active, columns, positions = terms.whiteners, terms.active, terms.columns, terms.positions
     lower, upper = terms.lower, terms.upper
@@ -224,10 +235,9 @@ def linearize_share(
                     total += _violation(r[a], lower[at + a], upper[at + a]) ** 2
                 continue
             first_weight = term[WHITENER] + i * apart
-            if together == PLANE:
-                whiten_plane(address(whiteners), first_weight, address(residual), at, address(jacobian), entry)
-            elif together == SPACE:
-                whiten_space(address(whiteners), first_weight, address(residual), at, address(jacobian), entry)
+            if together:
+                places = address(whiteners), first_weight, address(residual), at, address(jacobian), entry
+                run(term[PAIR_WHITENING], places)
             else:
                 whiten(term[WHITEN], whiteners, term[WHITENER], i, r, J)
             squared = 0.0
@@ -248,26 +258,6 @@ def linearize_share(
             _accumulate(term, i, columns, positions, r, J, residual, jacobian, gradient, hessian)
         norms[t] = sqrt(total)
     return cost
-
-
-@compiled
-def linearize(
-    terms: TermArrays, values: Array, residual: Array, jacobian: Array, constraints: Array, constraint_jacobian: Array,
-    squares: Array, weights: Array, norms: Array, gradient: Array, hessian: Array, scratch: Array,
-) -> float:  # fmt: skip
-    """Residuals, Jacobians, gradient and J'J in one pass, scaled by the square roots of robust weights.
-
-    Factors whose loss is Python stop after whitening, see :func:`weigh`. Arrays from ``residual`` to ``hessian`` are
-    those of :class:`LinearArrays`, which as a record would count references to each of them; ``scratch`` holds a
-    factor's variables, then J with all its columns for terms that keep only some.
-
-    Returns:
-        The cost of all factors but those whose loss is Python.
-    """
-    return linearize_share(
-        terms, values, residual, jacobian, constraints, constraint_jacobian, squares, weights, norms, gradient, hessian,
-        scratch, 0, 1,
-    )  # fmt: skip
 
 
 TERM_ARRAYS = bundle(
@@ -312,7 +302,7 @@ def linearize_at_once(where: Address) -> None:
     wait_for(counters, 0, shares)
     k = first_chunk(counters, 1)
     while k < shares:
-        costs[k] = linearize_share(
+        costs[k] = linearize(
             terms, values, out.residual, out.jacobian, out.constraints, out.constraint_jacobian, out.squares,
             out.weights, norms[k], gradient if k == 0 else slopes[k - 1], hessian, scratch[k], k, shares,
         )  # fmt: skip
@@ -368,22 +358,16 @@ def _accumulate(
     at = term[POSITION] + i * (width * (width + 1) // 2)
     if term[PAIRED] > 0:
         corner = at + rows * (rows + 1) // 2
-        own, shared, other = positions[at], positions[corner], positions[corner + rows]
+        own, shared, other = int64(positions[at]), int64(positions[corner]), int64(positions[corner + rows])
         step, side = positions[at + 1] - own, positions[corner + 1] - shared
         below = corner + rows + 1
         hop, across = positions[below + rows] - other, positions[below] - shared
-        if rows == PLANE:
-            add_plane(
-                address(residual), term[ROW] + i * rows, address(jacobian), term[ENTRY] + i * rows * width,
-                address(gradient), columns[column], columns[column + rows],
-                address(hessian), own, step, other, hop, shared, side, across,
-            )  # fmt: skip
-        else:
-            add_space(
-                address(residual), term[ROW] + i * rows, address(jacobian), term[ENTRY] + i * rows * width,
-                address(gradient), columns[column], columns[column + rows],
-                address(hessian), own, step, other, hop, shared, side, across,
-            )  # fmt: skip
+        places = (
+            address(residual), term[ROW] + i * rows, address(jacobian), term[ENTRY] + i * rows * width,
+            address(gradient), columns[column], columns[column + rows],
+            address(hessian), own, step, other, hop, shared, side, across,
+        )  # fmt: skip
+        run(term[PAIR_ADDING], places)
     else:
         for d in range(width):
             total = 0.0

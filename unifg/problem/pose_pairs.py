@@ -10,9 +10,11 @@ begins and how far the second is from it says where all of them are. Factors for
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import TypeAlias
 
 from unifg.codegen.calls import local_vector
+from unifg.codegen.function_pointers import ADDRESS, NOTHING, link
 from unifg.codegen.jit import compiled
 from unifg.codegen.vectors import Address, get, load, plus, put, store, times
 from unifg.typing import IntArray
@@ -25,6 +27,7 @@ Add: TypeAlias = Callable[
 ]
 
 
+@cache
 def _whitening(dim: int) -> Whiten:
     """Compile W r and W J for d rows."""
     width, full = 2 * dim, 2 * dim // 4 * 4
@@ -62,6 +65,7 @@ def _whitening(dim: int) -> Whiten:
     return whiten
 
 
+@cache
 def _adding(dim: int) -> Add:
     """Compile the addition of J'r and J'J for d rows."""
     width, full, room = 2 * dim, 2 * dim // 4 * 4, 4 * dim * dim
@@ -142,8 +146,10 @@ def _adding(dim: int) -> Add:
     return add
 
 
-whiten_plane, whiten_space = _whitening(PLANE), _whitening(SPACE)
-add_plane, add_space = _adding(PLANE), _adding(SPACE)
+@cache
+def loops_of(dim: int) -> tuple[int, int]:
+    """Addresses of what whitens and what adds up factors of d rows, compiled when first asked for."""
+    return link(_whitening(dim), NOTHING, *[ADDRESS] * 6), link(_adding(dim), NOTHING, *[ADDRESS] * 15)
 
 
 @compiled

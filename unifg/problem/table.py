@@ -6,7 +6,7 @@ entries of the Jacobian, columns, and the places of J'J in the matrix of the nor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from unifg.factors.robust import Loss, form_of
 from unifg.factors.steps import as_table, movable_parts
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.problem.columns import Columns
-from unifg.problem.pose_pairs import PLANE, SPACE, paired
+from unifg.problem.pose_pairs import PLANE, SPACE, loops_of, paired
 from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, IntArray
 
@@ -49,14 +49,17 @@ from unifg.typing import Array, IntArray
     COLUMN,  # first column in TermArrays.columns
     POSITION,  # first place in TermArrays.positions
     PAIRED,  # rows of factors whose products have loops of their own (unifg.problem.pose_pairs); 0: none
+    PAIR_WHITENING,  # address of the one that whitens them
+    PAIR_ADDING,  # address of the one that adds up their products
     PART,  # first row of TermArrays.parts
     PARTS,  # of the variables; 0: linear, or without a compiled retraction
     SECOND,  # address of the kernel's second derivatives; 0: to be differenced
+    DIFFERENCING,  # address of the function that makes them then
     DIFFERENCED,  # whether the Jacobian is made of differences
     LOSS,  # which robust loss, or one of the words below
     LOSS_AT,  # where its two parameters stand in TermArrays.parameters
     FIELDS,
-) = range(32)
+) = range(35)
 
 COST, CONSTRAINT, BOUND, SCALAR = range(4)
 PYTHON, HELD = -1, -2  # losses whose formulas are Python; HELD: line searches keep the weights of a linearisation
@@ -122,7 +125,7 @@ class TermTable:
         """Lay everything out; numbers come with :meth:`bind`."""
         self._terms = [*terms, *scalars]
         self._owned: dict[CompiledTerm, Kernel | None] = {}
-        self._second = False
+        self._differencing: Callable[[], int] | None = None
         self._columns = columns
         self.fields = fields = np.zeros((len(self._terms), FIELDS), dtype=np.int64)
         gather, sizes, tangent = [], [], []
@@ -218,6 +221,7 @@ class TermTable:
         locate(fields, self.arrays.columns, self.arrays.unknown, normal.indptr, normal.indices, self.arrays.positions)
         for row, term in zip(fields, self._terms, strict=True):
             row[PAIRED] = self._paired(row, term, self.arrays.positions)
+            row[[PAIR_WHITENING, PAIR_ADDING]] = loops_of(int(row[PAIRED])) if row[PAIRED] else (0, 0)
 
     def pairs_at(self, positions: IntArray) -> bool:
         """Test whether terms whose loops are of fixed size could have them at other places, too."""
@@ -243,7 +247,7 @@ class TermTable:
         self._owned = {}
         arrays = self.arrays
         self.fields = np.concatenate([arrays.fields, arrays.scalars])
-        self.fields[:, [ADDRESS, SECOND, TABLE, TABLE_SIZE]] = 0
+        self.fields[:, [ADDRESS, SECOND, DIFFERENCING, PAIR_WHITENING, PAIR_ADDING, TABLE, TABLE_SIZE]] = 0
         first = len(arrays.fields)
         self.arrays = arrays._replace(fields=self.fields[:first], scalars=self.fields[first:])
         for row, term in zip(self.fields, self._terms, strict=True):
@@ -252,8 +256,8 @@ class TermTable:
     def renew(self, term: CompiledTerm) -> None:
         """Take the machine code of a traced term; the numbers of its parameters have not changed."""
         assert term.kernel is not None
-        self._take(term)
         term.place[PARTS] = 0 if term.kernel.linear else len(movable_parts(term.kernel.manifolds))
+        self._take(term)
 
     def row_of(self, term: CompiledTerm) -> int:
         """Number of the row of a term in ``fields``."""
@@ -268,28 +272,33 @@ class TermTable:
 
     def give_up(self, term: CompiledTerm) -> None:
         """Leave a term that was traced to its own function; its rows, entries and parameters stay where they are."""
-        self._take(term)
         term.place[PARTS] = 0 if term.kernel is None else len(movable_parts(term.kernel.manifolds))
         term.place[DIFFERENCED] = self.differenced = True
+        self._take(term)
 
     def _take(self, term: CompiledTerm) -> None:
         """Write where the machine code of a term and its table stand, and only then let go of what stood there."""
         row, kernel = term.place, term.kernel
         first = second = table = size = 0
         if kernel is not None:
-            wanted = self._second or row[KIND] == SCALAR or not kernel.derived
+            wanted = self._differencing is not None or row[KIND] == SCALAR or not kernel.derived
             first, second = kernel.address, kernel.second_address if wanted else 0
+            if self._differencing is not None and second == 0 and row[PARTS] > 0:
+                row[DIFFERENCING] = self._differencing()
             table, size = kernel.table.ctypes.data, kernel.table.size
         row[[ADDRESS, SECOND, TABLE, TABLE_SIZE]] = first, second, table, size
         self._owned[term] = kernel
 
-    def require_second(self) -> None:
-        """Have second derivatives of derived kernels generated, which not every solver needs."""
-        if not self._second:
+    def require_second(self, differencing: Callable[[], int]) -> None:
+        """Have second derivatives of kernels generated, which not every solver needs.
+
+        Args:
+            differencing: address of what differences kernels that have none.
+        """
+        if self._differencing is None:
+            self._differencing = differencing
             for term in self._terms:
-                if term.kernel is not None and term.kernel.derived:
-                    term.place[SECOND] = term.kernel.second_address
-            self._second = True
+                self._take(term)
 
     def bind(self, rebound: Sequence[CompiledTerm], lower: Array, upper: Array) -> None:
         """Copy limits and everything that some terms have bound; their parameters live here from then on."""

@@ -23,6 +23,7 @@ from unifg.modeling.variables import Data
 from unifg.problem.by_term import ByTerm
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
+from unifg.problem.hessian import require_second
 from unifg.problem.linearization import Linearization, all_finite
 from unifg.problem.units import SMALL_FORCES
 from unifg.solution.batch import SAMPLED, Batch, Outcomes, solve_batch
@@ -175,7 +176,7 @@ class Solver(Backend):
         program = idle_problem(graph)
         self.require(program)
         if not program.least_squares:  # there, curvature is asked for in rare cases only
-            program.table.require_second()
+            require_second(program)
         return Prepared(self, program, graph)
 
     def require(self, program: CompiledProblem) -> None:
@@ -667,7 +668,7 @@ class Prepared:
         """Prepared solvers of the same graph that belong to other threads; made once."""
         while len(self._twins) < count:
             twin = Prepared(self.solver, CompiledProblem(self.program.graph), self._graph)
-            twin.program.table.require_second()
+            require_second(twin.program)
             self._twins.append(twin)
         return self._twins[:count]
 
