@@ -119,6 +119,17 @@ class SaddlePoint:
         )
         return out, float(error)
 
+    def solve_rows(self, right: Array, enough: float) -> tuple[Array, Array]:
+        """Solve for the rows of (k, n); no other shift is tried.
+
+        Returns:
+            (k, n) solutions, and (k,) largest residual of each relative to the right-hand side, both equilibrated.
+        """
+        out, left = np.empty_like(right), np.empty(len(right))
+        plan, first = self.factorization.plan, self.unknowns
+        substitution.refine_rows(plan, *self._entries, right, self.scale, first, out, left, enough, CORRECTIONS)
+        return out, left
+
     def residual(self, solution: Array, right: Array) -> Array:
         """(n,) right - K x of the equilibrated system."""
         rest: Array = self.scale * (right - self.factorization.pattern.times(self._data, solution))

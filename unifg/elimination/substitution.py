@@ -276,6 +276,31 @@ def refine(
 
 
 @compiled
+def refine_rows(
+    plan: Plan,
+    indptr: IntArray,
+    indices: IntArray,
+    data: Array,
+    right: Array,
+    scale: Array,
+    first: int,
+    out: Array,
+    left: Array,
+    tolerance: float,
+    steps: int,
+) -> None:
+    """:func:`refine` for the rows of (k, n); ``left`` (k,) receives max scale |right - A x| / max scale |right|."""
+    rest, bulk = np.empty(right.shape[1]), np.empty(right.shape[1])
+    for k in range(len(right)):
+        refine(plan, indptr, indices, data, right[k], scale, first, out[k], tolerance, steps)
+        finite = residual(indptr, indices, data, out[k], right[k], scale, first, rest, bulk) < np.inf
+        worst = size = 0.0
+        for i in range(len(rest)):
+            worst, size = max(worst, scale[i] * abs(rest[i])), max(size, scale[i] * abs(right[k, i]))
+        left[k] = (worst / size if size > 0.0 else worst) if finite else np.inf
+
+
+@compiled
 def _remember(place: int, step: Array, effect: Array, moves: Array, effects: Array) -> None:
     """Keep a correction and its effect on the scaled residual, without what the others kept do, and of length one."""
     move, own = moves[place], effects[place]

@@ -13,7 +13,7 @@ factorised once; each column of ``wrt``, or each row of ``of``, is one solve.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,7 @@ from unifg.typing import Array, BoolArray, IntArray, Numbers
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
 LINEARIZED = "cost", "gradient", "hessian", "constraints", "constraint_jacobian"
 ENOUGH = 1e-10  # residual of most solves
+AT_ONCE = 64  # right-hand sides in one call
 WEAK = 10.0  # times the root of the tolerance: slack and multiplier of a row that may be active or not
 Named = Variable | str
 Weights = Mapping[Family, Numbers] | Mapping[Selection, Numbers] | Mapping[str, Numbers] | Mapping[Named, Numbers]
@@ -78,7 +79,12 @@ class Sensitivities:
                     "use a loss that ships",
                     term=term.name,
                 )
-        self._lin, self._edition, self._limits, self._changes = lin, edition, limits, dict[tuple[Wrt, ...], Change]()
+        self._lin, self._edition, self._limits, self._changes = (
+            lin,
+            edition,
+            limits,
+            dict[tuple[Hashable, ...], Change](),
+        )
         with program.lock:
             self._require_data()
             self._require_strict(tolerance)
@@ -187,14 +193,13 @@ class Sensitivities:
         result[row, of_fixed[which, row]] = 1.0
         asked = np.flatnonzero(places >= 0)
         if self._forward(places[asked]) or change.count <= len(asked):
-            for j in range(change.count if len(asked) else 0):
-                result[asked, j] = self._solved(change.column(j, self._system.pattern.size))[places[asked]]
+            for part in _chunks(np.arange(change.count if len(asked) else 0)):
+                result[np.ix_(asked, part)] = self._solved(self._columns(change, part))[:, places[asked]].T
             return result
-        right = np.zeros(self._system.pattern.size)
-        for i in asked:
-            right[places[i]] = 1.0
-            result[i] = change.pulled(self._solved(right))
-            right[places[i]] = 0.0
+        for part in _chunks(asked):
+            right = np.zeros((len(part), self._system.pattern.size))
+            right[np.arange(len(part)), places[part]] = 1.0
+            result[part] = [change.pulled(adjoint) for adjoint in self._solved(right)]
         return result
 
     def gradient(self, of: Mapping[Selection | str, Array], wrt: Wrt) -> Array:
@@ -215,9 +220,10 @@ class Sensitivities:
             own = np.where(columns < 0, -1, change.numbers[0, columns])
             np.add.at(total, own[own >= 0], given[own >= 0])
         if self._forward(np.flatnonzero(right)):
-            total += [self._solved(change.column(j, len(right))) @ right for j in range(change.count)]
+            for part in _chunks(np.arange(change.count)):
+                total[part] += self._solved(self._columns(change, part)) @ right
         elif right.any():
-            total += change.pulled(self._solved(right))
+            total += change.pulled(self._solved(right[None])[0])
         return total.reshape(change.shape)
 
     def _forward(self, places: IntArray) -> bool:
@@ -266,14 +272,19 @@ class Sensitivities:
             raise GraphError(f"data {wrt!r} does not belong to this graph")
         return datum(program, wrt)
 
+    def _called(self, wrt: Wrt) -> Hashable:
+        """Data and names by themselves, variables by their columns: each ``x[0]`` is another object."""
+        return wrt if isinstance(wrt, Data | str) else self._program.columns.of(as_selection(wrt)).tobytes()
+
     def _change(self, wrt: Sequence[Wrt]) -> Change:
         """Derivatives of the KKT conditions by parameters.
 
         Raises:
             GraphError: the data of this solution have been replaced, or a parameter has no derivative.
         """
-        if tuple(wrt) in self._changes:
-            return self._changes[tuple(wrt)]
+        asked = tuple(self._called(one) for one in wrt)
+        if asked in self._changes:
+            return self._changes[asked]
         program, given = self._program, [self._parameter(one) for one in wrt]
         unknown, ends = program.columns.unknown, np.cumsum([0, *(int(np.prod(one.shape)) for one in given)])
         starts = dict(zip(program.constraint_terms, (rows.start for rows in program.slices), strict=True))
@@ -302,7 +313,7 @@ class Sensitivities:
         order = kept[np.argsort(numbers[kept], kind="stable")]
         moved = np.where(moved < 0, -1, moved + ends[:-1, None])
         change = Change(given[0].shape, rows[order], numbers[order], values[order], heights, moved)
-        self._changes[tuple(wrt)] = change
+        self._changes[asked] = change
         return change
 
     def _of_fixed(self, numbers: IntArray) -> list[tuple[IntArray, IntArray, Array]]:
@@ -319,19 +330,34 @@ class Sensitivities:
         places = self._number[program.constraints.rows[own]]
         return [*found, (places, numbers[program.constraints.columns[own]], lin.constraint_jacobian[own])]
 
+    def _columns(self, change: Change, numbers: IntArray) -> Array:
+        """(k, size) right-hand sides for coordinates that follow each other."""
+        size = self._system.pattern.size
+        first, last = np.searchsorted(change.coordinates, [numbers[0], numbers[-1] + 1])
+        places = change.rows[first:last] + size * (change.coordinates[first:last] - numbers[0])
+        return np.bincount(places, -change.values[first:last], len(numbers) * size).reshape(-1, size)
+
     def _solved(self, right: Array) -> Array:
-        """The solution for a right-hand side.
+        """Solutions for the rows of (k, size).
 
         Raises:
-            GraphError: there is none.
+            GraphError: one has none.
         """
-        solution, rest = self._tried(right)
-        if not rest.max() <= 1.0:
-            what = f": {self._dependent} depends on other active rows" if self._dependent else ""
-            raise GraphError(
-                f"sensitivity: after a change of the data the active constraints contradict each other{what}"
-            )
-        return solution
+        with self._lock:
+            solutions, left = self._system.saddle.solve_rows(right, ENOUGH)
+        for k in np.flatnonzero(~(left <= SOLVED)):
+            solutions[k], rest = self._tried(right[k])
+            if not rest.max() <= 1.0:
+                what = f": {self._dependent} depends on other active rows" if self._dependent else ""
+                raise GraphError(
+                    f"sensitivity: after a change of the data the active constraints contradict each other{what}"
+                )
+        return solutions
+
+
+def _chunks(numbers: IntArray) -> Iterator[IntArray]:
+    """Numbers in parts, for each of which right-hand sides are held in memory."""
+    return (numbers[first : first + AT_ONCE] for first in range(0, len(numbers), AT_ONCE))
 
 
 @dataclass(frozen=True)
@@ -356,11 +382,6 @@ class Change:
     def count(self) -> int:
         """Coordinates of all parameters."""
         return len(self.heights)
-
-    def column(self, number: int, size: int) -> Array:
-        """(size,) right-hand side for one coordinate."""
-        first, last = np.searchsorted(self.coordinates, [number, number + 1])
-        return np.asarray(np.bincount(self.rows[first:last], -self.values[first:last], size), dtype=np.float64)
 
     def pulled(self, adjoint: Array) -> Array:
         """(K,) derivatives, of the solution for the rows that are asked for."""

@@ -1,0 +1,68 @@
+"""A prepared graph as a function for JAX, under ``jit``, ``grad`` and ``vmap``; of the extra ``jax``.
+
+solve = unifg.jax.layer(run, [weight], [x], guess)
+slope = jax.grad(lambda numbers: ((solve(numbers) - wanted) ** 2).sum())(numbers)
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from unifg.layers import Answers, Layer
+from unifg.typing import Array
+
+__all__ = ["layer"]
+
+REMEMBERED = 8  # answers whose slopes may be asked for without another solve
+
+
+def layer(*args: Any, **options: Any) -> Callable[..., Any]:
+    """Function from arrays to values of families; arguments and errors as of `unifg.layers.Layer`.
+
+    Arrays have the shapes of the data, or (..., shape) for several instances. The result is the array of the output, a
+    tuple of several, of the type of the first input.
+    """
+    inner = Layer(*args, **options)
+    known: OrderedDict[bytes, Answers] = OrderedDict()
+
+    def solved(given: tuple[Any, ...]) -> Answers:
+        """Answers, solved anew unless these very arrays were among the last ones."""
+        arrays = [np.asarray(one, dtype=np.float64) for one in given]
+        key = b"".join(repr(array.shape).encode() + array.tobytes() for array in arrays)
+        if key not in known:
+            known[key] = inner.solve(*arrays)
+            while len(known) > REMEMBERED:
+                known.popitem(last=False)
+        return known[key]
+
+    def answer(*given: Any) -> tuple[Array, ...]:
+        return tuple(values.astype(given[0].dtype) for values in solved(given).values)
+
+    def pull(given: tuple[Any, ...], slopes: tuple[Any, ...]) -> tuple[Array, ...]:
+        found = inner.pull(solved(given), [np.asarray(slope) for slope in slopes])
+        return tuple(slope.astype(one.dtype) for slope, one in zip(found, given, strict=True))
+
+    @jax.custom_vjp  # type: ignore[untyped-decorator]
+    def solve(*given: Any) -> tuple[Any, ...]:
+        leads = [one.shape[: one.ndim - h.value.ndim] for one, h in zip(given, inner.inputs, strict=True)]
+        lead, dtype = max(leads, key=len), given[0].dtype
+        shapes = [(*lead, family.count, family.manifold.storage) for family in inner.outputs]
+        results = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
+        return tuple(jax.pure_callback(answer, results, *given, vmap_method="broadcast_all"))
+
+    def backward(given: tuple[Any, ...], slopes: tuple[Any, ...]) -> tuple[Any, ...]:
+        results = tuple(jax.ShapeDtypeStruct(one.shape, one.dtype) for one in given)
+        return tuple(jax.pure_callback(pull, results, given, slopes, vmap_method="broadcast_all"))
+
+    solve.defvjp(lambda *given: (solve(*given), given), backward)
+
+    def call(*given: Any) -> Any:
+        found = solve(*map(jax.numpy.asarray, given))
+        return found if len(found) > 1 else found[0]
+
+    return call
