@@ -16,8 +16,9 @@ import numpy as np
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
-from unifg.solution.solution import AnyGuess, NotConverged, Solution
+from unifg.solution.solution import AnyGuess, Found, NotConverged, Solution
 from unifg.solution.solver import Callback, Solver
+from unifg.solution.starts import spread
 from unifg.solution.status import Status
 from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
 from unifg.solvers.interior_point.method import InteriorPoint
@@ -102,11 +103,16 @@ def solve(
     tolerance: float = 1e-6,
     time_limit: float = np.inf,
     verbose: bool = False,
+    starts: int = 1,
 ) -> Solution:
     """Do as ``fg.solve`` says."""
     choice = choose(graph, data, tolerance=tolerance, time_limit=time_limit, verbose=verbose)
     logger.info("picked %s for %s", choice.first.name, choice.reason)
+    others: tuple[Found, ...] = ()
+    if starts > 1:
+        guess, others = _best_start(choice.first, graph, guess, data or {}, starts)
     solution = choice.first.solve(graph, guess, data=data, callback=callback)
+    solution.others = others
     solution.picked = f"picked for {choice.reason}"
     left = time_limit - solution.seconds
     if solution.status in ELSEWHERE and left > 0.0:
@@ -115,9 +121,29 @@ def solve(
         other = replace(choice.second, time_limit=left).solve(graph, guess, data=data, callback=callback)
         if other.converged:
             other.picked = f"{solution.picked}, after {choice.first.name} ended as {how}"
-            solution = other
+            solution, other.others = other, others
         else:
             solution.picked += f"; {other.solver} ended as {other.status.name.lower().replace('_', ' ')}"
     if check and not solution.converged:
         raise NotConverged(solution)
     return solution
+
+
+def _best_start(
+    solver: Solver, graph: Model, guess: AnyGuess, data: Mapping[Data, Numbers], count: int
+) -> tuple[AnyGuess, tuple[Found, ...]]:
+    """The start whose answer is the cheapest, the guess where none has one; and the answers of all others."""
+    prepared = solver.prepare(graph)
+    program = prepared.program
+    with program.lock:
+        program.bind(data)
+        starts = spread(program, prepared.read(guess), count)
+    each = {handle: np.broadcast_to(value, (count, *np.shape(value))) for handle, value in data.items()}
+    batch = prepared.solve_many(starts, data=each)
+    costs = np.where([status.converged for status in batch.statuses], batch.cost, np.inf)
+    best = int(np.argmin(costs))
+    found = [
+        Found(status, float(batch.cost[k]), float(batch.violation[k]), {f.name: batch[f][k] for f in program.families})
+        for k, status in enumerate(batch.statuses)
+    ]
+    return starts[best], (*found[:best], *found[best + 1 :])

@@ -149,6 +149,7 @@ def solve(
     tolerance: float = 1e-6,
     time_limit: float = float("inf"),
     verbose: bool = False,
+    starts: int = 1,
 ) -> Solution:
     """Solve once, with the backend that what the graph states asks for.
 
@@ -168,6 +169,8 @@ def solve(
         tolerance: of the KKT test.
         time_limit: seconds for both together.
         verbose: log one line per iteration, or print it where logging is not configured.
+        starts: solve from so many starts, the guess and others around it, and keep the cheapest answer; what the others
+            found stands in ``solution.others``.
 
     Raises:
         GraphError: when the graph, guess or data is malformed.
@@ -176,7 +179,7 @@ def solve(
     from unifg.solvers import choice  # only who solves this way loads all backends
 
     options = {"data": data, "check": check, "callback": callback}
-    numbers = {"tolerance": tolerance, "time_limit": time_limit, "verbose": verbose}
+    numbers = {"tolerance": tolerance, "time_limit": time_limit, "verbose": verbose, "starts": starts}
     return choice.solve(graph, guess, **options, **numbers)  # type: ignore[arg-type]  # each as it is declared above
 
 

@@ -137,14 +137,14 @@ def _tangent(manifold: Manifold, points: Array, slopes: Array) -> Array:
     """(n, d) slopes along tangent coordinates, from (n, storage) slopes."""
     if isinstance(manifold, Rn):
         return slopes
-    return np.einsum("nsd,ns->nd", _frames(manifold, points), slopes)
+    return np.asarray(np.einsum("nsd,ns->nd", _frames(manifold, points), slopes))
 
 
 def _stored(manifold: Manifold, points: Array, slopes: Array) -> Array:
     """Slopes by stored numbers, in the shape of the points, from (..., d) slopes along tangent coordinates."""
     flat = points.reshape(-1, manifold.storage)
     back = np.linalg.pinv(_frames(manifold, flat))
-    return np.einsum("nds,nd->ns", back, slopes.reshape(len(flat), -1)).reshape(points.shape)
+    return np.asarray(np.einsum("nds,nd->ns", back, slopes.reshape(len(flat), -1)).reshape(points.shape))
 
 
 def _frames(manifold: Manifold, points: Array) -> Array:

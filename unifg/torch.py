@@ -34,8 +34,8 @@ class _Solve(torch.autograd.Function):  # type: ignore[misc]
 class Layer(torch.nn.Module, layers.Layer):  # type: ignore[misc]
     """A module from data to values of families; arguments as of `unifg.layers.Layer`.
 
-    Tensors have the shapes of the data, or (..., shape) for several instances. The result is the tensor of the output, a
-    tuple of several, with the type and on the device of the first input.
+    Tensors have the shapes of the data, or (..., shape) for several instances. The result is the tensor of the output,
+    a tuple of several, with the type and on the device of the first input.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 from weakref import ref
 
 import numpy as np
@@ -81,6 +81,22 @@ class Guess:
         return {"values": self.values, "multipliers": self.multipliers, "penalties": self.penalties}
 
 
+class Found(NamedTuple):
+    """Answer from one of several starts.
+
+    Attributes:
+        status: of its solve.
+        cost: there.
+        violation: of its constraints.
+        values: by the names of the families.
+    """
+
+    status: Status
+    cost: float
+    violation: float
+    values: dict[str, Array]
+
+
 class Solution:
     """The final iterate with its KKT numbers.
 
@@ -101,6 +117,7 @@ class Solution:
         in_python: seconds of them spent in residuals that Python evaluates, see ``graph.check``.
         verdict: which measurements it believes, from solves that decide that.
         picked: for what the backend was picked, where the caller named none.
+        others: answers of the other starts, where several were asked for.
         checked: whether traced functions were evaluated as they were written at this answer, and agreed.
         mistraced: terms left to Python by that check, and the reasons; the solve was repeated without their traces.
     """
@@ -113,6 +130,7 @@ class Solution:
     checked = False
     mistraced: Mapping[str, str] = MappingProxyType({})
     picked = ""
+    others: tuple[Found, ...] = ()
     verdict: OutlierReport[Solution] | None = None
 
     def __init__(

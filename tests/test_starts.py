@@ -1,0 +1,64 @@
+"""Several starts of one solve: the cheapest answer, and what the others found."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.models import obstacles, unicycle
+
+
+def waves() -> tuple[fg.Graph, fg.Family]:
+    """Many minima, the lowest of which lies at 3.8 in a plane of its own units."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda x: (np.sin(5.0 * x) + 0.1 * (x - 4.0) ** 2).sum(axis=1), x, name="waves")
+    graph.bound(x, lower=-6.0, upper=6.0, name="box")
+    return graph, x
+
+
+def test_more_starts_find_the_lowest_of_many_minima() -> None:
+    graph, x = waves()
+    single, several = (fg.solve(graph, {x: [[-5.0]]}, starts=count) for count in (1, 40))
+    assert single.converged
+    assert several.converged
+    assert several.cost < single.cost - 1.0
+    assert not single.others
+    assert len(several.others) == 39
+    assert several.cost <= min(found.cost for found in several.others if found.status.converged)
+    assert all(-6.0 <= found.values["x"].item() <= 6.0 for found in several.others)
+    again = fg.solve(graph, {x: [[-5.0]]}, starts=40)
+    np.testing.assert_array_equal(again[x], several[x])
+
+
+def test_starts_pass_an_obstacle_on_both_sides() -> None:
+    """The guess goes straight through a disc that lies to one side: from there it is passed on the longer side."""
+    count = 20
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    centre = graph.data("centre", [[1.0, 0.12]])
+    graph.fix(x[0], [0.0, 0.0, 0.0])
+    graph.fix(x[-1], [2.0, 0.0, 0.0])
+    graph.minimize(fg.prior, u, [0.0, 0.0], sigma=1.0, name="effort")
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.1, lower=0.0, upper=0.0, name="motion")
+    graph.constrain(obstacles.disc_clearance, x[1:-1], centre, np.array([0.4]), lower=0.0, name="disc")
+    line = np.linspace([0.0, 0.0, 0.0], [2.0, 0.0, 0.0], count + 1)
+    line[1:-1, 1] = 0.6  # on the wrong side
+    guess = {x: line, u: np.tile([1.0, 0.0], (count, 1))}
+    single, several = (fg.solve(graph, guess, starts=starts) for starts in (1, 12))
+    assert single.converged
+    assert several.converged
+    assert single[x][count // 2, 1] > 0.0 > several[x][count // 2, 1]
+    assert several.cost < 0.98 * single.cost
+    moved = fg.solve(graph, guess, data={centre: [[1.0, -0.12]]}, starts=12)
+    assert moved[x][count // 2, 1] > 0.0
+    assert moved.cost == pytest.approx(several.cost, rel=1e-5)
+
+
+def test_the_guess_is_kept_where_no_start_has_an_answer() -> None:
+    graph, x = waves()
+    graph.constrain(lambda x: x, x, lower=7.0, name="beyond")
+    solution = fg.solve(graph, {x: [[-5.0]]}, starts=3)
+    assert solution.status is fg.Status.LOCALLY_INFEASIBLE
+    assert not any(found.status.converged for found in solution.others)

@@ -1,0 +1,49 @@
+"""Further starts around a guess, for problems with several minima (multistart).
+
+Families of many members, which mostly run along a trajectory, move by smooth curves that leave their ends alone; others
+member by member. The moves are as large as what the guess itself covers, so that they are in the user's units.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.lie import Manifold
+from unifg.problem.columns import Values
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.solution.solution import Guess
+from unifg.typing import Array
+
+WAVES = 3  # half waves along a family at most
+LONG = 5  # members from which on a family is taken for a trajectory
+
+
+def spread(program: CompiledProblem, guess: tuple[Values, Array, Array], count: int) -> list[Guess]:
+    """Starts around a guess, the same ones each time, within the bounds of the unknowns.
+
+    Args:
+        program: the compiled graph, with its data bound.
+        guess: values, multipliers and penalties; the first of the starts.
+        count: of starts, 1 or more.
+    """
+    rng, (values, multipliers, penalties) = np.random.default_rng(0), guess
+    starts = [Guess.stored(program, (values.flat.copy(), multipliers, penalties))]
+    for _ in range(count - 1):
+        moved = Values(program.columns, values.flat.copy())
+        for family, points in moved.items():
+            points[:] = family.manifold.retract(points, _steps(family.manifold, points, rng))
+        program.retraction.fix(moved)
+        starts.append(Guess.stored(program, (program.within_bounds(moved).flat, multipliers, penalties)))
+    return starts
+
+
+def _steps(manifold: Manifold, points: Array, rng: np.random.Generator) -> Array:
+    """(n, d) random tangent steps for (n, storage) points."""
+    count = len(points)
+    covered = np.abs(manifold.local(np.repeat(points[:1], count, axis=0), points)).max(axis=0, initial=0.0)
+    size = np.where(covered > 0.0, covered, covered.max(initial=0.0) or 1.0)
+    if count < LONG:
+        return np.asarray(size * rng.standard_normal((count, manifold.dim)))
+    waves = np.sin(np.pi * np.outer(np.linspace(0.0, 1.0, count), np.arange(1, WAVES + 1)))
+    heights = rng.standard_normal((WAVES, manifold.dim)) / np.arange(1, WAVES + 1)[:, None]
+    return np.asarray(0.5 * size * (waves @ heights))
