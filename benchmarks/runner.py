@@ -102,7 +102,10 @@ PAGES: dict[str, dict[str, float]] = {
         "coupling": 0.8, "covariance_plans": 0.1, "active_perception": 0.1, "shared_dynamics": 0.1,
         "excluded_pasts": 0.05,
     },
-    "control": {"control_cases": 0.4, "moved_goals": 0.1, "many_instances": 0.02, "own_functions": 0.1, "claims": 0.2},
+    "control": {
+        "control_cases": 0.4, "moved_goals": 0.1, "many_instances": 0.02, "derivatives": 0.02, "own_functions": 0.1,
+        "claims": 0.2,
+    },
     "collection": {"collection": 0.1, "cops": 0.05},
     "pose-graphs": {"elimination": 0.1, "incremental": 0.1, "wrong_closures": 4.0},
     "navigation": {"navigation": 0.1, "localisation": 0.15},

@@ -16,6 +16,7 @@ import pytest
 import unifg as fg
 from benchmarks import (
     collection,
+    derivatives,
     elimination,
     gtsam_peer,
     horizon_and_velocity,
@@ -283,3 +284,8 @@ def test_many_instances_are_beside_a_loop() -> None:
     row = many_instances.measure(many_instances.UNICYCLES[0], rounds=1, count=4)
     assert row[:2] == ("unicycle straight, N = 20", "4 of 4") and len(row) == 6
     assert min(map(float, row[2:])) > 0.0
+
+
+def test_derivatives_are_beside_problems_solved_again() -> None:
+    row = derivatives.measure(many_instances.UNICYCLES[1], rounds=1)
+    assert row[0] < 1e-6 and len(row) == 7 and min(row[1:]) > 0.0

@@ -335,8 +335,8 @@ class Sensitivities:
         size = self._system.pattern.size
         first, last = np.searchsorted(change.coordinates, [numbers[0], numbers[-1] + 1])
         places = change.rows[first:last] + size * (change.coordinates[first:last] - numbers[0])
-        right: Array = np.bincount(places, -change.values[first:last], len(numbers) * size).reshape(-1, size)
-        return right
+        right = np.bincount(places, -change.values[first:last], len(numbers) * size)
+        return np.asarray(right, dtype=np.float64).reshape(-1, size)
 
     def _solved(self, right: Array) -> Array:
         """Solutions for the rows of (k, size).
