@@ -16,10 +16,10 @@ import numpy as np
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
-from unifg.solution.solution import AnyGuess, Found, NotConverged, Solution
+from unifg.solution.solution import AnyGuess, NotConverged, Solution
 from unifg.solution.solver import Callback, Solver
 from unifg.solution.starts import spread
-from unifg.solution.status import Status
+from unifg.solution.status import Found, Status
 from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
 from unifg.solvers.interior_point.method import InteriorPoint
 from unifg.solvers.least_squares import LevenbergMarquardt

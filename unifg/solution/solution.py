@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import ref
 
 import numpy as np
@@ -27,7 +27,8 @@ from unifg.solution.marginal import Variables, information, marginal_prior
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.sensitivity import Named, Sensitivities, Weights, Wrt
-from unifg.solution.status import Status
+from unifg.solution.status import Found, Status
+from unifg.solution.tube import tube
 from unifg.solution.verify import Verified, verified
 from unifg.solution.warm_start import Shifts
 from unifg.typing import Array, BoolArray, Numbers
@@ -79,22 +80,6 @@ class Guess:
     def __getstate__(self) -> dict[str, Any]:
         """Pickle what is viewed."""
         return {"values": self.values, "multipliers": self.multipliers, "penalties": self.penalties}
-
-
-class Found(NamedTuple):
-    """Answer from one of several starts.
-
-    Attributes:
-        status: of its solve.
-        cost: there.
-        violation: of its constraints.
-        values: by the names of the families.
-    """
-
-    status: Status
-    cost: float
-    violation: float
-    values: dict[str, Array]
 
 
 class Solution:
@@ -534,6 +519,22 @@ class Solution:
         if data is None:
             raise GraphError("verify: the data of this solution were replaced; verify what the solve returned")
         return verified(program, self.values, self._multipliers, self.cost, data, tolerance)
+
+    def tube(self, term: str, pieces: int = 16) -> Array:
+        """(n - 1, m, 2) least and greatest values of a term's rows between each factor and the next, as a proof.
+
+        From one factor to the next all variables and data of the term move in straight lines of their stored numbers,
+        headings the short way round. Bounds come from interval arithmetic, so they are never too narrow; they approach
+        the true ones as ``pieces`` grow.
+
+        Args:
+            term: name of a term whose function is traced, of vectors and poses in the plane.
+            pieces: boxes between two factors.
+
+        Raises:
+            GraphError: there is no such term, or it is of another kind.
+        """
+        return tube(self._program, self._lin.values, term, pieces)
 
     def report(self) -> str:
         """The status sentence with the numbers behind it, and the times of the parts."""

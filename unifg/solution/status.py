@@ -1,6 +1,9 @@
 """Why a solve ended, as a sentence."""
 
 from enum import Enum
+from typing import NamedTuple
+
+from unifg.typing import Array
 
 
 class Status(Enum):
@@ -50,3 +53,19 @@ class Status(Enum):
     def converged(self) -> bool:
         """True if a solution is claimed."""
         return self in (Status.CONVERGED, Status.HARDLY_DETERMINED)
+
+
+class Found(NamedTuple):
+    """Answer from one of several starts.
+
+    Attributes:
+        status: of its solve.
+        cost: there.
+        violation: of its constraints.
+        values: by the names of the families.
+    """
+
+    status: Status
+    cost: float
+    violation: float
+    values: dict[str, Array]
