@@ -32,7 +32,8 @@ FLOORS: tuple[tuple[str, ...], ...] = (
     ("solution",),
     ("solvers", "smoothing", "models"),
     ("horizon", "pose_graphs"),
-    ("files",),
+    ("files", "layers"),
+    ("torch", "jax"),
     ("view",),
     ("precompile",),
     ("unifg",),  # the names of the user's script, gathered

@@ -32,6 +32,7 @@ OPEN_MODULES = {
     "unifg",
     "unifg.codegen.compile_counter",
     "unifg.errors",
+    "unifg.layers",
     "unifg.solution.solver",
     "unifg.solution.status",
     "unifg.problem.hessian",
@@ -57,7 +58,7 @@ def test_dir_lists_what_is_public() -> None:
 LATE = (
     "scipy", "osqp", "piqp", "qpsolvers", "platformdirs", "matplotlib", "pandas", "casadi", "email", "numba.np.linalg",
     "unifg.solvers", "unifg.models", "unifg.smoothing", "unifg.plots", "unifg.style", "unifg.view", "unifg.horizon",
-    "unifg.files", "unifg.pose_graphs", "unifg.scenarios", "unifg.precompile",
+    "unifg.files", "unifg.pose_graphs", "unifg.scenarios", "unifg.precompile", "unifg.layers", "torch", "jax",
 )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from unifg import layers
+from unifg.layers import Layer as Function
 
 __all__ = ["Layer"]
 
@@ -20,7 +20,7 @@ class _Solve(torch.autograd.Function):  # type: ignore[misc]
     """Solve forward, take slopes back by the implicit function theorem."""
 
     @staticmethod
-    def forward(ctx: Any, layer: layers.Layer, *given: Any) -> tuple[Any, ...]:
+    def forward(ctx: Any, layer: Function, *given: Any) -> tuple[Any, ...]:
         ctx.answers = layer.solve(*(tensor.detach().cpu().numpy() for tensor in given))
         ctx.layer, ctx.given = layer, given
         return tuple(torch.as_tensor(array).to(given[0]) for array in ctx.answers.values)
@@ -31,7 +31,7 @@ class _Solve(torch.autograd.Function):  # type: ignore[misc]
         return None, *(torch.as_tensor(slope).to(g) for slope, g in zip(found, ctx.given, strict=True))
 
 
-class Layer(torch.nn.Module, layers.Layer):  # type: ignore[misc]
+class Layer(torch.nn.Module, Function):  # type: ignore[misc]
     """A module from data to values of families; arguments as of `unifg.layers.Layer`.
 
     Tensors have the shapes of the data, or (..., shape) for several instances. The result is the tensor of the output,
@@ -41,7 +41,7 @@ class Layer(torch.nn.Module, layers.Layer):  # type: ignore[misc]
     def __init__(self, *args: Any, **options: Any) -> None:
         """State what goes in and what comes out."""
         torch.nn.Module.__init__(self)
-        layers.Layer.__init__(self, *args, **options)
+        Function.__init__(self, *args, **options)
 
     def forward(self, *given: Any) -> Any:
         """Values of the outputs.

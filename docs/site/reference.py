@@ -15,7 +15,10 @@ from pathlib import Path
 
 CHECKOUT = Path(__file__).resolve().parent.parent.parent
 NOTEBOOKS = sorted((CHECKOUT / "docs" / "notebooks").glob("*.ipynb"))
-ROOMS = ("unifg", "unifg.solvers", "unifg.horizon", "unifg.smoothing", "unifg.pose_graphs", "unifg.view", "unifg.lie")
+ROOMS = (
+    "unifg", "unifg.solvers", "unifg.horizon", "unifg.smoothing", "unifg.pose_graphs", "unifg.view", "unifg.lie",
+    "unifg.layers", "unifg.torch", "unifg.jax",
+)  # fmt: skip
 """Their names are public where they are listed."""
 SHELVES = ("unifg.models", "unifg.files")
 """The modules that they list are."""
