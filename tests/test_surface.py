@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import re
 import sys
 from importlib import metadata
@@ -27,6 +28,8 @@ def test_no_name_comes_or_goes_unseen() -> None:
 
 def test_every_listed_name_can_be_imported() -> None:
     for module, names in reference.public().items():
+        if module in ("unifg.torch", "unifg.jax") and not importlib.util.find_spec(module.removeprefix("unifg.")):
+            continue  # of an extra that is not installed
         found = importlib.import_module(module)
         assert [name for name in names if not hasattr(found, name)] == [], module
 
