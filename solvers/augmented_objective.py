@@ -16,7 +16,7 @@ import numpy as np
 
 from unifg.codegen.function_pointers import Memory, all_of, linked_to
 from unifg.codegen.inner import inner
-from unifg.codegen.jit import compiled
+from unifg.codegen.jit import compiled, inlined
 from unifg.elimination.plan import Plan
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
@@ -208,15 +208,19 @@ def slope_of(where: int, gradient: Array, entries: Array, multipliers: Array) ->
     return largest
 
 
+@inlined
+def _after(value: float, lower: float, upper: float, multiplier: float, penalty: float) -> float:
+    """lambda+ of one row; NaN stays visible."""
+    above, below = multiplier + penalty * (value - upper), multiplier + penalty * (value - lower)
+    updated = (above if above > 0.0 else 0.0) + (below if below < 0.0 else 0.0)
+    return updated if value == value else value
+
+
 @compiled
 def update(constraints: Array, lower: Array, upper: Array, multipliers: Array, penalty: Array, out: Array) -> None:
     """Write lambda+: the first-order dual update, zero for inactive rows."""
     for row in range(len(out)):
-        above = multipliers[row] + penalty[row] * (constraints[row] - upper[row])
-        below = multipliers[row] + penalty[row] * (constraints[row] - lower[row])
-        out[row] = (above if above > 0.0 else 0.0) + (below if below < 0.0 else 0.0)
-        if constraints[row] != constraints[row]:
-            out[row] = constraints[row]  # NaN stays visible
+        out[row] = _after(constraints[row], lower[row], upper[row], multipliers[row], penalty[row])
 
 
 @compiled
@@ -224,10 +228,6 @@ def barrier(constraints: Array, lower: Array, upper: Array, multipliers: Array, 
     """Sum of the terms."""
     total = 0.0
     for row in range(len(constraints)):
-        above = multipliers[row] + penalty[row] * (constraints[row] - upper[row])
-        below = multipliers[row] + penalty[row] * (constraints[row] - lower[row])
-        after = (above if above > 0.0 else 0.0) + (below if below < 0.0 else 0.0)
-        if constraints[row] != constraints[row]:
-            after = constraints[row]
+        after = _after(constraints[row], lower[row], upper[row], multipliers[row], penalty[row])
         total += (after * after - multipliers[row] * multipliers[row]) / (2.0 * penalty[row])
     return total
