@@ -70,17 +70,17 @@ class Primal:
         self.damping = 0.0
         self.hopeful = False
         self.reached: Linearization | None = None
-        self._held: tuple[object, ...] = ()
+        self._held: tuple[object, ...] = (None,)  # nothing is that, so that the first call describes
 
     @property
     def address(self) -> int:
         """Address of the description of :class:`Held` at present; limits and terms may be new ones with new data."""
-        program, plan = self.program, self.solver.plan
-        present = program.arrays, plan, program.equality
-        if not self._held or not all(map(is_, present, self._held)):
-            normal = program.normal
-            found = Held(program.arrays, plan, program.columns.free, normal.indptr, normal.indices, program.equality)
-            self._held, self._words = present, arrays.describe(found)
+        program, normal = self.program, self.program.normal
+        present = Held(
+            program.arrays, self.solver.plan, program.columns.free, normal.indptr, normal.indices, program.equality
+        )
+        if not all(map(is_, present, self._held)):
+            self._held, self._words = present, arrays.describe(present)
             self._address = int(self._words.ctypes.data)
         return self._address
 
