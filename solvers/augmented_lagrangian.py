@@ -106,46 +106,34 @@ class AugmentedLagrangian(Solver):
     def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Alternate primal and dual steps."""
         rho, weights = self._first_penalties(run, workspace)
-        if self.schedule == "bazzana":
-            return self._literal(run, workspace, rho, weights)
-        if self.schedule == "bazzana-damped":
-            return self._damped(run, workspace, rho, weights)
-        return self._tightening(run, workspace, rho, weights)
+        alternate = self._tightening if self.schedule == "bcl" else self._literal
+        return alternate(run, workspace, rho, weights)
 
     def _literal(self, run: SolveState, primal: Primal, rho: float, weights: Array) -> Status | None:
-        """One Gauss-Newton step, one dual step, constant rho."""
-        run.penalties = penalty = rho * weights
-        while run.status is None:
-            lin, multipliers = run.lin, run.multipliers
-            step = primal.direction(
-                primal.curvature(lin, multipliers, penalty), primal.gradient(lin, multipliers, penalty)
-            )
-            if step is None:
-                return Status.SINGULAR
-            after = run.program.linearize(run.program.retract(lin.values, step))
-            updated = primal.next_multipliers(after.constraints, multipliers, penalty)
-            run.accept(after, updated, norm(step), 1.0, penalty=rho)
-            if run.status is None and self._stop_rule(run, norm(step)):
-                return Status.STOP_RULE
-        return None
+        """One Gauss-Newton step, one dual step, constant rho.
 
-    def _damped(self, run: SolveState, primal: Primal, rho: float, weights: Array) -> Status | None:
-        """The same with Levenberg and Marquardt's damping: a primal step has to lower the augmented objective."""
+        With Levenberg and Marquardt's damping a primal step has to lower the augmented objective.
+        """
         run.penalties = penalty = rho * weights
-        damping = Damping(self.damping)
+        damping, damped = Damping(self.damping), self.schedule == "bazzana-damped"
         while run.status is None:
-            lin, multipliers = run.lin, run.multipliers
-            taken = damped_step(primal, lin, multipliers, penalty, damping)
-            if taken is None:  # at a minimum to all digits: the dual step goes on
-                values, step, rejected = lin.values, np.zeros(run.program.size), 0
-                damping = Damping(self.damping)
-            else:
+            lin, multipliers, rejected = run.lin, run.multipliers, 0
+            if not damped:
+                curvature = primal.curvature(lin, multipliers, penalty)
+                found = primal.direction(curvature, primal.gradient(lin, multipliers, penalty))
+                if found is None:
+                    return Status.SINGULAR
+                values, step = run.program.retract(lin.values, found), found
+            elif (taken := damped_step(primal, lin, multipliers, penalty, damping)) is not None:
                 values, step, rejected = taken
+            else:  # at a minimum to all digits: the dual step goes on
+                values, step, damping = lin.values, np.zeros(run.program.size), Damping(self.damping)
             after = run.program.linearize(values)
             updated = primal.next_multipliers(after.constraints, multipliers, penalty)
-            if taken is None and np.array_equal(updated, multipliers):
+            if values is lin.values and np.array_equal(updated, multipliers):
                 return settle(run, Status.STALLED)
-            run.accept(after, updated, norm(step), 1.0, penalty=rho, damping=damping.value, rejected=rejected)
+            details = {"damping": damping.value, "rejected": rejected} if damped else {}
+            run.accept(after, updated, norm(step), 1.0, penalty=rho, **details)
             if run.status is None and self._stop_rule(run, norm(step)):
                 return Status.STOP_RULE
         return None
@@ -267,7 +255,8 @@ class AugmentedLagrangian(Solver):
         least = WARM_PENALTY * largest(run.multipliers / scale)
         given = run.penalties > 0.0
         if given.any():
-            rho = float(np.median((run.penalties / weights)[given]))
+            found = np.sort((run.penalties / weights)[given])  # np.median takes longer than the step that follows
+            rho = float(0.5 * (found[(len(found) - 1) // 2] + found[len(found) // 2]))
             weights = np.where(given, run.penalties / rho, weights)
         else:
             outside = float(np.square(scale * run.program.violation(run.lin.constraints)).sum())

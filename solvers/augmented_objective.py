@@ -9,20 +9,47 @@ least-squares backends descend on the same.
 from __future__ import annotations
 
 from functools import cached_property
+from operator import is_
+from typing import NamedTuple
 
 import numpy as np
 
+from unifg.codegen.function_pointers import Memory, all_of, linked_to
 from unifg.codegen.inner import inner
-from unifg.codegen.jit import compiled
+from unifg.codegen.jit import compiled, inlined
+from unifg.elimination.plan import Plan
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.problem.evaluation import transposed_times
+from unifg.problem.evaluation import times, transposed_times
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Evaluation, Linearization
 from unifg.problem.table import TermArrays
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, BoolArray, IntArray
 
 DIAGONAL_FLOOR = 1e-9  # of the largest diagonal entry: damping must act on unknowns with little curvature too
+
+
+class Held(NamedTuple):
+    """Arrays that stay where they are from step to step.
+
+    Attributes:
+        terms: of the program.
+        plan: of the elimination of the normal equations.
+        free: columns that are unknown.
+        indptr, indices: pattern of the normal matrix.
+        equality: (M,) which rows are.
+    """
+
+    terms: TermArrays
+    plan: Plan
+    free: IntArray
+    indptr: IntArray
+    indices: IntArray
+    equality: BoolArray
+
+
+arrays = Memory()  # of Held: Numba takes ten microseconds to unpack it in every call
+held = all_of(arrays)
 
 
 class Primal:
@@ -43,6 +70,19 @@ class Primal:
         self.damping = 0.0
         self.hopeful = False
         self.reached: Linearization | None = None
+        self._held: tuple[object, ...] = (None,)  # nothing is that, so that the first call describes
+
+    @property
+    def address(self) -> int:
+        """Address of the description of :class:`Held` at present; limits and terms may be new ones with new data."""
+        program, normal = self.program, self.program.normal
+        present = Held(
+            program.arrays, self.solver.plan, program.columns.free, normal.indptr, normal.indices, program.equality
+        )
+        if not all(map(is_, present, self._held)):
+            self._held, self._words = present, arrays.describe(present)
+            self._address = int(self._words.ctypes.data)
+        return self._address
 
     @cached_property
     def alike(self) -> IntArray:
@@ -82,8 +122,7 @@ class Primal:
 
     def slope(self, lin: Linearization, multipliers: Array) -> float:
         """Largest entry of the Lagrangian's gradient over the unknowns."""
-        program = self.program
-        return float(slope_of(program.arrays, program.columns.free, lin.gradient, lin.constraint_jacobian, multipliers))
+        return float(slope_of(self.address, lin.gradient, lin.constraint_jacobian, multipliers))
 
     def curvature(self, lin: Linearization, multipliers: Array, penalty: Array) -> Array:
         """Gauss-Newton Hessian entries J'J + A' diag(rho, active rows) A."""
@@ -94,13 +133,9 @@ class Primal:
     def expected_multipliers(
         self, lin: Linearization, step: Array, multipliers: Array, penalty: Array, base: Array
     ) -> Array:
-        """(M,) lambda+ after a step, by the linear model of the constraints that are ``base`` without a step.
-
-        Base and limit are subtracted before the step is added, so that a large penalty finds no rounding to multiply.
-        """
-        program, after = self.program, np.empty(len(multipliers))
-        moved = program.constraints.times(lin.constraint_jacobian, step)
-        update(moved, program.lower - base, program.upper - base, multipliers, penalty, after)
+        """(M,) lambda+ after a step, by the linear model of the constraints that are ``base`` without a step."""
+        after = np.empty(len(multipliers))
+        expect(self.address, lin.constraint_jacobian, step, base, multipliers, penalty, after)
         return after
 
     def bend(self, lin: Linearization, multipliers: Array) -> Array:
@@ -145,28 +180,47 @@ def _subtract(entries: Array, others: Array) -> bool:
     return largest > 0.0
 
 
-@compiled
-def slope_of(terms: TermArrays, free: IntArray, gradient: Array, entries: Array, multipliers: Array) -> float:
+@linked_to(arrays)
+def expect(
+    where: int, entries: Array, step: Array, base: Array, multipliers: Array, penalty: Array, out: Array
+) -> None:
+    """Write lambda+ after a step, by the linear model of the constraints that are ``base`` without a step.
+
+    Base and limit are subtracted before the step is added, so that a large penalty finds no rounding to multiply.
+    """
+    terms = held(where).terms
+    moved = np.empty_like(base)
+    times(terms, False, entries, step, moved)
+    update(moved, terms.lower - base, terms.upper - base, multipliers, penalty, out)
+
+
+@linked_to(arrays)
+def slope_of(where: int, gradient: Array, entries: Array, multipliers: Array) -> float:
     """Max |gradient + A' multipliers| over the unknowns; NaN where one is."""
+    known = held(where)
     full, largest = gradient.copy(), 0.0
-    transposed_times(terms, False, entries, multipliers, full)
-    for k in range(len(free)):
-        size = abs(full[free[k]])
+    transposed_times(known.terms, False, entries, multipliers, full)
+    for k in range(len(known.free)):
+        size = abs(full[known.free[k]])
         if size != size:
             return np.nan
         largest = max(largest, size)
     return largest
 
 
+@inlined
+def _after(value: float, lower: float, upper: float, multiplier: float, penalty: float) -> float:
+    """lambda+ of one row; NaN stays visible."""
+    above, below = multiplier + penalty * (value - upper), multiplier + penalty * (value - lower)
+    updated = (above if above > 0.0 else 0.0) + (below if below < 0.0 else 0.0)
+    return updated if value == value else value
+
+
 @compiled
 def update(constraints: Array, lower: Array, upper: Array, multipliers: Array, penalty: Array, out: Array) -> None:
     """Write lambda+: the first-order dual update, zero for inactive rows."""
     for row in range(len(out)):
-        above = multipliers[row] + penalty[row] * (constraints[row] - upper[row])
-        below = multipliers[row] + penalty[row] * (constraints[row] - lower[row])
-        out[row] = (above if above > 0.0 else 0.0) + (below if below < 0.0 else 0.0)
-        if constraints[row] != constraints[row]:
-            out[row] = constraints[row]  # NaN stays visible
+        out[row] = _after(constraints[row], lower[row], upper[row], multipliers[row], penalty[row])
 
 
 @compiled
@@ -174,10 +228,6 @@ def barrier(constraints: Array, lower: Array, upper: Array, multipliers: Array, 
     """Sum of the terms."""
     total = 0.0
     for row in range(len(constraints)):
-        above = multipliers[row] + penalty[row] * (constraints[row] - upper[row])
-        below = multipliers[row] + penalty[row] * (constraints[row] - lower[row])
-        after = (above if above > 0.0 else 0.0) + (below if below < 0.0 else 0.0)
-        if constraints[row] != constraints[row]:
-            after = constraints[row]
+        after = _after(constraints[row], lower[row], upper[row], multipliers[row], penalty[row])
         total += (after * after - multipliers[row] * multipliers[row]) / (2.0 * penalty[row])
     return total

@@ -13,19 +13,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.function_pointers import linked_to
 from unifg.codegen.jit import compiled
 from unifg.codegen.loops import copy_to, dot
 from unifg.elimination.fronts import factor
-from unifg.elimination.plan import NEGATIVE, Plan
+from unifg.elimination.plan import NEGATIVE
 from unifg.elimination.substitution import solve
 from unifg.elimination.symmetric import add_times
 from unifg.problem.columns import Values
 from unifg.problem.evaluation import add_constraints, times, transposed_times
 from unifg.problem.linearization import Linearization
-from unifg.problem.table import TermArrays
-from unifg.solvers.augmented_objective import DIAGONAL_FLOOR, Primal, barrier, update
+from unifg.solvers.augmented_objective import DIAGONAL_FLOOR, Primal, arrays, barrier, held, update
 from unifg.solvers.globalize.damping import LARGEST, SUFFICIENT, Damping, gain
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import Array, IntArray
 
 NEWTON_STEPS = 12
 SHORTEST = 1e-3
@@ -136,16 +136,10 @@ def model_step(
         The tangent step and the decrease the model predicts; None when a system cannot be factorised, or the second
         derivatives leave it indefinite.
     """
-    program = primal.program
     primal.damping = damping
-    step = np.zeros(program.size)
+    step = np.zeros(primal.program.size)
     predicted = minimize(
-        program.arrays,
-        primal.solver.plan,
-        program.columns.free,
-        program.normal.indptr,
-        program.normal.indices,
-        program.equality,
+        primal.address,
         lin.residual,
         lin.jacobian,
         lin.constraints if constraints is None else constraints,
@@ -162,14 +156,9 @@ def model_step(
     return None if np.isnan(predicted) else (step, predicted)
 
 
-@compiled
+@linked_to(arrays)
 def minimize(
-    terms: TermArrays,
-    plan: Plan,
-    free: IntArray,
-    indptr: IntArray,
-    indices: IntArray,
-    equality: BoolArray,
+    where: int,
     start_residual: Array,
     jacobian: Array,
     start_constraints: Array,
@@ -184,6 +173,7 @@ def minimize(
     step: Array,
 ) -> float:
     """Newton's method on the piecewise quadratic; returns the predicted decrease, NaN when a system is singular."""
+    terms, plan, free, indptr, indices, equality = held(where)
     curved = len(bend) > 0
     # Beside squares: what second derivatives add, and costs that are no squares.
     beyond = curved or len(bowl) > 0

@@ -138,8 +138,7 @@ class LevenbergMarquardt(LeastSquares):
                 return Status.STALLED
             values, step, rejected = taken
             # Rejected steps are the exception: the first trial is linearised at once, later ones are evaluated first.
-            lin = workspace.reached if rejected == 0 else None
-            lin = run.program.linearize(values) if lin is None else lin
+            lin = workspace.linearized(values)
             run.accept(lin, none, norm(step), 1.0, damping=used, rejected=rejected)
             if run.status is None and norm(step) < self.step_tolerance:
                 return Status.STOP_RULE

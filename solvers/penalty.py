@@ -17,7 +17,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
-from unifg.solvers.augmented_objective import Primal, update
+from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import damped_step, model_step
 from unifg.solvers.globalize.damping import Damping
 from unifg.solvers.globalize.feasibility_restoration import settle
@@ -103,7 +103,9 @@ class Penalty(Solver):
                 return True
             values, step, rejected = taken
             before = primal.merit(run.lin, none, penalty)
-            estimate = _estimate(run.program, run.lin, step, penalty)
+            # rho times the violation of the new iterate would be mostly rounding errors once rho is large; the linear
+            # model's balance the gradient of the cost to the accuracy of the linear solve.
+            estimate = primal.expected_multipliers(run.lin, step, none, penalty, run.lin.constraints)
             lin = run.program.linearize(values)
             run.accept(lin, estimate, norm(step), 1.0, penalty=rho, damping=damping.value, rejected=rejected)
             if run.status is not None:
@@ -117,16 +119,3 @@ class Penalty(Solver):
     def _violated(self, run: SolveState) -> bool:
         """Test whether the constraints as they are ask for a heavier weight."""
         return max(run.optimality.violation, run.optimality.complementarity) > self.tolerance
-
-
-def _estimate(program: CompiledProblem, lin: Linearization, step: Array, penalty: Array) -> Array:
-    """(M,) multipliers from the linear model of a step: the penalties times the violations after it.
-
-    rho times the violation of the new iterate would be mostly rounding errors once rho is large; these balance the
-    gradient of the cost to the accuracy of the linear solve. The small numbers are added before the large ones.
-    """
-    moved = program.constraints.times(lin.constraint_jacobian, step)
-    estimate = np.empty(len(penalty))
-    lower, upper = program.lower - lin.constraints, program.upper - lin.constraints
-    update(moved, lower, upper, np.zeros(len(penalty)), penalty, estimate)
-    return estimate

@@ -23,7 +23,7 @@ ROUNDING = 1e-12  # of the residuals of graphs that fit exactly, numbers of orde
 
 
 @dataclass
-class OutlierReport:
+class KktNumbers:
     """KKT numbers found by the judge."""
 
     stationarity: float
@@ -36,13 +36,13 @@ class OutlierReport:
         return max(self.stationarity, self.violation, self.complementarity, self.wrong_sign)
 
 
-def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None = None) -> OutlierReport:
+def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None = None) -> KktNumbers:
     """Measure the KKT conditions of ``graph`` at ``solution``."""
     data = data or {}
     values = solution.values
     moved = [(family, row, column) for family, row, column in _free(graph)]
     if all(isinstance(term, Cost) for term in graph.terms):
-        return OutlierReport(_relative_offset(graph, values, moved, data), 0.0, 0.0, 0.0)
+        return KktNumbers(_relative_offset(graph, values, moved, data), 0.0, 0.0, 0.0)
     gradient = np.array(
         [(_f(graph, _at(values, m, STEP), data) - _f(graph, _at(values, m, -STEP), data)) for m in moved]
     )
@@ -58,7 +58,7 @@ def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None
     wrong = np.where((duals > 0.0) & np.isinf(upper) | (duals < 0.0) & np.isinf(lower), np.abs(duals), 0.0)
     limit = np.where(duals > 0.0, upper, lower)
     slack = np.where(np.isfinite(limit) & (lower != upper), np.abs(g - np.where(np.isfinite(limit), limit, 0.0)), 0.0)
-    return OutlierReport(
+    return KktNumbers(
         float(np.abs(gradient).max(initial=0.0)) / scale,
         float(outside.max(initial=0.0)),
         float((np.abs(duals) * slack).max(initial=0.0)) / scale,

@@ -393,3 +393,23 @@ def test_which_optimum_a_swing_up_finds_depends_on_the_first_penalty() -> None:
     assert abs(light.cost / heavy.cost - 1.0) > 0.01
     again = InteriorPoint().solve(graph, fg.Guess(light.values, light.multipliers), check=True)
     assert again.cost == pytest.approx(light.cost, rel=1e-6)  # an optimum, too
+
+
+def test_rows_that_become_equalities_are_so_for_the_compiled_steps() -> None:
+    """A prepared solver that has seen other limits goes the way of one that has not, iterate by iterate."""
+
+    def stated() -> tuple[fg.Graph, dict[fg.Family, Array], fg.Data]:
+        graph, upper = fg.Graph(), 0.0
+        p = graph.variables("p", fg.Rn(2), 5)
+        top = graph.data("top", upper)
+        graph.minimize(fg.prior, p, np.stack([np.linspace(-1.0, 1.0, 5), np.ones(5)], axis=1), sigma=0.5)
+        graph.constrain(lambda x: x[:, 1:] - x[:, :1] ** 2, p, lower=0.0, upper=top, name="curve")
+        return graph, {p: np.full((5, 2), 0.3)}, top
+
+    graph, guess, top = stated()
+    run = AugmentedLagrangian().prepare(graph)
+    for limit in (0.0, np.inf, 0.0, 0.5):
+        found = run.solve(guess, data={top: limit}, check=True)
+        graph, again, other = stated()
+        fresh = AugmentedLagrangian().prepare(graph).solve(again, data={other: limit}, check=True)
+        assert [row.cost for row in found.history] == [row.cost for row in fresh.history]

@@ -20,7 +20,7 @@ from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian, require_second
 from unifg.problem.linearization import Linearization
-from unifg.problem.snapshot import Memory
+from unifg.problem.snapshot import LinearizationMemory
 from unifg.problem.systems import stacked
 from unifg.problem.table import COST, COUNT, KIND, ROW, ROWS
 from unifg.solution.batch import Outcomes
@@ -284,7 +284,7 @@ class Workspace:
             log=iterations + 2,
             data=len(plan.slots),
         )
-        self._answer = Memory(program)
+        self._answer = LinearizationMemory(program)
         arrays_of: dict[str, Any] = {name.replace("sizes", "norms"): a for name, a in self._answer.arrays.items()}
         self.work = self.work._replace(**arrays_of)
         self.problem = Problem(

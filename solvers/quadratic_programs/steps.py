@@ -16,7 +16,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.retraction import retract_parts
 from unifg.problem.scalars import add_scalars, evaluate_scalars
-from unifg.problem.snapshot import Memory
+from unifg.problem.snapshot import LinearizationMemory
 from unifg.solution.history import Iteration
 from unifg.solution.optimality import read_numbers
 from unifg.solution.solver import SolveState
@@ -88,7 +88,7 @@ class Steps:
         self._reached: Linearization | None = None
         self._moved: Values | None = None
         self.work = _empty(program)
-        self._answer = Memory(program)
+        self._answer = LinearizationMemory(program)
         reached: dict[str, Any] = {REACHED.get(name, name): array for name, array in self._answer.arrays.items()}
         self.work = self.work._replace(**reached)
         self.now = Fields(self.work.scalars)

@@ -51,6 +51,19 @@ def whiten(kind: int, whiteners: Array, first: int, i: int, r: Array, J: Array) 
                         J[a, d] += w * J[b, d]
 
 
+def whitener_of(name: str, sigma: Array | None, information: Array | None, count: int, size: int) -> tuple[int, Array]:
+    """Kind of whitening, 0 for none, and what it multiplies by, see :func:`reciprocals` and :func:`square_roots`.
+
+    Raises:
+        GraphError: naming the term, when a weight does not fit.
+    """
+    if sigma is not None:
+        return DIAGONAL, reciprocals(name, sigma, count, size)
+    if information is not None:
+        return FULL, square_roots(name, information, count, size)
+    return 0, np.zeros((1, 0))
+
+
 def reciprocals(name: str, sigma: Array, count: int, size: int) -> Array:
     """1 / sigma as (1, m) or (n, m).
 

@@ -18,7 +18,7 @@ from unifg.typing import Array
 MADE = ("norms", "scalars", "rounding")  # of other arrays
 
 
-class Memory:
+class LinearizationMemory:
     """Arrays of one linearisation that compiled code writes to, side by side.
 
     Attributes:
@@ -57,7 +57,7 @@ class Snapshot(Linearization):
     """A linearisation whose arrays are parts of one."""
 
     def __init__(self, program: CompiledProblem, cost: float, flat: Array, parts: Mapping[str, slice]) -> None:
-        """Made by :meth:`Memory.copied`."""
+        """Made by :meth:`LinearizationMemory.copied`."""
         self.cost = cost
         self._program, self._flat, self._parts = program, flat, parts
 

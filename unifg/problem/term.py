@@ -29,7 +29,7 @@ from unifg.factors.differences import (
 )
 from unifg.factors.kernel import Kernel, evaluate_rows, side_by_side
 from unifg.factors.per_factor import per_factor
-from unifg.factors.whitening import DIAGONAL, FULL, reciprocals, square_roots
+from unifg.factors.whitening import DIAGONAL, FULL, whitener_of
 from unifg.lie import Manifold
 from unifg.modeling.probing import blocks_of, size_of, told, tried
 from unifg.modeling.terms import Constraint, Cost, Parameter, ScalarCost, Term
@@ -586,11 +586,9 @@ class CompiledTerm:
 
     def _weights(self, data: Bound) -> tuple[int, Array]:
         """Whitening of the residuals, and its matrices."""
-        term, how, by = self.term, 0, np.zeros(0)
-        if isinstance(term, Cost) and term.sigma is not None:
-            how, by = DIAGONAL, reciprocals(self.name, resolve(term.sigma, data), self.count, self.size)
-        if isinstance(term, Cost) and term.information is not None:
-            how, by = FULL, square_roots(self.name, resolve(term.information, data), self.count, self.size)
+        weights = (self.term.sigma, self.term.information) if isinstance(self.term, Cost) else (None, None)
+        sigma, information = (None if weight is None else resolve(weight, data) for weight in weights)
+        how, by = whitener_of(self.name, sigma, information, self.count, self.size)
         return how | (how > 0 and len(by) > 1), by
 
     def _pack(self, kernel: Kernel) -> None:

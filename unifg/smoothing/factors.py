@@ -17,7 +17,7 @@ from unifg.errors import GraphError
 from unifg.factors.kernel import Kernel, side_by_side
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import QUADRATIC, Form, Loss, form_of
-from unifg.factors.whitening import DIAGONAL, FULL, reciprocals, square_roots
+from unifg.factors.whitening import whitener_of
 from unifg.lie import Manifold
 from unifg.lie.product import leaves
 from unifg.lie.retraction import ADDITION, move_of
@@ -214,18 +214,14 @@ class Types:
             raise GraphError(f"term '{name}': {error}", term=name) from None
         shapes = tuple([parameter.shape[1:] for parameter in parameters])
         size = kernel.size(shapes)
-        whitening, whitener = 0, np.zeros((1, 0))
-        if sigma is not None:
-            whitening, whitener = DIAGONAL, reciprocals(name, _numbers(name, "sigma", sigma), count, size)
-        elif information is not None:
-            roots = square_roots(name, _numbers(name, "information", information), count, size)
-            whitening, whitener = FULL, roots.reshape(len(roots), size * size)
-        data = side_by_side([*parameters, whitener], count)
+        weights = _numbers(name, "sigma", sigma), _numbers(name, "information", information)
+        whitening, whitener = whitener_of(name, *weights, count, size)
+        data = side_by_side([*parameters, whitener.reshape(len(whitener), -1)], count)
         finite = np.isfinite(data).all(axis=1)
         if not finite.all():
             index = int(np.argmin(finite))
             raise GraphError(f"term '{name}': a parameter of factor {index} is not finite", term=name, index=index)
-        counts = data.shape[1] - whitener.shape[1], data.shape[1], whitening, size
+        counts = data.shape[1] - whitener[0].size, data.shape[1], whitening, size
         kind = self._kind(kernel, counts, selections, shapes, *form)
         return _active(Staged(kind, families, members, data, name), active), trace
 
@@ -336,8 +332,10 @@ def _active(staged: Staged, active: Any) -> Staged:
     return staged
 
 
-def _numbers(name: str, which: str, parameter: Parameter) -> Array:
-    """The present value of a parameter of a term."""
+def _numbers(name: str, which: str, parameter: Parameter | None) -> Array | None:
+    """The present value of a parameter of a term; None where there is none."""
+    if parameter is None:
+        return None
     return parameter.value if isinstance(parameter, Data) else doubles(f"term '{name}': {which}", parameter, term=name)
 
 

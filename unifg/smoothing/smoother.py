@@ -31,7 +31,7 @@ from unifg.smoothing.queries import (
 from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, Records, State, empty_state
 from unifg.smoothing.tree import give_up
 from unifg.smoothing.undetermined import enough
-from unifg.smoothing.update import begin, renew, update_tree
+from unifg.smoothing.update import begin, renew
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers
 
 FIRST_MADE = PLACE[MADE[0]]
@@ -317,17 +317,14 @@ class Smoother:
         """One pass over the tree."""
         state = self._state
         now = self.relinearize if (int(self._counts[UPDATES]) + 1) % self.every == 0 else np.inf
-        rest = self.relinearize, self.wildfire, self._chronological
+        chain = begin(self._memory, now)
         if self._batches:
-            chain = begin(self._memory, now)
             try:
                 self._batches.linearize(state, self._memory)
             except BaseException:
                 give_up(self._memory, 0)  # the chain is lost; factors are kept
                 raise
-            failed, lists, numbers = renew(self._memory, chain, *rest)
-        else:
-            failed, lists, numbers = update_tree(self._memory, now, *rest)
+        failed, lists, numbers = renew(self._memory, chain, self.relinearize, self.wildfire, self._chronological)
         self._move(lists, numbers)
         if failed >= 0:
             family = self._order[int(state.variables["family"][failed])]

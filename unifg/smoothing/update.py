@@ -22,14 +22,6 @@ from unifg.typing import Array, IntArray
 
 
 @compiled
-def update_tree(
-    memory: Address, relinearize: float, limit: float, threshold: float, chronological: bool
-) -> tuple[int, IntArray | None, Array | None]:
-    """Bring tree and steps up to date with the factors: :func:`begin`, then :func:`renew`."""
-    return renew(memory, begin(memory, relinearize), limit, threshold, chronological)
-
-
-@compiled
 def begin(memory: Address, relinearize: float) -> int:
     """Move linearisation points and find the chain of cliques to dissolve.
 

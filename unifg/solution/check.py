@@ -19,7 +19,7 @@ from unifg.modeling.variables import Data, Family
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
 from unifg.problem.term import CompiledTerm
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array, ArrayLike, IntArray
 
 JACOBIAN_TOLERANCE = 1e-5  # relative; a central difference is good to about 1e-9 where the residual is smooth
 PIVOT_TOLERANCE = 1e-11  # relative to the largest pivot of the damped normal equations
@@ -152,11 +152,6 @@ def _undetermined(program: CompiledProblem, values: Values) -> list[Finding]:
             if factorization.pivots().min() > PIVOT_TOLERANCE:
                 return []
             loose = np.flatnonzero(np.abs(null_direction(factorization, program.size)) > 0.1)
-    members: dict[str, list[int]] = {}
-    for column in loose.tolist():
-        family, member = program.columns.name(int(program.columns.free[column]))
-        if member not in members.setdefault(family, []):
-            members[family].append(member)
     return [
         Finding(
             "undetermined",
@@ -166,8 +161,18 @@ def _undetermined(program: CompiledProblem, values: Values) -> list[Finding]:
             family,
             found[0],
         )
-        for family, found in members.items()
+        for family, found in members_of(program, loose).items()
     ]
+
+
+def members_of(program: CompiledProblem, unknowns: IntArray) -> dict[str, list[int]]:
+    """Members that some unknowns belong to, by family."""
+    members: dict[str, list[int]] = {}
+    for column in program.columns.free[unknowns].tolist():
+        family, member = program.columns.name(column)
+        if member not in members.setdefault(family, []):
+            members[family].append(member)
+    return members
 
 
 def listed(family: str, members: list[int]) -> str:

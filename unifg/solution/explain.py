@@ -13,7 +13,7 @@ from unifg.modeling.soft import SLACK
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.term import CompiledTerm
-from unifg.solution.check import listed, null_direction
+from unifg.solution.check import listed, members_of, null_direction
 from unifg.solution.conditioning import cheap
 from unifg.solution.fit import Fit
 from unifg.typing import Array, BoolArray
@@ -114,11 +114,7 @@ def weak(program: CompiledProblem, lin: Linearization, rows: BoolArray) -> Itera
     if curvature > WEAK:
         return
     step = direction * scale
-    found: dict[str, list[int]] = {}
-    for column in np.flatnonzero(np.abs(direction) > 0.3).tolist():  # of the largest
-        family, member = program.columns.name(int(program.columns.free[column]))
-        if member not in found.setdefault(family, []):
-            found[family].append(member)
+    found = members_of(program, np.flatnonzero(np.abs(direction) > 0.3))  # of the largest
     what = " with ".join(listed(family, own) for family, own in found.items())
     if curvature <= NOTHING:
         yield f"Nothing determines {what}: add a prior, another measurement or a fix."
