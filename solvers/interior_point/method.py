@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from unifg.codegen.clock import clock
-from unifg.codegen.function_pointers import memory
+from unifg.codegen.function_pointers import ADDRESS, NOTHING, link, memory
 from unifg.errors import BackendError
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
@@ -30,8 +30,7 @@ from unifg.solution.optimality import Optimality, optimality, read_numbers
 from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
-from unifg.solvers.interior_point import state
-from unifg.solvers.interior_point.each import solve_each
+from unifg.solvers.interior_point import each, state
 from unifg.solvers.interior_point.loop import addresses, call
 from unifg.solvers.interior_point.state import Fields, Problem, empty_work
 from unifg.typing import Array, IntArray
@@ -104,15 +103,16 @@ class InteriorPoint(Solver):
 
     def solve_each(self, workspace: Workspace, rows: Array, guesses: Array, duals: Array) -> Outcomes:
         """Solve many instances, which differ in numbers alone."""
-        found, multipliers, numbers = workspace.solve_each(self, rows, guesses, duals)
-        answers, finite, sized = numbers[:, 0].astype(int), numbers[:, 7] > 0.0, numbers[:, 3] <= SUSPICIOUS
-        passed = (numbers[:, 4:7] <= self.tolerance).all(axis=1) & finite & sized
-        stopped = (answers == state.STOPPED) & finite & ~passed
-        statuses = [
-            Status.CONVERGED if good else Status.STOP_RULE if over else None
-            for good, over in zip(passed.tolist(), stopped.tolist(), strict=True)
-        ]
-        return Outcomes(statuses, found, multipliers, numbers[:, 2], numbers[:, 1].astype(np.int64), numbers[:, 4:7])
+        given = workspace.instances(self, rows, guesses, duals)
+        words = each.instances.describe(given)
+        call(link(each.solve_each, NOTHING, ADDRESS), words.ctypes.data)
+        numbers = given.numbers
+        statuses = [ENDINGS.get(answer) for answer in numbers[:, each.ANSWER].tolist()]
+        return Outcomes(
+            [status if status in (Status.CONVERGED, Status.STOP_RULE) else None for status in statuses],
+            given.found, given.found_multipliers, numbers[:, each.COST], numbers[:, each.ITERATIONS].astype(np.int64),
+            numbers[:, each.STATIONARITY :],
+        )  # fmt: skip
 
     def workspace(self, program: CompiledProblem) -> Workspace:
         """Structure of the KKT matrix."""
@@ -367,23 +367,19 @@ class Workspace:
         work.multipliers[:] = multipliers
         return now
 
-    def solve_each(
-        self, options: InteriorPoint, rows: Array, guesses: Array, duals: Array
-    ) -> tuple[Array, Array, Array]:
-        """Solve many instances in one compiled call, see :mod:`unifg.solvers.interior_point.each`."""
+    def instances(self, options: InteriorPoint, rows: Array, guesses: Array, duals: Array) -> each.Instances:
+        """Arguments of one compiled call that solves many instances."""
         program, work, count = self.program, self.work, len(rows)
         now = self.prepare(options, guesses[0], duals[0])
         now["watched"] = 0
-        sizes = len(work.values), len(work.multipliers), 8
-        found, multipliers, numbers = (np.zeros((count, size)) for size in sizes)
-        functions = np.array([self._links[name] for name in ("reset", "loop", "conclude")])
-        carried, retraction = program.binding.carried, program.retraction
-        solve_each(
-            functions, self._address, work.scalars, options.barrier, options.penalty, rows, carried[:3],
-            (*carried[3:], retraction.fixed), program.reader.quaternions, guesses, duals, work.values,
-            work.multipliers, work.kkt, found, multipliers, numbers,
+        sizes = len(work.values), len(work.multipliers), each.NUMBERS
+        functions = np.array([*(self._links[name] for name in ("reset", "loop", "conclude")), self._address])
+        starts, binding = np.array([options.barrier, options.penalty]), program.binding
+        return each.Instances(
+            functions, work.scalars, starts, rows, *binding.carried, program.retraction.fixed, binding.quaternions,
+            program.reader.quaternions, guesses, duals, work.values, work.multipliers, work.kkt,
+            *(np.zeros((count, size)) for size in sizes),
         )  # fmt: skip
-        return found, multipliers, numbers
 
     def begin_at(self, values: Array, options: InteriorPoint) -> None:
         """Go on from other values, about whose multipliers nothing is known."""

@@ -13,7 +13,9 @@ import numpy as np
 
 from unifg.codegen.bisect import first_not_below
 from unifg.codegen.jit import compiled
+from unifg.codegen.native import Source
 from unifg.elimination.symmetric import Symmetric
+from unifg.factors.autodiff.expression import Expression
 from unifg.factors.kernel import Kernel
 from unifg.factors.robust import Loss, form_of
 from unifg.factors.steps import as_table, movable_parts
@@ -262,6 +264,15 @@ class TermTable:
     def row_of(self, term: CompiledTerm) -> int:
         """Number of the row of a term in ``fields``."""
         return self._terms.index(term)
+
+    @property
+    def sources(self) -> dict[int, Source]:
+        """Functions of the derived kernels, by the addresses of their machine code."""
+        found = {}
+        for kernel in self._owned.values():
+            if isinstance(expression := getattr(kernel, "expression", None), Expression):
+                found.update(expression.sources())
+        return found
 
     def without(self, terms: Sequence[CompiledTerm]) -> TermArrays:
         """The arrays for a pass in which residuals and Jacobians of some terms are there already."""
