@@ -8,12 +8,25 @@ from unifg.codegen.calls import vector
 from unifg.codegen.function_pointers import Memory, all_of, linked_to, run
 from unifg.lie.so3 import all_unit
 from unifg.problem.linearization import all_finite
+from unifg.solution.export import REFUSED
 from unifg.solution.multipliers import SUSPICIOUS
-from unifg.solvers.interior_point.state import CONVERGED, MOVED, NOT_FINITE, REFUSED, STALLED, STOPPED, Records
+from unifg.solvers.interior_point.state import (
+    CONVERGED,
+    LIMIT_REACHED,
+    MOVED,
+    NOT_FINITE,
+    SINGULAR,
+    STALLED,
+    STOPPED,
+    VIOLATED,
+    Records,
+)
 from unifg.typing import Array, IntArray
 
 ANSWER, ITERATIONS, COST, SUSPICION, STATIONARITY, VIOLATION, COMPLEMENTARITY, NUMBERS = range(8)
 """Columns of ``Instances.numbers``, and how many there are."""
+WORDS = CONVERGED, STOPPED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE
+"""Words of answers, besides REFUSED."""
 
 
 class Instances(NamedTuple):
@@ -110,7 +123,7 @@ def solve_each(address: int) -> None:
             answer = CONVERGED
         elif not finite:
             answer = NOT_FINITE
-        elif answer == CONVERGED:
+        elif answer == CONVERGED or answer == VIOLATED:
             answer = STALLED
         number[ANSWER], number[ITERATIONS] = answer, state.iteration
         number[COST], number[SUSPICION] = state.cost, state.suspicion

@@ -15,6 +15,7 @@ import numpy as np
 
 from unifg.codegen.clock import clock
 from unifg.codegen.function_pointers import ADDRESS, NOTHING, link, memory
+from unifg.codegen.standalone import Entry
 from unifg.errors import BackendError
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
@@ -22,8 +23,9 @@ from unifg.problem.hessian import lagrangian_hessian, require_second
 from unifg.problem.linearization import Linearization
 from unifg.problem.snapshot import Memory
 from unifg.problem.systems import stacked
-from unifg.problem.table import COST, COUNT, KIND, ROW, ROWS
+from unifg.problem.table import COST, COUNT, KERNEL_WIDTH, KIND, ROW, ROWS
 from unifg.solution.batch import Outcomes
+from unifg.solution.export import Exported
 from unifg.solution.history import Iteration
 from unifg.solution.multipliers import SUSPICIOUS, Slopes
 from unifg.solution.optimality import Optimality, optimality, read_numbers
@@ -46,6 +48,7 @@ ENDINGS = {
     state.TRY: Status.TIME_LIMIT,  # there was no time for the step
 }
 NO_ANSWER = -1
+ROOM = 2**18  # bytes for arrays that compiled functions allocate, besides those that grow with the graph
 STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
 RESTARTS = 3  # from points that violate less than where the method came to a halt
 
@@ -113,6 +116,11 @@ class InteriorPoint(Solver):
             given.found, given.found_multipliers, numbers[:, each.COST], numbers[:, each.ITERATIONS].astype(np.int64),
             numbers[:, each.STATIONARITY :],
         )  # fmt: skip
+
+    def entry(self, workspace: Workspace) -> Exported:
+        """The compiled loop for one instance."""
+        last = workspace.work.values.copy(), workspace.work.multipliers.copy()
+        return Exported(workspace.entry(self), {word: ENDINGS[word] for word in each.WORDS}, *last)
 
     def workspace(self, program: CompiledProblem) -> Workspace:
         """Structure of the KKT matrix."""
@@ -306,7 +314,6 @@ class Workspace:
         self.problem.links[:] = addresses(table.weights > 0, table.scalars > 0)
         self._held = program.equality
         self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)
-        self.now["clock"] = clock()
 
     def _unequal(self, term: IntArray) -> bool:
         """Test whether a row of the table is a term with inequality rows."""
@@ -362,7 +369,7 @@ class Workspace:
         )
         now["keeping"] = max(tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         self.call("reset")
-        now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
+        now["clock"], now["limit"], now["exact"] = clock(), options.max_iterations, options.hessian == "exact"
         self.begin_at(values, options)
         work.multipliers[:] = multipliers
         return now
@@ -379,6 +386,27 @@ class Workspace:
             functions, work.scalars, starts, rows, *binding.carried, program.retraction.fixed, binding.quaternions,
             program.reader.quaternions, guesses, duals, work.values, work.multipliers, work.kkt,
             *(np.zeros((count, size)) for size in sizes),
+        )  # fmt: skip
+
+    def entry(self, options: InteriorPoint) -> Entry:
+        """Everything that a solve of one instance works on."""
+        program, work, problem = self.program, self.work, self.problem
+        rows = program.binding.rows({}, 1)
+        assert rows is not None
+        guess = np.zeros((1, len(work.values))), np.zeros((1, len(work.multipliers)))
+        arguments = self.instances(options, rows, *guess)
+        self.now["clock"] = 0  # time is not taken
+        words = each.instances.describe(arguments)
+        found = arguments.found, arguments.found_multipliers, arguments.numbers
+        fields = program.table.fields
+        blank = [array for array in (*work, problem.scratch, problem.plan.numbers) if array is not work.scalars]
+        addressing = words, self._words, arguments.functions, problem.links, problem.retraction, fields, problem.terms.parts
+        widest, scratch = int(fields[:, KERNEL_WIDTH].max()), program.table.scratch
+        room = 6 * widest**2 + 8 * scratch + len(work.constraint_jacobian) + len(work.multipliers)
+        return Entry(
+            link(each.solve_each, NOTHING, ADDRESS), words,
+            (problem, work, arguments, tuple(kernel.table for kernel in program.table.kernels)), addressing, blank,
+            (rows, *guess, *found), 8 * room + ROOM,
         )  # fmt: skip
 
     def begin_at(self, values: Array, options: InteriorPoint) -> None:

@@ -123,7 +123,6 @@ LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
 # What a call answers.
 TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE, VIOLATED, STOPPED = range(10)
-REFUSED = -1  # before the first call
 # What the loop asks of Python, before it is called again.
 LINEARIZE, BEND, EVALUATE, SHOW = range(10, 14)
 # What is known of the Hessian of Gauss-Newton; while it is examined, the matrix is written without the sides.

@@ -169,3 +169,19 @@ def _machine(level: int) -> Any:
     """Code generator for this processor."""
     triple, name, features = _processor()
     return binding.Target.from_triple(triple).create_target_machine(cpu=name, features=features, opt=level)
+
+
+def target_machine(triple: str, level: int = 3) -> Any:
+    """Code generator for shared objects; for this processor, or for all of a triple.
+
+    Raises:
+        RuntimeError: the triple is unknown.
+    """
+    own, name, features = _processor()
+    if triple:
+        binding.initialize_all_targets()
+        binding.initialize_all_asmprinters()
+        own, name, features = triple, "", ""
+    return binding.Target.from_triple(own).create_target_machine(
+        cpu=name, features=features, opt=level, reloc="pic", codemodel="default"
+    )

@@ -266,13 +266,15 @@ class TermTable:
         return self._terms.index(term)
 
     @property
+    def kernels(self) -> list[Kernel]:
+        """Those whose addresses stand in the rows."""
+        return [kernel for kernel in self._owned.values() if kernel is not None]
+
+    @property
     def sources(self) -> dict[int, Source]:
         """Functions of the derived kernels, by the addresses of their machine code."""
-        found = {}
-        for kernel in self._owned.values():
-            if isinstance(expression := getattr(kernel, "expression", None), Expression):
-                found.update(expression.sources())
-        return found
+        expressions = [getattr(kernel, "expression", None) for kernel in self.kernels]
+        return {a: s for e in expressions if isinstance(e, Expression) for a, s in e.sources().items()}
 
     def without(self, terms: Sequence[CompiledTerm]) -> TermArrays:
         """The arrays for a pass in which residuals and Jacobians of some terms are there already."""
