@@ -88,7 +88,8 @@ def solve_each(address: int) -> None:
         address: of :class:`Instances`.
     """
     given = all_at(address)
-    functions, state, values, multipliers, kkt = given.functions, given.now[0], given.values, given.multipliers, given.kkt
+    functions, state, kkt = given.functions, given.now[0], given.kkt
+    values, multipliers = given.values, given.multipliers
     arrays, width = functions[3], given.rows.shape[1]
     for k in range(len(given.rows)):
         row, number = vector(given.rows, k * width, width), vector(given.numbers, k * NUMBERS, NUMBERS)

@@ -398,9 +398,9 @@ class Workspace:
         self.now["clock"] = 0  # time is not taken
         words = each.instances.describe(arguments)
         found = arguments.found, arguments.found_multipliers, arguments.numbers
-        fields = program.table.fields
+        fields, parts = program.table.fields, problem.terms.parts
         blank = [array for array in (*work, problem.scratch, problem.plan.numbers) if array is not work.scalars]
-        addressing = words, self._words, arguments.functions, problem.links, problem.retraction, fields, problem.terms.parts
+        addressing = words, self._words, arguments.functions, problem.links, problem.retraction, fields, parts
         widest, scratch = int(fields[:, KERNEL_WIDTH].max()), program.table.scratch
         room = 6 * widest**2 + 8 * scratch + len(work.constraint_jacobian) + len(work.multipliers)
         return Entry(

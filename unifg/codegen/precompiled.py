@@ -46,7 +46,8 @@ ARCHIVE = SHIPPED
 ABOUT, CODE = "about.json", "code.xz"
 WRAPPER = "_ZN7cpython"  # prefix of what Python calls
 MATHEMATICS = (
-    "(a?(sin|cos|tan)h?|atan2|exp2?|expm1|log(10|1p|2)?|sqrt|cbrt|pow|hypot|fmod|floor|ceil|rint|erfc?|mem(set|cpy|move))"
+    r"(a?(sin|cos|tan)h?|atan2|exp2?|expm1|log(10|1p|2)?|sqrt|cbrt|pow|hypot|fmod|floor|ceil|"
+    r"rint|erfc?|mem(set|cpy|move))"
 )
 OUTSIDE = re.compile(rf"llvm\.|NRT_|numba_|{PREFIX}|{MATHEMATICS}$")
 """Symbols that members may expect from outside: of LLVM, of Numba's own library, and of C's for mathematics."""

@@ -273,9 +273,7 @@ def object_code(
     return bytes(machine.emit_object(whole)), layout.size + entry.room
 
 
-def _function(
-    address: int, name: str, sources: Mapping[int, Source], context: Any, machine: Any, target: str
-) -> Any:
+def _function(address: int, name: str, sources: Mapping[int, Source], context: Any, machine: Any, target: str) -> Any:
     """Module of the function at an address under another name, and what it calls hidden from other modules."""
     if (source := sources.get(address)) is not None:
         module, own = source.module(context, target_machine(target, source.level)), NAME

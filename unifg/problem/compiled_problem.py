@@ -176,7 +176,7 @@ class CompiledProblem:
     @property
     def python_parts(self) -> list[str]:
         """What of a solve is Python's, but for the verification of answers, each with its names."""
-        traced = [known.name for known in self.demanding]
+        traced = [known.term.name for known in self.demanding]
         held = [self.row_name(row)[0] for row in self.fixed_rows().tolist()]
         bound = [handle.name for handle, reader in self._readers.items() if reader.bound]
         left = [*self.left_to_python, *(term.name for term in self.terms if term.differenced)]

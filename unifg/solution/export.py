@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -69,8 +69,8 @@ extern const double {name}_data[], {name}_values[], {name}_multipliers[];
  *
  * guess and answer may be the same array, and so may both arrays of multipliers.
  * report: {upper}_REPORT numbers, see above.
- * workspace: {upper}_WORKSPACE bytes at a multiple of 64. Its first 8 bytes are zero before the first call. It belongs to
- *     one call at a time: each thread brings its own.
+ * workspace: {upper}_WORKSPACE bytes at a multiple of 64. Its first 8 bytes are zero before the first call. It belongs
+ *     to one call at a time: each thread brings its own.
  */
 int {name}_solve(const double *data, const double *guess, const double *guess_multipliers, double *answer,
                  double *multipliers, double *report, void *workspace);
@@ -136,23 +136,21 @@ def export(prepared: Exportable, folder: Path, name: str, target: str) -> list[P
 
 def _header(name: str, program: CompiledProblem, found: Exported, workspace: int, target: str) -> str:
     """The header in C."""
-    upper = name.upper()
+    upper, columns, data = name.upper(), program.columns, program.binding.present
     statuses = {word: (status.name, status.value) for word, status in found.statuses.items()} | OTHERS
-    columns, data = program.columns, program.binding.present
     sizes = {"DATA": sum(value.size for value in data.values()), "VALUES": columns.stored}
     sizes |= {"MULTIPLIERS": len(program.lower), "REPORT": len(REPORT), "WORKSPACE": workspace}
-    families = [(family.name, (family.count, family.manifold.storage), family.manifold.name) for family in columns.families]
-    rows = [(name, shape, "factors and rows") for name, _, shape in program.places]
+    families = [(f.name, (f.count, f.manifold.storage), f.manifold.name) for f in columns.families]
     return HEADER.format(
         name=name,
         upper=upper,
         processor=target or "the processor it was exported on",
         data=_places([(handle.name, value.shape, "") for handle, value in data.items()]),
         values=_places(families),
-        multipliers=_places(rows),
-        sizes=_words(upper, sizes.items()),
-        statuses=_words(upper, [(word, k) for k, (word, _) in statuses.items()], [text for _, text in statuses.values()]),
-        report=_words(upper, [(word.upper(), k) for k, word in enumerate(REPORT)]),
+        multipliers=_places([(term, shape, "factors and rows") for term, _, shape in program.places]),
+        sizes=_words(upper, [(word, size, "") for word, size in sizes.items()]),
+        statuses=_words(upper, [(word, k, f"  /* {text} */") for k, (word, text) in statuses.items()]),
+        report=_words(upper, [(word.upper(), k, "") for k, word in enumerate(REPORT)]),
     )
 
 
@@ -166,12 +164,9 @@ def _places(parts: Iterable[tuple[str, tuple[int, ...], str]]) -> str:
     return "\n".join(lines) or " *   none"
 
 
-def _words(upper: str, words: Iterable[tuple[str, int]], comments: Sequence[str] = ()) -> str:
-    """Lines of an enumeration."""
-    lines = [f"  {upper}_{word} = {value}" for word, value in words]
-    told = [f"  /* {comment} */" for comment in comments] or [""] * len(lines)
-    ends = [","] * (len(lines) - 1) + [""]
-    return "\n".join(line + end + comment for line, end, comment in zip(lines, ends, told, strict=True))
+def _words(upper: str, words: Iterable[tuple[str, int, str]]) -> str:
+    """Lines of an enumeration: words, numbers and comments."""
+    return "\n".join(f"  {upper}_{word} = {value},{comment}" for word, value, comment in words)
 
 
 def _linked(made: Path, shared: Path) -> list[Path]:
