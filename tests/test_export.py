@@ -16,6 +16,7 @@ import pytest
 
 import unifg as fg
 from asserting import below
+from fences import CHECKOUT, fences
 from problems.control import Quadrotor, Stated, Unicycle
 from unifg.errors import BackendError
 from unifg.models import unicycle
@@ -188,6 +189,22 @@ def test_too_little_room_is_an_answer(tmp_path: Path, monkeypatch: pytest.Monkey
     prepared.export(tmp_path)
     [(status, *_)] = built(tmp_path)([(in_order(prepared, {}), *flat(prepared, guess))])
     assert status == words(tmp_path)["NO_ROOM"]
+
+
+@compiled_by_c
+def test_the_program_of_the_page_plans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its ticks are those of Python."""
+    page = list(fences(CHECKOUT / "docs" / "howto" / "export.md"))
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    exec(next(fence.code for fence in page if fence.language == "python"), names)
+    Path("main.c").write_text(next(fence.code for fence in page if fence.language == "c"), encoding="utf-8")
+    subprocess.run([str(COMPILER), "-std=c11", "main.c", "plan/plan.o", "-Iplan", "-lm", "-o", "main"], check=True)
+    told = subprocess.run(["./main"], capture_output=True, text=True, check=True).stdout
+    plan, run, u = names["solution"], names["run"], names["u"]
+    for tick, line in enumerate(told.splitlines()):
+        plan = run.solve(plan, data={names["here"]: [0.0, 0.01 * tick, 0.0]}, check=True)
+        assert line.split() == [str(plan.iterations), f"{plan[u][0, 0]:.17g}", f"{plan.cost:.17g}"]
 
 
 def test_an_object_file_for_another_processor(tmp_path: Path) -> None:
