@@ -18,6 +18,7 @@ import unifg as fg
 from asserting import below
 from fences import CHECKOUT, fences
 from problems.control import Quadrotor, Stated, Unicycle
+from unifg.codegen import standalone
 from unifg.errors import BackendError
 from unifg.models import unicycle
 from unifg.solution.solver import Prepared
@@ -157,6 +158,22 @@ def test_nothing_but_mathematics_is_expected_of_others(tmp_path: Path) -> None:
     wanted = {name.partition("@")[0] for name, kind in symbols if kind == "U"}
     mathematics = {"sin", "cos", "tan", "sincos", "exp", "log", "log1p", "pow", "sqrt", "atan2", "fmod", "hypot"}
     assert wanted <= mathematics | {"memcpy", "memset", "memmove", "frexp", "ldexp"}
+
+
+def test_code_that_needs_more_than_mathematics_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, guess, _ = around_a_disc()
+    prepared = InteriorPoint().prepare(graph)
+    prepared.solve(guess)
+    monkeypatch.setattr(standalone, "OUTSIDE", re.compile(r"llvm\.|log1p$"))
+    with pytest.raises(BackendError, match="expects cos, sin, sqrt, tan, which is a part of Python"):
+        prepared.export(tmp_path)
+    assert not [*tmp_path.iterdir()]
+    monkeypatch.undo()
+    found = prepared.entry()
+    found.entry.addressing[0][4] += 2**20  # an address in the description of an array
+    monkeypatch.setattr(prepared, "entry", lambda: found)
+    with pytest.raises(BackendError, match="is that of no function and no array that is known"):
+        prepared.export(tmp_path)
 
 
 @compiled_by_c

@@ -46,10 +46,10 @@ def placed(function: Any, result: Any, arguments: tuple[Any, ...]) -> int:
     return found
 
 
-def code_at(where: int) -> tuple[str, str] | None:
-    """Module in LLVM's language and name of the function at an address; None where no compiled function stands."""
+def code_at(where: int) -> tuple[Any, str] | None:
+    """LLVM's module and the name of the function at an address; None where no compiled function stands."""
     library, name = _libraries.get(where, (lambda: None, ""))
-    return None if (found := library()) is None else (str(found._get_module_for_linking()), name)
+    return None if (found := library()) is None else (found._get_module_for_linking(), name)
 
 
 def _primitive(generator: Callable[..., Any]) -> Any:

@@ -113,7 +113,9 @@ define i32 @{name}_solve({parameters}, ptr %w) {{
   %result = alloca ptr
   %raised = alloca ptr
   %base = ptrtoint ptr %w to i64
-  %own = xor i64 %base, {mark}
+  %loaded = ptrtoint ptr @image to i64
+  %here = xor i64 %base, %loaded
+  %own = xor i64 %here, {mark}
   %found = load i64, ptr %w
   %known = icmp eq i64 %own, %found
   br i1 %known, label %ready, label %begin
@@ -250,7 +252,7 @@ def object_code(
         elif value not in empty:
             raise UnifgError(f"address {value:#x} is that of no function and no array that is known")
         layout.image[place - LINE : place - LINE + 8] = bytes(8)
-    image = bytes(layout.image)
+    image = bytes(layout.image)  # a workspace knows its place, this layout, and where the object is loaded
     mark = int.from_bytes(hashlib.sha256(image + repr((placed, given)).encode()).digest()[:7], "little")
     text = MEMORY.format(room=entry.room, size=layout.size) + FUNCTION.format(
         name=name, bytes=len(image), image="".join(f"\\{byte:02x}" for byte in image), mark=mark, line=LINE,
@@ -284,8 +286,8 @@ def _function(address: int, name: str, sources: Mapping[int, Source], context: A
         found = code_at(address)
         if found is None:
             raise UnifgError("a compiled function is gone: keep the prepared solver that is exported")
-        text, own = found
-        text = COUNTING.sub(r"declare void @\1(ptr)\n", ALIASES.sub(r"@\1", text))
+        text, own = ALIASES.sub(r"@\1", str(found[0])), found[1]
+        text = COUNTING.sub(r"declare void @\1(ptr)\n", text)
         module = _parsed(RAISED.sub(r"\1 = internal constant \2 zeroinitializer", text), context, machine)
     _keep_alone(module, {own}, machine)
     module.get_function(own).name = name

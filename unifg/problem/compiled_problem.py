@@ -175,7 +175,7 @@ class CompiledProblem:
 
     @property
     def python_parts(self) -> list[str]:
-        """What of a solve is Python's, but for the verification of answers, each with its names."""
+        """Parts of a solve that are Python's, besides the verification of answers, with their names."""
         traced = [known.term.name for known in self.demanding]
         held = [self.row_name(row)[0] for row in self.fixed_rows().tolist()]
         bound = [handle.name for handle, reader in self._readers.items() if reader.bound]
