@@ -314,6 +314,7 @@ class Workspace:
         self.problem.links[:] = addresses(table.weights > 0, table.scalars > 0)
         self._held = program.equality
         self._links, self.now = Fields(self.problem.links), Fields(self.work.scalars)
+        self.now["clock"] = clock()
 
     def _unequal(self, term: IntArray) -> bool:
         """Test whether a row of the table is a term with inequality rows."""
@@ -369,7 +370,7 @@ class Workspace:
         )
         now["keeping"] = max(tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         self.call("reset")
-        now["clock"], now["limit"], now["exact"] = clock(), options.max_iterations, options.hessian == "exact"
+        now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
         self.begin_at(values, options)
         work.multipliers[:] = multipliers
         return now
@@ -395,12 +396,11 @@ class Workspace:
         assert rows is not None
         guess = np.zeros((1, len(work.values))), np.zeros((1, len(work.multipliers)))
         arguments = self.instances(options, rows, *guess)
-        self.now["clock"] = 0  # time is not taken
         words = each.instances.describe(arguments)
         found = arguments.found, arguments.found_multipliers, arguments.numbers
-        fields, parts = program.table.fields, problem.terms.parts
+        fields, links = program.table.fields, (arguments.functions, problem.links)
         blank = [array for array in (*work, problem.scratch, problem.plan.numbers) if array is not work.scalars]
-        addressing = words, self._words, arguments.functions, problem.links, problem.retraction, fields, parts
+        addressing = words, self._words, *links, problem.retraction, fields, problem.terms.parts, work.scalars
         widest, scratch = int(fields[:, KERNEL_WIDTH].max()), program.table.scratch
         room = 6 * widest**2 + 8 * scratch + len(work.constraint_jacobian) + len(work.multipliers)
         return Entry(

@@ -21,6 +21,7 @@ import numpy as np
 from llvmlite import binding as llvm
 
 from unifg.codegen.calls import code_at
+from unifg.codegen.clock import clock
 from unifg.codegen.errors import PREFIX
 from unifg.codegen.native import NAME, Source, number, target_machine
 from unifg.codegen.precompiled import MATHEMATICS, leave_out_unused
@@ -229,7 +230,7 @@ def object_code(
     layout, machine = Layout(entry), target_machine(target)
     functions, placed = {entry.function: 0}, []
     arrays = list(arrays_in(entry.arrays))
-    empty = {array.ctypes.data for array in (*arrays, *entry.given) if not array.size}
+    empty = {clock(), *(array.ctypes.data for array in (*arrays, *entry.given) if not array.size)}  # time is not taken
     provided = {a.ctypes.data: k for k, a in enumerate(entry.given) if a.size}
     given = [f"  %p{k} = getelementptr i8, ptr %g{k}, i64 0" for k in range(len(entry.given))]
     bounds = [(array.ctypes.data, array.ctypes.data + array.nbytes) for array in entry.addressing]
