@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 import os
 import re
@@ -193,6 +194,31 @@ def test_input_that_python_refuses_is_refused(tmp_path: Path) -> None:
     refused = [status == enumerated["REFUSED"] for status, *_ in found]
     assert refused == [True, False, True, True, True, True, True, False, True, False, False]
     assert found[-1][0] == enumerated["CONVERGED"]
+
+
+@compiled_by_c
+def test_a_workspace_that_was_moved_is_set_up_anew(tmp_path: Path) -> None:
+    """It would refer to where it was before; one of another solver, to functions of that."""
+    graph, guess, _ = around_a_disc()
+    functions = []
+    for name, limit in (("solver", 300), ("other", 2)):
+        prepared = InteriorPoint(max_iterations=limit).prepare(graph)
+        prepared.solve(guess)
+        *_, shared = prepared.export(tmp_path, name=name)
+        functions.append(ctypes.CDLL(str(shared))[f"{name}_solve"])
+    arrays = [in_order(prepared, {}), *flat(prepared, guess), np.zeros(103), np.zeros(120), np.zeros(REPORT)]
+
+    def answer(which: int, space: Array) -> Array:
+        functions[which](*(ctypes.c_void_p(array.ctypes.data) for array in (*arrays, space)))
+        return arrays[3].copy()
+
+    space = np.zeros(words(tmp_path)["WORKSPACE"] // 8)  # both solvers have the same arrays
+    found = answer(0, space)
+    moved, before = space.copy(), space.tobytes()
+    np.testing.assert_array_equal(answer(0, moved), found)
+    assert space.tobytes() == before and found.any()
+    np.testing.assert_array_equal(answer(1, space), answer(1, np.zeros_like(space)))
+    assert arrays[-1][1] == 2.0
 
 
 @compiled_by_c
