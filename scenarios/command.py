@@ -174,6 +174,16 @@ def _mcap(chosen: argparse.Namespace) -> int:
     return SUCCEEDED
 
 
+def _check(chosen: argparse.Namespace) -> int:
+    """Check a saved answer, and print the verdict with its reason."""
+    from unifg.scenarios.commands.answers import load_graph
+    from unifg.solution.saved import check_answer
+
+    found = check_answer(load_graph(chosen.graph), chosen.answer, chosen.tolerance)
+    print(found)
+    return SUCCEEDED if found else FAILED
+
+
 def _warm_up(chosen: argparse.Namespace) -> int:
     """Compile everything, and print how much there was to do."""
     from unifg.scenarios.commands import warm
@@ -448,6 +458,17 @@ COMMANDS = {
             "--live": _LIVE,
         },
         extras=("view",),
+    ),
+    "check": Command(
+        _check, "check a saved answer",
+        "Check an answer that solution.save wrote by the functions of its graph, independently of any solver.",
+        {
+            "graph": {"metavar": "SCRIPT.py:GRAPH", "help": "a graph, or a function that returns it; or MODULE:GRAPH"},
+            "answer": {"type": Path, "metavar": "FILE.npz", "help": "values, multipliers, cost and data"},
+            "--tolerance": {
+                "type": float, "default": 1e-6, "help": "of violation and KKT numbers (default: %(default)s)",
+            },
+        },
     ),
     "mcap": Command(
         _mcap, "export a drive",

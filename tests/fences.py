@@ -10,7 +10,7 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 PYTHON = frozenset({"python"})
 SHELL = frozenset({"sh", "bash"})
 # Shown, never run. Anything else, and a fence without a language, is refused: a slip must not hide code.
-SHOWN = frozenset({"text", "bibtex", "json", "toml", "yaml", "mermaid"})
+SHOWN = frozenset({"c", "text", "bibtex", "json", "toml", "yaml", "mermaid"})
 
 _OPENING = re.compile(r"^(?P<indent>[ \t]*)(?P<mark>`{3,}|~{3,})[ \t]*(?P<info>[^`]*)$")
 _SKIP = re.compile(r"^\s*<!--\s*skip:\s*(?P<reason>.*?)\s*-->\s*$")

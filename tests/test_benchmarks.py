@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
@@ -18,6 +20,7 @@ from benchmarks import (
     collection,
     derivatives,
     elimination,
+    exported,
     gtsam_peer,
     horizon_and_velocity,
     many_instances,
@@ -278,6 +281,13 @@ def test_a_moved_goal_among_discs_costs_no_more_than_with_twenty_starts(seed: in
     assert row["more"] < 16, "ordinary ticks try one start"
     text = moved_goals.tables([row])
     assert "| loop, 20 ms |" in text and "1 fields" in text
+
+
+@pytest.mark.skipif(shutil.which(os.environ.get("CC", "cc")) is None, reason="no C compiler is here")
+def test_exported_solvers_are_beside_python() -> None:
+    row = exported.measure(None, rounds=1)
+    assert row[0] == "README, N = 20" and len(row) == 6
+    assert min(map(float, row[1:])) > 0.0
 
 
 def test_many_instances_are_beside_a_loop() -> None:

@@ -2,82 +2,130 @@
 
 from __future__ import annotations
 
-from unifg.codegen.function_pointers import run
-from unifg.codegen.jit import compiled
+from typing import NamedTuple
+
+from unifg.codegen.calls import vector
+from unifg.codegen.function_pointers import Memory, all_of, linked_to, run
 from unifg.lie.so3 import all_unit
 from unifg.problem.linearization import all_finite
-from unifg.solvers.interior_point.state import MOVED, Records
+from unifg.solution.export import REFUSED
+from unifg.solution.multipliers import SUSPICIOUS
+from unifg.solvers.interior_point.state import (
+    CONVERGED,
+    LIMIT_REACHED,
+    MOVED,
+    NOT_FINITE,
+    SINGULAR,
+    STALLED,
+    STOPPED,
+    VIOLATED,
+    Records,
+)
 from unifg.typing import Array, IntArray
 
+ANSWER, ITERATIONS, COST, SUSPICION, STATIONARITY, VIOLATION, COMPLEMENTARITY, NUMBERS = range(8)
+"""Columns of ``Instances.numbers``, and how many there are."""
+WORDS = CONVERGED, STOPPED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE
+"""Words of answers, besides REFUSED."""
 
-@compiled
-def solve_each(
-    functions: IntArray,
-    address: int,
-    now: Records,
-    barrier: float,
-    penalty: float,
-    rows: Array,
-    parameters: tuple[IntArray, IntArray, Array],
-    fixed: tuple[IntArray, IntArray, Array, IntArray],
-    quaternions: IntArray,
-    guesses: Array,
-    duals: Array,
-    values: Array,
-    multipliers: Array,
-    kkt: Array,
-    found: Array,
-    found_multipliers: Array,
-    numbers: Array,
-) -> None:
-    """Solve one instance after the other.
 
-    Args:
-        functions: addresses of ``reset``, ``loop`` and ``conclude``.
-        address: of their arrays.
+class Instances(NamedTuple):
+    """Arguments of :func:`solve_each`.
+
+    Attributes:
+        functions: addresses of ``reset``, ``loop``, ``conclude``, and of their arrays.
         now: (1,) their scalars, with the options written.
-        barrier: first mu.
-        penalty: first rho.
+        starts: (2,) first mu and first rho.
         rows: (K, D) numbers of all data.
-        parameters: places in a row, places in the parameters of kernels, these.
-        fixed: the same for the values of fixed variables, and where these are stored.
-        quaternions: places where they start among stored values; no instance is solved where one is not of norm 1.
+        sources, targets, parameters: places in a row, places in the parameters of kernels, these.
+        fixed_sources, fixed_targets, fixed: the same for the values of fixed variables.
+        places: where those are stored.
+        elements, quaternions: places where they start in a row and among stored values; no instance is solved where one
+            is not of norm 1.
         guesses: (K or 1, S) stored values.
         duals: (K or 1, M) multipliers.
-        values: (S,) of ``Work``.
-        multipliers: (M,) of the same.
-        kkt: of the same.
+        values, multipliers, kkt: of ``Work``.
         found: (K, S) answers.
         found_multipliers: (K, M) theirs.
-        numbers: (K, 8) answer of the loop, iterations, cost, size of the multipliers, KKT numbers but the worst row.
+        numbers: (K, NUMBERS) word of the answer, iterations, cost, size of the multipliers, KKT numbers.
     """
-    state = now[0]
-    sources, targets, numbers_of_kernels = parameters
-    fixed_sources, fixed_targets, fixed_values, places = fixed
-    for k in range(len(rows)):
-        for p in range(len(sources)):
-            numbers_of_kernels[targets[p]] = rows[k, sources[p]]
-        for p in range(len(fixed_sources)):
-            fixed_values[fixed_targets[p]] = rows[k, fixed_sources[p]]
-        guess = k if len(guesses) > 1 else 0
+
+    functions: IntArray
+    now: Records
+    starts: Array
+    rows: Array
+    sources: IntArray
+    targets: IntArray
+    parameters: Array
+    fixed_sources: IntArray
+    fixed_targets: IntArray
+    fixed: Array
+    places: IntArray
+    elements: IntArray
+    quaternions: IntArray
+    guesses: Array
+    duals: Array
+    values: Array
+    multipliers: Array
+    kkt: Array
+    found: Array
+    found_multipliers: Array
+    numbers: Array
+
+
+instances = Memory()
+all_at = all_of(instances)
+
+
+@linked_to(instances)
+def solve_each(address: int) -> None:
+    """Solve one instance after the other.
+
+    The word of an answer is CONVERGED where the judge of all backends would say so, STOPPED where the stop rule has
+    ended the loop, REFUSED without a solve, else what ended it.
+
+    Args:
+        address: of :class:`Instances`.
+    """
+    given = all_at(address)
+    functions, state, kkt = given.functions, given.now[0], given.kkt
+    values, multipliers = given.values, given.multipliers
+    arrays, width = functions[3], given.rows.shape[1]
+    for k in range(len(given.rows)):
+        row, number = vector(given.rows, k * width, width), vector(given.numbers, k * NUMBERS, NUMBERS)
+        for p in range(len(given.sources)):
+            given.parameters[given.targets[p]] = row[given.sources[p]]
+        for p in range(len(given.fixed_sources)):
+            given.fixed[given.fixed_targets[p]] = row[given.fixed_sources[p]]
+        guess = k if len(given.guesses) > 1 else 0
         for i in range(len(values)):
-            values[i] = guesses[guess, i]
+            values[i] = given.guesses[guess, i]
         for i in range(len(multipliers)):
-            multipliers[i] = duals[guess, i]
-        for i in range(len(places)):
-            values[places[i]] = fixed_values[i]
-        if not (all_finite(values) and all_unit(values, quaternions)):
-            numbers[k, 7] = 0.0
+            multipliers[i] = given.duals[guess, i]
+        for i in range(len(given.places)):
+            values[given.places[i]] = given.fixed[i]
+        known = all_finite(values) and all_finite(multipliers) and all_unit(values, given.quaternions)
+        for i in range(width):
+            known = known and row[i] == row[i]
+        number[ANSWER] = REFUSED
+        if not (known and all_unit(row, given.elements)):
             continue
-        run(functions[0], (address,))
-        state.mu, state.rho, state.going_on, state.stage = barrier, penalty, 0, MOVED
-        run(functions[1], (address,))
-        run(functions[2], (address,))
+        run(functions[0], (arrays,))
+        state.mu, state.rho, state.going_on, state.stage = given.starts[0], given.starts[1], 0, MOVED
+        run(functions[1], (arrays,))
+        run(functions[2], (arrays,))
         for i in range(len(values)):
-            found[k, i] = values[i]
+            given.found[k, i] = values[i]
         for i in range(len(multipliers)):
-            found_multipliers[k, i] = multipliers[i]
-        numbers[k, 0], numbers[k, 1], numbers[k, 2], numbers[k, 3] = (
-            state.answer, state.iteration, state.cost, state.suspicion,
-        )  # fmt: skip
-        numbers[k, 4], numbers[k, 5], numbers[k, 6], numbers[k, 7] = kkt[0], kkt[1], kkt[2], kkt[4]
+            given.found_multipliers[k, i] = multipliers[i]
+        finite, answer = kkt[4] > 0.0, state.answer
+        worst = max(max(kkt[0], kkt[1]), kkt[2])
+        if finite and worst <= state.tolerance and state.suspicion <= SUSPICIOUS:
+            answer = CONVERGED
+        elif not finite:
+            answer = NOT_FINITE
+        elif answer == CONVERGED or answer == VIOLATED:
+            answer = STALLED
+        number[ANSWER], number[ITERATIONS] = answer, state.iteration
+        number[COST], number[SUSPICION] = state.cost, state.suspicion
+        number[STATIONARITY], number[VIOLATION], number[COMPLEMENTARITY] = kkt[0], kkt[1], kkt[2]

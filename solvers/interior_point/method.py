@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 
 from unifg.codegen.clock import clock
-from unifg.codegen.function_pointers import memory
+from unifg.codegen.function_pointers import ADDRESS, NOTHING, link, memory
+from unifg.codegen.standalone import Entry
 from unifg.errors import BackendError
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
@@ -22,16 +23,16 @@ from unifg.problem.hessian import lagrangian_hessian, require_second
 from unifg.problem.linearization import Linearization
 from unifg.problem.snapshot import LinearizationMemory
 from unifg.problem.systems import stacked
-from unifg.problem.table import COST, COUNT, KIND, ROW, ROWS
+from unifg.problem.table import COST, COUNT, KERNEL_WIDTH, KIND, ROW, ROWS
 from unifg.solution.batch import Outcomes
+from unifg.solution.export import Exported
 from unifg.solution.history import Iteration
 from unifg.solution.multipliers import SUSPICIOUS, Slopes
 from unifg.solution.optimality import Optimality, optimality, read_numbers
 from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
-from unifg.solvers.interior_point import state
-from unifg.solvers.interior_point.each import solve_each
+from unifg.solvers.interior_point import each, state
 from unifg.solvers.interior_point.loop import addresses, call
 from unifg.solvers.interior_point.state import Fields, Problem, empty_work
 from unifg.typing import Array, IntArray
@@ -47,6 +48,7 @@ ENDINGS = {
     state.TRY: Status.TIME_LIMIT,  # there was no time for the step
 }
 NO_ANSWER = -1
+ROOM = 2**18  # bytes for arrays that compiled functions allocate, besides those that grow with the graph
 STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
 RESTARTS = 3  # from points that violate less than where the method came to a halt
 
@@ -104,15 +106,21 @@ class InteriorPoint(Solver):
 
     def solve_each(self, workspace: Workspace, rows: Array, guesses: Array, duals: Array) -> Outcomes:
         """Solve many instances, which differ in numbers alone."""
-        found, multipliers, numbers = workspace.solve_each(self, rows, guesses, duals)
-        answers, finite, sized = numbers[:, 0].astype(int), numbers[:, 7] > 0.0, numbers[:, 3] <= SUSPICIOUS
-        passed = (numbers[:, 4:7] <= self.tolerance).all(axis=1) & finite & sized
-        stopped = (answers == state.STOPPED) & finite & ~passed
-        statuses = [
-            Status.CONVERGED if good else Status.STOP_RULE if over else None
-            for good, over in zip(passed.tolist(), stopped.tolist(), strict=True)
-        ]
-        return Outcomes(statuses, found, multipliers, numbers[:, 2], numbers[:, 1].astype(np.int64), numbers[:, 4:7])
+        given = workspace.instances(self, rows, guesses, duals)
+        words = each.instances.describe(given)
+        call(link(each.solve_each, NOTHING, ADDRESS), words.ctypes.data)
+        numbers = given.numbers
+        statuses = [ENDINGS.get(answer) for answer in numbers[:, each.ANSWER].tolist()]
+        return Outcomes(
+            [status if status in (Status.CONVERGED, Status.STOP_RULE) else None for status in statuses],
+            given.found, given.found_multipliers, numbers[:, each.COST], numbers[:, each.ITERATIONS].astype(np.int64),
+            numbers[:, each.STATIONARITY :],
+        )  # fmt: skip
+
+    def entry(self, workspace: Workspace) -> Exported:
+        """The compiled loop for one instance."""
+        last = workspace.work.values.copy(), workspace.work.multipliers.copy()
+        return Exported(workspace.entry(self), {word: ENDINGS[word] for word in each.WORDS}, *last)
 
     def workspace(self, program: CompiledProblem) -> Workspace:
         """Structure of the KKT matrix."""
@@ -367,23 +375,39 @@ class Workspace:
         work.multipliers[:] = multipliers
         return now
 
-    def solve_each(
-        self, options: InteriorPoint, rows: Array, guesses: Array, duals: Array
-    ) -> tuple[Array, Array, Array]:
-        """Solve many instances in one compiled call, see :mod:`unifg.solvers.interior_point.each`."""
+    def instances(self, options: InteriorPoint, rows: Array, guesses: Array, duals: Array) -> each.Instances:
+        """Arguments of one compiled call that solves many instances."""
         program, work, count = self.program, self.work, len(rows)
         now = self.prepare(options, guesses[0], duals[0])
         now["watched"] = 0
-        sizes = len(work.values), len(work.multipliers), 8
-        found, multipliers, numbers = (np.zeros((count, size)) for size in sizes)
-        functions = np.array([self._links[name] for name in ("reset", "loop", "conclude")])
-        carried, retraction = program.binding.carried, program.retraction
-        solve_each(
-            functions, self._address, work.scalars, options.barrier, options.penalty, rows, carried[:3],
-            (*carried[3:], retraction.fixed), program.reader.quaternions, guesses, duals, work.values,
-            work.multipliers, work.kkt, found, multipliers, numbers,
+        sizes = len(work.values), len(work.multipliers), each.NUMBERS
+        functions = np.array([*(self._links[name] for name in ("reset", "loop", "conclude")), self._address])
+        starts, binding = np.array([options.barrier, options.penalty]), program.binding
+        return each.Instances(
+            functions, work.scalars, starts, rows, *binding.carried, program.retraction.fixed, binding.quaternions,
+            program.reader.quaternions, guesses, duals, work.values, work.multipliers, work.kkt,
+            *(np.zeros((count, size)) for size in sizes),
         )  # fmt: skip
-        return found, multipliers, numbers
+
+    def entry(self, options: InteriorPoint) -> Entry:
+        """Everything that a solve of one instance works on."""
+        program, work, problem = self.program, self.work, self.problem
+        rows = program.binding.rows({}, 1)
+        assert rows is not None
+        guess = np.zeros((1, len(work.values))), np.zeros((1, len(work.multipliers)))
+        arguments = self.instances(options, rows, *guess)
+        words = each.instances.describe(arguments)
+        found = arguments.found, arguments.found_multipliers, arguments.numbers
+        fields, links = program.table.fields, (arguments.functions, problem.links)
+        blank = [array for array in (*work, problem.scratch, problem.plan.numbers) if array is not work.scalars]
+        addressing = words, self._words, *links, problem.retraction, fields, problem.terms.parts, work.scalars
+        widest, scratch = int(fields[:, KERNEL_WIDTH].max()), program.table.scratch
+        room = 6 * widest**2 + 8 * scratch + len(work.constraint_jacobian) + len(work.multipliers)
+        return Entry(
+            link(each.solve_each, NOTHING, ADDRESS), words,
+            (problem, work, arguments, tuple(kernel.table for kernel in program.table.kernels)), addressing, blank,
+            (rows, *guess, *found), 8 * room + ROOM,
+        )  # fmt: skip
 
     def begin_at(self, values: Array, options: InteriorPoint) -> None:
         """Go on from other values, about whose multipliers nothing is known."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, ref
 
 from llvmlite import ir
 from numba import types
@@ -23,6 +23,7 @@ RESIDUAL = (VECTOR, VECTOR, VECTOR, VECTOR, MATRIX)
 RETRACTION = (VECTOR, VECTOR, VECTOR)
 """Types of a retraction: point, step, moved point (written)."""
 _addresses: WeakKeyDictionary[Callable[..., Any], dict[tuple[Any, ...], int]] = WeakKeyDictionary()
+_libraries: dict[int, tuple[ref[Any], str]] = {}
 
 
 def address(function: Callable[..., Any], arguments: tuple[Any, ...]) -> int:
@@ -32,11 +33,23 @@ def address(function: Callable[..., Any], arguments: tuple[Any, ...]) -> int:
     """
     known = _addresses.setdefault(function, {})
     if arguments not in known:
-        dispatcher: Any = function
-        dispatcher.compile(types.void(*arguments))
-        result = dispatcher.overloads[arguments]
-        known[arguments] = int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+        known[arguments] = placed(function, types.void, arguments)
     return known[arguments]
+
+
+def placed(function: Any, result: Any, arguments: tuple[Any, ...]) -> int:
+    """Compile for arguments and a result of the given types and return the address of the machine code."""
+    function.compile(result(*arguments))
+    library, name = (overload := function.overloads[arguments]).library, overload.fndesc.llvm_func_name
+    found = int(library.get_pointer_to_function(name))
+    _libraries[found] = ref(library), name
+    return found
+
+
+def code_at(where: int) -> tuple[Any, str] | None:
+    """LLVM's module and the name of the function at an address; None where no compiled function stands."""
+    library, name = _libraries.get(where, (lambda: None, ""))
+    return None if (found := library()) is None else (found._get_module_for_linking(), name)
 
 
 def _primitive(generator: Callable[..., Any]) -> Any:

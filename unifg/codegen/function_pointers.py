@@ -15,7 +15,7 @@ from numba import typeof, types
 from numba.core import cgutils
 from numba.core.datamodel import default_manager
 
-from unifg.codegen.calls import _primitive
+from unifg.codegen.calls import _primitive, placed
 from unifg.codegen.jit import _Cache, compiled, spelled
 from unifg.errors import UnifgError
 from unifg.typing import IntArray
@@ -52,10 +52,7 @@ def link(function: Callable[..., Any], result: Any, *arguments: Any) -> int:
 
     The caller keeps ``function`` alive for as long as the address is used.
     """
-    dispatcher: Any = function
-    dispatcher.compile(result(*arguments))
-    overload = dispatcher.overloads[arguments]
-    return int(overload.library.get_pointer_to_function(overload.fndesc.llvm_func_name))
+    return placed(function, result, arguments)
 
 
 def link_like(function: Callable[..., Any], result: Any, *arguments: Any) -> int:

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Iterable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import llvmlite
 import llvmlite.binding as binding
@@ -27,7 +27,7 @@ LONG = 20_000  # lines
 SOURCES = (__file__, str(Path(__file__).with_name("calls.py")))
 """Files that say what is generated."""
 _MARK = "the body"
-_NAME = "derived"  # of every function: each has an engine of its own
+NAME = "derived"  # of every function: each has an engine of its own
 
 
 class Native:
@@ -52,22 +52,53 @@ class Native:
         self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), machine)
         self._engine.add_object_file(binding.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
-        self.address = int(self._engine.get_function_address(_NAME))
+        self.address = int(self._engine.get_function_address(NAME))
 
     def __reduce__(self) -> NoReturn:
         """Refuse: in a copy the address would be good for nothing."""
         raise TypeError("machine code is neither copied nor pickled: its owner generates it anew")
 
 
-def generated(
-    arguments: tuple[Any, ...], body: Sequence[str], declarations: Iterable[str] = (), loops: bool = False
-) -> bytes:
-    """Object code of one function.
+class Source(NamedTuple):
+    """A function in LLVM's language.
 
-    The optimiser runs only where there are loops, for their vectors: what is written states nothing twice and has
-    nothing to move. The second level of code generation
-    gives code no quicker than the first, the lowest four times slower code ten times sooner, which serves functions so
-    long that the first takes seconds.
+    Attributes:
+        text: of its module.
+        loops: whether it has any.
+    """
+
+    text: str
+    loops: bool
+
+    def module(self, context: Any, machine: Any) -> Any:
+        """The module, optimised for a processor.
+
+        The optimiser runs only where there are loops, for their vectors: what is written states nothing twice and has
+        nothing to move.
+        """
+        module = binding.parse_assembly(self.text, context)
+        module.triple, module.data_layout = machine.triple, str(machine.target_data)
+        if self.loops:
+            options = binding.create_pipeline_tuning_options(speed_level=2)
+            options.loop_vectorization = True
+            passes = binding.create_pass_builder(machine, options)
+            passes.getModulePassManager().run(module, passes)
+        return module
+
+    @property
+    def level(self) -> int:
+        """Level of code generation.
+
+        The second gives code no quicker than the first, the lowest four times slower code ten times sooner, which
+        serves functions so long that the first takes seconds.
+        """
+        return 0 if self.text.count("\n") > LONG else 1
+
+
+def source(
+    arguments: tuple[Any, ...], body: Sequence[str], declarations: Iterable[str] = (), loops: bool = False
+) -> Source:
+    """One function.
 
     Args:
         arguments: Numba types of the arrays it takes.
@@ -77,16 +108,13 @@ def generated(
         loops: whether the body has any.
     """
     head, before, after = _frame(arguments)
-    source = "\n".join((*declarations, head.replace(_MARK, _NAME), before, *body, after))
-    with binding.parse_assembly(source, binding.create_context()) as module:  # numbers stay with a context for ever
-        module.triple = binding.get_default_triple()
-        machine = _machine(0 if source.count("\n") > LONG else 1)
-        module.data_layout = str(machine.target_data)
-        if loops:
-            options = binding.create_pipeline_tuning_options(speed_level=2)
-            options.loop_vectorization = True
-            passes = binding.create_pass_builder(machine, options)
-            passes.getModulePassManager().run(module, passes)
+    return Source("\n".join((*declarations, head.replace(_MARK, NAME), before, *body, after)), loops)
+
+
+def generated(written: Source) -> bytes:
+    """Object code of one function for this processor."""
+    machine = _machine(written.level)
+    with written.module(binding.create_context(), machine) as module:  # numbers stay with a context for ever
         return bytes(machine.emit_object(module))
 
 
@@ -141,3 +169,19 @@ def _machine(level: int) -> Any:
     """Code generator for this processor."""
     triple, name, features = _processor()
     return binding.Target.from_triple(triple).create_target_machine(cpu=name, features=features, opt=level)
+
+
+def target_machine(triple: str, level: int = 3) -> Any:
+    """Code generator for shared objects; for this processor, or for all of a triple.
+
+    Raises:
+        RuntimeError: the triple is unknown.
+    """
+    own, name, features = _processor()
+    if triple:
+        binding.initialize_all_targets()
+        binding.initialize_all_asmprinters()
+        own, name, features = triple, "", ""
+    return binding.Target.from_triple(own).create_target_machine(
+        cpu=name, features=features, opt=level, reloc="pic", codemodel="default"
+    )

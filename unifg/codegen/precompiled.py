@@ -45,10 +45,11 @@ logger = logging.getLogger("unifg")
 ARCHIVE = SHIPPED
 ABOUT, CODE = "about.json", "code.xz"
 WRAPPER = "_ZN7cpython"  # prefix of what Python calls
-OUTSIDE = re.compile(
-    rf"llvm\.|NRT_|numba_|{PREFIX}|(a?(sin|cos|tan)h?|atan2|exp2?|expm1|log(10|1p|2)?|sqrt|cbrt|pow|hypot|fmod|floor|ceil|"
-    r"rint|erfc?|mem(set|cpy|move))$"
+MATHEMATICS = (
+    r"(a?(sin|cos|tan)h?|atan2|exp2?|expm1|log(10|1p|2)?|sqrt|cbrt|pow|hypot|fmod|floor|ceil|"
+    r"rint|erfc?|mem(set|cpy|move))"
 )
+OUTSIDE = re.compile(rf"llvm\.|NRT_|numba_|{PREFIX}|{MATHEMATICS}$")
 """Symbols that members may expect from outside: of LLVM, of Numba's own library, and of C's for mathematics."""
 
 
@@ -166,6 +167,13 @@ def undefined(text: str) -> Iterable[str]:
     yield from (variable.name for variable in module.global_variables if variable.is_declaration)
 
 
+def leave_out_unused(module: Any, machine: Any) -> None:
+    """Take away what nothing refers to that is seen from outside."""
+    passes = llvm.create_new_module_pass_manager()
+    passes.add_global_dead_code_eliminate_pass()
+    passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
+
+
 class Recorder:
     """Keeps what is compiled while an archive is made.
 
@@ -212,10 +220,7 @@ class Recorder:
         for function in module.functions:
             if function.name.startswith((WRAPPER, "cfunc.")) and not function.is_declaration:
                 function.linkage = llvm.Linkage.internal
-        builder = llvm.create_pass_builder(self._codegen._tm, llvm.create_pipeline_tuning_options())
-        passes = llvm.create_new_module_pass_manager()
-        passes.add_global_dead_code_eliminate_pass()
-        passes.run(module, builder)
+        leave_out_unused(module, self._codegen._tm)
         return str(module)
 
     def write(self, path: Path) -> None:

@@ -76,7 +76,7 @@ class Binding:
             found, own = quaternions_of(manifold), self.place(handle).reshape(-1, manifold.storage)
             starts += [own[:, start] for start in found or ()]
             self._others = self._others or found is None
-        self._quaternions = np.concatenate(starts)
+        self.quaternions = np.concatenate(starts)
         self.present.update({handle: np.empty_like(handle.value) for handle in self._flags})
         self._changed = np.zeros(len(self._numbers), dtype=np.bool_)
         self._all, self.edition = True, 0
@@ -123,7 +123,7 @@ class Binding:
         rows = np.empty((count, len(self._flat)))
         for handle, first, last in zip(self._numbers, self._starts[:-1], self._starts[1:], strict=True):
             rows[:, first:last] = np.asarray(data.get(handle, handle.value), dtype=np.float64).reshape(-1, last - first)
-        quaternions = rows[:, self._quaternions[:, None] + np.arange(4)]
+        quaternions = rows[:, self.quaternions[:, None] + np.arange(4)]
         off = np.abs(np.linalg.norm(quaternions, axis=2) - 1.0) >= UNIT
         return None if np.isnan(rows).any() or off.any() else rows
 
@@ -149,7 +149,7 @@ class Binding:
         if data.keys() != slots.keys():
             self._take_defaults(data)
         flags = {handle: handle.check(data.get(handle, handle.value)) for handle in self._flags} if self._flags else {}
-        off = self._others or (len(self._quaternions) > 0 and not all_unit(self._coming, self._quaternions))
+        off = self._others or (len(self.quaternions) > 0 and not all_unit(self._coming, self.quaternions))
         for what, handle, manifold, term in self._elements if off else ():
             mask = flags[term.active].astype(bool) if isinstance(term.active, Data) else term.active
             slots[handle][...] = nearest(what, manifold, slots[handle], mask, term.name)

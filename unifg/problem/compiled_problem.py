@@ -171,8 +171,27 @@ class CompiledProblem:
     @property
     def numbers_only(self) -> bool:
         """True if instances with other data differ in numbers that compiled loops read, and Python has no part."""
-        python = self.rebinds or self.soft or self.differenced or self.demanding or self._branches
-        return self.fully_compiled and not (python or self.reader.particular or len(self.fixed_rows()))
+        return not (self.python_parts or self._branches)
+
+    @property
+    def python_parts(self) -> list[str]:
+        """Parts of a solve that are Python's, besides the verification of answers, with their names."""
+        traced = [known.term.name for known in self.demanding]
+        held = [self.row_name(row)[0] for row in self.fixed_rows().tolist()]
+        bound = [handle.name for handle, reader in self._readers.items() if reader.bound]
+        left = [*self.left_to_python, *(term.name for term in self.terms if term.differenced)]
+        found = {
+            "terms that are not traced, but evaluated or differenced": left,
+            "terms whose functions assert something": traced,
+            "data from which limits, weights or flags are made": bound,
+            "soft constraints": list(self.soft),
+            "constraints of fixed variables alone": held,
+            "families whose manifold has conditions of its own": [f.name for f, *_ in self.reader.particular],
+        }
+        parts = [f"{what}: {', '.join(dict.fromkeys(names))}" for what, names in found.items() if names]
+        if not parts and (self.differenced or not self.fully_compiled):
+            parts.append("a loss, a retraction or a derivative that is not compiled")
+        return parts
 
     @property
     def hessian(self) -> Symmetric:

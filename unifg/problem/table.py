@@ -13,7 +13,9 @@ import numpy as np
 
 from unifg.codegen.bisect import first_not_below
 from unifg.codegen.jit import compiled
+from unifg.codegen.native import Source
 from unifg.elimination.symmetric import Symmetric
+from unifg.factors.autodiff.expression import Expression
 from unifg.factors.kernel import Kernel
 from unifg.factors.robust import Loss, form_of
 from unifg.factors.steps import as_table, movable_parts
@@ -262,6 +264,17 @@ class TermTable:
     def row_of(self, term: CompiledTerm) -> int:
         """Number of the row of a term in ``fields``."""
         return self._terms.index(term)
+
+    @property
+    def kernels(self) -> list[Kernel]:
+        """Those whose addresses stand in the rows."""
+        return [kernel for kernel in self._owned.values() if kernel is not None]
+
+    @property
+    def sources(self) -> dict[int, Source]:
+        """Functions of the derived kernels, by the addresses of their machine code."""
+        expressions = [getattr(kernel, "expression", None) for kernel in self.kernels]
+        return {a: s for e in expressions if isinstance(e, Expression) for a, s in e.sources().items()}
 
     def without(self, terms: Sequence[CompiledTerm]) -> TermArrays:
         """The arrays for a pass in which residuals and Jacobians of some terms are there already."""

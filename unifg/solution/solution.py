@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
+from os import PathLike
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
 from weakref import ref
@@ -26,6 +27,7 @@ from unifg.solution.history import FactorNorms, History, Iteration, factor_norms
 from unifg.solution.marginal import Variables, information, marginal_prior
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
+from unifg.solution.saved import write_answer
 from unifg.solution.sensitivity import Named, Sensitivities, Weights, Wrt
 from unifg.solution.status import Found, Status
 from unifg.solution.tube import tube
@@ -515,10 +517,25 @@ class Solution:
         Raises:
             GraphError: for a solution that was not returned: another one has taken its place, and its data.
         """
+        return verified(*self._claims("verify"), tolerance)
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write values, multipliers, cost and the data of that solve to a file of NumPy (.npz).
+
+        ``unifg check SCRIPT.py:GRAPH FILE`` checks it; :mod:`unifg.solution.saved` names the arrays.
+
+        Raises:
+            GraphError: as of :meth:`verify`.
+            OSError: the file cannot be written.
+        """
+        write_answer(path, *self._claims("save"))
+
+    def _claims(self, what: str) -> tuple[CompiledProblem, dict[Family, Array], Array, float, dict[Data, Array]]:
+        """The graph and what the solution says of it, with the data of that solve."""
         program, data = self._program, self._program.data_of(self)
         if data is None:
-            raise GraphError("verify: the data of this solution were replaced; verify what the solve returned")
-        return verified(program, self.values, self._multipliers, self.cost, data, tolerance)
+            raise GraphError(f"{what}: the data of this solution were replaced; {what} what the solve returned")
+        return program, self.values, self._multipliers, self.cost, data
 
     def tube(self, term: str, pieces: int = 16) -> Array:
         """(n - 1, m, 2) least and greatest values of a term's rows between each factor and the next, as a proof.

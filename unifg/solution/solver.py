@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 from weakref import ReferenceType, ref
 
@@ -29,6 +30,7 @@ from unifg.problem.units import SMALL_FORCES
 from unifg.solution.batch import SAMPLED, Batch, Outcomes, solve_batch
 from unifg.solution.capabilities import Constraints, require
 from unifg.solution.conditioning import HARDLY
+from unifg.solution.export import Exported, export
 from unifg.solution.history import HEADER, Deferred, Iteration, factor_norms, line, show
 from unifg.solution.incumbent import Incumbent, Incumbents
 from unifg.solution.multipliers import Slopes, estimated
@@ -203,6 +205,10 @@ class Solver(Backend):
             guesses: (K or 1, S) stored values.
             duals: (K or 1, M) multipliers.
         """
+        raise NotImplementedError
+
+    def entry(self, workspace: Any) -> Exported:
+        """The compiled loop of :meth:`solve_each` for one instance, for :meth:`Prepared.export`."""
         raise NotImplementedError
 
     @abstractmethod
@@ -658,6 +664,47 @@ class Prepared:
             GraphError: numbers of instances or shapes do not fit, and as of :meth:`solve`.
         """
         return solve_batch(self, guesses, data or {}, threads)
+
+    def export(self, folder: str | Path, *, name: str = "solver", target: str = "") -> list[Path]:
+        """Write the solver as a C function for programs without Python: header, object file and shared object.
+
+        The function takes no memory but the workspace of its caller, and gives the bits of a solve in Python that needs
+        one attempt. It verifies no answer by the functions as written: solve here first.
+
+        Args:
+            folder: to be made where there is none.
+            name: of the files, and what all names in C begin with.
+            target: triple of another processor, as "aarch64-unknown-linux-gnu": an object file that is not linked.
+
+        Returns:
+            The files; without the shared object where there is no C compiler, which is logged with what to do.
+
+        Raises:
+            BackendError: the backend or a part of the graph needs Python, which is named; no solve has been made; or
+                the compiler has failed, with what it says.
+        """
+        self._enter()
+        try:
+            return export(self, Path(folder), name, target)
+        finally:
+            self._leave()
+
+    def entry(self) -> Exported:
+        """The backend's loop, for :func:`unifg.solution.export.export`.
+
+        Raises:
+            BackendError: there is none.
+        """
+        reason = "solve once, so that answers are verified, and export then"
+        if type(self.solver).entry is Solver.entry:
+            reason = "its loop is Python's: prepare InteriorPoint()"
+        elif self.program.least_squares:
+            reason = "without constraints or general costs Python judges every step: add a bound"
+        elif getattr(self.solver, "time_limit", math.inf) < math.inf:
+            reason = "it has a time limit: limit its iterations"
+        elif self._workspace is not None and self._solves > 0:
+            return self.solver.entry(self._workspace)
+        raise BackendError(f"this prepared {self.solver.name} is not exported: {reason}")
 
     @property
     def solves_each(self) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 from unifg.codegen.calls import MATRIX, RESIDUAL, VECTOR
-from unifg.codegen.native import POINTER, generated, number
+from unifg.codegen.native import POINTER, Source, number, source
 from unifg.factors.autodiff.loops import INVARIANT, Repeats, Slot, Sum, Template
 from unifg.factors.autodiff.operations import Op
 from unifg.factors.autodiff.tape import Tape
@@ -26,7 +26,7 @@ _COMPARISONS = {Op.LESS: "olt", Op.LESS_EQUAL: "ole", Op.EQUAL: "oeq"}
 _ONE, _MINUS, _ZERO = number(1.0), number(-1.0), number(0.0)
 
 
-def residual_code(tape: Tape, rows: Sequence[int], slopes: dict[tuple[int, int], int], width: int) -> bytes:
+def residual_code(tape: Tape, rows: Sequence[int], slopes: dict[tuple[int, int], int], width: int) -> Source:
     """``f(v, p, table, r, J)``: the rows, and their derivatives unless J has no rows."""
     line = _Writer(tape, {Op.VARIABLE: "%data0", Op.PARAMETER: "%data1"}, [*rows, *slopes.values()])
     loops = line.repeated(rows, slopes, width)
@@ -55,10 +55,10 @@ def residual_code(tape: Tape, rows: Sequence[int], slopes: dict[tuple[int, int],
         for column in range(width):
             line.store("%data4", row * width + column, slopes.get((row, column), tape.zero))
     line.write("br label %done", "done:")
-    return line.generated(RESIDUAL)
+    return line.source(RESIDUAL)
 
 
-def second_code(tape: Tape, entries: dict[tuple[int, int], int], width: int) -> bytes:
+def second_code(tape: Tape, entries: dict[tuple[int, int], int], width: int) -> Source:
     """``second(v, p, table, w, S)``: the symmetric matrix whose upper half is given."""
     sources = {Op.VARIABLE: "%data0", Op.PARAMETER: "%data1", Op.WEIGHT: "%data3"}
     line = _Writer(tape, sources, list(entries.values()))
@@ -67,7 +67,7 @@ def second_code(tape: Tape, entries: dict[tuple[int, int], int], width: int) -> 
     for place in range(width * width):
         row, column = divmod(place, width)
         line.store("%data4", place, entries.get((min(row, column), max(row, column)), tape.zero))
-    return line.generated((VECTOR, VECTOR, VECTOR, VECTOR, MATRIX))
+    return line.source((VECTOR, VECTOR, VECTOR, VECTOR, MATRIX))
 
 
 class Rows(NamedTuple):
@@ -115,13 +115,13 @@ class _Writer:
         self._called = dict[str, int]()  # number of arguments
         self._liberty = ""
 
-    def generated(self, arguments: tuple[object, ...]) -> bytes:
-        """Object code of the expression."""
+    def source(self, arguments: tuple[object, ...]) -> Source:
+        """The function of the expression."""
         declarations = [
             f"declare double @{called}({', '.join(['double'] * count)}) nounwind readnone"
             for called, count in self._called.items()
         ]
-        return generated(arguments, self._lines, declarations, self._count > 0)
+        return source(arguments, self._lines, declarations, self._count > 0)
 
     def write(self, *lines: str) -> None:
         """Put down instructions."""

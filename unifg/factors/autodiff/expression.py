@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -13,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from unifg.codegen.cache_folder import cache_folder
-from unifg.codegen.native import SOURCES, Native, generation
+from unifg.codegen.native import SOURCES, Native, Source, generated, generation
 from unifg.codegen.objects import Objects
 from unifg.factors.autodiff.calculus import bent, hessian, jacobian
 from unifg.factors.autodiff.emit import residual_code, second_code
@@ -108,13 +107,18 @@ class Expression:
 
     def residual(self) -> Native:
         """``f(v, p, table, r, J)`` as machine code."""
-        return self._native("residual", self._residual)
+        return self._native("residual")
 
     def second(self) -> Native:
         """``second(v, p, table, w, S)`` as machine code."""
-        return self._native("second", self._second)
+        return self._native("second")
 
-    def _native(self, which: str, generate: Callable[[], bytes]) -> Native:
+    def sources(self) -> dict[int, Source]:
+        """The functions whose machine code has been asked for, by the addresses of that."""
+        with generating:
+            return {native.address: self._source(which) for which, native in self._natives.items()}
+
+    def _native(self, which: str) -> Native:
         """Load code from disk, or generate it, once: what is handed out is never replaced."""
         with generating:
             native = self._natives.get(which)
@@ -122,7 +126,7 @@ class Expression:
                 key = hashlib.sha256(f"{which} {self._stated} {_WRITERS} {generation()}".encode()).hexdigest()
                 code = _objects().find(key) if _WRITERS else None
                 if code is None:
-                    code = generate()
+                    code = generated(self._source(which))
                     if _WRITERS:
                         _objects().keep(key, code)
                 native = self._natives[which] = Native(code)
@@ -147,12 +151,15 @@ class Expression:
         digest.update(repr((place[list(self.rows)].tolist(), self.width, tape.size)).encode())
         return digest.hexdigest()
 
-    def _residual(self) -> bytes:
+    def _source(self, which: str) -> Source:
+        return self._residual() if which == "residual" else self._second()
+
+    def _residual(self) -> Source:
         tape, nodes = self.tape.at_rest([*self.rows, *self.slopes.values()])
         count = len(self.rows)
         slopes = dict(zip(self.slopes, nodes[count:], strict=True))
         return residual_code(tape, nodes[:count], slopes, self.width)
 
-    def _second(self) -> bytes:
+    def _second(self) -> Source:
         tape, nodes = self.tape.at_rest(list(self.curvature.values()))
         return second_code(tape, dict(zip(self.curvature, nodes, strict=True)), self.width)
