@@ -18,7 +18,7 @@ from unifg.typing import Array
 FUNCTIONS: dict[str, Callable[[Array], Array]] = {
     "polynomial": lambda x: np.stack([x[:, 0] * x[:, 1] - x[:, 0] ** 2, (x[:, 0] - x[:, 1]) ** 3], axis=1),
     "quotient": lambda x: (x[:, :1] - 1.0) / (2.0 + x[:, 1:] ** 2),
-    "waves": lambda x: np.stack([np.sin(4.0 * x[:, 0]) * np.cos(x[:, 1] - 7.0), np.sin(x[:, 0] / (x[:, 1] + 4.0))], axis=1),
+    "waves": lambda x: np.stack([np.sin(4 * x[:, 0]) * np.cos(x[:, 1] - 7.0), np.sin(x[:, 0] / (x[:, 1] + 4))], axis=1),
     "rising": lambda x: np.stack([np.sqrt(1.0 + x[:, 0] ** 2), np.exp(-x[:, 1]), np.tanh(x[:, 0] + x[:, 1])], axis=1),
     "kinks": lambda x: np.stack([np.abs(x[:, 0]) - np.maximum(x[:, 1], 0.3), np.minimum(x[:, 0], x[:, 1])], axis=1),
     "choices": lambda x: np.where(x[:, :1] < x[:, 1:], np.floor(x[:, :1]), np.rint(x[:, 1:] * 3.0)),
