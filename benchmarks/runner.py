@@ -103,8 +103,8 @@ PAGES: dict[str, dict[str, float]] = {
         "excluded_pasts": 0.05,
     },
     "control": {
-        "control_cases": 0.4, "moved_goals": 0.1, "many_instances": 0.02, "derivatives": 0.02, "exported": 0.01, "own_functions": 0.1,
-        "claims": 0.2,
+        "control_cases": 0.4, "moved_goals": 0.1, "many_instances": 0.02, "derivatives": 0.02, "exported": 0.01,
+        "own_functions": 0.1, "claims": 0.2,
     },
     "collection": {"collection": 0.1, "cops": 0.05},
     "pose-graphs": {"elimination": 0.1, "incremental": 0.1, "wrong_closures": 4.0},
