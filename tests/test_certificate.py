@@ -251,6 +251,7 @@ def minima(pose_graph: PoseGraph, starts: Array) -> list[PoseGraph]:
 
 
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.product(4)
 def test_a_local_minimum_is_not_certified_and_a_better_map_is_better(seed: int) -> None:
     """The given poses are judged, not those that the certificate walks to: most of these came back certified."""
     graph, starts = small(seed)

@@ -288,6 +288,7 @@ def test_every_shipped_residual_has_a_case() -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
+@pytest.mark.product(30)
 def test_jacobian(name: str) -> None:
     case, points, manifolds, constants = CASES[name]
     numerical = jacobian(lambda *p: case.function(*p, *constants), points, manifolds)
@@ -356,6 +357,7 @@ def test_models_are_kernels_unless_their_functions_are_batched() -> None:
 
 
 @pytest.mark.parametrize("name", KERNELS)
+@pytest.mark.product(30)
 def test_in_a_graph(name: str) -> None:
     """Some of the variables are constants, shared or one for each factor; so are parameters; factors are inactive."""
     case, points, manifolds, constants = CASES[name]

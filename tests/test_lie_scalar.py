@@ -27,6 +27,7 @@ PARTS: list[LieGroup] = [
 
 
 @pytest.mark.parametrize("group", PARTS, ids=str)
+@pytest.mark.product(1)
 def test_one_element_and_a_batch_of_products_agree(group: LieGroup) -> None:
     """Of the groups themselves `test_own_manifolds.test_axioms_hold` compares them."""
     report = check_manifold(group)
@@ -152,6 +153,7 @@ def total(series_of_t: list[Fraction], t: Fraction) -> float:
 @pytest.mark.parametrize(
     "theta", [0.0, 1e-300, 1e-160, 1e-12, 1e-4, 0.1, 0.49, 0.4999999, 0.5, 0.51, 0.7, 1.0, 2.0, 3.0]
 )
+@pytest.mark.product(6)
 def test_functions_of_an_angle(theta: float) -> None:
     """Against exact sums of the power series; the slopes are multiplied by theta^3 at least wherever they serve."""
     square, t = Fraction(theta) ** 2, theta * theta

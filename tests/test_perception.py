@@ -77,6 +77,7 @@ def test_one_scan_places_a_disc(distance: float, radius: float) -> None:
 
 
 @pytest.mark.parametrize("distance", [1.0, 2.0, 2.9])
+@pytest.mark.product(1)
 def test_tracks_are_right_with_a_disturbed_estimate(distance: float) -> None:
     """After half a second the centre is right to 0.05 m although each pose is off by 0.02 m and 0.006 rad."""
     occupancy = hall(pillar=True)
@@ -124,7 +125,7 @@ def test_wide_things_become_several_discs() -> None:
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.2, 2.4, -1.9])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_velocity_of_a_mover(heading: float) -> None:
     """One second after it was first seen, the velocity of a mover at 0.3 m/s is right to 0.1 m/s."""
     occupancy = hall()
@@ -163,7 +164,7 @@ def test_mover_that_turns_round_is_followed() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.6, 1.0, 1.5])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
     """From where it turns it goes a forearm, at any speed, to where its track thought that it would not be."""
     occupancy, length, wrong = hall(), 2.2, []
@@ -203,6 +204,7 @@ def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
 
 
 @pytest.mark.parametrize("waits", [5.0, 12.0])
+@pytest.mark.product(1)
 def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
     """Ten seconds in one place; and when it goes on then, that is seen as of any other."""
     occupancy = hall()
@@ -297,6 +299,7 @@ def test_poor_scans_are_survived() -> None:
 
 
 @pytest.mark.data
+@pytest.mark.product(1, of="tracks in a building")
 def test_empty_building_gives_no_tracks(shared_data: Path) -> None:
     """Fifty metres through the real building, the estimate off by 0.03 m and 0.008 rad: no false tracks."""
     occupancy = load_map(shared_data / "maps" / "dis-B1-2011-09-27.yaml")
@@ -310,6 +313,7 @@ def test_empty_building_gives_no_tracks(shared_data: Path) -> None:
 
 
 @pytest.mark.data
+@pytest.mark.product(1, of="tracks in a building")
 def test_discs_in_the_building(shared_data: Path) -> None:
     """Discs beside a drive through the real building are found, placed to 0.05 m within 3 m, and quickly."""
     occupancy = load_map(shared_data / "maps" / "dis-B1-2011-09-27.yaml")
