@@ -94,7 +94,7 @@ def text_of(path: Path) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def nodes(path: Path) -> tuple[ast.AST, ...]:
+def nodes_in(path: Path) -> tuple[ast.AST, ...]:
     """All nodes of a file."""
     return nodes_of(text_of(path))
 
@@ -254,7 +254,7 @@ def test_side_folders_use_absolute_imports() -> None:
         f"{name_of(path)}:{node.lineno}"
         for package, path in LIBRARY
         if package != "unifg"
-        for node in nodes(path)
+        for node in nodes_in(path)
         if isinstance(node, ast.ImportFrom) and node.level
     ]
     assert wrong == []
@@ -300,7 +300,7 @@ def sized(folders: str) -> tuple[int, float]:
     """Statements below folders, without imports and docstrings, and nodes of syntax a statement."""
     statements = nodes = 0
     for path in (path for folder in folders.split() for path in sources(CHECKOUT / folder)):
-        for node in nodes(path):
+        for node in nodes_in(path):
             text = isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str)
             statements += isinstance(node, ast.stmt) and not text and not isinstance(node, ast.Import | ast.ImportFrom)
             nodes += isinstance(node, ast.stmt | ast.expr)
@@ -321,7 +321,7 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
     asking = [
         f"{name_of(path)}:{getattr(node, 'lineno', 1)}: {text.partition(chr(10))[0]}"
         for path in EVERYTHING
-        for node in nodes(path)
+        for node in nodes_in(path)
         if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module)
         and (text := ast.get_docstring(node) or "").partition(" ")[0].rstrip(",.:") in words
     ]
@@ -333,7 +333,7 @@ def test_the_library_is_silent() -> None:
         f"{name_of(path)}:{node.lineno}"
         for _, path in LIBRARY
         if path != CHECKOUT / "scenarios" / "command.py"
-        for node in nodes(path)
+        for node in nodes_in(path)
         if (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print")
         or (isinstance(node, ast.Attribute) and ast.unparse(node) in ("sys.stdout", "sys.stderr"))
     ]
@@ -439,7 +439,7 @@ def test_no_other_private_name_of_numba_is_used() -> None:
     for package, path in LIBRARY:
         if room_of(module_of(package, path)) != "codegen":
             continue
-        for node in nodes(path):
+        for node in nodes_in(path):
             if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__"):
                 mine = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls", "own")
                 (own if mine else used).add(node.attr)

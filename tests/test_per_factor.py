@@ -186,7 +186,7 @@ CHANGES = {
 
 
 def solved(folder: Path, *changes: str) -> tuple[str, list[tuple[int, float]]]:
-    """What a process logs that solves with functions of its user; numbers of compiled functions, and solutions."""
+    """Log of a process that solves with functions of its user; numbers of compiled functions, and solutions."""
     for change in changes:
         (folder / change).mkdir(exist_ok=True)
         before, after, value = CHANGES[change]
