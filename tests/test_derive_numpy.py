@@ -287,7 +287,6 @@ SINCE_TWO = {"vecdot", "vecnorm", "mT", "isclose"}
 
 @pytest.mark.filterwarnings("ignore:numpy.fix is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("name", [name for name in SURFACE if not OLD or name not in SINCE_TWO])
-@pytest.mark.product(60)
 def test_what_numpy_offers(name: str) -> None:
     function = SURFACE[name]
     rng = np.random.default_rng(0)

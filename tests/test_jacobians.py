@@ -288,7 +288,6 @@ def test_every_shipped_residual_has_a_case() -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.product(30)
 def test_jacobian(name: str) -> None:
     case, points, manifolds, constants = CASES[name]
     numerical = jacobian(lambda *p: case.function(*p, *constants), points, manifolds)

@@ -219,7 +219,6 @@ PARAMETERS: dict[str, Callable[[fg.Graph, fg.Family], Any]] = {
 
 
 @pytest.mark.parametrize("kind", PARAMETERS)
-@pytest.mark.product(12)
 def test_every_kind_of_parameter(kind: str) -> None:
     graph, x = walk(PARAMETERS[kind])
     guess = {x: np.array([[k, 0.1 * k, 0.1 * k] for k in range(5)], dtype=float)}

@@ -431,7 +431,7 @@ def test_a_robot_with_the_wrong_map_rests_and_says_so() -> None:
         ("solver-timeout@1", "no plan"),
     ],
 )
-@pytest.mark.product(1)
+@pytest.mark.product(2)
 def test_other_faults_are_named_too(fault: str, cause: str) -> None:
     log = faulty(fault)
     assert cause in log.cause and log.collisions == 0
