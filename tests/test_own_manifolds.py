@@ -271,7 +271,7 @@ class Chain:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda m: m.name)
-@pytest.mark.product(1)
+@pytest.mark.product(1, of="derivatives along own manifolds")
 def test_all_backends_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
     chain = Chain(manifold)
     answer = chain.answer()
