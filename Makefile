@@ -47,7 +47,9 @@ help:
 demo: $(VENV)/installed
 	$(BIN)/unifg run navigation --coupling joint --obstacles 3 --seed 0 --out out/demo
 
+# Tests start some fifty processes, which would compile the sources anew wherever Python may not write what it compiled.
 test: $(VENV)/ready
+	@$(BIN)/python -W ignore -m compileall -qq unifg solvers models scenarios benchmarks tools
 	$(ONE_THREAD) $(BIN)/unifg warmup
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
 

@@ -1,7 +1,7 @@
 """Fixtures every test may use: the shared data beside the checkout, and reproducible randomness.
 
-A test marked ``product(n)`` is a large table, of which n cases are drawn; another commit draws others. ``--all`` runs
-the whole, ``UNIFG_TEST_SEED`` repeats a draw.
+A test marked ``product(n)`` is a large table, of which n cases are drawn; another commit draws others. Tests marked
+``product(n, of="name")`` are one table together. ``--all`` runs the whole, ``UNIFG_TEST_SEED`` repeats a draw.
 """
 
 import gc
@@ -17,6 +17,9 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 CHECKOUT = Path(__file__).resolve().parent.parent
+
+# Syntax trees and compilers make many objects that live: looking through them again and again took a sixth of the time.
+gc.set_threshold(100_000, 50, 50)
 
 # Same examples on every machine and in every run: a red test stays red until the code changes.
 settings.register_profile("unifg", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
@@ -86,8 +89,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         return
     products = defaultdict[str, list[pytest.Item]](list)
     for item in items:
-        if item.get_closest_marker("product"):
-            products[item.nodeid.partition("[")[0]].append(item)
+        if marker := item.get_closest_marker("product"):
+            products[marker.kwargs.get("of", item.nodeid.partition("[")[0])].append(item)
     dropped = set[pytest.Item]()
     for name, cases in products.items():
         marker = cases[0].get_closest_marker("product")

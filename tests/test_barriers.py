@@ -443,7 +443,7 @@ SETTINGS = {
 
 @pytest.mark.parametrize("where", SETTINGS)
 @pytest.mark.parametrize("name", INEQUALITIES)
-@pytest.mark.product(12)
+@pytest.mark.product(6)
 def test_backends_answer_barriers(name: str, where: str) -> None:
     solver = INEQUALITIES[name]
     start, centre, radius, alpha, dt = SETTINGS[where]
@@ -966,6 +966,7 @@ def test_braking_stays_in_the_set() -> None:
 
 
 @pytest.mark.parametrize("name", INEQUALITIES)
+@pytest.mark.product(2)
 def test_a_tick_of_the_guarded_flight(name: str) -> None:
     flight, solver = GuardedFlight("slack"), replace(INEQUALITIES[name], tolerance=1e-5)
     found = solver.solve(flight.graph, flight.guess())

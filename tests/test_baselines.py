@@ -92,6 +92,7 @@ def drives(
 
 
 @pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.product(2)
 def test_limits_of_speed_and_acceleration_are_kept(name: str) -> None:
     poses, controls = drives(planner(name), 25, start=np.array([2.0, 2.2, 0.2]))
     assert (np.abs(controls) <= np.array(SETTINGS.limits) + 1e-12).all()

@@ -40,6 +40,7 @@ def assert_same(batch: Batch, singles: list[fg.Solution], family: fg.Family) -> 
 
 @pytest.mark.parametrize("case", [Unicycle("straight", True, 20), Quadrotor("goto", False, 20)], ids=str)
 @pytest.mark.parametrize("options", [{}, {"step_tolerance": np.inf}, {"max_iterations": 9}], ids=str)
+@pytest.mark.product(3)
 def test_instances_are_solved_as_one_by_one(case: Unicycle | Quadrotor, options: dict[str, Any]) -> None:
     stated, each = instances(case, COUNT if case.robot == "unicycle" else 20)
     prepared = InteriorPoint(tolerance=1e-4, **options).prepare(stated.graph)

@@ -274,6 +274,7 @@ def test_flights_are_compared_seed_by_seed() -> None:
 
 
 @pytest.mark.parametrize("seed", [102, 104])
+@pytest.mark.product(1)
 def test_a_moved_goal_among_discs_costs_no_more_than_with_twenty_starts(seed: int) -> None:
     row = moved_goals.measure(moved_goals.Cell(seed))
     assert row["warm, plan"] > 1.5 * row["best"] and row["loop, plan"] <= 1.02 * row["best"]

@@ -296,11 +296,13 @@ def compared_with_casadi(function: Function, *values: Array) -> None:
 
 
 @pytest.mark.parametrize("name", PLAIN)
+@pytest.mark.product(25)
 def test_values_jacobians_and_hessians_are_casadis(name: str) -> None:
     compared_with_casadi(PLAIN[name], *points((Rn(4), Rn(3)), 6))
 
 
 @pytest.mark.parametrize("name", GROUPS)
+@pytest.mark.product(8)
 def test_derivatives_on_groups_are_those_of_the_function(name: str) -> None:
     """Fourth-order differences of what the function itself computes along the retraction."""
     function, arguments = GROUPS[name]

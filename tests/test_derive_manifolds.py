@@ -170,6 +170,7 @@ TWINS: dict[str, tuple[Any, Any, Any]] = {  # of the user's, of the library, and
 
 
 @pytest.mark.parametrize("name", TWINS)
+@pytest.mark.product(2)
 def test_a_group_of_ones_own_has_the_derivatives_of_its_twin(name: str) -> None:
     """Same group, other numbers: residuals, Jacobians and Hessians in tangent coordinates are the same."""
     mine, known, carried = TWINS[name]
@@ -256,7 +257,7 @@ def test_a_retraction_too_short_for_second_derivatives_is_refused() -> None:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda manifold: manifold.name)
-@pytest.mark.product(2)
+@pytest.mark.product(1, of="derivatives along own manifolds")
 def test_manifolds_that_know_nothing_of_tracing(manifold: fg.Manifold) -> None:
     """Retraction and local coordinates agree with fourth-order differences along the manifold's own retraction."""
     rng = np.random.default_rng(6)

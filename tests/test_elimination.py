@@ -73,6 +73,17 @@ def backward_error(matrix: sp.csc_matrix, x: Array, right: Array) -> float:
     return float(np.abs(right - matrix @ x).max() / size)
 
 
+def solving(
+    rng: np.random.Generator, pattern: Symmetric, data: Array, error: float, *label: IntArray, **options: Any
+) -> Factorization:
+    """Factorization that solves a random system to less than a backward error."""
+    factorization = Factorization(pattern, *label, **options)
+    assert factorization.factor(data)
+    right = rng.normal(size=pattern.size)
+    assert backward_error(full(pattern, data), factorization.solve(right), right) < error
+    return factorization
+
+
 ORDERINGS: list[Ordering] = ["auto", "minimum-degree", "nested-dissection", "natural"]
 
 
@@ -81,10 +92,7 @@ ORDERINGS: list[Ordering] = ["auto", "minimum-degree", "nested-dissection", "nat
 def test_positive_definite_grids(rng: np.random.Generator, side: int, ordering: Ordering | None) -> None:
     pattern, data, label, _ = grid(rng, side, 3)
     chosen: Ordering = rng.permutation(side * side) if ordering is None else ordering
-    factorization = Factorization(pattern, label, ordering=chosen)
-    assert factorization.factor(data)
-    right = rng.normal(size=pattern.size)
-    assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-14
+    factorization = solving(rng, pattern, data, 1e-14, label, ordering=chosen)
     assert factorization.inertia == (pattern.size, 0, 0)
     assert factorization.definite
     assert factorization.failure == -1
@@ -95,10 +103,7 @@ def test_large_fronts(rng: np.random.Generator, size: int) -> None:
     """Fronts wide enough for BLAS, positive and signed."""
     for multipliers in (0, 1):
         pattern, data, label, _ = system(rng, [size] * 4, [(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)], multipliers)
-        factorization = Factorization(pattern, label)
-        assert factorization.factor(data)
-        right = rng.normal(size=pattern.size)
-        assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-11
+        factorization = solving(rng, pattern, data, 1e-11, label)
         assert factorization.inertia == (size * (4 - multipliers), size * multipliers, 0)
         assert factorization.definite == (multipliers == 0)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from test_elimination import System, backward_error, full, system
+from test_elimination import System, backward_error, full, solving, system
 from unifg.codegen.jit import compiled
 from unifg.elimination import fronts, substitution
 from unifg.elimination.chain import stages
@@ -73,10 +73,7 @@ def test_stages_touch_only_the_next(rng: np.random.Generator) -> None:
 def test_several_chains_and_loose_nodes(rng: np.random.Generator) -> None:
     edges = [(k, k + 1) for k in range(9)] + [(k, k + 1) for k in range(11, 20)]
     pattern, data, label, _ = system(rng, [2] * 22, edges)
-    factorization = Factorization(pattern, label)
-    assert factorization.factor(data)
-    right = rng.normal(size=pattern.size)
-    assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-14
+    solving(rng, pattern, data, 1e-14, label)
 
 
 def test_wide_graphs_are_no_chains(rng: np.random.Generator) -> None:
@@ -84,10 +81,7 @@ def test_wide_graphs_are_no_chains(rng: np.random.Generator) -> None:
     loops = [(k, k + 1) for k in range(99)] + [(int(k), int(k) + 40) for k in rng.integers(0, 60, 30)]
     for nodes, edges in ((40, star), (100, loops)):
         pattern, data, label, _ = system(rng, [3] * nodes, edges)
-        factorization = Factorization(pattern, label)
-        assert factorization.factor(data)
-        right = rng.normal(size=pattern.size)
-        assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-14
+        solving(rng, pattern, data, 1e-14, label)
 
 
 @compiled

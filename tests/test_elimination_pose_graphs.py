@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from test_elimination import backward_error, full
+from test_elimination import backward_error, full, solving
 from unifg.elimination.factorization import Factorization, Ordering
 from unifg.elimination.symmetric import Symmetric, scatter
 from unifg.typing import Array, IntArray
@@ -140,10 +140,7 @@ def test_large_planar_graph(rng: np.random.Generator) -> None:
     work, fill = [], []
     for poses in (4000, 16000):
         pattern, data, label = normal(wander(rng, poses))
-        factorization = Factorization(pattern, label)
-        assert factorization.factor(data)
-        right = rng.normal(size=pattern.size)
-        assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-12
+        factorization = solving(rng, pattern, data, 1e-12, label)
         tree = factorization.tree
         assert tree.height < poses // 20
         work.append(tree.flops)
@@ -161,9 +158,6 @@ def test_volume_is_dissected(rng: np.random.Generator) -> None:
     quaternion = rng.normal(size=(len(first), 4))
     jacobian = -adjoint_of_inverse(np.column_stack([rng.normal(size=(len(first), 3)), quaternion]))
     pattern, data, label = normal((side**3, first, second, jacobian, np.tile(np.eye(6), (len(first), 1, 1))))
-    factorization = Factorization(pattern, label)
-    assert factorization.factor(data)
-    right = rng.normal(size=pattern.size)
-    assert backward_error(full(pattern, data), factorization.solve(right), right) < 1e-12
+    factorization = solving(rng, pattern, data, 1e-12, label)
     assert factorization.tree.kind == "nested-dissection"
     assert factorization.tree.flops < Factorization(pattern, label, ordering="minimum-degree").tree.flops

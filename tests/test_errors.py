@@ -12,7 +12,7 @@ import pytest
 
 import unifg as fg
 from problems.known import short_drive
-from test_house import LIBRARY, name_of, tree_of
+from test_house import LIBRARY, name_of, text_of, tree_of
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.symmetric import Symmetric
 from unifg.files.ros_map import OccupancyMap
@@ -55,8 +55,9 @@ def plain(source: str) -> list[str]:
     return list(walk(tree_of(source), "", ""))
 
 
+@pytest.mark.xdist_group("house")
 def test_no_plain_exception_is_raised() -> None:
-    raised = {name_of(path): plain(path.read_text(encoding="utf-8")) for _, path in LIBRARY}
+    raised = {name_of(path): plain(text_of(path)) for _, path in LIBRARY}
     assert {name: found for name, found in raised.items() if found} == {}
 
 

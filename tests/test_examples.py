@@ -19,6 +19,7 @@ EXAMPLES = sorted((CHECKOUT / "examples").glob("*.py"))
 PAGE = CHECKOUT / "docs" / "guide" / "examples.md"
 PICTURES = CHECKOUT / "docs" / "images" / "examples"
 LONGEST, LARGEST = 60, 60_000  # lines of a script, bytes of a picture
+run_by_draw = pytest.mark.product(12, of="examples")
 
 
 class Ran(dict[str, Any]):
@@ -73,6 +74,7 @@ def test_no_picture_is_left_of_an_example_that_is_gone() -> None:
     assert {picture.stem for picture in PICTURES.iterdir()} == {path.stem for path in EXAMPLES}
 
 
+@run_by_draw
 def test_swap_backends(run: Run) -> None:
     ran = run("swap_backends")
     assert set(ran["refusals"]) == {"KKT", "LevenbergMarquardt"}
@@ -84,6 +86,7 @@ def test_swap_backends(run: Run) -> None:
         assert re.search(rf"^{name} .*CONVERGED$", ran.printed, re.MULTILINE)
 
 
+@run_by_draw
 def test_unicycle_mpc_loop(run: Run) -> None:
     ran = run("unicycle_mpc_loop")
     assert len(ran["results"]) == 3
@@ -94,6 +97,7 @@ def test_unicycle_mpc_loop(run: Run) -> None:
     assert np.linalg.norm(lane[:, :2] - disc, axis=1).min() < ran["radius"] - 0.1
 
 
+@run_by_draw
 def test_barriers_in_a_smoother(run: Run) -> None:
     """The trajectory that grew is that of all factors at once, and the robot has kept off."""
     ran = run("barriers_in_a_smoother")
@@ -105,6 +109,7 @@ def test_barriers_in_a_smoother(run: Run) -> None:
     assert f"{ran['effort'].eliminated} of 61" in ran.printed
 
 
+@run_by_draw
 def test_covariance_aware_plan(run: Run) -> None:
     ran = run("covariance_aware_plan")
     x, P, light = ran["x"], ran["P"], []
@@ -116,6 +121,7 @@ def test_covariance_aware_plan(run: Run) -> None:
     assert abs(light[0]) < 1e-3 and 0.2 < light[1] < light[2]  # the more it wants to be sure, the farther it goes
 
 
+@run_by_draw
 def test_own_robot(run: Run) -> None:
     ran = run("own_robot")
     interior, augmented = ran["solutions"].values()
@@ -130,6 +136,7 @@ def test_own_robot(run: Run) -> None:
         assert np.abs(ran["STATE"].local(driven[-1], solution[x][-1])).max() < 1e-5
 
 
+@run_by_draw
 def test_pose_graph_with_a_hard_closure(run: Run) -> None:
     ran = run("pose_graph_with_a_hard_closure")
     x, truth, half = ran["x"], ran["truth"], ran["N"] // 2
@@ -145,6 +152,7 @@ def test_pose_graph_with_a_hard_closure(run: Run) -> None:
     assert ran["slope"] == pytest.approx(-ran["pull"][0], rel=1e-2)
 
 
+@run_by_draw
 def test_inertial_odometry(run: Run) -> None:
     ran = run("inertial_odometry")
     assert ran["solution"].converged
@@ -161,6 +169,7 @@ def test_inertial_odometry(run: Run) -> None:
     assert ran["receiver"].counts.placed == len(ran["stamps"]) and ran["imu"].counts.unknown == 0
 
 
+@run_by_draw
 def test_joint_past_future(run: Run) -> None:
     ran = run("joint_past_future")
     assert list(ran["results"]) == ["sequential", "joint"]
@@ -169,6 +178,7 @@ def test_joint_past_future(run: Run) -> None:
         assert converged == 60
 
 
+@run_by_draw
 def test_own_robot_loop(run: Run) -> None:
     ran = run("own_robot_loop")
     assert list(ran["results"]) == ["sequential", "joint"]
@@ -178,6 +188,7 @@ def test_own_robot_loop(run: Run) -> None:
         assert converged > 55
 
 
+@run_by_draw
 def test_own_group(run: Run) -> None:
     ran = run("own_group")
     x, S2 = ran["x"], ran["S2"]
@@ -193,6 +204,7 @@ def test_own_group(run: Run) -> None:
         assert (solution[x] @ ran["sun"]).max() < np.cos(ran["away"]) + 1e-6
 
 
+@run_by_draw
 def test_real_time_iteration(run: Run) -> None:
     ran = run("real_time_iteration")
     best = ran["results"]["to the end"][0]
@@ -203,6 +215,7 @@ def test_real_time_iteration(run: Run) -> None:
         assert np.abs(driven[:, 0]).max() < 1.21  # a plan keeps to 1.2, the world is not the plan
 
 
+@run_by_draw
 def test_quadrotor_figure8(run: Run) -> None:
     ran = run("quadrotor_figure8")
     assert len(ran["results"]) == 3
@@ -210,6 +223,7 @@ def test_quadrotor_figure8(run: Run) -> None:
         assert off < 0.04 and 20.0 < tilt < 35.0 and status is fg.Status.CONVERGED
 
 
+@run_by_draw
 def test_range_only_slam(run: Run) -> None:
     ran = run("range_only_slam")
     assert ran["echoes"].sum() > 40
@@ -220,6 +234,7 @@ def test_range_only_slam(run: Run) -> None:
     assert ran["results"]["GNC"][0].verdict is not None
 
 
+@run_by_draw
 def test_casadi_model(run: Run) -> None:
     pytest.importorskip("casadi")
     ran = run("casadi_model")
@@ -233,12 +248,14 @@ def test_casadi_model(run: Run) -> None:
         assert np.allclose(reached, [4.0, 0.0, 0.0, 0.0], atol=1e-5)
 
 
+@run_by_draw
 def test_casadi_model_says_what_is_missing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(SystemExit, match=r'pip install "unifg\[casadi\]"'):
         run("casadi_model")
 
 
+@run_by_draw
 def test_own_backend_constrained(run: Run) -> None:
     """On the table of problems: test_own_backend.py."""
     ran = run("own_backend_constrained")
@@ -249,6 +266,7 @@ def test_own_backend_constrained(run: Run) -> None:
     assert own.iterations <= kkt.iterations + 2
 
 
+@run_by_draw
 def test_own_qp_solver(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     import qpsolvers
 
@@ -264,6 +282,7 @@ def test_own_qp_solver(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {row.details["qp"] for row in own.history[1:]} == {"mehrotra"}
 
 
+@run_by_draw
 def test_scene_of_my_graph(run: Run) -> None:
     ran = run("scene_of_my_graph")
     x, solution = ran["x"], ran["solution"]
@@ -276,6 +295,7 @@ def test_scene_of_my_graph(run: Run) -> None:
     assert {"x", "truth"} <= set(ran["scene"].layers)
 
 
+@run_by_draw
 def test_live_view(run: Run) -> None:
     ran = run("live_view")
     assert re.search(r"open http://127\.0\.0\.1:\d+/", ran.printed)
@@ -287,6 +307,7 @@ def test_live_view(run: Run) -> None:
     assert "Live" in (ran.folder / "live_view.html").read_text(encoding="utf-8")
 
 
+@run_by_draw
 def test_first_order_tick(run: Run) -> None:
     """The corrected tick is nearer to the full one by far, except where the plan changes sides."""
     ran = run("first_order_tick")
@@ -297,6 +318,7 @@ def test_first_order_tick(run: Run) -> None:
     assert gaps.min() > -0.05
 
 
+@run_by_draw
 def test_influential_measurements(run: Run) -> None:
     ran = run("influential_measurements")
     for moved, foretold, true in ran["results"].values():
@@ -304,6 +326,7 @@ def test_influential_measurements(run: Run) -> None:
     assert ran["moved"].max() > 20.0 * np.median(ran["moved"])
 
 
+@run_by_draw
 def test_learned_weights(run: Run) -> None:
     """The gradient is that of the drive, and it leads down."""
     ran = run("learned_weights")
@@ -317,6 +340,7 @@ def test_learned_weights(run: Run) -> None:
         )
 
 
+@run_by_draw
 def test_learned_noise(run: Run) -> None:
     """On drives that were not seen it is as good as with the sigmas that they were made with."""
     ran = run("learned_noise")

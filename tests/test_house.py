@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 CHECKOUT = Path(__file__).resolve().parent.parent
+pytestmark = pytest.mark.xdist_group("house")  # what one process has parsed
 
 # Import name of each package -> its folder in the checkout.
 FOLDERS = {
@@ -82,9 +83,21 @@ def tree_of(source: str) -> ast.Module:
     return ast.parse(source)
 
 
-def parsed(path: Path) -> ast.Module:
-    """Parse a file."""
-    return tree_of(path.read_text(encoding="utf-8"))
+@cache
+def nodes_of(source: str) -> tuple[ast.AST, ...]:
+    """All nodes of a source."""
+    return tuple(ast.walk(tree_of(source)))
+
+
+@cache
+def text_of(path: Path) -> str:
+    """Read a file once."""
+    return path.read_text(encoding="utf-8")
+
+
+def nodes_in(path: Path) -> tuple[ast.AST, ...]:
+    """All nodes of a file."""
+    return nodes_of(text_of(path))
 
 
 def name_of(path: Path) -> str:
@@ -92,14 +105,14 @@ def name_of(path: Path) -> str:
     return path.relative_to(CHECKOUT).as_posix()
 
 
-def imports(tree: ast.AST, package: str = "") -> Iterator[tuple[int, str]]:
+def imports(source: str, package: str = "") -> Iterator[tuple[int, str]]:
     """Yield (line, absolute module name) of everything imported, wherever in the file.
 
     Args:
-        tree: Parsed module.
+        source: Text of a module.
         package: Package the module lives in; what relative imports are relative to.
     """
-    for node in ast.walk(tree):
+    for node in nodes_of(source):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -151,7 +164,7 @@ def storey_of(module: str) -> int:
 def known(source: str, package: str) -> tuple[tuple[int, str], ...]:
     """(line, module) of what a source imports of this house; of a name in a module, the module."""
     found = []
-    for line, name in imports(tree_of(source), package):
+    for line, name in imports(source, package):
         module = name if name in MODULES else name.rpartition(".")[0]
         if module in MODULES and (module == name or module != "unifg"):
             found.append((line, module))
@@ -176,7 +189,7 @@ def test_imports_point_down() -> None:
     wrong = {
         module: found
         for module, path in MODULES.items()
-        if (found := wrong_imports(path.read_text(encoding="utf-8"), module, package_of(module)))
+        if (found := wrong_imports(text_of(path), module, package_of(module)))
     }
     assert wrong == {}
 
@@ -186,7 +199,7 @@ def test_imports_of_scenarios_point_down() -> None:
         f"{module}, line {line}: {other}"
         for module, path in MODULES.items()
         if room_of(module) == "scenarios"
-        for line, other in known(path.read_text(encoding="utf-8"), package_of(module))
+        for line, other in known(text_of(path), package_of(module))
         if room_of(other) == "scenarios" and storey_of(other) > storey_of(module)
     ]
     assert up == []
@@ -194,7 +207,7 @@ def test_imports_of_scenarios_point_down() -> None:
 
 def test_no_file_knows_itself_by_way_of_others() -> None:
     knows = {
-        module: {other for _, other in known(path.read_text(encoding="utf-8"), package_of(module))}
+        module: {other for _, other in known(text_of(path), package_of(module))}
         for module, path in MODULES.items()
         if path.name != "__init__.py"
     }
@@ -212,7 +225,7 @@ def test_nobody_imports_side_folders_by_bare_name() -> None:
     wrong = [
         f"{name_of(path)}:{line}: {module}"
         for path in EVERYTHING
-        for line, module in imports(parsed(path))
+        for line, module in imports(text_of(path))
         if any(is_in(module, side) for side in SIDES)
     ]
     assert wrong == []
@@ -231,7 +244,7 @@ def test_tests_and_their_problems_know_no_measurements() -> None:
     knowing = {
         path.name
         for path in sources(CHECKOUT / "tests")
-        for _, module in imports(parsed(path))
+        for _, module in imports(text_of(path))
         if is_in(module, "benchmarks") or is_in(module, "tools")
     }
     assert knowing == OF_MEASUREMENTS
@@ -242,7 +255,7 @@ def test_side_folders_use_absolute_imports() -> None:
         f"{name_of(path)}:{node.lineno}"
         for package, path in LIBRARY
         if package != "unifg"
-        for node in ast.walk(parsed(path))
+        for node in nodes_in(path)
         if isinstance(node, ast.ImportFrom) and node.level
     ]
     assert wrong == []
@@ -288,7 +301,7 @@ def sized(folders: str) -> tuple[int, float]:
     """Statements below folders, without imports and docstrings, and nodes of syntax a statement."""
     statements = nodes = 0
     for path in (path for folder in folders.split() for path in sources(CHECKOUT / folder)):
-        for node in ast.walk(parsed(path)):
+        for node in nodes_in(path):
             text = isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str)
             statements += isinstance(node, ast.stmt) and not text and not isinstance(node, ast.Import | ast.ImportFrom)
             nodes += isinstance(node, ast.stmt | ast.expr)
@@ -309,7 +322,7 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
     asking = [
         f"{name_of(path)}:{getattr(node, 'lineno', 1)}: {text.partition(chr(10))[0]}"
         for path in EVERYTHING
-        for node in ast.walk(parsed(path))
+        for node in nodes_in(path)
         if isinstance(node, ast.FunctionDef | ast.ClassDef | ast.Module)
         and (text := ast.get_docstring(node) or "").partition(" ")[0].rstrip(",.:") in words
     ]
@@ -321,7 +334,7 @@ def test_the_library_is_silent() -> None:
         f"{name_of(path)}:{node.lineno}"
         for _, path in LIBRARY
         if path != CHECKOUT / "scenarios" / "command.py"
-        for node in ast.walk(parsed(path))
+        for node in nodes_in(path)
         if (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print")
         or (isinstance(node, ast.Attribute) and ast.unparse(node) in ("sys.stdout", "sys.stderr"))
     ]
@@ -344,7 +357,7 @@ def test_products_of_long_vectors_wake_no_threads() -> None:
         for folder in folders
         for path in sorted((CHECKOUT / folder).rglob("*.py"))
         if path.parent.name != "ta"  # its matrices are those of one state
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        for number, line in enumerate(text_of(path).splitlines(), 1)
         if woken.search(line)
     ]
     assert not found, "\n".join(found)
@@ -362,7 +375,7 @@ def test_no_machine_paths() -> None:
         f"{name_of(path)}:{number}: {line.strip()}"
         for path in files
         if path.is_file() and path.suffix in TEXT
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1)
+        for number, line in enumerate(text_of(path).splitlines(), start=1)
         if MACHINE_PATH.search(line)
     ]
     assert found == []
@@ -380,7 +393,7 @@ PRIVATE_NAME = re.compile(r"\.(py_func|overloads|targetoptions|get_pointer_to_fu
 
 def private_sides(source: str) -> list[str]:
     """List where a source reaches into Numba."""
-    modules = [f"line {line}: {name}" for line, name in imports(tree_of(source)) if PRIVATE_MODULE.match(name)]
+    modules = [f"line {line}: {name}" for line, name in imports(source) if PRIVATE_MODULE.match(name)]
     lines = enumerate(source.splitlines(), start=1)
     return modules + [f"line {number}: {line.strip()}" for number, line in lines if PRIVATE_NAME.search(line)]
 
@@ -389,11 +402,11 @@ def test_only_the_machine_knows_the_inside_of_numba() -> None:
     wrong = {
         name_of(path): found
         for package, path in HOUSE
-        if room_of(module_of(package, path)) != "codegen" and (found := private_sides(path.read_text(encoding="utf-8")))
+        if room_of(module_of(package, path)) != "codegen" and (found := private_sides(text_of(path)))
     }
     assert wrong == {}
     inside = [path for package, path in LIBRARY if room_of(module_of(package, path)) == "codegen"]
-    assert any(private_sides(path.read_text(encoding="utf-8")) for path in inside)  # the witness sees what there is
+    assert any(private_sides(text_of(path)) for path in inside)  # the witness sees what there is
 
 
 # Names of Numba that it does not promise, and where they are found: all that unifg.codegen uses.
@@ -427,7 +440,7 @@ def test_no_other_private_name_of_numba_is_used() -> None:
     for package, path in LIBRARY:
         if room_of(module_of(package, path)) != "codegen":
             continue
-        for node in ast.walk(parsed(path)):
+        for node in nodes_in(path):
             if isinstance(node, ast.Attribute) and node.attr.startswith("_") and not node.attr.startswith("__"):
                 mine = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls", "own")
                 (own if mine else used).add(node.attr)
@@ -436,7 +449,7 @@ def test_no_other_private_name_of_numba_is_used() -> None:
             elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("numba"):
                 used |= {alias.name for alias in node.names if alias.name.startswith("_")}
     assert used - own - {"_fields"} <= set(BELOW_THE_SURFACE)
-    assert "getrefcount" not in "".join(path.read_text(encoding="utf-8") for _, path in LIBRARY)
+    assert "getrefcount" not in "".join(text_of(path) for _, path in LIBRARY)
 
 
 def test_numba_has_no_expiry_date() -> None:

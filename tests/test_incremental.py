@@ -23,6 +23,7 @@ from unifg.typing import Array
 
 @pytest.mark.parametrize("group", [fg.SE2, fg.SE3, fg.SO3], ids=lambda g: g.name)
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.product(5)
 def test_every_update_is_a_batch_step(group: Any, seed: int) -> None:
     """Thresholds zero: after each update the estimates are those of a Gauss-Newton step over everything."""
     rng = np.random.default_rng(seed)
@@ -54,6 +55,7 @@ def test_every_update_is_a_batch_step(group: Any, seed: int) -> None:
 
 @pytest.mark.parametrize("group", [fg.SE2, fg.SE3], ids=lambda g: g.name)
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.product(4)
 def test_some_points_move_and_others_stay(group: Any, seed: int) -> None:
     """With a threshold the estimates solve the linear problem of the factors at the points the smoother reports."""
     rng = np.random.default_rng(seed)

@@ -32,7 +32,7 @@ EVERY_METHOD = pytest.mark.parametrize("method", NAMES)
 
 @EVERY_METHOD
 @EVERY_GROUP
-@pytest.mark.product(8)
+@pytest.mark.product(4)
 def test_order_of_convergence(group: fg.LieGroup, method: Method) -> None:
     """Against the exact motion, at steps that halve."""
     field, order = Carried(group), METHODS[cast(str, method)].order
@@ -61,7 +61,7 @@ def flown() -> Array:
 
 
 @EVERY_METHOD
-@pytest.mark.product(3)
+@pytest.mark.product(1)
 def test_order_on_position_attitude_velocity(method: Method) -> None:
     """The state of a flying robot, against rk4 at a sixteenth of the finest step."""
     order, errors = METHODS[cast(str, method)].order, []
@@ -152,7 +152,7 @@ def linearized(
 
 @pytest.mark.parametrize("method", [*NAMES, HEUN], ids=str)
 @EVERY_GROUP
-@pytest.mark.product(10)
+@pytest.mark.product(5)
 def test_jacobians(group: fg.LieGroup, method: Method) -> None:
     """Traced in a graph: against differences of the defect."""
     points, manifolds = step_of(group)

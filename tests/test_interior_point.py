@@ -282,6 +282,7 @@ def disturbed(loss: Loss | None) -> tuple[fg.Graph, fg.Guess]:
 
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
 @pytest.mark.parametrize("loss", [None, fg.Cauchy(0.5), fg.Reweighted(lambda s: np.where(s < 5.0, 1.0, 0.25))])
+@pytest.mark.product(3)
 def test_terms_in_python_change_no_step(loss: Loss | None, hessian: Literal["gauss-newton", "exact"]) -> None:
     """None, one or all terms without a kernel; alone or watched: one loop, the same iterates."""
     runs = []

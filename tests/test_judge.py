@@ -273,6 +273,7 @@ def flat(row: Callable[[Array], Array], cost: float, rows: float, unknown: float
     ],
     ids=["exp", "cube", "slope", "small slope"],
 )
+@pytest.mark.product(40)
 def test_degenerate_multipliers_have_no_units(
     row: Callable[[Array], Array],
     start: float,
@@ -402,6 +403,7 @@ def test_estimated_multipliers_have_the_sign_of_their_limits() -> None:
 
 @pytest.mark.parametrize("watched", [False, True])
 @pytest.mark.parametrize("solver", [s for s in EVERY if s.constraints == "all"], ids=lambda s: s.name)
+@pytest.mark.product(4)
 def test_rows_between_fixed_variables_are_judged_first_and_named(solver: Solver, watched: bool) -> None:
     """No step changes them: nothing is gained by an iteration."""
     graph = fg.Graph()

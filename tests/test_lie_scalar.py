@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from fractions import Fraction
 from math import comb, factorial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,6 +28,7 @@ PARTS: list[LieGroup] = [
 
 
 @pytest.mark.parametrize("group", PARTS, ids=str)
+@pytest.mark.product(1)
 def test_one_element_and_a_batch_of_products_agree(group: LieGroup) -> None:
     """Of the groups themselves `test_own_manifolds.test_axioms_hold` compares them."""
     report = check_manifold(group)
@@ -73,15 +75,18 @@ def test_products_of_the_same_parts_in_another_order_are_not_confused() -> None:
 # -- batches --
 
 
-def test_wrong_lengths_are_named() -> None:
-    with pytest.raises(UnifgError, match=r"se2.exp takes \(..., 3\) arrays; got shape \(5, 4\)"):
-        SE2.exp(np.zeros((5, 4)))
-    with pytest.raises(UnifgError, match=r"se3.retract takes \(..., 6\) arrays; got shape \(3,\)"):
-        SE3.retract(SE3.identity(), np.zeros(3))
-    with pytest.raises(UnifgError, match=r"so2.exp takes \(..., 1\) arrays; got shape \(\)"):
-        SO2.exp(0.3)
-    with pytest.raises(ValueError, match="broadcast"):
-        SE2.compose(np.zeros((2, 3)), np.zeros((4, 3)))
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        (SE2.exp, (np.zeros((5, 4)),), r"se2.exp takes \(..., 3\) arrays; got shape \(5, 4\)"),
+        (SE3.retract, (SE3.identity(), np.zeros(3)), r"se3.retract takes \(..., 6\) arrays; got shape \(3,\)"),
+        (SO2.exp, (0.3,), r"so2.exp takes \(..., 1\) arrays; got shape \(\)"),
+        (SE2.compose, (np.zeros((2, 3)), np.zeros((4, 3))), "broadcast"),
+    ],
+)
+def test_wrong_lengths_are_named(function: Callable[..., Array], arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(ValueError if message == "broadcast" else UnifgError, match=message):
+        function(*arguments)
 
 
 def test_any_layout_will_do(rng: Generator) -> None:
@@ -152,6 +157,7 @@ def total(series_of_t: list[Fraction], t: Fraction) -> float:
 @pytest.mark.parametrize(
     "theta", [0.0, 1e-300, 1e-160, 1e-12, 1e-4, 0.1, 0.49, 0.4999999, 0.5, 0.51, 0.7, 1.0, 2.0, 3.0]
 )
+@pytest.mark.product(6)
 def test_functions_of_an_angle(theta: float) -> None:
     """Against exact sums of the power series; the slopes are multiplied by theta^3 at least wherever they serve."""
     square, t = Fraction(theta) ** 2, theta * theta

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -250,25 +252,30 @@ def test_nearest_rotation(rng: Generator) -> None:
     assert_close(SO3.matrix(scaled), rotation, 1e-14)
 
 
-def test_refusals() -> None:
-    with pytest.raises(UnifgError, match=r"quaternion \(1,\) \[0. 0. 0. 0.\] names no rotation"):
-        SO3.from_quaternion([[1, 0, 0, 0], [0, 0, 0, 0]], order="wxyz")
-    with pytest.raises(UnifgError, match="names no rotation"):
-        SO3.from_quaternion([np.nan, 0, 0, 1], order="xyzw")
-    with pytest.raises(UnifgError, match=r"matrix \(0, 2\) has singular values .* no single nearest"):
-        SO3.from_matrix(np.array([[np.eye(3), np.eye(3), np.zeros((3, 3))]]))
-    with pytest.raises(UnifgError, match="no single nearest"):
-        SO3.from_matrix(np.diag([1.0, 1.0, -1.0]))  # every half turn about a level axis is as near
-    with pytest.raises(UnifgError, match="not finite"):
-        SO3.from_matrix(np.full((3, 3), np.nan))
-    with pytest.raises(UnifgError, match=r"takes \(..., 3, 3\) matrices; got shape \(4, 4\)"):
-        SO3.from_matrix(np.eye(4))
-    with pytest.raises(UnifgError, match=r"\[0.0, 0.0, 0.0, 2.0\]: it must be 0, 0, 0, 1"):
-        SE3.from_matrix(2.0 * np.eye(4))
-    with pytest.raises(UnifgError, match=r"takes \(..., 4, 4\) matrices"):
-        SE3.from_matrix(np.eye(3))
-    with pytest.raises(UnifgError, match=r"joins \(..., 3\) and \(..., 4\) arrays; got shapes \(2,\) and \(4,\)"):
-        SE3.from_parts([0.0, 0.0], SO3.identity())
+REFUSED: dict[str, Callable[[], object]] = {
+    r"quaternion \(1,\) \[0. 0. 0. 0.\] names no rotation": lambda: SO3.from_quaternion(
+        [[1, 0, 0, 0], [0, 0, 0, 0]], order="wxyz"
+    ),
+    "names no rotation": lambda: SO3.from_quaternion([np.nan, 0, 0, 1], order="xyzw"),
+    r"matrix \(0, 2\) has singular values .* no single nearest": lambda: SO3.from_matrix(
+        np.array([[np.eye(3), np.eye(3), np.zeros((3, 3))]])
+    ),
+    # every half turn about a level axis is as near
+    "no single nearest": lambda: SO3.from_matrix(np.diag([1.0, 1.0, -1.0])),
+    "not finite": lambda: SO3.from_matrix(np.full((3, 3), np.nan)),
+    r"takes \(..., 3, 3\) matrices; got shape \(4, 4\)": lambda: SO3.from_matrix(np.eye(4)),
+    r"\[0.0, 0.0, 0.0, 2.0\]: it must be 0, 0, 0, 1": lambda: SE3.from_matrix(2.0 * np.eye(4)),
+    r"takes \(..., 4, 4\) matrices": lambda: SE3.from_matrix(np.eye(3)),
+    r"joins \(..., 3\) and \(..., 4\) arrays; got shapes \(2,\) and \(4,\)": lambda: SE3.from_parts(
+        [0.0, 0.0], SO3.identity()
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_refusals(message: str) -> None:
+    with pytest.raises(UnifgError, match=message):
+        REFUSED[message]()
 
 
 def test_poses_by_hand() -> None:

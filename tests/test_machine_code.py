@@ -134,7 +134,7 @@ def test_functions_that_keep_changing_leave_nothing(monkeypatch: pytest.MonkeyPa
     def work(first: int, count: int) -> None:
         for k in range(first, first + count):
             stated(lambda x, k=float(k): np.sin(x) + k * x - 1.0)[0].compile()
-        gc.collect()
+            gc.collect()
 
     work(0, 30)
     before = resident()

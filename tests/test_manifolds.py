@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -113,14 +114,15 @@ def test_pack_and_unpack(rng: Generator) -> None:
 
 
 def test_bad_manifolds_are_refused() -> None:
-    with pytest.raises(UnifgError, match="no components"):
-        Product()
-    with pytest.raises(UnifgError, match="'p' of Product is 3: give a manifold"):
-        Product(p=3)  # type: ignore[call-overload]
-    with pytest.raises(UnifgError, match=r"'p' of Product is .*Rn.*: give a manifold"):
-        Product(p=Rn)  # type: ignore[call-overload]
-    with pytest.raises(UnifgError, match="underscore"):
-        Product(_p=SE2)
+    components: list[tuple[dict[str, Any], str]] = [
+        ({}, "no components"),
+        ({"p": 3}, "'p' of Product is 3: give a manifold"),
+        ({"p": Rn}, r"'p' of Product is .*Rn.*: give a manifold"),
+        ({"_p": SE2}, "underscore"),
+    ]
+    for named, message in components:
+        with pytest.raises(UnifgError, match=message):
+            Product(**named)
     with pytest.raises(UnifgError, match=r"Rn\(0\)"):
         Rn(0)
     with pytest.raises(TypeError):

@@ -60,6 +60,7 @@ def test_converges_within_every_limit(name: str, solver: str) -> None:
 
 @all_cases
 @both
+@pytest.mark.product(2)
 def test_an_independent_judge_agrees(name: str, solver: str) -> None:
     settings = ManoeuvreSettings()
     graph, _, _, guess = state_problem(CASES[name], settings)

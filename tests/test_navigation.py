@@ -41,7 +41,7 @@ CORNER = NavigationSettings(start=(10.8, 17.0, -1.57), goals=((16.5, 14.0, 0.0),
     [replace(CORRIDOR, obstacles=2, seed=1), replace(CORNER, obstacles=1, seed=2)],
     ids=["corridor", "corner"],
 )
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_short_drive_reaches_its_goal(settings: NavigationSettings, solver: str) -> None:
     log = run_navigation(replace(settings, solver=solver))
     metrics = episode_metrics(log)
@@ -63,6 +63,7 @@ def test_short_drive_reaches_its_goal(settings: NavigationSettings, solver: str)
 
 @pytest.mark.data
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
+@pytest.mark.product(1)
 def test_a_goal_that_looks_back_along_the_way_is_reached(coupling: str) -> None:
     """The robot turns by half a circle where it arrives, within its accelerations, and does not rest before."""
     log = run_navigation(replace(CORRIDOR, coupling=coupling, goals=((8.0, 14.0, np.pi),)))
@@ -92,7 +93,7 @@ def test_turtlebot_world(shared_data: Path, solver: str) -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.product(1)
+@pytest.mark.product(1, of="seeds of drives")
 def test_same_seed_same_drive(solver: str) -> None:
     settings = replace(CORRIDOR, solver=solver, obstacles=2, seed=5)
     one, two = (Episode(settings).run(stop_after(40)) for _ in range(2))
@@ -110,6 +111,7 @@ def test_same_seed_same_drive(solver: str) -> None:
             assert value == other, name
 
 
+@pytest.mark.product(1, of="seeds of drives")
 def test_other_seed_other_drive() -> None:
     settings = [replace(CORRIDOR, obstacles=2, seed=seed) for seed in (5, 6)]
     one, two = (Episode(s).run(stop_after(10)) for s in settings)
@@ -164,7 +166,7 @@ def replace_solver(monkeypatch: pytest.MonkeyPatch, episode: Episode, double: ob
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("good", [12, 30], ids=["straight", "in the turn"])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_failed_solves_brake_to_rest_along_the_stored_plan(
     monkeypatch: pytest.MonkeyPatch, solver: str, good: int
 ) -> None:

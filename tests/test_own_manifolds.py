@@ -35,7 +35,7 @@ SHIPPED: list[fg.Manifold] = [fg.SO2, fg.SE2, fg.SO3, fg.SE3, fg.Rn(3), fg.Produ
 
 
 @pytest.mark.parametrize("manifold", SHIPPED + OWN, ids=lambda m: m.name)
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_axioms_hold(manifold: fg.Manifold) -> None:
     report = fg.check_manifold(manifold)
     assert report.ok, str(report)
@@ -142,6 +142,7 @@ MUTANTS: list[tuple[fg.Manifold, str, Callable[..., None], str]] = [
 
 
 @pytest.mark.parametrize(("good", "name", "wrong", "axiom"), MUTANTS, ids=[f"{m[1]} {m[2].__name__}" for m in MUTANTS])
+@pytest.mark.product(5)
 def test_mutants_are_named(good: fg.Manifold, name: str, wrong: Callable[..., None], axiom: str) -> None:
     mutant: Any = type("Mutant", (type(good),), {name: fg.elementwise(compiled(wrong)), "name": "mutant"})()
     report = fg.check_manifold(mutant)
@@ -270,7 +271,7 @@ class Chain:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda m: m.name)
-@pytest.mark.product(2)
+@pytest.mark.product(1, of="derivatives along own manifolds")
 def test_all_backends_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
     chain = Chain(manifold)
     answer = chain.answer()
@@ -290,7 +291,7 @@ def test_all_backends_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda m: m.name)
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_smoothers_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
     chain = Chain(manifold)
     smoother, lag = fg.Incremental(relinearize=0.0, wildfire=0.0), fg.FixedLag(COUNT)

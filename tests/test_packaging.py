@@ -222,7 +222,7 @@ def test_console_script(clean: Path) -> None:
 
 @pytest.mark.parametrize("installed", [False, True], ids=["not installed", "installed"])
 @pytest.mark.parametrize("links", ["text files", "missing"])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_a_checkout_without_links_finds_its_side_folders(links: str, installed: bool, tmp_path: Path) -> None:
     """Imports from a checkout work even where Git or an archive makes no symbolic links."""
     ignored = shutil.ignore_patterns("__pycache__", *SIDES)

@@ -126,13 +126,11 @@ def test_the_number_of_rows_must_be_told() -> None:
 
 
 KEPT = """
-import logging, sys
 import numba, numpy as np
 import unifg as fg
-from unifg.codegen.compile_counter import tally
+from unifg.codegen.compile_counter import counting
 from unifg.solvers import GaussNewton
 from outside import scaled, helper
-logging.basicConfig(level=logging.INFO, stream=sys.stdout, format="%(message)s")
 OFFSET = 0.5
 
 def made(weight):
@@ -147,9 +145,10 @@ def unknown(x, r):
 
 graph = fg.Graph()
 x = graph.variables("x", fg.Rn(1), 1)
-graph.minimize(fg.residual(unknown if "unknown" in sys.argv else made(2.0), rows=1, derivatives="differences"), x)
-solution = GaussNewton().solve(graph, {x: np.ones((1, 1))})
-print("compiled", len(tally.compiled), round(float(solution[x][0, 0]), 9))
+graph.minimize(fg.residual(made(2.0), rows=1, derivatives="differences"), x)
+with counting() as new:
+    solution = GaussNewton().solve(graph, {x: np.ones((1, 1))})
+print(len(new.compiled), round(float(solution[x][0, 0]), 9))
 """
 OUTSIDE = """
 import numba
@@ -163,41 +162,50 @@ def scaled(x):
 def helper(x):
     return x - 3.0
 """
+SCRIPTS = """
+import logging, runpy, shutil, sys
+logging.basicConfig(level=logging.INFO, format="%(message)s")
+sys.dont_write_bytecode = True  # files change within the second that tells compiled ones apart
+sys.path.insert(0, sys.argv[1])
+for changed in sys.argv[2:]:
+    shutil.copytree(changed, sys.argv[1], dirs_exist_ok=True)
+    sys.modules.pop("outside", None)
+    runpy.run_path(f"{sys.argv[1]}/script.py")
+"""
+# What is replaced by what, and the solution.
 CHANGES = {
+    "nothing": ("", "", 0.125),
     "a comment": ("OFFSET = 0.5", "OFFSET = 0.5  # [m]", 0.125),
     "a captured number": ("made(2.0)", "made(4.0)", 0.0625),
     "a global constant": ("OFFSET = 0.5", "OFFSET = 1.5", 0.375),
     "the formula": ("- OFFSET", "+ OFFSET", -0.125),
     "a callee in another file": ("2.0 * x", "4.0 * x", 0.0625),
+    "a callee that no fingerprint covers": ("", "", 3.0),
+    "the inside of that": ("- 3.0", "- 4.0", 4.0),
 }
 
 
-def solved(folder: Path, *arguments: str) -> tuple[str, int, float]:
-    """Output of a process that solves with a function of its user, compiled functions, and the solution."""
-    place = {**os.environ, VARIABLE: str(folder / "cache"), "PYTHONPATH": os.pathsep.join((str(folder), *sys.path))}
-    command = [sys.executable, str(folder / "program.py"), *arguments]
+def solved(folder: Path, *changes: str) -> tuple[str, list[tuple[int, float]]]:
+    """Log of a process that solves with functions of its user; numbers of compiled functions, and solutions."""
+    for change in changes:
+        (folder / change).mkdir(exist_ok=True)
+        before, after, value = CHANGES[change]
+        for name, source in (("script.py", KEPT), ("outside.py", OUTSIDE)):
+            changed = source.replace("made(2.0)", "unknown") if value >= 3.0 else source
+            (folder / change / name).write_text(changed.replace(before, after), encoding="utf-8")
+    place = {**os.environ, VARIABLE: str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", SCRIPTS, str(folder / "run"), *(str(folder / change) for change in changes)]
     ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=True)
-    found = ended.stdout.split()
-    return ended.stdout, int(found[-2]), float(found[-1])
+    lines = [line.split() for line in ended.stdout.splitlines()]
+    return ended.stderr, [(int(count), float(answer)) for count, answer in lines]
 
 
 def test_a_differenced_function_is_compiled_once_on_a_machine(tmp_path: Path) -> None:
     """A second process compiles nothing; a change of what the function computes is seen, one of a comment is not."""
-    (tmp_path / "program.py").write_text(KEPT, encoding="utf-8")
-    (tmp_path / "outside.py").write_text(OUTSIDE, encoding="utf-8")
-    assert solved(tmp_path)[1] > 0
-    assert solved(tmp_path)[1:] == (0, 0.125)
-    for change, (before, after, value) in CHANGES.items():
-        for name, source in (("program.py", KEPT), ("outside.py", OUTSIDE)):
-            (tmp_path / name).write_text(source.replace(before, after), encoding="utf-8")
-        _, count, answer = solved(tmp_path)
-        assert answer == value and (count == 0) == (change == "a comment"), change
-
-
-def test_a_function_that_no_fingerprint_covers_is_compiled_anew_and_named(tmp_path: Path) -> None:
-    (tmp_path / "program.py").write_text(KEPT, encoding="utf-8")
-    for number in (3.0, 4.0):
-        (tmp_path / "outside.py").write_text(OUTSIDE.replace("3.0", str(number)), encoding="utf-8")
-        output, count, answer = solved(tmp_path, "unknown")
-        assert count > 0 and answer == number
-        assert output.count("is compiled in every process: it uses 'helper'") == 1
+    unknown = list(CHANGES)[-2]
+    for changes in (["nothing", unknown], [change for change in CHANGES if change != unknown]):
+        logged, found = solved(tmp_path, *changes)
+        assert logged.count("is compiled in every process: it uses 'helper'") == 1
+        for change, (count, answer) in zip(changes, found, strict=True):
+            known = change in ("nothing", "a comment") and unknown not in changes
+            assert answer == CHANGES[change][2] and (count == 0) == known, change

@@ -77,6 +77,7 @@ def test_one_scan_places_a_disc(distance: float, radius: float) -> None:
 
 
 @pytest.mark.parametrize("distance", [1.0, 2.0, 2.9])
+@pytest.mark.product(1)
 def test_tracks_are_right_with_a_disturbed_estimate(distance: float) -> None:
     """After half a second the centre is right to 0.05 m although each pose is off by 0.02 m and 0.006 rad."""
     occupancy = hall(pillar=True)
@@ -124,7 +125,7 @@ def test_wide_things_become_several_discs() -> None:
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.2, 2.4, -1.9])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_velocity_of_a_mover(heading: float) -> None:
     """One second after it was first seen, the velocity of a mover at 0.3 m/s is right to 0.1 m/s."""
     occupancy = hall()
@@ -144,12 +145,18 @@ def test_velocity_of_a_mover(heading: float) -> None:
     assert max(errors) < 0.1
 
 
+def met(
+    begin: tuple[float, float], end: tuple[float, float], speed: float = 0.3, seed: int = 4, yields: bool = True
+) -> tuple[World, DiscTracker, np.random.Generator]:
+    """A robot in the middle of the hall, and a mover that goes to and fro between two points."""
+    occupancy, mover = hall(), Obstacle(np.array(begin), 0.2, np.array(end), speed)
+    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(seed), yields=yields)
+    return world, DiscTracker(field(occupancy)), np.random.default_rng(5)
+
+
 def test_mover_that_turns_round_is_followed() -> None:
     """Over turns the track stays one, and near the mover."""
-    occupancy = hall()
-    mover = Obstacle(np.array([4.0, 5.5]), 0.2, np.array([6.0, 5.5]), 0.3)
-    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4))
-    tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
+    world, tracker, rng = met((4.0, 5.5), (6.0, 5.5))
     identities: set[int] = set()
     away: list[float] = []
     for _ in range(200):
@@ -163,15 +170,13 @@ def test_mover_that_turns_round_is_followed() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.6, 1.0, 1.5])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
     """From where it turns it goes a forearm, at any speed, to where its track thought that it would not be."""
-    occupancy, length, wrong = hall(), 2.2, []
+    length, wrong = 2.2, []
     for seed in range(3):
-        begin = np.array([3.8 + 0.2 * seed, 5.3])
-        mover = Obstacle(begin, 0.2, begin + np.array([length, 0.0]), speed)
-        world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(seed), yields=False)
-        tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(seed)
+        begin = 3.8 + 0.2 * seed
+        world, tracker, rng = met((begin, 5.3), (begin + length, 5.3), speed, seed, yields=False)
         turn = math.ceil(length / speed / DT - 1e-9)
         watch(world, tracker, turn - 10, np.zeros(3), rng)
         found = np.array([watch(world, tracker, 1, np.array([0.005, 0.005, 0.002]), rng).velocity[0, 0]
@@ -183,10 +188,7 @@ def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
 
 def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
     """A mover that has stood for two seconds, for the robot's sake, is not left behind by its track."""
-    occupancy = hall()
-    mover = Obstacle(np.array([6.5, 4.0]), 0.2, np.array([4.0, 4.0]), 0.3)
-    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4))
-    tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
+    world, tracker, rng = met((6.5, 4.0), (4.0, 4.0))
     still = np.zeros(3)
     waited = 0
     for _ in range(80):
@@ -203,12 +205,10 @@ def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
 
 
 @pytest.mark.parametrize("waits", [5.0, 12.0])
+@pytest.mark.product(1)
 def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
     """Ten seconds in one place; and when it goes on then, that is seen as of any other."""
-    occupancy = hall()
-    mover = Obstacle(np.array([6.5, 4.0]), 0.2, np.array([4.0, 4.0]), 0.3)
-    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4))
-    tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
+    world, tracker, rng = met((6.5, 4.0), (4.0, 4.0))
     watch(world, tracker, 41, np.zeros(3), rng)  # it has come to the robot and waits from then on
     assert tracker.tracks().mover.tolist() == [True]
     tracks = watch(world, tracker, round(10.0 * waits), np.zeros(3), rng)
@@ -223,10 +223,7 @@ def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
 @pytest.mark.parametrize("speed", [0.2, 0.5])
 @pytest.mark.product(1)
 def test_one_who_goes_to_and_fro_stays_a_mover(speed: float) -> None:
-    occupancy = hall()
-    mover = Obstacle(np.array([4.0, 5.5]), 0.2, np.array([4.8, 5.5]), speed)
-    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(4), yields=False)
-    tracker, rng = DiscTracker(field(occupancy)), np.random.default_rng(5)
+    world, tracker, rng = met((4.0, 5.5), (4.8, 5.5), speed, yields=False)
     watch(world, tracker, 60, np.zeros(3), rng)
     assert all(watch(world, tracker, 10, np.zeros(3), rng).mover.all() for _ in range(20))
 
@@ -297,6 +294,7 @@ def test_poor_scans_are_survived() -> None:
 
 
 @pytest.mark.data
+@pytest.mark.product(1, of="tracks in a building")
 def test_empty_building_gives_no_tracks(shared_data: Path) -> None:
     """Fifty metres through the real building, the estimate off by 0.03 m and 0.008 rad: no false tracks."""
     occupancy = load_map(shared_data / "maps" / "dis-B1-2011-09-27.yaml")
@@ -310,6 +308,7 @@ def test_empty_building_gives_no_tracks(shared_data: Path) -> None:
 
 
 @pytest.mark.data
+@pytest.mark.product(1, of="tracks in a building")
 def test_discs_in_the_building(shared_data: Path) -> None:
     """Discs beside a drive through the real building are found, placed to 0.05 m within 3 m, and quickly."""
     occupancy = load_map(shared_data / "maps" / "dis-B1-2011-09-27.yaml")

@@ -171,7 +171,7 @@ def test_no_backend_compiles_after_prepare_however_its_solves_end() -> None:
 
 
 @pytest.mark.parametrize(("what", "coupling"), [("drive", "sequential"), ("drive", "joint"), ("flight", "joint")])
-@pytest.mark.product(1)
+@pytest.mark.product(1, of="episodes that are prepared")
 def test_no_tick_compiles_though_solves_fail(what: str, coupling: str) -> None:
     found = said(EPISODE, what, coupling)
     assert isinstance(found, list)
@@ -180,6 +180,7 @@ def test_no_tick_compiles_though_solves_fail(what: str, coupling: str) -> None:
     assert new == [[], [], []] and columns == [0] * 16
 
 
+@pytest.mark.product(1, of="episodes that are prepared")
 def test_no_tick_compiles_whatever_it_turns_to() -> None:
     """A route repaired nearby and on the whole map, a step aside, the last stop, a way back, a robot found again."""
     found = said(TURNS)

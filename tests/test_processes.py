@@ -62,6 +62,7 @@ def prepared_solve(work: tuple[Any, Walk]) -> fg.Solution:
 
 
 @pytest.mark.parametrize("start", ["fork", "spawn", pytest.param("forkserver", marks=every)])
+@pytest.mark.product(1)
 def test_pools_solve_with_every_backend(start: str) -> None:
     if start not in mp.get_all_start_methods():
         pytest.skip(f"this system does not {start}")

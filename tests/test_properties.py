@@ -175,6 +175,7 @@ def snapshot(graph: fg.Graph, guess: Guess) -> Any:
 @pytest.mark.parametrize("name", CONSTRAINED)
 @given(seed=SEEDS)
 @MORE
+@pytest.mark.product(3)
 def test_every_claim_is_true(name: str, seed: int) -> None:
     graph, guess = wild(seed)
     terms, families, before = snapshot(graph, guess)

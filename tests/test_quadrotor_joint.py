@@ -300,6 +300,7 @@ def test_the_structure_is_compiled_once(compilations: list[int]) -> None:
 
 
 @pytest.mark.parametrize("association", ["known", "unknown"])
+@pytest.mark.product(1)
 def test_a_flight_believes_what_the_joint_graph_says(association: str) -> None:
     settings = FlightSettings(seed=SEED, coupling="joint")
     flight = Flight(replace(settings, estimator=replace(settings.estimator, association=association)))

@@ -25,6 +25,7 @@ from unifg.typing import Array
 
 
 @pytest.mark.parametrize("count", [0, 10, 25])
+@pytest.mark.product(1)
 def test_corridors_keep_their_promises(count: int) -> None:
     for seed in range(20):
         layout = corridor(seed, count)

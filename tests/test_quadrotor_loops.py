@@ -36,6 +36,7 @@ def missed(before: Array, after: Array, h: float, gust: Array) -> Array:
 
 
 @pytest.mark.parametrize("h", [0.01, 0.05])
+@pytest.mark.product(1)
 def test_the_loops_are_exact_and_the_pose_nearly(h: float) -> None:
     before, after = flown(1, h)
     wrong = missed(before, after, h, np.zeros(3))

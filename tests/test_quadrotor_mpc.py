@@ -60,6 +60,7 @@ def test_every_coupling_flies_and_knows_where_it_is(coupling: str) -> None:
 
 
 @pytest.mark.parametrize("solver", ["sqp", "alm"])
+@pytest.mark.product(1)
 def test_every_backend_flies(solver: str) -> None:
     log = run_flight(short(1.0, solver=solver))
     assert log.collisions == 0
@@ -84,6 +85,7 @@ def test_a_flight_reaches_the_target_and_learns_the_mass() -> None:
 
 
 @pytest.mark.parametrize("association", ["known", "unknown"])
+@pytest.mark.product(1)
 def test_walls_on_the_map_correct_the_heading_and_cylinders_do_not(association: str) -> None:
     headings = []
     for surveyed in (True, False):
@@ -305,6 +307,7 @@ def test_tracks_find_velocities(association: str) -> None:
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
+@pytest.mark.product(1)
 def test_a_gust_is_no_motion_of_the_vehicle(coupling: str) -> None:
     """Gusts that push and are felt do not bend the believed velocity."""
     log = run_flight(short(2.0, coupling=coupling, faults=(Fault("gust", 0.5, 1.5),)))

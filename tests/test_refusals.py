@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,18 +74,17 @@ def test_bad_data_and_duals_are_refused() -> None:
     graph.bound(x, lower=low, upper=1.0, name="box")
     run = SQP().prepare(graph)
     guess = {x: np.zeros((4, 2))}
-    with pytest.raises(fg.GraphError, match=r"data 'target' has shape \(3,\)"):
-        run.solve(guess, data={target: [0.0, 0.0, 0.0]})
-    with pytest.raises(fg.GraphError, match="data 'target' contains NaN"):
-        run.solve(guess, data={target: [0.0, np.nan]})
-    with pytest.raises(fg.GraphError, match="'box': lower exceeds upper in factor 0"):
-        run.solve(guess, data={low: 2.0})
-    with pytest.raises(fg.GraphError, match="does not belong"):
-        run.solve(guess, data={fg.Graph().data("t", [0.0]): [1.0]})
-    with pytest.raises(fg.GraphError, match="which is no constraint"):
-        run.solve(guess, duals={"bax": np.zeros((4, 2))})
-    with pytest.raises(fg.GraphError, match="multipliers of 'box' have shape"):
-        run.solve(guess, duals={"box": np.zeros(4)})
+    refused: list[tuple[dict[str, Any], str]] = [
+        ({"data": {target: [0.0, 0.0, 0.0]}}, r"data 'target' has shape \(3,\)"),
+        ({"data": {target: [0.0, np.nan]}}, "data 'target' contains NaN"),
+        ({"data": {low: 2.0}}, "'box': lower exceeds upper in factor 0"),
+        ({"data": {fg.Graph().data("t", [0.0]): [1.0]}}, "does not belong"),
+        ({"duals": {"bax": np.zeros((4, 2))}}, "which is no constraint"),
+        ({"duals": {"box": np.zeros(4)}}, "multipliers of 'box' have shape"),
+    ]
+    for given, message in refused:
+        with pytest.raises(fg.GraphError, match=message):
+            run.solve(guess, **given)
     assert run.solve(guess).converged, "a refused solve leaves the prepared solver usable"
 
 

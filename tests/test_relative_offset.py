@@ -88,6 +88,7 @@ PROBLEMS = {
 
 @pytest.mark.parametrize("problem", PROBLEMS)
 @pytest.mark.parametrize("solver", BACKENDS, ids=lambda s: s.name)
+@pytest.mark.product(16)
 def test_the_unit_of_cost_changes_nothing(solver: fg.Solver, problem: str) -> None:
     """Information times 1e6 used to end at the iteration limit, times 1e-6 was called converged far from the end."""
     graph, guess = PROBLEMS[problem](1.0)
@@ -317,6 +318,7 @@ def test_the_report_says_which_measure_it_is() -> None:
         ("sphere2500", 1351.4019259, 8),
     ],
 )
+@pytest.mark.product(2)
 def test_published_optima_in_other_units(shared_data: Path, name: str, chi2: float, most: int) -> None:
     pose_graph = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz")
     for times in (1.0, 1e-6, 1e6):

@@ -60,7 +60,7 @@ def test_a_clean_drive_keeps_every_closure(seed: int, kind: Kind) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["tinyGrid3D.g2o", "smallGrid3D.g2o", "intel.g2o.gz", "M3500.g2o.gz"])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_a_published_graph_keeps_every_closure(shared_data: Path, name: str) -> None:
     graph = read_g2o(shared_data / "pose_graphs" / name)
     solution, found, kept = robust(graph, fg.TruncatedLeastSquares(THRESHOLD if graph.group is fg.SE2 else 4.1))
@@ -81,6 +81,7 @@ def test_what_is_improbable_as_stated_is_not_kept() -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3])
+@pytest.mark.product(1)
 def test_uneven_closures_are_kept_beside_wrong_ones(share: float) -> None:
     """Two right ones with more noise than the others were given up together with the wrong ones."""
     clean, _ = drive(10, HEAVY)
@@ -285,6 +286,7 @@ def test_a_group_says_what_depends_on_it() -> None:
 
 
 @pytest.mark.parametrize("seed", [6, 13])
+@pytest.mark.product(1)
 def test_scale_does_not_decide_where_nothing_is_trusted(seed: int) -> None:
     """With odometry trusted, the answer gives up a wrong closure that pays; otherwise, the cost as stated decides."""
     sim = manhattan(150, seed, outliers=0.3)

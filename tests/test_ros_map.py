@@ -10,7 +10,7 @@ import pytest
 
 from unifg.errors import FileFormatError, ModelError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
-from unifg.typing import Array
+from unifg.typing import Array, BoolArray
 
 HEADER = (
     "image: m.pgm\nresolution: 0.1\norigin: [1.0, 2.0, 0.0]\nnegate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n"
@@ -134,16 +134,21 @@ def test_a_damaged_image_and_a_missing_file_are_refused(tmp_path: Path) -> None:
         load_map(tmp_path)
 
 
-def test_impossible_maps_cannot_be_made() -> None:
-    some, none = np.ones((2, 3), dtype=bool), np.zeros((2, 3), dtype=bool)
-    with pytest.raises(ModelError, match="both occupied and free"):
-        OccupancyMap(some, some, 0.1, (0.0, 0.0, 0.0))
-    with pytest.raises(ModelError, match="one shape"):
-        OccupancyMap(some, none[:1], 0.1, (0.0, 0.0, 0.0))
-    with pytest.raises(ModelError, match="resolution"):
-        OccupancyMap(some, none, 0.0, (0.0, 0.0, 0.0))
-    with pytest.raises(ModelError, match="origin"):
-        OccupancyMap(some, none, 0.1, (0.0, math.inf, 0.0))
+FULL, BARE = np.ones((2, 3), dtype=bool), np.zeros((2, 3), dtype=bool)
+
+
+@pytest.mark.parametrize(
+    ("free", "resolution", "x", "message"),
+    [
+        (FULL, 0.1, 0.0, "both occupied and free"),
+        (BARE[:1], 0.1, 0.0, "one shape"),
+        (BARE, 0.0, 0.0, "resolution"),
+        (BARE, 0.1, math.inf, "origin"),
+    ],
+)
+def test_impossible_maps_cannot_be_made(free: BoolArray, resolution: float, x: float, message: str) -> None:
+    with pytest.raises(ModelError, match=message):
+        OccupancyMap(FULL, free, resolution, (0.0, x, 0.0))
 
 
 @pytest.mark.data

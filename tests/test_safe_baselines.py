@@ -108,6 +108,7 @@ def test_splines_are_for_things_at_rest() -> None:
 
 
 @pytest.mark.parametrize("controller", ["filter", "spline"])
+@pytest.mark.product(1)
 def test_baselines_pass_the_cylinder(controller: str) -> None:
     (flight,) = flights(SafeSettings(alpha=(3.0,), controller=(controller,)))  # type: ignore[arg-type]
     flight.situation = replace(flight.situation, duration=3.2)

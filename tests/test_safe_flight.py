@@ -377,6 +377,7 @@ def test_who_is_asked_for_flies() -> None:
 
 
 @pytest.mark.parametrize("reading", ["decay", "published"])
+@pytest.mark.product(1)
 def test_a_velocity_in_the_barrier_bends_the_plan(reading: Reading) -> None:
     start, ahead = np.array([-2.2, 0.02, 1.5, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0]), pillar(0.0, 0.0, (-1.0, 0.0, 0.0))
     plans = [decide(keeper(reading=reading, gamma=gamma, alpha=1.2), start, 2.0, ahead) for gamma in (0.0, 0.4)]

@@ -41,6 +41,7 @@ def named(units: dict[str, float]) -> str:
 
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
 @pytest.mark.parametrize("units", UNITS, ids=named)
+@pytest.mark.product(12)
 def test_units_do_not_decide_whether_sqp_converges(units: dict[str, Any], hessian: Any) -> None:
     """The same optimum in about as many steps; the judge keeps to the units of the graph."""
     graph, guess = drive(**units)

@@ -131,6 +131,7 @@ def test_one_sensor_stands_in_both_graphs_of_a_joint_loop(rng: Generator) -> Non
 
 
 @pytest.mark.parametrize("static", [False, True], ids=["biases that walk", "one bias"])
+@pytest.mark.product(1)
 def test_inertial_navigation_in_a_window(static: bool, rng: Generator) -> None:
     """Biases are a component of the states, or one static unknown; fixes between nodes at 3.7 Hz."""
     noise, rate = ImuNoise(1e-3, 1e-2, 1e-4, 1e-3), 100.0

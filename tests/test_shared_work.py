@@ -163,6 +163,7 @@ def apart(x: Array, y: Array, r: Array) -> None:
 
 
 @pytest.mark.parametrize("robust", [None, fg.Huber(1.0)], ids=["squares", "Huber"])
+@pytest.mark.product(1)
 def test_a_solve_with_threads_repeats_itself(lattice: PoseGraph, robust: fg.Loss | None) -> None:
     """With a function of one's own beside the shipped ones, and one factor left out."""
     graph, x, guess = lattice.graph(robust=robust)

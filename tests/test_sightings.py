@@ -153,6 +153,7 @@ def past_the_pillar(seconds: float = 4.2, **settings: Any) -> Any:
     return flight.run()
 
 
+@pytest.mark.product(1, of="flights by sightings")
 def test_a_filter_below_a_plan_that_sees_gets_past() -> None:
     """A plan at every fifth tick; one that does not see leads into the cylinder, and the filter stands before it."""
     sees, blind = (
@@ -163,6 +164,7 @@ def test_a_filter_below_a_plan_that_sees_gets_past() -> None:
     assert sees.statuses[2::5].count("last plan") == sees.statuses[3::5].count("last plan") == 84
 
 
+@pytest.mark.product(1, of="flights by sightings")
 def test_a_sigma_that_is_wrong_is_survived() -> None:
     """Looks four times as noisy as they are believed to be."""
     log = past_the_pillar(sight="noisy", sighting=SightingSettings(noise=0.04, believed=0.01))

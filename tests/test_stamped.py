@@ -70,6 +70,7 @@ def test_interpolation_passes_through_both_nodes(name: str, rng: Generator) -> N
 
 
 @pytest.mark.parametrize("name", WAYS)
+@pytest.mark.product(3)
 def test_interpolation_is_traced_with_exact_derivatives(name: str, rng: Generator) -> None:
     """On symbols it is what it is on numbers, with the derivatives of differences."""
     manifold, between = WAYS[name]

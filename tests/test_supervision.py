@@ -377,6 +377,7 @@ def faulty(fault: str, coupling: str = "sequential", ticks: int = 50) -> Episode
 
 
 @pytest.mark.parametrize("kind", ["lidar-max", "lidar-frozen", "lidar-delayed", "beams-missing"])
+@pytest.mark.product(2)
 def test_a_blind_robot_brakes_at_once_and_says_why(kind: str) -> None:
     log = faulty(f"{kind}@1", ticks=26)
     last_good = 9  # the tick at 0.9 s
@@ -398,6 +399,7 @@ def test_a_robot_that_sees_again_goes_on() -> None:
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
+@pytest.mark.product(1)
 def test_a_robot_without_odometry_goes_on_slowly(coupling: str) -> None:
     log = faulty("odometry-nan@1", coupling)
     assert log.health[-1] == "degraded" and log.cause[-1] == "no odometry: not finite"
@@ -406,6 +408,7 @@ def test_a_robot_without_odometry_goes_on_slowly(coupling: str) -> None:
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
+@pytest.mark.product(1)
 def test_a_kidnapped_robot_stops_and_finds_itself(coupling: str) -> None:
     log = faulty("kidnapped@1", coupling, 60)
     assert np.hypot(*(log.true_pose[10] - log.true_pose[9])[:2]) > 3.0
@@ -428,6 +431,7 @@ def test_a_robot_with_the_wrong_map_rests_and_says_so() -> None:
         ("solver-timeout@1", "no plan"),
     ],
 )
+@pytest.mark.product(2)
 def test_other_faults_are_named_too(fault: str, cause: str) -> None:
     log = faulty(fault)
     assert cause in log.cause and log.collisions == 0

@@ -141,6 +141,7 @@ def test_a_choice_has_the_slope_of_what_is_chosen() -> None:
 
 @pytest.mark.parametrize("condition", [1.0, 1e5, 1e10])
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 6])
+@pytest.mark.product(6)
 def test_linear_systems_are_solved_as_well_as_their_condition_allows(size: int, condition: float) -> None:
     """Value and both derivatives by A and b, within 100 roundings times the condition number."""
     rng = np.random.default_rng(size)

@@ -27,6 +27,7 @@ for verbose in (True, False):
 
 
 @pytest.mark.parametrize("configure", ["", "logging.basicConfig()"])
+@pytest.mark.product(1)
 def test_verbose_prints_although_logging_is_not_configured(configure: str) -> None:
     script = SCRIPT.format(configure=configure)
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)

@@ -312,26 +312,23 @@ def test_what_has_no_place_is_refused_with_what_to_do() -> None:
     graph.minimize(fg.prior, q, np.zeros(7), sigma=1.0)
     graph.minimize(fg.prior, s, np.zeros(4), sigma=1.0)
     solution = GaussNewton().solve(graph, {q: np.zeros((2, 7)), s: np.zeros((3, 4))})
-    with pytest.raises(ViewError, match=r"'q' of Rn\(7\) cannot be drawn.*give position=lambda"):
-        Scene.of(solution, q)
-    with pytest.raises(ViewError, match=r"'s' of .*name a component \(s\.pose\), or give position="):
-        Scene.of(solution, s)
-    with pytest.raises(ViewError, match=r"no family of this solution has a place \('q' of Rn\(7\), 's' of"):
-        Scene.of(solution)
-    assert legend(Scene.of(solution, s.pose).html()) == ["s.pose", "s.pose: poses"]
-    assert legend(Scene.of(solution, q, position=lambda v: v[:, :3]).html()) == ["q"]
-    with pytest.raises(ViewError, match="'q': place 0 is"):
-        Scene.of(solution, q, position=lambda v: np.full((len(v), 2), math.nan))
-    with pytest.raises(ViewError, match=r"returned \(2, 5\)"):
-        Scene.of(solution, q, position=lambda v: v[:, :5])
-    with pytest.raises(GraphError, match="no term is called 'nothing'"):
-        Scene.of(solution, s.pose, terms=["nothing"])
-    with pytest.raises(ViewError, match="found ndarray"):
-        Scene.of(solution, np.zeros(3))  # type: ignore[arg-type]
-    with pytest.raises(ViewError, match="one of solutions, iterates, members"):
-        Scene.of(solution, s.pose, over="time")
+    refused: list[tuple[tuple[Any, ...], dict[str, Any], str]] = [
+        ((q,), {}, r"'q' of Rn\(7\) cannot be drawn.*give position=lambda"),
+        ((s,), {}, r"'s' of .*name a component \(s\.pose\), or give position="),
+        ((), {}, r"no family of this solution has a place \('q' of Rn\(7\), 's' of"),
+        ((q,), {"position": lambda v: np.full((len(v), 2), math.nan)}, "'q': place 0 is"),
+        ((q,), {"position": lambda v: v[:, :5]}, r"returned \(2, 5\)"),
+        ((s.pose,), {"terms": ["nothing"]}, "no term is called 'nothing'"),
+        ((np.zeros(3),), {}, "found ndarray"),
+        ((s.pose,), {"over": "time"}, "one of solutions, iterates, members"),
+    ]
+    for selection, options, message in refused:
+        with pytest.raises((ViewError, GraphError), match=message):
+            Scene.of(solution, *selection, **options)
     with pytest.raises(ViewError, match="no solution to look at"):
         Scene.of([], s.pose)
+    assert legend(Scene.of(solution, s.pose).html()) == ["s.pose", "s.pose: poses"]
+    assert legend(Scene.of(solution, q, position=lambda v: v[:, :3]).html()) == ["q"]
 
 
 def test_empty_and_single_members_are_drawn() -> None:
