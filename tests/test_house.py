@@ -284,13 +284,13 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 30_088, "scenarios": 10_301, "benchmarks": 4_627, "tests": 34_006,
-    "docs examples": 1_776, "unifg/factors": 4_227, "unifg/problem": 3_122, "models": 2_269,
-    "unifg/elimination": 2_089, "solvers": 4_841, "unifg/solution": 2_735, "unifg/smoothing": 1_625,
+    "unifg solvers models": 30_712, "scenarios": 10_332, "benchmarks": 4_745, "tests": 34_486,
+    "docs examples": 1_776, "unifg/factors": 4_306, "unifg/problem": 3_137, "models": 2_269,
+    "unifg/elimination": 2_103, "solvers": 4_914, "unifg/solution": 2_916, "unifg/smoothing": 1_619,
     "unifg/lie": 1_585, "unifg/view": 1_404, "unifg/files": 1_010, "unifg/pose_graphs": 1_036,
-    "unifg/horizon": 1_201, "unifg/modeling": 1_044, "unifg/codegen": 1_183, "unifg/plots": 418,
+    "unifg/horizon": 1_201, "unifg/modeling": 1_067, "unifg/codegen": 1_320, "unifg/plots": 418,
     "scenarios/scenes": 1_274, "scenarios/simulation": 1_150, "scenarios/campaigns": 912,
-    "scenarios/quadrotor": 1_749, "scenarios/ground": 1_133, "scenarios/commands": 562,
+    "scenarios/quadrotor": 1_749, "scenarios/ground": 1_133, "scenarios/commands": 589,
     "scenarios/logs": 492, "scenarios/perception": 745, "scenarios/planning": 623,
 }  # fmt: skip
 # Nodes of syntax a statement: budgets are not met by denser code.

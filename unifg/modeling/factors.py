@@ -111,7 +111,10 @@ def _deviation(group: LieGroup, functions: Functions) -> Callable[..., None]:
 
 
 def _deviation_second(group: LieGroup, functions: Functions) -> Callable[..., None]:
-    """Write what moves J'w of the same: the slope of Jr^-1(r)' w along r, times Jr^-1(r) (eq. 79)."""
+    """Write the symmetric part of what moves J'w of the same, the slope of Jr^-1(r)' w along r times Jr^-1(r) (eq. 79).
+
+    On geodesics through x, which the Hessian is that of, the other part does not count.
+    """
     dim = group.dim
     deviation, inverse_jacobian, bend = functions.log_between, functions.right_jacobian_inverse, functions.bend
 
@@ -131,6 +134,9 @@ def _deviation_second(group: LieGroup, functions: Functions) -> Callable[..., No
                     weighted += w[i] * slope[i, j]
                 for k in range(dim):
                     S[c, k] += weighted * J[j, k]
+        for c in range(dim):
+            for k in range(c):
+                S[c, k] = S[k, c] = 0.5 * (S[c, k] + S[k, c])
 
     return second
 
