@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from test_elimination import System, backward_error, full, solving, system
 from unifg.codegen.jit import compiled
-from unifg.elimination import fronts, substitution
+from unifg.elimination import analysis, fronts, substitution
 from unifg.elimination.chain import stages
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.ordering import block_graph
@@ -49,6 +49,18 @@ def test_horizons(rng: np.random.Generator, length: int, state: int, control: in
     assert factorization.inertia == (int((~negative).sum()), int(negative.sum()), 0)
     refined = factorization.refine(data, right)
     assert backward_error(full(pattern, data), refined, right) < 1e-15
+
+
+def test_other_orders_are_looked_for_where_a_chain_fills_in(rng: np.random.Generator) -> None:
+    """Not for a horizon, whose chain fits its neighbourhoods; a tree of 127 nodes is no chain to speak of."""
+    pattern, _, label, _ = horizon(rng, 30, 3, 2, True)
+    with mock.patch.object(analysis, "predicted_cost", side_effect=AssertionError("another order was looked for")):
+        assert analysis.analyse(pattern.indptr, pattern.indices, label, "auto").kind == "chain"
+        with pytest.raises(AssertionError, match="another order"):
+            pattern, _, label, _ = system(rng, [1] * 127, [((i - 1) // 2, i) for i in range(1, 127)])
+            analysis.analyse(pattern.indptr, pattern.indices, label, "auto")
+    assert stages(*block_graph(pattern.indptr, pattern.indices, label, 127), np.ones(127, dtype=np.int64))[0]
+    assert analysis.analyse(pattern.indptr, pattern.indices, label, "auto").kind == "minimum-degree"
 
 
 def test_stages_touch_only_the_next(rng: np.random.Generator) -> None:

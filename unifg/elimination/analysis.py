@@ -110,24 +110,10 @@ def analyse(indptr: IntArray, indices: IntArray, blocks: IntArray | None, orderi
         tree = graph.tree(stage=separators(pointer, neighbours, weight))
     elif ordering == "metis":
         kind, tree = "METIS", graph.tree(metis_order(pointer, neighbours, weight))
-    elif ordering in ("auto", "minimum-degree"):
+    elif ordering == "minimum-degree":
         tree = graph.tree()
-        if ordering == "auto":
-            kind, cost = "minimum-degree", predicted_cost(weight, tree[0], tree[1], tree[3])
-            candidates: list[tuple[str, Callable[[], Tree]]] = []
-            if cost > max(DISSECT[0], DISSECT[1] * nodes):
-                candidates.append(
-                    ("nested-dissection", lambda: graph.tree(stage=separators(pointer, neighbours, weight)))
-                )
-                if installed():
-                    candidates.append(("METIS", lambda: graph.tree(metis_order(pointer, neighbours, weight))))
-            for name, make in candidates:
-                other = make()
-                if (less := predicted_cost(weight, other[0], other[1], other[3])) < cost:
-                    kind, tree, cost = name, other, less
-            chain, line, least = stages(pointer, neighbours, weight)
-            if chain and least <= cost:
-                kind, tree = "chain", line
+    elif ordering == "auto":
+        kind, tree = _cheapest(graph)
     else:
         raise UnifgError(
             f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural or "
@@ -155,6 +141,44 @@ def analyse(indptr: IntArray, indices: IntArray, blocks: IntArray | None, orderi
         part=part,
     )
     return Structure(plan, panels + waiting + SLACK, starts, order, bounds, parent, kind)
+
+
+def _cheapest(graph: Graph) -> tuple[str, Tree]:
+    """The order of least predicted cost, and its name."""
+    weight, pointer, neighbours = graph
+    chain, line, least = stages(pointer, neighbours, weight)
+    if chain and _fits(graph, line):
+        return "chain", line
+    kind, tree = "minimum-degree", graph.tree()
+    cost = predicted_cost(weight, tree[0], tree[1], tree[3])
+    candidates: list[tuple[str, Callable[[], Tree]]] = []
+    if cost > max(DISSECT[0], DISSECT[1] * len(weight)):
+        candidates.append(("nested-dissection", lambda: graph.tree(stage=separators(pointer, neighbours, weight))))
+        if installed():
+            candidates.append(("METIS", lambda: graph.tree(metis_order(pointer, neighbours, weight))))
+    for name, make in candidates:
+        other = make()
+        if (less := predicted_cost(weight, other[0], other[1], other[3])) < cost:
+            kind, tree, cost = name, other, less
+    return ("chain", line) if chain and least <= cost else (kind, tree)
+
+
+def _fits(graph: Graph, line: Tree) -> bool:
+    """Test whether a chain's fronts take no more than each node would with the neighbours that it begins with.
+
+    Then hardly anything fills in, and no other order need be looked for: of 1600 graphs the cheapest one for which
+    minimum degree is better is at 1.7 of this bound, plans of robots are below 0.6.
+    """
+    weight, pointer, neighbours = graph
+    order, bounds, _, passed = line
+    own = np.diff(_sums(weight[order])[bounds])
+    beside = weight + np.diff(_sums(weight[neighbours])[pointer])
+    return bool((own * (own + passed) ** 2).sum() <= (weight * beside**2).sum())
+
+
+def _sums(numbers: IntArray) -> IntArray:
+    """(n + 1,) sums of the first numbers."""
+    return np.concatenate([[0], np.cumsum(numbers)])
 
 
 def _labels(blocks: IntArray, size: int) -> IntArray:
