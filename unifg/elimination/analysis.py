@@ -20,6 +20,7 @@ from unifg.typing import IntArray
 Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "metis", "natural"] | IntArray
 SLACK = 16  # numbers the kernels may read beyond the last matrix
 DISSECT = 4e6, 3e3  # predicted nanoseconds, in all and per node, from which nested dissection is tried
+FILL = 1.4  # see :func:`_fits`
 NOTHING = np.zeros(0)
 
 
@@ -164,16 +165,16 @@ def _cheapest(graph: Graph) -> tuple[str, Tree]:
 
 
 def _fits(graph: Graph, line: Tree) -> bool:
-    """Test whether a chain's fronts take no more than each node would with the neighbours that it begins with.
+    """Test whether a chain's fronts take about what each node would with the neighbours that it begins with.
 
-    Then hardly anything fills in, and no other order need be looked for: of 1600 graphs the cheapest one for which
-    minimum degree is better is at 1.7 of this bound, plans of robots are below 0.6.
+    Then hardly anything fills in, and no other order need be looked for: of 1600 graphs those for which minimum degree
+    is better are at 1.7 or more, plans of robots at 0.5 to 1.3.
     """
     weight, pointer, neighbours = graph
     order, bounds, _, passed = line
     own = np.diff(_sums(weight[order])[bounds])
     beside = weight + np.diff(_sums(weight[neighbours])[pointer])
-    return bool((own * (own + passed) ** 2).sum() <= (weight * beside**2).sum())
+    return bool((own * (own + passed) ** 2).sum() <= FILL * (weight * beside**2).sum())
 
 
 def _sums(numbers: IntArray) -> IntArray:
