@@ -204,15 +204,16 @@ def evaluate_rows(
 ) -> None:
     """Run one kernel, or its second derivatives, over rows of its arguments."""
     count, rows = residual.shape
+    v, p, r, J = variables.ravel(), parameters.ravel(), residual.reshape(count * rows), jacobian.ravel()
     storage, size, width = variables.shape[1], parameters.shape[1], jacobian.shape[2]
     shared = parameters.shape[0] == 1
     derive = jacobian.shape[1]
     for i in range(count):
         call_residual(
             where,
-            vector(variables, i * storage, storage),
-            vector(parameters, 0 if shared else i * size, size),
+            vector(v, i * storage, storage),
+            vector(p, 0 if shared else i * size, size),
             table,
-            vector(residual, i * rows, rows),
-            matrix(jacobian, i * derive * width, derive, width),
+            vector(r, i * rows, rows),
+            matrix(J, i * derive * width, derive, width),
         )
