@@ -14,8 +14,8 @@ import unifg as fg
 from benchmarks.report import table
 from benchmarks.runner import Timing
 from benchmarks.timing import number
+from problems.around_a_disc import around_a_disc
 from problems.control import Problem, Quadrotor
-from unifg.models import unicycle
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 
@@ -26,18 +26,9 @@ Case = tuple[str, fg.Graph, fg.Guess, list[dict[fg.Data, Array]]]
 
 def readme() -> Case:
     """README's first graph, with its start as data."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 21), graph.variables("u", fg.Rn(2), 20)
-    start = graph.data("start", np.zeros(3))
-    graph.fix(x[0], start)
-    graph.minimize(fg.prior, x[-1], [2, 1, 0], sigma=0.01, name="goal")
-    graph.minimize(fg.prior, u, [0, 0], name="effort")
-    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.1, lower=0, upper=0, name="motion")
-    graph.constrain(lambda p: np.hypot(p[:, 0] - 1, p[:, 1] - 0.5)[:, None], x[1:], lower=0.4, name="disc")
-    graph.bound(u, lower=-2, upper=2, name="limits")
+    graph, guess, start = around_a_disc()
     starts = 0.1 * np.random.default_rng(0).standard_normal((STARTS, 3))
-    guess = fg.Guess({x: np.linspace([0, 0, 0], [2, 1, 0], 21), u: np.zeros((20, 2))})
-    return "README, N = 20", graph, guess, [{start: one} for one in starts]
+    return "README, N = 20", graph, fg.Guess(guess), [{start: one} for one in starts]
 
 
 def stated(case: Problem) -> Case:

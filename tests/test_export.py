@@ -18,10 +18,10 @@ import pytest
 import unifg as fg
 from asserting import below
 from fences import CHECKOUT, fences
+from problems.around_a_disc import around_a_disc
 from problems.control import Quadrotor, Stated, Unicycle
 from unifg.codegen import standalone
 from unifg.errors import BackendError
-from unifg.models import unicycle
 from unifg.solution.solver import Prepared
 from unifg.solvers import SQP, InteriorPoint
 from unifg.typing import Array
@@ -85,20 +85,6 @@ def assert_same(prepared: Prepared, folder: Path, guess: Any, each: Sequence[Map
             np.testing.assert_array_equal(multipliers, flat(prepared, single)[1])
             measured = single.cost, single.stationarity, single.violation, single.complementarity
             assert report[1] == single.iterations and (*report[2:3], *report[4:]) == measured
-
-
-def around_a_disc() -> tuple[fg.Graph, dict[fg.Family, Array], fg.Data]:
-    """README's first graph, with its start as data."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 21), graph.variables("u", fg.Rn(2), 20)
-    start = graph.data("start", [0.0, 0.0, 0.0])
-    graph.fix(x[0], start)
-    graph.minimize(fg.prior, x[-1], [2, 1, 0], sigma=0.01, name="goal")
-    graph.minimize(fg.prior, u, [0, 0], name="effort")
-    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.1, lower=0, upper=0, name="motion")
-    graph.constrain(lambda p: np.hypot(p[:, 0] - 1, p[:, 1] - 0.5)[:, None], x[1:], lower=0.4, name="disc")
-    graph.bound(u, lower=-2, upper=2, name="limits")
-    return graph, {x: np.linspace([0, 0, 0], [2, 1, 0], 21), u: np.zeros((20, 2))}, start
 
 
 def with_losses() -> tuple[fg.Graph, dict[fg.Family, Array], fg.Data]:

@@ -625,6 +625,17 @@ class CompiledProblem:
         """Pickle the graph: addresses of machine code mean nothing elsewhere, nor do views of arrays."""
         return compile_graph, (self.graph,)
 
+    def term_named(self, name: str) -> CompiledTerm:
+        """The term of a name.
+
+        Raises:
+            GraphError: there is none.
+        """
+        known = {term.name: term for term in self.terms}
+        if name not in known:
+            raise GraphError(f"no term is called '{name}' (there are: {', '.join(known) or 'none'})", term=name)
+        return known[name]
+
     def row_place(self, row: int) -> tuple[str, int, int]:
         """Term, factor and row of the factor of a constraint row."""
         for name, rows, (_, size) in self.places:

@@ -225,11 +225,7 @@ class Solution:
         Raises:
             GraphError: when no term has that name.
         """
-        for compiled in self._program.terms:
-            if compiled.name == term:
-                return compiled.term.selections
-        known = ", ".join(compiled.name for compiled in self._program.terms) or "none"
-        raise GraphError(f"no term is called '{term}' (there are: {known})", term=term)
+        return self._program.term_named(term).term.selections
 
     def dual(self, name: str) -> Array:
         """Multipliers of a constraint or bound (n, m), or reaction of fixed variables (n, d).

@@ -1,4 +1,4 @@
-"""Why a solve ended, as a sentence."""
+"""Why a solve ended, as a sentence; what is kept of a solve from one of several starts."""
 
 from enum import Enum
 from typing import NamedTuple
