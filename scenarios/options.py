@@ -12,6 +12,7 @@ import dataclasses
 import inspect
 import math
 import re
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ __all__ = [
     "add_options",
     "count",
     "existing",
+    "find_modules_in",
     "leaves",
     "not_negative",
     "option",
@@ -238,6 +240,12 @@ def _numbers(text: str) -> tuple[float, ...]:
         return tuple(float(word) for word in text.split(","))
     except ValueError:
         return ()
+
+
+def find_modules_in(folder: Path) -> None:
+    """Let modules of a folder be imported by name, as a user's own that options name."""
+    if str(folder) not in sys.path:
+        sys.path.insert(0, str(folder))
 
 
 def existing(what: str) -> Text:

@@ -284,13 +284,13 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 30_718, "scenarios": 10_332, "benchmarks": 4_736, "tests": 34_495,
+    "unifg solvers models": 30_718, "scenarios": 10_333, "benchmarks": 4_736, "tests": 34_495,
     "docs examples": 1_776, "unifg/factors": 4_306, "unifg/problem": 3_142, "models": 2_269,
     "unifg/elimination": 2_117, "solvers": 4_914, "unifg/solution": 2_903, "unifg/smoothing": 1_619,
     "unifg/lie": 1_585, "unifg/view": 1_404, "unifg/files": 1_010, "unifg/pose_graphs": 1_036,
     "unifg/horizon": 1_201, "unifg/modeling": 1_067, "unifg/codegen": 1_320, "unifg/plots": 418,
     "scenarios/scenes": 1_274, "scenarios/simulation": 1_150, "scenarios/campaigns": 912,
-    "scenarios/quadrotor": 1_749, "scenarios/ground": 1_133, "scenarios/commands": 589,
+    "scenarios/quadrotor": 1_749, "scenarios/ground": 1_132, "scenarios/commands": 588,
     "scenarios/logs": 492, "scenarios/perception": 745, "scenarios/planning": 623,
 }  # fmt: skip
 # Nodes of syntax a statement: budgets are not met by denser code.

@@ -10,6 +10,7 @@ from types import ModuleType
 
 from unifg.errors import ScenarioError
 from unifg.modeling.model import Model
+from unifg.scenarios.options import find_modules_in
 
 __all__ = ["load_graph"]
 
@@ -39,8 +40,7 @@ def _module(where: str) -> ModuleType:
     """Run a script under its own name, or import a module."""
     script = Path(where)
     folder = script.parent.resolve() if script.suffix == ".py" else Path.cwd()
-    if str(folder) not in sys.path:
-        sys.path.insert(0, str(folder))
+    find_modules_in(folder)
     if script.suffix != ".py":
         try:
             return import_module(where)

@@ -9,7 +9,6 @@ misleading, and ``iterations``, a number for the record.
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass
 from importlib import import_module
@@ -24,6 +23,7 @@ from unifg.horizon import Plan
 from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.options import find_modules_in
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.polyline import arc_lengths
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -210,8 +210,7 @@ def load_planner(name: str, context: PlannerContext) -> PlannerAdapter:
     if not (module_name and colon and class_name):
         example = "benchmarks.baselines.elastic_band:ElasticBand"
         raise ScenarioError(f"unknown planner '{name}': give 'mpc' or MODULE:CLASS, for example {example}")
-    if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
+    find_modules_in(Path.cwd())
     try:
         module = import_module(module_name)
     except ImportError as error:
