@@ -146,7 +146,7 @@ class AugmentedLagrangian(Solver):
         unit = self._scale(primal, run.lin)
         # Goals are for scaled violations, the KKT test and the last resort for those as stated.
         heaviest = LARGEST_PENALTY / min(1.0, float(weights.min(initial=1.0)))
-        least = 0.1 * self.tolerance * min(1.0, float(scale.min(initial=1.0)))
+        least = 0.1 * run.tolerances.violation * min(1.0, float(scale.min(initial=1.0)))
         gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
         exact = self.hessian == "exact" and (len(weights) > 0 or bool(run.program.scalar_terms))
         first, outer, stuck, last = rho, 0, 0, np.inf
@@ -205,7 +205,7 @@ class AugmentedLagrangian(Solver):
                 return ending
             falling = violation <= FALLING * last
             lost = run.has_been_feasible and len(recent) == PATIENCE
-            lost = lost and violation > max(self.tolerance, FALLING * max(recent))
+            lost = lost and violation > max(run.tolerances.violation, FALLING * max(recent))
             last, recent = violation, [*recent, violation][-PATIENCE:]
             stuck = 0 if falling else stuck + 1
             if stuck == PATIENCE and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
@@ -215,7 +215,7 @@ class AugmentedLagrangian(Solver):
                 if len(run.history) - before <= 1 and not stalled:  # so easy that the next one may be harder
                     rho = max(rho, min(rho * self.penalty_growth, LARGEST_EASY))
                 violation_goal = max(min(violation_goal / rho**0.9, FALL * change), least)
-                gradient_goal = max(0.1 * gradient_goal, 0.0 if run.program.least_squares else 0.1 * self.tolerance)
+                gradient_goal = max(0.1 * gradient_goal, 0.0 if run.program.least_squares else run.enough)
             else:
                 if run.lin is here and not falling and (lost or run.infeasible_stationary()):
                     ending = leave(run)
@@ -240,7 +240,7 @@ class AugmentedLagrangian(Solver):
                     gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
                 else:  # falling, as where constraints have no multipliers
                     multipliers = after
-                    gradient_goal = max(0.1 * gradient_goal, 0.1 * self.tolerance)
+                    gradient_goal = max(0.1 * gradient_goal, run.enough)
             if stalled:
                 damping = Damping(self.damping)
         return None
@@ -291,7 +291,7 @@ class AugmentedLagrangian(Solver):
         if run.program.least_squares:  # one subproblem, and no absolute measure of its gradient
             return 0.0, 1.0
         size = largest(primal.gradient(run.lin, multipliers, penalty))
-        return max(min(0.1 * size, 1.0), 0.1 * self.tolerance), float(max(rho**-0.1, 0.1 * self.tolerance))
+        return max(min(0.1 * size, 1.0), run.enough), float(max(rho**-0.1, 0.1 * run.tolerances.violation))
 
     def _stop_rule(self, run: SolveState, step_norm: float) -> bool:
         return step_norm < self.step_tolerance and run.optimality.violation < self.violation_tolerance

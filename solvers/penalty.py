@@ -96,7 +96,7 @@ class Penalty(Solver):
         damping = Damping(self.damping)
         for _ in range(self.inner_iterations):
             gradient = float(np.abs(primal.gradient(run.lin, none, penalty)).max(initial=0.0))
-            if self._violated(run) and gradient <= max(min(1.0, 1.0 / rho), 0.1 * self.tolerance):
+            if self._violated(run) and gradient <= max(min(1.0, 1.0 / rho), run.enough):
                 return False
             taken = damped_step(primal, run.lin, none, penalty, damping)
             if taken is None:
@@ -118,4 +118,4 @@ class Penalty(Solver):
 
     def _violated(self, run: SolveState) -> bool:
         """Test whether the constraints as they are ask for a heavier weight."""
-        return max(run.optimality.violation, run.optimality.complementarity) > self.tolerance
+        return not run.optimality.feasible(run.tolerances)

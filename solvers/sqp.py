@@ -126,7 +126,7 @@ class SQP(Solver):
         now, turning = steps.now, self.hessian == "auto" and self.time_limit == np.inf and self.qp != "elimination"
         alone = program.sided and (run.alone or (not run.watched and self._known(program)))
         rule = self.step_tolerance, self.violation_tolerance
-        steps.prepare(self.tolerance, self.full_steps, self.second_order_correction, self.max_iterations, rule)
+        steps.prepare(self.tolerances, self.full_steps, self.second_order_correction, self.max_iterations, rule)
         if run.alone:
             workspace.begin()
             budget = _budget(watch, 1 if turning else 0) if alone and workspace.compiled else 0
@@ -145,7 +145,7 @@ class SQP(Solver):
                 if turning and converges_slowly(run.history):
                     turning, workspace = False, workspace.curved()
                     self._begin(run, workspace)
-                calls = watch.calls(run.optimality.violation, run.tolerance)
+                calls = watch.calls(run.optimality.violation, run.tolerances.violation)
                 if calls and settle(run, Status.STALLED) is Status.LOCALLY_INFEASIBLE:
                     return Status.LOCALLY_INFEASIBLE
                 if run.status is not None:
@@ -245,7 +245,7 @@ def _noted(run: SolveState, workspace: Subproblems, watch: RestorationTrigger, r
         begun: violations of those from which another step was looked for.
     """
     for violation in begun:
-        watch.calls(violation, run.tolerance)
+        watch.calls(violation, run.tolerances.violation)
     if stepped := run.iterations >= rows:
         workspace.answered()
     return stepped
@@ -260,7 +260,7 @@ def _size(run: SolveState, workspace: Subproblems) -> float:
     """The largest KKT number of the present iterate, in scaled units."""
     program, scaling, measured = run.program, workspace.scaling, run.optimality
     if scaling.neutral:
-        return kkt_size(*measured[:3], run.multipliers)
+        return kkt_size(*measured[:3], measured.slope)
     gradient = program.lagrangian_gradient(run.lin, run.multipliers)[program.columns.free]
     return max(
         largest(scaling.columns * gradient),

@@ -69,7 +69,8 @@ def test_size_of_a_cost_is_a_mean_of_its_curvatures() -> None:
     free, places, ones = np.arange(3), np.arange(3), np.ones(3)
 
     def size(hessian: list[float], gradient: list[float], units: Any = ones, rest: Any = ()) -> float:
-        return float(cost_unit(free, places, np.array(hessian), np.array(rest), np.array(gradient), units))
+        measures = Units(places, free, places, ones, np.ones((5, 3)), ones, units)
+        return float(cost_unit(measures, np.array(hessian), np.array(rest), np.array(gradient)))
 
     assert size([1.0, 100.0, 0.0], [0.0, 0.0, 0.0]) == pytest.approx(10.0)
     assert size([1e-12, 1.0, 1.0], [0.0, 0.0, 0.0]) == pytest.approx(1e-4)  # a tiny regularisation

@@ -8,6 +8,7 @@ import pytest
 import unifg as fg
 from problems.control import Unicycle
 from problems.hock_schittkowski import SMALL
+from unifg.solution.optimality import Tolerances
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.attempt import SECANT_DECAY
 from unifg.solvers.quadratic_programs.scaling import Scaling
@@ -64,7 +65,7 @@ def test_missing_curvature_by_hand() -> None:
     def seen(multiplier: float, step: Array, unit: float, curved: bool = False, before_that: float = 0.0) -> float:
         """Missing curvature, by an attempt that takes the step with this multiplier whatever the merit says."""
         steps, dual = Steps(program), np.array([multiplier])
-        steps.prepare(1e-6, True, False)
+        steps.prepare(Tolerances(1e-6, 1e-6), True, False)
         steps.start(Scaling(program, np.full(2, unit), np.ones(1)), before, dual)
         steps.now["missing"] = before_that
         steps.pose(before, dual, 0.7, 1e-6, False, curved)

@@ -47,7 +47,7 @@ def resume(run: SolveState, status: Status) -> Status | None:
     found = _settled(run)
     if found is None or found[1]:
         return status if found is None else Status.LOCALLY_INFEASIBLE
-    if np.abs(run.program.violation(found[0].constraints)).max(initial=0.0) > run.tolerance:
+    if run.violates(found[0].constraints):
         return status
     run.multipliers = np.zeros(len(run.multipliers))
     run.begin_at(found[0])
@@ -68,9 +68,9 @@ def _settled(run: SolveState) -> tuple[Linearization, bool] | None:
 def nearest(run: SolveState) -> tuple[Linearization, bool]:
     """End of the descent on the violation from the present iterate, and true if nothing near violates less."""
     found = within_bounds(run.program, run.lin)
-    if not infeasible_stationary(run.program, found, run.tolerance):
-        found = least_violation(run.program, found, run.tolerance, run.begin_restoration_step)
-    while infeasible_stationary(run.program, found, run.tolerance):
+    if not infeasible_stationary(run.program, found, run.tolerances.violation):
+        found = least_violation(run.program, found, run.tolerances.violation, run.begin_restoration_step)
+    while infeasible_stationary(run.program, found, run.tolerances.violation):
         lower = _downhill(run, found)
         if lower is None:
             return found, True
@@ -103,7 +103,7 @@ def _downhill(run: SolveState, lin: Linearization) -> Linearization | None:
         start = program.linearize(values)
         if not start.finite or (k == 0 and not _squared(program, start) < (1.0 - LESS) * here):
             continue
-        found = least_violation(program, start, run.tolerance, run.begin_restoration_step, convex=k > 0)
+        found = least_violation(program, start, run.tolerances.violation, run.begin_restoration_step, convex=k > 0)
         if found.finite and _squared(program, found) < (1.0 - LESS) * here:
             return found
     return None

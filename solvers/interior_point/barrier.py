@@ -42,10 +42,9 @@ import numpy as np
 
 from unifg.codegen.function_pointers import linked, parts, run
 from unifg.codegen.jit import compiled
-from unifg.codegen.loops import largest
 from unifg.problem.evaluation import transposed_times
-from unifg.problem.table import BOUND, COLUMN, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
-from unifg.problem.units import SMALL_FORCES, cost_unit, mean_force
+from unifg.problem.table import TermArrays
+from unifg.problem.units import SMALL_FORCES, cost_unit, find_units, mean_force
 from unifg.solvers.interior_point.state import (
     CONVERGED,
     LIMIT_REACHED,
@@ -59,7 +58,6 @@ from unifg.solvers.interior_point.state import (
 )
 from unifg.typing import Array, IntArray
 
-OBJECTIVE = 0  # table.COST
 KAPPA = 50.0  # mu is lowered when the error of the barrier problem is below KAPPA mu
 SOLVED = 50.0  # penalties are looked at when it is below SOLVED mu
 MOST_SHORT_STEPS = 5  # in a row, before equalities become elastic
@@ -71,10 +69,9 @@ MOST_RAISES = 6  # of penalties, tenfold each
 LEAST_PENALTY = 3.0  # times the largest slope of the objective
 WORTH = 0.25  # of the cost at the start: largest first mu
 NOTHING = 1e-20  # of the size of the cost: one that is only rounding
-FAR = 100.0  # from one: largest entry of a row that calls for other units
-SWEEPS = 8
 BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
 FIRST_SLACK = 1e-2  # smallest slack of a cold start
+LEAST_FINER = 1e-4  # of the least mu, where the KKT test asks for more
 WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active has been found
 
 
@@ -136,7 +133,7 @@ def _split(c: float, rho: float, mu: float) -> tuple[float, float]:
 def measure(address: int) -> None:
     """KKT numbers of the problem at the present iterate, and what the error of the barrier problem is made of."""
     concavity, constraint_jacobian, constraints = parts(address, "concavity constraint_jacobian constraints")
-    diagonal, free, full, gradient, hessian = parts(address, "diagonal free full gradient hessian")
+    free, full, gradient, hessian, measures = parts(address, "free full gradient hessian measures")
     multipliers, pairs, penalties = parts(address, "multipliers pairs penalties")
     row_units, rows, scalars, sides, terms = parts(address, "row_units rows scalars sides terms")
     (units,) = parts(address, "units")
@@ -155,21 +152,20 @@ def measure(address: int) -> None:
     for k in range(len(full)):
         full[k] = gradient[k]
     transposed_times(terms, False, constraint_jacobian, multipliers, full)
-    stationarity = force = violation = paid = complementarity = size = 0.0
+    stationarity = violation = paid = complementarity = 0.0
     for column in free:
-        if not abs(full[column]) <= stationarity:  # NaN stays
-            stationarity = abs(full[column])
-        force = max(force, abs(full[column]) * units[column])
+        force = abs(full[column]) * units[column]
+        if not force <= stationarity:  # NaN stays
+            stationarity = force
     for row in range(len(constraints)):
         value, multiplier = constraints[row], multipliers[row]
-        size += abs(multiplier)
         outside = max(value - upper[row], lower[row] - value)
         if not outside <= violation:
             violation = outside
         paid = max(paid, outside * penalties[row])
         if lower[row] != upper[row]:
             limit = upper[row] if multiplier > 0.0 else lower[row]
-            slack = abs(value - limit) if math.isfinite(limit) else 1.0
+            slack = abs(value - limit) if math.isfinite(limit) else row_units[row]
             complementarity = max(complementarity, abs(multiplier) * slack)
     if now.elastic == 0:
         for row in rows:
@@ -180,19 +176,18 @@ def measure(address: int) -> None:
             pz, nz = p * (penalties[row] - multipliers[row]), n * (penalties[row] + multipliers[row])
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
-    now.size = cost_unit(free, diagonal, hessian, concavity, gradient, units)
-    scale = max(min(1.0, now.size), size / max(1, len(constraints)) / 100.0)  # no more than that of the KKT test
-    now.scale, now.stationarity, now.violation = scale, stationarity / scale, violation
-    now.complementarity, now.gap, now.least, now.most = complementarity / scale, gap, least, most
-    now.forces = max(now.size, mean_force(terms, constraint_jacobian, multipliers) / SMALL_FORCES)
-    now.force, now.paid = force / now.forces, paid
+    now.size = cost_unit(measures, hessian, concavity, gradient)
+    now.forces = max(now.size, mean_force(terms, units, constraint_jacobian, multipliers) / SMALL_FORCES)
+    now.stationarity, now.complementarity = stationarity / now.forces, complementarity / now.forces
+    now.violation = violation
+    now.gap, now.least, now.most, now.paid = gap, least, most, paid
 
 
 @compiled
 def _error(now: Any) -> float:
     """Error of the barrier problem, in units of the objective, and so comparable with mu."""
     centring = max(now.most - now.mu, now.mu - now.least) / now.forces
-    error: float = max(max(now.force, now.gap), centring) * now.size
+    error: float = max(max(now.stationarity, now.gap), centring) * now.size
     return error
 
 
@@ -210,74 +205,12 @@ def _forces(
     return pull, push
 
 
-@compiled
-def _far_from_one(terms: TermArrays, jacobian: Array) -> bool:
-    """Test whether some row of the constraint Jacobian has its largest entry far from one."""
-    fields = terms.fields
-    for t in range(len(fields)):
-        term = fields[t]
-        if term[KIND] == OBJECTIVE or term[KIND] == BOUND:
-            continue
-        width, entry = term[WIDTH], term[ENTRY]
-        for _ in range(term[COUNT] * term[ROWS]):
-            size = largest(jacobian, entry, entry + width)
-            if not (FAR > size > 1.0 / FAR or size == 0.0):
-                return True
-            entry += width
-    return False
-
-
-@compiled
-def _find_units(
-    terms: TermArrays, jacobian: Array, row_units: Array, units: Array, row_size: Array, column_size: Array
-) -> None:
-    """Units of rows and unknowns in which the largest entries of the constraint Jacobian are near one (Ruiz 2001).
-
-    They are one where no row has its largest entry far from one, those of fixed variables included.
-    """
-    fields, columns, unknowns = terms.fields, terms.columns, terms.unknown
-    for row in range(len(row_units)):
-        row_units[row] = 1.0
-    for column in range(len(units)):
-        units[column] = 1.0
-    if not _far_from_one(terms, jacobian):
-        return
-    for _ in range(SWEEPS):
-        for row in range(len(row_size)):
-            row_size[row] = 0.0
-        for column in range(len(column_size)):
-            column_size[column] = 0.0
-        for t in range(len(fields)):
-            term = fields[t]
-            if term[KIND] == OBJECTIVE:
-                continue
-            m, width, entry = term[ROWS], term[WIDTH], term[ENTRY]
-            for i in range(term[COUNT]):
-                for a in range(m):
-                    row = term[ROW] + i * m + a
-                    most = 0.0
-                    for d in range(width):
-                        column = columns[term[COLUMN] + i * width + d]
-                        if unknowns[column] >= 0:
-                            size = 1.0 if term[KIND] == BOUND else abs(jacobian[entry + (i * m + a) * width + d])
-                            size *= units[column] / row_units[row]
-                            most = max(most, size)
-                            column_size[column] = max(column_size[column], size)
-                    row_size[row] = most
-        for row in range(len(row_size)):
-            if 0.0 < row_size[row] < math.inf:
-                row_units[row] *= math.sqrt(row_size[row])
-        for column in range(len(column_size)):
-            if 0.0 < column_size[column] < math.inf:
-                units[column] /= math.sqrt(column_size[column])
-
-
 @linked
 def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
     concavity, constraint_jacobian, constraints = parts(address, "concavity constraint_jacobian constraints")
-    diagonal, free, full, gradient, heights = parts(address, "diagonal free full gradient heights")
-    hessian, links = parts(address, "hessian links")
+    free, gradient, heights, hessian = parts(address, "free gradient heights hessian")
+    links, measures = parts(address, "links measures")
     multipliers, pairs, penalties, row_units = parts(address, "multipliers pairs penalties row_units")
     rows, scalars, sides, terms, units = parts(address, "rows scalars sides terms units")
     now = scalars[0]
@@ -293,8 +226,8 @@ def begin(address: int) -> None:
                     count += 1
     now.sides, now.elastic = count, 0 if len(rows) else 1
     if now.scaling == 1:
-        _find_units(terms, constraint_jacobian, row_units, units, penalties, full)
-    size = cost_unit(free, diagonal, hessian, concavity, gradient, units)
+        find_units(terms, measures, now.violation_unit, hessian, concavity, gradient, constraints, constraint_jacobian)
+    size = cost_unit(measures, hessian, concavity, gradient)
     now.cost_unit = 1.0
     if now.scaling == 1:
         now.cost_unit = size
@@ -321,11 +254,11 @@ def begin(address: int) -> None:
             sides[k].y, sides[k].s, sides[k].e = y, c, 0.0
         error = 0.0
         for row in range(len(lower)):
-            error = max(error, max(constraints[row] - upper[row], lower[row] - constraints[row]))
+            error = max(error, max(constraints[row] - upper[row], lower[row] - constraints[row]) / row_units[row])
         if 0.1 * error < WARM_MU:  # else the other numbers make no difference
             run(links[0].measure, (address,))
-            error = max(max(now.stationarity, now.violation), now.complementarity)
-        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * min(1.0, size)
+            error = max(max(now.stationarity, error), now.complementarity)
+        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * size
     mu = now.mu
     for k in range(count):
         row = sides[k].row
@@ -341,7 +274,7 @@ def begin(address: int) -> None:
         sides[k].y, sides[k].s, sides[k].e = y, s, mu / (penalty - y)
         sides[k].ds = sides[k].de = sides[k].dy = 0.0
     theta = merit(now, sides, pairs, penalties, row_units, rows, lower, 0.0, constraints, 0.0)[1]
-    now.theta_small, now.theta_large = 1e-4 * max(1.0, theta), 1e4 * max(1.0, theta)
+    now.theta_small, now.theta_large = 1e-4 * max(1.0, theta), 1e3 * max(1.0, theta)
     now.filtered = now.failures = now.short_steps = 0
     now.delta = now.last_delta = now.step = now.taken = 0.0
     now.estimated = 0
@@ -357,7 +290,7 @@ def begin(address: int) -> None:
 def test(address: int) -> None:
     """Test the iterate; if there is to be a step, lower mu and measure what the line search compares with."""
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
-    full, gradient, kept, links, log = parts(address, "full gradient kept links log")
+    full, gradient, kept, kkt, links, log = parts(address, "full gradient kept kkt links log")
     multipliers, pairs, penalties, row_units = parts(address, "multipliers pairs penalties row_units")
     rows, scalars, sides, terms, values = parts(address, "rows scalars sides terms values")
     now = scalars[0]
@@ -366,19 +299,22 @@ def test(address: int) -> None:
         row[0], row[1], row[2] = now.cost, now.stationarity, now.violation
         row[3], row[4], row[5] = now.complementarity, now.step, now.taken
         row[6], row[7], row[8] = now.mu, now.delta, now.gauss_newton
-    tolerance = now.tolerance
-    worst = max(max(now.stationarity, now.violation), now.complementarity)
+    tolerance, feasible = now.tolerance, now.feasible
+    now.concluded = 0
+    worst = max(max(now.stationarity, now.complementarity), now.gap)
     if not math.isfinite(now.stationarity + now.violation + now.cost):
         now.answer = NOT_FINITE
         return
     guessed = now.cold == 1 and now.iteration == 0 and now.sides > 0  # large multipliers hide forces
-    # Tiny units would let a point pass that is none yet.
-    hidden = max(now.force * now.forces / now.scale, now.gap)
-    if max(worst, hidden) <= tolerance and not guessed:
-        now.answer = CONVERGED
-        return
+    if worst <= tolerance and now.violation <= feasible and not guessed:
+        run(links[0].conclude, (address,))
+        if max(kkt[0], kkt[2]) <= tolerance:
+            now.answer, now.concluded = CONVERGED, 1
+            return
+        now.finer = max(0.1 * now.finer, LEAST_FINER)  # the units at the answer are others
+        run(links[0].measure, (address,))  # it was written over
     # With a larger mu, what is active has not been found, and short steps are those towards another problem's answer.
-    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * min(1.0, now.size):
+    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * now.size:
         if now.violation < now.violation_tolerance:
             now.answer = STOPPED
             return
@@ -389,23 +325,23 @@ def test(address: int) -> None:
     if now.iteration >= now.limit:
         now.answer = LIMIT_REACHED
         return
-    if now.cost < BOTTOMLESS * now.cost_unit and now.violation > tolerance:
+    if now.cost < BOTTOMLESS * now.cost_unit and now.violation > feasible:
         now.answer = STALLED  # no penalty holds back an objective that falls faster than violation grows
         return
-    if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violation > tolerance:
+    if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violation > feasible:
         run(links[0].relax, (address,))
-    smallest = 0.1 * tolerance * min(1.0, now.size)
+    smallest = 0.1 * tolerance * now.finer * now.size
     bound = False
-    if _error(now) <= SOLVED * now.mu and now.violation > tolerance:
+    if _error(now) <= SOLVED * now.mu and now.violation > feasible:
         # Whether something is violated because its penalty is too low, or because it has to be. With the least mu that
         # is told by a solved problem: a step before, equalities without a penalty may still be on their way.
         bound = now.mu <= smallest and _error(now) <= tolerance * now.size
         if now.mu <= LATE_MU * min(now.paid, now.rho):
             for k in range(now.sides):
-                bound = bound or (sides[k].y > AT_PENALTY * penalties[sides[k].row] and sides[k].e > tolerance)
+                bound = bound or (sides[k].y > AT_PENALTY * penalties[sides[k].row] and sides[k].e > feasible)
             for k in range(len(rows) if now.elastic == 1 else 0):
                 row, away = rows[k], max(pairs[k].p, pairs[k].n)
-                bound = bound or (abs(multipliers[row]) > AT_PENALTY * penalties[row] and away > tolerance)
+                bound = bound or (abs(multipliers[row]) > AT_PENALTY * penalties[row] and away > feasible)
         if bound:
             pull, push = _forces(terms, free, gradient, multipliers, constraint_jacobian, full)
             run(links[0].measure, (address,))  # it was written over
@@ -422,12 +358,12 @@ def test(address: int) -> None:
                 penalties[row] *= 10.0
             now.paid *= 10.0
             run(links[0].relax, (address,))
-    if now.violation <= tolerance and now.mu <= smallest and _error(now) <= now.mu:
+    if now.violation <= feasible and now.mu <= smallest and _error(now) <= now.mu:
         # All is done that can be done at these penalties. A multiplier near its own lets a row give way by
         # mu / (penalty - multiplier): no violation that counts, but too much for complementarity.
         near = False
         for k in range(now.sides):
-            near = near or sides[k].y * sides[k].e > tolerance * now.scale
+            near = near or sides[k].y * sides[k].e > tolerance * now.forces
         if near:
             if now.raises >= MOST_RAISES:
                 now.answer = STALLED
@@ -490,4 +426,4 @@ def relax(address: int) -> None:
         pairs[k].p, pairs[k].n, pairs[k].dp, pairs[k].dn = p, n, 0.0, 0.0
     run(links[0].measure, (address,))
     theta = merit(now, sides, pairs, penalties, row_units, rows, terms.lower, 0.0, constraints, 0.0)[1]
-    now.theta_large = max(now.theta_large, 1e4 * max(1.0, theta))
+    now.theta_large = max(now.theta_large, 1e3 * max(1.0, theta))

@@ -13,6 +13,7 @@ from unifg.problem.evaluation import add_constraints, times, transposed_times
 from unifg.solvers.interior_point.state import AGAIN, EXAMINED, NO, SINGULAR, TRY, UNKNOWN, YES
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
+LEAST_SHIFT = 1e-8  # less leaves singular arcs without any curvature
 DUAL_SHIFT = 1e-11
 SHORT = 0.01  # length of a step
 LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
@@ -71,12 +72,12 @@ def direct(address: int) -> None:
                 continue
         if delta == 0.0:
             last = now.last_delta
-            delta = FIRST_SHIFT if last == 0.0 else max(1e-12, last / SHIFT_DECAY)
+            delta = FIRST_SHIFT if last == 0.0 else max(LEAST_SHIFT, last / SHIFT_DECAY)
         else:
             delta *= FIRST_GROWTH if now.last_delta == 0.0 else SHIFT_GROWTH
         if delta > LARGEST_SHIFT:
             now.answer = SINGULAR
-            if now.elastic == 0 and now.violation > now.tolerance:
+            if now.elastic == 0 and now.violation > now.feasible:
                 run(links[0].relax, (address,))
                 now.answer = AGAIN
             return
@@ -111,18 +112,16 @@ def examine(address: int) -> None:
     Where it is, less of the second derivatives is more curvature. Where it is not, as with a cost that is no square,
     they are the only curvature of some direction, which would be left to the barrier alone.
     """
-    data, free, hessian, links, plan = parts(address, "data free hessian links plan")
-    rows, scalars, shift, units = parts(address, "rows scalars shift units")
+    data, free, hessian, links, measures = parts(address, "data free hessian links measures")
+    plan, rows, scalars, shift, units = parts(address, "plan rows scalars shift units")
     now = scalars[0]
-    share, largest, least = now.share, 0.0, math.inf
-    for entry in hessian:
-        largest = max(largest, abs(entry))
-    for place in free:
-        least = min(least, units[place])
+    share, largest, diagonal = now.share, 0.0, measures.diagonal
+    for k in range(len(free)):
+        largest = max(largest, abs(hessian[diagonal[k]]) * units[free[k]] ** 2)
     now.share, now.definite = 0.0, EXAMINED
     run(links[0].assemble, (address,))
     for k in range(len(free)):
-        shift[k] = -FLAT * largest * (least / units[free[k]]) ** 2
+        shift[k] = -FLAT * largest / units[free[k]] ** 2
     definite = largest > 0.0 and holds(links[0].factor, (plan, data, shift)) and plan.state[NEGATIVE] == len(rows)
     now.share, now.definite = share, YES if definite else NO
 

@@ -119,8 +119,8 @@ def solve_each(address: int) -> None:
         for i in range(len(multipliers)):
             given.found_multipliers[k, i] = multipliers[i]
         finite, answer = kkt[4] > 0.0, state.answer
-        worst = max(max(kkt[0], kkt[1]), kkt[2])
-        if finite and worst <= state.tolerance and state.suspicion <= SUSPICIOUS:
+        met = max(kkt[0], kkt[2]) <= state.tolerance and kkt[1] <= state.feasible
+        if finite and met and state.suspicion <= SUSPICIOUS:
             answer = CONVERGED
         elif not finite:
             answer = NOT_FINITE

@@ -135,6 +135,7 @@ def reset(address: int) -> None:
     steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
     now = scalars[0]
     now.asked, now.iteration, now.kept, now.raises, now.definite = 0.0, 0, 0, 0, UNKNOWN
+    now.finer, now.concluded = 1.0, 0
     now.evaluating = now.solving = now.judging = 0.0
     fill(row_units, 1.0)
     fill(units, 1.0)
@@ -157,14 +158,16 @@ def conclude(address: int) -> None:
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
     full, gradient, kkt, links, multipliers = parts(address, "full gradient kkt links multipliers")
     scalars, steepest_gradient, terms = parts(address, "scalars steepest_gradient terms")
-    (steepest_jacobian,) = parts(address, "steepest_jacobian")
+    concavity, final, hessian, steepest_jacobian = parts(address, "concavity final hessian steepest_jacobian")
     now = scalars[0]
+    if now.concluded == 1:
+        return
     began = seconds(now.clock)
     run(links[0].raise_slopes, (constraint_jacobian, gradient, steepest_jacobian, steepest_gradient))
     arrays = multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
-    judged = terms, free, gradient, constraints, constraint_jacobian, multipliers, full, kkt
-    run(links[0].kkt_numbers, judged)
+    derivatives = hessian, concavity, gradient, constraints, constraint_jacobian
+    run(links[0].kkt_numbers, (terms, final, now.violation_unit, *derivatives, multipliers, full, kkt))
     now.judging += seconds(now.clock) - began
 
 
@@ -288,7 +291,19 @@ def addresses(robust: bool, general: bool) -> Records:
     )
     rows, gradient, free = kinds["constraint_jacobian"], kinds["gradient"], kinds["free"]
     links[0]["kkt_numbers"] = link(
-        kkt_numbers, NOTHING, terms, free, gradient, constraints, rows, constraints, gradient, kinds["kkt"]
+        kkt_numbers,
+        NOTHING,
+        terms,
+        kinds["final"],
+        NUMBER,
+        kinds["hessian"],
+        kinds["concavity"],
+        gradient,
+        constraints,
+        rows,
+        constraints,
+        gradient,
+        kinds["kkt"],
     )
     links[0]["raise_slopes"] = link(raise_slopes, NOTHING, rows, gradient, rows, gradient)
     links[0]["size_of"] = link(size_of, NUMBER, constraints, rows, gradient, free, NUMBER)

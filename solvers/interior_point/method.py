@@ -28,7 +28,7 @@ from unifg.solution.batch import Outcomes
 from unifg.solution.export import Exported
 from unifg.solution.history import Iteration
 from unifg.solution.multipliers import SUSPICIOUS, Slopes
-from unifg.solution.optimality import Optimality, optimality, read_numbers
+from unifg.solution.optimality import Optimality, Tolerances, optimality, read_numbers
 from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
@@ -176,7 +176,7 @@ class InteriorPoint(Solver):
             reason = self._attempt(run, workspace)
             if now["answer"] not in STUCK or run.status not in (None, Status.ITERATION_LIMIT):
                 return reason
-            if run.optimality.violation <= run.tolerance:
+            if run.optimality.violation <= run.tolerances.violation:
                 return reason
             found = run.lin
             if not run.has_been_feasible and self.restoration:
@@ -189,7 +189,7 @@ class InteriorPoint(Solver):
                 return reason
             if now["answer"] == state.VIOLATED:  # the penalty was too low
                 now["going_on"] = 1
-            elif run.has_been_feasible or _largest(run.program.violation(found.constraints)) <= run.tolerance:
+            elif run.has_been_feasible or not run.violates(found.constraints):
                 workspace.begin_at(run.least_violated.flat if run.has_been_feasible else found.values.flat, self)
                 restarts += 1
             else:
@@ -239,10 +239,10 @@ class InteriorPoint(Solver):
             lin, multipliers, iterations = workspace.found(), work.multipliers.copy(), now["iteration"]
             history = _history(work.log[: iterations + 1].copy(), lin, run.seconds)
             workspace.call("conclude")
-            if now["kept"] and now["violation"] > run.tolerance:
+            if now["kept"] and now["violation"] > run.tolerances.violation:
                 run.begin_at(program.linearize(program.columns.view(work.kept.copy())))
-            measured = workspace.judged(lin, multipliers, run.tolerance)
-            sound = ending is Status.STOP_RULE or measured.passes(run.tolerance)
+            measured = workspace.judged(lin, multipliers, run.tolerances)
+            sound = ending is Status.STOP_RULE or measured.passes(run.tolerances)
             slopes = None
             if not sound or now["suspicion"] > SUSPICIOUS:
                 slopes = Slopes(program, work.steepest_jacobian, work.steepest_gradient)
@@ -294,7 +294,8 @@ class Workspace:
         )
         self._answer = LinearizationMemory(program)
         arrays_of: dict[str, Any] = {name.replace("sizes", "norms"): a for name, a in self._answer.arrays.items()}
-        self.work = self.work._replace(**arrays_of)
+        measures = program.unit_memory()
+        self.work = self.work._replace(**arrays_of, row_units=measures.rows, units=measures.unknowns)
         self.problem = Problem(
             np.zeros(1, state.LINKS),
             program.arrays,
@@ -306,8 +307,9 @@ class Workspace:
             arrays.rows,
             arrays.entries,
             doubles,
-            program.normal.diagonal,
             np.array([self._unequal(row) for row in program.arrays.fields], dtype=np.int64),
+            measures,
+            program.unit_memory(),
         )
         self._describe()
         require_second(program)
@@ -360,15 +362,16 @@ class Workspace:
             self._describe()
         work, now, self._taken, self.compiled = self.work, self.now, None, 0.0
         # The test of least squares has no absolute tolerance.
-        tolerance = options.tolerance
-        now["tolerance"] = 0.0 if self.program.least_squares else tolerance
+        kkt, violation = options.tolerances
+        now["tolerance"] = 0.0 if self.program.least_squares else kkt
+        now["feasible"], now["violation_unit"] = violation, options.tolerances.violation_unit
         now["scaling"], now["assisted"] = bool(options.scaling), not self.program.fully_compiled
         now["step_tolerance"] = options.step_tolerance
         now["violation_tolerance"], now["clocked"] = (
             options.violation_tolerance,
             clocked or options.time_limit < np.inf,
         )
-        now["keeping"] = max(tolerance, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
+        now["keeping"] = max(violation, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         self.call("reset")
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
         self.begin_at(values, options)
@@ -399,7 +402,8 @@ class Workspace:
         words = each.instances.describe(arguments)
         found = arguments.found, arguments.found_multipliers, arguments.numbers
         fields, links = program.table.fields, (arguments.functions, problem.links)
-        blank = [array for array in (*work, problem.scratch, problem.plan.numbers) if array is not work.scalars]
+        memory = problem.scratch, problem.plan.numbers, *problem.measures[-4:], *problem.final[-4:]
+        blank = [array for array in (*work, *memory) if array is not work.scalars]
         addressing = words, self._words, *links, problem.retraction, fields, problem.terms.parts, work.scalars
         widest, scratch = int(fields[:, KERNEL_WIDTH].max()), program.table.scratch
         room = 6 * widest**2 + 8 * scratch + len(work.constraint_jacobian) + len(work.multipliers)
@@ -428,10 +432,10 @@ class Workspace:
             self.call("split")
         return self._answer.copied(self.now["cost"])
 
-    def judged(self, lin: Linearization, multipliers: Array, tolerance: float) -> Optimality:
+    def judged(self, lin: Linearization, multipliers: Array, tolerances: Tolerances) -> Optimality:
         """KKT numbers at the last iterate, which compiled code has found unless it does not know them all."""
         if self.program.differenced:
-            return optimality(self.program, lin, multipliers, tolerance)
+            return optimality(self.program, lin, multipliers, violation_unit=tolerances.violation_unit)
         return read_numbers(self.work.kkt, lin.cost)
 
     def take(self, lin: Linearization) -> None:
@@ -462,10 +466,6 @@ def _history(log: Array, lin: Linearization, seconds: float) -> Callable[[], lis
         return made
 
     return rows
-
-
-def _largest(violation: Array) -> float:
-    return float(np.abs(violation).max(initial=0.0))
 
 
 def _details(mu: float, delta: float, gauss_newton: float) -> dict[str, float | int | str]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from unifg.elimination.plan import Plan
 from unifg.problem.table import TermArrays
+from unifg.problem.units import Units
 from unifg.solution.optimality import NUMBERS
 from unifg.typing import Array, IntArray
 
@@ -36,8 +37,8 @@ NOW = np.dtype(
         ("gap", np.float64),  # largest |h| and |c + e - s|
         ("least", np.float64),  # smallest product of a slack and its multiplier
         ("most", np.float64),  # largest
-        ("scale", np.float64),  # of stationarity and complementarity
-        ("forces", np.float64),  # the same whatever the units of the rows
+        ("forces", np.float64),  # what stationarity and complementarity are relative to
+        ("finer", np.float64),  # share of the least mu
         ("step", np.float64),  # norm of the last step taken
         ("taken", np.float64),  # its length
         ("trial_cost", np.float64),
@@ -46,13 +47,14 @@ NOW = np.dtype(
         ("saved_dual", np.float64),
         ("asked", np.float64),  # penalty at which it was asked whether the violation is the least
         ("paid", np.float64),  # largest violation of a row times its penalty
-        ("force", np.float64),  # stationarity in the units of the unknowns
         ("share", np.float64),  # of the second derivatives in the KKT matrix
         ("cost_unit", np.float64),  # what the objective is measured in: its size at the start
         ("size", np.float64),  # of the objective at the present iterate
         ("step_tolerance", np.float64),  # norm of a full step below which to stop, once the violation is small enough
         ("violation_tolerance", np.float64),
         ("suspicion", np.float64),  # size of the multipliers, as :mod:`unifg.solution.multipliers` has it
+        ("feasible", np.float64),  # tolerance of the violation
+        ("violation_unit", np.float64),  # that of the tolerance of violation relative to the other
         ("keeping", np.float64),  # violation up to which an iterate counts as one that keeps all constraints
         ("evaluating", np.float64),  # seconds of the solve in terms and their derivatives
         ("solving", np.float64),  # in linear systems
@@ -76,6 +78,7 @@ NOW = np.dtype(
         ("elastic", np.int64),  # whether equalities are elastic, as inequalities always are
         ("going_on", np.int64),  # whether slacks and multipliers are there: the solve goes on where it was
         ("clocked", np.int64),  # whether to ask before every direction if there is time for it
+        ("concluded", np.int64),  # whether the present iterate has been judged
         ("kept", np.int64),  # whether an iterate kept all constraints
         ("short_steps", np.int64),  # in a row
         ("scaling", np.int64),  # whether units are to be found
@@ -146,8 +149,9 @@ class Problem(NamedTuple):
         rows: (E,) equality rows.
         entries: entries of the constraint Jacobian behind those of the Hessian in ``Work.data``.
         doubles: (D, 2) places in ``Work.data`` that mean one entry of the matrix: the second is added to the first.
-        diagonal: (n,) places of the diagonal among the entries of the Hessian.
         unequal: (T,) whether a term has inequality rows.
+        measures: units of the solve, found at its start.
+        final: those of the KKT test, found at the answer.
     """
 
     links: Records
@@ -160,8 +164,9 @@ class Problem(NamedTuple):
     rows: IntArray
     entries: IntArray
     doubles: IntArray
-    diagonal: IntArray
     unequal: IntArray
+    measures: Units
+    final: Units
 
 
 class Work(NamedTuple):
@@ -172,7 +177,7 @@ class Work(NamedTuple):
         sides: (2 M,) one for each finite limit of an inequality row.
         pairs: (E,) one for each equality row.
         penalties: (M,) of the elastic variables of a row.
-        row_units, units: (M,) what a row, and (width,) what an unknown, is measured in.
+        row_units, units: (M,) what a row, and (width,) what an unknown, is measured in: those of ``measures``.
         kept: stored values of the last iterate that kept all constraints.
         values, trial: stored values of the present iterate and of a trial.
         move: (n,) tangent step to the trial.

@@ -22,6 +22,7 @@ from unifg.codegen.loops import copy_to, dot
 from unifg.problem.evaluation import times, transposed_times
 from unifg.problem.linearization import all_finite
 from unifg.problem.table import TermArrays
+from unifg.problem.units import Units
 from unifg.solution.optimality import NUMBERS
 from unifg.solvers.globalize.line_search import SHORTEST
 from unifg.solvers.globalize.merit import ARMIJO
@@ -74,6 +75,7 @@ NOW = np.dtype(
         ("scaling", np.int64),  # whether units may be needed
         ("step_tolerance", np.float64),
         ("violation_tolerance", np.float64),
+        ("feasible", np.float64),  # tolerance of the violation
         ("clock", np.int64),  # address of the clock, 0 for none
     ]
 )
@@ -108,6 +110,7 @@ class Problem(NamedTuple):
         bounded: places of stored values with a bound.
         bounds: the row of each of them.
         units: patterns that units are found from.
+        measures: units of the KKT test.
     """
 
     links: IntArray
@@ -123,6 +126,7 @@ class Problem(NamedTuple):
     bounded: IntArray
     bounds: IntArray
     units: Patterns
+    measures: Units
 
 
 LINKED = ("minimize", "retract", "evaluate", "evaluate_scalars", "linearize", "add_scalars", "find_units")

@@ -19,7 +19,6 @@ from unifg.solution.multipliers import raise_slopes
 from unifg.solution.optimality import kkt_numbers
 from unifg.solution.solver import UNBOUNDED_COST
 from unifg.solvers.globalize.merit import FARTHEST
-from unifg.solvers.globalize.norms import total
 from unifg.solvers.quadratic_programs.attempt import (
     FIND_UNITS,
     LOGGED,
@@ -58,7 +57,7 @@ def loop(address: int) -> None:
             return
     while True:
         if now.alone == 1:
-            size = kkt_size(work.kkt[0], work.kkt[1], work.kkt[2], work.multipliers)
+            size = kkt_size(work.kkt[0], work.kkt[1], work.kkt[2], work.kkt[5] / work.kkt[6])
             now.accuracy = useful_accuracy(False, size, now.tolerance, 1.0)
             now.damping, now.stage = max(now.next_damping, now.missing), POSED
             if now.logged > 0:
@@ -135,8 +134,8 @@ def _record(problem: Problem, work: Work, shown: bool) -> bool:
     now, kkt, log = work.scalars[0], work.kkt, work.log
     raise_slopes(work.next_jacobian, work.next_gradient, work.steepest_jacobian, work.steepest_gradient)
     kkt_numbers(
-        problem.terms, problem.free, work.next_gradient, work.next_constraints, work.next_jacobian, work.multipliers,
-        work.full, kkt,
+        problem.terms, problem.measures, now.feasible / now.tolerance, work.next_hessian, work.concavity,
+        work.next_gradient, work.next_constraints, work.next_jacobian, work.multipliers, work.full, kkt,
     )  # fmt: skip
     finite = kkt[4] != 0.0 and math.isfinite(now.next_cost)
     if not finite:
@@ -153,14 +152,14 @@ def _record(problem: Problem, work: Work, shown: bool) -> bool:
             at += 1
     now.logged += 1
     sound = finite and now.next_cost >= UNBOUNDED_COST and kkt[0] < np.inf
-    return sound and max(kkt[0], kkt[1], kkt[2]) > now.tolerance and now.iteration < now.limit
+    met = max(kkt[0], kkt[2]) <= now.tolerance and kkt[1] <= now.feasible
+    return sound and not met and now.iteration < now.limit
 
 
 @compiled
-def kkt_size(stationarity: float, violation: float, complementarity: float, multipliers: Array) -> float:
-    """The largest KKT number, with the stationarity as it is before it is scaled by the multipliers."""
-    scale = max(1.0, total(multipliers) / max(len(multipliers), 1) / 100.0)
-    return max(scale * stationarity, violation, complementarity)
+def kkt_size(stationarity: float, violation: float, complementarity: float, slope: float) -> float:
+    """The largest KKT number, with the stationarity as a gradient of the Lagrangian."""
+    return max(slope * stationarity, violation, complementarity)
 
 
 @compiled

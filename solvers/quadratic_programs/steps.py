@@ -18,7 +18,7 @@ from unifg.problem.retraction import retract_parts
 from unifg.problem.scalars import add_scalars, evaluate_scalars
 from unifg.problem.snapshot import LinearizationMemory
 from unifg.solution.history import Iteration
-from unifg.solution.optimality import read_numbers
+from unifg.solution.optimality import Tolerances, read_numbers
 from unifg.solution.solver import SolveState
 from unifg.solvers.interior_point.state import Fields
 from unifg.solvers.quadratic_programs.attempt import (
@@ -107,7 +107,7 @@ class Steps:
 
     def prepare(
         self,
-        tolerance: float,
+        tolerances: Tolerances,
         full_steps: bool,
         correcting: bool,
         limit: int = 0,
@@ -116,7 +116,7 @@ class Steps:
         """Begin a solve with the present data.
 
         Args:
-            tolerance: of the KKT test.
+            tolerances: of the KKT test.
             full_steps: whether every step is taken in full.
             correcting: whether to ask for second-order corrections.
             limit: iterations before giving up.
@@ -128,7 +128,8 @@ class Steps:
                 self._describe()
             self._held = program.equality
         now["assisted"] = self._assisted = program.large or not program.fully_compiled
-        now["tolerance"], now["least_squares"] = tolerance, program.least_squares
+        now["tolerance"], now["feasible"] = tolerances
+        now["least_squares"] = program.least_squares
         now["full_steps"], now["correcting"], now["limit"], self.pending = full_steps, correcting, limit, False
         now["step_tolerance"], now["violation_tolerance"] = stop
 
@@ -182,6 +183,7 @@ class Steps:
         optimality = run.optimality
         self._load(run.lin, run.multipliers)
         self.work.kkt[:3] = optimality.stationarity, optimality.violation, optimality.complementarity
+        self.work.kkt[5:] = optimality.size, optimality.unit
         return self._run_alone(run, POSED, budget)
 
     def _run_alone(self, run: SolveState, stage: int, budget: int) -> list[float]:
@@ -204,7 +206,7 @@ class Steps:
         log, (values, constraints, multipliers) = self._log[:count].copy(), self._parts
         heads, last, number = log[:, :NUMBERED].tolist(), log[-1], len(run.history) - 1
         measured = read_numbers(work.kkt, heads[-1][COST])
-        if not measured.holds(run.tolerance):
+        if not measured.holds(run.tolerances):
             for head, row in zip(heads[:-1], log, strict=False):
                 number += int(head[SHOWN])  # what is not shown takes the place of the one before
                 run.pass_by(number, head[VIOLATION], head[COST], row[constraints], row[values], row[multipliers])
@@ -344,4 +346,5 @@ def _problem(program: CompiledProblem, work: Work) -> Problem:
     return Problem(
         np.array(links), terms, system, program.normal.diagonal, program.equality, retraction.parts, free,
         retraction.fixed, retraction.fixed_values, scratch, program.bounded, np.flatnonzero(program.bound_rows), units,
+        program.unit_memory(),
     )  # fmt: skip

@@ -109,6 +109,15 @@ class Columns:
         return Values(self, flat)
 
     @cached_property
+    def coordinates(self) -> IntArray:
+        """(width,) number of the coordinate of a family that each column belongs to."""
+        each, first = [np.zeros(0, dtype=np.int64)], 0
+        for family in self.families:
+            each.append(first + np.tile(np.arange(family.manifold.dim), family.count))
+            first += family.manifold.dim
+        return np.concatenate(each)
+
+    @cached_property
     def extents(self) -> tuple[IntArray, IntArray, IntArray]:
         """For every tangent coordinate, found once, what the numbers are whose largest is its size.
 

@@ -40,6 +40,7 @@ from unifg.problem.systems import Systems
 from unifg.problem.table import ENTRY, PARAMETER, POSITION, ROW, WIDTH, TermArrays, TermTable
 from unifg.problem.term import CompiledTerm
 from unifg.problem.thread_partition import Shares
+from unifg.problem.units import Units, unit_memory
 from unifg.problem.verification import Verification
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -452,6 +453,11 @@ class CompiledProblem:
                     cost += sum(float(term.residual(values).sum()) for term in general)
                     self.python_seconds += perf_counter() - began
         return Evaluation(cost, constraints)
+
+    def unit_memory(self) -> Units:
+        """Units of one, with memory to find others at a point (:mod:`unifg.problem.units`)."""
+        table = self.table
+        return unit_memory(self.columns, self.normal.diagonal, table.blocks, table.constraints)
 
     def linearize(self, values: Mapping[Family, Array], search: bool = False) -> Linearization:
         """Everything a backend needs at ``values``; with ``search``, by search Jacobians where a residual has one."""

@@ -113,6 +113,7 @@ class TermTable:
         scalars: number of factors of costs that are no squares.
         constraints: number of constraint rows.
         entries, constraint_entries: lengths of the stacked Jacobians.
+        blocks: rows of one factor times its columns, of all constraints but bounds.
         sizes: lengths of the stacked residual, its Jacobian, the stacked constraints and theirs.
         scratch: how many numbers the loops need for one factor.
         differenced: whether the Jacobian of any term is made of differences.
@@ -200,6 +201,7 @@ class TermTable:
             else:
                 self._take(term)
         self.holding = HELD in fields[:, LOSS]
+        self.blocks = int((fields[:, ROWS] * fields[:, WIDTH])[fields[:, KIND] == CONSTRAINT].sum())
         self.sizes = self.residuals, self.entries, self.constraints, self.constraint_entries
         counts = fields[:, COUNT]
         self._active_starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)

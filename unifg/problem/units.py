@@ -1,39 +1,84 @@
-"""Size of an objective and of the forces of its constraints: units in which a solve goes the same way for any cost."""
+"""Units of unknowns, constraint rows and cost in which a solve goes the same way, whatever units a graph is written in.
+
+A block is the part of a constraint row that belongs to one coordinate of a family, over all factors of a term. With a
+its largest entry, u the unit of the coordinate, r that of the row and k that of the cost, whose largest curvature along
+the coordinate is h, the logarithms of the units minimise
+
+    sum (log a + log u - log r)^2 + sum (log h + 2 log u - log k)^2
+
+(Curtis and Reid, IMA J. Appl. Math. 10, 1972). The sum has no other constants in it, so multiplying rows, unknowns or
+the cost by a number multiplies their units by the same. One degree of freedom is left: the rows are in the mean
+measured in what the tolerance of their violation is relative to that of the other conditions; without constraints but
+bounds, unknowns in the distances to these.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
+
+import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.codegen.loops import largest
-from unifg.problem.table import BOUND, COST, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.problem.columns import Columns
+from unifg.problem.table import BOUND, COLUMN, CONSTRAINT, COST, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
 from unifg.typing import Array, IntArray
+
+
+class Units(NamedTuple):
+    """Units of unknowns and rows, and where to find what they are made of.
+
+    Attributes:
+        coordinates: (width,) number of the coordinate of a family that each column belongs to.
+        free: (n,) columns that are unknown.
+        diagonal: (n,) places of their curvatures among the entries of the Hessian.
+        blocks, sums: memory.
+        rows: (M,) units of the constraint rows.
+        unknowns: (width,) of the unknowns.
+    """
+
+    coordinates: IntArray
+    free: IntArray
+    diagonal: IntArray
+    blocks: Array
+    sums: Array
+    rows: Array
+    unknowns: Array
+
+
+def unit_memory(columns: Columns, diagonal: IntArray, blocks: int, rows: int) -> Units:
+    """Units of one, and memory to find others."""
+    coordinates, count = columns.coordinates, sum(family.manifold.dim for family in columns.families)
+    memory = np.empty(blocks), np.empty((5, count))
+    return Units(coordinates, columns.free, diagonal, *memory, np.ones(rows), np.ones(columns.width))
+
 
 LARGE_PULL = 1e3  # times the curvatures: slopes of the cost from which on it is they that count
 LEAST_SHARE = 1e-4  # of the largest curvature, below which a mean of all is not believed
+UNIT, CURVATURE, POWER, TOTAL, WEIGHT = range(5)  # rows of memory for each coordinate
+SWEEPS = 10  # of the minimisation, one variable after the other
+SMALLEST = -14.0  # logarithm of the entry of a block, in its units, below which it counts as zero
+MODEST = 4.6  # logarithm of a hundred
 SMALL_FORCES = 100.0  # times the cost: multipliers from which on it is they that count
 
 
 @compiled
-def cost_unit(
-    free: IntArray, diagonal: IntArray, hessian: Array, concavity: Array, gradient: Array, units: Array
-) -> float:
+def cost_unit(units: Units, hessian: Array, concavity: Array, gradient: Array) -> float:
     """Geometric mean of the magnitudes of the curvatures of the cost along the unknowns.
 
     Where nothing is curved it is that of the largest slope and of the sum of all. Slopes far above curvatures count,
     too, and a mean far below the largest curvature does not. One where the cost has neither.
 
     Args:
-        free: (n,) columns that are unknown.
-        diagonal: (n,) places of their curvatures among the entries of the Hessian.
+        units: of the unknowns.
         hessian: entries of that of Gauss-Newton.
         concavity: what the second derivatives of scalar costs add to them; empty without such costs.
         gradient: (width,) of the cost.
-        units: (width,) of the unknowns.
     """
+    free, diagonal = units.free, units.diagonal
     logarithms, product, count, pull, slopes, steepest = 0.0, 1.0, 0, 0.0, 0.0, 0.0
     for k in range(len(free)):
-        unit = units[free[k]]
+        unit = units.unknowns[free[k]]
         slope = abs(gradient[free[k]]) * unit
         pull, slopes = max(pull, slope), slopes + slope
         curvature = abs(hessian[diagonal[k]] + (concavity[diagonal[k]] if len(concavity) else 0.0))
@@ -54,18 +99,207 @@ def cost_unit(
 
 
 @compiled
-def mean_force(terms: TermArrays, entries: Array, multipliers: Array) -> float:
+def find_units(
+    terms: TermArrays,
+    units: Units,
+    violation_unit: float,
+    hessian: Array,
+    concavity: Array,
+    gradient: Array,
+    constraints: Array,
+    jacobian: Array,
+) -> None:
+    """Write the units of the module's docstring.
+
+    Args:
+        terms: of the program.
+        units: which are written.
+        violation_unit: tolerance of the violation over that of the other conditions.
+        hessian: of the cost, as for :func:`cost_unit`.
+        concavity: the same.
+        gradient: the same.
+        constraints: (M,) values.
+        jacobian: entries of their Jacobian.
+    """
+    coordinates, blocks, sums = units.coordinates, units.blocks, units.sums
+    row_units, unknowns = units.rows, units.unknowns
+    fields = terms.fields
+    _log_blocks(terms, jacobian, blocks)
+    _log_curvatures(units, hessian, concavity, gradient)
+    for k in range(2 * SWEEPS):
+        _sweep(terms, coordinates, blocks, sums, row_units, k == SWEEPS)
+    count = 0
+    for k in range(sums.shape[1]):
+        if sums[WEIGHT, k] > 0.0:
+            sums[TOTAL, count], count = sums[UNIT, k], count + 1
+    middle = _middle(sums[TOTAL], count)
+    far = count > 0 and max(sums[TOTAL, count - 1] - middle, middle - sums[TOTAL, 0]) > MODEST
+    for k in range(sums.shape[1]):
+        if not far or sums[WEIGHT, k] == 0.0:
+            sums[UNIT, k] = middle
+    count, first = 0, 0
+    for t in range(len(fields)):
+        if fields[t, KIND] == CONSTRAINT:
+            for row in range(fields[t, ROW], fields[t, ROW] + fields[t, ROWS]):
+                row_units[row] = -math.inf
+                for d in range(fields[t, WIDTH]):
+                    unit = sums[UNIT, coordinates[terms.columns[fields[t, COLUMN] + d]]]
+                    row_units[row] = max(row_units[row], blocks[first + d] + unit)
+                first += fields[t, WIDTH]
+                if row_units[row] > -math.inf:
+                    blocks[count], count = row_units[row], count + 1
+    middle = _middle(blocks, count)
+    far = far or (count > 0 and max(blocks[count - 1] - middle, middle - blocks[0]) > MODEST)
+    shift = math.log(violation_unit) - middle if count > 0 else _bounded(terms, constraints, coordinates, sums)
+    for column in range(len(unknowns)):
+        unknowns[column] = math.exp(sums[UNIT, coordinates[column]] + shift)
+    for t in range(len(fields)):
+        term = fields[t]
+        first, m = term[ROW], term[ROWS]
+        for row in range(first, first + term[COUNT] * m):
+            if term[KIND] == BOUND:
+                row_units[row] = unknowns[terms.columns[term[COLUMN] + row - first]]
+            elif term[KIND] == CONSTRAINT and row >= first + m:
+                row_units[row] = row_units[row - m]
+            elif term[KIND] == CONSTRAINT:
+                row_units[row] = math.exp((row_units[row] if far and row_units[row] > -math.inf else middle) + shift)
+
+
+@compiled
+def _middle(numbers: Array, count: int) -> float:
+    """Median of the first so many, which are sorted; zero of none."""
+    for k in range(1, count):
+        number, at = numbers[k], k
+        while at > 0 and numbers[at - 1] > number:
+            numbers[at] = numbers[at - 1]
+            at -= 1
+        numbers[at] = number
+    return 0.5 * (numbers[count // 2] + numbers[(count - 1) // 2]) if count > 0 else 0.0
+
+
+@compiled
+def _log_blocks(terms: TermArrays, jacobian: Array, blocks: Array) -> None:
+    """Write the logarithm of the largest entry of each block."""
+    fields, first = terms.fields, 0
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] != CONSTRAINT:
+            continue
+        size, entry = term[ROWS] * term[WIDTH], term[ENTRY]
+        for b in range(first, first + size):
+            blocks[b] = 0.0
+        for _ in range(term[COUNT]):
+            for b in range(size):
+                magnitude = abs(jacobian[entry + b])
+                if blocks[first + b] < magnitude < math.inf:
+                    blocks[first + b] = magnitude
+            entry += size
+        for b in range(first, first + size):
+            blocks[b] = math.log(blocks[b]) if blocks[b] > 0.0 else -math.inf
+        first += size
+
+
+@compiled
+def _log_curvatures(units: Units, hessian: Array, concavity: Array, gradient: Array) -> None:
+    """Write the logarithms of the largest curvature of the cost along each coordinate, or else of its slope."""
+    free, diagonal, coordinates, sums = units.free, units.diagonal, units.coordinates, units.sums
+    for k in range(sums.shape[1]):
+        sums[UNIT, k] = sums[CURVATURE, k] = sums[POWER, k] = 0.0
+    for power in (2, 1):
+        for k in range(len(free)):
+            at = coordinates[free[k]]
+            size = abs(gradient[free[k]])
+            if power == 2:
+                size = abs(hessian[diagonal[k]] + (concavity[diagonal[k]] if len(concavity) else 0.0))
+            if sums[POWER, at] <= power and sums[CURVATURE, at] < size < math.inf:
+                sums[CURVATURE, at], sums[POWER, at] = size, power
+    for k in range(sums.shape[1]):
+        if sums[POWER, k] > 0.0:
+            sums[CURVATURE, k] = math.log(sums[CURVATURE, k])
+
+
+@compiled
+def _sweep(
+    terms: TermArrays, coordinates: IntArray, blocks: Array, sums: Array, row_units: Array, forget: bool
+) -> None:
+    """Minimise over the unit of the cost, then over those of all rows, then over those of all coordinates.
+
+    With ``forget``, entries that are too small in these units count as zero from then on.
+    """
+    fields, columns = terms.fields, terms.columns
+    cost, count, first = 0.0, 0, 0
+    for k in range(sums.shape[1]):
+        if sums[POWER, k] > 0.0:
+            cost += sums[CURVATURE, k] + sums[POWER, k] * sums[UNIT, k]
+            count += 1
+    for k in range(sums.shape[1]):
+        power = sums[POWER, k]
+        sums[TOTAL, k] = power * (cost / max(count, 1) - sums[CURVATURE, k])
+        sums[WEIGHT, k] = power**2
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] != CONSTRAINT:
+            continue
+        for row in range(term[ROW], term[ROW] + term[ROWS]):
+            total, seen = 0.0, 0
+            for d in range(term[WIDTH]):
+                if blocks[first + d] > -math.inf:
+                    at = coordinates[columns[term[COLUMN] + d]]
+                    if forget and blocks[first + d] + sums[UNIT, at] - row_units[row] < SMALLEST:
+                        blocks[first + d] = -math.inf
+                        continue
+                    total += blocks[first + d] + sums[UNIT, at]
+                    seen += 1
+            row_units[row] = total / max(seen, 1)
+            for d in range(term[WIDTH]):
+                if blocks[first + d] > -math.inf:
+                    at = coordinates[columns[term[COLUMN] + d]]
+                    sums[TOTAL, at] += row_units[row] - blocks[first + d]
+                    sums[WEIGHT, at] += 1.0
+            first += term[WIDTH]
+    for k in range(sums.shape[1]):
+        if sums[WEIGHT, k] > 0.0:
+            sums[UNIT, k] = sums[TOTAL, k] / sums[WEIGHT, k]
+
+
+@compiled
+def _bounded(terms: TermArrays, values: Array, coordinates: IntArray, sums: Array) -> float:
+    """Logarithm of the mean distance of bounded unknowns to their bounds, or between these; zero without any.
+
+    The power mean of exponent 1/4: neither unknowns at their bounds nor bounds that are never met tell much.
+    """
+    total, count = 0.0, 0
+    for t in range(len(terms.fields)):
+        term = terms.fields[t]
+        for k in range(term[COUNT] if term[KIND] == BOUND else 0):
+            row, unit = term[ROW] + k, sums[UNIT, coordinates[terms.columns[term[COLUMN] + k]]]
+            lower, upper = terms.lower[row], terms.upper[row]
+            distance = upper - lower
+            if not distance < math.inf:
+                distance = min(abs(values[row] - lower), abs(upper - values[row]))
+            if distance < math.inf:
+                total += math.sqrt(math.sqrt(distance * math.exp(-unit)))
+                count += 1
+    return 4.0 * math.log(total / count) if total > 0.0 else 0.0
+
+
+@compiled
+def mean_force(terms: TermArrays, unknowns: Array, entries: Array, multipliers: Array) -> float:
     """Mean over the constraint rows of the largest force of a row on an unknown, which no unit of the row changes."""
-    fields, total = terms.fields, 0.0
+    fields, columns, total = terms.fields, terms.columns, 0.0
     for t in range(len(fields)):
         term = fields[t]
         if term[KIND] == COST:
             continue
-        width, entry, row = term[WIDTH], term[ENTRY], term[ROW]
-        for _ in range(term[COUNT] * term[ROWS]):
-            multiplier = abs(multipliers[row])
-            if multiplier > 0.0:
-                total += multiplier * (1.0 if term[KIND] == BOUND else largest(entries, entry, entry + width))
-            row += 1
-            entry += width
+        m, width, entry, row, column = term[ROWS], term[WIDTH], term[ENTRY], term[ROW], term[COLUMN]
+        for _ in range(term[COUNT]):
+            for _ in range(m):
+                multiplier, size = abs(multipliers[row]), 0.0
+                if multiplier > 0.0:
+                    for d in range(width):
+                        size = max(size, abs(entries[entry + d]) * unknowns[columns[column + d]])
+                    total += multiplier * size
+                row += 1
+                entry += width
+            column += width
     return total / max(len(multipliers), 1)

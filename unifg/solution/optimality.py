@@ -2,12 +2,14 @@
 
 For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipliers:
 
-- stationarity: max |grad f + A' lambda| over the unknowns (tangent coordinates, right perturbation);
+- stationarity: max u |grad f + A' lambda| / F over the unknowns (tangent coordinates, right perturbation);
 - violation: max distance of g outside [l, u];
-- complementarity: max |lambda_i| times the distance of g_i to the limit its sign points at; a multiplier
-  pointing at a limit that does not exist has the wrong sign and counts as |lambda_i|.
+- complementarity: max |lambda_i| / F times the distance of g_i to the limit its sign points at; a multiplier pointing
+  at a limit that does not exist has the wrong sign, and the distance is the unit of the row.
 
-Stationarity and complementarity are divided by max(1, mean|lambda| / 100); the violation is not scaled.
+u are the units of unknowns, and F is the size of what the sums are made of: that of the cost, or a hundredth of the
+mean force of a constraint row (:mod:`unifg.problem.units`). Neither number depends on the units of cost, rows and
+unknowns. The violation is in the graph's units, with a tolerance of its own.
 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
@@ -41,11 +43,29 @@ from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.problem.units import SMALL_FORCES, Units, cost_unit, find_units, mean_force
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
 
-NUMBERS = 5  # that :func:`kkt_numbers` writes
+NUMBERS = 7  # that :func:`kkt_numbers` writes
+
+
+class Tolerances(NamedTuple):
+    """Tolerances of the KKT test.
+
+    Attributes:
+        kkt: of stationarity and complementarity.
+        violation: of the violation, in the units of the constraints.
+    """
+
+    kkt: float
+    violation: float
+
+    @property
+    def violation_unit(self) -> float:
+        """What the rows are measured in, in the mean."""
+        return self.violation / self.kkt
 
 
 class Optimality(NamedTuple):
@@ -58,6 +78,7 @@ class Optimality(NamedTuple):
         determined: whether no unknown may be moved freely; looked at for least squares only.
         rounding: by how much differences may be wrong about the stationarity.
         weakest: of least squares, the smallest pivot of the Hessian relative to its diagonal; 1 where nobody looked.
+        size, unit: F and the largest of the u; 1 for least squares.
     """
 
     stationarity: float
@@ -68,19 +89,30 @@ class Optimality(NamedTuple):
     determined: bool = True
     rounding: float = 0.0
     weakest: float = 1.0
+    size: float = 1.0
+    unit: float = 1.0
 
-    def holds(self, tolerance: float) -> bool:
-        """Test whether all three numbers are within ``tolerance``."""
-        return self.finite and max(self.stationarity, self.violation, self.complementarity) <= tolerance
+    @property
+    def slope(self) -> float:
+        """Gradient of the Lagrangian whose stationarity is at most one."""
+        return self.size / self.unit
 
-    def passes(self, tolerance: float) -> bool:
-        """Test whether all three numbers are known to be within ``tolerance``, at a point that is determined."""
-        return self.determined and self.holds(tolerance) and self.rounding <= tolerance
+    def holds(self, tolerances: Tolerances) -> bool:
+        """Test whether all three numbers are within their tolerances."""
+        return self.finite and self.feasible(tolerances) and self.stationarity <= tolerances.kkt
 
-    def blurred(self, tolerance: float) -> bool:
-        """Test whether rounding above ``tolerance`` is all that differences still see of the stationarity."""
-        sound = self.finite and max(self.violation, self.complementarity) <= tolerance
-        return sound and self.stationarity <= self.rounding and self.rounding > tolerance
+    def feasible(self, tolerances: Tolerances) -> bool:
+        """Test whether violation and complementarity are."""
+        return self.violation <= tolerances.violation and self.complementarity <= tolerances.kkt
+
+    def passes(self, tolerances: Tolerances) -> bool:
+        """Test whether all three numbers are known to be within their tolerances, at a point that is determined."""
+        return self.determined and self.holds(tolerances) and self.rounding <= tolerances.kkt
+
+    def blurred(self, tolerances: Tolerances) -> bool:
+        """Test whether rounding above its tolerance is all that differences still see of the stationarity."""
+        sound = self.finite and self.feasible(tolerances)
+        return sound and self.stationarity <= self.rounding and self.rounding > tolerances.kkt
 
 
 def optimality(
@@ -90,6 +122,7 @@ def optimality(
     enough: float = 0.0,
     lent: Factored | None = None,
     guess: Array | None = None,
+    violation_unit: float = 1.0,
 ) -> Optimality:
     """Measure the KKT conditions at a linearised point.
 
@@ -100,6 +133,7 @@ def optimality(
         enough: of least squares, a relative offset above this may be a lower bound, which takes no factorisation.
         lent: of least squares, a backend's factorisation near this point.
         guess: of least squares, the stored values that the solve began with.
+        violation_unit: what constraint rows are measured in, in the mean, as of :class:`Tolerances`.
     """
     if program.least_squares:
         offset = relative_offset(program, lin, enough, lent, guess)
@@ -107,33 +141,25 @@ def optimality(
             return Optimality(np.inf, np.inf, np.inf, -1, False)
         rounding = _relative_rounding(program, lin, multipliers) if program.differenced else 0.0
         return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding, offset.weakest)
-    gradient, found = np.empty(len(lin.gradient)), np.empty(NUMBERS)
-    kkt_numbers(
-        program.arrays,
-        program.columns.free,
-        lin.gradient,
-        lin.constraints,
-        lin.constraint_jacobian,
-        multipliers,
-        gradient,
-        found,
-    )
+    gradient, found, units = np.empty(len(lin.gradient)), np.empty(NUMBERS), program.unit_memory()
+    derivatives = lin.hessian, lin.concavity, lin.gradient, lin.constraints, lin.constraint_jacobian
+    kkt_numbers(program.arrays, units, violation_unit, *derivatives, multipliers, gradient, found)
     measured = read_numbers(found, lin.cost)
     if not measured.finite:
         return measured
     rounding = 0.0
     if program.differenced:
-        rounding = float(gradient_rounding(program, lin, multipliers).max(initial=0.0))
-        rounding /= max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
+        uncertain = gradient_rounding(program, lin, multipliers) * units.unknowns[program.columns.free]
+        rounding = float(uncertain.max(initial=0.0)) / measured.size
     return measured._replace(rounding=rounding)
 
 
 def read_numbers(found: Array, cost: float) -> Optimality:
     """Numbers that :func:`kkt_numbers` has written."""
-    stationarity, violation, complementarity, worst, finite = found.tolist()
+    stationarity, violation, complementarity, worst, finite, size, unit = found.tolist()
     if finite == 0.0 or not math.isfinite(cost):
         return Optimality(np.inf, np.inf, np.inf, -1, False)
-    return Optimality(stationarity, violation, complementarity, int(worst), True)
+    return Optimality(stationarity, violation, complementarity, int(worst), True, size=size, unit=unit)
 
 
 def _relative_rounding(program: CompiledProblem, lin: Linearization, multipliers: Array) -> float:
@@ -210,7 +236,10 @@ def _add_rounding(
 @compiled
 def kkt_numbers(
     terms: TermArrays,
-    free: IntArray,
+    units: Units,
+    violation_unit: float,
+    hessian: Array,
+    concavity: Array,
     slope: Array,
     constraints: Array,
     entries: Array,
@@ -218,25 +247,34 @@ def kkt_numbers(
     gradient: Array,
     found: Array,
 ) -> None:
-    """Write stationarity, violation, complementarity, worst row, and whether everything is finite.
+    """Write stationarity, violation, complementarity, worst row, whether everything is finite, and their size.
 
     Args:
         terms: of the program.
-        free: columns that are unknown.
+        units: which are found.
+        violation_unit: what the rows are measured in, in the mean.
+        hessian: entries of the Hessian of the objective.
+        concavity: negative curvature of scalar costs; empty without.
         slope: (width,) gradient of the objective.
         constraints: (M,) values.
         entries: of the constraint Jacobian.
         multipliers: (M,).
         gradient: (width,) memory, for the gradient of the Lagrangian.
-        found: (5,) result.
+        found: (7,) result.
     """
-    stationarity, violation, complementarity, size = 0.0, 0.0, 0.0, 0.0
+    stationarity, violation, complementarity = 0.0, 0.0, 0.0
     worst, count, finite = -1, len(constraints), True
-    lower, upper = terms.lower, terms.upper
+    lower, upper, free = terms.lower, terms.upper, units.free
+    find_units(terms, units, violation_unit, hessian, concavity, slope, constraints, entries)
+    unknowns, rows = units.unknowns, units.rows
+    force = mean_force(terms, unknowns, entries, multipliers) / SMALL_FORCES
+    size = max(cost_unit(units, hessian, concavity, slope), force)
     copy_to(slope, gradient)
     evaluation.transposed_times(terms, False, entries, multipliers, gradient)
+    largest = 0.0
     for k in range(len(free)):
-        stationarity = max(stationarity, abs(gradient[free[k]]))
+        largest = max(largest, unknowns[free[k]])
+        stationarity = max(stationarity, abs(gradient[free[k]]) * unknowns[free[k]])
     for k in range(len(slope)):
         finite = finite and math.isfinite(slope[k])
     for k in range(len(entries)):
@@ -244,17 +282,15 @@ def kkt_numbers(
     for row in range(count):
         value, multiplier = constraints[row], multipliers[row]
         finite = finite and math.isfinite(value) and math.isfinite(multiplier)
-        size += abs(multiplier)
         outside = max(max(value - upper[row], lower[row] - value), 0.0)
         if worst < 0 or outside > violation:
             worst, violation = row, outside
         if lower[row] != upper[row]:
             limit = upper[row] if multiplier > 0.0 else lower[row]
-            slack = abs(value - limit) if math.isfinite(limit) else 1.0
+            slack = abs(value - limit) if math.isfinite(limit) else rows[row]
             complementarity = max(complementarity, abs(multiplier) * slack)
-    scale = max(1.0, size / max(count, 1) / 100.0)
-    found[0], found[1], found[2] = stationarity / scale, violation, complementarity / scale
-    found[3], found[4] = worst, finite
+    found[0], found[1], found[2] = stationarity / size, violation, complementarity / size
+    found[3], found[4], found[5], found[6] = worst, finite, size, largest
 
 
 def infeasible_stationary(program: CompiledProblem, lin: Linearization, tolerance: float) -> bool:

@@ -34,7 +34,7 @@ from unifg.solution.export import Exported, export
 from unifg.solution.history import HEADER, Deferred, Iteration, factor_norms, line, show
 from unifg.solution.incumbent import Incumbent, Incumbents
 from unifg.solution.multipliers import Slopes, estimated
-from unifg.solution.optimality import Optimality, infeasible_stationary, optimality, within_bounds
+from unifg.solution.optimality import Optimality, Tolerances, infeasible_stationary, optimality, within_bounds
 from unifg.solution.relative_offset import Factored
 from unifg.solution.solution import AnyGuess, Guess, NotConverged, Solution, values_of
 from unifg.solution.status import Status
@@ -113,7 +113,8 @@ class Solver(Backend):
     """Options common to all backends.
 
     Attributes:
-        tolerance: for the KKT test of :mod:`unifg.solution.optimality`.
+        tolerance: for the KKT test of :mod:`unifg.solution.optimality`: its stationarity and complementarity.
+        feasibility_tolerance: for its violation, in the units of the constraints; None: the same number.
         max_iterations: iterations (linear systems or subproblems solved) before giving up.
         time_limit: seconds before giving up, checked once an iteration.
         verbose: log one line per iteration at level INFO to the logger ``unifg``; where logging is not configured for
@@ -125,6 +126,7 @@ class Solver(Backend):
     """
 
     tolerance: float = 1e-6
+    feasibility_tolerance: float | None = None
     max_iterations: int = 100
     time_limit: float = np.inf
     verbose: bool = False
@@ -136,12 +138,20 @@ class Solver(Backend):
         """Refuse options no solve could honour."""
         if not self.tolerance > 0.0:
             raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
+        if self.feasibility_tolerance is not None and not self.feasibility_tolerance > 0.0:
+            found = self.feasibility_tolerance
+            raise BackendError(f"{self.name}: feasibility_tolerance must be positive or None, found {found}")
         if np.isnan(self.time_limit):
             raise BackendError(f"{self.name}: time_limit must be a number of seconds, found {self.time_limit}")
         if self.max_iterations < 0:
             raise BackendError(f"{self.name}: max_iterations must not be negative, found {self.max_iterations}")
         if self.search_iterations < 0:
             raise BackendError(f"{self.name}: search_iterations must not be negative, found {self.search_iterations}")
+
+    @property
+    def tolerances(self) -> Tolerances:
+        """Both tolerances of the KKT test."""
+        return Tolerances(self.tolerance, self.feasibility_tolerance or self.tolerance)
 
     def solve(
         self,
@@ -243,7 +253,7 @@ class SolveState:
         parts: seconds of a compiled loop in evaluation, linear systems and the test of the answer, and of all of the
             loop; None where nobody took them.
         alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
-        tolerance: of the KKT test.
+        tolerances: of the KKT test.
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
             squares may use and overwrite; None where the backend has no such thing.
         slopes: the largest so far, where there are constraints.
@@ -259,7 +269,7 @@ class SolveState:
         self._started = time.perf_counter()
         self._in_python = program.python_seconds
         self.program = program
-        self.tolerance = solver.tolerance
+        self.tolerances = solver.tolerances
         self.history: list[Iteration] = []
         self.status: Status | None = None
         self.incumbents = Incumbents(program)
@@ -355,8 +365,12 @@ class SolveState:
 
     def _move(self, lin: Linearization, multipliers: Array) -> None:
         self.see(lin.constraint_jacobian, lin.gradient)
-        measured = optimality(self.program, lin, multipliers, self.tolerance, self.lent, self._start.flat)
+        measured = self._measure(lin, multipliers)
         self._settle(lin, multipliers, measured, True)
+
+    def _measure(self, lin: Linearization, multipliers: Array) -> Optimality:
+        kkt, unit = self.tolerances.kkt, self.tolerances.violation_unit
+        return optimality(self.program, lin, multipliers, kkt, self.lent, self._start.flat, unit)
 
     def _settle(self, lin: Linearization, multipliers: Array, measured: Optimality, candidate: bool) -> None:
         """Make an iterate the present one; a ``candidate`` may be returned if the solve ends without success."""
@@ -413,7 +427,7 @@ class SolveState:
         if self.status is not None or not len(rows):
             return
         outside = np.abs(self.program.violation(constraints)[rows])
-        if outside.max() > self.tolerance:
+        if outside.max() > self.tolerances.violation:
             if self.alone:
                 self.accept(self.program.linearize(self.values), self.multipliers, 0.0, 0.0)
             self.optimality = self.optimality._replace(worst_row=int(rows[outside.argmax()]))
@@ -466,7 +480,16 @@ class SolveState:
     def has_been_feasible(self) -> bool:
         """True if the start or an iterate met the constraints, which proves that they can be met."""
         _ = self.least_violated
-        return self._least <= self.tolerance
+        return self._least <= self.tolerances.violation
+
+    @property
+    def enough(self) -> float:
+        """Gradient of the Lagrangian that is small enough for the KKT test, with something to spare."""
+        return 0.1 * self.tolerances.kkt * min(1.0, self.optimality.slope)
+
+    def violates(self, constraints: Array) -> bool:
+        """Test whether (M,) values of the constraints are outside their limits."""
+        return float(np.abs(self.program.violation(constraints)).max(initial=0.0)) > self.tolerances.violation
 
     def begin_restoration_step(self) -> bool:
         """Count a step of feasibility restoration; returns whether there is no time for it."""
@@ -477,7 +500,7 @@ class SolveState:
 
     def infeasible_stationary(self) -> bool:
         """Test whether no nearby point violates the constraints less, though they are violated."""
-        return infeasible_stationary(self.program, self.lin, self.tolerance)
+        return infeasible_stationary(self.program, self.lin, self.tolerances.violation)
 
     def finish(self, reason: Status | None) -> Solution:
         """Return the last iterate, or after a solve without success the best one, judged by the KKT test.
@@ -490,17 +513,17 @@ class SolveState:
         if status not in (Status.CONVERGED, Status.STOP_RULE) or not self.optimality.finite:
             status, returned = self._without_success(status)
         measured = self.optimality
-        if measured.passes(self.tolerance) and status is not Status.UNBOUNDED:
+        if measured.passes(self.tolerances) and status is not Status.UNBOUNDED:
             status = Status.CONVERGED if measured.weakest > HARDLY else Status.HARDLY_DETERMINED
             if self._excess() > 0.0:
                 status = Status.DEGENERATE
-        elif measured.holds(self.tolerance) and not measured.determined:
+        elif measured.holds(self.tolerances) and not measured.determined:
             status = Status.UNDETERMINED
-        elif measured.holds(self.tolerance) and status is not Status.UNBOUNDED:
+        elif measured.holds(self.tolerances) and status is not Status.UNBOUNDED:
             status = Status.IMPRECISE
         elif status in (Status.STALLED, Status.ITERATION_LIMIT) and self._lost_slope(measured):
             status = Status.DEGENERATE
-        elif measured.blurred(self.tolerance) and status in (Status.STALLED, Status.ITERATION_LIMIT):
+        elif measured.blurred(self.tolerances) and status in (Status.STALLED, Status.ITERATION_LIMIT):
             status = Status.IMPRECISE
         elif status.converged:
             status = Status.STALLED
@@ -518,7 +541,7 @@ class SolveState:
             returned,
         )
         solution.restoration_steps, solution._parts = self.restoration_steps, self.parts
-        solution.tolerance, solution._edition = self.tolerance, self.program.binding.edition
+        solution.tolerance, solution._edition = self.tolerances.kkt, self.program.binding.edition
         solution.in_python = self.program.python_seconds - self._in_python
         return solution
 
@@ -532,26 +555,29 @@ class SolveState:
             self._move(within, self.multipliers)
         returned = self._return_best(status)
         earlier = status is Status.ITERATION_LIMIT and returned < self.iterations  # the multipliers of a barrier there
-        if (earlier or status in (Status.STALLED, Status.SINGULAR)) and self.optimality.violation <= self.tolerance:
+        if earlier or status in (Status.STALLED, Status.SINGULAR):
             self._estimate()
         return status, returned
 
     def _excess(self) -> float:
         """Sum of multipliers that are larger than constraints with a slope ever need, zero elsewhere."""
-        return 0.0 if self.slopes is None else self.slopes.excess(self.lin, self.multipliers, self.tolerance)
+        return 0.0 if self.slopes is None else self.slopes.excess(self.lin, self.multipliers, self.tolerances.kkt)
 
     def _lost_slope(self, measured: Optimality) -> bool:
         """Test whether a solve without success is one whose KKT numbers hold in proportion to huge multipliers."""
-        if max(measured.violation, measured.complementarity) > self.tolerance:
+        if not measured.feasible(self.tolerances):
             return False
-        return measured.stationarity <= self.tolerance * self._excess() / SMALL_FORCES
+        return measured.stationarity <= self.tolerances.kkt * self._excess() / SMALL_FORCES
 
     def _estimate(self) -> None:
         """Take multipliers that are made of the gradients here, if all KKT numbers are better with them."""
-        before, found = self.optimality, estimated(self.program, self.lin, self.tolerance)
-        if found is None or before.holds(self.tolerance):
+        before = self.optimality
+        if before.violation > self.tolerances.violation:
             return
-        after = optimality(self.program, self.lin, found, self.tolerance)
+        found = estimated(self.program, self.lin, self.tolerances.violation)
+        if found is None or before.holds(self.tolerances):
+            return
+        after = self._measure(self.lin, found)
         pairs = zip(after[:3], before[:3], strict=True)
         if all(better <= worse for better, worse in pairs) and after[:3] != before[:3]:
             self.multipliers, self.optimality = found, after
@@ -559,7 +585,7 @@ class SolveState:
     def returns_best(self, status: Status | None) -> bool:
         """Test whether an ending asks for the best iterate instead of the last."""
         asked = self._solver.max_iterations <= FEW or getattr(self._solver, "step_tolerance", 0.0) == np.inf
-        sound = asked or status not in WITHOUT_SUCCESS or self.optimality.holds(self.tolerance)
+        sound = asked or status not in WITHOUT_SUCCESS or self.optimality.holds(self.tolerances)
         return not (self.optimality.finite and sound)
 
     def _return_best(self, status: Status) -> int:
@@ -580,10 +606,10 @@ class SolveState:
             return Status.UNBOUNDED
         if self.optimality.stationarity == np.inf:  # a saddle or maximum, where no model shows a way
             return Status.STALLED
-        if self.optimality.holds(self.tolerance):
+        if self.optimality.holds(self.tolerances):
             if not self.optimality.determined:
                 return Status.UNDETERMINED
-            return Status.CONVERGED if self.optimality.passes(self.tolerance) else Status.IMPRECISE
+            return Status.CONVERGED if self.optimality.passes(self.tolerances) else Status.IMPRECISE
         if self.iterations >= self._solver.max_iterations:
             return Status.ITERATION_LIMIT
         return None
