@@ -306,6 +306,7 @@ def test(address: int) -> None:
         now.answer = NOT_FINITE
         return
     guessed = now.cold == 1 and now.iteration == 0 and now.sides > 0  # large multipliers hide forces
+    # The sizes that the KKT test divides by may be smaller or larger than that of the forces.
     if worst <= tolerance and now.violation <= feasible and not guessed:
         run(links[0].conclude, (address,))
         if max(kkt[0], kkt[2]) <= tolerance:

@@ -158,7 +158,8 @@ def conclude(address: int) -> None:
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
     full, gradient, kkt, links, multipliers = parts(address, "full gradient kkt links multipliers")
     scalars, steepest_gradient, terms = parts(address, "scalars steepest_gradient terms")
-    concavity, final, hessian, steepest_jacobian = parts(address, "concavity final hessian steepest_jacobian")
+    concavity, final, heights, hessian = parts(address, "concavity final heights hessian")
+    (steepest_jacobian,) = parts(address, "steepest_jacobian")
     now = scalars[0]
     if now.concluded == 1:
         return
@@ -166,8 +167,11 @@ def conclude(address: int) -> None:
     run(links[0].raise_slopes, (constraint_jacobian, gradient, steepest_jacobian, steepest_gradient))
     arrays = multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
+    squares = now.cost
+    for height in heights:
+        squares -= height
     derivatives = hessian, concavity, gradient, constraints, constraint_jacobian
-    run(links[0].kkt_numbers, (terms, final, now.violation_unit, *derivatives, multipliers, full, kkt))
+    run(links[0].kkt_numbers, (terms, final, now.violation_unit, squares, *derivatives, multipliers, full, kkt))
     now.judging += seconds(now.clock) - began
 
 
@@ -295,6 +299,7 @@ def addresses(robust: bool, general: bool) -> Records:
         NOTHING,
         terms,
         kinds["final"],
+        NUMBER,
         NUMBER,
         kinds["hessian"],
         kinds["concavity"],

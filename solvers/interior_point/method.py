@@ -402,7 +402,7 @@ class Workspace:
         words = each.instances.describe(arguments)
         found = arguments.found, arguments.found_multipliers, arguments.numbers
         fields, links = program.table.fields, (arguments.functions, problem.links)
-        memory = problem.scratch, problem.plan.numbers, *problem.measures[-4:], *problem.final[-4:]
+        memory = problem.scratch, problem.plan.numbers, *problem.measures[-5:], *problem.final[-5:]
         blank = [array for array in (*work, *memory) if array is not work.scalars]
         addressing = words, self._words, *links, problem.retraction, fields, problem.terms.parts, work.scalars
         widest, scratch = int(fields[:, KERNEL_WIDTH].max()), program.table.scratch

@@ -57,7 +57,7 @@ def loop(address: int) -> None:
             return
     while True:
         if now.alone == 1:
-            size = kkt_size(work.kkt[0], work.kkt[1], work.kkt[2], work.kkt[5] / work.kkt[6])
+            size = kkt_size(work.kkt[0], work.kkt[1], work.kkt[2], work.kkt[5])
             now.accuracy = useful_accuracy(False, size, now.tolerance, 1.0)
             now.damping, now.stage = max(now.next_damping, now.missing), POSED
             if now.logged > 0:
@@ -134,8 +134,9 @@ def _record(problem: Problem, work: Work, shown: bool) -> bool:
     now, kkt, log = work.scalars[0], work.kkt, work.log
     raise_slopes(work.next_jacobian, work.next_gradient, work.steepest_jacobian, work.steepest_gradient)
     kkt_numbers(
-        problem.terms, problem.measures, now.feasible / now.tolerance, work.next_hessian, work.concavity,
-        work.next_gradient, work.next_constraints, work.next_jacobian, work.multipliers, work.full, kkt,
+        problem.terms, problem.measures, now.feasible / now.tolerance, now.next_cost - work.heights.sum(),
+        work.next_hessian, work.concavity, work.next_gradient, work.next_constraints, work.next_jacobian,
+        work.multipliers, work.full, kkt,
     )  # fmt: skip
     finite = kkt[4] != 0.0 and math.isfinite(now.next_cost)
     if not finite:

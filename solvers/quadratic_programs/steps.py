@@ -183,7 +183,7 @@ class Steps:
         optimality = run.optimality
         self._load(run.lin, run.multipliers)
         self.work.kkt[:3] = optimality.stationarity, optimality.violation, optimality.complementarity
-        self.work.kkt[5:] = optimality.size, optimality.unit
+        self.work.kkt[5] = optimality.slope
         return self._run_alone(run, POSED, budget)
 
     def _run_alone(self, run: SolveState, stage: int, budget: int) -> list[float]:

@@ -32,7 +32,7 @@ class Units(NamedTuple):
         coordinates: (width,) number of the coordinate of a family that each column belongs to.
         free: (n,) columns that are unknown.
         diagonal: (n,) places of their curvatures among the entries of the Hessian.
-        blocks, sums: memory.
+        blocks, logs, sums: memory.
         rows: (M,) units of the constraint rows.
         unknowns: (width,) of the unknowns.
     """
@@ -41,6 +41,7 @@ class Units(NamedTuple):
     free: IntArray
     diagonal: IntArray
     blocks: Array
+    logs: Array
     sums: Array
     rows: Array
     unknowns: Array
@@ -49,15 +50,18 @@ class Units(NamedTuple):
 def unit_memory(columns: Columns, diagonal: IntArray, blocks: int, rows: int) -> Units:
     """Units of one, and memory to find others."""
     coordinates, count = columns.coordinates, sum(family.manifold.dim for family in columns.families)
-    memory = np.empty(blocks), np.empty((5, count))
+    memory = np.empty(blocks), np.empty(blocks), np.empty((5, count))
     return Units(coordinates, columns.free, diagonal, *memory, np.ones(rows), np.ones(columns.width))
 
 
 LARGE_PULL = 1e3  # times the curvatures: slopes of the cost from which on it is they that count
 LEAST_SHARE = 1e-4  # of the largest curvature, below which a mean of all is not believed
 UNIT, CURVATURE, POWER, TOTAL, WEIGHT = range(5)  # rows of memory for each coordinate
-SWEEPS = 10  # of the minimisation, one variable after the other
-SMALLEST = -14.0  # logarithm of the entry of a block, in its units, below which it counts as zero
+SIZE = TOTAL
+SHARE = 0.1  # of the largest gradient of a row
+LEAST_MOVE = 1e-2  # of an unknown, in its unit: what makes a force that counts
+SWEEPS = 20  # of the minimisation, one variable after the other
+SMALLEST = -14.0  # logarithm of an entry, relative to others, from which on it counts as zero
 MODEST = 4.6  # logarithm of a hundred
 SMALL_FORCES = 100.0  # times the cost: multipliers from which on it is they that count
 
@@ -125,32 +129,21 @@ def find_units(
     row_units, unknowns = units.rows, units.unknowns
     fields = terms.fields
     _log_blocks(terms, jacobian, blocks)
-    _log_curvatures(units, hessian, concavity, gradient)
-    for k in range(2 * SWEEPS):
-        _sweep(terms, coordinates, blocks, sums, row_units, k == SWEEPS)
-    count = 0
     for k in range(sums.shape[1]):
-        if sums[WEIGHT, k] > 0.0:
-            sums[TOTAL, count], count = sums[UNIT, k], count + 1
-    middle = _middle(sums[TOTAL], count)
-    far = count > 0 and max(sums[TOTAL, count - 1] - middle, middle - sums[TOTAL, 0]) > MODEST
-    for k in range(sums.shape[1]):
-        if not far or sums[WEIGHT, k] == 0.0:
-            sums[UNIT, k] = middle
-    count, first = 0, 0
-    for t in range(len(fields)):
-        if fields[t, KIND] == CONSTRAINT:
-            for row in range(fields[t, ROW], fields[t, ROW] + fields[t, ROWS]):
-                row_units[row] = -math.inf
-                for d in range(fields[t, WIDTH]):
-                    unit = sums[UNIT, coordinates[terms.columns[fields[t, COLUMN] + d]]]
-                    row_units[row] = max(row_units[row], blocks[first + d] + unit)
-                first += fields[t, WIDTH]
-                if row_units[row] > -math.inf:
-                    blocks[count], count = row_units[row], count + 1
-    middle = _middle(blocks, count)
-    far = far or (count > 0 and max(blocks[count - 1] - middle, middle - blocks[0]) > MODEST)
-    shift = math.log(violation_unit) - middle if count > 0 else _bounded(terms, constraints, coordinates, sums)
+        sums[UNIT, k] = 0.0
+    far, sloped = _log_rows(terms, units) > MODEST, _log_curvatures(units, hessian, concavity, gradient)
+    if far or sloped:
+        _forget_small(terms, units)
+        for _ in range(SWEEPS):
+            _sweep(terms, units)
+        far = far or _spread(sums) > MODEST
+        for k in range(0 if far else sums.shape[1]):
+            sums[UNIT, k] = 0.0
+        _log_rows(terms, units)
+    middle = sums[TOTAL, 0]
+    shift = math.log(violation_unit) - middle
+    if not middle < math.inf:
+        middle, shift = 0.0, _bounded(terms, constraints, coordinates, sums)
     for column in range(len(unknowns)):
         unknowns[column] = math.exp(sums[UNIT, coordinates[column]] + shift)
     for t in range(len(fields)):
@@ -166,15 +159,58 @@ def find_units(
 
 
 @compiled
-def _middle(numbers: Array, count: int) -> float:
-    """Median of the first so many, which are sorted; zero of none."""
+def _log_rows(terms: TermArrays, units: Units) -> float:
+    """Write the logarithm of the largest entry of each row, and into ``sums[TOTAL, 0]`` their median or infinity.
+
+    Returns:
+        Largest distance of one from the median.
+    """
+    fields, sums, logs = terms.fields, units.sums, units.logs
+    count, first = 0, 0
+    for t in range(len(fields)):
+        if fields[t, KIND] == CONSTRAINT:
+            for row in range(fields[t, ROW], fields[t, ROW] + fields[t, ROWS]):
+                largest = -math.inf
+                for d in range(fields[t, WIDTH]):
+                    at = units.coordinates[terms.columns[fields[t, COLUMN] + d]]
+                    largest = max(largest, units.blocks[first + d] + sums[UNIT, at])
+                first += fields[t, WIDTH]
+                units.rows[row] = largest
+                if largest > -math.inf:
+                    logs[count], count = largest, count + 1
+    if count == 0:
+        sums[TOTAL, 0] = math.inf
+        return 0.0
     for k in range(1, count):
-        number, at = numbers[k], k
-        while at > 0 and numbers[at - 1] > number:
-            numbers[at] = numbers[at - 1]
+        number, at = logs[k], k
+        while at > 0 and logs[at - 1] > number:
+            logs[at] = logs[at - 1]
             at -= 1
-        numbers[at] = number
-    return 0.5 * (numbers[count // 2] + numbers[(count - 1) // 2]) if count > 0 else 0.0
+        logs[at] = number
+    middle = 0.5 * (logs[count // 2] + logs[(count - 1) // 2])
+    sums[TOTAL, 0] = middle
+    return max(logs[count - 1] - middle, middle - logs[0])
+
+
+@compiled
+def _forget_small(terms: TermArrays, units: Units) -> None:
+    """Take blocks for zero whose entries are tiny beside others of their row and of their coordinate."""
+    fields, sums = terms.fields, units.sums
+    for k in range(sums.shape[1]):
+        sums[TOTAL, k] = -math.inf
+    for forget in (False, True):
+        first = 0
+        for t in range(len(fields)):
+            if fields[t, KIND] != CONSTRAINT:
+                continue
+            for row in range(fields[t, ROW], fields[t, ROW] + fields[t, ROWS]):
+                for d in range(fields[t, WIDTH]):
+                    at = units.coordinates[terms.columns[fields[t, COLUMN] + d]]
+                    if not forget:
+                        sums[TOTAL, at] = max(sums[TOTAL, at], units.blocks[first + d])
+                    elif units.blocks[first + d] < min(sums[TOTAL, at], units.rows[row]) + SMALLEST:
+                        units.blocks[first + d] = -math.inf
+                first += fields[t, WIDTH]
 
 
 @compiled
@@ -200,11 +236,15 @@ def _log_blocks(terms: TermArrays, jacobian: Array, blocks: Array) -> None:
 
 
 @compiled
-def _log_curvatures(units: Units, hessian: Array, concavity: Array, gradient: Array) -> None:
-    """Write the logarithms of the largest curvature of the cost along each coordinate, or else of its slope."""
-    free, diagonal, coordinates, sums = units.free, units.diagonal, units.coordinates, units.sums
+def _log_curvatures(units: Units, hessian: Array, concavity: Array, gradient: Array) -> bool:
+    """Write the logarithms of the largest curvature of the cost along each coordinate, or else of its slope.
+
+    Returns:
+        Whether the cost has a slope somewhere where it has no curvature.
+    """
+    free, diagonal, coordinates, sums, sloped = units.free, units.diagonal, units.coordinates, units.sums, False
     for k in range(sums.shape[1]):
-        sums[UNIT, k] = sums[CURVATURE, k] = sums[POWER, k] = 0.0
+        sums[CURVATURE, k] = sums[POWER, k] = 0.0
     for power in (2, 1):
         for k in range(len(free)):
             at = coordinates[free[k]]
@@ -214,19 +254,27 @@ def _log_curvatures(units: Units, hessian: Array, concavity: Array, gradient: Ar
             if sums[POWER, at] <= power and sums[CURVATURE, at] < size < math.inf:
                 sums[CURVATURE, at], sums[POWER, at] = size, power
     for k in range(sums.shape[1]):
+        sloped = sloped or sums[POWER, k] == 1.0
         if sums[POWER, k] > 0.0:
             sums[CURVATURE, k] = math.log(sums[CURVATURE, k])
+    return sloped
 
 
 @compiled
-def _sweep(
-    terms: TermArrays, coordinates: IntArray, blocks: Array, sums: Array, row_units: Array, forget: bool
-) -> None:
-    """Minimise over the unit of the cost, then over those of all rows, then over those of all coordinates.
+def _spread(sums: Array) -> float:
+    """Largest distance of the logarithm of a unit from the mean of the least and the largest."""
+    least, most = math.inf, -math.inf
+    for k in range(sums.shape[1]):
+        if sums[WEIGHT, k] > 0.0:
+            least, most = min(least, sums[UNIT, k]), max(most, sums[UNIT, k])
+    return 0.5 * (most - least)
 
-    With ``forget``, entries that are too small in these units count as zero from then on.
-    """
-    fields, columns = terms.fields, terms.columns
+
+@compiled
+def _sweep(terms: TermArrays, units: Units) -> None:
+    """Minimise over the unit of the cost, then over those of all rows, then over those of all coordinates."""
+    fields, columns, coordinates = terms.fields, terms.columns, units.coordinates
+    blocks, sums, row_units = units.blocks, units.sums, units.rows
     cost, count, first = 0.0, 0, 0
     for k in range(sums.shape[1]):
         if sums[POWER, k] > 0.0:
@@ -245,9 +293,6 @@ def _sweep(
             for d in range(term[WIDTH]):
                 if blocks[first + d] > -math.inf:
                     at = coordinates[columns[term[COLUMN] + d]]
-                    if forget and blocks[first + d] + sums[UNIT, at] - row_units[row] < SMALLEST:
-                        blocks[first + d] = -math.inf
-                        continue
                     total += blocks[first + d] + sums[UNIT, at]
                     seen += 1
             row_units[row] = total / max(seen, 1)
@@ -281,6 +326,74 @@ def _bounded(terms: TermArrays, values: Array, coordinates: IntArray, sums: Arra
                 total += math.sqrt(math.sqrt(distance * math.exp(-unit)))
                 count += 1
     return 4.0 * math.log(total / count) if total > 0.0 else 0.0
+
+
+@compiled
+def find_sizes(
+    terms: TermArrays,
+    units: Units,
+    cost: float,
+    hessian: Array,
+    concavity: Array,
+    gradient: Array,
+    jacobian: Array,
+    multipliers: Array,
+) -> float:
+    """Write the sizes of gradients along each coordinate, in whose units they are found; return that of products.
+
+    Of a sum of squares f with the curvature h it is a tenth of sqrt(2 f h), as of a residual along its own Jacobian; of
+    constraints a tenth of the largest force of a row. Neither counts below what moves the unknown, or the mean unknown,
+    by a hundredth of its unit; nor, where nothing is curved, below the slopes of the cost.
+
+    Args:
+        terms: of the program.
+        units: found by :func:`find_units` at the same point; ``sums[SIZE]`` is written.
+        cost: sum of the squares, halved.
+        hessian: of the cost, as for :func:`cost_unit`.
+        concavity: the same.
+        gradient: the same.
+        jacobian: entries of that of the constraints.
+        multipliers: (M,).
+
+    Returns:
+        Geometric mean of size times unit.
+    """
+    fields, columns, coordinates, sums = terms.fields, terms.columns, units.coordinates, units.sums
+    count, mean, curved = sums.shape[1], 0.0, False
+    for k in range(count):
+        sums[SIZE, k] = sums[CURVATURE, k] = sums[UNIT, k] = 0.0
+    for k in range(len(units.free)):
+        at, place = coordinates[units.free[k]], units.diagonal[k]
+        sums[UNIT, at] = units.unknowns[units.free[k]]
+        curvature = abs(hessian[place] + (concavity[place] if len(concavity) else 0.0))
+        sums[CURVATURE, at] = max(sums[CURVATURE, at], curvature)
+        curved = curved or curvature > 0.0
+    least = (LEAST_MOVE if curved else 1.0) * cost_unit(units, hessian, concavity, gradient)
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] == COST:
+            continue
+        m, width, entry, row, column = term[ROWS], term[WIDTH], term[ENTRY], term[ROW], term[COLUMN]
+        for _ in range(term[COUNT]):
+            for _ in range(m):
+                multiplier = SHARE * abs(multipliers[row])
+                if multiplier > 0.0:
+                    for d in range(width):
+                        at = coordinates[columns[column + d]]
+                        sums[SIZE, at] = max(sums[SIZE, at], multiplier * abs(jacobian[entry + d]))
+                row += 1
+                entry += width
+            column += width
+    known = 0
+    for k in range(count):
+        if sums[UNIT, k] == 0.0:  # fixed
+            continue
+        known += 1
+        curvature = sums[CURVATURE, k]
+        size = max(SHARE * math.sqrt(2.0 * max(cost, 0.0) * curvature), LEAST_MOVE * curvature * sums[UNIT, k])
+        sums[SIZE, k] = max(max(sums[SIZE, k], size), least / sums[UNIT, k])
+        mean += math.log(sums[SIZE, k] * sums[UNIT, k])
+    return math.exp(mean / max(known, 1))
 
 
 @compiled

@@ -119,7 +119,10 @@ class Verification:
             self._slopes = np.empty((term.count, term.size, self._columns.shape[1]))
         self._evaluate(self.kernel.address, values, self._rows, self._slopes)
         slope = np.einsum("nmd,nd->nm", self._slopes, direction[self._columns])
-        reach = max(float(np.abs(values.flat[self._places]).max(initial=0.0)), float(np.abs(middle).max(initial=0.0)))
+        # Arguments are rounded, and that is seen through the slopes.
+        seen = np.maximum(np.abs(self._slopes).sum(axis=2), 1.0)
+        reach = seen * float(np.abs(values.flat[self._places]).max(initial=0.0))
+        reach = np.maximum(reach, float(np.abs(middle).max(initial=0.0)))
         wrong: BoolArray = np.ones(term.count, dtype=bool)
 
         def quotient(length: float) -> Array:

@@ -2,14 +2,14 @@
 
 For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipliers:
 
-- stationarity: max u |grad f + A' lambda| / F over the unknowns (tangent coordinates, right perturbation);
+- stationarity: max |grad f + A' lambda| / s over the unknowns (tangent coordinates, right perturbation);
 - violation: max distance of g outside [l, u];
-- complementarity: max |lambda_i| / F times the distance of g_i to the limit its sign points at; a multiplier pointing
+- complementarity: max |lambda_i| / p times the distance of g_i to the limit its sign points at; a multiplier pointing
   at a limit that does not exist has the wrong sign, and the distance is the unit of the row.
 
-u are the units of unknowns, and F is the size of what the sums are made of: that of the cost, or a hundredth of the
-mean force of a constraint row (:mod:`unifg.problem.units`). Neither number depends on the units of cost, rows and
-unknowns. The violation is in the graph's units, with a tolerance of its own.
+s is the size of what these gradients are sums of along a coordinate of a family, and p the mean of s times the unit of
+the coordinate (:mod:`unifg.problem.units`). Neither number depends on the units of cost, rows and unknowns. The
+violation is in the graph's units, with a tolerance of its own.
 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
@@ -43,7 +43,7 @@ from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROWS, WIDTH, TermArrays
-from unifg.problem.units import SMALL_FORCES, Units, cost_unit, find_units, mean_force
+from unifg.problem.units import SIZE, Units, find_sizes, find_units
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
@@ -64,7 +64,7 @@ class Tolerances(NamedTuple):
 
     @property
     def violation_unit(self) -> float:
-        """What the rows are measured in, in the mean."""
+        """Unit of constraint rows in the mean."""
         return self.violation / self.kkt
 
 
@@ -78,7 +78,7 @@ class Optimality(NamedTuple):
         determined: whether no unknown may be moved freely; looked at for least squares only.
         rounding: by how much differences may be wrong about the stationarity.
         weakest: of least squares, the smallest pivot of the Hessian relative to its diagonal; 1 where nobody looked.
-        size, unit: F and the largest of the u; 1 for least squares.
+        slope, unit: the smallest s and the largest unit; 1 for least squares.
     """
 
     stationarity: float
@@ -89,13 +89,8 @@ class Optimality(NamedTuple):
     determined: bool = True
     rounding: float = 0.0
     weakest: float = 1.0
-    size: float = 1.0
+    slope: float = 1.0
     unit: float = 1.0
-
-    @property
-    def slope(self) -> float:
-        """Gradient of the Lagrangian whose stationarity is at most one."""
-        return self.size / self.unit
 
     def holds(self, tolerances: Tolerances) -> bool:
         """Test whether all three numbers are within their tolerances."""
@@ -142,24 +137,27 @@ def optimality(
         rounding = _relative_rounding(program, lin, multipliers) if program.differenced else 0.0
         return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding, offset.weakest)
     gradient, found, units = np.empty(len(lin.gradient)), np.empty(NUMBERS), program.unit_memory()
-    derivatives = lin.hessian, lin.concavity, lin.gradient, lin.constraints, lin.constraint_jacobian
-    kkt_numbers(program.arrays, units, violation_unit, *derivatives, multipliers, gradient, found)
+    kkt_numbers(
+        program.arrays, units, violation_unit, lin.cost - sum(float(part.sum()) for part in lin.scalars.values()),
+        lin.hessian, lin.concavity, lin.gradient, lin.constraints, lin.constraint_jacobian, multipliers, gradient,
+        found,
+    )  # fmt: skip
     measured = read_numbers(found, lin.cost)
     if not measured.finite:
         return measured
     rounding = 0.0
     if program.differenced:
-        uncertain = gradient_rounding(program, lin, multipliers) * units.unknowns[program.columns.free]
-        rounding = float(uncertain.max(initial=0.0)) / measured.size
+        sizes = units.sums[SIZE][units.coordinates[units.free]]
+        rounding = float((gradient_rounding(program, lin, multipliers) / sizes).max(initial=0.0))
     return measured._replace(rounding=rounding)
 
 
 def read_numbers(found: Array, cost: float) -> Optimality:
     """Numbers that :func:`kkt_numbers` has written."""
-    stationarity, violation, complementarity, worst, finite, size, unit = found.tolist()
+    stationarity, violation, complementarity, worst, finite, slope, unit = found.tolist()
     if finite == 0.0 or not math.isfinite(cost):
         return Optimality(np.inf, np.inf, np.inf, -1, False)
-    return Optimality(stationarity, violation, complementarity, int(worst), True, size=size, unit=unit)
+    return Optimality(stationarity, violation, complementarity, int(worst), True, slope=slope, unit=unit)
 
 
 def _relative_rounding(program: CompiledProblem, lin: Linearization, multipliers: Array) -> float:
@@ -238,6 +236,7 @@ def kkt_numbers(
     terms: TermArrays,
     units: Units,
     violation_unit: float,
+    cost: float,
     hessian: Array,
     concavity: Array,
     slope: Array,
@@ -247,13 +246,14 @@ def kkt_numbers(
     gradient: Array,
     found: Array,
 ) -> None:
-    """Write stationarity, violation, complementarity, worst row, whether everything is finite, and their size.
+    """Write the KKT numbers, the worst row, whether everything is finite, the least size and the largest unit.
 
     Args:
         terms: of the program.
         units: which are found.
         violation_unit: what the rows are measured in, in the mean.
-        hessian: entries of the Hessian of the objective.
+        cost: sum of the squares in it, halved.
+        hessian: entries of its Hessian.
         concavity: negative curvature of scalar costs; empty without.
         slope: (width,) gradient of the objective.
         constraints: (M,) values.
@@ -266,15 +266,14 @@ def kkt_numbers(
     worst, count, finite = -1, len(constraints), True
     lower, upper, free = terms.lower, terms.upper, units.free
     find_units(terms, units, violation_unit, hessian, concavity, slope, constraints, entries)
-    unknowns, rows = units.unknowns, units.rows
-    force = mean_force(terms, unknowns, entries, multipliers) / SMALL_FORCES
-    size = max(cost_unit(units, hessian, concavity, slope), force)
+    product = find_sizes(terms, units, cost, hessian, concavity, slope, entries, multipliers)
     copy_to(slope, gradient)
     evaluation.transposed_times(terms, False, entries, multipliers, gradient)
-    largest = 0.0
+    least, unit = math.inf, 0.0
     for k in range(len(free)):
-        largest = max(largest, unknowns[free[k]])
-        stationarity = max(stationarity, abs(gradient[free[k]]) * unknowns[free[k]])
+        size = units.sums[SIZE, units.coordinates[free[k]]]
+        least, unit = min(least, size), max(unit, units.unknowns[free[k]])
+        stationarity = max(stationarity, abs(gradient[free[k]]) / size)
     for k in range(len(slope)):
         finite = finite and math.isfinite(slope[k])
     for k in range(len(entries)):
@@ -287,10 +286,10 @@ def kkt_numbers(
             worst, violation = row, outside
         if lower[row] != upper[row]:
             limit = upper[row] if multiplier > 0.0 else lower[row]
-            slack = abs(value - limit) if math.isfinite(limit) else rows[row]
+            slack = abs(value - limit) if math.isfinite(limit) else units.rows[row]
             complementarity = max(complementarity, abs(multiplier) * slack)
-    found[0], found[1], found[2] = stationarity / size, violation, complementarity / size
-    found[3], found[4], found[5], found[6] = worst, finite, size, largest
+    found[0], found[1], found[2] = stationarity, violation, complementarity / product
+    found[3], found[4], found[5], found[6] = worst, finite, least, unit
 
 
 def infeasible_stationary(program: CompiledProblem, lin: Linearization, tolerance: float) -> bool:

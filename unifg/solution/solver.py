@@ -17,6 +17,7 @@ import numpy as np
 
 from unifg.codegen.inner import inner
 from unifg.errors import BackendError, GraphError
+from unifg.factors.steps import EPSILON
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
 from unifg.modeling.soft import SLACK
@@ -49,6 +50,7 @@ UNBOUNDED_COST = -1e20
 KEPT = 4  # workspaces of single solves, for each graph
 EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new branches
 AT_ONCE, LATER = 4, 256  # verifications of new branches: so many without delay, then one in so many solves
+NEARLY, FEW_DIGITS = 100.0, 1e-4  # times the tolerance: KKT numbers, and rounding of unknowns, that may go together
 FEW = 3  # iterations that are asked for as such, one after the other in a control loop
 WITHOUT_SUCCESS = (
     Status.ITERATION_LIMIT,
@@ -523,7 +525,7 @@ class SolveState:
             status = Status.IMPRECISE
         elif status in (Status.STALLED, Status.ITERATION_LIMIT) and self._lost_slope(measured):
             status = Status.DEGENERATE
-        elif measured.blurred(self.tolerances) and status in (Status.STALLED, Status.ITERATION_LIMIT):
+        elif status in (Status.STALLED, Status.ITERATION_LIMIT) and self._imprecise(measured):
             status = Status.IMPRECISE
         elif status.converged:
             status = Status.STALLED
@@ -568,6 +570,16 @@ class SolveState:
         if not measured.feasible(self.tolerances):
             return False
         return measured.stationarity <= self.tolerances.kkt * self._excess() / SMALL_FORCES
+
+    def _imprecise(self, measured: Optimality) -> bool:
+        """Test whether rounding is what keeps the KKT test from holding, of differences or of large unknowns."""
+        kkt, violation = self.tolerances
+        if measured.blurred(self.tolerances):
+            return True
+        rounding = EPSILON * float(np.abs(self.lin.stored).max(initial=0.0))
+        return rounding > FEW_DIGITS * kkt * measured.unit and measured.holds(
+            Tolerances(NEARLY * kkt, NEARLY * violation)
+        )
 
     def _estimate(self) -> None:
         """Take multipliers that are made of the gradients here, if all KKT numbers are better with them."""

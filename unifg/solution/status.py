@@ -39,8 +39,8 @@ class Status(Enum):
         "graph.check(guess), fix a variable or add priors."
     )
     IMPRECISE = (
-        "The KKT conditions seem to hold, but differences of values as large as these cannot tell: attach Jacobians, "
-        "or state the costs in smaller numbers."
+        "The KKT conditions seem to hold, but rounding of values as large as these cannot tell: state them in smaller "
+        "numbers, as distances from a point nearby; or attach Jacobians where they are differenced."
     )
     SINGULAR = (
         "The linear system is singular: the costs do not determine every unknown; run graph.check(guess), add priors, "
