@@ -258,7 +258,7 @@ def begin(address: int) -> None:
         if 0.1 * error < WARM_MU:  # else the other numbers make no difference
             run(links[0].measure, (address,))
             error = max(max(now.stationarity, error), now.complementarity)
-        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * size
+        now.mu = max(min(0.1 * error, WARM_MU), 0.1 * now.tolerance) * min(1.0, size)
     mu = now.mu
     for k in range(count):
         row = sides[k].row
@@ -315,7 +315,7 @@ def test(address: int) -> None:
         now.finer = max(0.1 * now.finer, LEAST_FINER)  # the units at the answer are others
         run(links[0].measure, (address,))  # it was written over
     # With a larger mu, what is active has not been found, and short steps are those towards another problem's answer.
-    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * now.size:
+    if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * min(1.0, now.size):
         if now.violation < now.violation_tolerance:
             now.answer = STOPPED
             return

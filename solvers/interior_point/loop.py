@@ -158,8 +158,8 @@ def conclude(address: int) -> None:
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
     full, gradient, kkt, links, multipliers = parts(address, "full gradient kkt links multipliers")
     scalars, steepest_gradient, terms = parts(address, "scalars steepest_gradient terms")
-    concavity, final, heights, hessian = parts(address, "concavity final heights hessian")
-    (steepest_jacobian,) = parts(address, "steepest_jacobian")
+    concavity, final, hessian, jacobian = parts(address, "concavity final hessian jacobian")
+    residual, steepest_jacobian = parts(address, "residual steepest_jacobian")
     now = scalars[0]
     if now.concluded == 1:
         return
@@ -167,11 +167,8 @@ def conclude(address: int) -> None:
     run(links[0].raise_slopes, (constraint_jacobian, gradient, steepest_jacobian, steepest_gradient))
     arrays = multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
-    squares = now.cost
-    for height in heights:
-        squares -= height
-    derivatives = hessian, concavity, gradient, constraints, constraint_jacobian
-    run(links[0].kkt_numbers, (terms, final, now.violation_unit, squares, *derivatives, multipliers, full, kkt))
+    derivatives = hessian, concavity, gradient, residual, jacobian, constraints, constraint_jacobian
+    run(links[0].kkt_numbers, (terms, final, now.violation_unit, *derivatives, multipliers, full, kkt))
     now.judging += seconds(now.clock) - began
 
 
@@ -300,10 +297,11 @@ def addresses(robust: bool, general: bool) -> Records:
         terms,
         kinds["final"],
         NUMBER,
-        NUMBER,
         kinds["hessian"],
         kinds["concavity"],
         gradient,
+        residual,
+        kinds["jacobian"],
         constraints,
         rows,
         constraints,

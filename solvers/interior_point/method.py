@@ -362,9 +362,9 @@ class Workspace:
             self._describe()
         work, now, self._taken, self.compiled = self.work, self.now, None, 0.0
         # The test of least squares has no absolute tolerance.
-        kkt, violation = options.tolerances
+        kkt, violation, unit = options.tolerances
         now["tolerance"] = 0.0 if self.program.least_squares else kkt
-        now["feasible"], now["violation_unit"] = violation, options.tolerances.violation_unit
+        now["feasible"], now["violation_unit"] = violation, unit
         now["scaling"], now["assisted"] = bool(options.scaling), not self.program.fully_compiled
         now["step_tolerance"] = options.step_tolerance
         now["violation_tolerance"], now["clocked"] = (

@@ -54,7 +54,7 @@ NOW = np.dtype(
         ("violation_tolerance", np.float64),
         ("suspicion", np.float64),  # size of the multipliers, as :mod:`unifg.solution.multipliers` has it
         ("feasible", np.float64),  # tolerance of the violation
-        ("violation_unit", np.float64),  # that of the tolerance of violation relative to the other
+        ("violation_unit", np.float64),  # of the rows in the mean, 0 where nothing tells it
         ("keeping", np.float64),  # violation up to which an iterate counts as one that keeps all constraints
         ("evaluating", np.float64),  # seconds of the solve in terms and their derivatives
         ("solving", np.float64),  # in linear systems

@@ -76,6 +76,7 @@ NOW = np.dtype(
         ("step_tolerance", np.float64),
         ("violation_tolerance", np.float64),
         ("feasible", np.float64),  # tolerance of the violation
+        ("violation_unit", np.float64),  # of the rows in the mean, 0 where nothing tells it
         ("clock", np.int64),  # address of the clock, 0 for none
     ]
 )

@@ -128,7 +128,7 @@ class Steps:
                 self._describe()
             self._held = program.equality
         now["assisted"] = self._assisted = program.large or not program.fully_compiled
-        now["tolerance"], now["feasible"] = tolerances
+        now["tolerance"], now["feasible"], now["violation_unit"] = tolerances
         now["least_squares"] = program.least_squares
         now["full_steps"], now["correcting"], now["limit"], self.pending = full_steps, correcting, limit, False
         now["step_tolerance"], now["violation_tolerance"] = stop

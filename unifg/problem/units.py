@@ -7,9 +7,13 @@ the coordinate is h, the logarithms of the units minimise
     sum (log a + log u - log r)^2 + sum (log h + 2 log u - log k)^2
 
 (Curtis and Reid, IMA J. Appl. Math. 10, 1972). The sum has no other constants in it, so multiplying rows, unknowns or
-the cost by a number multiplies their units by the same. One degree of freedom is left: the rows are in the mean
-measured in what the tolerance of their violation is relative to that of the other conditions; without constraints but
-bounds, unknowns in the distances to these.
+the cost by a number multiplies their units by the same. One degree of freedom is left. Where the tolerance of the
+violation is stated, it tells the unit of the rows: their median is what it is relative to the tolerance of the other
+conditions. Else the median of the units of unknowns is one. Without constraints but bounds, unknowns are measured in
+their distances to these.
+
+Where the largest entries of all rows are within a factor of a hundred of each other, as in graphs in usual units, all
+rows have one unit and all unknowns another.
 """
 
 from __future__ import annotations
@@ -50,16 +54,17 @@ class Units(NamedTuple):
 def unit_memory(columns: Columns, diagonal: IntArray, blocks: int, rows: int) -> Units:
     """Units of one, and memory to find others."""
     coordinates, count = columns.coordinates, sum(family.manifold.dim for family in columns.families)
-    memory = np.empty(blocks), np.empty(blocks), np.empty((5, count))
+    memory = np.empty(blocks), np.empty(max(blocks, count)), np.empty((5, count))
     return Units(coordinates, columns.free, diagonal, *memory, np.ones(rows), np.ones(columns.width))
 
 
+NO_DISTANCE = 1e-10  # of an unknown to a bound: it is there
 LARGE_PULL = 1e3  # times the curvatures: slopes of the cost from which on it is they that count
 LEAST_SHARE = 1e-4  # of the largest curvature, below which a mean of all is not believed
 UNIT, CURVATURE, POWER, TOTAL, WEIGHT = range(5)  # rows of memory for each coordinate
 SIZE = TOTAL
-SHARE = 0.1  # of the largest gradient of a row
-LEAST_MOVE = 1e-2  # of an unknown, in its unit: what makes a force that counts
+SHARE = 0.01  # of the largest product that a gradient is a sum of
+LEAST_MOVE = 1e-6  # of an unknown, in its unit: what makes a force that counts
 SWEEPS = 20  # of the minimisation, one variable after the other
 SMALLEST = -14.0  # logarithm of an entry, relative to others, from which on it counts as zero
 MODEST = 4.6  # logarithm of a hundred
@@ -118,7 +123,7 @@ def find_units(
     Args:
         terms: of the program.
         units: which are written.
-        violation_unit: tolerance of the violation over that of the other conditions.
+        violation_unit: of the rows in the mean; 0: that of the unknowns is one.
         hessian: of the cost, as for :func:`cost_unit`.
         concavity: the same.
         gradient: the same.
@@ -131,8 +136,10 @@ def find_units(
     _log_blocks(terms, jacobian, blocks)
     for k in range(sums.shape[1]):
         sums[UNIT, k] = 0.0
-    far, sloped = _log_rows(terms, units) > MODEST, _log_curvatures(units, hessian, concavity, gradient)
-    if far or sloped:
+    far = _log_rows(terms, units) > MODEST
+    bounded = not sums[TOTAL, 0] < math.inf  # at most
+    sloped = _log_curvatures(units, hessian, concavity, gradient)
+    if far or (sloped and not bounded):
         _forget_small(terms, units)
         for _ in range(SWEEPS):
             _sweep(terms, units)
@@ -140,10 +147,13 @@ def find_units(
         for k in range(0 if far else sums.shape[1]):
             sums[UNIT, k] = 0.0
         _log_rows(terms, units)
-    middle = sums[TOTAL, 0]
-    shift = math.log(violation_unit) - middle
-    if not middle < math.inf:
+    middle, shift = sums[TOTAL, 0], 0.0
+    if bounded:
         middle, shift = 0.0, _bounded(terms, constraints, coordinates, sums)
+    elif violation_unit > 0.0:
+        shift = math.log(violation_unit) - middle
+    elif far:
+        shift = -_middle(units)
     for column in range(len(unknowns)):
         unknowns[column] = math.exp(sums[UNIT, coordinates[column]] + shift)
     for t in range(len(fields)):
@@ -156,6 +166,28 @@ def find_units(
                 row_units[row] = row_units[row - m]
             elif term[KIND] == CONSTRAINT:
                 row_units[row] = math.exp((row_units[row] if far and row_units[row] > -math.inf else middle) + shift)
+
+
+@compiled
+def _middle(units: Units) -> float:
+    """Median of the logarithms of the units of all coordinates that count."""
+    sums, logs, count = units.sums, units.logs, 0
+    for k in range(sums.shape[1]):
+        if sums[WEIGHT, k] > 0.0:
+            logs[count], count = sums[UNIT, k], count + 1
+    return _median(logs, count) if count > 0 else 0.0
+
+
+@compiled
+def _median(numbers: Array, count: int) -> float:
+    """Median of the first so many, which are sorted."""
+    for k in range(1, count):
+        number, at = numbers[k], k
+        while at > 0 and numbers[at - 1] > number:
+            numbers[at] = numbers[at - 1]
+            at -= 1
+        numbers[at] = number
+    return 0.5 * (numbers[count // 2] + numbers[(count - 1) // 2])
 
 
 @compiled
@@ -181,14 +213,7 @@ def _log_rows(terms: TermArrays, units: Units) -> float:
     if count == 0:
         sums[TOTAL, 0] = math.inf
         return 0.0
-    for k in range(1, count):
-        number, at = logs[k], k
-        while at > 0 and logs[at - 1] > number:
-            logs[at] = logs[at - 1]
-            at -= 1
-        logs[at] = number
-    middle = 0.5 * (logs[count // 2] + logs[(count - 1) // 2])
-    sums[TOTAL, 0] = middle
+    middle = sums[TOTAL, 0] = _median(logs, count)
     return max(logs[count - 1] - middle, middle - logs[0])
 
 
@@ -309,7 +334,7 @@ def _sweep(terms: TermArrays, units: Units) -> None:
 
 @compiled
 def _bounded(terms: TermArrays, values: Array, coordinates: IntArray, sums: Array) -> float:
-    """Logarithm of the mean distance of bounded unknowns to their bounds, or between these; zero without any.
+    """Logarithm of a tenth of the mean distance of unknowns to their bounds, or between these; zero without any.
 
     The power mean of exponent 1/4: neither unknowns at their bounds nor bounds that are never met tell much.
     """
@@ -322,45 +347,43 @@ def _bounded(terms: TermArrays, values: Array, coordinates: IntArray, sums: Arra
             distance = upper - lower
             if not distance < math.inf:
                 distance = min(abs(values[row] - lower), abs(upper - values[row]))
-            if distance < math.inf:
+            if NO_DISTANCE < distance < math.inf:
                 total += math.sqrt(math.sqrt(distance * math.exp(-unit)))
                 count += 1
-    return 4.0 * math.log(total / count) if total > 0.0 else 0.0
+    return 4.0 * math.log(total / count) - math.log(10.0) if total > 0.0 else 0.0
 
 
 @compiled
 def find_sizes(
     terms: TermArrays,
     units: Units,
-    cost: float,
     hessian: Array,
     concavity: Array,
     gradient: Array,
+    residual: Array,
     jacobian: Array,
     multipliers: Array,
-) -> float:
-    """Write the sizes of gradients along each coordinate, in whose units they are found; return that of products.
+    constraint_jacobian: Array,
+) -> None:
+    """Write the sizes of gradients along each coordinate.
 
-    Of a sum of squares f with the curvature h it is a tenth of sqrt(2 f h), as of a residual along its own Jacobian; of
-    constraints a tenth of the largest force of a row. Neither counts below what moves the unknown, or the mean unknown,
-    by a hundredth of its unit; nor, where nothing is curved, below the slopes of the cost.
+    It is a hundredth of the largest product that a gradient is a sum of: of a residual or a multiplier and an entry of
+    its Jacobian. It does not count below what moves the unknown, or the mean unknown, by a millionth of its unit; nor,
+    where nothing is curved, below a hundredth of the slopes of the cost.
 
     Args:
         terms: of the program.
         units: found by :func:`find_units` at the same point; ``sums[SIZE]`` is written.
-        cost: sum of the squares, halved.
         hessian: of the cost, as for :func:`cost_unit`.
         concavity: the same.
         gradient: the same.
-        jacobian: entries of that of the constraints.
+        residual: (C,) of all costs.
+        jacobian: entries of theirs.
         multipliers: (M,).
-
-    Returns:
-        Geometric mean of size times unit.
+        constraint_jacobian: entries of that of the constraints.
     """
-    fields, columns, coordinates, sums = terms.fields, terms.columns, units.coordinates, units.sums
-    count, mean, curved = sums.shape[1], 0.0, False
-    for k in range(count):
+    coordinates, sums, curved = units.coordinates, units.sums, False
+    for k in range(sums.shape[1]):
         sums[SIZE, k] = sums[CURVATURE, k] = sums[UNIT, k] = 0.0
     for k in range(len(units.free)):
         at, place = coordinates[units.free[k]], units.diagonal[k]
@@ -368,32 +391,34 @@ def find_sizes(
         curvature = abs(hessian[place] + (concavity[place] if len(concavity) else 0.0))
         sums[CURVATURE, at] = max(sums[CURVATURE, at], curvature)
         curved = curved or curvature > 0.0
-    least = (LEAST_MOVE if curved else 1.0) * cost_unit(units, hessian, concavity, gradient)
+    _raise_sizes(terms, units, True, residual, jacobian)
+    _raise_sizes(terms, units, False, multipliers, constraint_jacobian)
+    least = (LEAST_MOVE if curved else SHARE) * cost_unit(units, hessian, concavity, gradient)
+    for k in range(sums.shape[1]):
+        if sums[UNIT, k] > 0.0:  # else fixed
+            size = max(LEAST_MOVE * sums[CURVATURE, k] * sums[UNIT, k], least / sums[UNIT, k])
+            sums[SIZE, k] = max(SHARE * sums[SIZE, k], size)
+
+
+@compiled
+def _raise_sizes(terms: TermArrays, units: Units, costs: bool, values: Array, jacobian: Array) -> None:
+    """Raise sizes to the largest product of a value of a row and an entry of its Jacobian."""
+    fields, columns, coordinates, sums = terms.fields, terms.columns, units.coordinates, units.sums
     for t in range(len(fields)):
         term = fields[t]
-        if term[KIND] == COST:
+        if (term[KIND] == COST) != costs:
             continue
         m, width, entry, row, column = term[ROWS], term[WIDTH], term[ENTRY], term[ROW], term[COLUMN]
         for _ in range(term[COUNT]):
-            for _ in range(m):
-                multiplier = SHARE * abs(multipliers[row])
-                if multiplier > 0.0:
+            for a in range(row, row + m):
+                value = abs(values[a])
+                if value > 0.0:
                     for d in range(width):
                         at = coordinates[columns[column + d]]
-                        sums[SIZE, at] = max(sums[SIZE, at], multiplier * abs(jacobian[entry + d]))
-                row += 1
+                        sums[SIZE, at] = max(sums[SIZE, at], value * abs(jacobian[entry + d]))
                 entry += width
+            row += m
             column += width
-    known = 0
-    for k in range(count):
-        if sums[UNIT, k] == 0.0:  # fixed
-            continue
-        known += 1
-        curvature = sums[CURVATURE, k]
-        size = max(SHARE * math.sqrt(2.0 * max(cost, 0.0) * curvature), LEAST_MOVE * curvature * sums[UNIT, k])
-        sums[SIZE, k] = max(max(sums[SIZE, k], size), least / sums[UNIT, k])
-        mean += math.log(sums[SIZE, k] * sums[UNIT, k])
-    return math.exp(mean / max(known, 1))
 
 
 @compiled

@@ -2,14 +2,16 @@
 
 For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipliers:
 
-- stationarity: max |grad f + A' lambda| / s over the unknowns (tangent coordinates, right perturbation);
+- stationarity: max |grad f + A' lambda| over the unknowns (tangent coordinates, right perturbation);
 - violation: max distance of g outside [l, u];
-- complementarity: max |lambda_i| / p times the distance of g_i to the limit its sign points at; a multiplier pointing
-  at a limit that does not exist has the wrong sign, and the distance is the unit of the row.
+- complementarity: max |lambda_i| times the distance of g_i to the limit its sign points at; a multiplier pointing at a
+  limit that does not exist has the wrong sign, and the distance is one.
 
-s is the size of what these gradients are sums of along a coordinate of a family, and p the mean of s times the unit of
-the coordinate (:mod:`unifg.problem.units`). Neither number depends on the units of cost, rows and unknowns. The
-violation is in the graph's units, with a tolerance of its own.
+Stationarity and complementarity are divided by max(1, mean|lambda| / 100), or they are relative, whichever is less: the
+gradient to s, the size of what it is a sum of along the coordinate of a family (`find_sizes` of
+:mod:`unifg.problem.units`), and lambda_i to what makes its force as large. Where numbers are large, relative ones alone
+can be met: they do not depend on the units of cost, rows and unknowns. The violation is in the graph's units, with a
+tolerance of its own, which tells the unit of rows.
 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
@@ -42,8 +44,8 @@ from unifg.factors.steps import EPSILON, FIRST, step_for
 from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
-from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, KIND, ROW, ROWS, WIDTH, TermArrays
-from unifg.problem.units import SIZE, Units, find_sizes, find_units
+from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.problem.units import SIZE, SMALL_FORCES, Units, find_sizes, find_units
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
@@ -57,15 +59,12 @@ class Tolerances(NamedTuple):
     Attributes:
         kkt: of stationarity and complementarity.
         violation: of the violation, in the units of the constraints.
+        violation_unit: unit of the constraint rows in the mean, which a stated tolerance tells; 0 where it is not.
     """
 
     kkt: float
     violation: float
-
-    @property
-    def violation_unit(self) -> float:
-        """Unit of constraint rows in the mean."""
-        return self.violation / self.kkt
+    violation_unit: float = 0.0
 
 
 class Optimality(NamedTuple):
@@ -78,7 +77,7 @@ class Optimality(NamedTuple):
         determined: whether no unknown may be moved freely; looked at for least squares only.
         rounding: by how much differences may be wrong about the stationarity.
         weakest: of least squares, the smallest pivot of the Hessian relative to its diagonal; 1 where nobody looked.
-        slope, unit: the smallest s and the largest unit; 1 for least squares.
+        slope, unit: gradient that counts as one, at least, and the largest unit of an unknown; 1 for least squares.
     """
 
     stationarity: float
@@ -117,7 +116,7 @@ def optimality(
     enough: float = 0.0,
     lent: Factored | None = None,
     guess: Array | None = None,
-    violation_unit: float = 1.0,
+    violation_unit: float = 0.0,
 ) -> Optimality:
     """Measure the KKT conditions at a linearised point.
 
@@ -138,9 +137,8 @@ def optimality(
         return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding, offset.weakest)
     gradient, found, units = np.empty(len(lin.gradient)), np.empty(NUMBERS), program.unit_memory()
     kkt_numbers(
-        program.arrays, units, violation_unit, lin.cost - sum(float(part.sum()) for part in lin.scalars.values()),
-        lin.hessian, lin.concavity, lin.gradient, lin.constraints, lin.constraint_jacobian, multipliers, gradient,
-        found,
+        program.arrays, units, violation_unit, lin.hessian, lin.concavity, lin.gradient, lin.residual, lin.jacobian,
+        lin.constraints, lin.constraint_jacobian, multipliers, gradient, found,
     )  # fmt: skip
     measured = read_numbers(found, lin.cost)
     if not measured.finite:
@@ -148,7 +146,9 @@ def optimality(
     rounding = 0.0
     if program.differenced:
         sizes = units.sums[SIZE][units.coordinates[units.free]]
-        rounding = float((gradient_rounding(program, lin, multipliers) / sizes).max(initial=0.0))
+        uncertain, mean = gradient_rounding(program, lin, multipliers), float(np.abs(multipliers).sum())
+        scale = max(1.0, mean / max(len(multipliers), 1) / SMALL_FORCES)
+        rounding = min(float((uncertain / sizes).max(initial=0.0)), float(uncertain.max(initial=0.0)) / scale)
     return measured._replace(rounding=rounding)
 
 
@@ -232,14 +232,49 @@ def _add_rounding(
 
 
 @compiled
+def _complementarity(
+    terms: TermArrays,
+    units: Units,
+    violation_unit: float,
+    scale: float,
+    constraints: Array,
+    entries: Array,
+    multipliers: Array,
+) -> float:
+    fields, columns, lower, upper, result = terms.fields, terms.columns, terms.lower, terms.upper, 0.0
+    unit = violation_unit if violation_unit > 0.0 else 1.0
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] == COST:
+            continue
+        m, width, entry, row, column = term[ROWS], term[WIDTH], term[ENTRY], term[ROW], term[COLUMN]
+        for _ in range(term[COUNT]):
+            for at in range(row, row + m):
+                if lower[at] != upper[at] and multipliers[at] != 0.0:
+                    share = 0.0
+                    for d in range(width):
+                        size = units.sums[SIZE, units.coordinates[columns[column + d]]]
+                        if size > 0.0:  # else fixed
+                            share = max(share, abs(entries[entry + d]) / size)
+                    limit = upper[at] if multipliers[at] > 0.0 else lower[at]
+                    slack = abs(constraints[at] - limit) if math.isfinite(limit) else unit
+                    result = max(result, abs(multipliers[at]) * slack * min(share / unit, 1.0 / scale))
+                entry += width
+            row += m
+            column += width
+    return result
+
+
+@compiled
 def kkt_numbers(
     terms: TermArrays,
     units: Units,
     violation_unit: float,
-    cost: float,
     hessian: Array,
     concavity: Array,
     slope: Array,
+    residual: Array,
+    jacobian: Array,
     constraints: Array,
     entries: Array,
     multipliers: Array,
@@ -251,45 +286,46 @@ def kkt_numbers(
     Args:
         terms: of the program.
         units: which are found.
-        violation_unit: what the rows are measured in, in the mean.
-        cost: sum of the squares in it, halved.
-        hessian: entries of its Hessian.
+        violation_unit: of the rows in the mean; 0 where nothing tells it.
+        hessian: entries of the Hessian of the objective.
         concavity: negative curvature of scalar costs; empty without.
         slope: (width,) gradient of the objective.
+        residual: (C,) of its squares.
+        jacobian: entries of theirs.
         constraints: (M,) values.
         entries: of the constraint Jacobian.
         multipliers: (M,).
         gradient: (width,) memory, for the gradient of the Lagrangian.
         found: (7,) result.
     """
-    stationarity, violation, complementarity = 0.0, 0.0, 0.0
+    stationarity, violation = 0.0, 0.0
     worst, count, finite = -1, len(constraints), True
     lower, upper, free = terms.lower, terms.upper, units.free
     find_units(terms, units, violation_unit, hessian, concavity, slope, constraints, entries)
-    product = find_sizes(terms, units, cost, hessian, concavity, slope, entries, multipliers)
+    find_sizes(terms, units, hessian, concavity, slope, residual, jacobian, multipliers, entries)
     copy_to(slope, gradient)
     evaluation.transposed_times(terms, False, entries, multipliers, gradient)
-    least, unit = math.inf, 0.0
+    least, unit, relative, total = math.inf, 0.0, 0.0, 0.0
     for k in range(len(free)):
-        size = units.sums[SIZE, units.coordinates[free[k]]]
+        size, slopes = units.sums[SIZE, units.coordinates[free[k]]], abs(gradient[free[k]])
         least, unit = min(least, size), max(unit, units.unknowns[free[k]])
-        stationarity = max(stationarity, abs(gradient[free[k]]) / size)
+        stationarity, relative = max(stationarity, slopes), max(relative, slopes / size)
     for k in range(len(slope)):
         finite = finite and math.isfinite(slope[k])
     for k in range(len(entries)):
         finite = finite and math.isfinite(entries[k])
     for row in range(count):
-        value, multiplier = constraints[row], multipliers[row]
-        finite = finite and math.isfinite(value) and math.isfinite(multiplier)
+        value = constraints[row]
+        finite = finite and math.isfinite(value) and math.isfinite(multipliers[row])
         outside = max(max(value - upper[row], lower[row] - value), 0.0)
         if worst < 0 or outside > violation:
             worst, violation = row, outside
-        if lower[row] != upper[row]:
-            limit = upper[row] if multiplier > 0.0 else lower[row]
-            slack = abs(value - limit) if math.isfinite(limit) else units.rows[row]
-            complementarity = max(complementarity, abs(multiplier) * slack)
-    found[0], found[1], found[2] = stationarity, violation, complementarity / product
-    found[3], found[4], found[5], found[6] = worst, finite, least, unit
+        total += abs(multipliers[row])
+    scale = max(1.0, total / max(count, 1) / SMALL_FORCES)
+    stationarity = min(stationarity / scale, relative)
+    complementarity = _complementarity(terms, units, violation_unit, scale, constraints, entries, multipliers)
+    found[0], found[1], found[2] = stationarity, violation, complementarity
+    found[3], found[4], found[5], found[6] = worst, finite, max(least, scale), unit
 
 
 def infeasible_stationary(program: CompiledProblem, lin: Linearization, tolerance: float) -> bool:

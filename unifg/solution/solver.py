@@ -153,7 +153,8 @@ class Solver(Backend):
     @property
     def tolerances(self) -> Tolerances:
         """Both tolerances of the KKT test."""
-        return Tolerances(self.tolerance, self.feasibility_tolerance or self.tolerance)
+        stated = self.feasibility_tolerance
+        return Tolerances(self.tolerance, stated or self.tolerance, (stated or 0.0) / self.tolerance)
 
     def solve(
         self,
@@ -573,7 +574,7 @@ class SolveState:
 
     def _imprecise(self, measured: Optimality) -> bool:
         """Test whether rounding is what keeps the KKT test from holding, of differences or of large unknowns."""
-        kkt, violation = self.tolerances
+        kkt, violation, _ = self.tolerances
         if measured.blurred(self.tolerances):
             return True
         rounding = EPSILON * float(np.abs(self.lin.stored).max(initial=0.0))
