@@ -44,7 +44,7 @@ from unifg.codegen.function_pointers import linked, parts, run
 from unifg.codegen.jit import compiled
 from unifg.problem.evaluation import transposed_times
 from unifg.problem.table import TermArrays
-from unifg.problem.units import SMALL_FORCES, cost_unit, find_units, mean_force
+from unifg.problem.units import SMALL_FORCES, cost_unit, find_units
 from unifg.solvers.interior_point.state import (
     CONVERGED,
     LIMIT_REACHED,
@@ -71,7 +71,7 @@ WORTH = 0.25  # of the cost at the start: largest first mu
 NOTHING = 1e-20  # of the size of the cost: one that is only rounding
 BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
 FIRST_SLACK = 1e-2  # smallest slack of a cold start
-LEAST_FINER = 1e-4  # of the least mu, where the KKT test asks for more
+LEAST_FINER = 1e-10  # of the least mu, where the KKT test asks for more
 WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active has been found
 
 
@@ -152,17 +152,18 @@ def measure(address: int) -> None:
     for k in range(len(full)):
         full[k] = gradient[k]
     transposed_times(terms, False, constraint_jacobian, multipliers, full)
-    stationarity = violation = paid = complementarity = 0.0
+    stationarity = violation = paid = complementarity = excess = push = 0.0
     for column in free:
         force = abs(full[column]) * units[column]
         if not force <= stationarity:  # NaN stays
             stationarity = force
     for row in range(len(constraints)):
         value, multiplier = constraints[row], multipliers[row]
+        push += abs(multiplier) * row_units[row]
         outside = max(value - upper[row], lower[row] - value)
         if not outside <= violation:
             violation = outside
-        paid = max(paid, outside * penalties[row])
+        paid, excess = max(paid, outside * penalties[row]), max(excess, outside / row_units[row])
         if lower[row] != upper[row]:
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else row_units[row]
@@ -177,9 +178,11 @@ def measure(address: int) -> None:
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
     now.size = cost_unit(measures, hessian, concavity, gradient)
-    now.forces = max(now.size, mean_force(terms, units, constraint_jacobian, multipliers) / SMALL_FORCES)
+    now.forces = max(now.size, push / max(len(constraints), 1) / SMALL_FORCES)
     now.stationarity, now.complementarity = stationarity / now.forces, complementarity / now.forces
-    now.violation = violation
+    # Rows in small units count, too, where a large tolerance says nothing of them.
+    now.violation, now.excess = violation, excess
+    now.violated = 1 if violation > now.feasible or excess > now.tolerance else 0
     now.gap, now.least, now.most, now.paid = gap, least, most, paid
 
 
@@ -307,12 +310,12 @@ def test(address: int) -> None:
         return
     guessed = now.cold == 1 and now.iteration == 0 and now.sides > 0  # large multipliers hide forces
     # The sizes that the KKT test divides by may be smaller or larger than that of the forces.
-    if worst <= tolerance and now.violation <= feasible and not guessed:
+    if worst <= tolerance and now.violated == 0 and not guessed:
         run(links[0].conclude, (address,))
         if max(kkt[0], kkt[2]) <= tolerance:
             now.answer, now.concluded = CONVERGED, 1
             return
-        now.finer = max(0.1 * now.finer, LEAST_FINER)  # the units at the answer are others
+        now.finer = max(0.03 * now.finer, LEAST_FINER)  # the units at the answer are others
         run(links[0].measure, (address,))  # it was written over
     # With a larger mu, what is active has not been found, and short steps are those towards another problem's answer.
     if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * min(1.0, now.size):
@@ -326,17 +329,18 @@ def test(address: int) -> None:
     if now.iteration >= now.limit:
         now.answer = LIMIT_REACHED
         return
-    if now.cost < BOTTOMLESS * now.cost_unit and now.violation > feasible:
+    if now.cost < BOTTOMLESS * now.cost_unit and now.violated == 1:
         now.answer = STALLED  # no penalty holds back an objective that falls faster than violation grows
         return
-    if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violation > feasible:
+    if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violated == 1:
         run(links[0].relax, (address,))
     smallest = 0.1 * tolerance * now.finer * now.size
     bound = False
-    if _error(now) <= SOLVED * now.mu and now.violation > feasible:
+    if _error(now) <= SOLVED * now.mu and now.violated == 1:
         # Whether something is violated because its penalty is too low, or because it has to be. With the least mu that
         # is told by a solved problem: a step before, equalities without a penalty may still be on their way.
-        bound = now.mu <= smallest and _error(now) <= tolerance * now.size
+        # Where the tolerance alone is violated, and not the unit of a row, digits are missing.
+        bound = now.mu <= smallest and _error(now) <= tolerance * now.size and now.excess > tolerance
         if now.mu <= LATE_MU * min(now.paid, now.rho):
             for k in range(now.sides):
                 bound = bound or (sides[k].y > AT_PENALTY * penalties[sides[k].row] and sides[k].e > feasible)
@@ -359,12 +363,13 @@ def test(address: int) -> None:
                 penalties[row] *= 10.0
             now.paid *= 10.0
             run(links[0].relax, (address,))
-    if now.violation <= feasible and now.mu <= smallest and _error(now) <= now.mu:
+    if (now.violated == 0 or now.excess <= tolerance) and now.mu <= smallest and _error(now) <= now.mu:
         # All is done that can be done at these penalties. A multiplier near its own lets a row give way by
         # mu / (penalty - multiplier): no violation that counts, but too much for complementarity.
         near = False
         for k in range(now.sides):
             near = near or sides[k].y * sides[k].e > tolerance * now.forces
+            near = near or (now.violated == 1 and sides[k].e > feasible)
         if near:
             if now.raises >= MOST_RAISES:
                 now.answer = STALLED

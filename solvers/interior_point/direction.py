@@ -77,7 +77,7 @@ def direct(address: int) -> None:
             delta *= FIRST_GROWTH if now.last_delta == 0.0 else SHIFT_GROWTH
         if delta > LARGEST_SHIFT:
             now.answer = SINGULAR
-            if now.elastic == 0 and now.violation > now.feasible:
+            if now.elastic == 0 and now.violated == 1:
                 run(links[0].relax, (address,))
                 now.answer = AGAIN
             return

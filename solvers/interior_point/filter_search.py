@@ -64,7 +64,7 @@ def judge(address: int) -> None:
         now.delta = max(1e-3, 100.0 * now.delta)
         now.answer = AGAIN
         if now.failures > (MOST_FAILURES if now.elastic == 1 else FEW_FAILURES):
-            if now.elastic == 1 or now.violation <= now.feasible:
+            if now.elastic == 1 or now.violated == 0:
                 now.answer = STALLED
             else:
                 run(links[0].relax, (address,))

@@ -165,7 +165,7 @@ def conclude(address: int) -> None:
         return
     began = seconds(now.clock)
     run(links[0].raise_slopes, (constraint_jacobian, gradient, steepest_jacobian, steepest_gradient))
-    arrays = multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
+    arrays = terms, multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
     derivatives = hessian, concavity, gradient, residual, jacobian, constraints, constraint_jacobian
     run(links[0].kkt_numbers, (terms, final, now.violation_unit, *derivatives, multipliers, full, kkt))
@@ -309,7 +309,7 @@ def addresses(robust: bool, general: bool) -> Records:
         kinds["kkt"],
     )
     links[0]["raise_slopes"] = link(raise_slopes, NOTHING, rows, gradient, rows, gradient)
-    links[0]["size_of"] = link(size_of, NUMBER, constraints, rows, gradient, free, NUMBER)
+    links[0]["size_of"] = link(size_of, NUMBER, terms, constraints, rows, gradient, free, NUMBER)
     functions = {
         "begin": barrier.begin,
         "measure": barrier.measure,

@@ -33,6 +33,7 @@ NOW = np.dtype(
         ("cost", np.float64),
         ("stationarity", np.float64),
         ("violation", np.float64),
+        ("excess", np.float64),  # violation in the units of the rows
         ("complementarity", np.float64),
         ("gap", np.float64),  # largest |h| and |c + e - s|
         ("least", np.float64),  # smallest product of a slack and its multiplier
@@ -78,6 +79,7 @@ NOW = np.dtype(
         ("elastic", np.int64),  # whether equalities are elastic, as inequalities always are
         ("going_on", np.int64),  # whether slacks and multipliers are there: the solve goes on where it was
         ("clocked", np.int64),  # whether to ask before every direction if there is time for it
+        ("violated", np.int64),  # whether a row is, by the tolerance or in its unit
         ("concluded", np.int64),  # whether the present iterate has been judged
         ("kept", np.int64),  # whether an iterate kept all constraints
         ("short_steps", np.int64),  # in a row

@@ -9,7 +9,8 @@ the coordinate is h, the logarithms of the units minimise
 (Curtis and Reid, IMA J. Appl. Math. 10, 1972). The sum has no other constants in it, so multiplying rows, unknowns or
 the cost by a number multiplies their units by the same. One degree of freedom is left. Where the tolerance of the
 violation is stated, it tells the unit of the rows: their median is what it is relative to the tolerance of the other
-conditions. Else the median of the units of unknowns is one. Without constraints but bounds, unknowns are measured in
+conditions. Else the median of the units of unknowns is one, and that
+of rows if it may as well be. Without constraints but bounds, unknowns are measured in
 their distances to these.
 
 Where the largest entries of all rows are within a factor of a hundred of each other, as in graphs in usual units, all
@@ -154,6 +155,8 @@ def find_units(
         shift = math.log(violation_unit) - middle
     elif far:
         shift = -_middle(units)
+    elif abs(middle) < MODEST:
+        middle = 0.0
     for column in range(len(unknowns)):
         unknowns[column] = math.exp(sums[UNIT, coordinates[column]] + shift)
     for t in range(len(fields)):
@@ -419,25 +422,3 @@ def _raise_sizes(terms: TermArrays, units: Units, costs: bool, values: Array, ja
                 entry += width
             row += m
             column += width
-
-
-@compiled
-def mean_force(terms: TermArrays, unknowns: Array, entries: Array, multipliers: Array) -> float:
-    """Mean over the constraint rows of the largest force of a row on an unknown, which no unit of the row changes."""
-    fields, columns, total = terms.fields, terms.columns, 0.0
-    for t in range(len(fields)):
-        term = fields[t]
-        if term[KIND] == COST:
-            continue
-        m, width, entry, row, column = term[ROWS], term[WIDTH], term[ENTRY], term[ROW], term[COLUMN]
-        for _ in range(term[COUNT]):
-            for _ in range(m):
-                multiplier, size = abs(multipliers[row]), 0.0
-                if multiplier > 0.0:
-                    for d in range(width):
-                        size = max(size, abs(entries[entry + d]) * unknowns[columns[column + d]])
-                    total += multiplier * size
-                row += 1
-                entry += width
-            column += width
-    return total / max(len(multipliers), 1)

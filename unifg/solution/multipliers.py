@@ -21,6 +21,7 @@ from unifg.codegen.jit import compiled
 from unifg.codegen.loops import largest
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
+from unifg.problem.table import COST, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
 from unifg.typing import Array, IntArray
 
 LARGEST = 1e6  # the least of it: costates of a long chain add up to the square of its rows
@@ -56,10 +57,10 @@ class Slopes:
             multipliers: (M,).
             tolerance: of the KKT test; a cost whose gradient never exceeded it has no scale.
         """
-        program = self._program
-        if not size_of(multipliers, self.jacobian, self.gradient, program.columns.free, tolerance) > SUSPICIOUS:
+        program, free = self._program, self._program.columns.free
+        if not size_of(program.arrays, multipliers, self.jacobian, self.gradient, free, tolerance) > SUSPICIOUS:
             return 0.0
-        gradient = np.abs(self.gradient[program.columns.free])
+        gradient = np.abs(self.gradient[free])
         rows, columns = program.constraints.free_rows, program.constraints.free_columns
         entries = np.abs(self.jacobian[program.constraints.free])
         unknowns, scale = np.ones(program.size), np.ones(len(multipliers))
@@ -116,11 +117,19 @@ def raise_slopes(jacobian: Array, gradient: Array, most: Array, steepest: Array)
 
 
 @compiled
-def size_of(multipliers: Array, jacobian: Array, gradient: Array, free: IntArray, tolerance: float) -> float:
-    """Sum of the multipliers times the largest slope of a row, over that of the cost."""
-    total, steepest = 0.0, tolerance
-    for multiplier in multipliers:
-        total += abs(multiplier)
+def size_of(
+    terms: TermArrays, multipliers: Array, jacobian: Array, gradient: Array, free: IntArray, tolerance: float
+) -> float:
+    """Sum of the multipliers, each times the largest slope of its row, over the largest slope of the cost."""
+    fields, total, steepest = terms.fields, 0.0, tolerance
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] == COST:
+            continue
+        width, entry, row = term[WIDTH], term[ENTRY], term[ROW]
+        for k in range(term[COUNT] * term[ROWS]):
+            slope = largest(jacobian, entry + k * width, entry + (k + 1) * width)
+            total += abs(multipliers[row + k]) * slope
     for k in free:
         steepest = max(steepest, abs(gradient[k]))
-    return total * largest(jacobian, 0, len(jacobian)) / steepest
+    return total / steepest
