@@ -315,3 +315,14 @@ def test_parts_of_python_are_refused_by_name() -> None:
     shown = made.data("shown", [True, False], each=True)
     made.minimize(lambda p: p, x, active=shown, name="some")
     assert "shown" in refused(made, guess)
+
+
+def test_the_header_tells_order_shapes_and_units(tmp_path: Path) -> None:
+    graph, guess, _ = around_a_disc()
+    prepared = InteriorPoint().prepare(graph)
+    prepared.solve(guess)
+    prepared.export(tmp_path)
+    words = " ".join((tmp_path / "solver.h").read_text().replace("\n * ", " ").split())
+    assert "row by row (the last axis runs fastest)" in words and "units the graph was written in" in words
+    for family in graph.families.values():
+        assert f"{family.name}, {family.count} x {family.manifold.storage} {family.manifold.name}" in words

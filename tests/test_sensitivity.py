@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -15,9 +16,14 @@ from problems.control import Problem, Unicycle, problems, sixteen
 from test_quadrotor_joint import Past
 from unifg.models import unicycle
 from unifg.pose_graphs import manhattan, sphere
+from unifg.problem.fixed_columns import FixedColumns
+from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.parameters import datum
+from unifg.problem.systems import KktStructure
 from unifg.scenarios.flight import FlightSettings
 from unifg.scenarios.quadrotor.flight_joint import JointSettings
+from unifg.solution import sensitivity
+from unifg.solution.gains import unfixed
 from unifg.solvers import SQP, GraduatedNonConvexity, InteriorPoint, LevenbergMarquardt
 from unifg.solvers.names import TABLE, backend
 from unifg.typing import Array
@@ -534,3 +540,78 @@ def test_a_solution_that_was_sent_is_asked_again() -> None:
     sent = pickle.loads(pickle.dumps(solution))
     np.testing.assert_array_equal(sent.sensitivity("x", "p"), expected)
     assert sent.tolerance == solution.tolerance == 1e-8
+
+
+def in_python(x: Array, y: Array) -> Array:
+    """No trace follows this."""
+    return np.array([[math.sin(a[0] * b[1]) + b[0] ** 2, a[1] * b[0] * b[1]] for a, b in zip(x, y, strict=True)])
+
+
+def product(x: Array, y: Array) -> Array:
+    return np.stack([np.sin(x[:, 0]) * y[:, 1], x[:, 1] * y[:, 0] ** 2], axis=1)
+
+
+BESIDE: dict[str, Callable[[fg.Graph, fg.Family], Any]] = {
+    "cost": lambda g, x: g.minimize(product, x[:-1], x[1:], sigma=[0.5, 2.0]),
+    "the same variable twice": lambda g, x: g.minimize(lambda x, y, z: x * y * z, x[0], x[1], x[1]),
+    "loss": lambda g, x: g.minimize(product, x[:-1], x[1:], sigma=0.3, robust=fg.Cauchy(0.5)),
+    "in Python": lambda g, x: g.minimize(in_python, x[:-1], x[1:]),
+    "constraint": lambda g, x: g.constrain(product, x[:-1], x[1:], lower=0.3, upper=0.3, name="g"),
+    "constraint in Python": lambda g, x: g.constrain(in_python, x[:-1], x[1:], upper=0.2, name="g"),
+    "scalar": lambda g, x: g.minimize_scalar(lambda x, y: np.sin(x[:, 0] * y[:, 1]) - x[:, 1] * y[:, 0], x[:-1], x[1:]),
+    "scalar in Python": lambda g, x: g.minimize_scalar(lambda x, y: in_python(x, y).sum(axis=1), x[:-1], x[1:]),
+}
+
+
+@pytest.mark.parametrize("kind", BESIDE)
+def test_columns_of_fixed_variables_are_those_of_the_problem_without_the_fix(kind: str) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 4)
+    graph.fix(x[[0, 2]], [[0.3, -0.5], [0.8, 0.2]])
+    graph.minimize(fg.prior, x, np.array([[0.2, 0.1], [1.0, 0.7], [0.4, 0.4], [-0.6, 1.2]]), name="prior")
+    BESIDE[kind](graph, x)
+    program = graph.compile()
+    lin = program.linearize({x: np.array([[0.3, -0.5], [0.9, 0.8], [0.8, 0.2], [-0.7, 1.1]])})
+    multipliers = np.linspace(0.5, 1.5, program.constraints.count)
+    columns = program.columns.of(x[[0, 2]]).ravel()
+    numbers = np.full(program.columns.width, -1)
+    numbers[columns] = np.arange(len(columns))
+    found = FixedColumns(program, numbers)
+    matrix = np.zeros((program.size + len(multipliers), len(columns)))
+    matrix[found.rows, found.coordinates] = found.entries(program, lin, multipliers)
+    assert (np.diff(found.coordinates * len(matrix) + found.rows) > 0).all()
+    twin, here = unfixed(program, columns, lin)
+    upper = twin.normal.matrix(lagrangian_hessian(twin, here, multipliers)).toarray()
+    hessian = np.triu(upper) + np.triu(upper, 1).T
+    slopes = twin.constraints.matrix(here.constraint_jacobian).toarray()
+    rounding = 1e-6 if "Python" in kind else 1e-13
+    assert np.abs(matrix).max() > 0.05
+    np.testing.assert_allclose(matrix[: program.size], hessian[np.ix_(program.columns.free, columns)], atol=rounding)
+    np.testing.assert_allclose(matrix[program.size :], slopes[:, columns], atol=rounding)
+
+
+def test_structure_is_found_once_and_one_factor_serves_several_solutions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The memory of the factor is borrowed: what another solution left there is replaced."""
+    stated = Unicycle("straight", False, 20).formulation()
+    run = InteriorPoint(tolerance=TIGHT).prepare(stated.graph)
+    starts = np.zeros(3), np.array([0.1, 0.05, -0.1])
+    first = run.solve(stated.guess, data={stated._start: starts[0]}, check=True)
+    asked: list[Any] = [stated.u[0], "limits"]
+    expected = first.sensitivity(asked, stated.x[0])
+    with monkeypatch.context() as patch:
+        patch.setattr(FixedColumns, "__init__", None)
+        patch.setattr(KktStructure, "of", None)
+        second = run.solve(stated.guess, data={stated._start: starts[1]}, check=True)
+        other = second.sensitivity(asked, stated.x[0])
+    assert np.abs(other - expected).max() > 1e-3
+    assert first._sensitivities._structure is second._sensitivities._structure
+    assert len(first._sensitivities._structure.kkt.spare) == 1
+    np.testing.assert_array_equal(first.sensitivity(stated.u[0], stated.x[0]), expected[:2])
+    np.testing.assert_array_equal(second.sensitivity(asked, stated.x[0]), other)
+
+
+def test_few_structures_of_questions_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sensitivity, "KEPT", 2)
+    known: dict[Any, str] = {}
+    found = [sensitivity.remembered(known, key, lambda key=key: key.upper()) for key in "abbca"]  # type: ignore[misc]
+    assert found == list("ABBCA") and list(known) == ["c", "a"]

@@ -12,6 +12,8 @@ from numba import njit
 import unifg as fg
 from unifg.modeling.variables import Data
 from unifg.models import unicycle
+from unifg.solution import as_written
+from unifg.solution.as_written import WrittenTerm
 from unifg.solvers import (
     SQP,
     AugmentedLagrangian,
@@ -318,3 +320,64 @@ def test_a_direction_without_curvature_is_undecided(solver: fg.Solver) -> None:
     graph.minimize(lambda x: 2.0 + 2.0 * k - np.exp(k * x[:, :1]) - np.exp(k * x[:, 1:]), x, name="sums")
     solution = solver.solve(graph, {x: [[0.3, 0.4]]}, check=True)
     assert solution.verify().verdict == "undecided"
+
+
+HEIGHTS = np.array([1.0, 2.0, 3.0, 4.0, 5.0])
+KNOWS: dict[str, tuple[Any, int]] = {  # a function, and the calls that its slopes take
+    "factor by factor": (lambda x, y, each, shared: x * y * each + shared, 4),
+    "numbers of its own": (lambda x, y, each, shared: x * y * each + shared * HEIGHTS[:, None], 18),
+    "its index": (lambda x, y, each, shared: x * y * each + shared * (np.arange(len(x)) % 2)[:, None], 18),
+    "the others": (lambda x, y, each, shared: (x - x.mean(axis=0)) * y * each + shared, 18),
+}
+
+
+@pytest.mark.parametrize("kind", KNOWS)
+def test_slopes_take_few_calls_where_the_function_allows_that(kind: str) -> None:
+    """Many moves stand in one long call, unless the function knows how many factors there are."""
+    function, most = KNOWS[kind]
+    calls = []
+
+    def counted(x: Array, y: Array, each: Array, shared: Array) -> Array:
+        calls.append(len(x))
+        return np.asarray(function(x, y, each, shared))
+
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.Rn(2), 5), graph.variables("y", fg.Rn(2), 5)
+    active = np.array([True, True, False, True, True])
+    given = fg.each(np.arange(1.0, 6.0)[:, None]), fg.shared([0.5, 0.7])
+    graph.minimize(counted, x, y, *given, active=active, name="term")
+    values = {x: np.arange(10.0).reshape(5, 2) / 7.0, y: np.arange(3.0, 13.0).reshape(5, 2) / 9.0}
+    program = graph.compile()
+    term = WrittenTerm(program.terms[0].term, program.columns, values, {})
+    calls.clear()
+    slopes, doubt = term.slopes()
+    assert len(calls) == most and max(calls) == 5 * 8
+    expected = np.zeros((5, 2, 4))
+    own = values[x] - (values[x].mean(axis=0) if kind == "the others" else 0.0)
+    for k in range(2):
+        expected[:, k, k] = values[y][:, k] * (0.0 if kind == "the others" else np.arange(1.0, 6.0))
+        expected[:, k, 2 + k] = own[:, k] * np.arange(1.0, 6.0)
+    np.testing.assert_allclose(slopes[active], expected[active], atol=1e-9)
+    assert not slopes[~active].any() and doubt.max() < 1e-8
+
+
+def test_a_large_term_is_moved_call_by_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A long call of it would not fit into a cache."""
+    monkeypatch.setattr(as_written, "LONGEST", 39)
+    lengths = []
+
+    def counted(x: Array) -> Array:
+        lengths.append(len(x))
+        return np.asarray(np.sin(x))
+
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 10)
+    graph.minimize(counted, x)
+    program = graph.compile()
+    term = WrittenTerm(program.terms[0].term, program.columns, {x: np.zeros((10, 1))}, {})
+    lengths.clear()
+    np.testing.assert_allclose(term.slopes()[0], 1.0, atol=1e-9)
+    assert lengths == [10] * 4
+    monkeypatch.setattr(as_written, "LONGEST", 40)
+    term.slopes()
+    assert lengths == [10] * 5 + [40]

@@ -9,7 +9,8 @@ import math
 
 from unifg.codegen.function_pointers import holds, linked, parts, run
 from unifg.elimination.plan import NEGATIVE
-from unifg.problem.evaluation import add_constraints, times, transposed_times
+from unifg.problem.evaluation import times, transposed_times
+from unifg.problem.systems import fill_stacked
 from unifg.solvers.interior_point.state import AGAIN, EXAMINED, NO, SINGULAR, TRY, UNKNOWN, YES
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
@@ -97,12 +98,8 @@ def assemble(address: int) -> None:
         data[k] = curvature[k] if share == 1.0 else hessian[k]
         if 0.0 < share < 1.0:
             data[k] += share * (curvature[k] - hessian[k])
-    for k in range(len(entries)):
-        data[normal + k] = constraint_jacobian[entries[k]]
-    if scalars[0].definite != EXAMINED:
-        add_constraints(terms, constraint_jacobian, row_weights, data)
-    for k in range(len(doubles) // 2):
-        data[doubles[2 * k]] += data[doubles[2 * k + 1]]
+    sides = scalars[0].definite != EXAMINED
+    fill_stacked(terms, entries, doubles, constraint_jacobian, row_weights, normal, sides, data)
 
 
 @linked

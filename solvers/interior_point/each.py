@@ -7,6 +7,7 @@ from typing import NamedTuple
 from unifg.codegen.calls import vector
 from unifg.codegen.function_pointers import Memory, all_of, linked_to, run
 from unifg.lie.so3 import all_unit
+from unifg.problem.guess import settle
 from unifg.problem.linearization import all_finite
 from unifg.solution.export import REFUSED
 from unifg.solution.multipliers import SUSPICIOUS
@@ -102,9 +103,7 @@ def solve_each(address: int) -> None:
             values[i] = given.guesses[guess, i]
         for i in range(len(multipliers)):
             multipliers[i] = given.duals[guess, i]
-        for i in range(len(given.places)):
-            values[given.places[i]] = given.fixed[i]
-        known = all_finite(values) and all_finite(multipliers) and all_unit(values, given.quaternions)
+        known = settle(values, given.places, given.fixed, given.quaternions) and all_finite(multipliers)
         for i in range(width):
             known = known and row[i] == row[i]
         number[ANSWER] = REFUSED

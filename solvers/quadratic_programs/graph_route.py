@@ -20,8 +20,8 @@ from unifg.codegen.loops import copy_to
 from unifg.elimination.fronts import factor
 from unifg.elimination.substitution import solve
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.problem.evaluation import add_constraints, times, transposed_times
-from unifg.problem.systems import KktArrays, fill, stacked
+from unifg.problem.evaluation import times, transposed_times
+from unifg.problem.systems import KktArrays, fill, fill_stacked, stacked
 from unifg.problem.table import TermArrays
 from unifg.solvers.globalize.norms import largest
 from unifg.solvers.quadratic_programs.subproblem import FINER, QP, QPAnswer, qp_error
@@ -427,14 +427,9 @@ def minimize_quadratic(
 @compiled
 def _load(terms: TermArrays, system: Stacked, hessian: Array, jacobian: Array, weights: Array, data: Array) -> None:
     """Write the entries of the KKT matrix with H + A' diag(weights) A."""
-    normal, entries, doubles = len(hessian), system.kkt.entries, system.doubles
-    for k in range(normal):
+    for k in range(len(hessian)):
         data[k] = hessian[k]
-    for k in range(len(entries)):
-        data[normal + k] = jacobian[entries[k]]
-    add_constraints(terms, jacobian, weights, data)
-    for k in range(len(doubles) // 2):
-        data[doubles[2 * k]] += data[doubles[2 * k + 1]]
+    fill_stacked(terms, system.kkt.entries, system.doubles, jacobian, weights, len(hessian), True, data)
 
 
 @compiled

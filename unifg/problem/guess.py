@@ -58,7 +58,7 @@ class GuessReader:
         else:
             values = self._read(guess)
         fixed = self._retraction
-        fine = _settle(values.flat, fixed.fixed, fixed.fixed_values, self.quaternions)
+        fine = settle(values.flat, fixed.fixed, fixed.fixed_values, self.quaternions)
         if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self.particular)):
             self._name_invalid(values)
         return values
@@ -105,7 +105,7 @@ class GuessReader:
 
 
 @compiled
-def _settle(values: Array, fixed: IntArray, fixed_values: Array, quaternions: IntArray) -> bool:
+def settle(values: Array, fixed: IntArray, fixed_values: Array, quaternions: IntArray) -> bool:
     """Give fixed variables their values; tell whether all numbers are finite, and quaternions of norm 1."""
     for k in range(len(fixed)):
         values[fixed[k]] = fixed_values[k]

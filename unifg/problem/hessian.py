@@ -74,7 +74,7 @@ def lagrangian_hessian(program: CompiledProblem, lin: Linearization, multipliers
     """
     require_second(program)
     entries = lin.hessian + lin.concavity if len(lin.concavity) else lin.hessian.copy()
-    add_curvature(program.arrays, lin.values.flat, lin.residual, lin.weights, multipliers, entries)
+    add_curvature(program.arrays, lin.stored, lin.residual, lin.weights, multipliers, entries)
     if program.table.robust:
         add_losses(program.arrays, lin.residual, lin.jacobian, lin.squares, lin.weights, entries)
     for term in program.batched:
@@ -86,7 +86,7 @@ def constraint_curvature(program: CompiledProblem, lin: Linearization, multiplie
     """Hessian of multipliers' g alone, in the order of ``CompiledProblem.normal``; arguments as above."""
     require_second(program)
     entries = np.zeros(program.normal.nnz)
-    add_curvature(program.arrays, lin.values.flat, np.zeros(len(lin.residual)), lin.weights, multipliers, entries)
+    add_curvature(program.arrays, lin.stored, np.zeros(len(lin.residual)), lin.weights, multipliers, entries)
     for term in program.batched:
         if not isinstance(term.term, Cost):
             _add(program, term, lin, multipliers, entries)

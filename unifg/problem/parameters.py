@@ -48,6 +48,7 @@ class Parameter(NamedTuple):
         manifold: of its rows; None for plain numbers.
         shape: of its coordinates.
         numbers: (width,) which coordinate moves a full tangent column, -1 where none does.
+        fixed: whether it moves any.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Parameter(NamedTuple):
     manifold: Manifold | None
     shape: tuple[int, ...]
     numbers: IntArray
+    fixed: bool
 
 
 class Part(NamedTuple):
@@ -96,10 +98,10 @@ def datum(program: CompiledProblem, handle: Data) -> Parameter:
     for fix in fixes:
         columns = program.columns.fixed[fix.name]
         numbers[columns] = np.broadcast_to(np.arange(np.prod(shape, dtype=int)).reshape(shape), columns.shape)
-    return Parameter(handle.name, handle, manifold, shape, numbers)
+    return Parameter(handle.name, handle, manifold, shape, numbers, bool(fixes))
 
 
-def fixed(program: CompiledProblem, selection: Selection) -> Parameter:
+def fixed_variables(program: CompiledProblem, selection: Selection) -> Parameter:
     """Fixed variables as a parameter.
 
     Raises:
@@ -112,7 +114,7 @@ def fixed(program: CompiledProblem, selection: Selection) -> Parameter:
         )
     numbers = np.full(program.columns.width, -1)
     numbers[columns] = np.arange(columns.size).reshape(columns.shape)
-    return Parameter(name, None, None, columns.shape, numbers)
+    return Parameter(name, None, None, columns.shape, numbers, bool(columns.size))
 
 
 def parts_of(

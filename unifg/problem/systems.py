@@ -21,7 +21,7 @@ from unifg.elimination.factorization import Factorization
 from unifg.elimination.plan import Plan
 from unifg.elimination.saddle import SaddlePoint
 from unifg.elimination.symmetric import Symmetric
-from unifg.problem.evaluation import transposed_times
+from unifg.problem.evaluation import add_constraints, transposed_times
 from unifg.problem.linearization import Rows
 from unifg.problem.table import TermArrays
 from unifg.typing import Array, BoolArray, IntArray
@@ -225,6 +225,31 @@ def fill(kkt: KktArrays, hessian: Array, constraint_jacobian: Array, data: Array
         data[kkt.normal[k]] = hessian[k]
     for k in range(len(kkt.entries)):
         data[kkt.places[k]] += constraint_jacobian[kkt.entries[k]]
+
+
+@compiled
+def fill_stacked(
+    terms: TermArrays, entries: IntArray, doubles: IntArray, constraint_jacobian: Array, weights: Array, normal: int,
+    sides: bool, data: Array,
+) -> None:  # fmt: skip
+    """Write what follows the ``normal`` entries of H in the order of :func:`stacked`.
+
+    Args:
+        terms: of the program.
+        entries: of the constraint Jacobian, as of :class:`KktArrays`.
+        doubles: pairs of :func:`stacked`.
+        constraint_jacobian: entries of A.
+        weights: (M,) of A' diag(weights) A, which is added to H if ``sides`` says so.
+        normal: number of entries of H, which stand in ``data``.
+        sides: see above.
+        data: the stacked entries.
+    """
+    for k in range(len(entries)):
+        data[normal + k] = constraint_jacobian[entries[k]]
+    if sides:
+        add_constraints(terms, constraint_jacobian, weights, data)
+    for k in range(len(doubles) // 2):
+        data[doubles[2 * k]] += data[doubles[2 * k + 1]]
 
 
 @compiled

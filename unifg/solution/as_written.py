@@ -21,8 +21,11 @@ from unifg.problem.traced import has_rows
 from unifg.typing import Array, BoolArray, IntArray
 
 STEP = 6e-5  # the longer of two steps [m, rad, ...]
+LENGTHS = STEP * np.array([1.0, -1.0, 0.5, -0.5])
 EPSILON = 2.0 * float(np.finfo(np.float64).eps)
 NOISE = 20.0  # roundings in second differences
+LONGEST = 1 << 17  # numbers in the points of one call
+ALIKE = 10.0 * EPSILON  # relative difference of a factor's rows in a call of more factors
 BEND = 1e-5  # of a squared norm, by which the slope of a robust loss is found
 
 
@@ -53,6 +56,7 @@ class WrittenTerm:
             point = values[chosen.family][chosen.indices][:, chosen.storage]
             self._arguments[k] = np.array(np.broadcast_to(point, (n, point.shape[1])))
         own = [columns.of(chosen) for chosen in term.selections]
+        self._long = not term.residual.rows  # whether many moves stand in one call
         self.columns: IntArray = np.concatenate([np.broadcast_to(c, (n, c.shape[1])) for c in own], axis=1)
         mask = resolve(term.active, data) if isinstance(term.active, Data) else term.active
         self.active: BoolArray = np.ones(n, dtype=bool) if mask is None else mask.astype(bool)
@@ -60,9 +64,9 @@ class WrittenTerm:
         sizes = [np.abs(self._arguments[k]).max(axis=1, keepdims=True) for k in self._places]
         self.rounding = EPSILON * np.maximum(1.0, np.max(sizes, axis=0))  # of zero, that of a number of order one
 
-    def _rows(self, arguments: list[Any]) -> Array:
-        """(n, m) rows for some arguments."""
-        own, n = self.term.residual, self.term.count
+    def _rows(self, arguments: list[Any], times: int = 1) -> Array:
+        """(n, m) rows for some arguments; (times n, m) for such arguments one after the other."""
+        own, n = self.term.residual, self.term.count * times
         if own.rows:
             each = [
                 k in self._places or (has_rows(a, declared) and len(a) == n)
@@ -74,7 +78,32 @@ class WrittenTerm:
                 found[i] = in_python(own.function, [a if a.ndim else float(a) for a in given], own.rows)
             return found
         given = [a.copy() if k in self._places else a for k, a in enumerate(arguments)]  # it may write into them
-        return np.where(self.active[:, None], np.array(own.function(*given)).reshape(n, -1), 0.0)
+        return np.where(np.tile(self.active, times)[:, None], np.array(own.function(*given)).reshape(n, -1), 0.0)
+
+    def _moved(self, place: int, there: Array) -> Array:
+        """(K, n, m) rows with an argument at (K, n, storage) points, in one call where the function allows that.
+
+        It may know how many factors there are: then the call fails, or the last rows differ from those by themselves.
+        """
+        arguments, times, n = self._arguments, len(there), self.term.count
+        before, after = arguments[:place], arguments[place + 1 :]
+        if self._long and times * sum(arguments[k].size for k in self._places) <= LONGEST:
+            many = [
+                np.tile(a, (times, *[1] * (a.ndim - 1)))
+                if isinstance(a, np.ndarray) and a.ndim and len(a) == n and declared is not False
+                else a
+                for a, declared in zip(arguments, self.term.rows, strict=True)
+            ]
+            many[place] = there.reshape(times * n, -1)
+            last = self._rows([*before, there[-1], *after])
+            try:
+                found = self._rows(many, times).reshape(times, *last.shape)
+                if np.allclose(found[-1], last, ALIKE, ALIKE, equal_nan=True):
+                    return found
+            except Exception:  # of the user's function
+                pass
+            self._long = False
+        return np.stack([self._rows([*before, point, *after]) for point in there])
 
     def slopes(self) -> tuple[Array, Array]:
         """(n, m, D) derivatives along right perturbations, and bounds of their errors.
@@ -84,11 +113,12 @@ class WrittenTerm:
         """
         found = []
         for place, chosen in zip(self._places, self.term.selections, strict=True):
-            point, before, after = self._arguments[place], self._arguments[:place], self._arguments[place + 1 :]
-            for step in np.eye(chosen.manifold.dim):
-                moved = [chosen.manifold.retract(point, length * step) for length in (STEP, -STEP, STEP / 2, -STEP / 2)]
-                found.append([self._rows([*before, there, *after]) for there in moved])
-        ahead, behind, near, nearly = (np.stack(rows, axis=2) for rows in zip(*found, strict=True))
+            point, dim = self._arguments[place], chosen.manifold.dim
+            steps = np.kron(LENGTHS[:, None], np.eye(dim))
+            many = np.tile(point, (len(steps), 1)), np.repeat(steps, len(point), axis=0)
+            there = np.asarray(chosen.manifold.retract(*many)).reshape(len(steps), *point.shape)
+            found.append(self._moved(place, there).reshape(len(LENGTHS), dim, *self.rows.shape))
+        ahead, behind, near, nearly = np.moveaxis(np.concatenate(found, axis=1), 1, 3)
         here = self.rows[:, :, None]
         long, short = (ahead - behind) / (2.0 * STEP), (near - nearly) / STEP
         rounding = (self.rounding[:, :, None] + EPSILON * np.abs(here)) / STEP * np.maximum(1.0, np.abs(short))

@@ -32,6 +32,9 @@ OTHERS = {
 HEADER = """\
 /* {name}: a solver written by unifg, for {processor}.
  *
+ * All arrays are doubles, those of several axes row by row (the last axis runs fastest). Data and residuals have the
+ * units the graph was written in; angles of manifolds are in rad, quaternions of norm 1.
+ *
  * Data, in this order:
 {data}
  *

@@ -22,7 +22,7 @@ from unifg.codegen.loops import largest
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COST, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, BoolArray, IntArray
 
 LARGEST = 1e6  # the least of it: costates of a long chain add up to the square of its rows
 LARGE = 1e3  # of a single row
@@ -133,3 +133,33 @@ def size_of(
     for k in free:
         steepest = max(steepest, abs(gradient[k]))
     return total / steepest
+
+
+@compiled
+def weakest(
+    constraints: Array, lower: Array, upper: Array, multipliers: Array, counted: BoolArray, equality: BoolArray
+) -> tuple[int, float, float]:
+    """Inequality that is closest to being active or not, by the larger of its two numbers.
+
+    Returns:
+        Its row, -1 without one; its distance from the nearer limit; its multiplier, scaled as the KKT test does.
+    """
+    total = 0.0
+    for multiplier in multipliers:
+        total += abs(multiplier)
+    scale = max(1.0, total / 100.0 / max(len(multipliers), 1))
+    row, least, slack = -1, np.inf, 0.0
+    for k in range(len(multipliers)):
+        if counted[k] and not equality[k]:
+            own = min(abs(constraints[k] - lower[k]), abs(constraints[k] - upper[k]))
+            if max(own, abs(multipliers[k]) / scale) < least:
+                row, least, slack = k, max(own, abs(multipliers[k]) / scale), own
+    return row, slack, abs(multipliers[row]) / scale if row >= 0 else 0.0
+
+
+@compiled
+def hold(constraints: Array, lower: Array, upper: Array, multipliers: Array, held: BoolArray) -> None:
+    """Write which inequalities are active: their multiplier outweighs the distance to its limit."""
+    for k in range(len(held)):
+        limit = upper[k] if multipliers[k] > 0.0 else lower[k]
+        held[k] = abs(multipliers[k]) > abs(constraints[k] - limit)

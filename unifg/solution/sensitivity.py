@@ -13,34 +13,97 @@ factorised once; each column of ``wrt``, or each row of ``of``, is one solve.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import accumulate
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from unifg.elimination.saddle import EXACT
 from unifg.errors import GraphError
 from unifg.factors.robust import form_of
-from unifg.locks import ReentrantLock
 from unifg.modeling.terms import Cost
 from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.fixed_columns import FixedColumns
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
-from unifg.problem.parameters import Parameter, datum, fixed, parts_of
-from unifg.problem.systems import fill
+from unifg.problem.parameters import Parameter, datum, fixed_variables, parts_of
+from unifg.problem.systems import KktSystem, fill, leave_out
 from unifg.solution.covariance import SOLVED
-from unifg.solution.gains import REPLACED, SAME, unfixed
+from unifg.solution.gains import REPLACED, SAME
+from unifg.solution.multipliers import weakest
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
 LINEARIZED = "cost", "gradient", "hessian", "constraints", "constraint_jacobian"
 ENOUGH = 1e-10  # residual of most solves
 AT_ONCE = 64  # right-hand sides in one call
+KEPT = 32  # structures of questions
 WEAK = 10.0  # times the root of the tolerance: slack and multiplier of a row that may be active or not
 Named = Variable | str
 Weights = Mapping[Family, Numbers] | Mapping[Selection, Numbers] | Mapping[str, Numbers] | Mapping[Named, Numbers]
 Wrt = Data | Variable | str
+T = TypeVar("T")
+
+
+class Part(NamedTuple):
+    """Places of what is asked for.
+
+    Attributes:
+        places: (k,) in the KKT system, `HEIGHT`, or -1 for none.
+        columns: (k,) full tangent columns, or -1.
+        unknown: whether all of it is unknown variables.
+    """
+
+    places: IntArray
+    columns: IntArray
+    unknown: bool
+
+
+class Structure:
+    """Structure that questions about all solutions of a graph share.
+
+    Attributes:
+        kkt: of the matrix with all constraint rows.
+        probe: (size,) random numbers.
+        open: (M,) rows with an unknown.
+        parts, parameters: the ones asked for.
+        fixed: columns of fixed variables, by the coordinates.
+    """
+
+    def __init__(self, program: CompiledProblem) -> None:
+        """Find it.
+
+        Raises:
+            GraphError: a loss has no second derivative.
+        """
+        for term in program.cost_terms:
+            if isinstance(term.term, Cost) and form_of(term.term.robust) is None:
+                raise GraphError(
+                    f"sensitivity: the loss of term '{term.name}' has formulas of its own, and no second derivative: "
+                    "use a loss that ships",
+                    term=term.name,
+                )
+        self.kkt = program.systems.structure(np.ones(program.constraints.count, dtype=bool))
+        self.probe = np.random.default_rng(0).standard_normal(self.kkt.factorization.pattern.size)
+        self.open = np.ones(program.constraints.count, dtype=bool)
+        self.open[program.fixed_rows()] = False
+        self.parts: dict[Hashable, Part] = {}
+        self.parameters: dict[Hashable, Parameter] = {}
+        self.fixed: dict[Hashable, FixedColumns] = {}
+
+
+def remembered(known: dict[Hashable, T], key: Hashable, find: Callable[[], T]) -> T:
+    """What was found for a key, or is now; the latest `KEPT` are kept."""
+    if key not in known:
+        while len(known) >= KEPT:
+            del known[next(iter(known))]
+        known[key] = find()
+    return known[key]
 
 
 class Sensitivities:
@@ -71,35 +134,23 @@ class Sensitivities:
             GraphError: when the data have been replaced, rows are weakly active, or the reduced Hessian is not positive
                 definite.
         """
-        self._program, self._multipliers, self._lock = program, multipliers, ReentrantLock()
-        for term in program.cost_terms:
-            if isinstance(term.term, Cost) and form_of(term.term.robust) is None:
-                raise GraphError(
-                    f"sensitivity: the loss of term '{term.name}' has formulas of its own, and no second derivative: "
-                    "use a loss that ships",
-                    term=term.name,
-                )
-        self._lin, self._edition, self._limits, self._changes = (
-            lin,
-            edition,
-            limits,
-            dict[tuple[Hashable, ...], Change](),
-        )
+        self._program, self._lin, self._edition, self._limits = program, lin, edition, limits
+        self._changes: dict[tuple[Hashable, ...], Change] = {}
         with program.lock:
+            self._structure = structure = program.once(Structure)
             self._require_data()
-            self._require_strict(tolerance)
-            held = active.copy()
-            held[program.fixed_rows()] = False
+            self._require_strict(multipliers, tolerance)
+            held = active & structure.open
             self._multipliers = np.where(held, multipliers, 0.0)
             hessian = lagrangian_hessian(program, lin, self._multipliers)
-        n, self._system = program.size, program.systems.kkt(np.ones(len(held), dtype=bool))
-        entries = np.zeros(self._system.pattern.nnz)
-        fill(self._system.arrays, hessian, lin.constraint_jacobian, entries)
-        out = np.concatenate([np.zeros(n, dtype=bool), ~held])
-        self._number = np.where(held, n + np.arange(len(held)), -1)
-        if not self._system.saddle.factor(self._system.without(entries, out)):
-            raise GraphError("sensitivity: the Hessian is not finite at the solution")
-        self._dependent = self._probe(out)
+        self._out = out = np.concatenate([np.zeros(program.size, dtype=bool), ~held])
+        with structure.kkt.borrowed() as system:
+            pattern, self._entries = system.pattern, np.empty(system.pattern.nnz)
+            fill(system.arrays, hessian, lin.constraint_jacobian, self._entries)
+            leave_out(pattern.indptr, pattern.indices, self._entries, out, program.size, self._entries)
+            if not system.load(self._entries):
+                raise GraphError("sensitivity: the Hessian is not finite at the solution")
+            self._dependent = self._probe(system)
 
     def _require_data(self) -> None:
         """Raise unless the present data are those of the solution: their number, or what they make of its values."""
@@ -113,26 +164,22 @@ class Sensitivities:
             raise GraphError(REPLACED)
         self._edition = program.binding.edition
 
-    def _require_strict(self, tolerance: float) -> None:
+    def _require_strict(self, multipliers: Array, tolerance: float) -> None:
         """Raise for the weakest row that may be active or not."""
         program, least = self._program, WEAK * float(np.sqrt(tolerance))
-        force = np.abs(self._multipliers)
-        force = force / max(1.0, float(force.mean()) / 100.0) if len(force) else force
-        g = self._lin.constraints
-        slack = np.minimum(*(np.abs(g - limit) for limit in self._limits))
-        size = np.where(program.equality, np.inf, np.maximum(slack, force))
-        size[program.fixed_rows()] = np.inf
-        if len(size) and (worst := int(np.argmin(size))) >= 0 and size[worst] < least:
-            term, factor, place = self._place(worst)
+        own = self._structure.open, program.equality
+        row, slack, force = weakest(self._lin.constraints, *self._limits, multipliers, *own)
+        if row >= 0 and max(slack, force) < least:
+            term, factor, place = self._place(row)
             raise GraphError(
-                f"sensitivity: {place} is weakly active, its slack {slack[worst]:.1e} and its multiplier "
-                f"{force[worst]:.1e} both below {least:.1e}: on either side of the present data the derivative is "
+                f"sensitivity: {place} is weakly active, its slack {slack:.1e} and its multiplier "
+                f"{force:.1e} both below {least:.1e}: on either side of the present data the derivative is "
                 "another. Solve with a smaller tolerance if one of them is not that small, else ask at other data",
                 term=term,
                 index=factor,
             )
 
-    def _probe(self, out: BoolArray) -> str:
+    def _probe(self, system: KktSystem) -> str:
         """Solve for random numbers: what is left of them is what the matrix is singular in.
 
         Returns:
@@ -141,13 +188,25 @@ class Sensitivities:
         Raises:
             GraphError: the reduced Hessian is singular or indefinite.
         """
-        program, system, n = self._program, self._system, self._program.size
-        right = np.random.default_rng(0).standard_normal(len(out)) / system.saddle.scale
-        right[out] = 0.0
-        rest = self._tried(right)[1]
-        singular = not rest.max(initial=0.0) <= 1.0
-        if singular:  # multipliers that dependent rows leave open may be too large to see the unknowns beside them
-            rest[:n] = self._tried(np.where(np.arange(len(out)) < n, right, 0.0))[1][:n]
+        n = self._program.size
+        right, dependent = self._structure.probe / system.saddle.scale, ""
+        right[self._out] = 0.0
+        if not system.saddle.solve_rows(right[None], ENOUGH)[1][0] <= SOLVED:
+            dependent = self._singular(system, right)
+        if system.factorization.inertia != (n, len(right) - n, 0):
+            raise GraphError(
+                "sensitivity: the reduced Hessian is indefinite: the solution is no strict local minimum, and what "
+                "becomes of it when data change is not determined; start elsewhere"
+            )
+        return dependent
+
+    def _singular(self, system: KktSystem, right: Array) -> str:
+        """What the matrix is singular in, from a system that was not solved at once; returns and errors as above."""
+        program, n, rest = self._program, self._program.size, _tried(system, right)[1]
+        if rest.max(initial=0.0) <= 1.0:
+            return ""
+        # multipliers that dependent rows leave open may be too large to see the unknowns beside them
+        rest[:n] = _tried(system, np.where(np.arange(len(right)) < n, right, 0.0))[1][:n]
         if not rest[:n].max(initial=0.0) <= 1.0:
             family, index = program.columns.name(int(program.columns.free[np.argmax(rest[:n])]))
             raise GraphError(
@@ -156,24 +215,7 @@ class Sensitivities:
                 family=family,
                 index=index,
             )
-        if system.factorization.inertia != (n, len(out) - n, 0):
-            raise GraphError(
-                "sensitivity: the reduced Hessian is indefinite: the solution is no strict local minimum, and what "
-                "becomes of it when data change is not determined; start elsewhere"
-            )
-        return self._place(int(np.argmax(rest[n:])))[2] if singular else ""
-
-    def _tried(self, right: Array) -> tuple[Array, Array]:
-        """A solution, refined no more than it needs, and what it leaves of every row, in multiples of what it may."""
-        saddle = self._system.saddle
-        solution, rest, most = right, right, SOLVED * float(np.abs(saddle.scale * right).max(initial=0.0)) or 1.0
-        for enough in (ENOUGH, EXACT):
-            with self._lock:
-                solution, _ = saddle.solve(right, enough)
-                rest = np.abs(saddle.residual(solution, right)) / most
-            if rest.max(initial=0.0) <= 1.0:
-                break
-        return solution, rest
+        return self._place(int(np.argmax(rest[n:])))[2]
 
     def _place(self, row: int) -> tuple[str, int, str]:
         """Term and factor of a constraint row, and the words for it."""
@@ -184,47 +226,68 @@ class Sensitivities:
         """(k, K) derivatives; arguments and errors as of :meth:`unifg.Solution.sensitivity`."""
         if not (of and wrt):
             raise GraphError("sensitivity() of what? Name families, members or constraints, and data")
-        places, columns = (np.concatenate(part) for part in zip(*map(self._rows, of), strict=True))
+        places, columns, unknown = self._rows(of)
         change = self._change(wrt)
-        result = np.zeros((len(places), change.count))
-        result[places == HEIGHT] = change.heights
+        if unknown:
+            return self._derivatives(change, places)
+        result, asked = np.zeros((len(places), change.count)), np.flatnonzero(places >= 0)
+        result[asked] = self._derivatives(change, places[asked])
+        if (places == HEIGHT).any():
+            result[places == HEIGHT] = self._heights(change)
         of_fixed = change.numbers[:, columns] * (columns >= 0) - (columns < 0)
         which, row = np.nonzero(of_fixed >= 0)
         result[row, of_fixed[which, row]] = 1.0
-        asked = np.flatnonzero(places >= 0)
-        if self._forward(places[asked]) or change.count <= len(asked):
-            for part in _chunks(np.arange(change.count if len(asked) else 0)):
-                result[np.ix_(asked, part)] = self._solved(self._columns(change, part))[:, places[asked]].T
+        return result
+
+    def _derivatives(self, change: Change, places: IntArray) -> Array:
+        """(k, K) derivatives of what stands at some places (k,) of the KKT system."""
+        result = np.empty((len(places), change.count))
+        if self._forward(places) or change.count <= len(places):
+            for part in _chunks(change.count if len(places) else 0):
+                result[:, part] = self._solved(self._columns(change, part))[:, places].T
             return result
-        for part in _chunks(asked):
-            right = np.zeros((len(part), self._system.pattern.size))
-            right[np.arange(len(part)), places[part]] = 1.0
+        for part in _chunks(len(places)):
+            right = np.zeros((part.stop - part.start, len(self._out)))
+            right[np.arange(len(right)), places[part]] = 1.0
             result[part] = [change.pulled(adjoint) for adjoint in self._solved(right)]
         return result
 
     def gradient(self, of: Mapping[Selection | str, Array], wrt: Wrt) -> Array:
         """Gradient of a weighted sum; arguments and errors as of :meth:`unifg.Solution.gradient`."""
-        change, right = self._change([wrt]), np.zeros(self._system.pattern.size)
-        total = np.zeros(change.count)
+        change, right = self._change([wrt]), np.zeros(len(self._out))
+        total, asked = np.zeros(change.count), False
         for what, weights in of.items():
-            places, columns = self._rows(what)
-            try:
-                given = np.broadcast_to(weights, shape := self._shape(what)).ravel()
-            except ValueError:
-                raise GraphError(
-                    f"gradient: weights of {what!r} have shape {weights.shape}, expected {shape}"
-                ) from None
-            np.add.at(right, places[places >= 0], given[places >= 0])
-            if (places == HEIGHT).any():
-                total += given * change.heights
-            own = np.where(columns < 0, -1, change.numbers[0, columns])
-            np.add.at(total, own[own >= 0], given[own >= 0])
-        if self._forward(np.flatnonzero(right)):
-            for part in _chunks(np.arange(change.count)):
+            places, columns, unknown = self._rows([what])
+            given = weights if unknown and not weights.ndim else self._weights(what, weights)
+            if not unknown:
+                if (places == HEIGHT).any():
+                    total += given * self._heights(change)
+                own = np.where(columns < 0, -1, change.numbers[0, columns])
+                np.add.at(total, own[own >= 0], given[own >= 0])
+                given, places = given[places >= 0], places[places >= 0]
+            np.add.at(right, places, given)
+            asked = asked or len(places) > 0
+        if self._dependent and self._forward(np.flatnonzero(right)):
+            for part in _chunks(change.count):
                 total[part] += self._solved(self._columns(change, part)) @ right
-        elif right.any():
+        elif asked:
             total += change.pulled(self._solved(right[None])[0])
         return total.reshape(change.shape)
+
+    def _weights(self, of: Selection | str, weights: Array) -> Array:
+        """Weights of what is asked for, one each.
+
+        Raises:
+            GraphError: they have another shape.
+        """
+        if not isinstance(of, str):
+            shape: tuple[int, ...] = len(of), of.manifold.dim
+        else:
+            shape = next((shape for name, _, shape in self._program.places if name == of), ())
+        try:
+            return np.broadcast_to(weights, shape).ravel()
+        except ValueError:
+            raise GraphError(f"gradient: weights of {of!r} have shape {weights.shape}, expected {shape}") from None
 
     def _forward(self, places: IntArray) -> bool:
         """Test whether columns are the only way, because active gradients depend on each other.
@@ -239,24 +302,28 @@ class Sensitivities:
             )
         return bool(self._dependent)
 
-    def _rows(self, of: Selection | str) -> tuple[IntArray, IntArray]:
-        """Places (k,) in the KKT system, or `HEIGHT`, or -1 for none; full tangent columns (k,), or -1."""
+    def _rows(self, of: Sequence[Selection | str]) -> Part:
+        """Places of what is asked for, one after the other; those of multipliers only where a row is held."""
+        known = self._structure.parts
+        part = remembered(known, tuple(map(_called, of)), lambda: _joined([self._part(one) for one in of]))
+        if part.unknown:
+            return part
+        places = part.places
+        return part._replace(places=np.where((places >= 0) & self._out[places], -1, places))
+
+    def _part(self, of: Selection | str) -> Part:
+        """Places of one part, whether rows are held or not."""
         program = self._program
         if not isinstance(of, str):
             columns = program.columns.of(of).ravel()
-            return program.columns.unknown[columns], columns
+            places = program.columns.unknown[columns]
+            return Part(places, columns, bool((places >= 0).all()))
         rows = [rows for name, rows, _ in program.places if name == of]
         if not rows and of != COST:
             known = ", ".join([*(name for name, _, _ in program.places), COST])
             raise GraphError(f"sensitivity: no family or constraint is called '{of}' (there are: {known})", term=of)
-        places = self._number[rows[0]] if rows else np.array([HEIGHT])
-        return places, np.full(len(places), -1)
-
-    def _shape(self, of: Selection | str) -> tuple[int, ...]:
-        """Shape of the weights of what is asked for."""
-        if not isinstance(of, str):
-            return len(of), of.manifold.dim
-        return next((shape for name, _, shape in self._program.places if name == of), ())
+        places = program.size + np.arange(rows[0].start, rows[0].stop) if rows else np.array([HEIGHT])
+        return Part(places, np.full(len(places), -1), False)
 
     def _parameter(self, wrt: Wrt) -> Parameter:
         program = self._program
@@ -267,14 +334,10 @@ class Sensitivities:
                 raise GraphError(f"sensitivity: no data or family is called '{wrt}' (there are: {known})")
             wrt = declared.get(wrt) or families[wrt]
         if not isinstance(wrt, Data):
-            return fixed(program, as_selection(wrt))
+            return fixed_variables(program, as_selection(wrt))
         if declared.get(wrt.name) is not wrt:
             raise GraphError(f"data {wrt!r} does not belong to this graph")
         return datum(program, wrt)
-
-    def _called(self, wrt: Wrt) -> Hashable:
-        """Data and names by themselves, variables by their columns: each ``x[0]`` is another object."""
-        return wrt if isinstance(wrt, Data | str) else self._program.columns.of(as_selection(wrt)).tobytes()
 
     def _change(self, wrt: Sequence[Wrt]) -> Change:
         """Derivatives of the KKT conditions by parameters.
@@ -282,61 +345,63 @@ class Sensitivities:
         Raises:
             GraphError: the data of this solution have been replaced, or a parameter has no derivative.
         """
-        asked = tuple(self._called(one) for one in wrt)
+        asked = tuple(map(_called, wrt))
         if asked in self._changes:
             return self._changes[asked]
-        program, given = self._program, [self._parameter(one) for one in wrt]
-        unknown, ends = program.columns.unknown, np.cumsum([0, *(int(np.prod(one.shape)) for one in given)])
-        starts = dict(zip(program.constraint_terms, (rows.start for rows in program.slices), strict=True))
-        heights, moved = np.zeros(ends[-1]), np.array([one.numbers for one in given])
-        parts = [(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros(0))]
+        program, known, fixed = self._program, self._structure.parameters, self._structure.fixed
+        given = [remembered(known, name, partial(self._parameter, one)) for name, one in zip(asked, wrt, strict=True)]
+        *starts, count = accumulate((math.prod(one.shape) for one in given), initial=0)
+        heights, parts = np.zeros(count), []
         with program.lock:
             self._require_data()
-            for first, one in zip(ends[:-1], given, strict=True):
-                if (one.numbers >= 0).any():
-                    gradient = program.lagrangian_gradient(self._lin, self._multipliers)
-                    np.add.at(heights, first + one.numbers[one.numbers >= 0], gradient[one.numbers >= 0])
-                    parts += [(rows, numbers + first, values) for rows, numbers, values in self._of_fixed(one.numbers)]
-                for number, part in parts_of(program, self._lin.values, self._multipliers, one):
-                    term = program.terms[number]
-                    places = unknown[np.concatenate(term.columns, axis=1)]
-                    if part.rows.shape[1]:
-                        rows = starts[term] + np.arange(term.count * term.size).reshape(term.count, -1)
-                        places = np.concatenate([places, self._number[rows]], axis=1)
-                    values = np.concatenate([part.slopes, part.rows], axis=1)
-                    numbers = part.numbers + first
-                    spread = [np.broadcast_to(a, values.shape).ravel() for a in (places[:, :, None], numbers[:, None])]
-                    parts.append((spread[0], spread[1], values.ravel()))
-                    np.add.at(heights, numbers, part.heights)
-        rows, numbers, values = map(np.concatenate, zip(*parts, strict=True))
-        kept = np.flatnonzero((rows >= 0) & (values != 0.0))
-        order = kept[np.argsort(numbers[kept], kind="stable")]
-        moved = np.where(moved < 0, -1, moved + ends[:-1, None])
-        change = Change(given[0].shape, rows[order], numbers[order], values[order], heights, moved)
-        self._changes[asked] = change
+            for first, one in zip(starts, given, strict=True):
+                if one.fixed:
+                    found = remembered(fixed, one.numbers.tobytes(), partial(FixedColumns, program, one.numbers))
+                    values = found.entries(program, self._lin, self._multipliers)
+                    parts.append((found.rows, found.coordinates + first, values))
+                if one.handle is not None:
+                    parts += self._of_data(one, first, heights)
+        moved = [np.where(one.numbers < 0, -1, one.numbers + first) for first, one in zip(starts, given, strict=True)]
+        if len(parts) == 1 and given[0].fixed:  # ordered already
+            rows, numbers, values = parts[0]
+            entries = rows, numbers, np.where(self._out[rows], 0.0, values)
+        else:
+            entries = _ordered(parts, self._out)
+        self._changes[asked] = change = Change(given[0].shape, *entries, heights, np.array(moved))
         return change
 
-    def _of_fixed(self, numbers: IntArray) -> list[tuple[IntArray, IntArray, Array]]:
-        """Rows, numbers and values of the KKT matrix in the columns of fixed variables, which (width,) numbers name."""
-        program, lin, unknown = self._program, self._lin, self._program.columns.unknown
-        twin, here = unfixed(program, np.flatnonzero(numbers >= 0), lin)
-        hessian = lagrangian_hessian(twin, here, self._multipliers)
-        ends = [twin.columns.free[part] for part in (twin.normal.indices, twin.normal.columns)]
-        found = []
-        for row, column in (ends, ends[::-1]):
-            own = np.flatnonzero((numbers[column] >= 0) & (unknown[row] >= 0))
-            found.append((unknown[row[own]], numbers[column[own]], hessian[own]))
-        own = np.flatnonzero(numbers[program.constraints.columns] >= 0)
-        places = self._number[program.constraints.rows[own]]
-        return [*found, (places, numbers[program.constraints.columns[own]], lin.constraint_jacobian[own])]
+    def _of_data(self, one: Parameter, first: int, heights: Array) -> Iterator[tuple[IntArray, IntArray, Array]]:
+        """Places, numbers and values of what data do to the terms that read them; adds to the heights."""
+        program = self._program
+        starts = dict(zip(program.constraint_terms, (rows.start for rows in program.slices), strict=True))
+        for number, part in parts_of(program, self._lin.values, self._multipliers, one):
+            term = program.terms[number]
+            places = program.columns.unknown[np.concatenate(term.columns, axis=1)]
+            if part.rows.shape[1]:
+                rows = program.size + starts[term] + np.arange(term.count * term.size).reshape(term.count, -1)
+                places = np.concatenate([places, rows], axis=1)
+            values = np.concatenate([part.slopes, part.rows], axis=1)
+            numbers = part.numbers + first
+            spread = [np.broadcast_to(a, values.shape).ravel() for a in (places[:, :, None], numbers[:, None])]
+            yield spread[0], spread[1], values.ravel()
+            np.add.at(heights, numbers, part.heights)
 
-    def _columns(self, change: Change, numbers: IntArray) -> Array:
+    def _heights(self, change: Change) -> Array:
+        """(K,) derivatives of the Lagrangian."""
+        heights = change.heights.copy()
+        for numbers in change.numbers:
+            if (moved := numbers >= 0).any():
+                gradient = self._program.lagrangian_gradient(self._lin, self._multipliers)
+                np.add.at(heights, numbers[moved], gradient[moved])
+        return heights
+
+    def _columns(self, change: Change, part: slice) -> Array:
         """(k, size) right-hand sides for coordinates that follow each other."""
-        size = self._system.pattern.size
-        first, last = np.searchsorted(change.coordinates, [numbers[0], numbers[-1] + 1])
-        places = change.rows[first:last] + size * (change.coordinates[first:last] - numbers[0])
-        right = np.bincount(places, -change.values[first:last], len(numbers) * size)
-        return np.asarray(right, dtype=np.float64).reshape(-1, size)
+        size, count = len(self._out), part.stop - part.start
+        first, last = np.searchsorted(change.coordinates, [part.start, part.stop])
+        places = change.rows[first:last] + size * (change.coordinates[first:last] - part.start)
+        right = np.bincount(places, -change.values[first:last], count * size)
+        return np.asarray(right, dtype=np.float64).reshape(count, size)
 
     def _solved(self, right: Array) -> Array:
         """Solutions for the rows of (k, size).
@@ -344,21 +409,59 @@ class Sensitivities:
         Raises:
             GraphError: one has none.
         """
-        with self._lock:
-            solutions, left = self._system.saddle.solve_rows(right, ENOUGH)
-        for k in np.flatnonzero(~(left <= SOLVED)):
-            solutions[k], rest = self._tried(right[k])
-            if not rest.max() <= 1.0:
-                what = f": {self._dependent} depends on other active rows" if self._dependent else ""
-                raise GraphError(
-                    f"sensitivity: after a change of the data the active constraints contradict each other{what}"
-                )
+        with self._structure.kkt.borrowed() as system:
+            system.load(self._entries)
+            solutions, left = system.saddle.solve_rows(right, ENOUGH)
+            for k in () if left.max(initial=0.0) <= SOLVED else np.flatnonzero(~(left <= SOLVED)):
+                solutions[k], rest = _tried(system, right[k])
+                if not rest.max() <= 1.0:
+                    what = f": {self._dependent} depends on other active rows" if self._dependent else ""
+                    raise GraphError(
+                        f"sensitivity: after a change of the data the active constraints contradict each other{what}"
+                    )
         return solutions
 
 
-def _chunks(numbers: IntArray) -> Iterator[IntArray]:
+def _called(asked: Named | Wrt) -> Hashable:
+    """Data and names by themselves, variables by their members: each ``x[0]`` is another object."""
+    if isinstance(asked, Data | str):
+        return asked
+    chosen = as_selection(asked)
+    return chosen.family, chosen.component, chosen.indices.tobytes()
+
+
+def _joined(parts: Sequence[Part]) -> Part:
+    """Several parts, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    places, columns = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
+    return Part(places, columns, all(part.unknown for part in parts))
+
+
+def _ordered(parts: Sequence[tuple[IntArray, IntArray, Array]], out: BoolArray) -> tuple[IntArray, IntArray, Array]:
+    """Rows, coordinates and values of entries, by coordinates, without those of no row or of one that is not held."""
+    none = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros(0)
+    rows, numbers, values = map(np.concatenate, zip(none, *parts, strict=True))
+    kept = np.flatnonzero((rows >= 0) & (values != 0.0) & ~out[rows])
+    order = kept[np.argsort(numbers[kept], kind="stable")]
+    return rows[order], numbers[order], values[order]
+
+
+def _tried(system: KktSystem, right: Array) -> tuple[Array, Array]:
+    """A solution, refined no more than it needs, and what it leaves of every row, in multiples of what it may."""
+    saddle = system.saddle
+    solution, rest, most = right, right, SOLVED * float(np.abs(saddle.scale * right).max(initial=0.0)) or 1.0
+    for enough in (ENOUGH, EXACT):
+        solution, _ = saddle.solve(right, enough)
+        rest = np.abs(saddle.residual(solution, right)) / most
+        if rest.max(initial=0.0) <= 1.0:
+            break
+    return solution, rest
+
+
+def _chunks(count: int) -> Iterator[slice]:
     """Numbers in parts, for each of which right-hand sides are held in memory."""
-    return (numbers[first : first + AT_ONCE] for first in range(0, len(numbers), AT_ONCE))
+    return (slice(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE))
 
 
 @dataclass(frozen=True)
@@ -368,7 +471,7 @@ class Change:
     Attributes:
         shape: of the coordinates, where there is one parameter.
         rows, coordinates, values: of the entries.
-        heights: (K,) derivatives of the Lagrangian.
+        heights: (K,) derivatives of the Lagrangian, but for what fixed variables do.
         numbers: (parameters, width) coordinate of each full tangent column, -1 for none.
     """
 

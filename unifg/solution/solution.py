@@ -25,6 +25,7 @@ from unifg.solution.fit import Fit, fit_of
 from unifg.solution.gains import feedback_gains
 from unifg.solution.history import FactorNorms, History, Iteration, factor_norms
 from unifg.solution.marginal import Variables, information, marginal_prior
+from unifg.solution.multipliers import hold
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.saved import write_answer
@@ -640,9 +641,8 @@ class Solution:
 
     def _held(self) -> BoolArray:
         """Inequalities that are active: the multiplier outweighs the distance to its limit."""
-        limit = np.where(self._multipliers > 0.0, self._upper, self._lower)
-        distance = np.where(np.isfinite(limit), np.abs(self._lin.constraints - limit), np.inf)
-        held: BoolArray = np.abs(self._multipliers) > distance
+        held: BoolArray = np.empty(len(self._multipliers), dtype=bool)
+        hold(self._lin.constraints, self._lower, self._upper, self._multipliers, held)
         return held
 
     def _selection(self, variable: Variable | str) -> Selection:

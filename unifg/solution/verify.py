@@ -215,7 +215,7 @@ class Conditions:
         diagonal = np.flatnonzero(matrix.indices == np.repeat(both, np.diff(matrix.indptr)))[size:]
         for _ in range(ROUNDS):  # of [[I, A'], [A, -s^2]] [rest; multipliers] = [-gradient; 0]
             matrix.data[diagonal] = -np.where(free, held, FAR**2)
-            found = spl.splu(matrix, SYMMETRIC).solve(right)
+            found = spl.splu(matrix, SYMMETRIC, relax=1, panel_size=1).solve(right)
             multipliers = np.where(free, found[own], 0.0)
             gain = sign * np.bincount(A.rows, A.numbers * found[A.columns], count)
             wrong = np.where(free, sign * multipliers < 0.0, candidate & (gain > worth))
