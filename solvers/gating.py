@@ -177,9 +177,7 @@ class Innovations:
             along = left + size / before * along
         return float(np.sum(residual * found))
 
-    def common(
-        self, rows: tuple[Array, Array, IntArray], shift: Array, starts: IntArray
-    ) -> tuple[Array, Array, Array]:
+    def common(self, rows: tuple[Array, Array, IntArray], shift: Array, starts: IntArray) -> tuple[Array, Array, Array]:
         """Sums over measurements of a group that may have an error in common, which moves their residuals by A e.
 
         With these, pull' (own - taken)^-1 pull is what the sum of squares loses where a group that counts is given such

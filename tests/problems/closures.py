@@ -76,7 +76,9 @@ def drive(count: int = 1500, seed: int = 0, spatial: bool = False, visits: int =
     if spatial:
         matrices = np.tile(np.eye(4), (count, 1, 1))
         turn, slope = truth[:, 2], 0.1 * np.cos(truth[:, 0] / 50.0)
-        matrices[:, :3, 0] = np.stack([np.cos(turn) * np.cos(slope), np.sin(turn) * np.cos(slope), np.sin(slope)], axis=1)
+        matrices[:, :3, 0] = np.stack(
+            [np.cos(turn) * np.cos(slope), np.sin(turn) * np.cos(slope), np.sin(slope)], axis=1
+        )
         matrices[:, :3, 1] = np.stack([-np.sin(turn), np.cos(turn), np.zeros(count)], axis=1)
         matrices[:, :3, 2] = np.cross(matrices[:, :3, 0], matrices[:, :3, 1])
         matrices[:, :2, 3], matrices[:, 2, 3] = truth[:, :2], 5.0 * np.sin(truth[:, 0] / 50.0)
@@ -85,7 +87,9 @@ def drive(count: int = 1500, seed: int = 0, spatial: bool = False, visits: int =
     return simulated(group, truth, pairs, 0.0, sigma, rng)
 
 
-def with_clusters(pose_graph: PoseGraph, claimed: Array, stretches: list[IntArray], seed: int) -> tuple[PoseGraph, list[IntArray]]:
+def with_clusters(
+    pose_graph: PoseGraph, claimed: Array, stretches: list[IntArray], seed: int
+) -> tuple[PoseGraph, list[IntArray]]:
     """Add closures between stretches, as they would be measured at other poses.
 
     Args:
@@ -100,7 +104,9 @@ def with_clusters(pose_graph: PoseGraph, claimed: Array, stretches: list[IntArra
     rng, edges, group = np.random.default_rng(seed), pose_graph.edges, pose_graph.group
     ends = np.concatenate(stretches)
     information = edges.information[rng.integers(0, len(edges), len(ends))]
-    noise = np.linalg.solve(np.swapaxes(np.linalg.cholesky(information), 1, 2), rng.standard_normal((len(ends), group.dim, 1)))
+    noise = np.linalg.solve(
+        np.swapaxes(np.linalg.cholesky(information), 1, 2), rng.standard_normal((len(ends), group.dim, 1))
+    )
     measured = group.retract(group.between(claimed[ends[:, 0]], claimed[ends[:, 1]]), noise[:, :, 0])
     added = Edges(ends[:, 0], ends[:, 1], measured, information)
     every = Edges(*(np.concatenate([getattr(one, name) for one in (edges, added)]) for name in FIELDS))
@@ -135,9 +141,7 @@ def aliased(pose_graph: PoseGraph, poses: Array, count: int, seed: int) -> tuple
     for k in range(count):
         ends, claimed = two_stretches(pose_graph, rng), poses.copy()
         a, b = ends[len(ends) // 2]
-        claimed[ends[:, 1]] = group.compose(
-            group.compose(poses[a], group.inverse(poses[b])), poses[ends[:, 1]]
-        )
+        claimed[ends[:, 1]] = group.compose(group.compose(poses[a], group.inverse(poses[b])), poses[ends[:, 1]])
         pose_graph, places = with_clusters(pose_graph, claimed, [ends], seed + k)
         found += places
     return pose_graph, found

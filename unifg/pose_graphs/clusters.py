@@ -24,12 +24,14 @@ from functools import cached_property
 
 import numpy as np
 
+from unifg.elimination.factorization import Factorization
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, ResidualName
+from unifg.pose_graphs.verdict import Kind
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.conditioning import HARDLY
 from unifg.solvers.gating import NEAR, UNCHECKED, Innovations, VarianceFactor, neighbours
-from unifg.solvers.least_squares import MAP, LevenbergMarquardt
+from unifg.solvers.least_squares import MAP, GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["Search", "Suspect", "optimum", "search"]
@@ -40,6 +42,7 @@ CALM = 0.1  # least variance, of that stated, that a contradiction is measured b
 AS_MUCH = 0.9  # of the largest fall: where two suspects cannot be told apart
 ODOMETRY = 1.25  # by how much more a step of odometry has to take away than any closures
 ROUNDS = 30  # of taking out
+FEW = 10  # Gauss-Newton iterations before damping
 FAR = 3.0  # standard deviations by which a map moves without an unsupported cluster
 LEVERAGE = 0.99  # share of what a map knows of two stretches that comes from an unsupported cluster, at least
 
@@ -50,6 +53,7 @@ class Suspect:
 
     Attributes:
         edges: (k,) positions in the graph.
+        alike: (l,) the same; for odometry, positions of steps of which one is enough.
         fall: of the sum of squares where the error is free.
         leverage: share of what the map knows of the two stretches that comes from them.
         moved: standard deviations by which the map moves without them; infinite where it falls apart.
@@ -57,6 +61,7 @@ class Suspect:
     """
 
     edges: IntArray
+    alike: IntArray
     fall: float
     leverage: float
     moved: float
@@ -69,21 +74,18 @@ class Search:
 
     Attributes:
         solved: the graph at its optimum near the given poses.
-        contradicted: closures, the largest fall first; of those that cannot be told apart, all.
-        slipped: steps of odometry, likewise: each with those of which one is enough.
-        unsupported: closures, those first without which the map moves farthest.
+        maps: graphs at their optima, and chi2 there, by the bytes of (m,) edges that count.
+        by_kind: "contradicted" closures, the largest fall first, and of those that cannot be told apart, all; "slipped"
+            steps of odometry; "unsupported" closures, those first without which the map moves farthest.
         leverage: (m,) of the cluster of each edge; that of odometry is zero.
-        rest: (m,) edges that are not contradicted.
         weak: names of unknowns of which less than five digits are known.
         ended: False where more may be contradicted than was taken out.
     """
 
     solved: PoseGraph
-    contradicted: tuple[Suspect, ...]
-    slipped: tuple[Suspect, ...]
-    unsupported: tuple[Suspect, ...]
+    maps: dict[bytes, tuple[PoseGraph, float]]
+    by_kind: dict[Kind, list[Suspect]]
     leverage: Array
-    rest: BoolArray
     weak: tuple[str, ...]
     ended: bool
 
@@ -103,72 +105,68 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     active, leverage = np.ones(len(edges), dtype=np.bool_), np.zeros(len(edges))
     closures = ~edges.odometry & (edges.first != edges.second)
     now = _Map(pose_graph, active, residual)
-    solved, weak = now.graph, now.weak()
-    taken: list[tuple[IntArray, list[Suspect]]] = []
+    solved, weak, maps = now.graph, now.weak(), {active.tobytes(): (now.graph, now.chi2)}
+    taken: list[list[Suspect]] = []
     while now.innovations.determined:
         found = now.suspects(_clusters(edges, closures & active))
         for one in found:
             leverage[one.edges] = one.leverage
         alone = now.alone()
         whole = [one for one in found if len(one.edges) > 1]
-        found += [replace(one, edges=np.array([k]), fall=float(alone[k])) for one in whole for k in one.edges]
+        found += [replace(one, edges=k[None], alike=k[None], fall=float(alone[k])) for one in whole for k in one.edges]
         found.sort(key=lambda one: -one.fall)
         worst = found[0].fall if found else 0.0
         steps = np.where(edges.odometry, alone, 0.0)
-        slip = float(steps.max(initial=0.0))
-        left = freedom - dim * len(taken)
+        slip, left = float(steps.max(initial=0.0)), freedom - dim * len(taken)
         limit = _limit(now.chi2 - max(worst, slip), left - dim, dim, len(edges))
         if not max(worst, slip) > limit or len(taken) == ROUNDS:
             break
+        before = np.flatnonzero(~active)
         if slip > ODOMETRY * worst:
-            picked = np.array([steps.argmax()])
-            alike = [Suspect(np.flatnonzero(steps >= AS_MUCH * slip), slip, 0.0, np.nan, np.flatnonzero(~active))]
+            alike = np.flatnonzero(steps >= AS_MUCH * slip)
+            taken.append([Suspect(steps.argmax()[None], alike, slip, 0.0, np.nan, before)])
         else:
-            picked = found[0].edges
-            alike = [replace(one, before=np.flatnonzero(~active)) for one in found if one.fall >= AS_MUCH * worst]
-        taken.append((picked, alike))
-        active[picked] = False
+            taken.append([replace(one, before=before) for one in found if one.fall >= AS_MUCH * worst])
+        active[taken[-1][0].edges] = False
         now = _Map(now.graph, active, residual)
+        maps[active.tobytes()] = now.graph, now.chi2
     contradicted: list[Suspect] = []
     slipped: list[Suspect] = []
     if taken:
         # What agrees with the map of the rest, whose noise may be larger than stated, was not at fault.
         over = max(1.0, now.chi2 / _quantile(left, 1.0 - CHANCE)) if left > 0 else 1.0
-        steps_out = [edge for edge, _ in taken if edges.odometry[edge[0]]]
-        for group in [*steps_out, *_clusters(edges, closures & ~active)]:
-            innovation = now.statistics([group])[1][0]
+        out = ~active
+        for group in [*np.flatnonzero(out & edges.odometry)[:, None], *_clusters(edges, closures & out)]:
+            innovation = float(now.statistics([group])[1][0])
+            first, *others = next(picked for picked in taken if np.isin(picked[0].edges, group).any())
             if not innovation > over * limit:
                 active[group] = True
-                continue
-            first = next(alike for edge, alike in taken if np.isin(edge, group).any())
-            if edges.odometry[group[0]]:
-                slipped.append(first[0])
+            elif edges.odometry[group[0]]:
+                slipped.append(first)
             else:
-                contradicted.append(replace(first[0], edges=group, fall=float(innovation)))
-                contradicted += [one for one in first[1:] if active[one.edges].all() and len(one.edges) > 0]
-        now = _Map(now.graph, active, residual)
-    named = np.concatenate([one.edges for one in contradicted]) if contradicted else np.zeros(0, dtype=np.intp)
-    out = np.flatnonzero(~active)
+                contradicted.append(replace(first, edges=group, alike=group, fall=innovation))
+                contradicted += [one for one in others if not out[one.edges].any() and one.fall > limit]
+        if (active & out).any():
+            now = _Map(now.graph, active, residual)
+            maps[active.tobytes()] = now.graph, now.chi2
+    named = np.concatenate([np.zeros(0, dtype=np.intp), *(one.edges for one in contradicted)])
+    last = now.suspects(_clusters(edges, closures & active)) if now.innovations.determined else []
     unsupported = [
-        replace(one, before=out)
-        for one in now.suspects(_clusters(edges, closures & active))
+        replace(one, before=np.flatnonzero(~active))
+        for one in last
         if one.moved > FAR and one.leverage >= LEVERAGE and not np.isin(one.edges, named).any()
     ]
-    return Search(
-        solved,
-        tuple(sorted(contradicted, key=lambda one: -one.fall)),
-        tuple(slipped),
-        tuple(sorted(unsupported, key=lambda one: -one.moved)),
-        leverage,
-        active,
-        weak,
-        len(taken) < ROUNDS,
-    )
+    by_kind: dict[Kind, list[Suspect]] = {
+        "contradicted": sorted(contradicted, key=lambda one: -one.fall),
+        "slipped": slipped,
+        "unsupported": sorted(unsupported, key=lambda one: -one.moved),
+    }
+    return Search(solved, maps, by_kind, leverage, weak, len(taken) < ROUNDS)
 
 
-def optimum(pose_graph: PoseGraph, residual: ResidualName = "log") -> tuple[PoseGraph, float]:
-    """Minimum of plain squares near the poses of a graph, to within 1e-5 of chi2, and chi2 there."""
-    solved = _Map(pose_graph, np.ones(len(pose_graph.edges), dtype=np.bool_), residual)
+def optimum(pose_graph: PoseGraph, active: BoolArray, residual: ResidualName = "log") -> tuple[PoseGraph, float]:
+    """Minimum of plain squares of some edges (m,) near the poses of a graph, to within 1e-5 of chi2, and chi2 there."""
+    solved = _Map(pose_graph, active, residual)
     return solved.graph, solved.chi2
 
 
@@ -199,20 +197,33 @@ class _Map:
         graph: all edges, at its poses.
         active: (m,) those that count.
         chi2: their sum of squares.
-        innovations: of any, by those that count.
     """
 
     def __init__(self, pose_graph: PoseGraph, active: BoolArray, residual: ResidualName) -> None:
         """Solve."""
         part = replace(pose_graph, edges=pose_graph.edges[active])
         stated, x, guess = part.graph(residual=residual)
-        solution = LevenbergMarquardt(tolerance=MAP).solve(stated, guess)
+        solution = GaussNewton(tolerance=MAP, max_iterations=FEW).solve(stated, guess)
+        if not solution.converged:
+            solution = LevenbergMarquardt(tolerance=MAP).solve(stated, solution)
         landmarks = solution[stated.families["landmarks"]] if len(part.landmarks) else None
         self.graph, self.active, self.residual = pose_graph.with_poses(solution[x], landmarks), active.copy(), residual
         self.chi2 = 2.0 * solution.cost
-        self._counting = stated.compile(), stated.compile().linearize(solution.values)
-        self._factorization = self._counting[0].systems.normal()
-        self.innovations = Innovations(self._counting[0], self._factorization, self._counting[1].hessian)
+        self._program, self._values = stated.compile(), solution.values
+
+    @cached_property
+    def _counting(self) -> tuple[CompiledProblem, Linearization]:
+        """Edges that count."""
+        return self._program, self._program.linearize(self._values)
+
+    @cached_property
+    def _factorization(self) -> Factorization:
+        return self._program.systems.normal()
+
+    @cached_property
+    def innovations(self) -> Innovations:
+        """Innovations of any edges, by those that count."""
+        return Innovations(self._program, self._factorization, self._counting[1].hessian)
 
     def weak(self) -> tuple[str, ...]:
         """Names of unknowns whose pivots are next to nothing, or that of the first that vanishes."""
@@ -245,7 +256,7 @@ class _Map:
         fall, _, leverage, moved = self.statistics(groups)
         none = np.zeros(0, dtype=np.intp)
         columns = zip(groups, fall.tolist(), leverage.tolist(), moved.tolist(), strict=True)
-        return [Suspect(group, *numbers, none) for group, *numbers in columns]
+        return [Suspect(group, group, *numbers, none) for group, *numbers in columns]
 
     def statistics(self, groups: list[IntArray]) -> tuple[Array, Array, Array, Array]:
         """(c,) falls of groups that count, squared innovations of those that do not, leverages, standard deviations.
