@@ -106,16 +106,14 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     closures = ~edges.odometry & (edges.first != edges.second)
     now = _Map(pose_graph, active, residual)
     solved, weak, maps = now.graph, now.weak(), {active.tobytes(): (now.graph, now.chi2)}
+    clusters: list[Suspect] = []
     taken: list[list[Suspect]] = []
     while now.innovations.determined:
-        found = now.suspects(_clusters(edges, closures & active))
-        for one in found:
+        clusters = now.suspects(_clusters(edges, closures & active))
+        for one in clusters:
             leverage[one.edges] = one.leverage
         alone = now.alone()
-        whole = [one for one in found if len(one.edges) > 1]
-        found += [replace(one, edges=k[None], alike=k[None], fall=float(alone[k])) for one in whole for k in one.edges]
-        found.sort(key=lambda one: -one.fall)
-        worst = found[0].fall if found else 0.0
+        worst = max([0.0, *(one.fall for one in clusters), *(alone[one.edges].max() for one in clusters)])
         steps = np.where(edges.odometry, alone, 0.0)
         slip, left = float(steps.max(initial=0.0)), freedom - dim * len(taken)
         limit = _limit(now.chi2 - max(worst, slip), left - dim, dim, len(edges))
@@ -126,6 +124,13 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
             alike = np.flatnonzero(steps >= AS_MUCH * slip)
             taken.append([Suspect(steps.argmax()[None], alike, slip, 0.0, np.nan, before)])
         else:
+            single = [
+                replace(one, edges=k[None], alike=k[None], fall=float(alone[k]))
+                for one in clusters
+                if len(one.edges) > 1
+                for k in one.edges[alone[one.edges] >= AS_MUCH * worst]
+            ]
+            found = sorted([*clusters, *single], key=lambda one: -one.fall)
             taken.append([replace(one, before=before) for one in found if one.fall >= AS_MUCH * worst])
         active[taken[-1][0].edges] = False
         now = _Map(now.graph, active, residual)
@@ -150,10 +155,11 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
             now = _Map(now.graph, active, residual)
             maps[active.tobytes()] = now.graph, now.chi2
     named = np.concatenate([np.zeros(0, dtype=np.intp), *(one.edges for one in contradicted)])
-    last = now.suspects(_clusters(edges, closures & active)) if now.innovations.determined else []
+    if taken and now.innovations.determined:
+        clusters = now.suspects(_clusters(edges, closures & active))
     unsupported = [
         replace(one, before=np.flatnonzero(~active))
-        for one in last
+        for one in clusters
         if one.moved > FAR and one.leverage >= LEVERAGE and not np.isin(one.edges, named).any()
     ]
     by_kind: dict[Kind, list[Suspect]] = {
@@ -187,7 +193,7 @@ def _clusters(edges: Edges, chosen: BoolArray) -> list[IntArray]:
     """Groups of the chosen edges whose ends lie near each other along the drive."""
     which = np.flatnonzero(chosen)
     ends = np.sort(np.stack([edges.first[which], edges.second[which]], axis=1), axis=1)
-    return [np.sort(which[group]) for group in neighbours(ends, NEAR)]
+    return [which[group] for group in neighbours(ends, NEAR)]
 
 
 class _Map:
