@@ -122,7 +122,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         before = np.flatnonzero(~active)
         if slip > ODOMETRY * worst:
             alike = np.flatnonzero(steps >= AS_MUCH * slip)
-            taken.append([Suspect(steps.argmax()[None], alike, slip, 0.0, np.nan, before)])
+            taken.append([Suspect(np.array([steps.argmax()]), alike, slip, 0.0, np.nan, before)])
         else:
             single = [
                 replace(one, edges=k[None], alike=k[None], fall=float(alone[k]))
@@ -262,7 +262,7 @@ class _Map:
         fall, _, leverage, moved = self.statistics(groups)
         none = np.zeros(0, dtype=np.intp)
         columns = zip(groups, fall.tolist(), leverage.tolist(), moved.tolist(), strict=True)
-        return [Suspect(group, group, *numbers, none) for group, *numbers in columns]
+        return [Suspect(group, group, a, b, c, none) for group, a, b, c in columns]
 
     def statistics(self, groups: list[IntArray]) -> tuple[Array, Array, Array, Array]:
         """(c,) falls of groups that count, squared innovations of those that do not, leverages, standard deviations.
