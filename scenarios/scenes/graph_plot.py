@@ -65,7 +65,7 @@ def plot_graph(graph: PoseGraph, outliers: BoolArray, name: str, ax: Axes, verdi
     """
     scene = Scene()
     declare_layers(scene)
-    width = 1.5 * line_width(graph) if len(graph.edges) <= _STRIPS else 0.0
+    width = (1.5 if verdict is None else 0.6) * line_width(graph) if len(graph.edges) <= _STRIPS else 0.0
     draw_graph(scene, graph, outliers, name, width, verdict)
     draw_points(scene, graph)
     ax = scene.draw(ax)

@@ -17,9 +17,9 @@ __all__ = ["declare_layers", "draw_graph", "draw_points", "graph_scene", "line_w
 
 LEVERAGES = (
     (-1.0, "closures", "closure", "loop closures: the same place seen again"),
-    (0.5, "leverage over 0.5", "#8cbf26", "closures of leverage 0.5 to 0.9: half of what is known there is theirs"),
-    (0.9, "leverage over 0.9", "goal", "closures of leverage 0.9 to 0.99"),
-    (0.99, "leverage over 0.99", "fixed", "closures of leverage over 0.99: the others hardly know better"),
+    (0.5, "leverage over 0.5", "#8cbf26", "of leverage 0.5 to 0.9"),
+    (0.9, "leverage over 0.9", "goal", "of leverage 0.9 to 0.99"),
+    (0.99, "leverage over 0.99", "fixed", "of leverage over 0.99"),
 )
 """Leverage above which closures have a layer of their own, its name, colour and words."""
 
@@ -57,8 +57,8 @@ def declare_layers(scene: Scene) -> None:
     for name, colour, words in (
         ("start", "odometry", "trajectory at the start"),
         *((name, colour, words) for _, name, colour, words in LEVERAGES),
-        ("unsupported", "scan", "closures that nothing else supports"),
-        ("contradicted", "outlier", "closures that the rest contradicts"),
+        ("unsupported", "scan", "unsupported, with stretches"),
+        ("contradicted", "outlier", "contradicted, with stretches"),
         ("trajectory", "robot", "trajectory: poses joined by odometry"),
         ("outliers", "outlier", "loop closures taken for outliers"),
         ("landmarks", "landmark", "landmarks"),
@@ -92,24 +92,28 @@ def draw_graph(
         width: of the trajectory, and of clusters that the verdict names [m]; zero for lines as thin as hair.
         verdict: on the map; None for closures of one colour.
     """
-    left = ~graph.edges.odometry & ~outliers
+    _trajectory(canvas, name, graph, width)
+    edges = graph.edges
+    left = ~edges.odometry & ~outliers
     layers = {"outliers": outliers}
     kinds: tuple[Kind, ...] = ("contradicted", "unsupported")
     for kind in kinds:
         chosen = np.zeros_like(left)
         for cluster in verdict.of(kind) if verdict else ():
             chosen[cluster.edges] = True
-        layers[kind] = chosen & left
+            ends = np.sort(np.stack([edges.first, edges.second])[:, cluster.edges], axis=0)
+            for stretch in ends:  # they may lie on each other, and the closures have no length
+                inside = (np.minimum(edges.first, edges.second) >= stretch.min()) & edges.odometry
+                chosen |= inside & (np.maximum(edges.first, edges.second) <= stretch.max())
+        layers[kind] = chosen & ~outliers
         left &= ~chosen
     leverage = verdict.leverage if verdict else np.zeros(len(left))
     for least, layer, _, _ in reversed(LEVERAGES):
         layers[layer] = left & (leverage > least)
         left &= leverage <= least
-    for layer, edges in reversed(layers.items()):
-        if edges.any():
-            wide = width if layer in kinds and width > 0.0 else None
-            canvas.lines(layer, segments(graph, edges), width=wide)
-    _trajectory(canvas, name, graph, width)
+    for layer, chosen in reversed(layers.items()):
+        if chosen.any():
+            canvas.lines(layer, segments(graph, chosen), width=2.0 * line_width(graph) if layer in kinds else None)
 
 
 def shown_steps(solved: SolvedGraph) -> list[int]:

@@ -106,7 +106,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     closures = ~edges.odometry & (edges.first != edges.second)
     now = _Map(pose_graph, active, residual)
     solved, weak, maps = now.graph, now.weak(), {active.tobytes(): (now.graph, now.chi2)}
-    clusters: list[Suspect] = []
+    ended, clusters = True, list[Suspect]()
     taken: list[list[Suspect]] = []
     while now.innovations.determined:
         clusters = now.suspects(_clusters(edges, closures & active))
@@ -117,7 +117,8 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         steps = np.where(edges.odometry, alone, 0.0)
         slip, left = float(steps.max(initial=0.0)), freedom - dim * len(taken)
         limit = _limit(now.chi2 - max(worst, slip), left - dim, dim, len(edges))
-        if not max(worst, slip) > limit or len(taken) == ROUNDS:
+        ended = not max(worst, slip) > limit
+        if ended or len(taken) == ROUNDS:
             break
         before = np.flatnonzero(~active)
         if slip > ODOMETRY * worst:
@@ -133,7 +134,11 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
             found = sorted([*clusters, *single], key=lambda one: -one.fall)
             taken.append([replace(one, before=before) for one in found if one.fall >= AS_MUCH * worst])
         active[taken[-1][0].edges] = False
-        now = _Map(now.graph, active, residual)
+        rest = _Map(now.graph, active, residual)
+        if not rest.innovations.determined:  # nothing is left to compare with
+            ended, active[taken.pop()[0].edges] = False, True
+            break
+        now = rest
         maps[active.tobytes()] = now.graph, now.chi2
     contradicted: list[Suspect] = []
     slipped: list[Suspect] = []
@@ -167,7 +172,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         "slipped": slipped,
         "unsupported": sorted(unsupported, key=lambda one: -one.moved),
     }
-    return Search(solved, maps, by_kind, leverage, weak, len(taken) < ROUNDS)
+    return Search(solved, maps, by_kind, leverage, weak, ended)
 
 
 def optimum(pose_graph: PoseGraph, active: BoolArray, residual: ResidualName = "log") -> tuple[PoseGraph, float]:
