@@ -9,8 +9,9 @@ know the two stretches at least eight times worse than the cluster does.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -171,10 +172,10 @@ def tables(rows: list[Row]) -> str:
     }
     times = [row for row in rows if row["fault"] == "time" and "ratio" in row]
     parts = [name for name in times[0] if name.endswith("[ms]")] if times else []
-    spent = {
+    spent: dict[str, Callable[[list[Row]], str]] = {
         "poses": lambda rows: str(rows[0]["poses"]),
         "cold solve [ms]": lambda rows: f"{1e3 * rows[0]['cold']:.0f}",
-        **{name: (lambda rows, name=name: str(rows[0][name])) for name in parts},
+        **{name: partial(_part, name) for name in parts},
         "verdict, times a cold solve": lambda rows: f"{rows[0]['ratio']:.2f}",
     }
     median = np.median([row["ratio"] for row in times]) if times else np.nan
@@ -183,6 +184,10 @@ def tables(rows: list[Row]) -> str:
         f"{listing(('graph',), {(row['graph'],): [row] for row in times}, spent)}\n\n"
         f"Median of the last column: {median:.2f}."
     )
+
+
+def _part(name: str, rows: list[Row]) -> str:
+    return str(rows[0][name])
 
 
 STUDY = Study(cells, judged, tables, range(100, 200), alone=lambda job: job.fault == "time")

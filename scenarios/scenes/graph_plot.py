@@ -72,8 +72,9 @@ def plot_graph(graph: PoseGraph, outliers: BoolArray, name: str, ax: Axes, verdi
     for number, cluster in enumerate(verdict.clusters[:NAMED] if verdict else (), start=1):
         chosen = np.zeros(len(graph.edges), dtype=bool)
         chosen[cluster.edges[len(cluster.edges) // 2]] = True
-        place = segments(graph, chosen)[0].mean(axis=0)
-        ax.text(*place, f"{number}", fontweight="bold", color=INK, bbox={"facecolor": "white", "pad": 1.5, "lw": 0.5})
+        place: Any = segments(graph, chosen)[0].mean(axis=0)
+        label: Any = ax.text  # on axes in space it takes three numbers
+        label(*place, f"{number}", fontweight="bold", color=INK, bbox={"facecolor": "white", "pad": 1.5, "lw": 0.5})
     return ax
 
 
