@@ -18,12 +18,11 @@ from unifg.errors import ScenarioError
 from unifg.factors.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares, Tukey
 from unifg.files.contents import legible
 from unifg.files.pose_graph import read_pose_graph
-from unifg.pose_graphs.certificate import Certificate, certify
 from unifg.pose_graphs.information import REPAIRS, Repair, indefinite
 from unifg.pose_graphs.initialise import chordal, lago, odometric, starts
-from unifg.pose_graphs.judgement import Judgement, judge
+from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName, RobustOn
-from unifg.pose_graphs.relaxation import admit
+from unifg.pose_graphs.verdict import Judgement, Verdict
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import existing, option
 from unifg.scenarios.stopwatch import Stopwatch
@@ -78,9 +77,8 @@ class SolveSettings:
         max_iterations: before giving up.
         threads: that share the work of a large graph; no more than there are free cores.
         no_scene: leave out the scene and the picture, which take longer than the solve.
-        certify: bound what another map could gain, by the dual of the chordal relaxation, and take a better map where
-            one is found on the way.
-        staircase: where that finds a way down, follow it.
+        effort: spent on the verdict: none, cheap (a bound on what another map could gain, closures that the others
+            contradict or do not support), or full (a better map is looked for as well, and taken).
         keep_map: keep the map of the first solve although a better one was found; that is a failure.
     """
 
@@ -95,8 +93,7 @@ class SolveSettings:
     max_iterations: int = option(100, metavar="N")
     threads: int = option(1, metavar="N")
     no_scene: bool = option(False)
-    certify: bool = option(False)
-    staircase: bool = option(False)
+    effort: Literal["none", "cheap", "full"] = option("cheap")
     keep_map: bool = option(False)
 
 
@@ -118,9 +115,9 @@ class SolvedGraph:
         step_numbers: (k,) iteration of each.
         begun: name of the first guess that was taken.
         judgement: what the graph says about itself at the solution, outliers left out.
-        certificate: of the solution, if it was asked for.
+        verdict: on the solution, outliers left out; None where none was asked for.
         better: cost, as stated, of a better map that was found and not taken; None without one.
-        seconds: wall-clock time by what it was spent on: read, initialise, compile, solve, certify.
+        seconds: wall-clock time by what it was spent on: read, initialise, compile, solve, verdict.
     """
 
     settings: SolveSettings
@@ -135,7 +132,7 @@ class SolvedGraph:
     step_numbers: list[int]
     begun: str
     judgement: Judgement
-    certificate: Certificate | None
+    verdict: Verdict | None
     better: float | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     interrupted: bool = False
@@ -184,8 +181,6 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     if not len(read.edges) and not read.sightings and not read.priors:
         raise ScenarioError(f"{settings.file}: there is no edge in this file, and nothing to solve")
     loss = robust_loss(settings.robust, read.group.dim)
-    if settings.certify or settings.staircase:
-        admit(read)  # refused before the solve
     if settings.init == "lago" and read.group.dim != 3:
         raise ScenarioError("--init lago is for planar pose graphs; use --init chordal")
     progress(0.05, f"first guess: {settings.init}")
@@ -204,23 +199,22 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     clock.split("initialise")
     solve = _Solve(settings, loss, clock, progress)
     solution, after, squared, outliers = solve(before)
-    certificate, worse, stopped = None, None, solution.status is Status.INTERRUPTED
-    if (settings.certify or settings.staircase) and not stopped:
+    verdict, worse, stopped = None, None, solution.status is Status.INTERRUPTED
+    if settings.effort != "none" and not stopped:
         try:
             while True:
-                progress(0.95, "is another map better?")
+                progress(0.95, "verdict")
                 clock.start()
-                certificate = certify(
-                    after,
-                    used=None if loss is None else ~outliers,
-                    staircase=settings.staircase,
-                    tolerance=_JUDGED[settings.tolerance],
+                verdict = after.verdict(
+                    effort=settings.effort,
                     residual=settings.residual,
+                    used=None if loss is None else ~outliers,
+                    tolerance=_JUDGED[settings.tolerance],
                 )
-                clock.split("certify")
-                if certificate.better is None:
+                clock.split("verdict")
+                if verdict.better is None:
                     break
-                again = solve(before.with_poses(certificate.better))
+                again = solve(before.with_poses(verdict.better))
                 # Compared as stated, losses included.
                 if not again[0].cost < (1.0 - _JUDGED[settings.tolerance]) * solution.cost:
                     break
@@ -235,9 +229,9 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
         progress(1.0, solution.status.name.lower().replace("_", " "))
     numbers, steps = _chosen(solve.iterates)
     chi2 = (in_file if read.placed else np.nan, at_start, float(squared.sum()) + after.seen_chi2())
-    judgement = judge(replace(after, edges=after.edges[~outliers]), settings.residual)
+    judgement = verdict.judgement if verdict else judge(replace(after, edges=after.edges[~outliers]), settings.residual)
     return SolvedGraph(
-        settings, before, after, chi2, solution, loss, squared, outliers, steps, numbers, begun, judgement, certificate,
+        settings, before, after, chi2, solution, loss, squared, outliers, steps, numbers, begun, judgement, verdict,
         worse, clock.seconds, stopped,
     )  # fmt: skip
 

@@ -151,7 +151,7 @@ class Innovations:
             chosen: (k,) factors that count.
             weight: (k,) with which they do.
         """
-        residual, jacobian, columns = self._rows(term, lin, chosen)
+        residual, jacobian, columns = self.rows(term, lin, chosen)
         free = columns >= 0
 
         def spread(errors: Array) -> Array:
@@ -177,6 +177,29 @@ class Innovations:
             along = left + size / before * along
         return float(np.sum(residual * found))
 
+    def common(self, rows: tuple[Array, Array, IntArray], shift: Array, starts: IntArray) -> tuple[Array, Array, Array]:
+        """Sums over measurements of a group that may have an error in common, which moves their residuals by A e.
+
+        With these, pull' (own - taken)^-1 pull is what the sum of squares loses where a group that counts is given such
+        an error of its own, and pull' (own + taken)^-1 pull is the squared innovation of one that does not count.
+
+        Args:
+            rows: see :meth:`rows`; one group after the other.
+            shift: (n, m, q) A of each of them.
+            starts: (c,) first measurement of each group.
+
+        Returns:
+            (c, q, q) A' A, (c, q, q) A' J S J' A, and (c, q) A' r.
+        """
+        residual, jacobian, columns = rows
+        own = np.add.reduceat(np.einsum("nmi,nmj->nij", shift, shift), starts)
+        pull = np.add.reduceat(np.einsum("nmi,nm->ni", shift, residual), starts)
+        free = columns >= 0
+        values = np.einsum("nma,nmi->nai", jacobian, shift)[free]
+        ends = np.concatenate([[0], np.cumsum(free.sum(axis=1))])
+        taken = self._solver.products(ends[np.append(starts, len(residual))], columns[free], values)
+        return own, taken, pull
+
     def redundancy(self, term: CompiledTerm, lin: Linearization, weight: Array) -> float:
         """Residuals of a term that count, less those that the unknowns take up: sum w (m - w tr J S J').
 
@@ -191,11 +214,11 @@ class Innovations:
 
     def _spread(self, term: CompiledTerm, lin: Linearization, chosen: BoolArray) -> tuple[Array, Array]:
         """(k, m) residuals and (k, m, m) J S J' of some factors."""
-        residual, jacobian, columns = self._rows(term, lin, chosen)
+        residual, jacobian, columns = self.rows(term, lin, chosen)
         spread = np.einsum("nia,nab,njb->nij", jacobian, self._covariance(columns), jacobian, optimize=True)
         return residual, 0.5 * (spread + spread.transpose(0, 2, 1))
 
-    def _rows(
+    def rows(
         self, term: CompiledTerm, lin: Linearization, chosen: BoolArray | IntArray
     ) -> tuple[Array, Array, IntArray]:
         """(k, m) residuals, (k, m, w) Jacobians and (k, w) their unknowns of some factors."""
@@ -228,19 +251,20 @@ def groups_of(term: CompiledTerm, chosen: BoolArray) -> list[IntArray]:
     if len(selections) < 2 or len(which) < FEWEST:
         return []
     places = np.stack([one.indices[which] for one in selections], axis=1)
+    return [np.sort(which[group]) for group in neighbours(places, NEAR) if len(group) >= FEWEST]
+
+
+def neighbours(places: IntArray, near: int) -> list[IntArray]:
+    """Groups of rows of (n, k) places that lie near each other in every place, one by one; every row is in a group."""
     order = np.argsort(places[:, 0], kind="stable")
-    which, places = which[order], places[order]
-    pairs: list[tuple[IntArray, IntArray]] = []
-    for apart in range(1, len(which)):
-        first, second = np.arange(len(which) - apart), np.arange(apart, len(which))
-        if (close := places[second, 0] - places[first, 0] <= NEAR).any():
-            close &= (np.abs(places[second] - places[first]) <= NEAR).all(axis=1)
-            pairs.append((first[close], second[close]))
-        else:
+    places = places[order]
+    pairs = [(np.zeros(0, dtype=np.intp),) * 2]
+    for apart in range(1, len(order)):
+        first, second = np.arange(len(order) - apart), np.arange(apart, len(order))
+        if not (close := places[second, 0] - places[first, 0] <= near).any():
             break
-    if not pairs:
-        return []
-    part = components(len(which), *(np.concatenate(ends) for ends in zip(*pairs, strict=True)))
-    order = np.argsort(part, kind="stable")
-    groups = np.split(which[order], np.flatnonzero(np.diff(part[order])) + 1)
-    return [np.sort(group) for group in groups if len(group) >= FEWEST]
+        close &= (np.abs(places[second] - places[first]) <= near).all(axis=1)
+        pairs.append((first[close], second[close]))
+    part = components(len(order), *(np.concatenate(ends) for ends in zip(*pairs, strict=True)))
+    inner = np.argsort(part, kind="stable")
+    return np.split(order[inner], np.flatnonzero(np.diff(part[inner])) + 1) if len(order) else []

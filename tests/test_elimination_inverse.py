@@ -88,6 +88,22 @@ def test_blocks_between_nodes_anywhere(rng: np.random.Generator, ordering: str) 
     assert factorization.inverse_blocks(own[0][:0], own[1][:0]).shape == (0, 2, 2)
 
 
+def test_products_of_sparse_blocks(rng: np.random.Generator) -> None:
+    """Rows of one block that occur twice are added; blocks follow each other."""
+    pattern, data, label, _ = grid(rng, 9, 3)
+    factorization = Factorization(pattern, label)
+    assert factorization.factor(data)
+    inverse = np.linalg.inv(full(pattern, data).toarray())
+    rows, starts = rng.integers(0, pattern.size, 17), [0, 5, 6, 17]
+    rows[3] = rows[1]
+    values = rng.standard_normal((17, 3))
+    found = factorization.products(np.array(starts), rows, values)
+    for k in range(3):
+        block = np.zeros((pattern.size, 3))
+        np.add.at(block, rows[starts[k] : starts[k + 1]], values[starts[k] : starts[k + 1]])
+        np.testing.assert_allclose(found[k], block.T @ inverse @ block, rtol=1e-9, atol=1e-12)
+
+
 def test_tree_describes_the_elimination(rng: np.random.Generator) -> None:
     pattern, data, label, _ = grid(rng, 8, 3)
     factorization = Factorization(pattern, label)

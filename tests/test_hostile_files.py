@@ -23,6 +23,7 @@ from unifg.files.contents import Limits, legible, read_bytes, read_text
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.ros_map import load_map
 from unifg.files.tum import read_tum
+from unifg.pose_graphs import PoseGraph
 from unifg.scenarios import pose_graph
 from unifg.scenarios.command import main
 from unifg.scenarios.planning.speed_profile import read_profile
@@ -272,13 +273,13 @@ def test_an_end_asked_for_after_the_solve_keeps_it(tmp_path: Path, monkeypatch: 
     def stopped(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pose_graph, "certify", stopped)
+    monkeypatch.setattr(PoseGraph, "verdict", stopped)
     edges = ("0 1 1 0 0", "1 2 1 0 1.57", "2 0 0.1 2 -1.57")
     text = "\n".join(f"EDGE_SE2 {edge} 1 0 0 1 0 1" for edge in edges)
     path = put(tmp_path, "g.g2o", ("".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in range(3)) + text).encode())
-    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--no-scene", "--certify"]) == 130
+    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--no-scene"]) == 130
     numbers = json.loads((tmp_path / "out" / "metrics.json").read_text())
-    assert numbers["interrupted"] and numbers["converged"] and numbers["certificate"] is None
+    assert numbers["interrupted"] and numbers["converged"] and numbers["verdict"] is None
 
 
 WITHOUT = """

@@ -14,7 +14,7 @@ import pytest
 import unifg as fg
 from scenes import commands_of, data_of
 from unifg.codegen.threads import threads
-from unifg.errors import GraphError, ScenarioError, UnifgError
+from unifg.errors import ScenarioError, UnifgError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.files.toro import write_toro
 from unifg.files.tum import read_tum
@@ -66,7 +66,7 @@ def test_writes_every_file_and_says_what_came_out(
     trajectory = read_tum(out / "trajectory.tum")
     size = after.group.point_dim
     np.testing.assert_allclose(trajectory.position[:, :size], after.poses[:, :size], atol=1e-8)
-    assert set(metrics["seconds"]) == {"read", "initialise", "compile", "solve"}
+    assert set(metrics["seconds"]) == {"read", "initialise", "compile", "solve", "verdict"}
 
 
 @pytest.mark.parametrize("solver", ["gn", "lm"])
@@ -178,12 +178,21 @@ def test_bad_files_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert message in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_what_cannot_be_certified_is_refused_before_it_is_solved(city: Path) -> None:
-    graph, said = read_g2o(city), list[str]()
-    known = write_g2o(city, replace(graph, fixed_ids=(0, 1)))
-    with pytest.raises(GraphError, match="two poses of one are known"):
-        solve_file(SolveSettings(known, certify=True), lambda _, text: said.append(text))
-    assert len(said) == 1  # that it was read
+def test_what_cannot_be_certified_is_solved_and_said(city: Path, tmp_path: Path) -> None:
+    known = write_g2o(city, replace(read_g2o(city), fixed_ids=(0, 1)))
+    assert command.main(["solve", str(known), "--no-scene", "--out", str(tmp_path / "out")]) == 0
+    verdict = numbers(tmp_path / "out")["verdict"]
+    assert verdict["certificate"] is None and "two poses of one are known" in verdict["uncertified"]
+
+
+def test_it_ends_in_the_verdict(city: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert command.main(["solve", str(city), "--out", str(out)]) == 0
+    verdict, said = numbers(out)["verdict"], capsys.readouterr().out.partition("\n\n")[0]
+    assert said.splitlines()[-1].split(None, 1) == ["verdict", verdict["sentence"]]
+    assert verdict["effort"] == "cheap" and verdict["starts"] == 0 and "bounds" not in said
+    assert command.main(["solve", str(city), "--effort", "none", "--no-scene", "--out", str(out)]) == 0
+    assert numbers(out)["verdict"] is None and "\nverdict " not in capsys.readouterr().out
 
 
 def folded_loop(path: Path) -> Path:
@@ -221,15 +230,15 @@ def test_a_better_map_is_taken(tmp_path: Path, capsys: pytest.CaptureFixture[str
     """The map that was solved is certified or replaced; told to keep the worse one, the command fails."""
     file, out = folded_loop(tmp_path / "loop.g2o"), tmp_path / "out"
     right = solve_file(SolveSettings(file)).chi2[2]
-    options = ["--init", "file", "--staircase", "--no-scene", "--out", str(out), *more]
+    options = ["--init", "file", "--effort", "full", "--no-scene", "--out", str(out), *more]
     assert command.main(["solve", str(file), *options]) == code
     said, found = capsys.readouterr().out, numbers(out)
-    certificate = found["certificate"]
+    certificate = found["verdict"]["certificate"]
     assert len(certificate["moved"]) == 2 and certificate["chi2_chordal"] - certificate["dual"] >= 0.0
     if code:
         assert found["chi2"] > 100.0 * right and found["better_cost"] == pytest.approx(0.5 * right, rel=1e-6)
         assert not certificate["certified"] and certificate["better_chi2"] == pytest.approx(right, rel=1e-6)
-        assert "a better map was found" in said and "kept all the same" in said and found["converged"]
+        assert "better one known" in said and "kept all the same" in said and found["converged"]
     else:
         assert found["chi2"] == pytest.approx(right, rel=1e-6) and found["better_cost"] is None
         assert certificate["better_chi2"] is None and "kept all the same" not in said
@@ -289,7 +298,7 @@ def test_an_interrupt_keeps_what_there_is(city: Path) -> None:
 
 
 def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
-    from unifg.scenarios.scenes.graph_scene import graph_scene, shown_steps
+    from unifg.scenarios.scenes.graph_scene import LEVERAGES, graph_scene, shown_steps
     from unifg.view.shapes import strips
 
     solved = solve_file(SolveSettings(city))
@@ -297,7 +306,9 @@ def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
     data = data_of(text)
     paths = {str(command["path"]) for command in commands_of(text) if command["type"] == "set_object"}
     assert shown == list(range(len(solved.steps)))
-    assert {f"/meshcat/{part}/{k}" for k in shown for part in ("trajectory", "closures")} <= paths
+    assert {f"/meshcat/trajectory/{k}" for k in shown} <= paths
+    layers = [layer for _, layer, _, _ in LEVERAGES]
+    assert all(any(f"/meshcat/{layer}/{k}" in paths for layer in layers) for k in shown)
     assert {"/meshcat/start", "/meshcat/first"} <= paths
     assert command.main(["solve", str(city), "--out", str(tmp_path)]) == 0
     page = (tmp_path / "scene.html").read_text()

@@ -49,7 +49,7 @@ def commands(folder: Path) -> dict[str, list[str]]:
     return {
         "run": RUN.split(),
         "campaign": ["campaign", str(campaign), "--workers", "1"],
-        "solve": ["solve", str(graph), "--init", "file", "--certify"],
+        "solve": ["solve", str(graph), "--init", "file", "--effort", "full"],
     }
 
 

@@ -10,13 +10,12 @@ import numpy as np
 from unifg.files.contents import legible
 from unifg.files.g2o import write_g2o
 from unifg.files.tum import write_tum
-from unifg.pose_graphs.certificate import Certificate
+from unifg.pose_graphs.verdict import Certificate, Verdict
 from unifg.scenarios import pose_graph
 from unifg.scenarios.commands.extras import absent, remedy
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.logs.metrics import table, write_metrics
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.solution.fit import FAR
 
 __all__ = ["SETTINGS", "metrics", "results", "run", "summary"]
 
@@ -97,7 +96,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "anchors_added": list(solved.judgement.anchors),
         "remarks": [*graph.remarks, *solved.judgement.sentences()],
         "better_cost": solved.better,
-        "certificate": None if solved.certificate is None else _certificate(solved.certificate),
+        "verdict": None if solved.verdict is None else _verdict(solved.verdict),
         "cost": solution.cost,
         "stationarity": solution.stationarity,
         "outliers": int(solved.outliers.sum()),
@@ -115,7 +114,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
 
 def summary(solved: SolvedGraph) -> str:
     """The outcome as a table of two columns."""
-    numbers, verdict, graph = metrics(solved), solved.solution.verdict, solved.after
+    numbers, report, graph = metrics(solved), solved.solution.verdict, solved.after
     more = f", {numbers['landmarks']} landmarks" if numbers["landmarks"] else ""
     flagged = "loop closures" if solved.settings.robust_on == "closures" else "measurements"
     skipped = ", ".join(f"{tag} ({count})" for tag, count in numbers["skipped_lines"].items())
@@ -135,15 +134,14 @@ def summary(solved: SolvedGraph) -> str:
         ("chi2 at the end", f"{numbers['chi2']:.9g}, {numbers['degrees_of_freedom']} degrees of freedom"),
         ("without outliers", f"{numbers['chi2_inliers']:.9g}" if numbers["outliers"] else ""),
         ("outliers", "" if solved.loss is None else f"{numbers['outliers']} of the {flagged}"),
-        ("worst edges", _worst(solved)),
-        *(("remark", sentence) for sentence in numbers["remarks"]),
+        *(("remark", sentence) for sentence in (graph.remarks if solved.verdict else numbers["remarks"])),
         ("held where it was", ", ".join(f"pose {name}" for name in numbers["anchors_added"][:5])),
-        ("another map", "" if solved.certificate is None else solved.certificate.sentence()),
         ("kept all the same", "" if solved.better is None else f"cost {solved.better:.6g} was found"),
-        ("believed", "" if verdict is None else verdict.sentence(numbers["cost"])),
+        ("believed", "" if report is None else report.sentence(numbers["cost"])),
         ("iterations", f"{numbers['iterations']}"),
         ("status", solved.solution.status.value),
         ("time", ", ".join(f"{name} {value:.1f} ms" for name, value in milliseconds.items())),
+        *_words(solved.verdict),
     ]
     return table(rows)
 
@@ -163,11 +161,45 @@ def _certificate(certificate: Certificate) -> dict[str, Any]:
     }
 
 
-def _worst(solved: SolvedGraph) -> str:
-    """The edges that disagree most, where any does."""
-    judgement = solved.judgement
-    pairs = zip(judgement.worst.tolist(), judgement.worst_chi2, strict=True)
-    return ", ".join(f"{a} - {b} ({chi2:.3g})" for (a, b), chi2 in pairs if chi2 > FAR * solved.after.group.dim)
+def _verdict(verdict: Verdict) -> dict[str, Any]:
+    return {
+        "sentence": verdict.sentence(),
+        "claim": verdict.claim,
+        "effort": verdict.effort,
+        "interval": None if verdict.interval is None else list(verdict.interval),
+        "starts": verdict.starts,
+        "basins": verdict.basins,
+        "better_chi2": None if verdict.better_chi2 is None else verdict.better_chi2[1],
+        "certificate": None if verdict.certificate is None else _certificate(verdict.certificate),
+        "uncertified": verdict.uncertified,
+        "clusters": [
+            {
+                "kind": one.kind,
+                "edges": one.edges.tolist(),
+                "stretches": one.stretches.tolist(),
+                "leverage": one.leverage,
+                "squared": one.squared,
+                "moved": None if one.moved is None else list(one.moved),
+                "chi2": None if one.chi2 is None else list(one.chi2),
+            }
+            for one in verdict.clusters
+        ],
+        "hardly_determined": list(verdict.weak),
+        "seconds": {name: round(value, 6) for name, value in verdict.seconds.items()},
+    }
+
+
+def _words(verdict: Verdict | None) -> list[tuple[str, str]]:
+    """Rows of the verdict, the sentence last."""
+    if verdict is None:
+        return []
+    spent = ", ".join(f"{name} {1e3 * value:.1f} ms" for name, value in verdict.seconds.items())
+    bounds = verdict.uncertified if verdict.certificate is None else verdict.certificate.sentence()
+    return [
+        ("time of the verdict", spent),
+        ("bounds", bounds if verdict.effort == "full" else ""),
+        ("verdict", verdict.sentence()),
+    ]
 
 
 def _pairs(solved: SolvedGraph) -> list[list[int]]:

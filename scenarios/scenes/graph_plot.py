@@ -10,8 +10,10 @@ import numpy as np
 
 from unifg.plots.descent import draw_cost
 from unifg.pose_graphs.pose_graph import PoseGraph
+from unifg.pose_graphs.verdict import NAMED, Verdict
 from unifg.scenarios.pose_graph import SolvedGraph
-from unifg.scenarios.scenes.graph_scene import declare_layers, draw_graph, draw_points, line_width
+from unifg.scenarios.scenes.graph_scene import declare_layers, draw_graph, draw_points, line_width, segments
+from unifg.style.colours import INK
 from unifg.style.figures import headline, key_of, new_figure
 from unifg.typing import BoolArray
 from unifg.view import Scene
@@ -39,18 +41,19 @@ def picture(solved: SolvedGraph) -> Figure:
         none = np.zeros(len(solved.outliers), dtype=bool)
         plot_graph(solved.before, none, "start", left)
         left.set_title(f"Before: {origin}, $\\chi^2$ = {solved.chi2[1]:.6g}")
-        plot_graph(solved.after, solved.outliers, "trajectory", right)
+        plot_graph(solved.after, solved.outliers, "trajectory", right, solved.verdict)
         right.set_title(f"After: $\\chi^2$ = {_ending(solved)}")
         plot_cost(solved, below)
         figure.legend(*key_of((left, right)), loc="outside lower center", ncols=5)
         graph = solved.after
         edges = f"{len(graph.edges) - len(graph.closures)} odometry edges, {len(graph.closures)} loop closures"
-        remarks = "".join(f"\n{fill(sentence, 110)}" for sentence in solved.judgement.sentences())
-        headline(figure, f"{solved.name}: {len(graph.poses)} poses, {edges}{remarks}")
+        said = [solved.verdict.sentence()] if solved.verdict else solved.judgement.sentences()
+        headline(figure, f"{solved.name}: {len(graph.poses)} poses, {edges}")
+        below.set_xlabel("\n".join(fill(sentence, 190) for sentence in said), ha="left", x=0.0)
     return figure
 
 
-def plot_graph(graph: PoseGraph, outliers: BoolArray, name: str, ax: Axes) -> Axes:
+def plot_graph(graph: PoseGraph, outliers: BoolArray, name: str, ax: Axes, verdict: Verdict | None = None) -> Axes:
     """Poses, edges and landmarks where they are, drawn as in the scene.
 
     Args:
@@ -58,13 +61,21 @@ def plot_graph(graph: PoseGraph, outliers: BoolArray, name: str, ax: Axes) -> Ax
         outliers: (m,) edges drawn as outliers.
         name: layer of the trajectory, "start" or "trajectory".
         ax: axes to draw into, three-dimensional ones for poses in space.
+        verdict: by which closures are coloured, and clusters numbered as it names them.
     """
     scene = Scene()
     declare_layers(scene)
-    width = 1.5 * line_width(graph) if len(graph.edges) <= _STRIPS else 0.0
-    draw_graph(scene, graph, outliers, name, width)
+    width = (1.5 if verdict is None else 0.6) * line_width(graph) if len(graph.edges) <= _STRIPS else 0.0
+    draw_graph(scene, graph, outliers, name, width, verdict)
     draw_points(scene, graph)
-    return scene.draw(ax)
+    ax = scene.draw(ax)
+    for number, cluster in enumerate(verdict.clusters[:NAMED] if verdict else (), start=1):
+        chosen = np.zeros(len(graph.edges), dtype=bool)
+        chosen[cluster.edges[len(cluster.edges) // 2]] = True
+        place: Any = segments(graph, chosen)[0].mean(axis=0)
+        label: Any = ax.text  # on axes in space it takes three numbers
+        label(*place, f"{number}", fontweight="bold", color=INK, bbox={"facecolor": "white", "pad": 1.5, "lw": 0.5})
+    return ax
 
 
 def plot_cost(solved: SolvedGraph, ax: Axes) -> Axes:

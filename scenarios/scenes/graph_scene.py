@@ -7,12 +7,21 @@ from typing import Any
 import numpy as np
 
 from unifg.pose_graphs.pose_graph import PoseGraph
+from unifg.pose_graphs.verdict import Kind, Verdict
 from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.typing import Array, BoolArray
 from unifg.view import Scene
 from unifg.view.canvas import Canvas
 
 __all__ = ["declare_layers", "draw_graph", "draw_points", "graph_scene", "line_width", "shown_steps"]
+
+LEVERAGES = (
+    (-1.0, "closures", "closure", "loop closures: the same place seen again"),
+    (0.5, "leverage over 0.5", "#8cbf26", "of leverage 0.5 to 0.9"),
+    (0.9, "leverage over 0.9", "goal", "of leverage 0.9 to 0.99"),
+    (0.99, "leverage over 0.99", "fixed", "of leverage over 0.99"),
+)
+"""Leverage above which closures have a layer of their own, its name, colour and words."""
 
 _MOST = 60_000  # edges drawn over all iterations; beyond, only the first guess and the solution are shown
 _MOST_STRIPS = 30_000  # odometry edges drawn with a width; beyond, as hair-thin lines
@@ -34,7 +43,7 @@ def graph_scene(solved: SolvedGraph) -> Scene:
     scene.plot("cost", log=True)
     for k, number in zip(shown, scene.numbers, strict=True):
         iterate, frame, cost = graph.with_poses(solved.steps[k]), scene.frame(), costs.get(number, solution.cost)
-        draw_graph(frame, iterate, solved.outliers, "trajectory", width)
+        draw_graph(frame, iterate, solved.outliers, "trajectory", width, solved.verdict)
         frame.readout("cost", f"{cost:.7g}")
         frame.value("cost", cost)
     scene.outcome, scene.good = solution.status.value, solution.converged
@@ -47,7 +56,9 @@ def declare_layers(scene: Scene) -> None:
     """Names, colours and words of the parts of a graph."""
     for name, colour, words in (
         ("start", "odometry", "trajectory at the start"),
-        ("closures", "closure", "loop closures: the same place seen again"),
+        *((name, colour, words) for _, name, colour, words in LEVERAGES),
+        ("unsupported", "scan", "unsupported, with stretches"),
+        ("contradicted", "outlier", "contradicted, with stretches"),
         ("trajectory", "robot", "trajectory: poses joined by odometry"),
         ("outliers", "outlier", "loop closures taken for outliers"),
         ("landmarks", "landmark", "landmarks"),
@@ -68,13 +79,41 @@ def draw_points(canvas: Canvas, graph: PoseGraph) -> None:
     canvas.points("first", graph.poses[:1, : graph.group.point_dim], pixels=9.0, colour="ink", legend="first pose")
 
 
-def draw_graph(canvas: Canvas, graph: PoseGraph, outliers: BoolArray, name: str, width: float) -> None:
-    """Draw closures, outliers and, in the layer of a name, the trajectory of a width [m]."""
-    odometry = graph.edges.odometry
-    for layer, edges in (("closures", ~odometry & ~outliers), ("outliers", outliers)):
-        if edges.any():
-            canvas.lines(layer, segments(graph, edges))
+def draw_graph(
+    canvas: Canvas, graph: PoseGraph, outliers: BoolArray, name: str, width: float, verdict: Verdict | None = None
+) -> None:
+    """Draw closures, by their leverage, outliers and, in the layer of a name, the trajectory of a width [m].
+
+    Args:
+        canvas: to draw on.
+        graph: poses and edges.
+        outliers: (m,) edges that are drawn as such.
+        name: layer of the trajectory.
+        width: of the trajectory, and of clusters that the verdict names [m]; zero for lines as thin as hair.
+        verdict: on the map; None for closures of one colour.
+    """
     _trajectory(canvas, name, graph, width)
+    edges = graph.edges
+    left = ~edges.odometry & ~outliers
+    layers = {"outliers": outliers}
+    kinds: tuple[Kind, ...] = ("contradicted", "unsupported")
+    for kind in kinds:
+        chosen = np.zeros_like(left)
+        for cluster in verdict.of(kind) if verdict else ():
+            chosen[cluster.edges] = True
+            ends = np.sort(np.stack([edges.first, edges.second])[:, cluster.edges], axis=0)
+            for stretch in ends:  # they may lie on each other, and the closures have no length
+                inside = (np.minimum(edges.first, edges.second) >= stretch.min()) & edges.odometry
+                chosen |= inside & (np.maximum(edges.first, edges.second) <= stretch.max())
+        layers[kind] = chosen & ~outliers
+        left &= ~chosen
+    leverage = verdict.leverage if verdict else np.zeros(len(left))
+    for least, layer, _, _ in reversed(LEVERAGES):
+        layers[layer] = left & (leverage > least)
+        left &= leverage <= least
+    for layer, chosen in reversed(layers.items()):
+        if chosen.any():
+            canvas.lines(layer, segments(graph, chosen), width=2.0 * line_width(graph) if layer in kinds else None)
 
 
 def shown_steps(solved: SolvedGraph) -> list[int]:
@@ -112,6 +151,7 @@ def _facts(solved: SolvedGraph) -> dict[str, Any]:
         "\u03c7\u00b2 before": f"{solved.chi2[1]:.7g}",
         "\u03c7\u00b2 after": f"{solved.chi2[2]:.7g}",
         "without outliers": f"{solved.chi2_inliers:.7g}" if solved.outliers.any() else "",
+        "verdict": solved.verdict.claim if solved.verdict else "",
         "solved in": f"{solution.iterations} iterations, {1e3 * solved.seconds['solve']:.0f} ms",
     }
 

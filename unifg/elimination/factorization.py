@@ -12,7 +12,7 @@ from unifg.codegen.threads import threads
 from unifg.elimination import fronts, sharing, substitution
 from unifg.elimination.analysis import SLACK, Ordering, Structure, analyse
 from unifg.elimination.inverse import invert, locate
-from unifg.elimination.off_diagonal_inverse import block_of, blocks_of_pairs, heights
+from unifg.elimination.off_diagonal_inverse import block_of, blocks_of_pairs, heights, products
 from unifg.elimination.plan import (
     FAILED,
     INDEX,
@@ -294,6 +294,27 @@ class Factorization:
         result: Array = blocks_of_pairs(
             self.plan, self._parent, self._owner(), self._heights, self._position[np.asarray(first, dtype=np.int64)],
             self._position[np.asarray(second, dtype=np.int64)], self._clean,
+        )  # fmt: skip
+        return result
+
+    def products(self, starts: IntArray, rows: IntArray, values: Array) -> Array:
+        """(c, d, d) products B' A^-1 B with matrices B (n, d) that have few rows which are not zero.
+
+        Only the paths from these rows to the root are looked at.
+
+        Args:
+            starts: (c + 1,) first entry of each matrix, and the end of the last one.
+            rows: (k,) scalars; of one that occurs twice in a matrix, the sum counts.
+            values: (k, d) of these rows.
+
+        Raises:
+            UnifgError: there is no factorisation.
+        """
+        self._demand("products")
+        result: Array = products(
+            self.plan, self._parent, self._owner(), np.asarray(starts, dtype=np.int64),
+            self._position[np.asarray(rows, dtype=np.int64)], np.ascontiguousarray(values, dtype=np.float64),
+            self._clean,
         )  # fmt: skip
         return result
 

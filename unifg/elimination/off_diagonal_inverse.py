@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.codegen.vectors import address, get, put
+from unifg.codegen.vectors import Address, address, get, put
 from unifg.elimination.plan import ADJACENT, FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, SCALARS, STRIDE, Plan
 from unifg.elimination.substitution import forward
 from unifg.typing import Array, IntArray
@@ -37,31 +37,85 @@ def climb(plan: Plan, parent: IntArray, start: int, scalar: int, clean: Array, o
         clean: zeros, as many as ``plan.work`` has; so they are afterwards.
         out: (height,) receives what stands on the path.
     """
-    fronts, rows, scalars, s, at = plan.fronts, plan.rows, plan.shape[SCALARS], start, 0
-    numbers, pivots, signs, x = address(plan.numbers), address(plan.pivots), address(plan.signs), address(clean)
+    x, s, at = address(clean), start, 0
     put(x, scalar, 1.0)
     while s >= 0:
-        first, width, below, panel, stride = (
-            fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, PANEL], fronts[s, STRIDE],
-        )  # fmt: skip
-        index, local = fronts[s, INDEX], first
-        if fronts[s, ADJACENT] == 0 and below > 0:
-            local = scalars
-            for i in range(width):
-                put(x, local + i, get(x, first + i))
-            for i in range(below):
-                put(x, local + width + i, get(x, get(rows, index + i)))
-        forward(x, local, numbers, panel, stride, width, width + below, pivots, signs, first)
-        for i in range(width):
-            out[at] = get(x, local + i)
-            put(x, first + i, 0.0)
-            at += 1
-        if local == scalars:
-            for i in range(below):
-                put(x, get(rows, index + i), get(x, local + width + i))
-            for i in range(width + below):
-                put(x, local + i, 0.0)
+        eliminate(plan, s, x, out, at)
+        at += plan.fronts[s, PIVOTS]
         s = parent[s]
+
+
+@compiled
+def eliminate(plan: Plan, s: int, x: Address, out: Array, at: int) -> None:
+    """Forward substitution of one front: its pivots go from ``x`` to ``out``, the rest of ``x`` is updated."""
+    fronts, rows, scalars = plan.fronts, plan.rows, plan.shape[SCALARS]
+    first, width, below, panel, stride = (
+        fronts[s, FIRST], fronts[s, PIVOTS], fronts[s, ROWS], fronts[s, PANEL], fronts[s, STRIDE],
+    )  # fmt: skip
+    index, local = fronts[s, INDEX], first
+    if fronts[s, ADJACENT] == 0 and below > 0:
+        local = scalars
+        for i in range(width):
+            put(x, local + i, get(x, first + i))
+        for i in range(below):
+            put(x, local + width + i, get(x, get(rows, index + i)))
+    numbers, pivots, signs = address(plan.numbers), address(plan.pivots), address(plan.signs)
+    forward(x, local, numbers, panel, stride, width, width + below, pivots, signs, first)
+    for i in range(width):
+        out[at + i] = get(x, local + i)
+        put(x, first + i, 0.0)
+    if local == scalars:
+        for i in range(below):
+            put(x, get(rows, index + i), get(x, local + width + i))
+        for i in range(width + below):
+            put(x, local + i, 0.0)
+
+
+@compiled
+def products(
+    plan: Plan, parent: IntArray, owner: IntArray, starts: IntArray, places: IntArray, values: Array, clean: Array
+) -> Array:
+    """(c, d, d) products B' A^-1 B with matrices B (n, d) of few rows: only paths to the root are looked at.
+
+    Args:
+        plan: with its factorisation.
+        parent: of each front.
+        owner: (n,) front that eliminates each scalar.
+        starts: (c + 1,) first entry of each matrix among ``places``.
+        places: (k,) rows of the matrices, in the order of elimination; of a row that occurs twice, the sum counts.
+        values: (k, d).
+        clean: see :func:`climb`.
+    """
+    count, size, fronts = len(starts) - 1, values.shape[1], plan.fronts
+    result, x = np.zeros((count, size, size)), address(clean)
+    marked, path = np.zeros(plan.shape[FRONTS], np.bool_), np.empty(plan.shape[FRONTS], np.int64)
+    for c in range(count):
+        length, height = 0, 0
+        for e in range(starts[c], starts[c + 1]):
+            s = owner[places[e]]
+            while s >= 0 and not marked[s]:
+                marked[s], path[length] = True, s
+                length, height, s = length + 1, height + fronts[s, PIVOTS], parent[s]
+        order = np.sort(path[:length])  # parents have larger numbers
+        columns, signs, at = np.empty((size, height)), np.empty(height), 0
+        for s in order:
+            marked[s] = False
+            for i in range(fronts[s, PIVOTS]):
+                signs[at] = plan.signs[fronts[s, FIRST] + i]
+                at += 1
+        for k in range(size):
+            for e in range(starts[c], starts[c + 1]):
+                put(x, places[e], get(x, places[e]) + values[e, k])
+            at = 0
+            for s in order:
+                eliminate(plan, s, x, columns[k], at)
+                at += fronts[s, PIVOTS]
+            for j in range(k + 1):
+                total = 0.0
+                for i in range(height):
+                    total += columns[k, i] * signs[i] * columns[j, i]
+                result[c, k, j] = result[c, j, k] = total
+    return result
 
 
 @compiled

@@ -1,16 +1,19 @@
 """Pose graphs: the data, residuals in two conventions, first guesses, and made-up examples."""
 
-from unifg.pose_graphs.certificate import Certificate, certify
+from unifg.pose_graphs import judging as _judging  # noqa: F401  enters PoseGraph.verdict
+from unifg.pose_graphs.certificate import certify
 from unifg.pose_graphs.consistency import pairwise_consistent
 from unifg.pose_graphs.generate import Simulated, manhattan, sphere
 from unifg.pose_graphs.information import Repair, indefinite, repaired
 from unifg.pose_graphs.initialise import Start, best_guess, chordal, lago, odometric, starts
-from unifg.pose_graphs.judgement import Judgement, judge
+from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Priors, Sightings
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
+from unifg.pose_graphs.verdict import Certificate, Cluster, Judgement, Verdict
 
 __all__ = [
     "Certificate",
+    "Cluster",
     "Edges",
     "Judgement",
     "PoseGraph",
@@ -19,6 +22,7 @@ __all__ = [
     "Sightings",
     "Simulated",
     "Start",
+    "Verdict",
     "bearing",
     "bearing_range",
     "best_guess",

@@ -19,75 +19,15 @@ from unifg.errors import GraphError
 from unifg.pose_graphs.linear import BlockQuadratic, polar
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.pose_graphs.relaxation import Relaxation
+from unifg.pose_graphs.verdict import Certificate
 from unifg.solvers.least_squares import LevenbergMarquardt
 from unifg.typing import Array, BoolArray
 
-__all__ = ["Certificate", "certify"]
+__all__ = ["certify"]
 
 ROUNDING = 1e-13  # of the sum of all weights: what sums of squares are worth
 RANKS = 5  # dimensions added to those of the world, at most
 STEPS = 40  # halvings on the way out of a saddle
-
-
-@dataclass(frozen=True, eq=False)
-class Certificate:
-    """Bounds on the cost of the best map of a pose graph.
-
-    Attributes:
-        certified: the chordal cost of the given poses is at most `tolerance` above the least possible one.
-        chi2: chordal cost of the given poses, with the weights of the graph.
-        dual: chordal cost that no poses whatever fall below.
-        gap: chi2 less dual; certified where it is at most `tolerance`.
-        tolerance: absolute.
-        least_eigenvalue: of the dual matrix on the frames; negative where the relaxation shows a way down.
-        poses: (n, storage) stationary point of the chordal cost near the given poses, anchors where they were.
-        moved: greatest distance [m] and turn [rad] from the given poses to those; no criterion.
-        rank: dimension of the frames in which the staircase ended; that of the world where it was not climbed.
-        caveats: sentences, what of the graph's weights the chordal cost does not hold.
-        interval: bounds on the least sum of r' Omega r over all maps, r the logarithm: a lower bound, and its value at
-            the given poses. None where there is none.
-        no_interval: the reason for that; empty otherwise.
-        better: (n, storage) solution, by the residual asked for, that a solve from `poses` ended at, where its chi2 is
-            lower than that of the given poses by more than the relative tolerance; otherwise None.
-        better_chi2: chi2 of the given poses by that residual and of `better`; None without it.
-    """
-
-    certified: bool
-    chi2: float
-    dual: float
-    gap: float
-    tolerance: float
-    least_eigenvalue: float
-    poses: Array
-    moved: tuple[float, float]
-    rank: int
-    caveats: tuple[str, ...]
-    interval: tuple[float, float] | None
-    no_interval: str
-    better: Array | None = None
-    better_chi2: tuple[float, float] | None = None
-
-    def sentence(self) -> str:
-        """Claims that hold, and those that are not made."""
-        if self.certified:
-            text = f"no map has a lower chordal chi2 than {self.chi2:.6g}, that of this one (but for {self.gap:.1g})"
-        else:
-            text = (
-                f"not certified: the chordal chi2 of this map is {self.chi2:.6g}, "
-                f"and a map as low as {self.dual:.6g} is not excluded"
-            )
-        said = [text, f"a stationary point of that cost lies {self.moved[0]:.2g} m and {self.moved[1]:.2g} rad away"]
-        if self.better_chi2 is not None:
-            said.append(
-                f"a better map was found: chi2 {self.better_chi2[1]:.6g}, of this one {self.better_chi2[0]:.6g}"
-            )
-        if self.interval is None:
-            said.append(f"no interval is claimed for chi2: {self.no_interval}")
-        else:
-            least, here = self.interval
-            wide = f", {here / least:.3g} times as much" if least > 0.0 else ""
-            said.append(f"chi2 of the best map lies between {least:.6g} and {here:.6g}{wide}, that of this one")
-        return "; ".join([*said, *self.caveats, "nothing is claimed of robust losses"])
 
 
 def certify(
@@ -95,19 +35,21 @@ def certify(
     *,
     used: BoolArray | None = None,
     staircase: bool = False,
+    better: bool = True,
     tolerance: float = 1e-6,
     residual: ResidualName = "log",
 ) -> Certificate:
     """Bound what a map can gain over a graph's present poses.
 
     The chordal cost of these poses is compared with the dual of its relaxation. The dual is taken at the stationary
-    point of that cost near them. Where the comparison fails, a solve of plain squares begins there.
+    point of that cost near them. Where the comparison fails, a solve of plain squares begins there, if asked for.
 
     Args:
         pose_graph: with poses that solve it, in whatever residual; relative poses only.
         used: (m,) edges that count, say the inliers of a robust solve. The interval is left out where it is given:
             it is one of plain squares over all edges.
         staircase: where there is a way down, follow it.
+        better: whether to look for a better map where the comparison fails.
         tolerance: of the gap, relative to chi2.
         residual: by which a better map is looked for; the interval is that of the logarithm.
 
@@ -115,12 +57,7 @@ def certify(
         GraphError: the graph has landmarks, several poses of one part are known, or `used` is something else than one
             truth value for each edge.
     """
-    chosen = None if used is None else np.asarray(used)
-    if chosen is not None and (chosen.shape != (len(pose_graph.edges),) or chosen.dtype != np.bool_):
-        raise GraphError(
-            f"used has shape {chosen.shape} and holds {chosen.dtype}: expected ({len(pose_graph.edges)},) of bool, "
-            "one for each edge"
-        )
+    chosen = None if used is None else require_one_for_each(pose_graph, used)
     # Weights of positions and of frames are added up below: the unit of length is the graph's own, not the file's.
     unit = _length(pose_graph, chosen)
     scaled = _measured_in(pose_graph, unit)
@@ -155,7 +92,22 @@ def certify(
         chi2 - dual <= allowed, chi2, dual, max(chi2 - dual, 0.0), allowed, verdict.least, poses, moved, rank,
         problem.caveats, interval, missing,
     )  # fmt: skip
-    return found if found.certified else _improved(found, pose_graph, chosen, tolerance, residual)
+    return found if found.certified or not better else _improved(found, pose_graph, chosen, tolerance, residual)
+
+
+def require_one_for_each(pose_graph: PoseGraph, used: BoolArray | None) -> BoolArray:
+    """(m,) truth values of the edges that count, all of them for None.
+
+    Raises:
+        GraphError: they are something else than one truth value for each edge.
+    """
+    count = len(pose_graph.edges)
+    chosen = np.ones(count, dtype=np.bool_) if used is None else np.asarray(used)
+    if chosen.shape != (count,) or chosen.dtype != np.bool_:
+        raise GraphError(
+            f"used has shape {chosen.shape} and holds {chosen.dtype}: expected ({count},) of bool, one for each edge"
+        )
+    return chosen
 
 
 def _bound(judge: _Judge, start: Array, staircase: bool) -> tuple[Array, _Verdict, int, float]:

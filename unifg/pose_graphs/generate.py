@@ -69,7 +69,7 @@ def manhattan(count: int = 1000, seed: int = 0, outliers: float = 0.0, block: in
     truth = np.column_stack([cells[:, :2] - cells[0, :2], cells[:, 2] * (np.pi / 2)]).astype(np.float64)
     truth = SE2.retract(truth, np.zeros(3))
     closures = _same_place(cells[:, :2], apart=4 * block)
-    return _simulated(SE2, truth, closures, outliers, np.array(_PLANAR_SIGMA), rng)
+    return simulated(SE2, truth, closures, outliers, np.array(_PLANAR_SIGMA), rng)
 
 
 def sphere(
@@ -104,7 +104,7 @@ def sphere(
     truth = SE3.between(truth[:1], truth)
     above = np.arange(per_ring, count)
     closures = np.stack([above - per_ring, above], axis=1)
-    return _simulated(SE3, truth, closures, outliers, np.array(_SPATIAL_SIGMA), rng)
+    return simulated(SE3, truth, closures, outliers, np.array(_SPATIAL_SIGMA), rng)
 
 
 def _same_place(cells: Array | IntArray, apart: int) -> IntArray:
@@ -119,7 +119,7 @@ def _same_place(cells: Array | IntArray, apart: int) -> IntArray:
     return np.array(pairs, dtype=np.intp).reshape(-1, 2)
 
 
-def _simulated(
+def simulated(
     group: LieGroup, truth: Array, closures: IntArray, share: float, sigma: Array, rng: np.random.Generator
 ) -> Simulated:
     """Measure along the way and across the closures, and add wrong closures between random poses."""

@@ -18,6 +18,7 @@ from unifg.lie import SE2, SE3, LieGroup, Rn
 from unifg.modeling.factors import ManifoldResidual, between
 from unifg.modeling.variables import Family
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, position, sighting
+from unifg.pose_graphs.verdict import Effort, Verdict
 from unifg.solution.graph import Graph
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -37,6 +38,9 @@ _SEEN: dict[str, ManifoldResidual | Residual] = {
 
 GUESSES: list[Callable[[PoseGraph], Array]] = []
 """First guesses from measurements alone, entered by :mod:`unifg.pose_graphs.initialise`, which stands on this file."""
+
+JUDGES: list[Callable[[PoseGraph, Effort, ResidualName, BoolArray | None, float], Verdict]] = []
+"""The verdict on a map, entered by :mod:`unifg.pose_graphs.judging`, which stands on this file."""
 
 
 class _Measurements:
@@ -216,6 +220,28 @@ class PoseGraph:
         if everywhere is not None:
             graph.starts += [partial(_guessed, method, self, x) for method in GUESSES]
         return graph, x, guess
+
+    def verdict(
+        self,
+        *,
+        effort: Effort = "full",
+        residual: ResidualName = "log",
+        used: BoolArray | None = None,
+        tolerance: float = 1e-6,
+    ) -> Verdict:
+        """Confidence in the map that the present poses are: a record, and a sentence.
+
+        Args:
+            effort: "cheap" bounds what another map could gain, and looks for closures that the others contradict or
+                do not support; "full" climbs the staircase of the certificate and solves from other first guesses, too.
+            residual: as for :meth:`graph`.
+            used: (m,) edges that count, say the inliers of a robust solve.
+            tolerance: share of chi2 by which maps are told apart.
+
+        Raises:
+            GraphError: there is no measurement, or `used` is something else than one truth value for each edge.
+        """
+        return JUDGES[0](self, effort, residual, used, tolerance)
 
     def chi2(self, residual: ResidualName = "log") -> float:
         """Sum of r' Omega r over all measurements at the present values: no 1/2, no robust loss."""

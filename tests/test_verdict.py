@@ -1,0 +1,168 @@
+"""Verdicts on maps: clusters that are contradicted or unsupported, slips, other basins, and what they cost."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from problems.closures import adrift, aliased, drive, slipped
+from unifg.errors import GraphError
+from unifg.files.g2o import read_g2o
+from unifg.pose_graphs import PoseGraph, best_guess, manhattan, sphere
+from unifg.pose_graphs.clusters import _clusters, _Map, optimum
+from unifg.solvers import GaussNewton, LevenbergMarquardt
+from unifg.typing import IntArray
+
+
+def solved(pose_graph: PoseGraph) -> PoseGraph:
+    graph, x, guess = pose_graph.with_poses(best_guess(pose_graph)[1]).graph()
+    return pose_graph.with_poses(LevenbergMarquardt(tolerance="map").solve(graph, guess)[x])
+
+
+def found(fault: IntArray, kind: str, pose_graph: PoseGraph) -> bool:
+    verdict = solved(pose_graph).verdict(effort="cheap")
+    named = [one.edges for one in verdict.clusters if one.kind == kind]
+    return bool(named) and bool(np.isin(fault, np.concatenate(named)).all())
+
+
+def test_statistics_of_a_cluster_are_those_of_dense_matrices() -> None:
+    """Fall, leverage and movement, against the linear problem in which the later stretch may be displaced."""
+    made = solved(manhattan(120, 3).pose_graph)
+    now = _Map(made, np.ones(len(made.edges), dtype=bool), "log")
+    edges, group = made.edges, made.group
+    group_of = max(_clusters(edges, ~edges.odometry), key=len)
+    assert len(group_of) > 2
+    fall, innovation, leverage, moved = (values[0] for values in now.statistics([group_of]))
+    graph, x, _ = now.graph.graph()
+    solution = GaussNewton(max_iterations=1).solve(graph, {x: now.graph.poses})
+    program = graph.compile()
+    lin = program.linearize({x: now.graph.poses})
+    late = edges.second[group_of]
+    hinge = now.graph.poses[late[len(late) // 2]]
+    errors, moves = [], []
+    for e, pose in zip(group_of, late, strict=True):
+        root = np.linalg.cholesky(edges.information[e]).T
+        ends = now.graph.poses[edges.first[e]], now.graph.poses[pose]
+        errors.append(root @ group.log(group.between(edges.measured[e], group.between(*ends))))
+        across = group.adjoint(group.between(now.graph.poses[pose], hinge))
+        step, columns = 1e-6, []
+        for k in range(3):
+            shifted = group.retract(ends[1], across[:, k] * step)
+            there = root @ group.log(group.between(edges.measured[e], group.between(ends[0], shifted)))
+            columns.append((there - errors[-1]) / step)
+        moves.append(np.array(columns).T)
+    shift, error = np.concatenate(moves), np.concatenate(errors)
+    information = np.linalg.inv(solution.covariance(x[1:]))
+    slope = np.zeros((len(information), 3))
+    for e, block in zip(group_of, moves, strict=True):
+        own = group.adjoint(group.between(now.graph.poses[edges.second[e]], hinge))
+        jacobian = block @ np.linalg.inv(own)
+        back = group.adjoint(group.between(now.graph.poses[edges.second[e]], now.graph.poses[edges.first[e]]))
+        for pose, part in ((edges.second[e], jacobian), (edges.first[e], -jacobian @ back)):
+            if pose:
+                slope[3 * pose - 3 : 3 * pose] += part.T @ block
+    held = slope.T @ np.linalg.solve(information, slope)
+    own, pull = shift.T @ shift, shift.T @ error
+    free = np.linalg.solve(own - held, pull)
+    assert fall == pytest.approx(pull @ free, rel=1e-3)
+    assert innovation == pytest.approx(pull @ np.linalg.solve(own + held, pull), rel=1e-3)
+    assert leverage == pytest.approx(np.linalg.eigvals(np.linalg.solve(own, held)).real.max(), rel=1e-4)
+    assert moved == pytest.approx(np.sqrt(free @ held @ free), rel=1e-3)
+    assert lin.cost == pytest.approx(0.5 * now.chi2)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+@pytest.mark.parametrize("spatial", [False, True])
+def test_clusters_that_the_rest_contradicts_are_named(count: int, spatial: bool) -> None:
+    made = drive(900, 5, spatial=spatial) if spatial else manhattan(600, 5)
+    dirty, faults = aliased(made.pose_graph, made.truth, count, 5)
+    verdict = solved(dirty).verdict(effort="cheap")
+    named = np.concatenate([one.edges for one in verdict.of("contradicted")])
+    assert np.isin(np.concatenate(faults), named).all()
+    first = verdict.of("contradicted")[0]
+    assert first.moved is not None and first.moved[0] > 1.0
+    assert first.chi2 is not None and first.chi2[1] < 0.9 * first.chi2[0]
+    assert "the rest contradicts" in verdict.sentence()
+    others = np.ones(len(dirty.edges), dtype=bool)
+    others[named] = False
+    kept = solved(replace(dirty, edges=dirty.edges[others])).verdict(effort="cheap")
+    assert not kept.of("contradicted")
+
+
+def test_a_cluster_that_nothing_else_reaches_is_unsupported() -> None:
+    dirty, (fault,) = adrift(drive(1200, 2), 2)
+    assert found(fault, "unsupported", dirty)
+
+
+def test_a_slip_is_not_laid_on_closures() -> None:
+    made = manhattan(600, 4).pose_graph
+    verdict = solved(slipped(made, 200, np.array([2.0, 0.0, 0.1]))).verdict(effort="cheap")
+    assert [200 in one.edges for one in verdict.of("slipped")] == [True] and not verdict.of("contradicted")
+    assert "loops contradict a step of odometry between" in verdict.sentence()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_clean_graphs_have_no_contradiction(seed: int) -> None:
+    for made in (manhattan(500, seed), drive(700, seed), sphere(6, 12, seed)):
+        verdict = solved(made.pose_graph).verdict(effort="cheap")
+        assert not verdict.of("contradicted") and not verdict.of("slipped") and verdict.ended
+        assert all(one.leverage >= 0.99 and one.deviations > 3.0 for one in verdict.of("unsupported"))
+        assert verdict.leverage.shape == (len(made.pose_graph.edges),) and (verdict.leverage <= 1.0).all()
+
+
+def test_noise_larger_than_stated_contradicts_nothing() -> None:
+    made = manhattan(300, 1).pose_graph
+    sure = replace(made, edges=replace(made.edges, information=25.0 * made.edges.information))
+    verdict = solved(sure).verdict(effort="cheap")
+    assert not verdict.of("contradicted") and not verdict.of("slipped")
+    assert "times as large as stated" in verdict.sentence()
+
+
+def test_effort_decides_what_is_claimed() -> None:
+    made = solved(manhattan(300, 1).pose_graph)
+    cheap, full = made.verdict(effort="cheap"), made.verdict()
+    assert cheap.starts == 0 and full.starts == 3 and full.basins == 1
+    assert {"residuals", "certificate", "clusters", "solved again"} == set(cheap.seconds)
+    assert set(full.seconds) == {*cheap.seconds, "basins"}
+    assert full.claim == "proven" and full.interval is not None and full.interval[1] == pytest.approx(made.chi2())
+    assert full.sentence().startswith("proven: chi2 ")
+    with pytest.raises(GraphError, match="effort is 'much'"):
+        made.verdict(effort="much")  # type: ignore[arg-type]
+    known = replace(made, fixed_ids=(0, 1)).verdict()
+    assert known.certificate is None and "are known" in known.uncertified and known.claim == "best of 1 basin"
+
+
+def test_a_better_map_is_handed_over() -> None:
+    made = manhattan(60, 0).pose_graph
+    turned = made.poses.copy()
+    turned[:, 2] += np.linspace(0.0, 4.0 * np.pi, len(turned))
+    here, _ = optimum(made.with_poses(turned), np.ones(len(made.edges), dtype=bool))
+    best = solved(made)
+    if here.chi2() < 1.1 * best.chi2():
+        pytest.skip("the start was not folded")
+    verdict = here.verdict()
+    assert verdict.better is not None and verdict.claim == "better one known"
+    assert made.with_poses(verdict.better).chi2() == pytest.approx(best.chi2(), rel=1e-4)
+
+
+def test_edges_that_do_not_count_are_not_judged() -> None:
+    made = manhattan(400, 3)
+    dirty, (fault,) = aliased(made.pose_graph, made.truth, 1, 3)
+    used = np.ones(len(dirty.edges), dtype=bool)
+    used[fault] = False
+    right = solved(made.pose_graph)
+    verdict = replace(right, edges=dirty.edges).verdict(effort="cheap", used=used)
+    assert not verdict.of("contradicted") and not verdict.leverage[fault].any()
+    assert not any(np.isin(fault, one.edges).any() for one in verdict.clusters)
+    with pytest.raises(GraphError, match="one for each edge"):
+        made.pose_graph.verdict(used=used[:-1])
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("name", ["M3500", "intel"])
+def test_published_graphs(shared_data: Path, name: str) -> None:
+    verdict = solved(read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz")).verdict(effort="cheap")
+    assert not verdict.of("contradicted") and not verdict.of("slipped")

@@ -1,0 +1,132 @@
+"""Verdict on the map of a pose graph: bounds, other basins, and clusters of closures, by the effort that is allowed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+
+import numpy as np
+
+from unifg.errors import GraphError
+from unifg.pose_graphs.certificate import certify, require_one_for_each
+from unifg.pose_graphs.clusters import Search, optimum, search
+from unifg.pose_graphs.initialise import odometric, starts
+from unifg.pose_graphs.judgement import judge
+from unifg.pose_graphs.pose_graph import JUDGES, PoseGraph, ResidualName
+from unifg.pose_graphs.verdict import NAMED, Certificate, Cluster, Effort, Verdict
+from unifg.typing import Array, BoolArray, IntArray
+
+__all__: list[str] = []
+
+SAME = 1e-3  # relative difference of chi2 up to which minima count as one
+LOWER = 1e-4  # share of chi2 by which another basin has to be better: it is solved to within 1e-5
+
+
+def _verdict(
+    pose_graph: PoseGraph, effort: Effort, residual: ResidualName, used: BoolArray | None, tolerance: float
+) -> Verdict:
+    """Compute the verdict; see `PoseGraph.verdict`."""
+    if effort not in ("cheap", "full"):
+        raise GraphError(f"effort is {effort!r}: expected 'cheap' or 'full'")
+    seconds: dict[str, float] = {}
+    counts = require_one_for_each(pose_graph, used)
+    judged = pose_graph if used is None else replace(pose_graph, edges=pose_graph.edges[counts])
+    with _timed(seconds, "residuals"):
+        judgement = judge(judged, residual)
+    certificate, uncertified = None, ""
+    with _timed(seconds, "certificate"):
+        full = effort == "full"
+        try:
+            certificate = certify(
+                pose_graph, used=used, staircase=full, better=full, tolerance=tolerance, residual=residual
+            )
+        except GraphError as reason:
+            uncertified = str(reason)
+    with _timed(seconds, "clusters"):
+        found = search(judged, judgement.freedom, residual)
+    with _timed(seconds, "solved again"):
+        clusters = _clusters(found, judged, residual)
+    tried, basins, better = 0, 1, None
+    if full:
+        with _timed(seconds, "basins"):
+            tried, basins, better = _basins(judged, found.solved, certificate, residual)
+    places, leverage = np.flatnonzero(counts), np.zeros(len(counts))
+    leverage[places] = found.leverage
+    return Verdict(
+        effort,
+        judgement,
+        certificate,
+        uncertified,
+        tried,
+        basins,
+        None if better is None else better[0],
+        None if better is None else (judgement.chi2, better[1]),
+        tuple(replace(one, edges=places[one.edges]) for one in clusters),
+        leverage,
+        found.weak,
+        found.ended,
+        seconds,
+    )
+
+
+def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[Cluster]:
+    """Clusters with the names of their stretches, the first of them solved again without."""
+    dim, count = judged.group.point_dim, len(judged.edges)
+
+    def solved(left_out: IntArray) -> tuple[BoolArray, PoseGraph, float]:
+        """Edges that are left, their map, and its chi2."""
+        mask = np.ones(count, dtype=np.bool_)
+        mask[left_out] = False
+        if mask.tobytes() not in found.maps:
+            found.maps[mask.tobytes()] = optimum(found.solved, mask, residual)
+        return mask, *found.maps[mask.tobytes()]
+
+    clusters: list[Cluster] = []
+    for kind, suspects in found.by_kind.items():
+        for suspect in suspects:
+            ends = np.sort(np.stack([judged.edges.first, judged.edges.second])[:, suspect.alike], axis=0)
+            stretches = judged.ids[np.stack([ends.min(axis=1), ends.max(axis=1)], axis=1)]
+            cluster = Cluster(kind, suspect.alike, stretches, suspect.fall, suspect.leverage, suspect.moved)
+            if len(clusters) < NAMED:
+                _, here, _ = solved(suspect.before)
+                others, there, chi2 = solved(np.concatenate([suspect.before, suspect.edges]))
+                apart = np.linalg.norm(judged.group.local(here.poses, there.poses)[:, dim:], axis=1)
+                away = np.linalg.norm(here.poses[:, :dim] - there.poses[:, :dim], axis=1)
+                moved = float(away.max()), float(apart.max())
+                rest = replace(here, edges=here.edges[others])
+                cluster = replace(cluster, moved=moved, chi2=(rest.chi2(residual), chi2))
+            clusters.append(cluster)
+    return clusters
+
+
+def _basins(
+    judged: PoseGraph, solved: PoseGraph, certificate: Certificate | None, residual: ResidualName
+) -> tuple[int, int, tuple[Array, float] | None]:
+    """Number of further starts, of different minima, and a better map than the given one with its chi2."""
+    minima = [(solved.poses, solved.chi2(residual))]
+    if certificate is not None and certificate.better is not None:
+        minima.append((certificate.better, judged.with_poses(certificate.better).chi2(residual)))
+    every = np.ones(len(judged.edges), dtype=np.bool_)
+    others = [start.poses for start in starts(judged, residual)[1:]]
+    with suppress(GraphError):
+        others.append(odometric(judged))
+    for poses in others:
+        reached, chi2 = optimum(judged.with_poses(poses), every, residual)
+        minima.append((reached.poses, chi2))
+    values = np.sort([chi2 for _, chi2 in minima])
+    best = min(minima, key=lambda one: one[1])
+    basins = 1 + int((np.diff(values) > SAME * values[1:]).sum())
+    return len(others), basins, best if best[1] < (1.0 - LOWER) * judged.chi2(residual) else None
+
+
+@contextmanager
+def _timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    """Add the time of a part."""
+    begin = time.perf_counter()
+    yield
+    seconds[part] = time.perf_counter() - begin
+
+
+JUDGES.append(_verdict)
