@@ -1,4 +1,4 @@
-"""Scenario ``navigation``: a unicycle localises itself by lidar and drives through a building under MPC.
+"""Scenario ``navigation``: a robot localises itself by lidar and drives through a building under MPC.
 
 Each tick: odometry predicts, the scan corrects (one factor graph), tracked discs are updated, the route is
 repaired if a disc stands on it, and the controller (a second factor graph, conditioned on the estimate) decides.
@@ -22,7 +22,6 @@ from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.horizon import Plan
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
-from unifg.models.unicycle import step
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.ground.drive_pilot import STOPPED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
@@ -168,13 +167,13 @@ class Episode:
         )
         walls = _field(true) if settings.imperfection != Imperfection() else self.distance_map
         self.world = World(
-            true, self.start, discs, sensors, robot_radius=control.robot_radius, lidar=settings.lidar,
+            true, self.start, discs, sensors, base=control.kind, body=control.hull, lidar=settings.lidar,
             odometry=settings.odometry, drivetrain=settings.drivetrain, yields=False,
             people=draw_traffic(settings.traffic, walls, self.path, about),
         )  # fmt: skip
         sigma = np.array(INITIAL_SIGMA)
         believed = self.start + sigma * belief.standard_normal(3)
-        self.faults = DriveFaults(settings.faults, settings.seed)
+        self.faults = DriveFaults(settings.faults, settings.seed, control.kind)
         self._right, self._drawn = (self.occupancy, self.distance_map), drawn
         self.pilot = self._pilot(believed, sigma)
         if not rehearsal:
@@ -200,7 +199,9 @@ class Episode:
             context = PlannerContext(self.distance_map, self.controller, of_planner)
             pilot.controller = load_planner(settings.planner, context)
         if settings.localiser == "amcl":
-            pilot.estimator = MonteCarlo(self.occupancy, self.distance_map, pose, sigma, of_localiser)
+            pilot.estimator = MonteCarlo(
+                self.occupancy, self.distance_map, pose, sigma, of_localiser, base=self.controller.kind
+            )
             pilot.pose = pilot.estimator.pose
         return pilot
 
@@ -223,7 +224,9 @@ class Episode:
             solver=s.solver if s.planner == MPC else s.planner,
             coupling=s.coupling,
             seed=s.seed,
-            control_limits=s.controller.limits,
+            control_limits=tuple(s.controller.box[1].tolist()),
+            base=s.controller.base,
+            body=s.controller.body,
             scan_angles=self.world.lidar.angles,
             obstacle_moves=self.world.discs()[:, 3].astype(bool),
             faults=[str(fault) for fault in s.faults],
@@ -252,10 +255,10 @@ class Episode:
         control = self.decide(number)
         if control is None:
             return None
-        self.world.step(*control, self.settings.controller.dt)
+        self.world.step(*control, dt=self.settings.controller.dt)
         return self._driven / path_length(self.path), f"goal {self._goal + 1}/{len(self.goals)}"
 
-    def decide(self, number: int) -> tuple[float, float] | None:
+    def decide(self, number: int) -> tuple[float, ...] | None:
         """Move on from the last tick, scan, decide and record; the control to be driven, None at the last goal."""
         dt, goal, now = self.settings.controller.dt, self._goal, self.world.time
         faults = self.faults
@@ -265,8 +268,8 @@ class Episode:
         odometry = None
         if number:
             measured = np.array(self.world.odometry())
-            self._dead_reckoning = step(self._dead_reckoning[None], measured[None], dt)[0]
-            self._driven += abs(measured[0]) * dt
+            self._dead_reckoning = self.controller.kind.step(self._dead_reckoning[None], measured[None], dt)[0]
+            self._driven += float(np.hypot(*measured[:2]) if self.controller.kind.slides else abs(measured[0])) * dt
             odometry = faults.odometry(measured, now)
         true_scan = self.world.scan()
         self.pilot.planless = faults.hold("solver-timeout", now)
@@ -288,8 +291,7 @@ class Episode:
         elif self.pilot.relocated:
             self._begin_leg(goal)
         asked = np.array(plan.control, dtype=np.float64)
-        v, omega = faults.control(asked, now, dt).tolist()
-        return v, omega
+        return tuple(faults.control(asked, now, dt).tolist())
 
     def _outcome(self, goal: int) -> str | None:
         """Outcome of a goal; None while the robot is on its way."""
@@ -330,7 +332,7 @@ class Episode:
         found, least = pose.copy(), self.controller.robot_radius + BESIDE
         for _ in range(FREEING):
             distance, slope = self.distance_map.distance_and_gradient(found[:2])
-            if distance >= least:
+            if distance >= least or self.controller.oriented:
                 break
             found[:2] += (least - distance) * slope / max(float(np.hypot(*slope)), 1e-9)
         return found
@@ -396,7 +398,9 @@ class Episode:
 
     def _route(self, begin: Array, end: Array) -> Route:
         s = self.controller
-        return Route(self.occupancy, self.distance_map, begin, end, s.robot_radius, *self._gaps())
+        return Route(
+            self.occupancy, self.distance_map, begin, end, s.robot_radius, *self._gaps(), base=s.kind, body=s.hull
+        )
 
     def _arrived(self, goal: int) -> bool:
         """Return True if the robot believes to be there, by an estimate that leaves room for being wrong.

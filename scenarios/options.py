@@ -19,6 +19,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
+from unifg.errors import UnifgError
 from unifg.files.contents import legible
 
 __all__ = [
@@ -26,6 +27,7 @@ __all__ = [
     "Option",
     "Text",
     "add_options",
+    "checked",
     "count",
     "existing",
     "find_modules_in",
@@ -182,6 +184,19 @@ def _help(leaf: Leaf, default: Any) -> str:
     words = " ".join(found[1].split()).rstrip(".") if found else ""
     quiet = default is MISSING or default is None or isinstance(default, bool)
     return words if quiet else f"{words} (default: {default})"
+
+
+def checked(read: Callable[[str], object]) -> Text:
+    """A word that ``read`` takes; one that it refuses is refused by the message of its error."""
+
+    def word(text: str) -> str:
+        try:
+            read(text)
+        except UnifgError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+        return text
+
+    return word
 
 
 def count(text: str, least: int = 0, most: int = 10**18) -> int:

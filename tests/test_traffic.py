@@ -13,6 +13,7 @@ from unifg.errors import ScenarioError
 from unifg.files.contents import Limits
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
+from unifg.models.footprint import Body
 from unifg.scenarios import navigation
 from unifg.scenarios.episode import run_ticks, silent
 from unifg.scenarios.navigation import Episode, NavigationSettings
@@ -23,7 +24,7 @@ from unifg.typing import Array
 
 PAUSE = 0.005
 QUIET = LidarModel(sigma=0.0, dropout=0.0)
-FAR = Space(np.array([-50.0, 0.0]), 0.17)
+FAR = Space(np.array([-50.0, 0.0]), Body.disc(0.17))
 
 
 def hall() -> OccupancyMap:

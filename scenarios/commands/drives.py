@@ -56,6 +56,7 @@ def summary(log: EpisodeLog) -> str:
     rows = (
         ("scenario", f"{m['scenario']} on {m['map']}{one_graph(m['coupling'])}"),
         ("solver, coupling, seed", f"{m['solver']}, {m['coupling']}, {m['seed']}"),
+        ("base, body", f"{m['base']}, {m['body']}" if log.body or log.base != "unicycle" else ""),
         ("goals reached", f"{m['goals_reached']} of {m['goals']}{stopped}"),
         *((f"goal {k + 1}", words) for k, words in enumerate(m["outcomes"]) if words != "reached"),
         ("health", health(m)),

@@ -48,6 +48,8 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "map": log.occupancy.name,
         "solver": log.solver,
         "coupling": log.coupling,
+        "base": log.base,
+        "body": log.body or f"disc:{log.robot_radius:g}",
         "seed": int(log.seed),
         "succeeded": log.succeeded,
         "interrupted": bool(log.interrupted),
