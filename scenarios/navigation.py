@@ -33,6 +33,7 @@ from unifg.scenarios.options import count, existing, option, pair, pose, positiv
 from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.planning.polyline import path_length
+from unifg.scenarios.protocols import LocaliserContext, constructed, load_class, name_of
 from unifg.scenarios.simulation.building import DEMO_GOALS, DEMO_START, building_map
 from unifg.scenarios.simulation.drivetrain import Drivetrain
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
@@ -56,6 +57,8 @@ HELPLESS = 20.0  # [s] that a robot that may not move waits before it gives up
 REACHED = "reached"
 MPC = "mpc"
 LOCALISERS = ("graph", "amcl")
+PLANE = "plane"
+OF_WORLD = ("step(*control, dt)", "scan()", "odometry()", "discs()", "clearance()")
 LARGEST = Limits(pixels=200_000_000)  # of a map that a user names: 700 m by 700 m at 0.05 m
 
 
@@ -81,7 +84,10 @@ class NavigationSettings:
         imperfection: of the robot's map.
         planner: of the motion along the route: "mpc", the controller of this library, or a class of your own,
             MODULE:CLASS, as `unifg.scenarios.ground.local_planner` describes it.
-        localiser: of the estimate: "graph", that of this library, or "amcl", a Monte Carlo localiser to compare with.
+        localiser: of the estimate: "graph", that of this library, "amcl", a Monte Carlo localiser to compare with, or
+            a class of your own, MODULE:CLASS, constructed with a `LocaliserContext`.
+        world: simulation: "plane", or a class of your own, MODULE:CLASS, with the arguments of
+            `unifg.scenarios.simulation.plane.World`.
         faults: what goes wrong; may be repeated.
     """
 
@@ -102,8 +108,9 @@ class NavigationSettings:
     lidar: LidarModel = field(default_factory=LidarModel)
     odometry: OdometryModel = field(default_factory=OdometryModel)
     imperfection: Imperfection = field(default_factory=Imperfection)
-    planner: str = option(MPC, metavar="MODULE:CLASS")
-    localiser: str = option(LOCALISERS[0], choices=LOCALISERS)
+    planner: str | type = option(MPC, text=str, metavar="MODULE:CLASS")
+    localiser: str | type = option(LOCALISERS[0], text=str, metavar="NAME|MODULE:CLASS")
+    world: str | type = option(PLANE, text=str, metavar="MODULE:CLASS")
     faults: tuple[Fault, ...] = option(
         (), text=one_of(DRIVE_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
     )
@@ -135,9 +142,10 @@ class Episode:
                 ("localiser", settings.localiser, LOCALISERS[0]),
             ):
                 if chosen != default:
-                    raise ScenarioError(f"the {word} '{chosen}' stands for itself: its coupling is 'sequential'")
-        if settings.localiser not in LOCALISERS:
-            raise ScenarioError(f"unknown localiser '{settings.localiser}': choose {' or '.join(LOCALISERS)}")
+                    raise ScenarioError(
+                        f"the {word} '{name_of(chosen)}' stands for itself: its coupling is 'sequential'"
+                    )
+        self._localiser = None if settings.localiser in LOCALISERS else self._own_localiser(settings.localiser)
         least, most = settings.obstacle_radius
         if not 0.0 < least <= most < np.inf:
             raise ScenarioError(f"obstacles have radii 0 < least <= greatest, got {least:g} and {most:g} m")
@@ -166,7 +174,10 @@ class Episode:
             rules=PlacementRules(radius=settings.obstacle_radius, speed=settings.mover_speed),
         )
         walls = _field(true) if settings.imperfection != Imperfection() else self.distance_map
-        self.world = World(
+        of_world = (
+            World if settings.world == PLANE else load_class("world", settings.world, (PLANE,), OF_WORLD, "fog:Fog")
+        )
+        self.world = of_world(
             true, self.start, discs, sensors, base=control.kind, body=control.hull, lidar=settings.lidar,
             odometry=settings.odometry, drivetrain=settings.drivetrain, yields=False,
             people=draw_traffic(settings.traffic, walls, self.path, about),
@@ -181,9 +192,12 @@ class Episode:
                 "navigation",
                 settings.coupling,
                 settings.solver,
-                settings.planner,
-                settings.localiser,
+                name_of(settings.planner),
+                name_of(settings.localiser),
+                name_of(settings.world),
                 control.avoidance,
+                control.base,
+                len(control.hull.discs),
             )
             rehearse(kind, lambda: Episode(replace(settings, faults=()), rehearsal=True))
 
@@ -202,8 +216,24 @@ class Episode:
             pilot.estimator = MonteCarlo(
                 self.occupancy, self.distance_map, pose, sigma, of_localiser, base=self.controller.kind
             )
-            pilot.pose = pilot.estimator.pose
+        elif self._localiser is not None:
+            own = LocaliserContext(
+                self.occupancy, self.distance_map, pose, sigma, self.world.lidar.beams, self.controller.kind,
+                of_localiser,
+            )  # fmt: skip
+            estimator = constructed("localiser", self._localiser, own, ("pose", "covariance"))
+            for name, default in (("iterations", 0), ("refused", "")):
+                if not hasattr(estimator, name):
+                    setattr(estimator, name, default)
+            pilot.estimator = estimator
+        pilot.pose = pilot.estimator.pose
         return pilot
+
+    @staticmethod
+    def _own_localiser(name: str | type) -> type:
+        return load_class(
+            "localiser", name, LOCALISERS, ("update(scan, odometry, dt)", "reset(pose, sigma)"), "my:Filter"
+        )
 
     def run(self, progress: Progress) -> EpisodeLog:
         """Tick until the last goal is reached or given up."""
@@ -221,7 +251,7 @@ class Episode:
             start=self.start,
             dt=s.controller.dt,
             robot_radius=s.controller.robot_radius,
-            solver=s.solver if s.planner == MPC else s.planner,
+            solver=s.solver if s.planner == MPC else name_of(s.planner),
             coupling=s.coupling,
             seed=s.seed,
             control_limits=tuple(s.controller.box[1].tolist()),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from unifg.scenarios.perception.disc_tracker import DiscTracker
 from unifg.scenarios.perception.explaining import PointWatch, explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.protocols import Estimator
 from unifg.scenarios.stopwatch import Stopwatch
 from unifg.typing import Array
 
@@ -40,32 +41,6 @@ STOPPED = "stopped"
 
 
 logger = logging.getLogger("unifg")
-
-
-class Estimator(Protocol):
-    """Localiser of the robot."""
-
-    @property
-    def iterations(self) -> int:
-        """Of the last update."""
-
-    @property
-    def pose(self) -> Array:
-        """(3,) present estimate [m, m, rad]."""
-
-    @property
-    def covariance(self) -> Array:
-        """(3, 3) of it, in the tangent space."""
-
-    @property
-    def refused(self) -> str:
-        """Why the last scan has not corrected the estimate, "" where it has."""
-
-    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
-        """Take in a scan, None for none, and the odometry (m,) since the last one, None on the first."""
-
-    def reset(self, pose: Array, sigma: Array) -> None:
-        """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
 
 
 PlannerT = TypeVar("PlannerT", bound=Controller | PlannerAdapter)

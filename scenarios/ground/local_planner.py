@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from importlib import import_module
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -22,9 +20,9 @@ from unifg.errors import ScenarioError
 from unifg.horizon import Plan
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.options import find_modules_in
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.polyline import arc_lengths
+from unifg.scenarios.protocols import constructed, load_class
 from unifg.typing import Array, ArrayLike, BoolArray
 
 __all__ = ["LocalPlanner", "PlannerAdapter", "PlannerContext", "Situation", "load_planner"]
@@ -212,30 +210,16 @@ def reachable(wanted: Array, applied: Array, settings: ControllerSettings) -> Ar
     return made
 
 
-def load_planner(name: str, context: PlannerContext) -> PlannerAdapter:
+def load_planner(name: str | type, context: PlannerContext) -> PlannerAdapter:
     """Construct a user's planner.
 
     Args:
-        name: ``MODULE:CLASS``; modules of the working directory are found, too.
+        name: ``MODULE:CLASS``, or the class; modules of the working directory are found, too.
         context: map, limits and random numbers, the argument of the class.
 
     Raises:
         ScenarioError: there is no such module or class, or it cannot be constructed or has no method ``control``.
     """
-    module_name, colon, class_name = name.partition(":")
-    if not (module_name and colon and class_name):
-        example = "benchmarks.baselines.elastic_band:ElasticBand"
-        raise ScenarioError(f"unknown planner '{name}': give 'mpc' or MODULE:CLASS, for example {example}")
-    find_modules_in(Path.cwd())
-    try:
-        module = import_module(module_name)
-    except ImportError as error:
-        raise ScenarioError(f"planner '{name}': cannot import {module_name} from {Path.cwd()}: {error}") from error
-    if not isinstance(kind := getattr(module, class_name, None), type):
-        raise ScenarioError(f"planner '{name}': {module_name} has no class {class_name}")
-    if not callable(getattr(kind, "control", None)):
-        raise ScenarioError(f"planner '{name}': {class_name} has no method control(situation)")
-    try:
-        return PlannerAdapter(kind(context), context)
-    except TypeError as error:
-        raise ScenarioError(f"planner '{name}': {class_name}(context) failed: {error}") from error
+    example = "benchmarks.baselines.elastic_band:ElasticBand"
+    kind = load_class("planner", name, ("mpc",), ("control(situation)",), example)
+    return PlannerAdapter(constructed("planner", kind, context), context)

@@ -38,7 +38,7 @@ class PathFollower:
         if self.path.ndim != 2 or self.path.shape[1] != 3 or len(self.path) < 2:
             raise ScenarioError(f"path of shape {self.path.shape}: at least two poses (P, 3) are needed")
         count = len(self.path)
-        self._arc = spacing * np.arange(count) if spacing else arc_lengths(self.path[:, :2])
+        self._arc: Array = spacing * np.arange(count) if spacing else arc_lengths(self.path[:, :2])
         self.length = float(self._arc[-1])
         # The goal's heading belongs to the goal alone: on the way there the heading stays that of the path.
         last = self.path[-1 if spacing else -2, 2]
@@ -98,7 +98,8 @@ class PathFollower:
             call.
         """
         reached = self.project(position, start_arclength)
-        stations: Array = np.minimum(reached + ahead, self._gate(reached))
+        stations: Array = reached + ahead
+        np.minimum(stations, self._gate(reached), out=stations)
         poses = at_stations(np.column_stack([self.path[:, :2], self._headings]), self._arc, stations)
         poses[stations >= self.length - 1e-9] = self.path[-1]
         poses[:, 2] = (poses[:, 2] + math.pi) % (2.0 * math.pi) - math.pi
