@@ -29,10 +29,10 @@ from unifg.lie import SE2, wrap_angle
 from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.localiser import Localiser
+from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.navigation import INITIAL_SIGMA, Episode, NavigationSettings
 from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
-from unifg.scenarios.protocols import Estimator
 from unifg.typing import Array
 
 SEEDS = range(200, 204)

@@ -10,10 +10,10 @@ if TYPE_CHECKING:
     from unifg.models.planar import Base
     from unifg.scenarios.ground.drive_settings import ControllerSettings
     from unifg.scenarios.ground.local_planner import LocalPlanner, PlannerContext, Situation
+    from unifg.scenarios.ground.protocols import Estimator, LocaliserContext, World
     from unifg.scenarios.logs.drive_log import EpisodeLog
     from unifg.scenarios.navigation import NavigationSettings, run_navigation
     from unifg.scenarios.perception.readings import Scan
-    from unifg.scenarios.protocols import Estimator, LocaliserContext, World
 
 __all__ = [
     "Base",
@@ -39,7 +39,7 @@ _HOMES = {
     "unifg.scenarios.logs.drive_log": ("EpisodeLog",),
     "unifg.scenarios.navigation": ("NavigationSettings", "run_navigation"),
     "unifg.scenarios.perception.readings": ("Scan",),
-    "unifg.scenarios.protocols": ("Estimator", "LocaliserContext", "World"),
+    "unifg.scenarios.ground.protocols": ("Estimator", "LocaliserContext", "World"),
 }
 
 

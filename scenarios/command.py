@@ -251,6 +251,10 @@ def _bench(chosen: argparse.Namespace) -> int:
 def _run(chosen: argparse.Namespace) -> int:
     """Run the chosen scenario, write what it left and say how it went."""
     settings = settings_of(chosen.module.SETTINGS, chosen, solver=chosen.solver)
+    if chosen.stated:
+        from unifg.scenarios.campaigns.stated_settings import Fields
+
+        settings = Fields(chosen.module.SETTINGS, Path.cwd()).restated(settings, chosen.stated)
     return _run_settings(chosen, chosen.module, settings, chosen.name)
 
 

@@ -26,6 +26,7 @@ from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.ground.drive_pilot import STOPPED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
+from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load_class, name_of
 from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.drive_log import EpisodeLog
@@ -33,9 +34,8 @@ from unifg.scenarios.options import count, existing, option, pair, pose, positiv
 from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.planning.polyline import path_length
-from unifg.scenarios.protocols import LocaliserContext, constructed, load_class, name_of
 from unifg.scenarios.simulation.building import DEMO_GOALS, DEMO_START, building_map
-from unifg.scenarios.simulation.drivetrain import Drivetrain
+from unifg.scenarios.simulation.drivetrain import PLANTS, Drivetrain, plant
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
 from unifg.scenarios.simulation.imperfection import Imperfection, imperfect
 from unifg.scenarios.simulation.placement import PlacementRules, place_obstacles
@@ -50,6 +50,7 @@ TRUE_DISTANCE = 0.2  # [m], what the truth must confirm
 TRUE_HEADING = 0.2  # [rad]
 USUAL_SIGMA = 0.01  # [m] of a position localised on a map
 SURE = 3.0  # standard deviations of the estimate that have to fit between what is believed and what must be true
+BESIDE_DISC = 0.08  # [m] beyond the radius that obstacles leave of a way
 BESIDE = 0.01  # [m] from walls beyond the radius, from where a way is looked for
 FREEING = 20  # steps to there
 SLOWEST = 0.25  # [m/s]; a goal that takes longer than this, and a minute, is given up
@@ -72,12 +73,16 @@ class NavigationSettings:
         goals: poses to be reached in this order, an option for each; without any, the demonstration's.
         solver: one of `unifg.solvers.names.CONSTRAINED`.
         coupling: of estimation and control: estimation first, then control conditioned on it; or one graph for both.
-        obstacles: number of obstacles that are not on the map; one in three moves.
+        believed: pose at the start as the robot believes it; without one it is drawn about the true one.
+        initial_sigma: standard deviations of that belief [m, m, rad].
+        obstacles: greatest number of obstacles that are not on the map; one in three moves.
         obstacle_radius: least and greatest radius of them [m]; the robot expects what the default says.
         mover_speed: speed of those that move [m/s], which the robot is not told.
         traffic: people.
         seed: of everything random.
         controller: weights and limits.
+        plant: base whose numbers the drivetrain has where they are not given: "light", PAL's "pmb2", or "harsh", with
+            lag, latency and slip besides.
         drivetrain: of the base; the controller is told the accelerations on its data sheet.
         lidar: as it is; what the robot believes of it is its own.
         odometry: likewise.
@@ -114,6 +119,9 @@ class NavigationSettings:
     faults: tuple[Fault, ...] = option(
         (), text=one_of(DRIVE_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
     )
+    believed: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
+    initial_sigma: tuple[float, float, float] = option(INITIAL_SIGMA, text=pose, metavar="X,Y,TH")
+    plant: str = option("light", choices=tuple(PLANTS))
 
 
 def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:
@@ -134,6 +142,9 @@ class Episode:
 
     def __init__(self, settings: NavigationSettings, *, rehearsal: bool = False) -> None:
         """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
+        if settings.plant not in PLANTS:
+            raise ScenarioError(f"unknown plant '{settings.plant}': choose {', '.join(PLANTS)}")
+        settings = replace(settings, drivetrain=plant(settings.plant, settings.drivetrain))
         self.settings = settings
         self.controller = control = replace(settings.controller, accelerations=settings.drivetrain.sheet)
         if settings.coupling != "sequential":
@@ -163,6 +174,11 @@ class Episode:
         legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
         self.legs = [self._route(begin, end) for begin, end in legs]
         self.path = np.concatenate([leg.path for leg in self.legs])
+        rules = PlacementRules(
+            radius=settings.obstacle_radius,
+            speed=settings.mover_speed,
+            way_clearance=max(PlacementRules.way_clearance, control.robot_radius + BESIDE_DISC),
+        )
         discs = place_obstacles(
             self.occupancy,
             self.distance_map,
@@ -171,7 +187,7 @@ class Episode:
             placement,
             start=self.start,
             goals=self.goals,
-            rules=PlacementRules(radius=settings.obstacle_radius, speed=settings.mover_speed),
+            rules=rules,
         )
         walls = _field(true) if settings.imperfection != Imperfection() else self.distance_map
         of_world = (
@@ -182,8 +198,12 @@ class Episode:
             odometry=settings.odometry, drivetrain=settings.drivetrain, yields=False,
             people=draw_traffic(settings.traffic, walls, self.path, about),
         )  # fmt: skip
-        sigma = np.array(INITIAL_SIGMA)
+        sigma = np.array(settings.initial_sigma)
+        if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+            raise ScenarioError(f"standard deviations of the first belief are positive, got {settings.initial_sigma}")
         believed = self.start + sigma * belief.standard_normal(3)
+        if settings.believed is not None:
+            believed = _pose(settings.believed, None, "believed")
         self.faults = DriveFaults(settings.faults, settings.seed, control.kind)
         self._right, self._drawn = (self.occupancy, self.distance_map), drawn
         self.pilot = self._pilot(believed, sigma)
@@ -260,6 +280,7 @@ class Episode:
             scan_angles=self.world.lidar.angles,
             obstacle_moves=self.world.discs()[:, 3].astype(bool),
             faults=[str(fault) for fault in s.faults],
+            obstacles_wanted=s.obstacles,
         )
         self._outcomes = ["time ran out"] * len(self.goals)
         self._goal, self._driven, self._dead_reckoning = 0, 0.0, self.pilot.pose
@@ -382,7 +403,7 @@ class Episode:
         if wrong:
             self.occupancy = askew(self.occupancy, before.pose)
             self.distance_map = _field(self.occupancy)
-        self.pilot = self._pilot(before.pose, np.array(INITIAL_SIGMA))
+        self.pilot = self._pilot(before.pose, np.array(self.settings.initial_sigma))
         self.pilot.take_over(before)
 
     def _free_places(self) -> Array:

@@ -10,24 +10,28 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from maps import building, field, walled
+from maps import building, field, stop_after, walled
 from unifg.errors import ModelError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
 from unifg.models import obstacles, unicycle
 from unifg.models.distance_map import SmoothField
 from unifg.models.footprint import EXCESS, Body, body_of
 from unifg.models.planar import Base, base_of
+from unifg.scenarios.campaigns.stated_settings import Fields
+from unifg.scenarios.command import main
+from unifg.scenarios.commands.drives import summary
 from unifg.scenarios.ground.drive_control import Controller
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
 from unifg.scenarios.ground.stopping import evasions, stopped
 from unifg.scenarios.logs.drive_metrics import episode_metrics
-from unifg.scenarios.navigation import NavigationSettings, run_navigation
+from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigation
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.follow import PathFollower
 from unifg.scenarios.planning.grid import SPACING
 from unifg.scenarios.planning.lattice import plan_poses
+from unifg.scenarios.simulation.drivetrain import Drivetrain
 from unifg.scenarios.simulation.plane import LidarModel, OdometryModel, World
 from unifg.typing import Array
 
@@ -279,3 +283,56 @@ def test_every_robot_parks_in_the_bay_of_the_yard(base: str, body: str, coupling
         assert log.control[-1, 0] <= 0.0 and np.abs(log.control[:, 1]).max() <= 0.6 + 1e-6
     if base == "omnidirectional":
         assert np.abs(log.control[:, 1]).max() > 0.1, "it goes sideways"
+
+
+# --------------------------------------------------------------------- options
+
+
+@pytest.mark.parametrize("thickness", [2, 3, 4])
+def test_a_door_of_half_a_metre_is_passed_by_a_robot_of_a_third(thickness: int, tmp_path: Path) -> None:
+    """Its middle line runs between two cells, where the field that the plan keeps to is highest."""
+
+    def behind(cells: int) -> NavigationSettings:
+        wall = walled(4.0, 3.0, name="door", blocks=((slice(0, 60), slice(40, 40 + thickness)),))
+        occupied = wall.occupied.copy()
+        occupied[25 : 25 + cells, 40 : 40 + thickness] = False
+        save_map(tmp_path / "door.yaml", replace(wall, occupied=occupied, free=~occupied))
+        return NavigationSettings(map=tmp_path / "door.yaml", start=(1.0, 1.5, 0.0), goals=((3.2, 1.5, 0.0),))
+
+    log = run_navigation(behind(10))
+    assert log.succeeded and log.clearance.min() > 0.03, log.outcomes
+    with pytest.raises(ScenarioError, match="no way"):
+        run_navigation(behind(8))
+
+
+def test_fewer_obstacles_than_asked_for_are_said() -> None:
+    settings = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((10.5, 14.1, 0.0),), obstacles=30)
+    log = Episode(settings, rehearsal=True).run(stop_after(3))
+    metrics = episode_metrics(log)
+    assert metrics["obstacles"] < metrics["obstacles_wanted"] == 30
+    assert f"{metrics['obstacles']} of 30 found a place" in summary(log)
+
+
+def test_speed_plant_and_belief_are_those_asked_for() -> None:
+    corridor = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),))
+    fast = run_navigation(replace(corridor, controller=ControllerSettings(speed=1.6)))
+    assert fast.succeeded and 1.5 < fast.control[:, 0].max() <= 1.6 + 1e-6
+    slow = Episode(replace(corridor, plant="pmb2", drivetrain=Drivetrain(turning=1.5)), rehearsal=True)
+    assert slow.controller.accelerations == (1.0, 1.5), "what is given is kept"
+    assert Episode(replace(corridor, plant="harsh"), rehearsal=True).settings.drivetrain.lag == 0.1
+    own = replace(corridor, believed=(6.6, 14.0, 0.02), initial_sigma=(0.2, 0.1, 0.1))
+    np.testing.assert_array_equal(Episode(own, rehearsal=True).pilot.pose, (6.6, 14.0, 0.02))
+    for wrong in ({"plant": "tank"}, {"initial_sigma": (0.0, 0.1, 0.1)}):
+        with pytest.raises(ScenarioError):
+            Episode(replace(corridor, **wrong), rehearsal=True)
+
+
+def test_any_setting_is_stated_by_its_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    stated = Fields(NavigationSettings, tmp_path).restated(
+        NavigationSettings(), ["controller.margin=0.3", "base=ackermann", "controller.pull=[0.1, 0.1, 0.2]"]
+    )
+    assert stated.controller.margin == 0.3 and stated.controller.kind.name.startswith("ackermann")
+    assert stated.controller.pull == (0.1, 0.1, 0.2)
+    for word, why in (("controller.margins=1", "did you mean"), ("controller.margin=wide", "does not fit"), ("x", "=")):
+        assert main(["run", "navigation", "--set", word, "--out", str(tmp_path)]) == 2
+        assert why in capsys.readouterr().err

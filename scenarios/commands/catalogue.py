@@ -50,6 +50,10 @@ class Scenario:
         parser.add_argument(
             "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
         )
+        parser.add_argument(
+            "--set", action="append", default=[], metavar="NAME=VALUE", dest="stated",
+            help="any setting by its name, such as controller.margin=0.3; may be repeated",
+        )  # fmt: skip
         if self.live:
             parser.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
         parser.set_defaults(module=module)

@@ -20,6 +20,7 @@ from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
 from unifg.scenarios.ground.local_planner import PlannerAdapter
 from unifg.scenarios.ground.localiser import Localiser
+from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.ground.relocalise import Relocaliser
 from unifg.scenarios.ground.route import Route
 from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Supervisor
@@ -28,7 +29,6 @@ from unifg.scenarios.perception.disc_tracker import DiscTracker
 from unifg.scenarios.perception.explaining import PointWatch, explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks
-from unifg.scenarios.protocols import Estimator
 from unifg.scenarios.stopwatch import Stopwatch
 from unifg.typing import Array
 

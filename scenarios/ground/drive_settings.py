@@ -33,7 +33,7 @@ class ControllerSettings:
     Attributes:
         horizon: steps N.
         dt: sampling time [s].
-        speed: reference speed along the path [m/s].
+        speed: reference speed along the path [m/s]; the limit of velocity is at least as great.
         base: kind of base: "unicycle", "ackermann", also with its numbers as ackermann:WHEELBASE,STEERING,RATE
             [m, rad, rad/s], or "omnidirectional".
         body: hull: LENGTHxWIDTH, disc:R, polygon:X,Y;X,Y;... (convex) or discs:X,Y,R;X,Y,R [m], x ahead of the axis;
@@ -71,7 +71,7 @@ class ControllerSettings:
     body: str = option("", text=checked(body_of), metavar="BODY")
     horizon: int = 30
     dt: float = 0.1
-    speed: float = 1.0
+    speed: float = option(1.0, text=positive, metavar="M/S")
     limits: tuple[float, float] = (1.0, 1.0)
     accelerations: tuple[float, float] = (2.5, 3.2)
     pose_sigma: tuple[float, float, float] = (0.3, 0.3, 0.6)
@@ -80,7 +80,7 @@ class ControllerSettings:
     rate_sigma: tuple[float, float] = (0.5, 1.0)
     control_weight: float = option(1.0, text=positive, metavar="W")
     pull: tuple[float, float, float] = (0.01, 0.01, 0.01)
-    robot_radius: float = 0.17
+    robot_radius: float = option(0.17, text=positive, metavar="M")
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
     sigmas: float = 2.0
@@ -169,7 +169,7 @@ class ControllerSettings:
     @property
     def _greatest(self) -> Array:
         """(m,) greatest controls."""
-        greatest = self.kind.spread(self.limits)
+        greatest = self.kind.spread((max(self.limits[0], self.speed), self.limits[1]))
         if self.kind.steering is not None:
             greatest[-1] = self.kind.steering[0]
         return greatest

@@ -20,9 +20,9 @@ from unifg.errors import ScenarioError
 from unifg.horizon import Plan
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.protocols import constructed, load_class
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.polyline import arc_lengths
-from unifg.scenarios.protocols import constructed, load_class
 from unifg.typing import Array, ArrayLike, BoolArray
 
 __all__ = ["LocalPlanner", "PlannerAdapter", "PlannerContext", "Situation", "load_planner"]

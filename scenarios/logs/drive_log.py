@@ -43,6 +43,7 @@ class EpisodeLog(StoredLog):
         outcomes: what has become of every goal, in words.
         dropped: samples that were not let in, by what was wrong with them.
         faults: what was made to go wrong.
+        obstacles_wanted: unforeseen obstacles that were asked for; fewer may have found a place.
         base: kind of base of the robot.
         body: of the robot, as its option has it; "" for a disc.
     """
@@ -68,6 +69,7 @@ class EpisodeLog(StoredLog):
     outcomes: list[str] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
+    obstacles_wanted: int = 0
     base: str = "unicycle"
     body: str = ""
 

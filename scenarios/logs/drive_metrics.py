@@ -57,6 +57,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "goals": len(log.goals),
         "goals_reached": sum(bool(flag) for flag in log.reached),
         "obstacles": int(log.obstacles.shape[1]),
+        "obstacles_wanted": int(log.obstacles_wanted),
         "collisions": int(log.collisions),
         "steps": log.ticks,
         "duration_s": float(duration),

@@ -38,7 +38,9 @@ class PathFollower:
         if self.path.ndim != 2 or self.path.shape[1] != 3 or len(self.path) < 2:
             raise ScenarioError(f"path of shape {self.path.shape}: at least two poses (P, 3) are needed")
         count = len(self.path)
-        self._arc: Array = spacing * np.arange(count) if spacing else arc_lengths(self.path[:, :2])
+        self._arc = arc_lengths(self.path[:, :2])
+        if spacing:
+            self._arc = spacing * np.arange(count, dtype=np.float64)
         self.length = float(self._arc[-1])
         # The goal's heading belongs to the goal alone: on the way there the heading stays that of the path.
         last = self.path[-1 if spacing else -2, 2]

@@ -28,6 +28,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 _log = logging.getLogger("unifg")
 
+WEIGHTS = (0.125, 0.75, 0.125)  # of the quadratic B-spline in the middle of a cell
 SPACING = 0.05  # between the poses of a planned path [m]
 _COMFORT = 0.15  # inflation beyond the robot's radius that is tried first [m]
 _LEVEL_STEP = 0.01  # the inflation is lowered by steps of this size until a way exists [m]
@@ -65,8 +66,22 @@ class Clearance:
         self.passable: BoolArray = occupancy.free
 
     def restrict(self, least: float) -> None:
-        """Enter no cell where the smoothed field of :class:`SmoothField`, which a controller keeps to, is lower."""
-        self.passable = self.occupancy.free & (smoothed(self.field.values) >= least)
+        """Enter no cell where the smoothed field of :class:`SmoothField`, which a controller keeps to, is lower.
+
+        It is looked at in the middle of the cell and of its sides: the middle line of a door may run between two cells.
+        """
+        values = self.field.values
+        highest = smoothed(values)
+        for axis in (0, 1):
+            side = ndimage.correlate1d(
+                ndimage.correlate1d(values, [0.5, 0.5], axis=axis, mode="nearest"),
+                WEIGHTS,
+                axis=1 - axis,
+                mode="nearest",
+            )  # between the cell before and this one
+            after = np.roll(side, -1, axis=axis)
+            highest = np.maximum(highest, np.maximum(side, after))
+        self.passable = self.occupancy.free & (highest >= least)
 
     def _lower_around(self, x: float, y: float, radius: float) -> None:
         reach = (radius + 2.0) / self.occupancy.resolution  # beyond two metres no inflation asks
@@ -199,9 +214,8 @@ def plan(
 
 def smoothed(values: Array) -> Array:
     """Values (H, W) of the quadratic B-splines over a grid at the middles of its cells, its border repeated."""
-    weights = np.array([0.125, 0.75, 0.125])
-    across = ndimage.correlate1d(values, weights, axis=0, mode="nearest")
-    found: Array = ndimage.correlate1d(across, weights, axis=1, mode="nearest")
+    across = ndimage.correlate1d(values, WEIGHTS, axis=0, mode="nearest")
+    found: Array = ndimage.correlate1d(across, WEIGHTS, axis=1, mode="nearest")
     return found
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from unifg.models.planar import Base
 from unifg.scenarios.options import not_negative, option, positive, share
 from unifg.typing import Array
 
-__all__ = ["Drivetrain", "Wheels", "followed"]
+__all__ = ["PLANTS", "Drivetrain", "Wheels", "followed", "plant"]
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,21 @@ class Drivetrain:
     def sheet(self) -> tuple[float, float]:
         """Accelerations [m/s^2, rad/s^2] as the data sheet has them: without a load."""
         return self.acceleration, self.turning
+
+
+PLANTS: dict[str, dict[str, float]] = {
+    "light": {},
+    "pmb2": {"acceleration": 1.0, "turning": 2.1},
+    "harsh": {"acceleration": 1.0, "turning": 2.1, "lag": 0.1, "latency": 0.05, "slip": 0.05, "skid": 0.05},
+}
+"""Bases by name: that of the DWB example, PAL's PMB-2, and one whose motors and floor are worse than it is told."""
+
+
+def plant(name: str, drivetrain: Drivetrain) -> Drivetrain:
+    """A drivetrain with the numbers of a named base where it has the usual ones."""
+    usual = Drivetrain()
+    preset = {key: value for key, value in PLANTS[name].items() if getattr(drivetrain, key) == getattr(usual, key)}
+    return replace(drivetrain, **preset)
 
 
 class Wheels:
