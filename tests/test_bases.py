@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -336,3 +337,14 @@ def test_any_setting_is_stated_by_its_name(capsys: pytest.CaptureFixture[str], t
     for word, why in (("controller.margins=1", "did you mean"), ("controller.margin=wide", "does not fit"), ("x", "=")):
         assert main(["run", "navigation", "--set", word, "--out", str(tmp_path)]) == 2
         assert why in capsys.readouterr().err
+
+
+def test_help_shows_twelve_options_first_and_all_in_groups(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "navigation", "--help"]) == 0
+    first = capsys.readouterr().out
+    flags = re.findall(r"^  (--[a-z-]+)", first, re.MULTILINE)
+    assert len(flags) == 12 and "--base" in flags and "--help all" in first
+    assert main(["run", "navigation", "--help", "all"]) == 0
+    everything = capsys.readouterr().out
+    assert set(flags) < set(re.findall(r"^  (--[a-z-]+)", everything, re.MULTILINE))
+    assert {"controller:", "drivetrain:", "lidar:", "--lag"} < set(everything.split())
