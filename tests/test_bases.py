@@ -21,6 +21,7 @@ from unifg.models.planar import Base, base_of
 from unifg.scenarios.campaigns.stated_settings import Fields
 from unifg.scenarios.command import main
 from unifg.scenarios.commands.drives import summary
+from unifg.scenarios.commands.flights import _short_of
 from unifg.scenarios.ground.drive_control import Controller
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
@@ -348,3 +349,10 @@ def test_help_shows_twelve_options_first_and_all_in_groups(capsys: pytest.Captur
     everything = capsys.readouterr().out
     assert set(flags) < set(re.findall(r"^  (--[a-z-]+)", everything, re.MULTILINE))
     assert {"controller:", "drivetrain:", "lidar:", "--lag"} < set(everything.split())
+
+
+def test_a_flight_says_where_the_speed_asked_for_is_out_of_reach() -> None:
+    settings = {"controller": {"guide": {"speed": 8.0, "acceleration": 2.0}}}
+    assert "of 8 asked for" in _short_of({"settings": settings, "max_speed_m_per_s": 5.0})
+    assert _short_of({"settings": settings, "max_speed_m_per_s": 7.9}) == ""
+    assert _short_of({"settings": {}, "max_speed_m_per_s": 1.0}) == ""
