@@ -28,8 +28,8 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2, wrap_angle
 from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.ground.drive_pilot import Estimator
 from unifg.scenarios.ground.localiser import Localiser
+from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.navigation import INITIAL_SIGMA, Episode, NavigationSettings
 from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan

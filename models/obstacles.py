@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from unifg.codegen.calls import vector
 from unifg.codegen.jit import compiled
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.kernel import Kernel
@@ -14,10 +15,11 @@ from unifg.factors.residuals import Residual, residual
 from unifg.lie import SE2
 from unifg.models.avoidance import count, to_balls
 from unifg.models.distance_map import SmoothField, smooth
+from unifg.models.footprint import Body
 from unifg.models.profile import of_distance
 from unifg.typing import Array
 
-__all__ = ["disc_clearance", "shortfall", "wall_distance"]
+__all__ = ["clearance_of", "disc_clearance", "shortfall", "wall_distance"]
 
 disc_clearance = residual(
     StatedKernel(to_balls, (SE2, 2, 1), partial(count, "disc clearance", 2, "pose"), name="disc clearance"),
@@ -29,6 +31,30 @@ radius: (M,) or (n, M); give the sum of the disc's and the robot's radii for hul
 )
 
 
+def clearance_of(body: Body) -> Residual:
+    """``disc_clearance`` of every disc of a body, (n, K M), disc by disc; smaller ones count as if they were larger.
+
+    The rows of a disc that is smaller than the largest are greater by the difference: what has to be kept is the same
+    for all of them.
+    """
+    if body.round:
+        return disc_clearance
+    table = [(x, y, less) for (x, y, _), less in zip(body.discs, body.smaller.tolist(), strict=True)]
+
+    def of_body(x: Array, centre: Array, radius: Array) -> Array:
+        cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
+        rows = []
+        for across, aside, less in table:
+            p = np.stack([x[:, 0] + cosine * across - sine * aside, x[:, 1] + sine * across + cosine * aside], axis=1)
+            rows.append(to_balls(p, centre, radius) + less)
+        return np.concatenate(rows, axis=1)
+
+    def rows_of(centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
+        return len(table) * count("disc clearance", 2, "pose", centre, radius)
+
+    return residual(StatedKernel(of_body, (SE2, 2, 1), rows_of, name="disc clearance of a body"))
+
+
 @compiled
 def _wall_distance(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
     """Smoothed distance of a position to the nearest wall."""
@@ -38,9 +64,31 @@ def _wall_distance(v: Array, p: Array, table: Array, r: Array, J: Array) -> None
         J[0, 0], J[0, 1], J[0, 2] = cosine * x + sine * y, cosine * y - sine * x, 0.0
 
 
-def wall_distance(field: SmoothField) -> Residual:
-    """``wall_distance(field)(x)``: signed distance of each SE(2) position to the nearest wall, (n, 1) [m]."""
-    return residual(Kernel(_wall_distance, (SE2,), 1, field.table, "wall distance"))
+@compiled
+def _body_distance(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
+    """The same of the discs of a body; in front of the map their number, then x, y and what is added of each."""
+    discs = int(table[0])
+    walls = vector(table, 1 + 3 * discs, len(table) - 1 - 3 * discs)
+    cosine, sine = math.cos(v[2]), math.sin(v[2])
+    for k in range(discs):
+        ahead, left = table[1 + 3 * k], table[2 + 3 * k]
+        distance, x, y = smooth(walls, v[0] + cosine * ahead - sine * left, v[1] + sine * ahead + cosine * left)
+        r[k] = distance + table[3 + 3 * k]
+        if len(J):
+            along, across = cosine * x + sine * y, cosine * y - sine * x
+            J[k, 0], J[k, 1], J[k, 2] = along, across, ahead * across - left * along
+
+
+def wall_distance(field: SmoothField, body: Body | None = None) -> Residual:
+    """``wall_distance(field)(x)``: signed distance of each SE(2) position to the nearest wall, (n, 1) [m].
+
+    With a body: of the centres of its discs, (n, K), those of smaller ones greater by the difference to the largest.
+    """
+    if body is None or body.round:
+        return residual(Kernel(_wall_distance, (SE2,), 1, field.table, "wall distance"))
+    discs = np.column_stack([np.array(body.discs)[:, :2], body.smaller])
+    table = np.concatenate([[float(len(discs))], discs.ravel(), field.table])
+    return residual(Kernel(_body_distance, (SE2,), len(discs), table, "wall distance of a body"))
 
 
 @compiled

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from unifg.errors import ModelError
 from unifg.lie import SE2
 from unifg.models import unicycle
+from unifg.models.planar import Base
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["OdometryNoise", "driven", "held", "predict"]
@@ -31,31 +33,36 @@ class OdometryNoise:
     floor: tuple[float, float, float] = (0.002, 0.002, 0.002)
 
     def covariance(self, u: Array, dt: float) -> Array:
-        """(3, 3) covariance of one step in the frame of its end [m^2, rad^2]."""
-        travelled, turned = abs(float(u[0])) * dt, abs(float(u[1])) * dt
+        """(3, 3) covariance of one step with body velocities (k,) in the frame of its end [m^2, rad^2]."""
+        travelled, turned = math.hypot(*u[:-1].tolist()) * dt, abs(float(u[-1])) * dt
         sigma = np.array(self.floor)
         sigma[0] += self.translation * travelled
-        sigma[1] += 0.5 * self.translation * travelled * turned + 0.2 * self.translation * travelled
+        across = 1.0 if len(u) > 2 else 0.2  # wheels that roll ahead do not slide
+        sigma[1] += 0.5 * self.translation * travelled * turned + across * self.translation * travelled
         sigma[2] += self.rotation * turned + self.drift * travelled
         return np.diag(sigma**2)
 
 
-def predict(pose: Array, covariance: Array, u: Array, dt: float, noise: OdometryNoise) -> tuple[Array, Array]:
+def predict(
+    pose: Array, covariance: Array, u: Array, dt: float, noise: OdometryNoise, base: Base = unicycle.BASE
+) -> tuple[Array, Array]:
     """Move an estimate by measured velocities.
 
     Args:
         pose: (3,) estimate [m, m, rad].
         covariance: (3, 3) in the tangent space at ``pose``, right perturbation.
-        u: (2,) measured v, omega [m/s, rad/s].
+        u: (m,) measured controls: of a unicycle v, omega [m/s, rad/s].
         dt: sampling time [s].
         noise: model of the wheels.
+        base: that moves.
 
     Returns:
         Predicted pose (3,) and covariance (3, 3) in the tangent space there.
     """
-    moved = unicycle.step(pose[None, :], np.asarray(u, dtype=np.float64)[None, :], dt)[0]
+    control = np.asarray(u, dtype=np.float64)
+    moved = base.step(pose[None, :], control[None, :], dt)[0]
     transport = SE2.adjoint(SE2.between(moved, pose))
-    return moved, transport @ covariance @ transport.T + noise.covariance(u, dt)
+    return moved, transport @ covariance @ transport.T + noise.covariance(base.of(control), dt)
 
 
 def driven(steps: ArrayLike) -> Array:

@@ -37,7 +37,7 @@ from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
 from unifg.scenarios.commands.extras import absent, remedy
 from unifg.scenarios.commands.outcome import Outcome, Progress
-from unifg.scenarios.options import count, settings_of
+from unifg.scenarios.options import Help, count, settings_of
 
 __all__ = ["main"]
 
@@ -111,7 +111,8 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
     run = commands.add_parser("run", help="run a scenario", description="Run a scenario.")
     scenarios = run.add_subparsers(title="scenarios", required=True, metavar="SCENARIO")
     for name, scenario in SCENARIOS.items():
-        one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary)
+        one = scenarios.add_parser(name, help=scenario.summary, description=scenario.summary, add_help=False)
+        one.add_argument("-h", "--help", action=Help, first=scenario.first)
         one.set_defaults(name=name, does=_run, extras=("view",), parser=one)  # pictures are wanted at the end
         if list(words[:2]) == ["run", name]:
             scenario.add_options(one)
@@ -251,6 +252,10 @@ def _bench(chosen: argparse.Namespace) -> int:
 def _run(chosen: argparse.Namespace) -> int:
     """Run the chosen scenario, write what it left and say how it went."""
     settings = settings_of(chosen.module.SETTINGS, chosen, solver=chosen.solver)
+    if chosen.stated:
+        from unifg.scenarios.campaigns.stated_settings import Fields
+
+        settings = Fields(chosen.module.SETTINGS, Path.cwd()).restated(settings, chosen.stated)
     return _run_settings(chosen, chosen.module, settings, chosen.name)
 
 

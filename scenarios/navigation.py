@@ -1,4 +1,4 @@
-"""Scenario ``navigation``: a unicycle localises itself by lidar and drives through a building under MPC.
+"""Scenario ``navigation``: a robot localises itself by lidar and drives through a building under MPC.
 
 Each tick: odometry predicts, the scan corrects (one factor graph), tracked discs are updated, the route is
 repaired if a disc stands on it, and the controller (a second factor graph, conditioned on the estimate) decides.
@@ -22,11 +22,11 @@ from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.horizon import Plan
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
-from unifg.models.unicycle import step
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.ground.drive_pilot import STOPPED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
+from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load_class, name_of
 from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.drive_log import EpisodeLog
@@ -35,7 +35,7 @@ from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.planning.polyline import path_length
 from unifg.scenarios.simulation.building import DEMO_GOALS, DEMO_START, building_map
-from unifg.scenarios.simulation.drivetrain import Drivetrain
+from unifg.scenarios.simulation.drivetrain import PLANTS, Drivetrain, plant
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
 from unifg.scenarios.simulation.imperfection import Imperfection, imperfect
 from unifg.scenarios.simulation.placement import PlacementRules, place_obstacles
@@ -50,6 +50,7 @@ TRUE_DISTANCE = 0.2  # [m], what the truth must confirm
 TRUE_HEADING = 0.2  # [rad]
 USUAL_SIGMA = 0.01  # [m] of a position localised on a map
 SURE = 3.0  # standard deviations of the estimate that have to fit between what is believed and what must be true
+BESIDE_DISC = 0.08  # [m] beyond the radius that obstacles leave of a way
 BESIDE = 0.01  # [m] from walls beyond the radius, from where a way is looked for
 FREEING = 20  # steps to there
 SLOWEST = 0.25  # [m/s]; a goal that takes longer than this, and a minute, is given up
@@ -57,6 +58,8 @@ HELPLESS = 20.0  # [s] that a robot that may not move waits before it gives up
 REACHED = "reached"
 MPC = "mpc"
 LOCALISERS = ("graph", "amcl")
+PLANE = "plane"
+OF_WORLD = ("step(*control, dt)", "scan()", "odometry()", "discs()", "clearance()")
 LARGEST = Limits(pixels=200_000_000)  # of a map that a user names: 700 m by 700 m at 0.05 m
 
 
@@ -70,19 +73,26 @@ class NavigationSettings:
         goals: poses to be reached in this order, an option for each; without any, the demonstration's.
         solver: one of `unifg.solvers.names.CONSTRAINED`.
         coupling: of estimation and control: estimation first, then control conditioned on it; or one graph for both.
-        obstacles: number of obstacles that are not on the map; one in three moves.
+        believed: pose at the start as the robot believes it; without one it is drawn about the true one.
+        initial_sigma: standard deviations of that belief [m, m, rad].
+        obstacles: greatest number of obstacles that are not on the map; one in three moves.
         obstacle_radius: least and greatest radius of them [m]; the robot expects what the default says.
         mover_speed: speed of those that move [m/s], which the robot is not told.
         traffic: people.
         seed: of everything random.
         controller: weights and limits.
+        plant: base whose numbers the drivetrain has where they are not given: "light", PAL's "pmb2", or "harsh", with
+            lag, latency and slip besides.
         drivetrain: of the base; the controller is told the accelerations on its data sheet.
         lidar: as it is; what the robot believes of it is its own.
         odometry: likewise.
         imperfection: of the robot's map.
         planner: of the motion along the route: "mpc", the controller of this library, or a class of your own,
             MODULE:CLASS, as `unifg.scenarios.ground.local_planner` describes it.
-        localiser: of the estimate: "graph", that of this library, or "amcl", a Monte Carlo localiser to compare with.
+        localiser: of the estimate: "graph", that of this library, "amcl", a Monte Carlo localiser to compare with, or
+            a class of your own, MODULE:CLASS, constructed with a `LocaliserContext`.
+        world: simulation: "plane", or a class of your own, MODULE:CLASS, with the arguments of
+            `unifg.scenarios.simulation.plane.World`.
         faults: what goes wrong; may be repeated.
     """
 
@@ -103,11 +113,15 @@ class NavigationSettings:
     lidar: LidarModel = field(default_factory=LidarModel)
     odometry: OdometryModel = field(default_factory=OdometryModel)
     imperfection: Imperfection = field(default_factory=Imperfection)
-    planner: str = option(MPC, metavar="MODULE:CLASS")
-    localiser: str = option(LOCALISERS[0], choices=LOCALISERS)
+    planner: str | type = option(MPC, text=str, metavar="MODULE:CLASS")
+    localiser: str | type = option(LOCALISERS[0], text=str, metavar="NAME|MODULE:CLASS")
+    world: str | type = option(PLANE, text=str, metavar="MODULE:CLASS")
     faults: tuple[Fault, ...] = option(
         (), text=one_of(DRIVE_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
     )
+    believed: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
+    initial_sigma: tuple[float, float, float] = option(INITIAL_SIGMA, text=pose, metavar="X,Y,TH")
+    plant: str = option("light", choices=tuple(PLANTS))
 
 
 def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:
@@ -128,6 +142,9 @@ class Episode:
 
     def __init__(self, settings: NavigationSettings, *, rehearsal: bool = False) -> None:
         """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
+        if settings.plant not in PLANTS:
+            raise ScenarioError(f"unknown plant '{settings.plant}': choose {', '.join(PLANTS)}")
+        settings = replace(settings, drivetrain=plant(settings.plant, settings.drivetrain))
         self.settings = settings
         self.controller = control = replace(settings.controller, accelerations=settings.drivetrain.sheet)
         if settings.coupling != "sequential":
@@ -136,9 +153,10 @@ class Episode:
                 ("localiser", settings.localiser, LOCALISERS[0]),
             ):
                 if chosen != default:
-                    raise ScenarioError(f"the {word} '{chosen}' stands for itself: its coupling is 'sequential'")
-        if settings.localiser not in LOCALISERS:
-            raise ScenarioError(f"unknown localiser '{settings.localiser}': choose {' or '.join(LOCALISERS)}")
+                    raise ScenarioError(
+                        f"the {word} '{name_of(chosen)}' stands for itself: its coupling is 'sequential'"
+                    )
+        self._localiser = None if settings.localiser in LOCALISERS else self._own_localiser(settings.localiser)
         least, most = settings.obstacle_radius
         if not 0.0 < least <= most < np.inf:
             raise ScenarioError(f"obstacles have radii 0 < least <= greatest, got {least:g} and {most:g} m")
@@ -156,6 +174,11 @@ class Episode:
         legs = zip([self.start, *self.goals[:-1]], self.goals, strict=True)
         self.legs = [self._route(begin, end) for begin, end in legs]
         self.path = np.concatenate([leg.path for leg in self.legs])
+        rules = PlacementRules(
+            radius=settings.obstacle_radius,
+            speed=settings.mover_speed,
+            way_clearance=max(PlacementRules.way_clearance, control.robot_radius + BESIDE_DISC),
+        )
         discs = place_obstacles(
             self.occupancy,
             self.distance_map,
@@ -164,17 +187,24 @@ class Episode:
             placement,
             start=self.start,
             goals=self.goals,
-            rules=PlacementRules(radius=settings.obstacle_radius, speed=settings.mover_speed),
+            rules=rules,
         )
         walls = _field(true) if settings.imperfection != Imperfection() else self.distance_map
-        self.world = World(
-            true, self.start, discs, sensors, robot_radius=control.robot_radius, lidar=settings.lidar,
+        of_world = (
+            World if settings.world == PLANE else load_class("world", settings.world, (PLANE,), OF_WORLD, "fog:Fog")
+        )
+        self.world = of_world(
+            true, self.start, discs, sensors, base=control.kind, body=control.hull, lidar=settings.lidar,
             odometry=settings.odometry, drivetrain=settings.drivetrain, yields=False,
             people=draw_traffic(settings.traffic, walls, self.path, about),
         )  # fmt: skip
-        sigma = np.array(INITIAL_SIGMA)
+        sigma = np.array(settings.initial_sigma)
+        if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
+            raise ScenarioError(f"standard deviations of the first belief are positive, got {settings.initial_sigma}")
         believed = self.start + sigma * belief.standard_normal(3)
-        self.faults = DriveFaults(settings.faults, settings.seed)
+        if settings.believed is not None:
+            believed = _pose(settings.believed, None, "believed")
+        self.faults = DriveFaults(settings.faults, settings.seed, control.kind)
         self._right, self._drawn = (self.occupancy, self.distance_map), drawn
         self.pilot = self._pilot(believed, sigma)
         if not rehearsal:
@@ -182,9 +212,12 @@ class Episode:
                 "navigation",
                 settings.coupling,
                 settings.solver,
-                settings.planner,
-                settings.localiser,
+                name_of(settings.planner),
+                name_of(settings.localiser),
+                name_of(settings.world),
                 control.avoidance,
+                control.base,
+                len(control.hull.discs),
             )
             rehearse(kind, lambda: Episode(replace(settings, faults=()), rehearsal=True))
 
@@ -200,9 +233,27 @@ class Episode:
             context = PlannerContext(self.distance_map, self.controller, of_planner)
             pilot.controller = load_planner(settings.planner, context)
         if settings.localiser == "amcl":
-            pilot.estimator = MonteCarlo(self.occupancy, self.distance_map, pose, sigma, of_localiser)
-            pilot.pose = pilot.estimator.pose
+            pilot.estimator = MonteCarlo(
+                self.occupancy, self.distance_map, pose, sigma, of_localiser, base=self.controller.kind
+            )
+        elif self._localiser is not None:
+            own = LocaliserContext(
+                self.occupancy, self.distance_map, pose, sigma, self.world.lidar.beams, self.controller.kind,
+                of_localiser,
+            )  # fmt: skip
+            estimator = constructed("localiser", self._localiser, own, ("pose", "covariance"))
+            for name, default in (("iterations", 0), ("refused", "")):
+                if not hasattr(estimator, name):
+                    setattr(estimator, name, default)
+            pilot.estimator = estimator
+        pilot.pose = pilot.estimator.pose
         return pilot
+
+    @staticmethod
+    def _own_localiser(name: str | type) -> type:
+        return load_class(
+            "localiser", name, LOCALISERS, ("update(scan, odometry, dt)", "reset(pose, sigma)"), "my:Filter"
+        )
 
     def run(self, progress: Progress) -> EpisodeLog:
         """Tick until the last goal is reached or given up."""
@@ -220,13 +271,16 @@ class Episode:
             start=self.start,
             dt=s.controller.dt,
             robot_radius=s.controller.robot_radius,
-            solver=s.solver if s.planner == MPC else s.planner,
+            solver=s.solver if s.planner == MPC else name_of(s.planner),
             coupling=s.coupling,
             seed=s.seed,
-            control_limits=s.controller.limits,
+            control_limits=tuple(s.controller.box[1].tolist()),
+            base=s.controller.base,
+            body=s.controller.body,
             scan_angles=self.world.lidar.angles,
             obstacle_moves=self.world.discs()[:, 3].astype(bool),
             faults=[str(fault) for fault in s.faults],
+            obstacles_wanted=s.obstacles,
         )
         self._outcomes = ["time ran out"] * len(self.goals)
         self._goal, self._driven, self._dead_reckoning = 0, 0.0, self.pilot.pose
@@ -252,10 +306,10 @@ class Episode:
         control = self.decide(number)
         if control is None:
             return None
-        self.world.step(*control, self.settings.controller.dt)
+        self.world.step(*control, dt=self.settings.controller.dt)
         return self._driven / path_length(self.path), f"goal {self._goal + 1}/{len(self.goals)}"
 
-    def decide(self, number: int) -> tuple[float, float] | None:
+    def decide(self, number: int) -> tuple[float, ...] | None:
         """Move on from the last tick, scan, decide and record; the control to be driven, None at the last goal."""
         dt, goal, now = self.settings.controller.dt, self._goal, self.world.time
         faults = self.faults
@@ -265,8 +319,8 @@ class Episode:
         odometry = None
         if number:
             measured = np.array(self.world.odometry())
-            self._dead_reckoning = step(self._dead_reckoning[None], measured[None], dt)[0]
-            self._driven += abs(measured[0]) * dt
+            self._dead_reckoning = self.controller.kind.step(self._dead_reckoning[None], measured[None], dt)[0]
+            self._driven += float(np.hypot(*measured[:2]) if self.controller.kind.slides else abs(measured[0])) * dt
             odometry = faults.odometry(measured, now)
         true_scan = self.world.scan()
         self.pilot.planless = faults.hold("solver-timeout", now)
@@ -288,8 +342,7 @@ class Episode:
         elif self.pilot.relocated:
             self._begin_leg(goal)
         asked = np.array(plan.control, dtype=np.float64)
-        v, omega = faults.control(asked, now, dt).tolist()
-        return v, omega
+        return tuple(faults.control(asked, now, dt).tolist())
 
     def _outcome(self, goal: int) -> str | None:
         """Outcome of a goal; None while the robot is on its way."""
@@ -330,7 +383,7 @@ class Episode:
         found, least = pose.copy(), self.controller.robot_radius + BESIDE
         for _ in range(FREEING):
             distance, slope = self.distance_map.distance_and_gradient(found[:2])
-            if distance >= least:
+            if distance >= least or self.controller.oriented:
                 break
             found[:2] += (least - distance) * slope / max(float(np.hypot(*slope)), 1e-9)
         return found
@@ -350,7 +403,7 @@ class Episode:
         if wrong:
             self.occupancy = askew(self.occupancy, before.pose)
             self.distance_map = _field(self.occupancy)
-        self.pilot = self._pilot(before.pose, np.array(INITIAL_SIGMA))
+        self.pilot = self._pilot(before.pose, np.array(self.settings.initial_sigma))
         self.pilot.take_over(before)
 
     def _free_places(self) -> Array:
@@ -396,7 +449,9 @@ class Episode:
 
     def _route(self, begin: Array, end: Array) -> Route:
         s = self.controller
-        return Route(self.occupancy, self.distance_map, begin, end, s.robot_radius, *self._gaps())
+        return Route(
+            self.occupancy, self.distance_map, begin, end, s.robot_radius, *self._gaps(), base=s.kind, body=s.hull
+        )
 
     def _arrived(self, goal: int) -> bool:
         """Return True if the robot believes to be there, by an estimate that leaves room for being wrong.

@@ -19,13 +19,16 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
+from unifg.errors import UnifgError
 from unifg.files.contents import legible
 
 __all__ = [
+    "Help",
     "Leaf",
     "Option",
     "Text",
     "add_options",
+    "checked",
     "count",
     "existing",
     "find_modules_in",
@@ -127,10 +130,13 @@ def add_options(parser: argparse.ArgumentParser, settings: type, **defaults: Any
         settings: the class.
         defaults: values of fields where the command line does not give one; None for the field's own.
     """
+    groups: dict[str, Any] = {"": parser}
     for leaf in leaves(settings):
-        chosen, name = leaf.option, leaf.path[-1]
+        chosen, name, inside = leaf.option, leaf.path[-1], " ".join(leaf.path[:-1])
         if chosen is None:
             continue
+        if inside not in groups:
+            groups[inside] = parser.add_argument_group(inside)
         default = defaults.get(name, leaf.declared.default)
         words: dict[str, Any] = {"help": _help(leaf, default).replace("%", "%%"), "metavar": chosen.metavar}
         kind = plain(leaf.kind)
@@ -146,7 +152,28 @@ def add_options(parser: argparse.ArgumentParser, settings: type, **defaults: Any
             parser.add_argument(name, **words)
         else:
             flag = "--" + (chosen.flag or name).replace("_", "-")
-            parser.add_argument(flag, dest=".".join(leaf.path), default=defaults.get(name, argparse.SUPPRESS), **words)
+            groups[inside].add_argument(
+                flag, dest=".".join(leaf.path), default=defaults.get(name, argparse.SUPPRESS), **words
+            )
+
+
+class Help(argparse.Action):
+    """Help on the options that are asked for most; with the word "all" on every one, in groups."""
+
+    def __init__(self, option_strings: Sequence[str], dest: str, first: Sequence[str] = ()) -> None:
+        """Show those of ``first`` alone, by flag; without any, all."""
+        super().__init__(option_strings, argparse.SUPPRESS, nargs="?", choices=("all",), default=argparse.SUPPRESS)
+        self.first, self.help = first, "show this help, or all options"
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
+        """Print the help and leave."""
+        if self.first and values != "all":
+            for action in parser._actions:
+                if action is not self and action.option_strings and action.option_strings[-1] not in self.first:
+                    action.help = argparse.SUPPRESS
+            parser.epilog = f"{len(parser._actions)} options in all: {parser.prog} --help all"
+        parser.print_help()
+        parser.exit()
 
 
 def settings_of(settings: type[S], chosen: argparse.Namespace, **more: Any) -> S:
@@ -180,8 +207,21 @@ def _help(leaf: Leaf, default: Any) -> str:
     doc = inspect.getdoc(leaf.owner) or ""
     found = re.search(rf"^    {leaf.path[-1]}: (.*?)(?=^ {{0,4}}\S|\Z)", doc, re.MULTILINE | re.DOTALL)
     words = " ".join(found[1].split()).rstrip(".") if found else ""
-    quiet = default is MISSING or default is None or isinstance(default, bool)
+    quiet = default in (MISSING, None, "") or isinstance(default, bool)
     return words if quiet else f"{words} (default: {default})"
+
+
+def checked(read: Callable[[str], object]) -> Text:
+    """A word that ``read`` takes; one that it refuses is refused by the message of its error."""
+
+    def word(text: str) -> str:
+        try:
+            read(text)
+        except UnifgError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+        return text
+
+    return word
 
 
 def count(text: str, least: int = 0, most: int = 10**18) -> int:

@@ -187,7 +187,7 @@ def test_help_and_version_exit_0(capsys: pytest.CaptureFixture[str]) -> None:
     for words in command.COMMANDS:
         assert command.main([words, "--help"]) == 0
         assert f"usage: unifg {words}" in capsys.readouterr().out
-    assert command.main(["run", "navigation", "--help"]) == 0
+    assert command.main(["run", "navigation", "--help", "all"]) == 0
     said = capsys.readouterr().out
     for flag in ("--map", "--start", "--goal", "--solver", "--coupling", "--obstacles", "--seed", "--out"):
         assert flag in said

@@ -12,12 +12,13 @@ import maps
 import unifg as fg
 from episodes import room
 from unifg.models.distance_map import DistanceMap, SmoothField
+from unifg.models.unicycle import followed
 from unifg.scenarios.ground import drive_control
 from unifg.scenarios.ground.drive_control import LEFT_BEHIND, OFF_WALLS, PATIENCE, Controller, is_behind
 from unifg.scenarios.ground.drive_parts import along, disc_limits, in_world, predicted, wall_limits
 from unifg.scenarios.ground.drive_past import Smoother
 from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.ground.stopping import evasions, followed, stopped
+from unifg.scenarios.ground.stopping import evasions, stopped
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.follow import PathFollower
@@ -180,8 +181,8 @@ def limits_of(others: Tracks, evasive: Array = RESTING, spread: Array | None = N
     """(N,) least distances to one disc, of a robot at a place known to a spread (2, 2)."""
     centres = predicted(SETTINGS, OPEN, others)
     limits = disc_limits(SETTINGS, OPEN, centres, others, evasive, np.zeros((2, 2)) if spread is None else spread)
-    assert limits.shape == (SETTINGS.horizon, 1)
-    return limits[:, 0]
+    assert limits.shape == (SETTINGS.horizon, 1, 1)
+    return limits[:, 0, 0]
 
 
 def test_clearances_widen_along_the_normal_with_what_the_estimate_may_be_off(field: DistanceMap) -> None:
@@ -286,7 +287,7 @@ def believing(field: DistanceMap) -> tuple[Controller, Smoother]:
         smoother.update(world.scan(), np.array(world.odometry()) if tick else None, SETTINGS.dt)
         if tick < 3:
             plan = controller.plan(smoother.pose, ahead(OPEN), tracks())
-            world.step(float(plan.control[0]), float(plan.control[1]), SETTINGS.dt)
+            world.step(*plan.control.tolist(), dt=SETTINGS.dt)
     return controller, smoother
 
 

@@ -12,6 +12,7 @@ from maps import building, field, stop_after
 from unifg.errors import ScenarioError
 from unifg.lie import SE2
 from unifg.models import lidar
+from unifg.models.footprint import Body
 from unifg.scenarios.ground.emergency_stop import EmergencyStop, agreed
 from unifg.scenarios.ground.localiser import Localiser, least, scan_covariance
 from unifg.scenarios.logs.drive_metrics import consistency, episode_metrics, nees
@@ -26,7 +27,7 @@ from unifg.scenarios.simulation.plane import LidarModel, World
 from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
-STOP = EmergencyStop(0.17, 2.5, 0.1)
+STOP = EmergencyStop(Body.disc(0.17), (2.5, 3.2), 0.1)
 FAST = np.array([1.0, 0.0])
 SHORT = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),), obstacles=1)
 HALF = LidarModel(beams=181, field=math.pi)
@@ -69,7 +70,7 @@ def test_the_blind_sector_is_that_of_lost_beams_within_the_field() -> None:
 
 def test_what_is_not_seen_is_occupied() -> None:
     clear = Scan(HALF.angles, np.full(181, 5.0))
-    assert STOP.is_free(FAST, clear, 1.0) and STOP.is_free(np.array([0.5, 1.0]), clear, 0.5)
+    assert STOP.is_free(FAST, clear, FAST) and STOP.is_free(np.array([0.5, 1.0]), clear, 0.5 * FAST)
     assert not STOP.is_free(-FAST, clear), "nothing is known of what is behind"
     assert STOP.control(-0.5 * FAST, np.zeros(2), clear)[0] == 0.0
     assert STOP.control(np.array([0.0, 1.0]), np.zeros(2), clear)[1] == 1.0, "turning touches nothing"

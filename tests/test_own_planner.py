@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from episodes import room
-from maps import field
+from maps import field, stop_after
+from unifg import scenarios
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
 from unifg.scenarios.command import main
@@ -22,6 +25,7 @@ from unifg.scenarios.perception.tracks import Tracks
 
 MODULE = """
 import numpy as np
+from unifg.scenarios.simulation.plane import World
 
 class Straight:
     def __init__(self, context):
@@ -54,6 +58,26 @@ class Eager:
 
     def control(self, now):
         return [0.0, 0.0]
+
+class Wheels:
+    def __init__(self, context):
+        self.base = context.base
+        self.reset(context.pose, context.sigma)
+
+    def reset(self, pose, sigma):
+        self.pose, self.covariance = np.array(pose), np.diag(np.square(sigma))
+
+    def update(self, scan, odometry, dt):
+        if odometry is not None:
+            self.pose = self.base.step(self.pose[None], odometry[None], dt)[0]
+
+class Blank(Wheels):
+    def reset(self, pose, sigma):
+        self.pose = pose
+
+class Slow(World):
+    def step(self, *control, dt):
+        super().step(*(0.5 * part for part in control), dt=dt)
 
 number = 3
 """
@@ -133,9 +157,45 @@ def test_an_answer_of_another_shape_is_refused(own: Path) -> None:
     [
         ({"planner": "x:Y", "coupling": "joint"}, "planner 'x:Y' stands for itself: its coupling is 'sequential'"),
         ({"localiser": "amcl", "coupling": "joint"}, "localiser 'amcl' stands for itself"),
-        ({"localiser": "best"}, "unknown localiser 'best': choose graph or amcl"),
+        ({"localiser": "best"}, "unknown localiser 'best': give 'graph' or 'amcl' or MODULE:CLASS"),
     ],
 )
 def test_planner_and_localiser_of_others_have_no_joint_graph(wrong: dict[str, str], words: str) -> None:
     with pytest.raises(ScenarioError, match=words):
         Episode(NavigationSettings(**wrong))  # type: ignore[arg-type]
+
+
+def test_a_localiser_and_a_world_of_ones_own_drive(own: Path) -> None:
+    plain = NavigationSettings(map=own / "room.yaml", start=(0.0, 0.0, 0.0), goals=((3.0, 0.0, 0.0),))
+    episode = Episode(replace(plain, localiser="my_planners:Wheels"), rehearsal=True)
+    log = episode.run(stop_after(10))
+    np.testing.assert_allclose(log.estimate, log.dead_reckoning, atol=1e-9)
+    usual = Episode(plain, rehearsal=True).run(stop_after(10))
+    slow = Episode(replace(plain, world="my_planners:Slow"), rehearsal=True).run(stop_after(10))
+    assert slow.true_pose[-1, 0] < 0.7 * usual.true_pose[-1, 0]
+    module = sys.modules["my_planners"]
+    same = Episode(replace(plain, world=module.Slow), rehearsal=True).run(stop_after(10))
+    np.testing.assert_array_equal(same.true_pose, slow.true_pose)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"localiser": "my_planners:Blank"}, "Blank has no covariance"),
+        ({"localiser": "my_planners:Straight"}, "has no method update"),
+        ({"localiser": "my_planners:Nothing"}, "has no class Nothing"),
+        ({"world": "my_planners:Wheels"}, "has no method step"),
+        ({"world": "flat"}, "unknown world 'flat'"),
+    ],
+)
+def test_parts_that_lack_something_are_refused_by_name(given: dict[str, str], words: str, own: Path) -> None:
+    with pytest.raises(ScenarioError, match=words):
+        Episode(replace(NavigationSettings(), **given), rehearsal=True)  # type: ignore[arg-type]
+
+
+def test_scenarios_list_what_can_be_replaced() -> None:
+    assert len(scenarios.__all__) <= 25 and sorted(dir(scenarios)) == sorted(scenarios.__all__)
+    for name in scenarios.__all__:
+        assert inspect.getdoc(getattr(scenarios, name)), name
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = scenarios.nothing

@@ -11,6 +11,7 @@ import pytest
 from maps import field, walled
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
+from unifg.models.unicycle import followed
 from unifg.scenarios.ground.drive_control import Controller
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.route import (
@@ -25,7 +26,6 @@ from unifg.scenarios.ground.route import (
     WALL_GAP,
     Route,
 )
-from unifg.scenarios.ground.stopping import followed
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.grid import SPACING
 from unifg.typing import Array

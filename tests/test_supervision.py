@@ -16,6 +16,7 @@ import pytest
 import maps
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor
+from unifg.models.footprint import Body
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
@@ -115,8 +116,8 @@ def test_a_scan_once_more_is_none_only_for_a_robot_that_has_moved() -> None:
         (np.array([np.nan, 0.0]), "not finite"),
         (np.array([0.0, np.inf]), "not finite"),
         (np.array([1e9, 0.0]), "faster than any wheel"),
-        (np.zeros(3), "not two numbers"),
-        ("fast", "not two numbers"),
+        (np.zeros(3), "not 2 numbers"),
+        ("fast", "not 2 numbers"),
     ],
 )
 def test_without_odometry_what_was_asked_for_stands_for_it(measured: Any, wrong: str) -> None:
@@ -276,7 +277,7 @@ def test_numbers_that_no_motor_has_are_refused_and_ticks_without_any_say_nothing
 
 # ----------------------------------------------------------------- the last stop
 
-STOP = EmergencyStop(0.17, 2.5, DT)
+STOP = EmergencyStop(Body.disc(0.17), (2.5, 3.2), DT)
 
 
 def ahead(distance: float, half: float = 0.15, base: float = 5.0) -> Scan:

@@ -13,6 +13,7 @@ from unifg.errors import ScenarioError
 from unifg.files.contents import Limits
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
+from unifg.models.footprint import Body
 from unifg.scenarios import navigation
 from unifg.scenarios.episode import run_ticks, silent
 from unifg.scenarios.navigation import Episode, NavigationSettings
@@ -23,7 +24,7 @@ from unifg.typing import Array
 
 PAUSE = 0.005
 QUIET = LidarModel(sigma=0.0, dropout=0.0)
-FAR = Space(np.array([-50.0, 0.0]), 0.17)
+FAR = Space(np.array([-50.0, 0.0]), Body.disc(0.17))
 
 
 def hall() -> OccupancyMap:
@@ -133,7 +134,8 @@ def test_a_map_of_half_a_kilometre_is_read(monkeypatch: pytest.MonkeyPatch, tmp_
 def test_obstacles_may_be_other_than_the_robot_expects() -> None:
     def radii(between: tuple[float, float]) -> Array:
         settings = NavigationSettings(obstacles=6, seed=2, obstacle_radius=between)
-        return Episode(settings, rehearsal=True).world.discs()[:, 2]
+        radius: Array = Episode(settings, rehearsal=True).world.discs()[:, 2]
+        return radius
 
     assert 0.15 <= radii((0.15, 0.25)).min() and radii((0.15, 0.25)).max() <= 0.25
     assert 0.08 <= radii((0.08, 0.1)).min() and radii((0.08, 0.1)).max() <= 0.1

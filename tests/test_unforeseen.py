@@ -12,7 +12,6 @@ from scipy import ndimage
 
 import maps
 from maps import walled
-from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map
 from unifg.scenarios.planning.grid import plan
 from unifg.scenarios.planning.polyline import polyline_distance
@@ -137,13 +136,12 @@ def test_same_seed_same_obstacles() -> None:
     assert placed(occupancy, 0, 5) == []
 
 
-def test_no_room_is_said() -> None:
+def test_as_many_are_placed_as_leave_a_way() -> None:
     """Too many obstacles, and a map that is too narrow from the start."""
     occupancy = floor()
-    with pytest.raises(ScenarioError, match=r"only \d of 6 unforeseen obstacles .*ask for at most"):
-        place_obstacles(occupancy, field(occupancy), way(occupancy)[:70], 6, np.random.default_rng(0))
-    with pytest.raises(ScenarioError, match="even without unforeseen obstacles"):
-        placed(floor(door=0.4), 1, 0)
+    few = place_obstacles(occupancy, field(occupancy), way(occupancy)[:70], 6, np.random.default_rng(0))
+    assert 0 < len(few) < 6
+    assert placed(floor(door=0.4), 1, 0) == []
 
 
 def test_movers_keep_off_walls_in_the_world() -> None:

@@ -241,14 +241,14 @@ def test_same_seed_same_bits_and_streams_stay_apart() -> None:
     [
         ((0.1, 2.0, 0.0), 0.0, 0.1, "would overlap a wall or an obstacle"),
         ((1.0, math.nan, 0.0), 0.0, 0.1, "three finite numbers"),
-        ((3.0, 2.0, 0.0), math.nan, 0.1, "not finite"),
+        ((3.0, 2.0, 0.0), math.nan, 0.1, "finite numbers"),
         ((3.0, 2.0, 0.0), 0.1, 0.0, "must be positive"),
     ],
 )
 def test_bad_input_is_refused(start: tuple[float, float, float], command: float, dt: float, words: str) -> None:
     """Standing in a wall, a start that is no pose, commands and durations that are no numbers."""
     with pytest.raises(ScenarioError, match=words):
-        quiet_world(start).step(command, 0.0, dt)
+        quiet_world(start).step(command, 0.0, dt=dt)
 
 
 @pytest.mark.data

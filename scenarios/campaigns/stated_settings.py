@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -84,6 +85,24 @@ class Fields:
         for path, value in values.items():
             made = replaced(made, path.split("."), value)
         return made
+
+    def restated(self, settings: S, words: Sequence[str]) -> S:
+        """Settings with other values, each stated as NAME=VALUE in the words of a campaign's file.
+
+        Raises:
+            ScenarioError: a word is none, or its value does not fit.
+        """
+        for word in words:
+            name, equals, text = word.partition("=")
+            try:
+                given = tomllib.loads(f"value = {text}")["value"]
+            except tomllib.TOMLDecodeError:
+                given = text  # a word without its quotes
+            if not equals:
+                raise ScenarioError(f"--set {word}: give NAME=VALUE, such as controller.margin=0.3")
+            path = self.named(name.strip(), "--set")
+            settings = replaced(settings, path.split("."), self.value(path, given, f"--set {word}"))
+        return settings
 
     def _fitting(self, kind: Any, given: Any, where: str, text: Text | None) -> Any:
         arguments = get_args(kind)

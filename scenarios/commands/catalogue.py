@@ -30,6 +30,7 @@ class Scenario:
         solvers: the list of `unifg.solvers.names` to choose from.
         defaults: of options, where the command line has others than the settings.
         live: whether it can be watched.
+        first: flags that its help shows before the word "all" is given; empty for every one.
     """
 
     module: str
@@ -37,6 +38,7 @@ class Scenario:
     solvers: str = "CONSTRAINED"
     defaults: Mapping[str, Any] = field(default_factory=dict)
     live: bool = True
+    first: tuple[str, ...] = ()
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """Load the scenario and add its options."""
@@ -50,6 +52,10 @@ class Scenario:
         parser.add_argument(
             "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
         )
+        parser.add_argument(
+            "--set", action="append", default=[], metavar="NAME=VALUE", dest="stated",
+            help="any setting by its name, such as controller.margin=0.3; may be repeated",
+        )  # fmt: skip
         if self.live:
             parser.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
         parser.set_defaults(module=module)
@@ -60,6 +66,20 @@ SCENARIOS = {
         "drives",
         "A robot localises itself by lidar and drives through a building under MPC.",
         defaults={"obstacles": 3},
+        first=(
+            "--map",
+            "--start",
+            "--goal",
+            "--base",
+            "--body",
+            "--speed",
+            "--plant",
+            "--obstacles",
+            "--planner",
+            "--localiser",
+            "--solver",
+            "--out",
+        ),
     ),
     "manoeuvres": Scenario(
         "manoeuvre_cases",

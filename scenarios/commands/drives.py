@@ -56,8 +56,10 @@ def summary(log: EpisodeLog) -> str:
     rows = (
         ("scenario", f"{m['scenario']} on {m['map']}{one_graph(m['coupling'])}"),
         ("solver, coupling, seed", f"{m['solver']}, {m['coupling']}, {m['seed']}"),
+        ("base, body", f"{m['base']}, {m['body']}" if log.body or log.base != "unicycle" else ""),
         ("goals reached", f"{m['goals_reached']} of {m['goals']}{stopped}"),
         *((f"goal {k + 1}", words) for k, words in enumerate(m["outcomes"]) if words != "reached"),
+        ("obstacles", _fewer(m["obstacles"], m["obstacles_wanted"])),
         ("health", health(m)),
         ("samples not let in", ", ".join(f"{count} {what}" for what, count in m["dropped_samples"].items())),
         ("collisions", f"{m['collisions']}"),
@@ -73,3 +75,8 @@ def summary(log: EpisodeLog) -> str:
         ("worst bound violation", f"{m['max_bound_violation']:.1e}"),
     )
     return table(rows)
+
+
+def _fewer(placed: int, wanted: int) -> str:
+    """Words where fewer obstacles found a place than were asked for."""
+    return f"{placed} of {wanted} found a place that leaves a way" if placed < wanted else ""

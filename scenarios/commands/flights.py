@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from unifg.scenarios import flight
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
@@ -17,6 +18,7 @@ from unifg.style.figures import write_figure
 __all__ = ["SETTINGS", "results", "run", "summary"]
 
 SETTINGS = flight.FlightSettings
+REACHED = 0.95  # of the speed asked for, from which nothing is said
 
 
 def run(settings: flight.FlightSettings, progress: Progress, announce: Announce | None = None) -> Outcome:
@@ -70,7 +72,7 @@ def summary(log: FlightLog) -> str:
         ("samples not let in", ", ".join(f"{count} {what}" for what, count in m["dropped_samples"].items())),
         ("collisions", f"{m['collisions']}"),
         ("flown", f"{m['path_length_m']:.2f} m in {m['duration_s']:.2f} s, {m['ticks']} ticks"),
-        ("speed", f"mean {m['mean_speed_m_per_s']:.2f} m/s, max {m['max_speed_m_per_s']:.2f}"),
+        ("speed", f"mean {m['mean_speed_m_per_s']:.2f} m/s, max {m['max_speed_m_per_s']:.2f}" + _short_of(m)),
         ("smallest clearance", f"{m['min_clearance_m']:.3f} m"),
         ("position error", _errors(m["position_error_m"], "m")),
         ("velocity error", _errors(m["velocity_error_m_per_s"], "m/s")),
@@ -81,6 +83,15 @@ def summary(log: FlightLog) -> str:
         ("estimate + plan", "median {p50:.1f} ms, p99 {p99:.1f}, max {max:.1f}".format(**m["tick_ms"])),
     )
     return table(rows)
+
+
+def _short_of(m: Mapping[str, Any]) -> str:
+    """Words where the speed asked for was not reached."""
+    guide = m["settings"].get("controller", {}).get("guide", {})
+    asked = guide.get("speed", 0.0)
+    if m["max_speed_m_per_s"] >= REACHED * asked:
+        return ""
+    return f" of {asked:g} asked for: bends and the way's length allow no more at {guide['acceleration']:g} m/s^2"
 
 
 def _errors(errors: Mapping[str, float] | None, unit: str) -> str:

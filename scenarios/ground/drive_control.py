@@ -1,8 +1,8 @@
 """Model-predictive controller of the ground robot as a factor graph (Bazzana et al. 2022, section V).
 
 Costs: distance to reference poses along the path (eq. 8), control effort, control rate, soft margins to walls and
-discs. Constraints: unicycle dynamics, limits of velocities and of accelerations, rest at the end, hard clearance from
-walls and from tracked discs.
+discs. Constraints: dynamics of the base, limits of velocities and of accelerations, rest at the end, hard clearance
+from walls and from tracked discs.
 """
 
 from __future__ import annotations
@@ -12,13 +12,22 @@ import numpy as np
 import unifg as fg
 from unifg.horizon import Context, ControlCost, Decision, InitialGuesses, LastPlan, Plan, RecedingHorizon, Term, Window
 from unifg.lie import wrap_angle
-from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
-from unifg.scenarios.ground.drive_parts import Clearance, Drive, EvasiveTrajectory, Limits, Motion, following, predicted
+from unifg.scenarios.ground.drive_parts import (
+    Clearance,
+    Drive,
+    EvasiveTrajectory,
+    Limits,
+    Motion,
+    disc_distances,
+    following,
+    predicted,
+    wall_distances,
+)
 from unifg.scenarios.ground.drive_past import robot
 from unifg.scenarios.ground.drive_settings import SECOND, ControllerSettings, backend
 from unifg.scenarios.ground.repulsion import Repulsion
-from unifg.scenarios.ground.stopping import evasions, followed, stopped
+from unifg.scenarios.ground.stopping import evasions, stopped
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.typing import Array
 
@@ -47,17 +56,17 @@ class Controller:
         """State the graph and prepare the backend; with a window, past and future are one graph."""
         self.settings = s = settings
         self.field = SmoothField(distance_map)
-        self._coming = np.zeros((0, 2))  # what would be driven next if nothing were decided any more
+        self._coming = np.zeros((0, s.kind.size))  # what would be driven next if nothing were decided any more
         self._evasion: int | None = None  # number of the evasion that was the last tick's way out
         terms: list[Term] = [
             *following(s),
-            ControlCost(s.weighted(s.control_sigma), s.weighted(s.rate_sigma), wanted=lambda now: now.given.wanted),
+            ControlCost(s.every(s.control_sigma), s.every(s.rate_sigma), wanted=lambda now: now.given.wanted),
             Motion(s),
             Limits(s),
             Repulsion(s, self.field) if s.avoidance in ("potential", "vortex") else Clearance(s, self.field),
         ]
         self.loop = RecedingHorizon(
-            robot(s.dt) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
+            robot(s.dt, s.kind) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
             cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND, s, COLD_PATIENCE), window=window,
             coupling="sequential" if window is None else "joint", pull=s.pull, limits=s.box, judge=self.judge,
             starts=InitialGuesses(self.along, self.leaving), believable=is_believable, patience=PATIENCE,
@@ -87,10 +96,21 @@ class Controller:
 
     def given(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Drive:
         """Context of the terms; arguments as of :meth:`plan`."""
-        cruise = np.zeros((self.settings.horizon, 2))
-        cruise[:, 0] = np.hypot(*np.diff(reference[:, :2], axis=0).T) / self.settings.dt
         spread = np.zeros((3, 3)) if covariance is None else covariance
-        return Drive(cruise, reference, tracks, spread, self._evasion_from(pose, tracks))
+        return Drive(self._cruise(reference), reference, tracks, spread, self._evasion_from(pose, tracks))
+
+    def _cruise(self, reference: Array) -> Array:
+        """(N, m) controls of the speeds along a reference (N + 1, 3)."""
+        s, way = self.settings, np.diff(reference[:, :2], axis=0)
+        cruise = np.zeros((s.horizon, s.kind.size))
+        cruise[:, 0] = np.hypot(*way.T) / s.dt
+        if s.oriented or s.kind.slides:  # it may lead backwards, or sideways
+            cosine, sine = np.cos(reference[:-1, 2]), np.sin(reference[:-1, 2])
+            ahead, left = (way * np.stack([cosine, sine], axis=-1)).sum(axis=1), way[:, 1] * cosine - way[:, 0] * sine
+            cruise[:, 0] = np.copysign(cruise[:, 0], ahead)
+            if s.kind.slides:
+                cruise[:, :2] = np.column_stack([ahead, left]) / s.dt
+        return cruise
 
     def _evasion_from(self, pose: Array, tracks: Tracks) -> EvasiveTrajectory:
         """Rest along the path of the last plan; if a mover would come too near there, the best simple way of evading.
@@ -101,16 +121,16 @@ class Controller:
         better: who turns back and forth between two ways out takes neither.
         """
         s, last = self.settings, self.loop.applied
-        controls = stopped(last, self._coming, s.most, s.horizon)
-        rest = EvasiveTrajectory(followed(pose, last, controls, s.dt), controls)
+        controls = stopped(last, self._coming, s.most, s.horizon, s.kind)
+        rest = EvasiveTrajectory(s.kind.followed(pose, last, controls, s.dt), controls)
         movers = tracks.at(tracks.mover)
         if not len(movers) or self._room(rest.states, predicted(s, pose, movers), movers.radius) >= 0.0:
             self._evasion = None
             return rest
         centres, best, before, self._evasion = predicted(s, pose, tracks), rest, self._evasion, None
         most = self._worth(rest.states, centres, tracks.radius)
-        for number, way in enumerate(evasions(last, s.most, s.box[1], s.horizon, s.dt)):
-            states = followed(pose, last, way, s.dt)
+        for number, way in enumerate(evasions(last, s.most, s.box[1], s.horizon, s.dt, s.kind)):
+            states = s.kind.followed(pose, last, way, s.dt)
             off_walls, clear, room = self._worth(states, centres, tracks.radius)
             worth = off_walls, clear, room + (COMMITTED if number == before else 0.0)
             if worth > most:
@@ -125,14 +145,13 @@ class Controller:
 
     def _room(self, states: Array, centres: Array, radii: Array) -> float:
         """Least gap between the hull at states (N + 1, 3) and discs at centres (N, k, 2), beyond what is to be kept."""
-        apart = np.hypot(*np.moveaxis(states[1:, None, :2] - centres, 2, 0)) - radii
+        apart = disc_distances(self.settings.hull, states[1:], centres) - radii
         return float(apart.min(initial=np.inf)) - self.settings.robot_radius - self.settings.disc_clearance
 
     def _off_walls(self, states: Array) -> float:
         """The same of walls."""
-        return (
-            float(self.field.distance(states[1:, :2]).min()) - self.settings.robot_radius - self.settings.wall_clearance
-        )
+        s = self.settings
+        return float(wall_distances(s.hull, self.field, states[1:]).min()) - s.robot_radius - s.wall_clearance
 
     def rest(self, pose: Array) -> tuple[Array, Array]:
         """Come to rest along the path of the last plan, without asking a solver.
@@ -141,16 +160,16 @@ class Controller:
             pose: (3,) present [m, m, rad].
 
         Returns:
-            Controls (N, 2) and states (N + 1, 3), the first of which is taken as applied.
+            Controls (N, m) and states (N + 1, 3), the first of which is taken as applied.
         """
         s, last = self.settings, self.loop.applied
-        controls = stopped(last, self._coming, s.most, s.horizon)
+        controls = stopped(last, self._coming, s.most, s.horizon, s.kind)
         self.loop.abandon()
         self.loop.applied, self._coming = controls[0].copy(), controls[1:]
-        return controls, followed(pose, last, controls, s.dt)
+        return controls, s.kind.followed(pose, last, controls, s.dt)
 
     def driven(self, control: Array) -> None:
-        """Be told that another control (2,) than the first of the plan is applied."""
+        """Be told that another control (m,) than the first of the plan is applied."""
         self.loop.applied = control.copy()
 
     def forget(self) -> None:
@@ -173,7 +192,7 @@ class Controller:
         return Decision(way.controls, way.states, "evading" if way.evades else "braking")
 
     def _within_reach(self, controls: Array, last: Array) -> Array:
-        """Controls (N, 2) of which the first is no farther from the last than the base can follow."""
+        """Controls (N, m) of which the first is no farther from the last than the base can follow."""
         most = self.settings.most
         controls[0] = np.clip(controls[0], last - most, last + most)
         return controls
@@ -189,6 +208,8 @@ class Controller:
         the robot's back.
         """
         s, reference = self.settings, now.given.reference
+        if s.oriented or s.kind.slides:  # the reference itself can be driven, but for the corners of its controls
+            return reference.copy(), np.clip(now.given.wanted, *s.box)
         speeds, controls = now.given.wanted[:, 0], np.zeros((s.horizon, 2))
         states, last = np.tile(now.present, (s.horizon + 1, 1)), now.last
         aim = 0
@@ -204,7 +225,7 @@ class Controller:
             fastest = np.minimum(s.box[1], s.most * (s.horizon - k))
             wanted = np.clip([speed, turn / PURSUIT_TIME], -fastest, fastest)
             controls[k] = np.clip(wanted, last - s.most, last + s.most)
-            states[k + 1] = unicycle.step(pose[None], 0.5 * (last + controls[k])[None], s.dt)[0]
+            states[k + 1] = s.kind.step(pose[None], 0.5 * (last + controls[k])[None], s.dt)[0]
             last = controls[k]
         return states, controls
 

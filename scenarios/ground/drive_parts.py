@@ -13,6 +13,7 @@ from unifg.horizon import Context, Term
 from unifg.models import obstacles, unicycle
 from unifg.models.barriers import share
 from unifg.models.distance_map import SmoothField
+from unifg.models.footprint import Body
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.perception.tracks import Tracks, nearest
 from unifg.scenarios.planning.reference_cost import ReferenceCost
@@ -30,7 +31,7 @@ class EvasiveTrajectory:
 
     Attributes:
         states: (N + 1, 3) poses from the present on [m, m, rad].
-        controls: (N, 2) [m/s, rad/s].
+        controls: (N, m) of the base.
         evades: True if it evades a mover before it comes to rest.
     """
 
@@ -44,7 +45,7 @@ class Drive:
     """Context of the terms at a tick.
 
     Attributes:
-        wanted: (N, 2) controls that would follow the reference [m/s, rad/s].
+        wanted: (N, m) controls that would follow the reference.
         reference: (N + 1, 3) poses along the path, the first beside the robot.
         tracks: discs the robot has seen.
         covariance: (3, 3) of the present pose by the past alone, in its tangent space.
@@ -70,16 +71,17 @@ def following(settings: ControllerSettings) -> list[Term]:
 
 @dataclass(frozen=True)
 class Motion:
-    """The unicycle with velocities that change steadily within a step, from those of now on."""
+    """The base with controls that change steadily within a step, from those of now on."""
 
     settings: ControllerSettings
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         """Add the dynamics."""
-        now, dt = graph.data("velocities now", np.zeros(2)), self.settings.dt
-        graph.constrain(unicycle.ramped, x[0], now, u[0], x[1], dt, lower=0.0, upper=0.0, name="first step")
+        base, dt = self.settings.kind, self.settings.dt
+        now = graph.data("velocities now", np.zeros(base.size))
+        graph.constrain(base.ramped, x[0], now, u[0], x[1], dt, lower=0.0, upper=0.0, name="first step")
         motion = x[1:-1], u[:-1], u[1:], x[2:], dt
-        graph.constrain(unicycle.ramped, *motion, lower=0.0, upper=0.0, name="dynamics")
+        graph.constrain(base.ramped, *motion, lower=0.0, upper=0.0, name="dynamics")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
         """The control applied last, which has been reached."""
@@ -88,7 +90,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Limits:
-    """Of the unicycle's velocities and of their changes, from those of now to rest after the last step."""
+    """Of the controls and of their changes, from those of now to rest after the last step."""
 
     settings: ControllerSettings
 
@@ -99,14 +101,15 @@ class Limits:
             graph.data(name, np.tile(side, (s.horizon, 1)), each=True) for name, side in zip(ENDS, s.box, strict=True)
         )
         graph.bound(u, lower=low, upper=high, name="limits")
-        graph.constrain(unicycle.rate, u[:-1], u[1:], lower=-s.most, upper=s.most, name="accelerations")
+        graph.constrain(s.kind.rate, u[:-1], u[1:], lower=-s.most, upper=s.most, name="accelerations")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
         """Controls that are reachable in the first step, and from which rest is reachable after the last."""
         s = self.settings
         least, most = s.box
         low, high = np.tile(least, (s.horizon, 1)), np.tile(most, (s.horizon, 1))
-        low[-1], high[-1] = np.maximum(least, -s.most), np.minimum(most, s.most)
+        falls = s.kind.resting
+        low[-1, falls], high[-1, falls] = np.maximum(least, -s.most)[falls], np.minimum(most, s.most)[falls]
         low[0], high[0] = np.maximum(low[0], now.last - s.most), np.minimum(high[0], now.last + s.most)
         return dict(zip(ENDS, (low, high), strict=True))
 
@@ -121,11 +124,12 @@ class Clearance:
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         """Add margins and limits."""
         s, n, m = self.settings, self.settings.horizon, self.settings.discs
-        wall_limit = graph.data("wall clearance", np.zeros((n, 1)), each=True)
-        disc_limit = graph.data("disc clearance", np.zeros((n, m)), each=True)
+        parts = len(s.hull.discs)
+        wall_limit = graph.data("wall clearance", np.zeros((n, parts)), each=True)
+        disc_limit = graph.data("disc clearance", np.zeros((n, parts * m)), each=True)
         centre = graph.data("disc centres", np.full((n, m, 2), FAR_AWAY), each=True)
         radius, shy_radius = graph.data("disc radii", np.zeros(m)), graph.data("disc radii for the margin", np.zeros(m))
-        walls, discs = obstacles.wall_distance(self.field), obstacles.disc_clearance
+        walls, discs = obstacles.wall_distance(self.field, s.hull), obstacles.clearance_of(s.hull)
         margin, sigma = s.robot_radius + s.margin, s.weighted((s.margin_sigma,))[0]
         graph.minimize(obstacles.shortfall(walls, margin), x[1:], sigma=sigma, name="wall margin")
         shy = obstacles.shortfall(discs, margin)
@@ -139,12 +143,12 @@ class Clearance:
         pose, given, chosen = now.present, now.given, nearest(now.given.tracks, now.present, m)
         k, spread = len(chosen), in_world(pose, given.covariance)
         centres, radii, shy = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m)
-        limits = np.zeros((n, m))
+        limits = np.zeros((n, len(s.hull.discs), m))
         centres[:, :k], radii[:k], shy[:k] = predicted(s, pose, chosen), chosen.radius, chosen.mover * s.mover_margin
-        limits[:, :k] = disc_limits(s, pose, centres[:, :k], chosen, given.evasive.states, spread)
+        limits[:, :, :k] = disc_limits(s, pose, centres[:, :k], chosen, given.evasive.states, spread)
         return {
             "wall clearance": wall_limits(s, self.field, given.evasive.states, given.reference, spread),
-            "disc clearance": limits,
+            "disc clearance": limits.reshape(n, -1),
             "disc centres": centres,
             "disc radii": radii,
             "disc radii for the margin": radii + shy,
@@ -167,8 +171,21 @@ def along(spread: Array, directions: Array) -> Array:
     return sigma
 
 
+def wall_distances(hull: Body, field: SmoothField, states: Array) -> Array:
+    """(N, K) distances to walls as their rows count them, of the discs of a body at states (N, 3) [m]."""
+    found: Array = field.distance(hull.places(states)) + hull.smaller
+    return found
+
+
+def disc_distances(hull: Body, states: Array, centres: Array) -> Array:
+    """(N, K, M) the same from centres (N, M, 2)."""
+    offset = hull.places(states)[:, :, None] - centres[:, None]
+    found: Array = np.hypot(offset[..., 0], offset[..., 1]) + hull.smaller[:, None]
+    return found
+
+
 def wall_limits(s: ControllerSettings, field: SmoothField, evasive: Array, reference: Array, spread: Array) -> Array:
-    """(N, 1) least distances to walls, as far as the way out keeps them.
+    """(N, K) least distances to walls, as far as the way out keeps them.
 
     They are wider by what the estimate (2, 2) may be off towards the wall that is nearest along the reference. With
     ``avoidance="barrier"`` what is left of the distance may shrink at the rate ``approach``, too.
@@ -176,9 +193,9 @@ def wall_limits(s: ControllerSettings, field: SmoothField, evasive: Array, refer
     _, slopes = field.distance_and_gradient(reference[1:, :2])
     least = s.robot_radius + s.wall_clearance + s.sigmas * along(spread, slopes)
     if s.avoidance == "barrier":
-        spare = np.maximum(float(field.distance(evasive[:1, :2])[0]) - least, 0.0)
+        spare = np.maximum(float(wall_distances(s.hull, field, evasive[:1]).min()) - least, 0.0)
         least = least + spare * share(s.approach, s.dt * np.arange(1, s.horizon + 1))
-    return np.minimum(least, field.distance(evasive[1:, :2]))[:, None]
+    return np.minimum(least[:, None], wall_distances(s.hull, field, evasive[1:]))
 
 
 def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
@@ -193,22 +210,24 @@ def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
 def disc_limits(
     s: ControllerSettings, pose: Array, centres: Array, tracks: Tracks, evasive: Array, spread: Array
 ) -> Array:
-    """(N, M) least distances to the centres (N, M, 2) of discs less their radii, as far as the way out keeps them.
+    """(N, K, M) least distances to the centres (N, M, 2) of discs less their radii, as far as the way out keeps them.
 
     They are wider by what the estimate (2, 2) may be off towards a disc. A disc that has ever moved is kept off by what
     it can travel in the meantime, or before it is noticed that it goes elsewhere, and what is left of the gap is a
     barrier that may shrink at the rate ``approach`` from now on; with ``avoidance="barrier"`` that holds for each.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)[:, None]
-    kept = np.hypot(*np.moveaxis(evasive[1:, None, :2] - centres, 2, 0)) - tracks.radius
+    kept = disc_distances(s.hull, evasive[1:], centres) - tracks.radius
     movers, now = tracks.mover, pose[:2] - tracks.centre
     walk = np.maximum(np.hypot(*tracks.velocity.T), s.mover_speed)
     allowance = np.where(movers, walk * np.minimum(stages, s.mover_surprise), 0.0)
     least = s.robot_radius + s.disc_clearance + s.sigmas * along(spread, now) + allowance
     guarded = movers | (s.avoidance == "barrier")
-    spare = np.where(guarded, np.maximum(np.hypot(*now.T) - tracks.radius - least, 0.0), 0.0)
+    gap = disc_distances(s.hull, pose[None], tracks.centre[None])[0].min(axis=0)
+    spare = np.where(guarded, np.maximum(gap - tracks.radius - least, 0.0), 0.0)
     # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it; not so to a disc
     # that moves.
     squeezed = np.minimum(kept, np.maximum(kept - s.squeeze, s.robot_radius + s.squeeze))
-    limits: Array = np.minimum(least + spare * share(s.approach, stages), np.where(movers, kept, squeezed))
+    barrier = (least + spare * share(s.approach, stages))[:, None]
+    limits: Array = np.minimum(barrier, np.where(movers, kept, squeezed))
     return limits

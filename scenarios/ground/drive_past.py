@@ -16,6 +16,7 @@ from unifg.horizon import Context, Robot, Window
 from unifg.models import lidar, odometry, unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.odometry import predict
+from unifg.models.planar import Base
 from unifg.scenarios.ground.localiser import (
     BEAM_SIGMA,
     FEWEST_BEAMS,
@@ -34,9 +35,9 @@ ROUNDS = 8  # of choosing the beams that count and moving the estimate
 STEADY = 0.01  # [m, rad]; an estimate that moves less has found its beams
 
 
-def robot(dt: float) -> Robot:
-    """A unicycle that is at a pose (3,) [m, m, rad], with v, omega (2,) held over ``dt`` [s]."""
-    return Robot(fg.SE2, fg.Rn(2), predict=lambda x, u: unicycle.step(x[None], u[None], dt)[0])
+def robot(dt: float, base: Base = unicycle.BASE) -> Robot:
+    """A base that is at a pose (3,) [m, m, rad], with a control (m,) held over ``dt`` [s]."""
+    return Robot(fg.SE2, fg.Rn(base.size), predict=lambda x, u: base.step(x[None], u[None], dt)[0])
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,7 @@ class Odometry:
     """The wheels' measured velocities, which stand for the controls that were applied, between consecutive poses."""
 
     dt: float
+    base: Base = unicycle.BASE
     noise: odometry.OdometryNoise = field(default_factory=odometry.OdometryNoise)
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
@@ -57,10 +59,10 @@ class Odometry:
         """The next pose seen from each, and how surely."""
         controls, empty = now.past.controls, now.past.empty
         information = np.zeros((len(controls), 3, 3))
-        covariances = [self.noise.covariance(u, self.dt) for u in controls[empty:]]
+        covariances = [self.noise.covariance(self.base.of(u), self.dt) for u in controls[empty:]]
         if covariances:
             information[empty:] = np.linalg.inv(covariances)
-        steps = unicycle.step(np.zeros((len(controls), 3)), controls, self.dt)
+        steps = self.base.step(np.zeros((len(controls), 3)), controls, self.dt)
         return {"odometry: measured": steps, "odometry: information": information}
 
 
@@ -120,15 +122,16 @@ class Smoother:
     """
 
     def __init__(
-        self, distance_map: DistanceMap, pose: Array, sigma: ArrayLike, beams: int, dt: float, length: int = WINDOW
-    ) -> None:
+        self, distance_map: DistanceMap, pose: Array, sigma: ArrayLike, beams: int, dt: float, length: int = WINDOW,
+        base: Base = unicycle.BASE,
+    ) -> None:  # fmt: skip
         """Begin at a pose (3,), believed with ``sigma`` (3,) or a covariance (3, 3)."""
         self.window = Window(
-            robot(dt), length, [Odometry(dt), Registration(distance_map, beams)], start=pose, sigma=sigma,
+            robot(dt, base), length, [Odometry(dt, base), Registration(distance_map, beams)], start=pose, sigma=sigma,
             solver=GaussNewton(max_iterations=12, step_tolerance=1e-3), rounds=ROUNDS, steady=STEADY,
         )  # fmt: skip
         self._looked = True
-        self._map, self._noise = distance_map, odometry.OdometryNoise()
+        self._map, self._noise, self._base = distance_map, odometry.OdometryNoise(), base
         self.covariance = self.window.state_covariance
 
     @property
@@ -147,12 +150,12 @@ class Smoother:
         return "" if self._looked else "no scan"
 
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
-        """Move the window by odometry (2,), None for none, attach the scan, if there is one, and register it."""
+        """Move the window by odometry (m,), None for none, attach the scan, if there is one, and register it."""
         skew = np.zeros((3, 3))
         if odometry is not None:
-            self.covariance = predict(self.pose, self.covariance, odometry, dt, self._noise)[1]
+            self.covariance = predict(self.pose, self.covariance, odometry, dt, self._noise, self._base)[1]
             self.window.move(odometry)
-            scan, skew = deskewed(scan, odometry)
+            scan, skew = deskewed(scan, self._base.of(odometry))
         self._looked = scan is not None
         if scan is not None:
             self.look(scan)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -12,7 +12,6 @@ import unifg as fg
 from unifg.errors import ScenarioError, UnifgError
 from unifg.files.ros_map import OccupancyMap
 from unifg.horizon import Plan
-from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_control import Controller
 from unifg.scenarios.ground.drive_past import Smoother
@@ -21,6 +20,7 @@ from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
 from unifg.scenarios.ground.local_planner import PlannerAdapter
 from unifg.scenarios.ground.localiser import Localiser
+from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.ground.relocalise import Relocaliser
 from unifg.scenarios.ground.route import Route
 from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Supervisor
@@ -43,32 +43,6 @@ STOPPED = "stopped"
 logger = logging.getLogger("unifg")
 
 
-class Estimator(Protocol):
-    """Localiser of the robot."""
-
-    @property
-    def iterations(self) -> int:
-        """Of the last update."""
-
-    @property
-    def pose(self) -> Array:
-        """(3,) present estimate [m, m, rad]."""
-
-    @property
-    def covariance(self) -> Array:
-        """(3, 3) of it, in the tangent space."""
-
-    @property
-    def refused(self) -> str:
-        """Why the last scan has not corrected the estimate, "" where it has."""
-
-    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
-        """Take in a scan, None for none, and the odometry (2,) since the last one, None on the first."""
-
-    def reset(self, pose: Array, sigma: Array) -> None:
-        """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
-
-
 PlannerT = TypeVar("PlannerT", bound=Controller | PlannerAdapter)
 
 
@@ -89,7 +63,7 @@ class Pilot(Generic[PlannerT]):
         share: of the beams of the last scan that the map explains.
         relocated: whether the last tick has found the robot at another place.
         slowed: true if the emergency stop has changed the control of the last tick.
-        driven: (2,) control of the last tick [m/s, rad/s].
+        driven: (m,) control of the last tick.
         search_said: why the last search has not found the robot, "" where it has.
         planless: whether no solve is to give a plan: a planner that is out of time.
     """
@@ -111,14 +85,19 @@ class Pilot(Generic[PlannerT]):
         self.clock = Stopwatch()
         self.pose = estimator.pose
         self.validator, self.supervisor = Validator(beams), Supervisor(RAMPS)
-        self.emergency_stop = EmergencyStop(s.robot_radius, float(s.most[0]) / s.dt, s.dt)
+        self.emergency_stop = EmergencyStop(s.hull, self._braking(s), s.dt, s.kind)
         self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
-        self.driven = np.zeros(2)
+        self.driven = np.zeros(s.kind.size)
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
-        self._signals = DriveSignals(s.dt, s.most)
+        self._signals = DriveSignals(s.dt, s.most, s.kind)
         self._pause, self.search_said = 0, ""
         self._awake = False
         self._first: Scan | None = None
+
+    @staticmethod
+    def _braking(settings: ControllerSettings) -> tuple[float, float]:
+        """Decelerations, moving and turning [m/s^2, rad/s^2]."""
+        return float(settings.most[0]) / settings.dt, settings.accelerations[1]
 
     @property
     def verdict(self) -> HealthReport:
@@ -144,7 +123,7 @@ class Pilot(Generic[PlannerT]):
 
         Args:
             scan: of now; None where none came.
-            odometry: (2,) since the last scan; None where none came.
+            odometry: (m,) since the last scan; None where none came.
             route: to follow.
             now: [s].
             first: whether nothing has been driven yet, so that there is no odometry.
@@ -169,12 +148,12 @@ class Pilot(Generic[PlannerT]):
         seen = self._first if looked else self.validator.scan(scan, now)
         wheels = None if first else self.validator.odometry(odometry, self.driven, s.dt)
         predicted = (
-            self.estimator.pose if wheels is None else unicycle.step(self.estimator.pose[None], wheels[None], s.dt)[0]
+            self.estimator.pose if wheels is None else s.kind.step(self.estimator.pose[None], wheels[None], s.dt)[0]
         )
         if not looked:
             self.estimator.update(seen, wheels, s.dt)
         if seen is not None and wheels is not None:
-            seen = seen.deskewed(wheels)
+            seen = seen.deskewed(s.kind.of(wheels))
         pose = self.pose = self.estimator.pose
         self.clock.split("localise")
         found = None if seen is None else explained(self._map, seen, pose)
@@ -236,7 +215,8 @@ class Pilot(Generic[PlannerT]):
 
     def _find_again(self, scan: Scan | None) -> None:
         """Search the map while the robot is lost, sees and rests."""
-        search, at_rest = self._search, not (np.abs(self.driven) > AT_REST).any()
+        velocity = self.controller.settings.kind.of(self.driven)
+        search, at_rest = self._search, not (np.abs(velocity) > AT_REST).any()
         if self.verdict.health is not Health.LOST or scan is None or not at_rest:
             search.begin(None)
             return
@@ -288,10 +268,10 @@ def make_pilot(
     """
     estimator: Estimator
     if coupling == "sequential":
-        estimator = Localiser(distance_map, pose, sigma, beams)
+        estimator = Localiser(distance_map, pose, sigma, beams, settings.kind)
         controller = Controller(distance_map, solver, settings)
     elif coupling == "joint":
-        estimator = smoother = Smoother(distance_map, pose, sigma, beams, settings.dt)
+        estimator = smoother = Smoother(distance_map, pose, sigma, beams, settings.dt, base=settings.kind)
         controller = Controller(distance_map, solver, settings, smoother.window)
     else:
         raise ScenarioError(f"unknown coupling '{coupling}': choose {' or '.join(COUPLINGS)}")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 import unifg as fg
 from unifg.errors import ScenarioError
-from unifg.scenarios.options import option, positive
+from unifg.models.footprint import Body, body_of
+from unifg.models.planar import Base, base_of
+from unifg.scenarios.options import checked, option, positive
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -30,7 +33,11 @@ class ControllerSettings:
     Attributes:
         horizon: steps N.
         dt: sampling time [s].
-        speed: reference speed along the path [m/s].
+        speed: reference speed along the path [m/s]; the limit of velocity is at least as great.
+        base: kind of base: "unicycle", "ackermann", also with its numbers as ackermann:WHEELBASE,STEERING,RATE
+            [m, rad, rad/s], or "omnidirectional".
+        body: hull: LENGTHxWIDTH, disc:R, polygon:X,Y;X,Y;... (convex) or discs:X,Y,R;X,Y,R [m], x ahead of the axis;
+            without one, a disc of the robot's radius.
         limits: greatest |v| [m/s] and |omega| [rad/s].
         accelerations: greatest changes of both, by the data sheet of the base [m/s^2, rad/s^2].
         pose_sigma: (x, y, theta) of the stage cost [m, m, rad].
@@ -39,7 +46,7 @@ class ControllerSettings:
         rate_sigma: (v, omega) change between samples [m/s, rad/s].
         control_weight: factor on all costs of the controller; matters where they meet those of the estimate.
         pull: most by which they may move a joint estimate from where the past puts it [m, m, rad].
-        robot_radius: [m].
+        robot_radius: of the disc [m]; of a body, of its largest disc.
         wall_clearance: least distance of the hull to walls [m].
         disc_clearance: least distance of the hull to tracked discs [m].
         sigmas: by how many standard deviations of the estimate, along the normal, both distances are wider.
@@ -60,9 +67,11 @@ class ControllerSettings:
         feasible: largest violation of a plan that may be driven.
     """
 
+    base: str = option("unicycle", text=checked(base_of), metavar="BASE")
+    body: str = option("", text=checked(body_of), metavar="BODY")
     horizon: int = 30
     dt: float = 0.1
-    speed: float = 1.0
+    speed: float = option(1.0, text=positive, metavar="M/S")
     limits: tuple[float, float] = (1.0, 1.0)
     accelerations: tuple[float, float] = (2.5, 3.2)
     pose_sigma: tuple[float, float, float] = (0.3, 0.3, 0.6)
@@ -71,7 +80,7 @@ class ControllerSettings:
     rate_sigma: tuple[float, float] = (0.5, 1.0)
     control_weight: float = option(1.0, text=positive, metavar="W")
     pull: tuple[float, float, float] = (0.01, 0.01, 0.01)
-    robot_radius: float = 0.17
+    robot_radius: float = option(0.17, text=positive, metavar="M")
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
     sigmas: float = 2.0
@@ -90,14 +99,39 @@ class ControllerSettings:
     feasible: float = 5e-4
 
     def __post_init__(self) -> None:
-        """Refuse an unknown way of avoiding things."""
+        """Refuse an unknown base or way of avoiding things."""
+        base_of(self.base)
+        if self.body:
+            object.__setattr__(self, "robot_radius", self.hull.radius)
+        if not self.hull.round and self.avoidance in ("potential", "vortex"):
+            raise ScenarioError(f"avoidance '{self.avoidance}' is one of discs about their axis; leave --body out")
         if self.avoidance not in AVOIDANCES:
             raise ScenarioError(f"unknown avoidance '{self.avoidance}': choose {', '.join(AVOIDANCES)}")
+
+    @property
+    def kind(self) -> Base:
+        """The base."""
+        return base_of(self.base)
+
+    @cached_property
+    def hull(self) -> Body:
+        """The body."""
+        return body_of(self.body) if self.body else Body.disc(self.robot_radius)
+
+    @property
+    def oriented(self) -> bool:
+        """True where a way has to be searched with its headings: of a car, or a body that is no disc about its axis."""
+        return self.kind.turning_radius > 0.0 or not self.hull.round
 
     def weighted(self, sigma: tuple[float, ...]) -> Array:
         """Standard deviations of costs of the controller, scaled by their common weight."""
         scaled: Array = np.array(sigma) / np.sqrt(self.control_weight)
         return scaled
+
+    def every(self, sigma: tuple[float, float]) -> Array:
+        """(m,) scaled standard deviations of all controls, from those of translation and of turning."""
+        translation, turning = self.weighted(sigma).tolist()
+        return self.kind.spread((translation, turning))
 
     @property
     def mover_surprise(self) -> float:
@@ -126,13 +160,24 @@ class ControllerSettings:
 
     @property
     def most(self) -> Array:
-        """(2,) greatest changes of the controls in a step [m/s, rad/s]; more than from end to end means nothing."""
-        return np.minimum(np.array(self.accelerations) * self.dt, 2.0 * np.array(self.limits))
+        """(m,) greatest changes of the controls in a step [m/s, rad/s]; more than from end to end means nothing."""
+        fastest = self.kind.spread(self.accelerations)
+        if self.kind.steering is not None:
+            fastest[-1] = self.kind.steering[1]
+        return np.minimum(fastest * self.dt, 2.0 * self._greatest)
+
+    @property
+    def _greatest(self) -> Array:
+        """(m,) greatest controls."""
+        greatest = self.kind.spread((max(self.limits[0], self.speed), self.limits[1]))
+        if self.kind.steering is not None:
+            greatest[-1] = self.kind.steering[0]
+        return greatest
 
     @property
     def box(self) -> tuple[Array, Array]:
-        """Least and greatest controls (2,) [m/s, rad/s], from which the base comes to rest within the horizon."""
-        limits: Array = np.minimum(np.array(self.limits), self.horizon * self.most)
+        """Least and greatest controls (m,), from which the base comes to rest within the horizon."""
+        limits: Array = np.minimum(self._greatest, self.horizon * self.most)
         return -limits, limits
 
 

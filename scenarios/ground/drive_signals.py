@@ -8,7 +8,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from unifg.lie import wrap_angle
+from unifg.lie import SE2, wrap_angle
+from unifg.models import unicycle
+from unifg.models.planar import Base
 from unifg.scenarios.ground.motor_lag import MotorLag
 from unifg.scenarios.monitoring.supervisor import Ramp
 from unifg.typing import Array
@@ -46,13 +48,17 @@ class DriveSignals:
         motors: how late they follow.
     """
 
-    def __init__(self, dt: float, most: Array) -> None:
-        """Begin with nothing the matter, in a base whose velocities change by at most (2,) in a tick."""
-        self._dt = dt
-        self.motors = MotorLag(dt, most)
+    def __init__(self, dt: float, most: Array, base: Base = unicycle.BASE) -> None:
+        """Begin with nothing the matter, in a base whose controls change by at most (m,) in a tick."""
+        self._dt, self._base = dt, base
+        self.motors = MotorLag(dt, most, base)
+        # Speeds of the left and of the right wheel, and of one that slides sideways.
+        self._sides = np.array([[1.0, 1.0], [-ARM, ARM]])
+        if base.slides:
+            self._sides = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-ARM, ARM, 0.0]])
         self._fix = self._plan = self._odometry = self._took = 0.0
         self._share, self._spread, self._blind = 1.0, 0.0, 0.0
-        self._asked: deque[Array] = deque([np.zeros(2)], maxlen=LATELY)
+        self._asked: deque[Array] = deque([base.of(np.zeros(base.size))], maxlen=LATELY)
         self._missed: deque[float] = deque(maxlen=AGREE)
         self._shifts: deque[tuple[float, float]] = deque(maxlen=WAY)
         self._fixed: Array | None = None
@@ -79,9 +85,9 @@ class DriveSignals:
             predicted: (3,) pose by the wheels [m, m, rad].
             pose: (3,) pose after the scan.
             covariance: (3, 3) of it.
-            wheels: (2,) velocities they have made [m/s, rad/s]; None at the first tick.
+            wheels: (m,) controls they have made; None at the first tick.
             trusted: whether they measured these.
-            asked: (2,) velocities asked for.
+            asked: (m,) controls asked for.
             blind: width of the widest sector of the scan whose beams are all lost [rad].
         """
         self._blind = blind
@@ -93,12 +99,13 @@ class DriveSignals:
         if wheels is None:
             return
         self._odometry = 0.0 if trusted else self._odometry + self._dt
-        self._asked.append(asked)
         self.motors.note(asked, wheels if trusted else None)
+        asked, wheels = self._base.of(asked), self._base.of(wheels)
+        self._asked.append(asked)
         done = [wheels if trusted else asked]
         if corrected and self._fixed is not None:  # what it has done, whatever the wheels say
-            turned = wrap_angle(pose[2] - self._fixed[2])
-            done.append(np.array([forward(self._fixed, pose), turned]) / self._dt)
+            turned, moved = wrap_angle(pose[2] - self._fixed[2]), self._moved(self._fixed, pose)
+            done.append(np.array([*moved, turned]) / self._dt)
         self._fixed = pose.copy() if corrected else None
         self._missed.append(min(self._misses(did) for did in done))
         self._held = max(0.0, self._held - self._dt)
@@ -106,6 +113,10 @@ class DriveSignals:
             self._held, self._hold = self._hold, 2.0 * self._hold
         shift = forward(predicted, pose) if corrected and trusted else 0.0
         self._shifts.append((shift, float(wheels[0]) * self._dt))
+
+    def _moved(self, one: Array, other: Array) -> Array:
+        """(1,) distance ahead, or (2,) ahead and to the left, from a pose (3,) to another [m]."""
+        return SE2.between(one, other)[:2] if self._base.slides else np.array([forward(one, other)])
 
     def planned(self, sound: bool) -> None:
         """Record if the tick has a plan of its own."""
@@ -116,9 +127,8 @@ class DriveSignals:
         self._took = seconds
 
     def _misses(self, did: Array) -> float:
-        """Share by which velocities (2,) miss the recent commands of one wheel."""
-        sides = np.array([[1.0, 1.0], [-ARM, ARM]])  # speeds of the left and of the right wheel
-        told, made = np.array(self._asked) @ sides, did @ sides
+        """Share by which body velocities (k,) miss the recent commands of one wheel."""
+        told, made = np.array(self._asked) @ self._sides, did @ self._sides
         missed = np.maximum(told.min(axis=0) - made, made - told.max(axis=0))
         return float(missed.max(initial=0.0) / max(np.abs(told).max(), CRAWL))
 

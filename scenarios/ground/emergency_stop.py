@@ -8,16 +8,21 @@ ahead are lost, the way is not known to be free; a sector that no beam has looke
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.lie import SE2
+from unifg.models import unicycle
+from unifg.models.footprint import Body
+from unifg.models.planar import Base
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array
 
 __all__ = ["EmergencyStop"]
 
-SLOW = 0.02  # [m/s]; slower is rest, and turning on the spot touches nothing
+SLOW = 0.02  # [m/s]; slower is rest
 SAMPLES = 12  # places along the way
 SHARES = 4  # speeds tried between the one asked for and the one that braking leaves
 BIAS = 0.015  # [m] by which the nearest of many noisy beams looks nearer than what it has met
@@ -32,62 +37,86 @@ class EmergencyStop:
     """Slows what would touch.
 
     Attributes:
-        radius: of the hull [m].
-        deceleration: of the robot [m/s^2].
+        body: of the robot.
+        decelerations: of the robot, moving and turning [m/s^2, rad/s^2].
         dt: for which a control is held [s].
+        base: that moves.
     """
 
-    radius: float
-    deceleration: float
+    body: Body
+    decelerations: tuple[float, float]
     dt: float
+    base: Base = unicycle.BASE
 
     def control(self, asked: Array, last: Array, scan: Scan) -> Array:
-        """The fastest control (2,) along the arc of the one asked for whose braking way is free, or that brakes.
+        """The fastest control (m,) along the arc of the one asked for whose braking way is free, or that brakes.
 
         Args:
-            asked: (2,) [m/s, rad/s].
-            last: (2,) that was driven until now.
+            asked: (m,) control.
+            last: (m,) that was driven until now.
             scan: of now.
         """
-        speed = float(asked[0])
-        if abs(speed) < SLOW or self.is_free(asked, scan, float(last[0])):
+        velocity, before = self.base.of(asked), self.base.of(last)
+        speed = self._pace(velocity)
+        if speed < SLOW or self.is_free(asked, scan, last):
             return asked
-        least = max(abs(float(last[0])) - self.deceleration * self.dt, 0.0) if last[0] * speed > 0.0 else 0.0
+        onward = float(before @ velocity) > 0.0
+        least = max(self._pace(before) - self.decelerations[0] * self.dt, 0.0) if onward else 0.0
         control: Array = asked
-        for slower in np.linspace(abs(speed), min(least, abs(speed)), SHARES + 1)[1:].tolist():
-            control = asked * (slower / abs(speed))
+        for slower in np.linspace(speed, min(least, speed), SHARES + 1)[1:].tolist():
+            control = np.where(self.base.resting, asked * (slower / speed), asked)
             if slower < SLOW:
-                return np.array([0.0, asked[1]])
-            if self.is_free(control, scan, float(last[0])):
+                control = np.zeros_like(asked)
+                if self.body.round or self.base.steering is not None:
+                    control[-1] = asked[-1]
+                return control
+            if self.is_free(control, scan, last):
                 break
         return control
 
-    def is_free(self, control: Array, scan: Scan, last: float | None = None) -> bool:
-        """Return True if a control (2,), reached from a speed ``last`` [m/s] and then braked, touches nothing seen.
+    def _pace(self, velocity: Array) -> float:
+        """Greatest speed of a point of the hull [m/s]; turning a disc about its axis moves none."""
+        speed = math.hypot(*velocity[:-1].tolist())
+        return speed if self.body.round else max(speed, abs(float(velocity[-1])) * self.body.bound)
+
+    def is_free(self, control: Array, scan: Scan, last: Array | None = None) -> bool:
+        """Return True if a control (m,), reached from the one before (m,) and then braked, touches nothing seen.
 
         Without ``last`` the control has been reached.
         """
-        v, omega = control.tolist()
-        away = np.abs(np.remainder(scan.angles - (0.0 if v > 0.0 else np.pi) + np.pi, 2.0 * np.pi) - np.pi)
-        ahead = away < AHEAD
-        if not ahead.any() or np.isnan(scan.ranges[ahead]).mean() > 1.0 - SEEN:
-            return False
-        mean = abs(v) if last is None else 0.5 * (abs(v) + max(last * np.sign(v), 0.0))
-        length = mean * self.dt + 0.5 * v * v / self.deceleration
+        velocity = self.base.of(control)
+        across, turn = velocity[:-1], float(velocity[-1])
+        speed, spent = math.hypot(*across.tolist()), 0.0
+        if speed >= SLOW:
+            bearing = math.atan2(float(across[1]) if len(across) > 1 else 0.0, float(across[0]))
+            away = np.abs(np.remainder(scan.angles - bearing + np.pi, 2.0 * np.pi) - np.pi)
+            ahead = away < AHEAD
+            if not ahead.any() or np.isnan(scan.ranges[ahead]).mean() > 1.0 - SEEN:
+                return False
+            before = speed if last is None else max(float(self.base.of(last)[:-1] @ across) / speed, 0.0)
+            length = 0.5 * (speed + before) * self.dt + 0.5 * speed * speed / self.decelerations[0]
+            spent = length / speed
+        if not self.body.round:
+            spent = max(spent, self.dt + 0.5 * abs(turn) / self.decelerations[1])
         ranges = agreed(scan)
-        near = ranges < length + self.radius
+        near = ranges < speed * spent + self.body.bound
         hidden = [begin + np.arange(STEP, width, STEP) for begin, width in scan.unseen.tolist()]
         angles = np.concatenate([scan.angles[near], *hidden])
         if not len(angles):
             return True
-        rim = np.full(len(angles) - int(near.sum()), self.radius)
+        rim = self.body.rim(angles[int(near.sum()) :])
         points = np.concatenate([ranges[near], rim])[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])
-        along = np.linspace(0.0, length, SAMPLES)
-        turn = along * omega / abs(v)
-        reach = np.sign(v) * along * np.sinc(0.5 * turn / np.pi)  # the chord of the arc
-        way = reach[:, None] * np.column_stack([np.cos(0.5 * turn), np.sin(0.5 * turn)])
-        gap = np.hypot(*np.moveaxis(points[:, None] - way[None], 2, 0))
-        return bool((gap.min(axis=1) >= np.minimum(self.radius - BIAS, gap[:, 0] - COMING)).all())
+        motion = np.zeros(3)
+        motion[: len(across)], motion[2] = across, turn
+        way = SE2.exp(np.linspace(0.0, spent, SAMPLES)[:, None] * motion)
+        seen = points[:, None] - way[:, :2]
+        if not self.body.round:
+            cosine, sine = np.cos(way[:, 2]), np.sin(way[:, 2])
+            seen = np.stack(
+                [cosine * seen[..., 0] + sine * seen[..., 1], cosine * seen[..., 1] - sine * seen[..., 0]], -1
+            )
+        gap = self.body.gap(seen)
+        return bool((gap.min(axis=1) >= np.minimum(-BIAS, gap[:, 0] - COMING)).all())
 
 
 def agreed(scan: Scan) -> Array:

@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from importlib import import_module
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -20,10 +18,9 @@ import numpy as np
 import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.horizon import Plan
-from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.options import find_modules_in
+from unifg.scenarios.ground.protocols import constructed, load_class
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.polyline import arc_lengths
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -75,18 +72,31 @@ class Situation:
         """Distance from the hull to walls and discs beyond the clearance to be kept; discs go straight on.
 
         Args:
-            points: (..., 2) positions of the robot [m].
+            points: (..., 2) positions of the robot [m], or (..., 3) poses [m, m, rad], which a body that is no disc
+                about its axis needs.
             times: from now, as many as points or the last axes of them [s].
 
         Returns:
             (...,) [m].
         """
         s, when = self.settings, np.asarray(times)[..., None]
+        if not s.hull.round:
+            if points.shape[-1] != 3:
+                raise ScenarioError("clearances of this body are those of poses (..., 3), positions do not do")
+            parts = np.moveaxis(s.hull.places(points), -2, 0)
+            gaps = [self._gap(part, when) + less for part, less in zip(parts, s.hull.smaller, strict=True)]
+            least: Array = np.min(gaps, axis=0) - s.robot_radius - self.doubt
+            return least
+        return self._gap(points[..., :2], when) - s.robot_radius - self.doubt
+
+    def _gap(self, points: Array, when: Array) -> Array:
+        """Distance (...) of points (..., 2) to walls and discs beyond the clearance to be kept [m]."""
+        s = self.settings
         distance = self.walls.distance(points) - s.wall_clearance
         for centre, velocity, radius in zip(self.tracks.centre, self.tracks.velocity, self.tracks.radius, strict=True):
             offset = points - (centre + when * velocity)
             np.minimum(distance, np.hypot(offset[..., 0], offset[..., 1]) - radius - s.disc_clearance, out=distance)
-        return distance - s.robot_radius - self.doubt
+        return distance
 
     def hits(self, clearance: Array, times: Array | float) -> BoolArray:
         """Flags of a drive of such clearances (...,) at those times: True for a hit that a robot at rest avoids."""
@@ -127,7 +137,7 @@ class PlannerAdapter:
     def __init__(self, planner: LocalPlanner, context: PlannerContext) -> None:
         """Begin at rest."""
         self.planner, self.settings, self._walls = planner, context.settings, context.distance_map
-        self.applied, self.estimate = np.zeros(2), np.zeros(3)
+        self.applied, self.estimate = np.zeros(context.settings.kind.size), np.zeros(3)
 
     def stations(self) -> Array:
         """(N + 1,) arc lengths of the reference [m]: as far as the horizon reaches at full speed."""
@@ -152,9 +162,12 @@ class PlannerAdapter:
         doubt = s.sigmas * float(np.sqrt(max(variance, 0.0)))
         now = Situation(self.estimate, self.applied, reference, tracks, self._walls, s, doubt)
         answer = self.planner.control(now)
-        wanted = np.zeros((1, 2)) if answer is None else np.atleast_2d(np.asarray(answer, dtype=np.float64))
-        if wanted.ndim != 2 or wanted.shape[1] != 2 or not len(wanted) or not np.isfinite(wanted).all():
-            raise ScenarioError(f"the planner returned {answer!r}: give finite controls (2,) or (K, 2), or None")
+        size = s.kind.size
+        wanted = np.zeros((1, size)) if answer is None else np.atleast_2d(np.asarray(answer, dtype=np.float64))
+        if wanted.ndim != 2 or wanted.shape[1] != size or not len(wanted) or not np.isfinite(wanted).all():
+            raise ScenarioError(
+                f"the planner returned {answer!r}: give finite controls ({size},) or (K, {size}), or None"
+            )
         wanted = np.concatenate([wanted, np.tile(wanted[-1], (max(s.horizon - len(wanted), 0), 1))])[: s.horizon]
         controls = now.reachable(wanted)
         least, most = s.box
@@ -164,14 +177,15 @@ class PlannerAdapter:
         if answer is None:
             status, source = fg.Status.LOCALLY_INFEASIBLE, "braking"
         iterations = 0 if answer is None else int(getattr(self.planner, "iterations", 1))
-        states = unicycle.rollout(self.estimate, controls, s.dt)
+        states = s.kind.rollout(self.estimate, controls, s.dt)
         return Plan(controls, states, status, iterations, source, excess, 1e3 * (time.perf_counter() - begin))
 
     def rest(self, pose: Array) -> tuple[Array, Array]:
         """Controls (N, 2) and states (N + 1, 3) of coming to rest, the first of which is taken as applied."""
-        controls = reachable(np.zeros((self.settings.horizon, 2)), self.applied, self.settings)
+        s = self.settings
+        controls = reachable(np.zeros((s.horizon, s.kind.size)), self.applied, s)
         self.applied, self.estimate = controls[0], np.asarray(pose, dtype=np.float64)
-        return controls, unicycle.rollout(self.estimate, controls, self.settings.dt)
+        return controls, s.kind.rollout(self.estimate, controls, s.dt)
 
     def driven(self, control: Array) -> None:
         """Record that another control (2,) than the first of the plan is applied."""
@@ -196,30 +210,16 @@ def reachable(wanted: Array, applied: Array, settings: ControllerSettings) -> Ar
     return made
 
 
-def load_planner(name: str, context: PlannerContext) -> PlannerAdapter:
+def load_planner(name: str | type, context: PlannerContext) -> PlannerAdapter:
     """Construct a user's planner.
 
     Args:
-        name: ``MODULE:CLASS``; modules of the working directory are found, too.
+        name: ``MODULE:CLASS``, or the class; modules of the working directory are found, too.
         context: map, limits and random numbers, the argument of the class.
 
     Raises:
         ScenarioError: there is no such module or class, or it cannot be constructed or has no method ``control``.
     """
-    module_name, colon, class_name = name.partition(":")
-    if not (module_name and colon and class_name):
-        example = "benchmarks.baselines.elastic_band:ElasticBand"
-        raise ScenarioError(f"unknown planner '{name}': give 'mpc' or MODULE:CLASS, for example {example}")
-    find_modules_in(Path.cwd())
-    try:
-        module = import_module(module_name)
-    except ImportError as error:
-        raise ScenarioError(f"planner '{name}': cannot import {module_name} from {Path.cwd()}: {error}") from error
-    if not isinstance(kind := getattr(module, class_name, None), type):
-        raise ScenarioError(f"planner '{name}': {module_name} has no class {class_name}")
-    if not callable(getattr(kind, "control", None)):
-        raise ScenarioError(f"planner '{name}': {class_name} has no method control(situation)")
-    try:
-        return PlannerAdapter(kind(context), context)
-    except TypeError as error:
-        raise ScenarioError(f"planner '{name}': {class_name}(context) failed: {error}") from error
+    example = "benchmarks.baselines.elastic_band:ElasticBand"
+    kind = load_class("planner", name, ("mpc",), ("control(situation)",), example)
+    return PlannerAdapter(constructed("planner", kind, context), context)

@@ -6,8 +6,9 @@ import numpy as np
 
 import unifg as fg
 from unifg.lie import SE2
-from unifg.models import lidar, odometry
+from unifg.models import lidar, odometry, unicycle
 from unifg.models.distance_map import DistanceMap
+from unifg.models.planar import Base
 from unifg.scenarios.perception.readings import Scan
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
@@ -40,7 +41,9 @@ class Localiser:
         refused: why the last scan has not corrected the estimate, "" where it has.
     """
 
-    def __init__(self, distance_map: DistanceMap, pose: Array, sigma: Array, beams: int) -> None:
+    def __init__(
+        self, distance_map: DistanceMap, pose: Array, sigma: Array, beams: int, base: Base = unicycle.BASE
+    ) -> None:
         """State the graph.
 
         Args:
@@ -48,12 +51,13 @@ class Localiser:
             pose: (3,) initial estimate [m, m, rad].
             sigma: (3,) its standard deviations [m, m, rad].
             beams: number of beams in a scan.
+            base: that the odometry is of.
         """
         self.pose = np.asarray(pose, dtype=np.float64)
         self.covariance = self._held = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
         self.iterations, self.refused = 0, ""
         self._map, self._skew = distance_map, np.zeros((3, 3))
-        self._noise = odometry.OdometryNoise()
+        self._noise, self._base = odometry.OdometryNoise(), base
         graph = fg.Graph()
         self._x = graph.variables("robot", fg.SE2, 1)
         self._prior = graph.data("predicted pose", np.zeros(3))
@@ -73,10 +77,10 @@ class Localiser:
         self._run = GaussNewton(max_iterations=12, step_tolerance=1e-5).prepare(graph)
 
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
-        """Move by odometry (2,) since the last scan, None for none, and register a scan, if there is one."""
+        """Move by odometry (m,) since the last scan, None for none, and register a scan, if there is one."""
         if odometry is not None:
             self.predict(odometry, dt)
-            scan, self._skew = deskewed(scan, odometry)
+            scan, self._skew = deskewed(scan, self._base.of(odometry))
         if scan is None:
             self.iterations, self.refused = 0, "no scan"
         else:
@@ -88,9 +92,9 @@ class Localiser:
         self.covariance = self._held = np.diag(sigma**2)
 
     def predict(self, u: Array, dt: float) -> None:
-        """Move the estimate by the wheels' measured velocities (2,) [m/s, rad/s]."""
-        self.covariance = odometry.predict(self.pose, self.covariance, u, dt, self._noise)[1]
-        self.pose, self._held = odometry.predict(self.pose, self._held, u, dt, self._noise)
+        """Move the estimate by the wheels' measured controls (m,)."""
+        self.covariance = odometry.predict(self.pose, self.covariance, u, dt, self._noise, self._base)[1]
+        self.pose, self._held = odometry.predict(self.pose, self._held, u, dt, self._noise, self._base)
 
     def correct(self, scan: Scan) -> None:
         """Register a scan on the map; a scan that says too little leaves the prediction, and ``refused`` says so."""
@@ -120,7 +124,7 @@ class Localiser:
 
 
 def deskewed(scan: Scan | None, velocity: Array) -> tuple[Scan | None, Array]:
-    """A scan as it would look at its end, and the covariance (3, 3) that wrong velocities (2,) give its pose.
+    """A scan as it would look at its end, and the covariance (3, 3) that wrong body velocities (k,) give its pose.
 
     They move the middle of the turn, and the whole scan with it.
     """

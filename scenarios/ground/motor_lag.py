@@ -14,6 +14,8 @@ import math
 import numpy as np
 
 from unifg.errors import ScenarioError
+from unifg.models import unicycle
+from unifg.models.planar import Base
 from unifg.scenarios.simulation.drivetrain import followed
 from unifg.typing import Array
 
@@ -24,29 +26,32 @@ THRESHOLD = 8.0  # of the logarithm of a likelihood ratio
 MOST = 30.0  # that is kept of it
 MEMORY = 5.0  # [s] over which it fades
 SCALE = 0.06  # relative standard deviation of what wheels say of their velocities
-FLOOR = np.array([0.02, 0.05])  # the same at rest [m/s, rad/s]
+FLOOR = (0.02, 0.05)  # the same at rest [m/s, rad/s]
 OUTLIER = 9.0  # a squared normalised residual counts as no more than this
 
 
 class MotorLag:
     """Watches the wheels of one base."""
 
-    def __init__(self, dt: float, most: Array) -> None:
+    def __init__(self, dt: float, most: Array, base: Base = unicycle.BASE) -> None:
         """Stand still.
 
         Args:
             dt: duration of a tick [s].
-            most: (2,) greatest changes of v and omega in a tick by the data sheet [m/s, rad/s].
+            most: (m,) greatest changes of the controls in a tick by the data sheet.
+            base: that moves.
 
         Raises:
             ScenarioError: a number that no base can have.
         """
         if not (math.isfinite(dt) and dt > 0.0):
             raise ScenarioError(f"a tick must last a finite, positive time, got {dt!r} s")
-        if np.shape(most) != (2,) or not (np.isfinite(most).all() and np.min(most) >= 0.0):
-            raise ScenarioError(f"greatest changes of v and omega must be two finite numbers >= 0, got {most!r}")
-        self._dt, self._most = dt, most
-        self._velocities = np.zeros((len(LAGS), 2))
+        if np.shape(most) != (base.size,) or not (np.isfinite(most).all() and np.min(most) >= 0.0):
+            raise ScenarioError(
+                f"greatest changes of the controls must be {base.size} finite numbers >= 0, got {most!r}"
+            )
+        self._dt, self._most, self._base = dt, most, base
+        self._velocities = np.zeros((len(LAGS), base.size))
         self._evidence = np.zeros(len(LAGS))
 
     @property
@@ -59,8 +64,8 @@ class MotorLag:
         """Take in a tick.
 
         Args:
-            asked: (2,) velocities asked for [m/s, rad/s]; a tick in which they are not finite says nothing.
-            done: (2,) mean velocities that the wheels have measured; None where they have not.
+            asked: (m,) controls asked for; a tick in which they are not finite says nothing.
+            done: (m,) mean controls that the wheels have measured; None where they have not.
         """
         if not np.isfinite(asked).all():
             return
@@ -69,6 +74,8 @@ class MotorLag:
         self._evidence *= math.exp(-self._dt / MEMORY)
         if done is None:
             return
-        sigma = FLOOR + SCALE * np.abs(expected[0])
-        squares = np.minimum(np.square((done - expected) / sigma), OUTLIER).sum(axis=1)
+        expected, made = self._base.velocities(expected), self._base.of(done)
+        floor = np.array([FLOOR[0]] * (len(made) - 1) + [FLOOR[1]])
+        sigma = floor + SCALE * np.abs(expected[0])
+        squares = np.minimum(np.square((made - expected) / sigma), OUTLIER).sum(axis=1)
         self._evidence = np.clip(self._evidence + 0.5 * (squares[0] - squares), 0.0, MOST)

@@ -8,11 +8,15 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
+from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
+from unifg.models.footprint import Body
+from unifg.models.planar import Base
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.follow import PathFollower
 from unifg.scenarios.planning.grid import SPACING, plan
+from unifg.scenarios.planning.lattice import plan_poses
 from unifg.scenarios.planning.polyline import headed, path_length, resample
 from unifg.typing import Array
 
@@ -76,6 +80,8 @@ class Route:
         robot_radius: float,
         wall_gap: float = WALL_GAP,
         disc_gap: float = GAP,
+        base: Base = unicycle.BASE,
+        body: Body | None = None,
     ) -> None:
         """Plan from ``start`` (3,) to ``goal`` (3,), with the clearances that the controller keeps.
 
@@ -87,13 +93,17 @@ class Route:
             robot_radius: [m].
             wall_gap: between hull and walls that a path must leave [m].
             disc_gap: between hull and discs that a path must leave [m].
+            base: that has to follow the path.
+            body: of the robot; None for a disc.
 
         Raises:
             ScenarioError: when there is no way.
         """
         self._occupancy = occupancy
         self._distance_map = distance_map
-        self._radius = robot_radius
+        self._radius, self._base = robot_radius, base
+        self._body = body or Body.disc(robot_radius)
+        self._oriented = base.turning_radius > 0.0 or not self._body.round
         self._wall_gap, self._disc_gap = wall_gap, disc_gap
         self.repairs = 0
         self.blocked: Blocked | None = None
@@ -106,14 +116,25 @@ class Route:
 
     def _plan(self, start: Array, goal: Array) -> Array:
         """A way (P, 3) on the map alone."""
+        return self._way(self._occupancy, self._distance_map, start, goal)
+
+    def _way(
+        self, occupancy: OccupancyMap, distance_map: DistanceMap, start: Array, goal: Array, discs: Array | None = None
+    ) -> Array:
+        """A way (P, 3) on a map, around discs (K, 3)."""
+        if self._oriented:
+            return plan_poses(
+                occupancy, distance_map, start, goal, base=self._base, body=self._body, gap=self._wall_gap,
+                extra_discs=discs,
+            )  # fmt: skip
         return plan(
-            self._occupancy, self._distance_map, start, goal, robot_radius=self._radius,
-            clearance_least=self._radius + self._wall_gap,
+            occupancy, distance_map, start, goal, robot_radius=self._radius,
+            clearance_least=self._radius + self._wall_gap, extra_discs=discs,
         )  # fmt: skip
 
     def _follow(self, path: Array) -> None:
         self.path = path
-        self._follower = PathFollower(path)
+        self._follower = PathFollower(path, SPACING if self._oriented else 0.0)
         self._reached = 0.0
 
     def reference(self, pose: Array, ahead: Array) -> Array:
@@ -153,8 +174,9 @@ class Route:
         if not len(standing):
             return False
         ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
-        offsets = self.path[ahead, None, :2] - standing.centre
-        room = np.hypot(offsets[..., 0], offsets[..., 1]) - standing.radius
+        offsets = self._body.places(self.path[ahead])[:, :, None] - standing.centre
+        gaps = np.hypot(offsets[..., 0], offsets[..., 1]) + self._body.smaller[:, None]
+        room = gaps.min(axis=1) - standing.radius
         blocked = (room < self._radius + self._disc_gap).any(axis=1)
         if not blocked.any():
             return False
@@ -213,7 +235,7 @@ class Route:
     def _retreat(self, pose: Array) -> None:
         """Go back the way the robot came, and then to the goal again."""
         back = np.stack([pose[:2], *self._crumbs[::-1]])
-        if path_length(back) < CRUMB:
+        if path_length(back) < CRUMB or self._oriented:
             return
         way = headed(resample(back, SPACING), float(pose[2]))
         try:
@@ -229,14 +251,13 @@ class Route:
         target = self.path[index]
         corners = np.stack([pose[:2], target[:2], *self.path[here : index + 1, :2]])
         # A disc the robot nearly touches is taken as small as leaves it free to go.
-        reach = np.hypot(*(tracks.centre - pose[:2]).T) - self._radius - STANDING_GAP
+        near = self._body.places(pose)[:, None] - tracks.centre
+        reach = (np.hypot(near[..., 0], near[..., 1]) + self._body.smaller[:, None]).min(axis=0)
+        reach = reach - self._radius - STANDING_GAP
         discs = np.column_stack([tracks.centre, np.clip(reach, 0.0, tracks.radius + allowance)])
         occupancy, distance_map = (self._occupancy, self._distance_map) if everywhere else self._window(corners)
         try:
-            detour = plan(
-                occupancy, distance_map, pose, target, robot_radius=self._radius,
-                clearance_least=self._radius + self._wall_gap, extra_discs=discs,
-            )  # fmt: skip
+            detour = self._way(occupancy, distance_map, pose, target, discs)
         except ScenarioError:
             return False  # the controller stops before the disc; the next scan may see a way
         self._follow(np.concatenate([detour[:-1], self.path[index:]]))

@@ -11,45 +11,51 @@ import math
 import numpy as np
 
 from unifg.models import unicycle
+from unifg.models.planar import Base
 from unifg.typing import Array
 
 EVADING = 1.0  # [s] for which the robot evades before it brakes
 TURNS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # turning rates tried, in shares of the greatest
 
 
-def stopped(last: Array, plan: Array, most: Array, count: int) -> Array:
-    """Velocities (count, 2) that bring a base to rest along the path of a plan, as soon as its accelerations allow.
+def stopped(last: Array, plan: Array, most: Array, count: int, base: Base = unicycle.BASE) -> Array:
+    """Controls (count, m) that bring a base to rest along the path of a plan, as soon as its accelerations allow.
 
-    The plan is driven more and more slowly, both velocities by the same factor, so that the path keeps its shape. The
-    factor that was good for one step is good for the next, because the plan itself keeps the accelerations; the least
-    that they allow is taken. Where the plan does not go on from the velocities now, both fade by themselves.
+    The plan is driven more and more slowly, all velocities by the same factor, so that the path keeps its shape; a
+    steering angle is that of the place on the path. The factor that was good for one step is good for the next, because
+    the plan itself keeps the accelerations; the least that they allow is taken. Where the plan does not go on from the
+    velocities now, all fade by themselves.
 
     Args:
-        last: (2,) velocities now [m/s, rad/s].
-        plan: (k, 2) those that would come next.
-        most: (2,) greatest changes in a step.
+        last: (m,) controls now.
+        plan: (k, m) those that would come next.
+        most: (m,) greatest changes in a step.
         count: of steps.
+        base: that moves.
     """
-    controls = np.zeros((count, 2))
-    (v, omega), (dv, domega) = last.tolist(), most.tolist()
-    ahead = [[v, omega], *plan.tolist(), [0.0, 0.0]]
-    factor, progress = 1.0, 0.0
+    resting = base.resting.tolist()
+    now, change = last.tolist(), most.tolist()
+    end = plan[-1] if len(plan) else last
+    ahead = [now, *plan.tolist(), np.where(base.resting, 0.0, end).tolist()]
+    controls, factor, progress = np.zeros((count, base.size)), 1.0, 0.0
     for k in range(count):
-        if abs(v) <= dv and abs(omega) <= domega:
+        if all(abs(v) <= d for v, d, falls in zip(now, change, resting, strict=True) if falls):
+            controls[k:, ~base.resting] = np.array(now)[~base.resting]
             break
         progress = min(progress + factor, len(ahead) - 1.0)
         at = min(int(progress), len(ahead) - 2)
         share = progress - at
         wanted = [(1.0 - share) * a + share * b for a, b in zip(ahead[at], ahead[at + 1], strict=True)]
-        low, high = _factors(v, wanted[0], dv)
-        other_low, other_high = _factors(omega, wanted[1], domega)
-        low, high = max(low, other_low, 0.0), min(high, other_high, factor)
+        ends = [
+            _factors(*each) for each, falls in zip(zip(now, wanted, change, strict=True), resting, strict=True) if falls
+        ]
+        low, high = max(*(least for least, _ in ends), 0.0), min(*(greatest for _, greatest in ends), factor)
         if low <= high:
             factor = low
-            v, omega = factor * wanted[0], factor * wanted[1]
+            now = [factor * w if falls else w for w, falls in zip(wanted, resting, strict=True)]
         else:
-            v, omega = v - min(max(v, -dv), dv), omega - min(max(omega, -domega), domega)
-        controls[k] = v, omega
+            now = [v - min(max(v, -d), d) if falls else v for v, d, falls in zip(now, change, resting, strict=True)]
+        controls[k] = now
     return controls
 
 
@@ -62,27 +68,29 @@ def _factors(now: float, wanted: float, most: float) -> tuple[float, float]:
     return min(ends) - slack, max(ends) + slack
 
 
-def evasions(last: Array, most: Array, limits: Array, count: int, dt: float) -> Array:
-    """(E, count, 2) velocities of ways to get out of the way: forwards or back, straight or turning, and then to rest.
+def evasions(last: Array, most: Array, limits: Array, count: int, dt: float, base: Base = unicycle.BASE) -> Array:
+    """(E, count, m) controls of ways to get out of the way: forwards or back, straight or turning, and then to rest.
+
+    A base that slides also goes sideways, and aslant.
 
     Args:
-        last: (2,) velocities now [m/s, rad/s].
-        most: (2,) greatest changes in a step.
-        limits: (2,) greatest velocities.
+        last: (m,) controls now.
+        most: (m,) greatest changes in a step.
+        limits: (m,) greatest controls.
         count: of steps.
         dt: [s].
+        base: that moves.
     """
-    wanted = np.array([(sense, turn) for sense in (1.0, -1.0) for turn in TURNS]) * limits
+    aside = [(0.0,)] if base.slides else [()]
+    ways = [(sense, *none, turn) for sense in (1.0, -1.0) for none in aside for turn in TURNS]
+    if base.slides:
+        ways += [(ahead, left, 0.0) for ahead in (-1.0, 0.0, 1.0) for left in (-1.0, 1.0)]
+    wanted = np.array(ways) * limits
     steps = np.arange(1, count + 1)[None, :, None]
     going = min(round(EVADING / dt), count)
     towards = wanted - last
-    ways: Array = last + np.sign(towards)[:, None] * np.minimum(np.abs(towards)[:, None], most * steps)
-    reached = ways[:, going - 1, None]
+    driven: Array = last + np.sign(towards)[:, None] * np.minimum(np.abs(towards)[:, None], most * steps)
+    reached = driven[:, going - 1, None]
     slowing = np.sign(reached) * np.maximum(np.abs(reached) - most * (steps - going), 0.0)
-    ways[:, going:] = slowing[:, going:]
-    return ways
-
-
-def followed(pose: Array, last: Array, controls: Array, dt: float) -> Array:
-    """(N + 1, 3) poses from ``pose`` on under velocities (N, 2) that are reached at the ends of their steps."""
-    return unicycle.rollout(pose, unicycle.ramp(last, controls), dt)
+    driven[:, going:] = np.where(base.resting, slowing, reached)[:, going:]
+    return driven

@@ -8,6 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
+from unifg.models.footprint import Body, body_of
 from unifg.scenarios.logs.columns import column, ragged, words
 from unifg.scenarios.logs.stored import StoredLog
 from unifg.typing import Array, BoolArray, IntArray
@@ -28,7 +29,7 @@ class EpisodeLog(StoredLog):
         goals: (G, 3) goal poses [m, m, rad].
         start: (3,) true start pose [m, m, rad].
         dt: control period [s].
-        robot_radius: radius of the robot's disc [m].
+        robot_radius: radius of the robot's disc, or of the largest disc of its body [m].
         solver: name of the backend, or of the planner in its place.
         coupling: how estimation and control were joined, such as ``"sequential"``.
         seed: seed of the episode.
@@ -36,12 +37,15 @@ class EpisodeLog(StoredLog):
         collisions: distinct contact events of the episode.
         reached: one flag per goal.
         obstacle_moves: (K,) True for obstacles that move.
-        control_limits: greatest abs(v) [m/s] and abs(omega) [rad/s].
+        control_limits: greatest absolute values of the controls.
         scenario: name of the scenario.
         interrupted: the user stopped the episode before its end.
         outcomes: what has become of every goal, in words.
         dropped: samples that were not let in, by what was wrong with them.
         faults: what was made to go wrong.
+        obstacles_wanted: unforeseen obstacles that were asked for; fewer may have found a place.
+        base: kind of base of the robot.
+        body: of the robot, as its option has it; "" for a disc.
     """
 
     KIND: ClassVar[str] = "unifg drive log 2"
@@ -59,12 +63,15 @@ class EpisodeLog(StoredLog):
     collisions: int
     reached: list[bool]
     obstacle_moves: BoolArray
-    control_limits: tuple[float, float] = (1.0, 1.0)
+    control_limits: tuple[float, ...] = (1.0, 1.0)
     scenario: str = "navigation"
     interrupted: bool = False
     outcomes: list[str] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
+    obstacles_wanted: int = 0
+    base: str = "unicycle"
+    body: str = ""
 
     time: Array = column("s")
     true_pose: Array = column("m, m, rad", 3)
@@ -74,8 +81,8 @@ class EpisodeLog(StoredLog):
     """Pose integrated from the wheel odometry alone."""
     covariance: Array = column("m^2, m rad, rad^2", 3, 3)
     """Of the estimate, in its tangent space."""
-    control: Array = column("m/s, rad/s", 2)
-    """Commanded v and omega."""
+    control: Array = column("m/s, rad/s", None)
+    """Commanded controls: of a unicycle v and omega, of a car v and the steering angle, or v_x, v_y and omega."""
     route: list[Array] = ragged("m, m, rad", 3, lasting=True)
     """The path to the present goal, as repaired so far."""
     horizon: Array = column("m, m, rad", None, 3)
@@ -130,6 +137,11 @@ class EpisodeLog(StoredLog):
         """(T,) all that a tick takes [ms]."""
         total: Array = self.localise_ms + self.perceive_ms + self.route_ms + self.plan_ms
         return total
+
+    @property
+    def hull(self) -> Body:
+        """Body of the robot."""
+        return body_of(self.body) if self.body else Body.disc(self.robot_radius)
 
     @property
     def succeeded(self) -> bool:

@@ -60,7 +60,7 @@ class Validator:
         self._beams = beams
         self._last: Array | None = None
         self._time = -math.inf
-        self._since = np.zeros(2)
+        self._since: Array = np.zeros(2)
 
     # ------------------------------------------------------------------ lidar
 
@@ -108,24 +108,25 @@ class Validator:
     # ----------------------------------------------------------------- wheels
 
     def odometry(self, measured: Array | None, applied: Array, dt: float) -> Array:
-        """The wheels' velocities (2,) [m/s, rad/s]; where they are none, those that were asked for.
+        """The wheels' controls (m,); where they are none, those that were asked for.
 
         Args:
             measured: as they arrived; None where none did.
-            applied: (2,) asked for since the last tick.
+            applied: (m,) asked for since the last tick.
             dt: duration [s].
         """
-        found = _numbers(measured, (2,))
-        numbers = np.zeros(2) if found is None else found
+        size, (speed, turning) = len(applied), self.settings.max_speed
+        found = _numbers(measured, (size,))
+        numbers = np.zeros(size) if found is None else found
         wrong = first_true(
             (measured is None, "none came"),
-            (found is None, "not two numbers"),
+            (found is None, f"not {size} numbers"),
             (not np.isfinite(numbers).all(), "not finite"),
-            (bool((np.abs(numbers) > self.settings.max_speed).any()), "faster than any wheel"),
+            (bool((np.abs(numbers) > [*[speed] * (size - 1), turning]).any()), "faster than any wheel"),
         )
         self._note("wheels", wrong)
         velocities = applied if wrong else numbers
-        self._since += np.abs(velocities) * dt
+        self._since += np.array([np.abs(velocities[:-1]).max(), abs(velocities[-1])]) * dt
         return velocities
 
     # ---------------------------------------------------------------- reading

@@ -26,6 +26,7 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2, wrap_angle
 from unifg.models import lidar, unicycle
 from unifg.models.distance_map import DistanceMap
+from unifg.models.planar import Base
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -107,9 +108,10 @@ class MonteCarlo:
         sigma: Array,
         rng: np.random.Generator,
         own: MonteCarloSettings | None = None,
+        base: Base = unicycle.BASE,
     ) -> None:
         """Draw the first particles around a pose (3,) with standard deviations (3,) [m, m, rad]."""
-        self.own = own or MonteCarloSettings()
+        self.own, self._base = own or MonteCarloSettings(), base
         self._rng, self._distances, self._occupancy = rng, distance_map, occupancy
         self._free: IntArray = np.argwhere(occupancy.free & ~occupancy.occupied)
         self.iterations, self.refused = self.own.particles[1], ""
@@ -132,12 +134,12 @@ class MonteCarlo:
         self._summarise()
 
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
-        """Move by odometry (2,) since the last scan, None for none; weigh by a scan once the robot has moved enough."""
+        """Move by odometry (m,) since the last scan, None for none; weigh by a scan once the robot has moved enough."""
         self.refused = "" if scan is not None else "no scan"
         if odometry is not None:
             u = np.asarray(odometry, dtype=np.float64)[None]
-            self._since = unicycle.step(self._since[None], u, dt)[0]
-            scan = None if scan is None else scan.deskewed(u[0])
+            self._since = self._base.step(self._since[None], u, dt)[0]
+            scan = None if scan is None else scan.deskewed(self._base.of(u[0]))
         far = np.hypot(*self._since[:2]) >= self.own.moved[0] or abs(self._since[2]) >= self.own.moved[1]
         if scan is None or not (far or self._fresh) or not lidar.usable(scan.ranges).any():
             self.pose = SE2.compose(self._mean[None], self._since[None])[0]

@@ -71,13 +71,14 @@ class Scan:
         """The scan as it would look from where the last beam was taken.
 
         Args:
-            velocity: (2,) forward and turning velocities of the lidar during the turn [m/s, rad/s].
+            velocity: (k,) body velocities of the lidar during the turn: forward and turning, of one that slides
+                sideways between them [m/s, rad/s].
         """
         if not self.turn or not velocity.any():
             return self
         count = len(self.angles)
         since = self.turn * (np.arange(count) - (count - 1)) / count
-        motion = since[:, None] * np.array([velocity[0], 0.0, velocity[1]])
+        motion = since[:, None] * np.array([*velocity[:-1], *[0.0] * (3 - len(velocity)), velocity[-1]])
         poses = SE2.exp(motion)
         ranges = np.where(self.valid, self.ranges, 1.0)
         points = SE2.act(poses, ranges[:, None] * np.column_stack([np.cos(self.angles), np.sin(self.angles)]))

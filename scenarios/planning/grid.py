@@ -20,6 +20,7 @@ from unifg.codegen.jit import compiled
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap, bilinear
+from unifg.scenarios.planning.heap import pop, push
 from unifg.scenarios.planning.polyline import headed, resample
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -27,6 +28,7 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 _log = logging.getLogger("unifg")
 
+WEIGHTS = (0.125, 0.75, 0.125)  # of the quadratic B-spline in the middle of a cell
 SPACING = 0.05  # between the poses of a planned path [m]
 _COMFORT = 0.15  # inflation beyond the robot's radius that is tried first [m]
 _LEVEL_STEP = 0.01  # the inflation is lowered by steps of this size until a way exists [m]
@@ -37,10 +39,15 @@ _SMOOTHING_SWEEPS = 400  # diffusion length sqrt(0.5 sweeps) SPACING = 0.7 m
 _ATTACH = 0.5  # how far start or goal may lie from the inflated free space [m]
 
 
-class _Clearance:
+class Clearance:
     """Distance to the nearest wall or disc, on the cells and between them."""
 
     def __init__(self, occupancy: OccupancyMap, distance_map: DistanceMap, discs: ArrayLike | None) -> None:
+        """Lower a map's distances around discs (K, 3) x, y, radius [m].
+
+        Raises:
+            ScenarioError: map and distances differ in shape.
+        """
         if distance_map.values.shape != occupancy.shape:
             raise ScenarioError(
                 f"planner: distance map {distance_map.values.shape} and map {occupancy.name!r} "
@@ -49,8 +56,8 @@ class _Clearance:
         self.occupancy = occupancy
         self.field = distance_map
         # Compiled for one layout: a part of a map, or a read-only array, would be compiled for anew.
-        self.discs: Array = _plain(np.asarray([] if discs is None else discs, dtype=np.float64).reshape(-1, 3))
-        self.known: BoolArray = _plain(occupancy.free)
+        self.discs: Array = plain(np.asarray([] if discs is None else discs, dtype=np.float64).reshape(-1, 3))
+        self.known: BoolArray = plain(occupancy.free)
         self.grid: Array = distance_map.values
         if len(self.discs):
             self.grid = self.grid.copy()
@@ -59,8 +66,22 @@ class _Clearance:
         self.passable: BoolArray = occupancy.free
 
     def restrict(self, least: float) -> None:
-        """Enter no cell where the smoothed field of :class:`SmoothField`, which a controller keeps to, is lower."""
-        self.passable = self.occupancy.free & (smoothed(self.field.values) >= least)
+        """Enter no cell where the smoothed field of :class:`SmoothField`, which a controller keeps to, is lower.
+
+        It is looked at in the middle of the cell and of its sides: the middle line of a door may run between two cells.
+        """
+        values = self.field.values
+        highest = smoothed(values)
+        for axis in (0, 1):
+            side = ndimage.correlate1d(
+                ndimage.correlate1d(values, [0.5, 0.5], axis=axis, mode="nearest"),
+                WEIGHTS,
+                axis=1 - axis,
+                mode="nearest",
+            )  # between the cell before and this one
+            after = np.roll(side, -1, axis=axis)
+            highest = np.maximum(highest, np.maximum(side, after))
+        self.passable = self.occupancy.free & (highest >= least)
 
     def _lower_around(self, x: float, y: float, radius: float) -> None:
         reach = (radius + 2.0) / self.occupancy.resolution  # beyond two metres no inflation asks
@@ -117,7 +138,7 @@ def is_free(occupancy: OccupancyMap, points: Array) -> BoolArray:
     return np.asarray(inside & occupancy.free[row.clip(0, height - 1), column.clip(0, width - 1)], dtype=bool)
 
 
-def _plain(array: NDArray[Scalar]) -> NDArray[Scalar]:
+def plain(array: NDArray[Scalar]) -> NDArray[Scalar]:
     """The array, or a copy of it, row by row and to be written to."""
     return np.require(array, requirements=["C", "W"])
 
@@ -157,7 +178,7 @@ def plan(
         raise ScenarioError(
             f"planner: start {start_pose.shape} and goal {goal_pose.shape} must be poses (x, y, heading)"
         )
-    clearance = _Clearance(occupancy, distance_map, extra_discs)
+    clearance = Clearance(occupancy, distance_map, extra_discs)
     for name, pose in (("start", start_pose), ("goal", goal_pose)):
         _check_standing(clearance, name, pose, robot_radius)
     least = robot_radius if clearance_least is None else max(clearance_least, robot_radius)
@@ -186,16 +207,15 @@ def plan(
     # of the grid.
     for stride in (1, 5):
         points = _shorten(clearance, resample(points, SPACING), float(level), robot_radius, stride)
-    points = _plain(resample(_smooth(clearance, resample(points, SPACING), preferred), SPACING))
+    points = plain(resample(_smooth(clearance, resample(points, SPACING), preferred), SPACING))
     _leave_corners(clearance.field.table, clearance.discs, points, float(level))
     return headed(points, float(goal_pose[2]))
 
 
 def smoothed(values: Array) -> Array:
     """Values (H, W) of the quadratic B-splines over a grid at the middles of its cells, its border repeated."""
-    weights = np.array([0.125, 0.75, 0.125])
-    across = ndimage.correlate1d(values, weights, axis=0, mode="nearest")
-    found: Array = ndimage.correlate1d(across, weights, axis=1, mode="nearest")
+    across = ndimage.correlate1d(values, WEIGHTS, axis=0, mode="nearest")
+    found: Array = ndimage.correlate1d(across, WEIGHTS, axis=1, mode="nearest")
     return found
 
 
@@ -218,12 +238,12 @@ def path_exists(
         clearance: distance from the robot's centre to every wall and disc along the way [m].
         discs: (K, 3) x, y, radius [m] of obstacles that are not on the map.
     """
-    room = _Clearance(occupancy, distance_map, discs)
+    room = Clearance(occupancy, distance_map, discs)
     first, last = (np.asarray(pose, dtype=np.float64)[:2] for pose in (start, goal))
     return _connected(room, first, last, clearance, 0.0) is not None
 
 
-def _check_standing(clearance: _Clearance, name: str, pose: Array, robot_radius: float) -> None:
+def _check_standing(clearance: Clearance, name: str, pose: Array, robot_radius: float) -> None:
     """Refuse a pose at which the robot cannot stand, saying why."""
     occupancy = clearance.occupancy
     where = f"planner: {name} ({pose[0]:.2f}, {pose[1]:.2f})"
@@ -251,7 +271,7 @@ def _check_standing(clearance: _Clearance, name: str, pose: Array, robot_radius:
 _Route = tuple[BoolArray, tuple[int, int], tuple[int, int]]
 
 
-def _connected(clearance: _Clearance, start: Array, goal: Array, level: float, least: float) -> _Route | None:
+def _connected(clearance: Clearance, start: Array, goal: Array, level: float, least: float) -> _Route | None:
     """The open cells that join start and goal and the two cells at which these join them, or None."""
     cells = clearance.open_cells(level)
     labels, _ = ndimage.label(cells)  # joined along edges: every joined square of cells can also be crossed diagonally
@@ -265,14 +285,14 @@ def _connected(clearance: _Clearance, start: Array, goal: Array, level: float, l
     return component, first, last
 
 
-def _cost(distance: Array, robot_radius: float) -> Array:
+def cost_per_metre(distance: Array, robot_radius: float) -> Array:
     """Cost per metre at these clearances: one, and more where walls are near."""
     lacking = np.clip((robot_radius + _WIDE - distance) / _WIDE, 0.0, 1.0)
     return 1.0 + _PENALTY * lacking * lacking
 
 
 def _cheapest(
-    clearance: _Clearance,
+    clearance: Clearance,
     cells: BoolArray,
     first: tuple[int, int],
     last: tuple[int, int],
@@ -283,9 +303,9 @@ def _cheapest(
     corner = np.array([rows[0], columns[0]])
     part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     cells = cells[part]
-    cost = _plain(_cost(clearance.grid[part], robot_radius))
+    cost = plain(cost_per_metre(clearance.grid[part], robot_radius))
     source, target = (np.array(cell) - corner for cell in (first, last))
-    before = _search(_plain(cells), cost, source, target)
+    before, _ = search(plain(cells), cost, source, target)
     chain = [int(source[0] * cells.shape[1] + source[1])]
     end = int(target[0] * cells.shape[1] + target[1])
     while chain[-1] != end:
@@ -295,11 +315,12 @@ def _cheapest(
 
 
 @compiled
-def _search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -> IntArray:
-    """Predecessor of every cell on the cheapest chain from ``target``, flat, as far as the way to ``source`` needs.
+def search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -> tuple[IntArray, Array]:
+    """Predecessor and cost of every cell on the cheapest chain from ``target``, flat, as far as ``source`` needs.
 
     Hart, Nilsson and Raphael's A* with the cheapest that eight directions allow; cells cost one per side at least. The
-    search runs from the target, so that the chain of predecessors runs from start to goal.
+    search runs from the target, so that the chain of predecessors runs from start to goal. With a source that is no
+    cell it goes on to all that can be reached.
     """
     height, width = cells.shape
     before = np.full(height * width, -1, dtype=np.int64)
@@ -311,19 +332,8 @@ def _search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -
     spent[begin] = 0.0
     keys[0], places[0], size = 0.0, begin, 1
     while size > 0:
-        current = places[0]
+        current = pop(keys, places, size)
         size -= 1
-        key, place, at = keys[size], places[size], 0
-        while True:  # the last one sinks from the top of the heap
-            child = 2 * at + 1
-            if child >= size:
-                break
-            if child + 1 < size and keys[child + 1] < keys[child]:
-                child += 1
-            if keys[child] >= key:
-                break
-            keys[at], places[at], at = keys[child], places[child], child
-        keys[at], places[at] = key, place
         if done[current]:
             continue
         done[current] = True
@@ -344,12 +354,8 @@ def _search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -
             spent[neighbour], before[neighbour] = total, current
             away, aside = abs(i - source[0]), abs(j - source[1])
             key = total + max(away, aside) + (math.sqrt(2.0) - 1.0) * min(away, aside)
-            at, size = size, size + 1
-            while at > 0 and keys[(at - 1) // 2] > key:
-                keys[at], places[at] = keys[(at - 1) // 2], places[(at - 1) // 2]
-                at = (at - 1) // 2
-            keys[at], places[at] = key, neighbour
-    return before
+            size = push(keys, places, size, key, neighbour)
+    return before, spent
 
 
 @compiled
@@ -365,11 +371,11 @@ def _nearest(table: Array, discs: Array, x: float, y: float) -> tuple[float, flo
     return distance, slope_x, slope_y
 
 
-def _shorten(clearance: _Clearance, points: Array, level: float, robot_radius: float, stride: int) -> Array:
+def _shorten(clearance: Clearance, points: Array, level: float, robot_radius: float, stride: int) -> Array:
     """Replace stretches of the grid path by straight lines that cost no more and keep the inflation."""
     middle = clearance.at(0.5 * (points[1:] + points[:-1]))
     step = np.hypot(*np.diff(points, axis=0).T)
-    spent = np.concatenate([[0.0], np.cumsum(step * _cost(middle, robot_radius))])
+    spent = np.concatenate([[0.0], np.cumsum(step * cost_per_metre(middle, robot_radius))])
     # The stubs from start and goal to the grid may be nearer to walls than the inflation; lines beside them
     # may be too.
     floor = np.minimum(clearance.at(points), level)
@@ -439,9 +445,9 @@ def _good_line(
     return bool(length * total / (pieces + 1) <= most)
 
 
-def _smooth(clearance: _Clearance, points: Array, preferred: float) -> Array:
+def _smooth(clearance: Clearance, points: Array, preferred: float) -> Array:
     """Diffuse the corners away; no point moves nearer to a wall unless it keeps the preferred clearance."""
-    points = _plain(points)
+    points = plain(points)
     _diffuse(clearance.field.table, clearance.known, clearance.discs, points, preferred, _SMOOTHING_SWEEPS)
     return points
 

@@ -86,15 +86,19 @@ def plot_localisation(log: EpisodeLog, ax: Axes) -> Axes:
 
 
 def plot_controls(log: EpisodeLog, speed: Axes, turning: Axes) -> None:
-    """Forward and turning speed over time against their limits, in two axes."""
-    names = (("v [m/s]", "Forward speed and its limits"), ("$\\omega$ [rad/s]", "Turning speed and its limits"))
+    """Forward and turning speed, or the steering angle, over time against their limits, in two axes."""
+    turn = ("$\\omega$ [rad/s]", "Turning speed and its limits")
+    if log.base.startswith("ackermann"):
+        turn = ("$\\delta$ [rad]", "Steering angle and its limits")
+    names = (("v [m/s]", "Forward speed and its limits"), turn)
     style = {"color": css("robot"), "lw": 1.1, "drawstyle": "steps-post"}
-    rows = zip((speed, turning), log.control.T, log.control_limits, names, strict=True)
-    for ax, values, limit, (label, title) in rows:
-        bounds, curve = (-1.18 * limit, 1.18 * limit), (values, style)
-        over_time(log, ax, title, label, [curve], levels=(-limit, limit), bounds=bounds)
+    for ax, column, (label, title) in zip((speed, turning), (0, -1), names, strict=True):
+        limit, curves = log.control_limits[column], [(log.control[:, column], style)]
+        if column == 0 and log.control.shape[1] > 2:
+            curves.append((log.control[:, 1], {**style, "color": css("estimate"), "label": "sideways"}))
+        over_time(log, ax, title, label, curves, levels=(-limit, limit), bounds=(-1.18 * limit, 1.18 * limit))
     shade_trouble(speed, log.dt, log.health, log.cause, "Forward speed")
-    if float(log.control[:, 0].min()) >= 0.0:  # it never reversed: show the half that was used
+    if float(log.control[:, :-1].min()) >= 0.0:  # it never reversed: show the half that was used
         speed.set_ylim(bottom=-0.08 * log.control_limits[0])
 
 

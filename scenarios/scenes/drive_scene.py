@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 
 from unifg.lie import SE2
+from unifg.models.footprint import Body
+from unifg.models.planar import base_of
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.metrics import collision_words, health, one_graph
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
-from unifg.scenarios.scenes.parts import draw_way, pillar
+from unifg.scenarios.scenes.parts import draw_way, pillar, standing
 from unifg.typing import Array, IntArray
 from unifg.view import Frame, Part, Scene, shapes
 
@@ -34,6 +36,11 @@ _SIGMAS, _ENLARGED = 3.0, 10.0  # of the ellipse of the estimate: centimetres in
 def _error(log: Any, k: int) -> float:
     """Localisation error [cm]."""
     return 100.0 * float(np.hypot(*(log.estimate[k] - log.true_pose[k])[:2]))
+
+
+def _velocity(log: Any, k: int) -> Array:
+    """Body velocities that were asked for."""
+    return base_of(log.base).of(np.asarray(log.control[k]))
 
 
 def _deviations(log: Any, k: int) -> str:
@@ -53,8 +60,8 @@ def _whole(log: Any, k: int) -> str:
 
 
 NUMBERS = (
-    Number("speed", lambda log, k: f"{log.control[k][0]:.2f} m/s"),
-    Number("turn", lambda log, k: f"{log.control[k][1]:.2f} rad/s"),
+    Number("speed", lambda log, k: f"{_velocity(log, k)[0]:.2f} m/s"),
+    Number("turn", lambda log, k: f"{_velocity(log, k)[-1]:.2f} rad/s"),
     Number("goal", lambda log, k: f"{log.goal_index[k] + 1} of {len(log.goals)}"),
     Number("localise + plan", None, lambda log, k: log.solve_ms[k], plot={"unit": "ms", "log": True}),
     Number(
@@ -133,7 +140,7 @@ def drive_stage(log: Any, outcomes: Sequence[str] = ()) -> Scene:
     scene.around = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, _WALL)])
     scene.speeds = (1, 2, 4, 8)
     scene.facts |= {"solver": f"{log.solver} ({log.coupling})", "seed": str(log.seed)}
-    _robots(scene, log.robot_radius, pin)
+    _robots(scene, log.hull, pin)
     for name, swatch, colour, words, width in LAYERS:
         scene.layer(name, swatch, colour, words, width * stroke or None)
     _goals(scene, log, stroke, pin)
@@ -201,7 +208,7 @@ def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
     return hits
 
 
-def _robots(scene: Scene, radius: float, pin: float) -> None:
+def _robots(scene: Scene, hull: Body, pin: float) -> None:
     """The robot where it truly is, where it believes to be, and where its wheels alone would put it."""
     # A pin hovers above the robot, which would be a few pixels in a whole building.
     turned = np.diag([0.25 * pin, 0.25 * pin, 0.75 * pin])[None]
@@ -212,9 +219,9 @@ def _robots(scene: Scene, radius: float, pin: float) -> None:
         ("odometry", 0.0, 0.0, 0.55, 0.8, "where its wheels alone would put it"),
     ):
         true, height = name == "robot", _BODY + higher
-        heading = shapes.wedge(1.2 * radius, height + 0.02)
+        heading = shapes.wedge(1.2 * hull.radius, height + 0.02)
         parts = [
-            pillar(radius + wider, height, name)._replace(opacity=opacity),
+            standing(hull, height, name, wider)._replace(opacity=opacity),
             Part("heading", heading, "heading" if true else name, False, clear),
             *([Part("pin", tip, "robot")] if true else []),
         ]

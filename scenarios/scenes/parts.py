@@ -6,11 +6,12 @@ import math
 
 import numpy as np
 
+from unifg.models.footprint import Body
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["draw_way", "floor", "layout", "pillar", "vehicle"]
+__all__ = ["draw_way", "floor", "layout", "pillar", "standing", "vehicle"]
 
 _NODES = 16  # of a way that changes from frame to frame
 _FLOOR = -0.02  # height of the floor, clear of what stands on it [m]
@@ -73,5 +74,19 @@ def draw_way(frame: Frame, name: str, way: Array) -> Array:
 
 def pillar(radius: float, height: float, colour: str) -> Part:
     """Upright cylinder [m]."""
-    column = shapes.copies(shapes.column(), np.zeros((1, 3)), np.diag([radius, radius, height])[None])
-    return Part("body", column, colour)
+    return standing(Body.disc(radius), height, colour)
+
+
+def standing(body: Body, height: float, colour: str, wider: float = 0.0) -> Part:
+    """Upright body [m], wider than it is."""
+    if body.outline:
+        corners = np.array(body.outline)
+        rim = corners * (1.0 + wider / np.hypot(*corners.T)[:, None])
+        low, high = (np.column_stack([rim, np.full(len(rim), z)]) for z in (0.0, height))
+        sides = shapes.quads(np.stack([low, np.roll(low, -1, axis=0), np.roll(high, -1, axis=0), high], axis=1))
+        fan = np.array([[0, k, k + 1] for k in range(1, len(rim) - 1)], dtype=np.intp)
+        return Part("body", shapes.merge([sides, (high, fan)]), colour)
+    discs = np.array(body.discs)
+    places = np.column_stack([discs[:, :2], np.zeros(len(discs))])
+    turns = np.stack([np.diag([radius + wider, radius + wider, height]) for radius in discs[:, 2]])
+    return Part("body", shapes.copies(shapes.column(), places, turns), colour)

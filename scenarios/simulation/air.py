@@ -21,6 +21,7 @@ import pymunk
 from unifg.errors import ScenarioError
 from unifg.lie import SO3
 from unifg.models import quadrotor
+from unifg.models.footprint import Body
 from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.planning.passage import obstacle_distance
 from unifg.scenarios.simulation.bearing_range import Sensor, SensorModel
@@ -96,7 +97,7 @@ class QuadrotorWorld(Space):
         self.grounded = False
         self._state = _start_state(layout, start)
         self._rates, self._force = np.zeros(3), SO3.act(SO3.inverse(self._state[3:7]), UP)
-        super().__init__(self._state[:2], VEHICLE_RADIUS)
+        super().__init__(self._state[:2], Body.disc(VEHICLE_RADIUS))
         if self._state[2] <= 0.0:
             self.begin(_FLOOR, counts=False)  # a start on the ground is no collision
         shapes = self._add_things()

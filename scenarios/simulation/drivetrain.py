@@ -10,15 +10,18 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from unifg.errors import ScenarioError
+from unifg.models import unicycle
+from unifg.models.planar import Base
 from unifg.scenarios.options import not_negative, option, positive, share
 from unifg.typing import Array
 
-__all__ = ["Drivetrain", "Wheels", "followed"]
+__all__ = ["PLANTS", "Drivetrain", "Wheels", "followed", "plant"]
 
 
 @dataclass(frozen=True)
@@ -72,28 +75,45 @@ class Drivetrain:
         return self.acceleration, self.turning
 
 
+PLANTS: dict[str, dict[str, float]] = {
+    "light": {},
+    "pmb2": {"acceleration": 1.0, "turning": 2.1},
+    "harsh": {"acceleration": 1.0, "turning": 2.1, "lag": 0.1, "latency": 0.05, "slip": 0.05, "skid": 0.05},
+}
+"""Bases by name: that of the DWB example, PAL's PMB-2, and one whose motors and floor are worse than it is told."""
+
+
+def plant(name: str, drivetrain: Drivetrain) -> Drivetrain:
+    """A drivetrain with the numbers of a named base where it has the usual ones."""
+    usual = Drivetrain()
+    preset = {key: value for key, value in PLANTS[name].items() if getattr(drivetrain, key) == getattr(usual, key)}
+    return replace(drivetrain, **preset)
+
+
 class Wheels:
-    """The velocities of a base's wheels over time.
+    """The controls of a base over time, as its motors make them.
 
     Attributes:
-        velocity: (2,) forward and turning, of the wheels now [m/s, rad/s].
+        velocity: (m,) of the motors now: of a unicycle forward and turning [m/s, rad/s].
     """
 
-    def __init__(self, drivetrain: Drivetrain) -> None:
+    def __init__(self, drivetrain: Drivetrain, base: Base = unicycle.BASE) -> None:
         """Stand still, told to stand still."""
         self._drivetrain = drivetrain
-        self._most = np.array(drivetrain.sheet) / (1.0 + drivetrain.load)
+        self._most = base.spread(drivetrain.sheet) / (1.0 + drivetrain.load)
+        if base.steering is not None and np.isfinite(self._most[-1]):
+            self._most[-1] = base.steering[1]
         self._coming: deque[tuple[float, Array]] = deque()
-        self._told = np.zeros(2)
+        self._told = np.zeros(base.size)
         self._now = 0.0
-        self.velocity = np.zeros(2)
+        self.velocity = np.zeros(base.size)
 
-    def tell(self, command: tuple[float, float]) -> None:
-        """Send a command (v, omega) [m/s, rad/s] now; it acts after the latency, until another does."""
+    def tell(self, command: Sequence[float]) -> None:
+        """Send a command (m,) now; it acts after the latency, until another does."""
         self._coming.append((self._now + self._drivetrain.latency, np.array(command)))
 
-    def advance(self, dt: float) -> tuple[float, float]:
-        """Let time pass; mean velocities (v [m/s], omega [rad/s]) over ``dt`` [s].
+    def advance(self, dt: float) -> Array:
+        """Let time pass; (m,) mean controls over ``dt`` [s].
 
         A command takes effect at the beginning of the interval in which its time comes, half an interval early or late.
         """
@@ -101,7 +121,7 @@ class Wheels:
             self._told = self._coming.popleft()[1]
         self._now += dt
         self.velocity, mean = followed(self._told, self.velocity, self._drivetrain.lag, self._most * dt, dt)
-        return float(mean[0]), float(mean[1])
+        return mean
 
 
 def followed(told: Array, before: Array, lag: float, most: Array, dt: float) -> tuple[Array, Array]:

@@ -14,7 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from unifg.errors import ScenarioError
+from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap
+from unifg.models.planar import Base
 from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.typing import Array
@@ -106,12 +109,18 @@ class _Faults:
 class DriveFaults(_Faults):
     """Faults of a drive."""
 
-    def __init__(self, faults: Sequence[Fault], seed: int) -> None:
-        """Begin before the first tick."""
+    def __init__(self, faults: Sequence[Fault], seed: int, base: Base = unicycle.BASE) -> None:
+        """Begin before the first tick.
+
+        Raises:
+            ScenarioError: a fault of wheels that the base does not have.
+        """
         super().__init__(faults, seed)
+        if base is not unicycle.BASE and any(fault.kind == "wheel-dead" for fault in faults):
+            raise ScenarioError("the fault 'wheel-dead' is one of a unicycle's two wheels: leave it or --base out")
         self._scans: deque[Scan] = deque(maxlen=100)
         self._frozen: Scan | None = None
-        self._driven = np.zeros(2)
+        self._driven = np.zeros(base.size)
         self._carried = False
 
     def scan(self, scan: Scan, now: float) -> Scan | None:
@@ -134,13 +143,13 @@ class DriveFaults(_Faults):
         return next((found for kind, found in arriving.items() if self.hold(kind, now)), scan)
 
     def odometry(self, measured: Array, now: float) -> Array:
-        """Velocities (2,) of the wheels that arrive [m/s, rad/s]."""
+        """Odometry (m,) that arrives."""
         if self.hold("odometry-nan", now):
-            return np.full(2, math.nan)
-        return measured * [SPIN, 1.0] if self.hold("odometry-slip", now) else measured
+            return np.full(len(measured), math.nan)
+        return measured * [*[SPIN] * (len(measured) - 1), 1.0] if self.hold("odometry-slip", now) else measured
 
     def control(self, asked: Array, now: float, dt: float) -> Array:
-        """Velocities (2,) that the motors make of those asked for [m/s, rad/s] over ``dt`` [s]."""
+        """Controls (m,) that the motors make of those asked for over ``dt`` [s]."""
         done = asked
         if self.hold("actuator-lag", now):
             done = self._driven + (1.0 - math.exp(-dt / LAG)) * (asked - self._driven)

@@ -1,4 +1,4 @@
-"""The simulated truth of a drive: a disc robot, walls and unforeseen obstacles, a lidar and wheel odometry.
+"""The simulated truth of a drive: a robot, walls and unforeseen obstacles, a lidar and wheel odometry.
 
 The world is built from an occupancy map and from obstacles that the map does not show. What the robot may
 know of it is what `World.scan` and `World.odometry` return; everything else (`World.pose`, `World.clearance`,
@@ -20,6 +20,10 @@ import pymunk
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
+from unifg.lie import SE2
+from unifg.models import unicycle
+from unifg.models.footprint import Body
+from unifg.models.planar import Base
 from unifg.scenarios.options import not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
@@ -32,6 +36,7 @@ __all__ = ["ROBOT_RADIUS", "LidarModel", "OdometryModel", "World"]
 ROBOT_RADIUS = 0.17
 """Radius of the robot's disc [m]."""
 
+HULL_SPACING = 0.02  # [m] between places of a hull whose distance from walls and obstacles is measured
 _REST_SPEED = 0.02  # [m/s]; below it the robot counts as being at rest
 
 EDGE = 0.3
@@ -107,6 +112,8 @@ class World(Space):
         lidar: LidarModel | None = None,
         odometry: OdometryModel | None = None,
         drivetrain: Drivetrain | None = None,
+        base: Base = unicycle.BASE,
+        body: Body | None = None,
         yields: bool = True,
         people: Sequence[Mover] = (),
     ) -> None:
@@ -117,10 +124,12 @@ class World(Space):
             start: (3,) true pose of the robot at time zero [m, m, rad].
             obstacles: discs that are not on the map.
             rng: source of all noise; its children are spawned, itself it is not advanced. None seeds with 0.
-            robot_radius: [m].
+            robot_radius: of a robot that is a disc [m].
             lidar: lidar to simulate; None for 360 beams, 12 m, 0.02 m, 1 % dropouts.
             odometry: wheel odometry to simulate; None for 5 % scale error and 2 % noise.
             drivetrain: what the base makes of its commands; None for a base that follows them at once.
+            base: of the robot.
+            body: of the robot; None for a disc.
             yields: obstacles that move stop before a robot at rest instead of going on through it.
             people: walk about by social forces.
 
@@ -137,14 +146,17 @@ class World(Space):
         self._odometry_model = odometry or OdometryModel()
         lidar_rng, odometry_rng = (np.random.default_rng(0) if rng is None else rng).spawn(2)
         self._lidar_rng, self._odometry_rng = lidar_rng, odometry_rng
-        self._scale = 1.0 + self._odometry_model.scale_sigma * odometry_rng.standard_normal(2)
-        self._measured = np.zeros(2)
+        self.base, size = base, base.size
+        self._scale = 1.0 + self._odometry_model.scale_sigma * odometry_rng.standard_normal(size)
+        self._measured = np.zeros(size)
         self._angles = self.lidar.angles
         self._drivetrain = drivetrain or Drivetrain.ideal()
-        self._wheels = Wheels(self._drivetrain)
-        self._command = (0.0, 0.0)
+        self._wheels = Wheels(self._drivetrain, base)
+        self._steered = 0.0
+        self._velocities = base.of(np.zeros(size)).tolist()
         self._left, self._spun, self._gripped = 0, 0.0, 0.0
-        super().__init__(pose, robot_radius, yields)
+        super().__init__(pose, body or Body.disc(robot_radius), yields)
+        self._boundary = self.body.boundary(HULL_SPACING)
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
             self.add_disc(obstacle, index)
@@ -157,7 +169,7 @@ class World(Space):
         self.add_vehicle()
         if self.clearance() < 0.0:
             raise ScenarioError(
-                f"the robot (radius {robot_radius:g} m) cannot start at ({pose[0]:g}, {pose[1]:g}): "
+                f"the robot (radius {self.radius:g} m) cannot start at ({pose[0]:g}, {pose[1]:g}): "
                 f"it would overlap a wall or an obstacle by {-self.clearance():.2f} m; "
                 f"choose a start in free space of map {occupancy.name!r}"
             )
@@ -180,24 +192,23 @@ class World(Space):
 
     # ------------------------------------------------------------------ motion
 
-    def step(self, v: float, omega: float, dt: float = 0.1) -> None:
-        """Tell the wheels a forward velocity and a turning rate for a while; walls and obstacles stop the robot.
+    def step(self, *control: float, dt: float = 0.1) -> None:
+        """Tell the wheels a control for a while; walls and obstacles stop the robot.
 
         Args:
-            v: forward velocity [m/s].
-            omega: turning rate [rad/s].
+            control: m numbers: of a unicycle forward velocity and turning rate [m/s, rad/s].
             dt: duration [s].
 
         Raises:
             ScenarioError: if a command or the duration is not a usable number.
         """
-        if not (math.isfinite(v) and math.isfinite(omega)):
+        if len(control) != self.base.size or not all(map(math.isfinite, control)):
             raise ScenarioError(
-                f"the control (v, omega) = ({v}, {omega}) is not finite; stop the robot, do not drive on it"
+                f"the control {control} is not {self.base.size} finite numbers; stop the robot, do not drive on it"
             )
-        self._wheels.tell((float(v), float(omega)))
+        self._wheels.tell(control)
         before, heading_before = self.vehicle.position, self.vehicle.angle
-        self._spun = self._gripped = 0.0
+        self._spun = self._gripped = self._steered = 0.0
         self._trail = [entry for entry in self._trail if entry[0] >= self.time - self.lidar.turn]
         for count, pause in enumerate(self.substeps(dt)):
             if not count:
@@ -212,12 +223,14 @@ class World(Space):
         grip = 1.0 - self._drivetrain.slip
         if self._left:  # the engine asks once more after the last substep of a tick
             self._left -= 1
-            self._command = self._wheels.advance(dt)
-            moved = abs(self._command[0]) + abs(self._command[1])
+            command = self._wheels.advance(dt)
+            self._velocities = self.base.of(command).tolist()
+            moved = math.fsum(map(abs, self._velocities))
             self._spun, self._gripped = self._spun + moved, self._gripped + moved * grip
-        v, omega = grip * self._command[0], grip * self._command[1]
+            self._steered += float(command[-1]) * dt
+        v, *across, omega = (grip * velocity for velocity in self._velocities)
         heading = body.angle + 0.5 * omega * dt
-        aside = -self._drivetrain.skid * v * omega
+        aside = sum(across) - self._drivetrain.skid * v * omega
         cosine, sine = math.cos(heading), math.sin(heading)
         body.velocity = (v * cosine - aside * sine, v * sine + aside * cosine)
         body.angular_velocity = omega
@@ -232,20 +245,24 @@ class World(Space):
         self.vehicle.velocity = self.without_contacts(self.vehicle.velocity, relative=False)
 
     def _measure(self, before: pymunk.Vec2d, heading_before: float, dt: float, grip: float) -> None:
-        """Read the wheels: forward and turning part of the SE(2) logarithm of the motion made, and what was slipped."""
+        """Read the wheels: the SE(2) logarithm of the motion made, as far as wheels roll, and what was slipped."""
         turn = self.vehicle.angle - heading_before
         body_motion = (self.vehicle.position - before).rotated(-heading_before)
         half = 0.5 * turn
         stretch = half / math.tan(half) if abs(half) > 1e-9 else 1.0
         forward = stretch * body_motion.x + half * body_motion.y
-        noise = self._odometry_model.noise_sigma * self._odometry_rng.standard_normal(2)
-        self._measured = np.array([forward, turn]) / (dt * grip) * (self._scale + noise)
+        left = [stretch * body_motion.y - half * body_motion.x] if self.base.slides else []
+        noise = self._odometry_model.noise_sigma * self._odometry_rng.standard_normal(self.base.size)
+        made = np.array([forward, *left, turn]) / (dt * grip)
+        if self.base.steering is not None:
+            made[-1] = self._steered / dt
+        self._measured = made * (self._scale + noise)
 
     def carry(self, pose: ArrayLike) -> None:
         """Put the robot down at another pose (3,) [m, m, rad], at rest; its wheels do not turn."""
         place = np.asarray(pose, dtype=np.float64)
         self.vehicle.position, self.vehicle.angle = (float(place[0]), float(place[1])), float(place[2])
-        self.vehicle.velocity, self._measured = (0.0, 0.0), np.zeros(2)
+        self.vehicle.velocity, self._measured = (0.0, 0.0), np.zeros(self.base.size)
         self.engine.reindex_shapes_for_body(self.vehicle)
 
     # ----------------------------------------------------------------- sensors
@@ -289,13 +306,13 @@ class World(Space):
         )
         return np.where(early < lidar.clutter, where * np.minimum(mixed_ranges, lidar.range_max), mixed_ranges)
 
-    def odometry(self) -> tuple[float, float]:
-        """Mean body velocities (v [m/s], omega [rad/s]) over the last step, as the wheels report them.
+    def odometry(self) -> tuple[float, ...]:
+        """Mean controls (m) over the last step, as the wheels report them: of a unicycle v [m/s] and omega [rad/s].
 
         They are proportional to the motion really made and to what the wheels slipped: wheels that a wall holds back
         do not spin, and sliding sideways, along a wall or in a turn, is not felt. (0, 0) before the first step.
         """
-        return float(self._measured[0]), float(self._measured[1])
+        return tuple(self._measured.tolist())
 
     # ------------------------------------------------------------ ground truth
 
@@ -307,10 +324,17 @@ class World(Space):
 
     def clearance(self) -> float:
         """Distance from the robot's hull to the nearest wall or obstacle [m]; negative when they overlap."""
-        reach, (x, y) = 2.0, self.vehicle.position
+        if self.body.round:
+            return self._distance(*self.vehicle.position) - self.radius
+        hull: Array = SE2.act(self.pose, self._boundary)
+        return min(self._distance(x, y) for x, y in hull.tolist())
+
+    def _distance(self, x: float, y: float) -> float:
+        """Distance from a place to the nearest wall or obstacle [m]."""
+        reach = 2.0
         while reach < 1000.0:  # the engine tests every shape in reach, so begin near
             nearest = self.engine.point_query_nearest((x, y), reach, OTHERS)
             if nearest is not None:
-                return float(nearest.distance) - self.radius
+                return float(nearest.distance)
             reach *= 4.0
         return math.inf

@@ -15,6 +15,7 @@ import numpy as np
 import pymunk
 
 from unifg.errors import ScenarioError
+from unifg.models.footprint import Body
 from unifg.typing import Array
 
 __all__ = ["OTHERS", "YIELD_GAP", "Mover", "Obstacle", "Policy", "Space", "ToAndFro", "reflected"]
@@ -90,12 +91,13 @@ class Space:
     Attributes:
         engine: pymunk's space.
         vehicle: body of the vehicle; a wall stops it, it does not turn it.
-        radius: of the vehicle's disc [m].
+        body: of the vehicle.
+        radius: of its largest disc [m].
         time: since the start [s].
         collisions: contact events so far; contacts with one owner less than 0.5 s apart are one.
     """
 
-    def __init__(self, place: Array, radius: float, yields: bool = True) -> None:
+    def __init__(self, place: Array, body: Body, yields: bool = True) -> None:
         """Stand at ``place`` (2,) or (3,), x, y and heading [m, m, rad], alone; ``yields``: movers wait at rest."""
         self.engine = pymunk.Space()
         self.engine.collision_slop = 1e-4  # the default lets shapes overlap by 0.1 m
@@ -103,7 +105,7 @@ class Space:
         self.vehicle = pymunk.Body(mass=1.0, moment=float("inf"))
         self.vehicle.position = (float(place[0]), float(place[1]))
         self.vehicle.angle = float(place[2]) if len(place) > 2 else 0.0
-        self.radius = radius
+        self.body, self.radius = body, body.radius
         self._yields = yields
         self.time = 0.0
         self.collisions = 0
@@ -135,10 +137,13 @@ class Space:
 
     def add_vehicle(self) -> None:
         """Let the vehicle in, after everything else."""
-        shape = pymunk.Circle(self.vehicle, self.radius)
-        shape.collision_type = _VEHICLE_TYPE
-        shape.filter = pymunk.ShapeFilter(categories=_VEHICLE_CATEGORY)
-        self.engine.add(self.vehicle, shape)
+        shapes: list[pymunk.Shape] = [pymunk.Circle(self.vehicle, r, (x, y)) for x, y, r in self.body.discs]
+        if self.body.outline:
+            shapes = [pymunk.Poly(self.vehicle, self.body.outline)]
+        for shape in shapes:
+            shape.collision_type = _VEHICLE_TYPE
+            shape.filter = pymunk.ShapeFilter(categories=_VEHICLE_CATEGORY)
+        self.engine.add(self.vehicle, *shapes)
         self.engine.on_collision(_VEHICLE_TYPE, _THING_TYPE, begin=self._on_begin, separate=self._on_separate)
 
     def discs(self) -> Array:

@@ -1,0 +1,164 @@
+"""Interfaces of what a user can replace in a drive: the world, the localiser, the planner.
+
+Each is a class that `unifg run navigation` takes as MODULE:CLASS, and `NavigationSettings` also as the class.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from unifg.errors import ScenarioError
+from unifg.files.ros_map import OccupancyMap
+from unifg.models.distance_map import DistanceMap
+from unifg.models.planar import Base
+from unifg.scenarios.options import find_modules_in
+from unifg.scenarios.perception.readings import Scan
+from unifg.typing import Array, ArrayLike
+
+__all__ = ["Estimator", "LocaliserContext", "World", "constructed", "load_class", "name_of"]
+
+
+class World(Protocol):
+    """Truth of a drive: the robot among walls and obstacles, and its sensors.
+
+    A class of a user's own takes the arguments of `unifg.scenarios.simulation.plane.World`, and is most easily derived
+    from it.
+    """
+
+    time: float
+    collisions: int
+    lidar: Any
+
+    @property
+    def pose(self) -> Array:
+        """(3,) true pose of the robot [m, m, rad]."""
+
+    def step(self, *control: float, dt: float) -> None:
+        """Apply a control (m,) of the base for ``dt`` [s]."""
+
+    def scan(self) -> Scan:
+        """Scan of the present."""
+
+    def odometry(self) -> Sequence[float]:
+        """Mean control (m,) over the last step as measured."""
+
+    def carry(self, pose: ArrayLike) -> None:
+        """Put the robot down at another pose (3,), at rest."""
+
+    def discs(self) -> Array:
+        """(K, 4) x, y, radius [m] of obstacles that are not on the map, and 1 for those that move."""
+
+    def clearance(self) -> float:
+        """Distance from the hull to the nearest thing [m]."""
+
+
+class Estimator(Protocol):
+    """Localiser of the robot.
+
+    A class of a user's own is constructed with a `LocaliserContext`; ``iterations`` and ``refused`` may be left out.
+    """
+
+    @property
+    def iterations(self) -> int:
+        """Of the last update."""
+
+    @property
+    def pose(self) -> Array:
+        """(3,) present estimate [m, m, rad]."""
+
+    @property
+    def covariance(self) -> Array:
+        """(3, 3) of it, in the tangent space."""
+
+    @property
+    def refused(self) -> str:
+        """Why the last scan has not corrected the estimate, "" where it has."""
+
+    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        """Take in a scan, None for none, and the odometry (m,) since the last one, None on the first."""
+
+    def reset(self, pose: Array, sigma: Array) -> None:
+        """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
+
+
+@dataclass(frozen=True)
+class LocaliserContext:
+    """Input of a localiser's construction.
+
+    Attributes:
+        occupancy: map that the robot was given.
+        distance_map: of it.
+        pose: (3,) believed at the start [m, m, rad].
+        sigma: (3,) its standard deviations [m, m, rad].
+        beams: number of beams in a scan.
+        base: that the odometry is of.
+        rng: for localisers that sample; decided by the seed of the run.
+    """
+
+    occupancy: OccupancyMap
+    distance_map: DistanceMap
+    pose: Array
+    sigma: Array
+    beams: int
+    base: Base
+    rng: np.random.Generator
+
+
+def name_of(given: str | type) -> str:
+    """MODULE:CLASS of a class, or the name itself."""
+    return given if isinstance(given, str) else f"{given.__module__}:{given.__qualname__}"
+
+
+def load_class(what: str, given: str | type, known: Sequence[str], methods: Sequence[str], example: str) -> type:
+    """A user's class.
+
+    Args:
+        what: it is, for messages.
+        given: ``MODULE:CLASS``, or the class; modules of the working directory are found, too.
+        known: names that stand for what ships.
+        methods: that it must have, with their arguments.
+        example: of such a name.
+
+    Raises:
+        ScenarioError: there is no such module or class, or it lacks a method.
+    """
+    module_name, colon, class_name = name_of(given).partition(":")
+    if not (module_name and colon and class_name):
+        choices = " or ".join(map(repr, known))
+        raise ScenarioError(f"unknown {what} '{given}': give {choices} or MODULE:CLASS, for example {example}")
+    kind: Any = given
+    if isinstance(given, str):
+        find_modules_in(Path.cwd())
+        try:
+            module = sys.modules.get(module_name) or import_module(module_name)
+        except ImportError as error:
+            raise ScenarioError(f"{what} '{given}': cannot import {module_name} from {Path.cwd()}: {error}") from error
+        kind = getattr(module, class_name, None)
+    if not isinstance(kind, type):
+        raise ScenarioError(f"{what} '{given}': {module_name} has no class {class_name}")
+    for method in methods:
+        if not callable(getattr(kind, method.partition("(")[0], None)):
+            raise ScenarioError(f"{what} '{name_of(given)}': {class_name} has no method {method}")
+    return kind
+
+
+def constructed(what: str, kind: type, context: object, attributes: Sequence[str] = ()) -> Any:
+    """An object of a user's class.
+
+    Raises:
+        ScenarioError: it cannot be constructed with the context, or lacks an attribute.
+    """
+    try:
+        made = kind(context)
+    except TypeError as error:
+        raise ScenarioError(f"{what} '{name_of(kind)}': {kind.__name__}(context) failed: {error}") from error
+    if lacking := [name for name in attributes if not hasattr(made, name)]:
+        raise ScenarioError(f"{what} '{name_of(kind)}': {kind.__name__} has no {', '.join(lacking)}")
+    return made
