@@ -178,7 +178,8 @@ def _middle(units: Units) -> float:
     for k in range(sums.shape[1]):
         if sums[WEIGHT, k] > 0.0:
             logs[count], count = sums[UNIT, k], count + 1
-    return _median(logs, count) if count > 0 else 0.0
+    middle: float = _median(logs, count) if count > 0 else 0.0
+    return middle
 
 
 @compiled
@@ -190,7 +191,8 @@ def _median(numbers: Array, count: int) -> float:
             numbers[at] = numbers[at - 1]
             at -= 1
         numbers[at] = number
-    return 0.5 * (numbers[count // 2] + numbers[(count - 1) // 2])
+    middle: float = 0.5 * (numbers[count // 2] + numbers[(count - 1) // 2])
+    return middle
 
 
 @compiled

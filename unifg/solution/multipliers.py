@@ -63,7 +63,9 @@ class Slopes:
         gradient = np.abs(self.gradient[free])
         rows, columns = program.constraints.free_rows, program.constraints.free_columns
         entries = np.abs(self.jacobian[program.constraints.free])
-        unknowns, scale = np.ones(program.size), np.ones(len(multipliers))
+        unknowns, steepest = np.ones(program.size), np.zeros(len(multipliers))
+        np.maximum.at(steepest, rows, entries)
+        scale = 1.0 / np.where(steepest > 0.0, steepest, 1.0)  # the same begin in any unit
         cost = 1.0 / (float(gradient.max(initial=0.0)) or 1.0)
         for _ in range(PASSES):
             scaled = entries * scale[rows] * unknowns[columns]
