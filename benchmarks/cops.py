@@ -140,8 +140,8 @@ def units() -> str:
         lines.append((problem.name, *shown))
     head = ("problem", "as stated", *CHANGES)
     notes = (
-        "Iterations (cost, divided by its factor), tolerance 1e-6, that of the violation times the factor of the rows; a "
-        "status is named where it is not converged. Numbers near 5e6 are stored to 1e-9, which some rows multiply."
+        "Iterations (cost, divided by its factor), tolerance 1e-6, that of the violation times the factor of the rows; "
+        "a status is named where it is not converged. Numbers near 5e6 are stored to 1e-9, which some rows multiply."
     )
     return f"{table(head, lines, 1)}\n\n{notes}"
 

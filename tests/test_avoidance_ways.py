@@ -57,7 +57,7 @@ def test_a_barrier_lets_the_gap_to_what_stands_shrink_at_a_rate(flat: DistanceMa
     limits = {}
     for avoidance in ("clearance", "barrier"):
         s = replace(PLAIN, avoidance=avoidance)
-        limits[avoidance] = disc_limits(s, PLACE, predicted(s, PLACE, seen), seen, rest, NONE)[:, 0]
+        limits[avoidance] = disc_limits(s, PLACE, predicted(s, PLACE, seen), seen, rest, NONE)[:, 0, 0]
     least = PLAIN.robot_radius + PLAIN.disc_clearance
     assert np.allclose(limits["clearance"], least)
     spare = 1.5 - 0.2 - least

@@ -36,6 +36,7 @@ from unifg.models import (
     vehicle,
 )
 from unifg.models.distance_map import DistanceMap, SmoothField
+from unifg.models.footprint import Body
 from unifg.models.potential import potential
 from unifg.pose_graphs import bearing, bearing_range, chart_between, distance, sighting
 from unifg.typing import Array
@@ -74,6 +75,10 @@ INSIDE = np.concatenate([RNG.uniform(-1.5, 1.5, (COUNT, 2)), poses()[:, 2:]], ax
 WALLS = obstacles.wall_distance(SmoothField(GRID))
 CASES["lidar.endpoint"] = (lidar.endpoint(GRID), [INSIDE], [fg.SE2], [RNG.uniform(-1.0, 1.0, (COUNT, 2))])
 CASES["obstacles.wall_distance"] = (WALLS, [INSIDE], [fg.SE2], [])
+BOX = Body.polygon([[0.3, 0.2], [-0.3, 0.2], [-0.3, -0.2], [0.3, -0.2]])
+CASES["obstacles.clearance_of"] = (
+    obstacles.clearance_of(BOX), [poses()], [fg.SE2], [RNG.normal(size=(4, 2)), np.full(4, 0.3)],
+)  # fmt: skip
 CASES["obstacles.shortfall"] = (obstacles.shortfall(WALLS, 0.3), [INSIDE], [fg.SE2], [])
 group: fg.LieGroup
 for group in (fg.Rn(3), fg.SO2, fg.SE2, fg.Product(pose=fg.SE2, v=fg.Rn(2))):

@@ -43,14 +43,14 @@ def named(units: dict[str, float]) -> str:
 @pytest.mark.parametrize("units", UNITS, ids=named)
 @pytest.mark.product(12)
 def test_units_do_not_decide_whether_sqp_converges(units: dict[str, Any], hessian: Any) -> None:
-    """The same optimum in about as many steps; the judge keeps to the units of the graph."""
+    """The same optimum in about as many steps; the judge keeps to the units of the graph, in which slopes are large."""
     graph, guess = drive(**units)
     solution = SQP(hessian=hessian).solve(graph, guess)
     assert solution.converged, solution.report()
     assert min(abs(solution.cost / cost - 1.0) for cost in (COST, OTHER_COST)) < 1e-4, solution.report()
     assert solution.iterations <= 25, solution.report()
     if max(units.values()) <= 1e4:  # the judge's differences are too coarse for the others
-        assert judge(graph, solution).worst() < 2e-6
+        assert judge(graph, solution).worst() < 2e-6 * max(1.0, units.get("position", 1.0) / 1e2)
 
 
 def test_without_scaling_units_decide() -> None:

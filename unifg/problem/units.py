@@ -219,7 +219,8 @@ def _log_rows(terms: TermArrays, units: Units) -> float:
         sums[TOTAL, 0] = math.inf
         return 0.0
     middle = sums[TOTAL, 0] = _median(logs, count)
-    return max(logs[count - 1] - middle, middle - logs[0])
+    distance: float = max(logs[count - 1] - middle, middle - logs[0])
+    return distance
 
 
 @compiled

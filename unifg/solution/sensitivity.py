@@ -98,7 +98,7 @@ class Structure:
 
 
 def remembered(known: dict[Hashable, T], key: Hashable, find: Callable[[], T]) -> T:
-    """What was found for a key, or is now; the latest `KEPT` are kept."""
+    """Find something for a key once; the latest `KEPT` are kept."""
     if key not in known:
         while len(known) >= KEPT:
             del known[next(iter(known))]
@@ -201,7 +201,7 @@ class Sensitivities:
         return dependent
 
     def _singular(self, system: KktSystem, right: Array) -> str:
-        """What the matrix is singular in, from a system that was not solved at once; returns and errors as above."""
+        """Find what the matrix is singular in, from a system that was not solved at once; returns and errors as above."""
         program, n, rest = self._program, self._program.size, _tried(system, right)[1]
         if rest.max(initial=0.0) <= 1.0:
             return ""
