@@ -201,7 +201,7 @@ class Sensitivities:
         return dependent
 
     def _singular(self, system: KktSystem, right: Array) -> str:
-        """Find what the matrix is singular in, from a system that was not solved at once; returns and errors as above."""
+        """Find what the matrix is singular in, from a system that was not solved at once."""
         program, n, rest = self._program, self._program.size, _tried(system, right)[1]
         if rest.max(initial=0.0) <= 1.0:
             return ""
