@@ -168,7 +168,7 @@ def conclude(address: int) -> None:
     arrays = terms, multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
     derivatives = hessian, concavity, gradient, residual, jacobian, constraints, constraint_jacobian
-    run(links[0].kkt_numbers, (terms, final, now.violation_unit, *derivatives, multipliers, full, kkt))
+    run(links[0].kkt_numbers, (terms, final, now.violation_unit, now.tolerance, *derivatives, multipliers, full, kkt))
     now.judging += seconds(now.clock) - began
 
 
@@ -296,6 +296,7 @@ def addresses(robust: bool, general: bool) -> Records:
         NOTHING,
         terms,
         kinds["final"],
+        NUMBER,
         NUMBER,
         kinds["hessian"],
         kinds["concavity"],

@@ -124,7 +124,8 @@ def optimality(
         program: the compiled graph with its data bound.
         lin: linearisation at the point, whose gradient is the true one, robust losses included.
         multipliers: (M,) one per constraint row.
-        enough: of least squares, a relative offset above this may be a lower bound, which takes no factorisation.
+        enough: tolerance. Of least squares, a relative offset above it may be a lower bound, which takes no
+            factorisation; of others, relative numbers are looked for above it.
         lent: of least squares, a backend's factorisation near this point.
         guess: of least squares, the stored values that the solve began with.
         violation_unit: what constraint rows are measured in, in the mean, as of :class:`Tolerances`.
@@ -137,8 +138,9 @@ def optimality(
         return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding, offset.weakest)
     gradient, found, units = np.empty(len(lin.gradient)), np.empty(NUMBERS), program.unit_memory()
     kkt_numbers(
-        program.arrays, units, violation_unit, lin.hessian, lin.concavity, lin.gradient, lin.residual, lin.jacobian,
-        lin.constraints, lin.constraint_jacobian, multipliers, gradient, found,
+        program.arrays, units, violation_unit, -1.0 if program.differenced else enough, lin.hessian, lin.concavity,
+        lin.gradient, lin.residual, lin.jacobian, lin.constraints, lin.constraint_jacobian, multipliers, gradient,
+        found,
     )  # fmt: skip
     measured = read_numbers(found, lin.cost)
     if not measured.finite:
@@ -270,6 +272,7 @@ def kkt_numbers(
     terms: TermArrays,
     units: Units,
     violation_unit: float,
+    enough: float,
     hessian: Array,
     concavity: Array,
     slope: Array,
@@ -287,6 +290,7 @@ def kkt_numbers(
         terms: of the program.
         units: which are found.
         violation_unit: of the rows in the mean; 0 where nothing tells it.
+        enough: where absolute numbers are below, relative ones are not looked for.
         hessian: entries of the Hessian of the objective.
         concavity: negative curvature of scalar costs; empty without.
         slope: (width,) gradient of the objective.
@@ -298,34 +302,42 @@ def kkt_numbers(
         gradient: (width,) memory, for the gradient of the Lagrangian.
         found: (7,) result.
     """
-    stationarity, violation = 0.0, 0.0
+    stationarity, violation, complementarity, total = 0.0, 0.0, 0.0, 0.0
     worst, count, finite = -1, len(constraints), True
     lower, upper, free = terms.lower, terms.upper, units.free
-    find_units(terms, units, violation_unit, hessian, concavity, slope, constraints, entries)
-    find_sizes(terms, units, hessian, concavity, slope, residual, jacobian, multipliers, entries)
     copy_to(slope, gradient)
     evaluation.transposed_times(terms, False, entries, multipliers, gradient)
-    least, unit, relative, total = math.inf, 0.0, 0.0, 0.0
     for k in range(len(free)):
-        size, slopes = units.sums[SIZE, units.coordinates[free[k]]], abs(gradient[free[k]])
-        least, unit = min(least, size), max(unit, units.unknowns[free[k]])
-        stationarity, relative = max(stationarity, slopes), max(relative, slopes / size)
+        stationarity = max(stationarity, abs(gradient[free[k]]))
     for k in range(len(slope)):
         finite = finite and math.isfinite(slope[k])
     for k in range(len(entries)):
         finite = finite and math.isfinite(entries[k])
     for row in range(count):
-        value = constraints[row]
-        finite = finite and math.isfinite(value) and math.isfinite(multipliers[row])
+        value, multiplier = constraints[row], multipliers[row]
+        finite = finite and math.isfinite(value) and math.isfinite(multiplier)
         outside = max(max(value - upper[row], lower[row] - value), 0.0)
         if worst < 0 or outside > violation:
             worst, violation = row, outside
-        total += abs(multipliers[row])
+        total += abs(multiplier)
+        if lower[row] != upper[row]:
+            limit = upper[row] if multiplier > 0.0 else lower[row]
+            slack = abs(value - limit) if math.isfinite(limit) else 1.0
+            complementarity = max(complementarity, abs(multiplier) * slack)
     scale = max(1.0, total / max(count, 1) / SMALL_FORCES)
-    stationarity = min(stationarity / scale, relative)
-    complementarity = _complementarity(terms, units, violation_unit, scale, constraints, entries, multipliers)
+    stationarity, complementarity, unit, least = stationarity / scale, complementarity / scale, 1.0, scale
+    if not max(stationarity, complementarity) <= enough and finite:
+        find_units(terms, units, violation_unit, hessian, concavity, slope, constraints, entries)
+        find_sizes(terms, units, hessian, concavity, slope, residual, jacobian, multipliers, entries)
+        least, relative, unit = math.inf, 0.0, 0.0
+        for k in range(len(free)):
+            size = units.sums[SIZE, units.coordinates[free[k]]]
+            least, unit = min(least, size), max(unit, units.unknowns[free[k]])
+            relative = max(relative, abs(gradient[free[k]]) / size)
+        stationarity, least = min(stationarity, relative), max(least, scale)
+        complementarity = _complementarity(terms, units, violation_unit, scale, constraints, entries, multipliers)
     found[0], found[1], found[2] = stationarity, violation, complementarity
-    found[3], found[4], found[5], found[6] = worst, finite, max(least, scale), unit
+    found[3], found[4], found[5], found[6] = worst, finite, least, unit
 
 
 def infeasible_stationary(program: CompiledProblem, lin: Linearization, tolerance: float) -> bool:
