@@ -12,6 +12,7 @@ import pytest
 
 import unifg as fg
 from unifg.solution.multipliers import Slopes, estimated
+from unifg.solution.optimality import optimality
 from unifg.solution.solver import Solver, SolveState
 from unifg.solvers import (
     KKT,
@@ -437,3 +438,39 @@ def test_check_names_violated_rows_between_fixed_variables() -> None:
     (finding,) = report.findings
     assert (finding.kind, finding.term, finding.index) == ("violated and fixed", "step", 0)
     assert "violated by 0.5, and all its variables are fixed" in finding.message
+
+
+def on_a_circle(size: float) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """The nearest point of a circle, whose row is in other units."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [3.0, 4.0])
+    graph.constrain(lambda p: size * ((p**2).sum(axis=1, keepdims=True) - 1.0), x, lower=0.0, upper=0.0, name="circle")
+    return graph, {x: np.array([[2.0, -1.0]])}
+
+
+@pytest.mark.parametrize("solver", [InteriorPoint(), SQP(), AugmentedLagrangian()], ids=lambda s: s.name)
+def test_the_violation_has_a_tolerance_of_its_own(solver: Solver) -> None:
+    graph, guess = on_a_circle(1e3)
+    strict, loose = (replace(solver, feasibility_tolerance=f).solve(graph, guess) for f in (1e-9, 10.0))
+    assert strict.converged and strict.violation <= 1e-9
+    assert loose.converged and loose.violation > 1e-9 and loose.iterations < strict.iterations
+
+
+def test_a_tolerance_of_nothing_is_refused() -> None:
+    with pytest.raises(fg.BackendError, match="feasibility_tolerance must be positive or None, found 0"):
+        SQP(feasibility_tolerance=0.0)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_large_numbers_are_judged_by_what_they_are_sums_of(size: float) -> None:
+    """A gradient of 1e6 times a millionth is a sum that cancels; of one, it is none."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [1.0], sigma=1.0 / np.sqrt(size))
+    graph.constrain(lambda p: p, x, lower=0.0, upper=0.0, name="zero")
+    program = graph.compile()
+    lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))
+    numbers = [optimality(program, lin, np.array([size * (1.0 + off)])) for off in (1e-9, 1e-4)]
+    assert numbers[0].stationarity <= 1e-6
+    assert numbers[1].stationarity == pytest.approx(min(1e-4 * size / max(1.0, size / 100.0), 1e-2), rel=1e-2)

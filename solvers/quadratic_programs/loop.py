@@ -134,8 +134,9 @@ def _record(problem: Problem, work: Work, shown: bool) -> bool:
     now, kkt, log = work.scalars[0], work.kkt, work.log
     raise_slopes(work.next_jacobian, work.next_gradient, work.steepest_jacobian, work.steepest_gradient)
     kkt_numbers(
-        problem.terms, problem.measures, now.violation_unit, now.tolerance, work.next_hessian, work.concavity, work.next_gradient,
-        work.residual, work.jacobian, work.next_constraints, work.next_jacobian, work.multipliers, work.full, kkt,
+        problem.terms, problem.measures, now.violation_unit, now.tolerance, work.next_hessian, work.concavity,
+        work.next_gradient, work.residual, work.jacobian, work.next_constraints, work.next_jacobian, work.multipliers,
+        work.full, kkt,
     )  # fmt: skip
     finite = kkt[4] != 0.0 and math.isfinite(now.next_cost)
     if not finite:
