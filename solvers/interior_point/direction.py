@@ -14,7 +14,7 @@ from unifg.problem.systems import fill_stacked
 from unifg.solvers.interior_point.state import AGAIN, EXAMINED, NO, SINGULAR, TRY, UNKNOWN, YES
 
 FIRST_SHIFT, LARGEST_SHIFT, FIRST_GROWTH, SHIFT_GROWTH, SHIFT_DECAY = 1e-4, 1e20, 100.0, 8.0, 3.0
-LEAST_SHIFT = 1e-8  # less leaves singular arcs without any curvature
+LEAST_SHIFT, SINGULAR_SHIFT = 1e-12, 1e-8  # less leaves singular arcs of costs without squares without any curvature
 DUAL_SHIFT = 1e-11
 SHORT = 0.01  # length of a step
 LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
@@ -73,7 +73,8 @@ def direct(address: int) -> None:
                 continue
         if delta == 0.0:
             last = now.last_delta
-            delta = FIRST_SHIFT if last == 0.0 else max(LEAST_SHIFT, last / SHIFT_DECAY)
+            least = SINGULAR_SHIFT if now.definite == NO else LEAST_SHIFT
+            delta = FIRST_SHIFT if last == 0.0 else max(least, last / SHIFT_DECAY)
         else:
             delta *= FIRST_GROWTH if now.last_delta == 0.0 else SHIFT_GROWTH
         if delta > LARGEST_SHIFT:
