@@ -12,7 +12,7 @@ from scipy.special import zeta
 
 import unifg as fg
 from test_derive import Open, compared, curved, evaluated, numpy_of_casadi
-from test_jacobians import CAR, CASES, COUNT, GRID, MOUNT, slopes_of
+from test_jacobians import BOX, CAR, CASES, COUNT, GRID, MOUNT, slopes_of
 from unifg.factors.autodiff.lookup import Lookup
 from unifg.factors.autodiff.rows import traced
 from unifg.factors.kernel import Argument, evaluate_rows
@@ -63,6 +63,16 @@ def tracking(x: Array, z: Array) -> Any:
 
 def discs(x: Array, centre: Array, radius: Array) -> Any:
     return np.linalg.norm(x[:, None, :2] - centre, axis=2) - radius
+
+
+def box(x: Array, centre: Array, radius: Array) -> Any:
+    """Clearance of every disc that covers the body of the cases, largest radius everywhere."""
+    rows = []
+    for (along, beside, _), less in zip(BOX.discs, BOX.smaller, strict=True):
+        cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
+        place = x[:, :2] + np.stack([cosine * along - sine * beside, sine * along + cosine * beside], axis=1)
+        rows.append(discs(np.concatenate([place, x[:, 2:]], axis=1), centre, radius) + less)
+    return np.concatenate(rows, axis=1)
 
 
 def spheres(x: Array, centre: Array, radius: Array) -> Any:
@@ -403,7 +413,8 @@ def uncertain(p: Array, t: Array, root: Array, centre: Array, radius: Array) -> 
 DEFINED: dict[str, Function] = {
     "unicycle.dynamics": unicycle_dynamics, "unicycle.ramped": unicycle_ramped,
     "unicycle.tracking": tracking, "unicycle.rate": difference(Rn(2)),
-    "obstacles.disc_clearance": discs, "obstacles.wall_distance": wall_distance, "lidar.endpoint": endpoint,
+    "obstacles.disc_clearance": discs, "obstacles.clearance_of": box,
+    "obstacles.wall_distance": wall_distance, "lidar.endpoint": endpoint,
     "obstacles.shortfall": shortfall(wall_distance), "potential.potential": repulsion(discs),
     "potential.potential, walls": repulsion(wall_distance), "potential.potential, vortex": repulsion(discs),
     "vehicle.dynamics": vehicle, "quadrotor.dynamics": undisturbed, "quadrotor.disturbed_dynamics": disturbed,
