@@ -120,11 +120,16 @@ class Judge:
         limit = np.where(duals > 0.0, self.upper, self.lower)
         distance = np.where(np.isfinite(limit), np.abs(rows - np.where(np.isfinite(limit), limit, 0.0)), 1.0)
         slack = np.where(self.lower == self.upper, 0.0, distance)
+        # Or relative, to a hundredth of the largest of what a gradient is a sum of.
+        slopes = np.abs(jacobian.toarray())
+        sizes = np.abs(duals[:, None] * slopes).max(axis=0, initial=0.0)
+        sizes = np.maximum(0.01 * np.maximum(sizes, np.abs(gradient)), scale)
+        shares = np.minimum((slopes / sizes).max(axis=1, initial=0.0), 1.0 / scale)
         return Numbers(
             cost,
-            float(np.abs(pull[self._free]).max(initial=0.0)) / scale,
+            float((np.abs(pull) / sizes)[self._free].max(initial=0.0)),
             float(np.abs(self._outside(rows)).max(initial=0.0)),
-            float((np.abs(duals) * slack).max(initial=0.0)) / scale,
+            float((np.abs(duals) * slack * shares).max(initial=0.0)),
         )
 
     def slope_of_violation(self, values: dict[fg.Family, Array]) -> float:
