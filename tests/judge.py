@@ -49,9 +49,14 @@ def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None
     gradient /= 2.0 * STEP
     duals = _duals(graph, solution)
     scale = max(1.0, float(np.abs(duals).mean()) / 100.0) if len(duals) else 1.0
+    # Or relative, to a hundredth of the largest of what a gradient is a sum of.
+    sizes, shares = np.maximum(0.01 * np.abs(gradient), scale), np.full(len(duals), 1.0 / scale)
     if len(duals):
         columns = [(_g(graph, _at(values, m, STEP), data) - _g(graph, _at(values, m, -STEP), data)) for m in moved]
-        gradient = gradient + np.array(columns) @ duals / (2.0 * STEP)
+        slopes = np.array(columns) / (2.0 * STEP)
+        gradient = gradient + slopes @ duals
+        sizes = np.maximum(sizes, 0.01 * np.abs(slopes * duals).max(axis=1, initial=0.0))
+        shares = np.minimum(shares, (np.abs(slopes) / sizes[:, None]).max(axis=0, initial=0.0))
     lower, upper = _limits(graph, data)
     g = _g(graph, values, data)
     outside = np.maximum(np.maximum(g - upper, lower - g), 0.0)
@@ -59,9 +64,9 @@ def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None
     limit = np.where(duals > 0.0, upper, lower)
     slack = np.where(np.isfinite(limit) & (lower != upper), np.abs(g - np.where(np.isfinite(limit), limit, 0.0)), 0.0)
     return KktNumbers(
-        float(np.abs(gradient).max(initial=0.0)) / scale,
+        float((np.abs(gradient) / sizes).max(initial=0.0)),
         float(outside.max(initial=0.0)),
-        float((np.abs(duals) * slack).max(initial=0.0)) / scale,
+        float((np.abs(duals) * slack * shares).max(initial=0.0)),
         float(wrong.max(initial=0.0)),
     )
 
