@@ -474,3 +474,17 @@ def test_large_numbers_are_judged_by_what_they_are_sums_of(size: float) -> None:
     numbers = [optimality(program, lin, np.array([size * (1.0 + off)])) for off in (1e-9, 1e-4)]
     assert numbers[0].stationarity <= 1e-6
     assert numbers[1].stationarity == pytest.approx(min(1e-4 * size / max(1.0, size / 100.0), 1e-2), rel=1e-2)
+
+
+@pytest.mark.parametrize("tiny", [0.0, 1e-12])
+def test_a_slope_of_rounding_hides_no_force(tiny: float) -> None:
+    """Beside a slope that is rounding, multipliers that balance nothing are seen."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize_scalar(lambda p: 11.0 * p[:, 0] + 0.0 * p[:, 1], x, name="cost")
+    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True) - 1.0, x, lower=0.0, name="outside")
+    graph.bound(x, lower=0.0, name="bounds")
+    program = graph.compile()
+    lin = program.linearize(program.values_from({x: np.array([[tiny, 1.5]])}))
+    measured = optimality(program, lin, np.array([-1.0 / 6.0, -11.0, 0.0]))
+    assert measured.stationarity > 0.1 and measured.complementarity > 0.1

@@ -27,7 +27,7 @@ the constraints exert on each other. Then violation is what is left to minimise,
 whether less of it is to be had (`VIOLATED`); compare Curtis, Schenk and Waechter, SIAM J. Optim. 20 (2010), and Thierry
 and Biegler, Optim. Methods Softw. 35 (2020).
 
-s y and e z are the same in any unit of a row. Units (`_find_units`) therefore enter only where numbers of different
+s y and e z are the same in any unit of a row. Units (`find_units`) therefore enter only where numbers of different
 rows or unknowns meet: penalties, first slacks, sums of violations, shifts of the diagonals, and the error of a barrier
 problem. The objective has a size (`unifg.problem.units`): first mu and penalties are in proportion to it, and so are
 errors that are compared with mu. The KKT test has none, so a large cost is solved to more digits.
@@ -334,7 +334,7 @@ def test(address: int) -> None:
         return
     if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violated == 1:
         run(links[0].relax, (address,))
-    smallest = 0.1 * tolerance * now.finer * now.size
+    smallest = 0.1 * tolerance * now.finer * min(1.0, now.size)
     bound = False
     if _error(now) <= SOLVED * now.mu and now.violated == 1:
         # Whether something is violated because its penalty is too low, or because it has to be. With the least mu that

@@ -158,8 +158,8 @@ def conclude(address: int) -> None:
     constraint_jacobian, constraints, free = parts(address, "constraint_jacobian constraints free")
     full, gradient, kkt, links, multipliers = parts(address, "full gradient kkt links multipliers")
     scalars, steepest_gradient, terms = parts(address, "scalars steepest_gradient terms")
-    concavity, final, hessian, jacobian = parts(address, "concavity final hessian jacobian")
-    residual, steepest_jacobian = parts(address, "residual steepest_jacobian")
+    jacobian, measures, residual, sizes = parts(address, "jacobian measures residual sizes")
+    (steepest_jacobian,) = parts(address, "steepest_jacobian")
     now = scalars[0]
     if now.concluded == 1:
         return
@@ -167,8 +167,9 @@ def conclude(address: int) -> None:
     run(links[0].raise_slopes, (constraint_jacobian, gradient, steepest_jacobian, steepest_gradient))
     arrays = terms, multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
-    derivatives = hessian, concavity, gradient, residual, jacobian, constraints, constraint_jacobian
-    run(links[0].kkt_numbers, (terms, final, now.violation_unit, now.tolerance, *derivatives, multipliers, full, kkt))
+    memory = free, measures.coordinates, sizes, now.violation_unit, now.tolerance
+    derivatives = gradient, residual, jacobian, constraints, constraint_jacobian
+    run(links[0].kkt_numbers, (terms, *memory, *derivatives, multipliers, full, kkt))
     now.judging += seconds(now.clock) - began
 
 
@@ -295,11 +296,11 @@ def addresses(robust: bool, general: bool) -> Records:
         kkt_numbers,
         NOTHING,
         terms,
-        kinds["final"],
+        free,
+        free,
+        kinds["sizes"],
         NUMBER,
         NUMBER,
-        kinds["hessian"],
-        kinds["concavity"],
         gradient,
         residual,
         kinds["jacobian"],

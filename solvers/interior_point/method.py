@@ -309,7 +309,7 @@ class Workspace:
             doubles,
             np.array([self._unequal(row) for row in program.arrays.fields], dtype=np.int64),
             measures,
-            program.unit_memory(),
+            np.zeros(program.columns.dimensions),
         )
         self._describe()
         require_second(program)
@@ -402,7 +402,7 @@ class Workspace:
         words = each.instances.describe(arguments)
         found = arguments.found, arguments.found_multipliers, arguments.numbers
         fields, links = program.table.fields, (arguments.functions, problem.links)
-        memory = problem.scratch, problem.plan.numbers, *problem.measures[-5:], *problem.final[-5:]
+        memory = problem.scratch, problem.plan.numbers, *problem.measures[-5:], problem.sizes
         blank = [array for array in (*work, *memory) if array is not work.scalars]
         addressing = words, self._words, *links, problem.retraction, fields, problem.terms.parts, work.scalars
         widest, scratch = int(fields[:, KERNEL_WIDTH].max()), program.table.scratch

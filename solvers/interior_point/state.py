@@ -153,7 +153,7 @@ class Problem(NamedTuple):
         doubles: (D, 2) places in ``Work.data`` that mean one entry of the matrix: the second is added to the first.
         unequal: (T,) whether a term has inequality rows.
         measures: units of the solve, found at its start.
-        final: those of the KKT test, found at the answer.
+        sizes: memory of the KKT test.
     """
 
     links: Records
@@ -168,7 +168,7 @@ class Problem(NamedTuple):
     doubles: IntArray
     unequal: IntArray
     measures: Units
-    final: Units
+    sizes: Array
 
 
 class Work(NamedTuple):

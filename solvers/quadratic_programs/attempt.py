@@ -22,7 +22,6 @@ from unifg.codegen.loops import copy_to, dot
 from unifg.problem.evaluation import times, transposed_times
 from unifg.problem.linearization import all_finite
 from unifg.problem.table import TermArrays
-from unifg.problem.units import Units
 from unifg.solution.optimality import NUMBERS
 from unifg.solvers.globalize.line_search import SHORTEST
 from unifg.solvers.globalize.merit import ARMIJO
@@ -111,7 +110,8 @@ class Problem(NamedTuple):
         bounded: places of stored values with a bound.
         bounds: the row of each of them.
         units: patterns that units are found from.
-        measures: units of the KKT test.
+        coordinates: (width,) number of the coordinate of a family that each column belongs to.
+        sizes: (coordinates,) memory of the KKT test.
     """
 
     links: IntArray
@@ -127,7 +127,8 @@ class Problem(NamedTuple):
     bounded: IntArray
     bounds: IntArray
     units: Patterns
-    measures: Units
+    coordinates: IntArray
+    sizes: Array
 
 
 LINKED = ("minimize", "retract", "evaluate", "evaluate_scalars", "linearize", "add_scalars", "find_units")

@@ -134,7 +134,7 @@ def _record(problem: Problem, work: Work, shown: bool) -> bool:
     now, kkt, log = work.scalars[0], work.kkt, work.log
     raise_slopes(work.next_jacobian, work.next_gradient, work.steepest_jacobian, work.steepest_gradient)
     kkt_numbers(
-        problem.terms, problem.measures, now.violation_unit, now.tolerance, work.next_hessian, work.concavity,
+        problem.terms, problem.free, problem.coordinates, problem.sizes, now.violation_unit, now.tolerance,
         work.next_gradient, work.residual, work.jacobian, work.next_constraints, work.next_jacobian, work.multipliers,
         work.full, kkt,
     )  # fmt: skip

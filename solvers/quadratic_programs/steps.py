@@ -346,5 +346,5 @@ def _problem(program: CompiledProblem, work: Work) -> Problem:
     return Problem(
         np.array(links), terms, system, program.normal.diagonal, program.equality, retraction.parts, free,
         retraction.fixed, retraction.fixed_values, scratch, program.bounded, np.flatnonzero(program.bound_rows), units,
-        program.unit_memory(),
+        program.columns.coordinates, np.zeros(program.columns.dimensions),
     )  # fmt: skip

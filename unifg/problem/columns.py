@@ -52,6 +52,7 @@ class Columns:
         stored: length of the storage of all families.
         offsets: first column of each family.
         width: number of columns, fixed variables included.
+        dimensions: number of coordinates of all families.
         size: number of unknown ones.
         free: (size,) columns that are unknown.
         unknown: (width,) number of each column among the unknowns, -1 where fixed.
@@ -69,6 +70,7 @@ class Columns:
             self.offsets[family], self.storage[family] = self.width, self.stored
             self.width += family.count * family.manifold.dim
             self.stored += family.count * family.manifold.storage
+        self.dimensions = sum(family.manifold.dim for family in families)
         self.parts = [(family, *self.place(family)) for family in families]
         is_free = np.ones(self.width, dtype=bool)
         self.fixed: dict[str, IntArray] = {}

@@ -54,7 +54,7 @@ class Units(NamedTuple):
 
 def unit_memory(columns: Columns, diagonal: IntArray, blocks: int, rows: int) -> Units:
     """Units of one, and memory to find others."""
-    coordinates, count = columns.coordinates, sum(family.manifold.dim for family in columns.families)
+    coordinates, count = columns.coordinates, columns.dimensions
     memory = np.empty(blocks), np.empty(max(blocks, count)), np.empty((5, count))
     return Units(coordinates, columns.free, diagonal, *memory, np.ones(rows), np.ones(columns.width))
 
@@ -63,9 +63,7 @@ NO_DISTANCE = 1e-10  # of an unknown to a bound: it is there
 LARGE_PULL = 1e3  # times the curvatures: slopes of the cost from which on it is they that count
 LEAST_SHARE = 1e-4  # of the largest curvature, below which a mean of all is not believed
 UNIT, CURVATURE, POWER, TOTAL, WEIGHT = range(5)  # rows of memory for each coordinate
-SIZE = TOTAL
 SHARE = 0.01  # of the largest product that a gradient is a sum of
-LEAST_MOVE = 1e-6  # of an unknown, in its unit: what makes a force that counts
 SWEEPS = 20  # of the minimisation, one variable after the other
 SMALLEST = -14.0  # logarithm of an entry, relative to others, from which on it counts as zero
 MODEST = 4.6  # logarithm of a hundred
@@ -362,54 +360,39 @@ def _bounded(terms: TermArrays, values: Array, coordinates: IntArray, sums: Arra
 @compiled
 def find_sizes(
     terms: TermArrays,
-    units: Units,
-    hessian: Array,
-    concavity: Array,
-    gradient: Array,
+    coordinates: IntArray,
     residual: Array,
     jacobian: Array,
     multipliers: Array,
     constraint_jacobian: Array,
+    sizes: Array,
 ) -> None:
-    """Write the sizes of gradients along each coordinate.
+    """Write the sizes of gradients along each coordinate, which no unit enters.
 
     It is a hundredth of the largest product that a gradient is a sum of: of a residual or a multiplier and an entry of
-    its Jacobian. It does not count below what moves the unknown, or the mean unknown, by a millionth of its unit; nor,
-    where nothing is curved, below a hundredth of the slopes of the cost.
+    its Jacobian.
 
     Args:
         terms: of the program.
-        units: found by :func:`find_units` at the same point; ``sums[SIZE]`` is written.
-        hessian: of the cost, as for :func:`cost_unit`.
-        concavity: the same.
-        gradient: the same.
+        coordinates: (width,) number of the coordinate that each column belongs to.
         residual: (C,) of all costs.
         jacobian: entries of theirs.
         multipliers: (M,).
         constraint_jacobian: entries of that of the constraints.
+        sizes: (coordinates,) result.
     """
-    coordinates, sums, curved = units.coordinates, units.sums, False
-    for k in range(sums.shape[1]):
-        sums[SIZE, k] = sums[CURVATURE, k] = sums[UNIT, k] = 0.0
-    for k in range(len(units.free)):
-        at, place = coordinates[units.free[k]], units.diagonal[k]
-        sums[UNIT, at] = units.unknowns[units.free[k]]
-        curvature = abs(hessian[place] + (concavity[place] if len(concavity) else 0.0))
-        sums[CURVATURE, at] = max(sums[CURVATURE, at], curvature)
-        curved = curved or curvature > 0.0
-    _raise_sizes(terms, units, True, residual, jacobian)
-    _raise_sizes(terms, units, False, multipliers, constraint_jacobian)
-    least = (LEAST_MOVE if curved else SHARE) * cost_unit(units, hessian, concavity, gradient)
-    for k in range(sums.shape[1]):
-        if sums[UNIT, k] > 0.0:  # else fixed
-            size = max(LEAST_MOVE * sums[CURVATURE, k] * sums[UNIT, k], least / sums[UNIT, k])
-            sums[SIZE, k] = max(SHARE * sums[SIZE, k], size)
+    for k in range(len(sizes)):
+        sizes[k] = 0.0
+    _raise_sizes(terms, coordinates, True, residual, jacobian, sizes)
+    _raise_sizes(terms, coordinates, False, multipliers, constraint_jacobian, sizes)
 
 
 @compiled
-def _raise_sizes(terms: TermArrays, units: Units, costs: bool, values: Array, jacobian: Array) -> None:
+def _raise_sizes(
+    terms: TermArrays, coordinates: IntArray, costs: bool, values: Array, jacobian: Array, sizes: Array
+) -> None:
     """Raise sizes to the largest product of a value of a row and an entry of its Jacobian."""
-    fields, columns, coordinates, sums = terms.fields, terms.columns, units.coordinates, units.sums
+    fields, columns = terms.fields, terms.columns
     for t in range(len(fields)):
         term = fields[t]
         if (term[KIND] == COST) != costs:
@@ -417,11 +400,11 @@ def _raise_sizes(terms: TermArrays, units: Units, costs: bool, values: Array, ja
         m, width, entry, row, column = term[ROWS], term[WIDTH], term[ENTRY], term[ROW], term[COLUMN]
         for _ in range(term[COUNT]):
             for a in range(row, row + m):
-                value = abs(values[a])
+                value = SHARE * abs(values[a])
                 if value > 0.0:
                     for d in range(width):
                         at = coordinates[columns[column + d]]
-                        sums[SIZE, at] = max(sums[SIZE, at], value * abs(jacobian[entry + d]))
+                        sizes[at] = max(sizes[at], value * abs(jacobian[entry + d]))
                 entry += width
             row += m
             column += width

@@ -45,12 +45,12 @@ from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
-from unifg.problem.units import SIZE, SMALL_FORCES, Units, find_sizes, find_units
+from unifg.problem.units import SMALL_FORCES, find_sizes
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
 
-NUMBERS = 7  # that :func:`kkt_numbers` writes
+NUMBERS = 6  # that :func:`kkt_numbers` writes
 
 
 class Tolerances(NamedTuple):
@@ -77,7 +77,7 @@ class Optimality(NamedTuple):
         determined: whether no unknown may be moved freely; looked at for least squares only.
         rounding: by how much differences may be wrong about the stationarity.
         weakest: of least squares, the smallest pivot of the Hessian relative to its diagonal; 1 where nobody looked.
-        slope, unit: gradient that counts as one, at least, and the largest unit of an unknown; 1 for least squares.
+        slope: gradient that counts as one, at least; 1 for least squares.
     """
 
     stationarity: float
@@ -89,7 +89,6 @@ class Optimality(NamedTuple):
     rounding: float = 0.0
     weakest: float = 1.0
     slope: float = 1.0
-    unit: float = 1.0
 
     def holds(self, tolerances: Tolerances) -> bool:
         """Test whether all three numbers are within their tolerances."""
@@ -136,30 +135,33 @@ def optimality(
             return Optimality(np.inf, np.inf, np.inf, -1, False)
         rounding = _relative_rounding(program, lin, multipliers) if program.differenced else 0.0
         return Optimality(offset.value, 0.0, 0.0, -1, True, offset.determined, rounding, offset.weakest)
-    gradient, found, units = np.empty(len(lin.gradient)), np.empty(NUMBERS), program.unit_memory()
+    columns = program.columns
+    gradient, found, sizes = np.empty(len(lin.gradient)), np.empty(NUMBERS), np.zeros(columns.dimensions)
     kkt_numbers(
-        program.arrays, units, violation_unit, -1.0 if program.differenced else enough, lin.hessian, lin.concavity,
-        lin.gradient, lin.residual, lin.jacobian, lin.constraints, lin.constraint_jacobian, multipliers, gradient,
-        found,
+        program.arrays, columns.free, columns.coordinates, sizes, violation_unit,
+        -1.0 if program.differenced else enough, lin.gradient, lin.residual, lin.jacobian, lin.constraints,
+        lin.constraint_jacobian, multipliers, gradient, found,
     )  # fmt: skip
     measured = read_numbers(found, lin.cost)
     if not measured.finite:
         return measured
     rounding = 0.0
     if program.differenced:
-        sizes = units.sums[SIZE][units.coordinates[units.free]]
-        uncertain, mean = gradient_rounding(program, lin, multipliers), float(np.abs(multipliers).sum())
-        scale = max(1.0, mean / max(len(multipliers), 1) / SMALL_FORCES)
-        rounding = min(float((uncertain / sizes).max(initial=0.0)), float(uncertain.max(initial=0.0)) / scale)
+        uncertain, total = gradient_rounding(program, lin, multipliers), float(np.abs(multipliers).sum())
+        scale = max(1.0, total / max(len(multipliers), 1) / SMALL_FORCES)
+        own = np.maximum(sizes[columns.coordinates[columns.free]], np.finfo(float).tiny)
+        with np.errstate(over="ignore"):
+            relative = float((uncertain / own).max(initial=0.0))
+        rounding = min(relative, float(uncertain.max(initial=0.0)) / scale)
     return measured._replace(rounding=rounding)
 
 
 def read_numbers(found: Array, cost: float) -> Optimality:
     """Numbers that :func:`kkt_numbers` has written."""
-    stationarity, violation, complementarity, worst, finite, slope, unit = found.tolist()
+    stationarity, violation, complementarity, worst, finite, slope = found.tolist()
     if finite == 0.0 or not math.isfinite(cost):
         return Optimality(np.inf, np.inf, np.inf, -1, False)
-    return Optimality(stationarity, violation, complementarity, int(worst), True, slope=slope, unit=unit)
+    return Optimality(stationarity, violation, complementarity, int(worst), True, slope=slope)
 
 
 def _relative_rounding(program: CompiledProblem, lin: Linearization, multipliers: Array) -> float:
@@ -236,13 +238,12 @@ def _add_rounding(
 @compiled
 def _complementarity(
     terms: TermArrays,
-    units: Units,
-    violation_unit: float,
-    scale: float,
+    shares: tuple[IntArray, Array, float, float],
     constraints: Array,
     entries: Array,
     multipliers: Array,
 ) -> float:
+    coordinates, sizes, violation_unit, scale = shares
     fields, columns, lower, upper, result = terms.fields, terms.columns, terms.lower, terms.upper, 0.0
     unit = violation_unit if violation_unit > 0.0 else 1.0
     for t in range(len(fields)):
@@ -253,14 +254,15 @@ def _complementarity(
         for _ in range(term[COUNT]):
             for at in range(row, row + m):
                 if lower[at] != upper[at] and multipliers[at] != 0.0:
-                    share = 0.0
+                    share = 0.0  # of the force of the row in the gradients
                     for d in range(width):
-                        size = units.sums[SIZE, units.coordinates[columns[column + d]]]
-                        if size > 0.0:  # else fixed
+                        size = sizes[coordinates[columns[column + d]]]
+                        if size > 0.0:
                             share = max(share, abs(entries[entry + d]) / size)
                     limit = upper[at] if multipliers[at] > 0.0 else lower[at]
                     slack = abs(constraints[at] - limit) if math.isfinite(limit) else unit
-                    result = max(result, abs(multipliers[at]) * slack * min(share / unit, 1.0 / scale))
+                    share = min(share / unit, 1.0 / scale) if share > 0.0 else 1.0 / scale
+                    result = max(result, abs(multipliers[at]) * slack * share)
                 entry += width
             row += m
             column += width
@@ -270,11 +272,11 @@ def _complementarity(
 @compiled
 def kkt_numbers(
     terms: TermArrays,
-    units: Units,
+    free: IntArray,
+    coordinates: IntArray,
+    sizes: Array,
     violation_unit: float,
     enough: float,
-    hessian: Array,
-    concavity: Array,
     slope: Array,
     residual: Array,
     jacobian: Array,
@@ -284,15 +286,15 @@ def kkt_numbers(
     gradient: Array,
     found: Array,
 ) -> None:
-    """Write the KKT numbers, the worst row, whether everything is finite, the least size and the largest unit.
+    """Write the KKT numbers, the worst row, whether everything is finite, and the least size.
 
     Args:
         terms: of the program.
-        units: which are found.
+        free: columns that are unknown.
+        coordinates: (width,) number of the coordinate that each column belongs to.
+        sizes: (coordinates,) memory.
         violation_unit: of the rows in the mean; 0 where nothing tells it.
         enough: where absolute numbers are below, relative ones are not looked for.
-        hessian: entries of the Hessian of the objective.
-        concavity: negative curvature of scalar costs; empty without.
         slope: (width,) gradient of the objective.
         residual: (C,) of its squares.
         jacobian: entries of theirs.
@@ -300,11 +302,11 @@ def kkt_numbers(
         entries: of the constraint Jacobian.
         multipliers: (M,).
         gradient: (width,) memory, for the gradient of the Lagrangian.
-        found: (7,) result.
+        found: (6,) result.
     """
     stationarity, violation, complementarity, total = 0.0, 0.0, 0.0, 0.0
     worst, count, finite = -1, len(constraints), True
-    lower, upper, free = terms.lower, terms.upper, units.free
+    lower, upper = terms.lower, terms.upper
     copy_to(slope, gradient)
     evaluation.transposed_times(terms, False, entries, multipliers, gradient)
     for k in range(len(free)):
@@ -325,19 +327,20 @@ def kkt_numbers(
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
     scale = max(1.0, total / max(count, 1) / SMALL_FORCES)
-    stationarity, complementarity, unit, least = stationarity / scale, complementarity / scale, 1.0, scale
+    stationarity, complementarity, least = stationarity / scale, complementarity / scale, scale
     if not max(stationarity, complementarity) <= enough and finite:
-        find_units(terms, units, violation_unit, hessian, concavity, slope, constraints, entries)
-        find_sizes(terms, units, hessian, concavity, slope, residual, jacobian, multipliers, entries)
-        least, relative, unit = math.inf, 0.0, 0.0
+        find_sizes(terms, coordinates, residual, jacobian, multipliers, entries, sizes)
+        least, relative = math.inf, 0.0
         for k in range(len(free)):
-            size = units.sums[SIZE, units.coordinates[free[k]]]
-            least, unit = min(least, size), max(unit, units.unknowns[free[k]])
-            relative = max(relative, abs(gradient[free[k]]) / size)
+            size, force = sizes[coordinates[free[k]]], abs(gradient[free[k]])
+            least = min(least, size)
+            if force > 0.0:
+                relative = max(relative, force / size if size > 0.0 else math.inf)
         stationarity, least = min(stationarity, relative), max(least, scale)
-        complementarity = _complementarity(terms, units, violation_unit, scale, constraints, entries, multipliers)
+        shares = coordinates, sizes, violation_unit, scale
+        complementarity = _complementarity(terms, shares, constraints, entries, multipliers)
     found[0], found[1], found[2] = stationarity, violation, complementarity
-    found[3], found[4], found[5], found[6] = worst, finite, least, unit
+    found[3], found[4], found[5] = worst, finite, least
 
 
 def infeasible_stationary(program: CompiledProblem, lin: Linearization, tolerance: float) -> bool:

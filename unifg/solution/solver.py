@@ -578,9 +578,7 @@ class SolveState:
         if measured.blurred(self.tolerances):
             return True
         rounding = EPSILON * float(np.abs(self.lin.stored).max(initial=0.0))
-        return rounding > FEW_DIGITS * kkt * measured.unit and measured.holds(
-            Tolerances(NEARLY * kkt, NEARLY * violation)
-        )
+        return rounding > FEW_DIGITS * kkt and measured.holds(Tolerances(NEARLY * kkt, NEARLY * violation))
 
     def _estimate(self) -> None:
         """Take multipliers that are made of the gradients here, if all KKT numbers are better with them."""
