@@ -284,9 +284,9 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 31_693, "scenarios": 10_807, "benchmarks": 4_828, "tests": 35_102,
+    "unifg solvers models": 31_696, "scenarios": 10_807, "benchmarks": 4_828, "tests": 35_102,
     "docs examples": 1_776, "unifg/factors": 4_306, "unifg/problem": 3_436, "models": 2_469,
-    "unifg/elimination": 2_155, "solvers": 4_876, "unifg/solution": 3_070, "unifg/smoothing": 1_619,
+    "unifg/elimination": 2_155, "solvers": 4_879, "unifg/solution": 3_070, "unifg/smoothing": 1_619,
     "unifg/lie": 1_585, "unifg/view": 1_404, "unifg/files": 1_010, "unifg/pose_graphs": 1_350,
     "unifg/horizon": 1_201, "unifg/modeling": 1_067, "unifg/codegen": 1_320, "unifg/plots": 418,
     "scenarios/scenes": 1_317, "scenarios/simulation": 1_175, "scenarios/campaigns": 923,

@@ -379,6 +379,7 @@ def test(address: int) -> None:
         less = min(0.2 * now.mu, now.mu * math.sqrt(now.mu / now.size))
         now.mu = less if less > 10.0 * smallest else smallest
         now.filtered = 0
+    now.settled = 1 if now.mu <= smallest else 0
     cost, lower = now.cost, terms.lower
     phi, theta = merit(now, sides, pairs, penalties, row_units, rows, lower, cost, constraints, 0.0)
     now.phi, now.theta = phi, theta

@@ -14,6 +14,7 @@ from unifg.solvers.interior_point.state import ACCEPTED, AGAIN, FILTER, STALLED,
 ARMIJO = 1e-4
 GAMMA_THETA, GAMMA_PHI = 1e-5, 1e-8
 HALVINGS = 20
+FAR = 1e3  # times the violation
 FEW_FAILURES, MOST_FAILURES = 2, 8  # of line searches in a row, before equalities become elastic and for good
 SHORT_STEP = 0.05  # length of one
 
@@ -32,7 +33,9 @@ def judge(address: int) -> None:
     slack = 1e-13 * max(now.cost_unit, abs(phi))
     switch = slope < 0.0 and alpha * (-slope / now.cost_unit) ** 2.3 > theta**1.1 and theta <= now.theta_small
     armijo = phi_trial <= phi + ARMIJO * alpha * slope + slack
-    good = finite and theta_trial <= now.theta_large
+    # With the least mu no step has reason to lead far from what the constraints say, however long singular arcs make it.
+    most = min(now.theta_large, max(now.theta_small, FAR * theta)) if now.settled == 1 else now.theta_large
+    good = finite and theta_trial <= most
     if good:
         if switch:
             good = armijo

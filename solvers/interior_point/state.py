@@ -68,6 +68,7 @@ NOW = np.dtype(
         ("exact", np.int64),  # whether to use second derivatives where they pay
         ("bending", np.int64),  # whether the present step does
         ("filtered", np.int64),  # pairs in the filter
+        ("settled", np.int64),  # whether mu is the least
         ("trials", np.int64),
         ("corrected", np.int64),  # whether the trial is a second-order correction
         ("failures", np.int64),  # line searches in a row that found nothing
