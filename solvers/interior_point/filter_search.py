@@ -33,7 +33,7 @@ def judge(address: int) -> None:
     slack = 1e-13 * max(now.cost_unit, abs(phi))
     switch = slope < 0.0 and alpha * (-slope / now.cost_unit) ** 2.3 > theta**1.1 and theta <= now.theta_small
     armijo = phi_trial <= phi + ARMIJO * alpha * slope + slack
-    # With the least mu no step has reason to lead far from what the constraints say, however long singular arcs make it.
+    # With the least mu no step need lead far from the constraints, however long singular arcs make it.
     most = min(now.theta_large, max(now.theta_small, FAR * theta)) if now.settled == 1 else now.theta_large
     good = finite and theta_trial <= most
     if good:
