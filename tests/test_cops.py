@@ -17,14 +17,14 @@ TIMES = ("robot", "steering", "brachistochrone, squared")
 OTHERS = ("chain", "catalyst", "orbit", "electrons", "cam", "rocket", "surface")
 
 
-@pytest.mark.parametrize("name", TIMES + OTHERS)
+@pytest.mark.parametrize("name", (*TIMES, *OTHERS, "glider"))
 def test_costs_without_squares_reach_the_literatures_optimum(name: str) -> None:
     problem = NAMED[name]
     graph, guess = problem.build()
     solution = InteriorPoint(tolerance=1e-8).solve(graph, guess)
     assert solution.converged
     assert solution.cost == pytest.approx(problem.best, rel=1e-4)
-    assert solution.iterations <= 100
+    assert solution.iterations <= (600 if name == "glider" else 100)  # where IPOPT takes 633
 
 
 CHANGES = {

@@ -78,7 +78,7 @@ class InteriorPoint(Solver):
 
     rehearses = True
 
-    max_iterations: int = 300
+    max_iterations: int = 1000
     hessian: Literal["exact", "gauss-newton"] = "exact"
     barrier: float = 0.3
     penalty: float = 1e3
