@@ -478,7 +478,7 @@ def test_the_time_of_a_solve_is_told_by_its_parts(monkeypatch: pytest.MonkeyPatc
     assert (
         SQP().solve(stated.graph, stated.guess).times == InteriorPoint().solve(stated.graph, stated.guess).times == {}
     )
-    prepared._workspace.now["clock"] = 0  # a system without that clock
+    prepared._workspace.now["clock"], prepared._workspace._settings = 0, None  # a system without that clock
     found = prepared.solve(stated.guess)
     assert found.times == {} and "Of the time" not in found.report()
     monkeypatch.setattr(ctypes, "CDLL", lambda name: object())

@@ -48,6 +48,10 @@ class EmergencyStop:
     dt: float
     base: Base = unicycle.BASE
 
+    def __post_init__(self) -> None:
+        """Load what a tick needs."""
+        SE2.exp(np.zeros((SAMPLES, 3)))
+
     def control(self, asked: Array, last: Array, scan: Scan) -> Array:
         """The fastest control (m,) along the arc of the one asked for whose braking way is free, or that brakes.
 

@@ -34,7 +34,7 @@ class Instances(NamedTuple):
     """Arguments of :func:`solve_each`.
 
     Attributes:
-        functions: addresses of ``reset``, ``loop``, ``conclude``, and of their arrays.
+        functions: addresses of ``solve_once`` and of its arrays.
         now: (1,) their scalars, with the options written.
         starts: (2,) first mu and first rho.
         rows: (K, D) numbers of all data.
@@ -91,7 +91,7 @@ def solve_each(address: int) -> None:
     given = all_at(address)
     functions, state, kkt = given.functions, given.now[0], given.kkt
     values, multipliers = given.values, given.multipliers
-    arrays, width = functions[3], given.rows.shape[1]
+    width = given.rows.shape[1]
     for k in range(len(given.rows)):
         row, number = vector(given.rows, k * width, width), vector(given.numbers, k * NUMBERS, NUMBERS)
         for p in range(len(given.sources)):
@@ -109,10 +109,8 @@ def solve_each(address: int) -> None:
         number[ANSWER] = REFUSED
         if not (known and all_unit(row, given.elements)):
             continue
-        run(functions[0], (arrays,))
         state.mu, state.rho, state.going_on, state.stage = given.starts[0], given.starts[1], 0, MOVED
-        run(functions[1], (arrays,))
-        run(functions[2], (arrays,))
+        run(functions[0], (functions[1],))
         for i in range(len(values)):
             given.found[k, i] = values[i]
         for i in range(len(multipliers)):

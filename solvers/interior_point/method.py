@@ -12,6 +12,7 @@ from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from unifg.codegen.clock import clock
 from unifg.codegen.function_pointers import ADDRESS, NOTHING, link, memory
@@ -29,7 +30,7 @@ from unifg.solution.export import Exported
 from unifg.solution.history import Iteration
 from unifg.solution.multipliers import SUSPICIOUS, Slopes
 from unifg.solution.optimality import Optimality, Tolerances, optimality, read_numbers
-from unifg.solution.solver import Solver, SolveState
+from unifg.solution.solver import UNBOUNDED_COST, Conclusion, Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
 from unifg.solvers.interior_point import each, state
@@ -136,6 +137,32 @@ class InteriorPoint(Solver):
         step: Array = now["alpha"] * workspace.work.step[: run.program.size]
         return step if now["answer"] == state.TRY else None
 
+    def at_once(self, workspace: Workspace, values: Values, multipliers: Array) -> Conclusion | bool:
+        """One compiled call, where nobody looks and the last solve has left its settings."""
+        if not workspace.repeats(self, values.flat, multipliers):
+            return False
+        try:
+            workspace.run("solve_once")
+        except KeyboardInterrupt:  # in compiled code Python learns of it when that is over
+            workspace.interrupted = True
+            return True
+        now, work = workspace.now, workspace.work
+        iterations, cost, ending = now["iteration"], now["cost"], ENDINGS[now["answer"]]
+        measured = read_numbers(work.kkt, cost)
+        held = measured.passes(self.tolerances)
+        if now["suspicion"] > SUSPICIOUS or not cost >= UNBOUNDED_COST or not measured.finite:
+            return True
+        if not held and ((now["kept"] and now["violation"] > now["feasible"]) or iterations >= self.max_iterations):
+            return True
+        if ending is not Status.STOP_RULE and not (held and ending is Status.CONVERGED):
+            return True
+        lin, status = workspace.found(), Status.CONVERGED if held else ending
+        history = _history(work.log[: iterations + 1].copy(), lin, workspace.compiled)
+        parts = now["evaluating"], now["solving"], now["judging"], workspace.compiled
+        return Conclusion(
+            lin, work.multipliers.copy(), measured, status, iterations, history, parts if now["clock"] else None
+        )
+
     def iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
         """Iterate to convergence; where that is not to be had, to a point of least violation, or on from another."""
         start, carried = run.values, run.multipliers
@@ -170,7 +197,7 @@ class InteriorPoint(Solver):
             run.consider(now["cost"], work.constraints.copy(), work.values.copy(), work.multipliers.copy())
 
     def _iterate(self, run: SolveState, workspace: Workspace) -> Status | None:
-        now = workspace.prepare(self, run.values.flat, run.multipliers)
+        now = workspace.now if run.begun else workspace.prepare(self, run.values.flat, run.multipliers)
         restarts = 0
         while True:
             reason = self._attempt(run, workspace)
@@ -199,9 +226,11 @@ class InteriorPoint(Solver):
     def _attempt(self, run: SolveState, workspace: Workspace) -> Status | None:
         """From where the workspace is to one of the endings."""
         program, work, now = run.program, workspace.work, workspace.now
-        assisted = now["assisted"]
+        assisted, begun, run.begun = now["assisted"], run.begun, False
         now["watched"], now["stage"] = not run.alone, state.LINEARIZED
-        if run.alone:
+        if begun:
+            pass
+        elif run.alone:
             if assisted:
                 workspace.take(program.linearize(program.columns.view(work.values.copy())))
             elif len(program.fixed_rows()):
@@ -217,9 +246,10 @@ class InteriorPoint(Solver):
                 if run.status is not None:
                     return None
             workspace.take(run.lin)
-        interrupted, seen, now["answer"] = False, now["iteration"], NO_ANSWER
+        interrupted, seen = begun and workspace.interrupted, now["iteration"]
+        now["answer"] = now["answer"] if begun else NO_ANSWER
         try:
-            while workspace.asks():
+            while not begun and workspace.asks():
                 if run.alone:
                     self._note(run, workspace)
                 if now["answer"] == state.TRY and run.out_of_time:
@@ -256,10 +286,13 @@ class Workspace:
     """Memory kept between solves of one structure.
 
     Attributes:
-        compiled: seconds of the solve in compiled code, but for the test of the answer.
+        compiled: seconds of the solve in compiled code, but for the test of the answer of a solve in parts.
+        interrupted: whether the user has interrupted the last solve in one call.
     """
 
-    compiled = 0.0
+    compiled, interrupted = 0.0, False
+    # Options, the bytes of the scalars, and what these are where a solve with such options begins.
+    _settings: tuple[dict[str, Any], NDArray[np.uint8], NDArray[np.uint8]] | None = None
 
     def __init__(self, program: CompiledProblem) -> None:
         """Analyse the KKT matrix and compile."""
@@ -332,12 +365,16 @@ class Workspace:
         """Run one of the linked functions."""
         call(self._links[function], self._address)
 
+    def run(self, function: str) -> None:
+        """Run one of the linked functions, and take its time."""
+        began = perf_counter()
+        self.call(function)
+        self.compiled += perf_counter() - began
+
     def asks(self) -> bool:
         """Run the loop up to an ending, a question, or something to show; answer a question; whether it goes on."""
         program, work, now = self.program, self.work, self.now
-        began = perf_counter()
-        self.call("loop")
-        self.compiled += perf_counter() - began
+        self.run("loop")
         answer = now["answer"]
         if answer == state.LINEARIZE:
             self.take(program.linearize(self._values()))
@@ -376,7 +413,31 @@ class Workspace:
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
         self.begin_at(values, options)
         work.multipliers[:] = multipliers
+        if not clocked:
+            self._keep_settings(options)
         return now
+
+    def _keep_settings(self, options: InteriorPoint) -> None:
+        """Keep the scalars that a solve begins with, if later ones with these options may go on without Python."""
+        program, now = self.program, self.now
+        looks = options.verbose or options.keep_values or options.keep_residuals or options.search_iterations
+        python = now["clocked"] or now["assisted"] or program.least_squares or program.differenced
+        self._settings = None
+        if not (looks or python or len(program.fixed_rows())):
+            now["watched"], now["stage"] = 0, state.MOVED
+            scalars = self.work.scalars.view(np.uint8)  # NumPy copies records field by field
+            self._settings = dict(vars(options)), scalars, scalars.copy()
+
+    def repeats(self, options: InteriorPoint, values: Array, multipliers: Array) -> bool:
+        """Set up a solve with the settings of the last one, unless options or graph are not as they were then."""
+        program, work, settings = self.program, self.work, self._settings
+        if settings is None or settings[0] != vars(options) or program.equality is not self._held:
+            return False
+        if not program.fully_compiled:
+            return False
+        settings[1][:], work.values[:], work.multipliers[:] = settings[2], values, multipliers
+        self._taken, self.compiled, self.interrupted = None, 0.0, False
+        return True
 
     def instances(self, options: InteriorPoint, rows: Array, guesses: Array, duals: Array) -> each.Instances:
         """Arguments of one compiled call that solves many instances."""
@@ -384,7 +445,7 @@ class Workspace:
         now = self.prepare(options, guesses[0], duals[0])
         now["watched"] = 0
         sizes = len(work.values), len(work.multipliers), each.NUMBERS
-        functions = np.array([*(self._links[name] for name in ("reset", "loop", "conclude")), self._address])
+        functions = np.array([self._links["solve_once"], self._address])
         starts, binding = np.array([options.barrier, options.penalty]), program.binding
         return each.Instances(
             functions, work.scalars, starts, rows, *binding.carried, program.retraction.fixed, binding.quaternions,

@@ -124,7 +124,7 @@ PAIR = np.dtype(
 # Addresses of compiled functions.
 FUNCTIONS = "factor solve linearize evaluate curve weigh add_scalars evaluate_scalars retract"
 FUNCTIONS += " begin measure test bend direct assemble examine estimate steer advance judge correct restore accept"
-FUNCTIONS += " relax increase_penalty renew loop reset split conclude kkt_numbers raise_slopes size_of"
+FUNCTIONS += " relax increase_penalty renew loop reset split conclude solve_once kkt_numbers raise_slopes size_of"
 LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 
 # What a call answers.

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 from weakref import ReferenceType, ref
 
 import numpy as np
@@ -61,6 +61,26 @@ WITHOUT_SUCCESS = (
     Status.INTERRUPTED,
 )
 """Endings that return the best iterate."""
+
+
+class Conclusion(NamedTuple):
+    """A success that needs no decision of :class:`SolveState`.
+
+    Attributes:
+        lin, multipliers, measured: linearisation, multipliers (M,) and KKT numbers at the answer.
+        status: CONVERGED or STOP_RULE.
+        iterations: taken.
+        history: makes their rows.
+        parts: as of :class:`SolveState`.
+    """
+
+    lin: Linearization
+    multipliers: Array
+    measured: Optimality
+    status: Status
+    iterations: int
+    history: Callable[[], list[Iteration]]
+    parts: tuple[float, float, float, float] | None
 
 
 class Backend(ABC):
@@ -224,6 +244,20 @@ class Solver(Backend):
         """The compiled loop of :meth:`solve_each` for one instance, for :meth:`Prepared.export`."""
         raise NotImplementedError
 
+    def at_once(self, workspace: Any, values: Values, multipliers: Array) -> Conclusion | bool:
+        """Solve in one compiled call that judges its answer.
+
+        Args:
+            workspace: of an earlier solve.
+            values: of the guess, checked.
+            multipliers: (M,) of the guess.
+
+        Returns:
+            The answer; False where there is no such call and nothing has begun; True where :meth:`iterate` has to go on
+            from where the workspace is, with ``run.begun``.
+        """
+        return False
+
     @abstractmethod
     def workspace(self, program: CompiledProblem) -> Any:
         """Memory that the backend keeps between solves of one structure."""
@@ -255,6 +289,7 @@ class SolveState:
         restoration_steps: of descents on the violation alone so far.
         parts: seconds of a compiled loop in evaluation, linear systems and the test of the answer, and of all of the
             loop; None where nobody took them.
+        begun: whether the workspace holds a first attempt that :meth:`Solver.at_once` has made.
         alone: whether nobody looks before the end; there is no linearisation then until :meth:`conclude`.
         tolerances: of the KKT test.
         lent: the backend's factorisation of a matrix near the Hessian of the objective, which the KKT test of least
@@ -283,6 +318,7 @@ class SolveState:
         self.lent: Factored | None = None
         self.slopes: Slopes | None = None
         self.iterations = self.restoration_steps = 0
+        self.begun = False
         self.parts: tuple[float, float, float, float] | None = None
         if solver.verbose:
             show(HEADER)
@@ -452,13 +488,12 @@ class SolveState:
             self.accept(reached, self.multipliers, math.sqrt(inner(step, step)), 1.0, search=1)
 
     def keep_with(self, error: Exception) -> None:
-        """Hand what has been reached along with an error, as its attribute ``reached``, and say so in a note."""
+        """Hand over what has been reached, if there is anything."""
         if not self.incumbents:
             return
         with suppress(Exception):  # the functions may raise again
             self.status = Status.INTERRUPTED
-            error.reached = self.finish(None)  # type: ignore[attr-defined]
-            error.add_note(f"after {self.iterations} iterations; the solution until then is in the error's `reached`")
+            hand_over(error, self.finish(None))
 
     @property
     def least_violated(self) -> Values:
@@ -627,6 +662,12 @@ class SolveState:
 
     def _decide_in_time(self) -> Status | None:
         return self._decide() or (Status.TIME_LIMIT if self.out_of_time else None)
+
+
+def hand_over(error: Exception, reached: Solution) -> None:
+    """Hand what has been reached along with an error, as its attribute ``reached``, and say so in a note."""
+    error.reached = reached  # type: ignore[attr-defined]
+    error.add_note(f"after {reached.iterations} iterations; the solution until then is in the error's `reached`")
 
 
 class Prepared:
@@ -807,13 +848,34 @@ class Prepared:
         program.bind(data or {})
         self._say_if_stale()
         values, multipliers, penalties = self.read(guess, duals)
-        run = SolveState(self.solver, program, values, multipliers, callback)
-        run.penalties = penalties
-        solution = self._verified(self._finished(run), run, callback)
+        began = time.perf_counter()
+        solution = self._verified(self._answered(values, multipliers, penalties, callback, began), began, callback)
         self._last = ref(solution)
         if check and not solution.converged:
             raise NotConverged(solution)
         return solution
+
+    def _answered(
+        self, values: Values, multipliers: Array, penalties: Array, callback: Callback | None, began: float
+    ) -> Solution:
+        """The solution of a solve from there: by one compiled call, if the backend has one and it succeeds."""
+        program, solver = self.program, self.solver
+        first = self._workspace is None or callback is not None or self.single
+        found = False if first else solver.at_once(self._workspace, values, multipliers)
+        if not isinstance(found, bool):
+            solution = Solution(
+                program, found.lin, found.multipliers, penalties, found.status, found.measured, found.history,
+                found.iterations, time.perf_counter() - began, solver.name, found.iterations,
+            )  # fmt: skip
+            solution._parts, solution.tolerance, solution._edition = (
+                found.parts,
+                solver.tolerance,
+                program.binding.edition,
+            )
+            return solution
+        run = SolveState(solver, program, values, multipliers, callback)
+        run._started, run.penalties, run.begun = began, penalties, found
+        return self._finished(run)
 
     def read(self, guess: AnyGuess, duals: Mapping[str, Numbers] | None = None) -> tuple[Values, Array, Array]:
         """Values, multipliers (M,) and penalties (M,) of a guess, checked; fixed variables have their values."""
@@ -833,7 +895,7 @@ class Prepared:
             penalties = self._stacked("penalties", guess.penalties) if guess.penalties else penalties
         return values, self._stacked("multipliers", {**carried, **duals} if duals else carried), penalties
 
-    def _verified(self, solution: Solution, run: SolveState, callback: Callback | None) -> Solution:
+    def _verified(self, solution: Solution, began: float, callback: Callback | None) -> Solution:
         """Evaluate traced functions as written at an answer, and solve again without the traces that differ."""
         program = self.program
         self._solves += 1
@@ -842,35 +904,38 @@ class Prepared:
         if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
             return solution
         values = solution._lin.values
-        broken = bool(program.demanding) and self._broken(run, values)
+        broken = bool(program.demanding) and self._broken(solution)
         due = slopes or self._solves % EVERY == 0 or self._owed or broken
         if not due and self._of_branches < AT_ONCE + self._solves // LATER and program.new_branches(values, False):
             due = True
             self._of_branches += 1
-        self._owed = due and run.out_of_time and not broken  # verified after the next solve that leaves time for it
+        late = time.perf_counter() - began > self.solver.time_limit
+        self._owed = due and late and not broken  # verified after the next solve that leaves time for it
         if not due or self._owed:
             return solution
         program.new_branches(values, True)
         mistraced: dict[str, str] = {}
         while found := program.mistraced(values, slopes, self._solves):
             mistraced |= found
-            again = SolveState(self.solver, program, program.columns.values(solution.values), run.multipliers, callback)
-            again._started, again.penalties = run._started, run.penalties
-            solution, values = self._finished(again), again.values
+            reached = program.columns.values(solution.values), solution._multipliers
+            again = SolveState(self.solver, program, *reached, callback)
+            again._started, again.penalties = began, solution._penalties
+            solution = self._finished(again)
             if not solution.finite:
                 break
-            self._broken(again, values)
-        solution.checked, solution.mistraced, solution.seconds = solution.finite, mistraced, run.seconds
+            values = solution._lin.values
+            self._broken(solution)
+        solution.checked, solution.mistraced = solution.finite, mistraced
+        solution.seconds = time.perf_counter() - began
         return solution
 
-    def _broken(self, run: SolveState, values: Values) -> bool:
+    def _broken(self, solution: Solution) -> bool:
         """Test what traced functions assert; the exception of one that fails is passed on as within a solve."""
         try:
-            return self.program.broken(values)
+            return self.program.broken(solution._lin.values)
         except Exception as error:
-            run.keep_with(error)
-            if hasattr(error, "reached"):  # which the KKT test would pass: it knows no assertions
-                error.reached.status = Status.INTERRUPTED
+            solution.status = Status.INTERRUPTED  # the KKT test would pass: it knows no assertions
+            hand_over(error, solution)
             raise
 
     def verify(self, solution: Solution) -> dict[str, str]:
