@@ -500,3 +500,80 @@ def test_a_tick_of_one_step_leaves_second_derivatives_out() -> None:
     cold: list[fg.Iteration] = []
     tick.solve(stated.guess, callback=cold.append)
     assert "gauss_newton" in cold[1].details and "gauss_newton" not in cold[2].details
+
+
+def cusp() -> tuple[fg.Graph, Any]:
+    """HS13: no multipliers at the answer."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(lambda p: p - [2.0, 0.0], x, name="near")
+    graph.constrain(lambda p: (1.0 - p[:, :1]) ** 3 - p[:, 1:], x, lower=0.0, name="cusp")
+    graph.bound(x, lower=0.0, name="box")
+    return graph, {x: [[-2.0, -2.0]]}
+
+
+def falling() -> tuple[fg.Graph, Any]:
+    """A cost that falls without end."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x, name="height")
+    graph.bound(x, lower=0.0, name="box")
+    return graph, {x: [[1.0]]}
+
+
+def driving() -> tuple[fg.Graph, Any]:
+    """A drive past discs."""
+    stated = Unicycle("straight", True, 20).formulation()
+    return stated.graph, stated.guess
+
+
+@pytest.mark.parametrize(
+    ("problem", "options", "status"),
+    [
+        (driving, {}, fg.Status.CONVERGED),
+        (driving, {"tolerance": 1e-12, "step_tolerance": 1e-3}, fg.Status.STOP_RULE),
+        (driving, {"step_tolerance": np.inf, "max_iterations": 2}, fg.Status.ITERATION_LIMIT),
+        (driving, {"max_iterations": 3}, fg.Status.ITERATION_LIMIT),
+        (driving, {"time_limit": 1e3}, fg.Status.CONVERGED),
+        (driving, {"keep_values": True}, fg.Status.CONVERGED),
+        (cusp, {}, fg.Status.DEGENERATE),
+        (falling, {}, fg.Status.UNBOUNDED),
+    ],
+)
+def test_a_solve_in_one_call_says_what_a_solve_in_parts_says(
+    problem: Any, options: dict[str, Any], status: fg.Status
+) -> None:
+    graph, guess = problem()
+    solver = InteriorPoint(**options)
+    used, fresh = solver.prepare(graph), solver.prepare(graph)
+    used.solve(guess)
+    one, other = used.solve(guess), fresh.solve(guess)  # the first one of a prepared solver goes on in parts
+    assert one.status is other.status is status
+    assert one.returned == other.returned and one.iterations == other.iterations
+    np.testing.assert_array_equal(one._lin.stored, other._lin.stored)
+    np.testing.assert_array_equal(one._multipliers, other._multipliers)
+    for number in ("cost", "stationarity", "violation", "complementarity", "tolerance", "worst", "finite"):
+        assert getattr(one, number) == getattr(other, number), number
+    assert len(one.history) == len(other.history)
+    assert [row.cost for row in one.history] == [row.cost for row in other.history]
+    if "keep_values" in options:
+        assert one.history[0].values is not None
+
+
+def test_a_tick_is_one_call_until_something_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, guess = driving()
+    prepared = InteriorPoint().prepare(graph)
+    prepared.solve(guess)
+    begun: list[bool] = []
+    real = InteriorPoint.at_once
+    monkeypatch.setattr(
+        InteriorPoint, "at_once", lambda *given: begun.append(not isinstance(found := real(*given), bool)) or found
+    )
+    first = prepared.solve(guess)
+    prepared.solver.tolerance = 1e-3  # an option of the same solver
+    loose = prepared.solve(guess)
+    prepared.solve(guess)
+    assert begun == [True, False, True]
+    assert loose.tolerance == 1e-3 and loose.iterations < first.iterations
+    prepared.solve(guess, callback=lambda row: None)
+    assert len(begun) == 3
