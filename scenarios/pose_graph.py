@@ -19,7 +19,7 @@ from unifg.factors.robust import DCS, Cauchy, Huber, Loss, TruncatedLeastSquares
 from unifg.files.contents import legible
 from unifg.files.pose_graph import read_pose_graph
 from unifg.pose_graphs.information import REPAIRS, Repair, indefinite
-from unifg.pose_graphs.initialise import chordal, lago, odometric, starts
+from unifg.pose_graphs.initialise import chordal, incremental, lago, odometric, starts
 from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName, RobustOn
 from unifg.pose_graphs.verdict import Judgement, Verdict
@@ -36,11 +36,12 @@ from unifg.typing import Array, BoolArray
 __all__ = ["SolveSettings", "SolvedGraph", "robust_loss", "solve_file"]
 
 AUTO = "auto"
-GUESSES: dict[str, Callable[[PoseGraph], Array]] = {
-    "file": lambda pose_graph: pose_graph.poses,
-    "odometry": odometric,
-    "lago": lago,
-    "chordal": chordal,
+GUESSES: dict[str, Callable[[PoseGraph], PoseGraph]] = {
+    "file": lambda read: read,
+    "odometry": lambda read: read.with_poses(odometric(read)),
+    "lago": lambda read: read.with_poses(lago(read)),
+    "chordal": lambda read: read.with_poses(chordal(read)),
+    "incremental": incremental,
 }
 LOSSES: dict[str, Callable[[float], Loss]] = {
     "huber": Huber,
@@ -188,11 +189,12 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
     if settings.init == AUTO:
         found = starts(read, settings.residual, loss)
         best = min(found, key=lambda start: start.cost)
-        begun, before, in_file, at_start = best.name, read.with_poses(best.poses), found[0].chi2, best.chi2
+        before = read.with_poses(best.poses, best.landmarks)
+        begun, in_file, at_start = best.name, found[0].chi2, best.chi2
     else:
         begun, before, in_file = (
             settings.init,
-            read.with_poses(GUESSES[settings.init](read)),
+            GUESSES[settings.init](read),
             read.chi2(settings.residual),
         )
         at_start = in_file if begun == "file" else before.chi2(settings.residual)

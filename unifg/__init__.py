@@ -120,6 +120,7 @@ __all__ = [
     "Tukey",
     "UnifgError",
     "ViewError",
+    "best_guess",
     "between",
     "check_manifold",
     "compiled",
@@ -181,6 +182,31 @@ def solve(
     options = {"data": data, "check": check, "callback": callback}
     numbers = {"tolerance": tolerance, "time_limit": time_limit, "verbose": verbose, "starts": starts}
     return choice.solve(graph, guess, **options, **numbers)  # type: ignore[arg-type]  # each as it is declared above
+
+
+def best_guess(
+    graph: Graph, guess: _AnyGuess, *, along: Family | None = None, data: _Mapping[Data, _Numbers] | None = None
+) -> Guess:
+    """The cheapest of a guess and others that are found by following a trajectory, for graphs with landmarks.
+
+    Least squares from dead reckoning may end in another minimum, or nowhere. Here the trajectory begins with ten
+    members and grows by half each time the costs that touch nothing else are minimised, or by a tenth if the answer
+    does not fit. New members continue the estimate by the steps between those of the guess. Landmarks come in when
+    enough rows determine them, where the guess has them relative to the trajectory. What all factors of a cost share
+    (calibrations) is held until the end. Constraints and costs that are no squares are left out, fixed variables stay.
+
+    Args:
+        graph: with costs that are squares.
+        guess: values of all families; of the trajectory its steps count, of landmarks their order of magnitude.
+        along: the family that runs along the trajectory; None for the one with the most members in a chain.
+        data: as of a solve.
+
+    Raises:
+        GraphError: when no cost ties successive members of a family, and as of a solve.
+    """
+    from unifg.solvers import continuation
+
+    return continuation.best_guess(graph, guess, along=along, data=data)
 
 
 def warmup(progress: _Callable[[float, str], object] | None = None) -> None:

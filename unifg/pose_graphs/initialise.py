@@ -19,9 +19,10 @@ from unifg.lie import SE2
 from unifg.pose_graphs.linear import block_least_squares, with_rotations
 from unifg.pose_graphs.pose_graph import GUESSES, PoseGraph, ResidualName
 from unifg.pose_graphs.spanning import spanning_tree
+from unifg.solvers.continuation import best_guess as grown
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["Start", "best_guess", "chordal", "lago", "odometric", "starts"]
+__all__ = ["Start", "best_guess", "chordal", "incremental", "lago", "odometric", "starts"]
 
 _CLOSURE_COST = 1e6  # a spanning tree takes loop closures only where there is no odometry
 _BLIND = 1e-12  # [1 / rad^2]; an edge with less information about the turn is the last that a tree takes
@@ -31,14 +32,16 @@ class Start(NamedTuple):
     """A first guess.
 
     Attributes:
-        name: "file", "odometry" where the poses of the graph came from there, "chordal" or "lago".
+        name: "file", "odometry" where the poses of the graph came from there, "chordal", "lago" or "incremental".
         poses: (n, storage).
+        landmarks: (k, p).
         chi2: sum of r' Omega r, without losses.
         cost: the same with a loss on the closures.
     """
 
     name: str
     poses: Array
+    landmarks: Array
     chi2: float
     cost: float
 
@@ -46,7 +49,8 @@ class Start(NamedTuple):
 def starts(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss | None = None) -> list[Start]:
     """First guesses and what they cost: the poses the graph has, chordal relaxation, in the plane also LAGO.
 
-    The poses of a file may lie in the basin of a folded map; a relaxation does not know them.
+    The poses of a file may lie in the basin of a folded map; a relaxation does not know them. Relaxations do not know
+    landmarks; where there are some, and no poses in the file, one more guess grows along the odometry.
 
     Args:
         pose_graph: the graph.
@@ -59,18 +63,21 @@ def starts(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss | N
     kinds = {"chordal": chordal, "lago": lago} if pose_graph.group is SE2 else {"chordal": chordal}
     closures = ~pose_graph.edges.odometry
 
-    def start(name: str, poses: Array) -> Start:
-        moved = pose_graph.with_poses(poses)
+    def start(name: str, moved: PoseGraph) -> Start:
         squared, seen = moved.squared_errors(residual), moved.seen_chi2()
         chi2 = float(squared.sum()) + seen
         if loss is None:
-            return Start(name, poses, chi2, chi2)
-        return Start(name, poses, chi2, float(squared[~closures].sum() + np.sum(loss.value(squared[closures]))) + seen)
+            return Start(name, moved.poses, moved.landmarks, chi2, chi2)
+        cost = float(squared[~closures].sum() + np.sum(loss.value(squared[closures]))) + seen
+        return Start(name, moved.poses, moved.landmarks, chi2, cost)
 
-    found = [start("file" if pose_graph.placed else "odometry", pose_graph.poses)]
+    found = [start("file" if pose_graph.placed else "odometry", pose_graph)]
     for name, method in kinds.items():
         with suppress(GraphError):
-            found.append(start(name, method(pose_graph)))
+            found.append(start(name, pose_graph.with_poses(method(pose_graph))))
+    if pose_graph.sightings and not pose_graph.placed:
+        with suppress(GraphError):
+            found.append(start("incremental", incremental(pose_graph, residual)))
     return found
 
 
@@ -78,6 +85,19 @@ def best_guess(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss
     """Whichever of :func:`starts` costs least: its name and poses (n, storage); for the arguments see there."""
     best = min(starts(pose_graph, residual, loss), key=lambda start: start.cost)
     return best.name, best.poses
+
+
+def incremental(pose_graph: PoseGraph, residual: ResidualName = "log") -> PoseGraph:
+    """Poses and landmarks found by solving for longer and longer parts of the trajectory.
+
+    See :func:`unifg.best_guess`.
+
+    Raises:
+        GraphError: poses do not follow each other.
+    """
+    graph, x, guess = pose_graph.graph(residual=residual)
+    found, landmarks = grown(graph, guess, along=x).values, graph.families.get("landmarks")
+    return pose_graph.with_poses(found[x], None if landmarks is None else found[landmarks])
 
 
 def odometric(pose_graph: PoseGraph) -> Array:

@@ -37,11 +37,15 @@ def spread(program: CompiledProblem, guess: tuple[Values, Array, Array], count: 
     return starts
 
 
+def extent(manifold: Manifold, points: Array) -> Array:
+    """(d,) largest tangent coordinates from the first of (n, storage) points to the others; 1 where all are one."""
+    covered = np.abs(manifold.local(np.repeat(points[:1], len(points), axis=0), points)).max(axis=0, initial=0.0)
+    return np.asarray(np.where(covered > 0.0, covered, covered.max(initial=0.0) or 1.0))
+
+
 def _steps(manifold: Manifold, points: Array, rng: np.random.Generator) -> Array:
     """(n, d) random tangent steps for (n, storage) points."""
-    count = len(points)
-    covered = np.abs(manifold.local(np.repeat(points[:1], count, axis=0), points)).max(axis=0, initial=0.0)
-    size = np.where(covered > 0.0, covered, covered.max(initial=0.0) or 1.0)
+    count, size = len(points), extent(manifold, points)
     if count < LONG:
         return np.asarray(size * rng.standard_normal((count, manifold.dim)))
     waves = np.sin(np.pi * np.outer(np.linspace(0.0, 1.0, count), np.arange(1, WAVES + 1)))
