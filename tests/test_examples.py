@@ -2,6 +2,7 @@
 
 import re
 import runpy
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -316,6 +317,38 @@ def test_first_order_tick(run: Run) -> None:
     assert np.median(ran["table"][:, 4]) < 100.0, "microseconds"
     gaps = np.linalg.norm(ran["table"][:, :2] - [2.6, -0.1], axis=1) - 0.3
     assert gaps.min() > -0.05
+
+
+@run_by_draw
+def test_many_plans(run: Run) -> None:
+    ran = run("many_plans")
+    assert ran["found"].converged and 0.2 * ran["K"] < ran["above"].sum() < 0.8 * ran["K"]
+
+
+@run_by_draw
+def test_explained_plan(run: Run) -> None:
+    ran = run("explained_plan")
+    for what, saved in ran["saved"].items():
+        assert 1e-3 * abs(ran["foretold"][what]) == pytest.approx(saved, rel=0.1)
+    assert "'disc' holds the solution" in ran["solution"].explain()
+
+
+@run_by_draw
+def test_checked_answer(run: Run) -> None:
+    """A change of ten times the tolerance is found, a hundredth of it is not."""
+    ran = run("checked_answer")
+    assert ran["sound"]
+    for (name, size), verdict in ran["found"].items():
+        assert size > 1e-7 or verdict, name
+        assert size < 5e-6 or verdict.verdict == "fails", name
+
+
+@run_by_draw
+def test_deployed_loop(run: Run) -> None:
+    if shutil.which("cc") is None:
+        pytest.skip("there is no C compiler")
+    ran = run("deployed_loop")
+    assert ran["same"] and ran["rows"][-1, 0] > 1.8
 
 
 @run_by_draw
