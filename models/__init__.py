@@ -8,6 +8,7 @@ __all__ = [
     "barriers",
     "between_nodes",
     "bicycle",
+    "bundle_adjustment",
     "cart_pole",
     "clearances",
     "detours",

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import FileFormatError
+from unifg.files.bal import read_bal
 from unifg.files.carmen import read_carmen
 from unifg.files.contents import Limits
 from unifg.files.euroc import read_euroc
@@ -59,6 +60,21 @@ TUM = b"""# t x y z qx qy qz qw
 0.0 0 0 0 0 0 0 1
 0.1 1 0 0 0 0 0.6 0.8
 0.2 2.5e0 0 0 0 0 0.6 0.8
+"""
+CAMERAS = b"""1 1 1
+0 0 1.5 -2.5
+0.1
+0.2
+0.3
+1
+2
+-9
+800
+-0.05
+0.01
+0.5
+0.6
+0.7
 """
 VICTORIA = b"""ODOMETRY 0 1 1 0 0.1 0.0001 0 0 4e-06 0 4e-06
 LANDMARK 1 2 11.5 -3.2 0.4 0 0.4
@@ -136,6 +152,7 @@ READERS = {
     "barcodes": Reader(lambda path: read_mrclam(path.parent, limits=SMALL), MRCLAM, ("Barcodes.dat",)),
     "room": Reader(lambda path: read_mrclam(path.parent, limits=SMALL), MRCLAM, tuple(MRCLAM)),
     "ranges": Reader(lambda path: read_plaza(path, path.parent / "TD.txt", limits=SMALL), PLAZA, tuple(PLAZA)),
+    "cameras": _one(read_bal, "problem.txt", CAMERAS),
     "profile": _one(read_profile, "speeds.csv", PROFILE),
 }
 WORDS = (

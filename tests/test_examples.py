@@ -352,6 +352,13 @@ def test_deployed_loop(run: Run) -> None:
 
 
 @run_by_draw
+def test_bundle_adjustment(run: Run) -> None:
+    ran = run("bundle_adjustment")
+    assert ran["errors"]["Cauchy"] < 0.25 * min(ran["errors"]["squares"], ran["errors"]["triangulated"])
+    assert ran["focal"]["Cauchy"].mean() == pytest.approx(800.0, rel=0.005)
+
+
+@run_by_draw
 def test_influential_measurements(run: Run) -> None:
     ran = run("influential_measurements")
     for moved, foretold, true in ran["results"].values():

@@ -1,4 +1,5 @@
-"""File formats: pose graphs (g2o, TORO), trajectories (TUM, KITTI, EuRoC), logs (CARMEN, MRCLAM, Plaza), maps (ROS).
+"""File formats: pose graphs (g2o, TORO), trajectories (TUM, KITTI, EuRoC), logs (CARMEN, MRCLAM, Plaza), maps (ROS),
+bundle adjustment (BAL).
 
 Each format is a module of its own; importing one reads nothing else.
 """
@@ -7,6 +8,7 @@ from importlib import import_module as _import_module
 from types import ModuleType as _ModuleType
 
 __all__ = [
+    "bal",
     "carmen",
     "contents",
     "decimals",
