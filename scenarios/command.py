@@ -227,6 +227,14 @@ def _doctor(chosen: argparse.Namespace) -> int:
     return FAILED if any(finding.good is False for finding in findings) else SUCCEEDED
 
 
+def _convert(chosen: argparse.Namespace) -> int:
+    """Write a file in another format."""
+    from unifg.scenarios.commands.convert import convert
+
+    print(f"{chosen.target}: {convert(chosen.source, chosen.target)}")
+    return SUCCEEDED
+
+
 def _bench(chosen: argparse.Namespace) -> int:
     """Time everything and compare it."""
     from unifg.scenarios.commands import performance
@@ -452,6 +460,14 @@ COMMANDS = {
                 "type": Path, "metavar": "DIR2", "help": "compare with the same episodes of another campaign",
             },
             "--any-code": _ANY_CODE,
+        },
+    ),
+    "convert": Command(
+        _convert, "a pose graph or trajectory in another format",
+        "Read g2o, TORO, GTSAM, TUM (.tum), KITTI (.kitti) or EuRoC (.csv); write g2o, TORO, TUM or KITTI.",
+        {
+            "source": {"type": Path, "metavar": "FILE", "help": "to read, gzipped or not"},
+            "target": {"type": Path, "metavar": "FILE2", "help": "to write: .g2o, .graph, .tum, .kitti, also .gz"},
         },
     ),
     "replay": Command(

@@ -566,9 +566,13 @@ def test_a_tick_is_one_call_until_something_changes(monkeypatch: pytest.MonkeyPa
     prepared.solve(guess)
     begun: list[bool] = []
     real = InteriorPoint.at_once
-    monkeypatch.setattr(
-        InteriorPoint, "at_once", lambda *given: begun.append(not isinstance(found := real(*given), bool)) or found
-    )
+
+    def at_once(*given: Any) -> Any:
+        found = real(*given)
+        begun.append(not isinstance(found, bool))
+        return found
+
+    monkeypatch.setattr(InteriorPoint, "at_once", at_once)
     first = prepared.solve(guess)
     prepared.solver.tolerance = 1e-3  # an option of the same solver
     loose = prepared.solve(guess)
