@@ -15,7 +15,7 @@ from unifg.scenarios import pose_graph
 from unifg.scenarios.commands.extras import absent, remedy
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.logs.metrics import table, write_metrics
-from unifg.scenarios.pose_graph import SolvedGraph
+from unifg.scenarios.pose_graph import AUTO, SolvedGraph
 
 __all__ = ["SETTINGS", "metrics", "results", "run", "summary"]
 
@@ -115,6 +115,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
 def summary(solved: SolvedGraph) -> str:
     """The outcome as a table of two columns."""
     numbers, report, graph = metrics(solved), solved.solution.verdict, solved.after
+    chosen = solved.settings.init
     more = f", {numbers['landmarks']} landmarks" if numbers["landmarks"] else ""
     flagged = "loop closures" if solved.settings.robust_on == "closures" else "measurements"
     skipped = ", ".join(f"{tag} ({count})" for tag, count in numbers["skipped_lines"].items())
@@ -140,6 +141,7 @@ def summary(solved: SolvedGraph) -> str:
         ("believed", "" if report is None else report.sentence(numbers["cost"])),
         ("iterations", f"{numbers['iterations']}"),
         ("status", solved.solution.status.value),
+        ("try first", "" if solved.solution.converged or chosen == AUTO else f"--init auto instead of --init {chosen}"),
         ("time", ", ".join(f"{name} {value:.1f} ms" for name, value in milliseconds.items())),
         *_words(solved.verdict),
     ]

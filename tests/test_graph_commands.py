@@ -1,4 +1,4 @@
-"""``unifg convert``: files of one format in another."""
+"""Files of pose graphs from the command line: ``unifg convert``, and the advice of ``unifg solve``."""
 
 from pathlib import Path
 
@@ -49,3 +49,13 @@ def test_what_cannot_be_written_is_refused_before_anything_is(
     assert main(["convert", str(tmp_path / "a.tum"), str(tmp_path / "b.g2o")]) != 0
     assert "it has no measurements" in capsys.readouterr().err
     assert not (tmp_path / "b.g2o").exists()
+
+
+@pytest.mark.parametrize(("words", "named"), [(["--init", "file"], True), ([], False)])
+def test_a_solve_from_a_stated_guess_that_ends_early_names_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], named: bool
+) -> None:
+    write_g2o(tmp_path / "a.g2o", sphere(rings=4, per_ring=8).pose_graph)
+    options = ["--max-iterations", "1", "--no-scene", "--effort", "none", "--out", str(tmp_path / "out")]
+    assert main(["solve", str(tmp_path / "a.g2o"), *words, *options]) != 0
+    assert ("--init auto instead of --init file" in capsys.readouterr().out) == named
