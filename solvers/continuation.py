@@ -30,7 +30,7 @@ from unifg.typing import Array, BoolArray, IntArray, Numbers
 __all__ = ["best_guess"]
 
 FIRST = 10  # members of the trajectory at first
-GROWTHS = 1.5, 1.1  # how many times more in each next solve: in leaps first, then carefully
+GROWTHS = np.inf, 1.5, 1.1  # how many times more in each next solve: all at once, in leaps, carefully
 GOOD = 2.0  # cost over degrees of freedom, times two, that asks for no other guess
 STEPS = 20  # of a solve at most
 FAR = 1e3  # times what a guess covers: standard deviation of the prior of what has been reached
@@ -151,8 +151,9 @@ class _Growth:
         """Grow to the whole, from the guess."""
         self.values, count, reached = dict(self._first), self._along.count, 0
         while reached < count:
-            before, reached = reached, min(count, max(FIRST, int(np.ceil(growth * reached))))
-            self._bring_in(before, reached)
+            before, reached = reached, int(min(count, max(FIRST, np.ceil(growth * max(reached, 1)))))
+            if growth < np.inf:
+                self._bring_in(before, reached)
             self._solve(reached, self._plan.held)
         self._solve(reached, set())
         return self.values

@@ -189,11 +189,12 @@ def best_guess(
 ) -> Guess:
     """The cheapest of a guess and others that are found by following a trajectory, for graphs with landmarks.
 
-    Least squares from dead reckoning may end in another minimum, or nowhere. Here the trajectory begins with ten
-    members and grows by half each time the costs that touch nothing else are minimised, or by a tenth if the answer
-    does not fit. New members continue the estimate by the steps between those of the guess. Landmarks come in when
-    enough rows determine them, where the guess has them relative to the trajectory. What all factors of a cost share
-    (calibrations) is held until the end. Constraints and costs that are no squares are left out, fixed variables stay.
+    Least squares from dead reckoning may end in another minimum, or nowhere. If twenty steps do not lead to a cost that
+    fits the degrees of freedom, the trajectory begins with ten members and grows by half each time the costs that touch
+    nothing else are minimised, and if that does not fit either, by a tenth. New members continue the estimate by the
+    steps between those of the guess. Landmarks come in when enough rows determine them, where the guess has them
+    relative to the trajectory. What all factors of a cost share (calibrations) is held until the end. Constraints and
+    costs that are no squares are left out, fixed variables stay.
 
     Args:
         graph: with costs that are squares.
