@@ -1,5 +1,4 @@
-"""File formats: pose graphs (g2o, TORO), trajectories (TUM, KITTI, EuRoC), logs (CARMEN, MRCLAM, Plaza), maps (ROS),
-bundle adjustment (BAL).
+"""File formats: pose graphs, trajectories, logs, maps, bundle adjustment.
 
 Each format is a module of its own; importing one reads nothing else.
 """
