@@ -173,6 +173,7 @@ class Flight:
         return recorder.finish(
             collisions=world.collisions, reached=self._reached, interrupted=interrupted,
             outcome=self._outcome(interrupted), dropped=dict(self.watch.validator.dropped),
+            subproblems=dict(self.pilot.controller.loop.subproblems),
         )  # fmt: skip
 
     def _outcome(self, interrupted: bool) -> str:

@@ -298,6 +298,7 @@ class Episode:
             reached=[outcome == REACHED for outcome in self._outcomes],
             outcomes=self._outcomes,
             dropped=dict(self.pilot.validator.dropped),
+            subproblems=dict(self.pilot.controller.loop.subproblems) if self.settings.planner == MPC else {},
             interrupted=interrupted,
         )
 

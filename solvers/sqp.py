@@ -66,7 +66,7 @@ class SQP(Solver):
         full_steps: take every step in full, as the paper does; no merit function.
     """
 
-    rehearses = True
+    rehearses = states_subproblems = True
 
     max_iterations: int = 200
     hessian: Literal["auto", "gauss-newton", "exact"] = "auto"

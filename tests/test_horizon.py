@@ -484,6 +484,16 @@ def test_backends_and_couplings_find_the_same_way() -> None:
             np.testing.assert_allclose(ends[coupling, name], ends[coupling, "ipm"], atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("solver", "names"), [(SQP(), {"osqp"}), (SQP(qp="graph"), {"graph"}), (InteriorPoint(), set())]
+)
+def test_a_loop_counts_who_solved_how_many_quadratic_programs(solver: fg.Solver, names: set[str]) -> None:
+    loop = line_loop(solver=solver)
+    plans, _ = drive(loop, 3)
+    assert set(loop.subproblems) == names
+    assert sum(loop.subproblems.values()) == (sum(plan.iterations for plan in plans) if names else 0)
+
+
 def test_what_the_couplings_hand_on() -> None:
     """Statics: as at the start, as estimated, or estimated in the same solve."""
     found = {}

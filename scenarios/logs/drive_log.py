@@ -42,6 +42,7 @@ class EpisodeLog(StoredLog):
         interrupted: the user stopped the episode before its end.
         outcomes: what has become of every goal, in words.
         dropped: samples that were not let in, by what was wrong with them.
+        subproblems: quadratic programs of plans by the solver that solved them; empty for backends without any.
         faults: what was made to go wrong.
         obstacles_wanted: unforeseen obstacles that were asked for; fewer may have found a place.
         base: kind of base of the robot.
@@ -68,6 +69,7 @@ class EpisodeLog(StoredLog):
     interrupted: bool = False
     outcomes: list[str] = field(default_factory=list)
     dropped: dict[str, int] = field(default_factory=dict)
+    subproblems: dict[str, int] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
     obstacles_wanted: int = 0
     base: str = "unicycle"

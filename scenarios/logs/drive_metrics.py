@@ -80,6 +80,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "health": {state: log.health.count(state) for state in ("ok", "degraded", "lost")},
         "causes": dict(sorted(Counter(cause for cause in log.cause if cause).items())),
         "dropped_samples": dict(sorted(log.dropped.items())),
+        "subproblems": dict(sorted(log.subproblems.items())),
         "last_stops": int(np.count_nonzero(log.emergency_stop)),
         "explained_share": {"mean": float(np.mean(log.explained)), "min": float(np.min(log.explained))},
         "tick_ms": timing(log.tick_ms),

@@ -43,6 +43,7 @@ class FlightLog(StoredLog):
         interrupted: the user stopped the flight before its end.
         outcome: of the flight, in words.
         dropped: samples that were not let in, by what was wrong with them.
+        subproblems: quadratic programs of plans by the solver that solved them; empty for backends without any.
     """
 
     KIND: ClassVar[str] = "unifg flight log 4"
@@ -56,6 +57,7 @@ class FlightLog(StoredLog):
     interrupted: bool = False
     outcome: str = ""
     dropped: dict[str, int] = field(default_factory=dict)
+    subproblems: dict[str, int] = field(default_factory=dict)
 
     truth: Array = column("m, 1, m/s", 10)
     believed: Array = column("m, 1, m/s", 10)

@@ -92,6 +92,7 @@ def flight_metrics(log: FlightLog) -> dict[str, Any]:
         "health": {state: log.health.count(state) for state in ("ok", "degraded", "lost")},
         "causes": dict(sorted(Counter(cause for cause in log.causes if cause).items())),
         "dropped_samples": dict(sorted(log.dropped.items())),
+        "subproblems": dict(sorted(log.subproblems.items())),
         "emergency_ticks": int(np.count_nonzero(log.emergency)),
         "tick_ms": timing(log.estimate_ms + log.plan_ms),
         **statistics(log),

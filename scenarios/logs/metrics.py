@@ -86,6 +86,7 @@ def of_solution(solution: Solution) -> dict[str, Any]:
         "converged": solution.converged,
         "cost": float(solution.cost),
         "iterations": solution.iterations,
+        "subproblems": solution.history.subproblems,
         "stationarity": float(solution.stationarity),
         "violation": float(solution.violation),
         "complementarity": float(solution.complementarity),

@@ -84,6 +84,7 @@ class RecedingHorizon:
         statuses: how often solves ended in what way.
         sources: how often what was applied; "late" counts plans that came after the deadline.
         rescues: how often the second backend had a plan when the first had none.
+        subproblems: how many quadratic programs of plans each solver has solved, where the backend has such.
         more_starts: how many were tried beside the first of a tick.
         milliseconds: wall-clock times of the last ticks [ms].
     """
@@ -191,6 +192,7 @@ class RecedingHorizon:
         self.milliseconds: deque[float] = deque(maxlen=TIMES)
         self.guess: Guess | None = None
         self.solution: Solution | None = None
+        self.subproblems: Counter[str] = Counter()
         self._solved_by: Prepared | None = self.warm
         self._verification_time = 0.0
         self.sent: Array = np.zeros((delay, robot.control.storage))
@@ -341,6 +343,8 @@ class RecedingHorizon:
         self.solution = solution
         self._solved_by = self.second if rescued else run if solution is first else None
         self.statuses[solution.status] += 1
+        if (self.second if rescued and self.second is not None else run).solver.states_subproblems:
+            self.subproblems.update(solution.history.subproblems)
         choice = self.decide(solution, now, late=self._clock() - begin > self._deadline)
         self._believe(solution, choice, present)
         decided = np.concatenate([self.sent, choice.controls[:1]])

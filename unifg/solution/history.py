@@ -8,6 +8,7 @@ value. The square root of the sum of squares over a term (for scalar costs the s
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from html import escape
@@ -172,6 +173,11 @@ class History(list[Iteration]):
     def _repr_html_(self) -> str:
         """The table, for notebooks."""
         return f"<pre>{escape(str(self))}</pre>"
+
+    @property
+    def subproblems(self) -> dict[str, int]:
+        """Number of quadratic programs by the solver whose answer was taken; empty of backends without any."""
+        return dict(Counter(str(row.details["qp"]) for row in self if "qp" in row.details))
 
     def column(self, name: str) -> Array:
         """(k,) numbers of one attribute of all rows."""

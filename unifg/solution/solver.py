@@ -90,6 +90,7 @@ class Backend(ABC):
         constraints: which it takes.
         scalar_costs: whether it takes costs that are no squares.
         soft: whether it takes the linear prices of soft constraints in any case.
+        states_subproblems: whether rows of its history name the solver of a quadratic program, as their detail "qp".
         rehearses: whether :meth:`Solver.prepare` may take it through small problems of its own
             (:mod:`unifg.solution.warmup_run`).
     """
@@ -97,6 +98,7 @@ class Backend(ABC):
     constraints: ClassVar[Constraints] = "all"
     scalar_costs: ClassVar[bool] = True
     soft: ClassVar[bool] = False
+    states_subproblems: ClassVar[bool] = False
     rehearses: ClassVar[bool] = False
 
     @property
