@@ -433,7 +433,7 @@ class Workspace:
         program, work, settings = self.program, self.work, self._settings
         if settings is None or settings[0] != vars(options) or program.equality is not self._held:
             return False
-        if not program.fully_compiled:
+        if program.differenced or not program.fully_compiled:  # since a trace was found to differ
             return False
         settings[1][:], work.values[:], work.multipliers[:] = settings[2], values, multipliers
         self._taken, self.compiled, self.interrupted = None, 0.0, False
