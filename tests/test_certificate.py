@@ -481,3 +481,13 @@ def test_a_map_needs_no_more_digits_than_it_shows(made: Simulated, solver: type[
     assert exact.cost <= near.cost <= (1.0 + 2e-5) * exact.cost
     with pytest.raises(BackendError, match="'map'"):
         solver(tolerance="good")  # type: ignore[arg-type]
+
+
+def test_equal_weights_are_bounded_as_each_of_them() -> None:
+    rng = np.random.default_rng(3)
+    for dim, size in ((2, 3), (3, 6)):
+        roots = rng.normal(size=(2, size, size))
+        both = roots @ np.swapaxes(roots, 1, 2)
+        mixed, equal = bounded_below(both, dim), bounded_below(np.repeat(both[1:], 4, axis=0), dim)
+        for some, alike in zip(mixed, equal, strict=True):
+            np.testing.assert_allclose(alike, np.repeat(some[1:], 4, axis=0), rtol=1e-12)

@@ -79,6 +79,9 @@ def bounded_below(information: Array, dim: int) -> tuple[Array, Array]:
     Returns:
         (m,) tau, and (m, k, k) Omega.
     """
+    if len(information) > 1 and (information == information[0]).all():  # as where one sensor has measured everything
+        one, own = bounded_below(information[:1], dim)
+        return np.repeat(one, len(information)), np.repeat(own, len(information), axis=0)
     lengths, axes = np.linalg.eigh(information[:, :dim, :dim])
     cross = np.swapaxes(axes, 1, 2) @ information[:, :dim, dim:]
     turning = information[:, dim:, dim:]
