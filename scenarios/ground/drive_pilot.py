@@ -23,6 +23,7 @@ from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.ground.relocalise import Relocaliser
 from unifg.scenarios.ground.route import Route
+from unifg.scenarios.ground.waiting import LOOK, occupancy, timed
 from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Supervisor
 from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.perception.disc_tracker import DiscTracker
@@ -192,11 +193,22 @@ class Pilot(Generic[PlannerT]):
         s = self.controller.settings
         if self.planless or share < 1.0:
             self.controller.settings = replace(s, speed=share * s.speed, feasible=-1.0 if self.planless else s.feasible)
-        reference = route.reference(pose, self.controller.stations())
+        reference = route.reference(pose, self._stations(pose, route))
         plan = self.controller.plan(pose, reference, self.tracks, self.estimator.covariance)
         self.controller.settings = s
         self.pose = self.controller.estimate
         return plan
+
+    def _stations(self, pose: Array, route: Route) -> Array:
+        """(N + 1,) how far ahead along the path the reference is, which waits for movers [m]."""
+        stations, movers = self.controller.stations(), self.tracks.at(self.tracks.mover)
+        s = self.controller.settings
+        step = s.dt * min(s.speed, float(s.box[1][0]))
+        if not len(movers) or not step or isinstance(self.controller, PlannerAdapter):
+            return stations
+        places = route.reference(pose, step * np.arange(LOOK + 1))[:, :2]
+        waits: Array = np.minimum(stations, step * timed(*occupancy(s, pose, places, movers))[: len(stations)])
+        return waits
 
     def _stop(self, plan: Plan, scan: Scan) -> Plan:
         """The plan, its first control slowed where beams say that its braking way is not free."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from unifg.scenarios.perception.rows import Rows
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
-__all__ = ["Tracks", "nearest"]
+__all__ = ["Tracks", "nearest", "to_and_fro"]
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,8 @@ class Tracks(Rows):
         identity: (m,) number of the track, kept for its lifetime.
         unseen: (m,) time since the track was last seen [s].
         mover: (m,) whether it has moved, and not stood in one place since for long; what stands now may go on.
+        sweep: (m, 6) of a mover both ends of where it was lately [m], and if it is known to go to and fro between them
+            the way it has made of a round trip from the first [m], and its speed [m/s]; else not a number.
     """
 
     centre: Array
@@ -31,6 +33,12 @@ class Tracks(Rows):
     identity: IntArray
     unseen: Array
     mover: BoolArray
+    sweep: Array = field(default_factory=lambda: np.zeros((0, 6)))
+
+    def __post_init__(self) -> None:
+        """Know no sweeps unless they are given."""
+        if len(self.sweep) < len(self.radius):
+            object.__setattr__(self, "sweep", np.full((len(self.radius), 6), np.nan))
 
     @classmethod
     def of_movers(cls, centre: Array, velocity: Array, radius: Array) -> Tracks:
@@ -52,6 +60,36 @@ class Tracks(Rows):
         return velocity
 
 
+    @property
+    def sweeps(self) -> BoolArray:
+        """(m,) whether it is known to go to and fro, and where."""
+        return np.isfinite(self.sweep[:, 5])
+
+    def swept(self, times: Array) -> Array:
+        """(N, m, 2) places of movers that go to and fro at times (N,) from now [m]."""
+        first, last, made, speed = np.split(self.sweep, [2, 4, 5], axis=1)
+        length = np.hypot(*(last - first).T)
+        along = to_and_fro(0.0, length, made[:, 0], speed[:, 0], times[:, None])
+        places: Array = first + (along / length)[..., None] * (last - first)
+        return places
+
+    def beside(self, place: Array) -> Array:
+        """(..., m, 2) places nearest to ``place`` (..., 2) where movers were lately; their centres where that is unknown."""
+        first, way = self.sweep[:, :2], self.sweep[:, 2:4] - self.sweep[:, :2]
+        length = np.maximum((way**2).sum(axis=1), 1e-12)
+        share = np.clip(((place[..., None, :] - first) * way).sum(axis=-1) / length, 0.0, 1.0)
+        places: Array = np.where(np.isnan(self.sweep[:, :1]), self.centre, first + share[..., None] * way)
+        return places
+
+
+def to_and_fro(first: ArrayLike, last: ArrayLike, made: ArrayLike, speed: ArrayLike, times: Array) -> Array:
+    """Places at times from now [s] of what goes to and fro between two places on a line, ``made`` past the first [m]."""
+    length = np.asarray(last) - first
+    way = (made + speed * times) % (2.0 * length)
+    places: Array = first + np.minimum(way, 2.0 * length - way)
+    return places
+
+
 def nearest(tracks: Tracks, position: ArrayLike, count: int, horizon: float = 1.5) -> Tracks:
     """The tracks that matter most at a place: those whose hulls are, or will soon be, nearest to it.
 
@@ -69,5 +107,6 @@ def nearest(tracks: Tracks, position: ArrayLike, count: int, horizon: float = 1.
     travel = horizon * tracks.velocity
     along = np.sum(offset * travel, axis=1) / np.maximum(np.sum(travel**2, axis=1), 1e-12)
     closest = offset - np.clip(along, 0.0, 1.0)[:, None] * travel
+    closest = np.where(tracks.sweeps[:, None], place - tracks.beside(place), closest)
     hull = np.linalg.norm(closest, axis=1) - tracks.radius
     return tracks.at(np.argsort(hull, kind="stable")[:count])

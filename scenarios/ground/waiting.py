@@ -1,0 +1,66 @@
+"""Where along its path a robot should be when, among movers: a search over path and time.
+
+Dynamic programming over places a step apart and times a step apart: in a step the robot goes on by one place or waits.
+What is occupied costs, so that a robot that is where a mover comes leaves it soon; of the ways that cost the same the
+earliest counts. A mover that is known to go to and fro occupies where it will be then, and for a rest without an end
+all of where it goes. Others occupy where they were lately and where they can be until the robot is at rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.perception.tracks import Tracks
+from unifg.typing import Array, BoolArray, IntArray
+
+LOOK = 60  # steps ahead
+TOUCH = 100.0  # cost of a step where it is occupied, in places of progress at the end
+EAGER = 0.01  # of being one place farther back for a step
+MARGIN = 0.05  # [m] more room than the controller asks for
+EARLY = 2  # steps that a mover may be early or late by
+
+
+def timed(occupied: BoolArray, unsafe: BoolArray) -> IntArray:
+    """Places (K + 1,) at every step, from the first place on.
+
+    Args:
+        occupied: (K + 1, S) of each place at each time.
+        unsafe: (S,) of each place, for a rest that has no end.
+    """
+    steps, place = len(occupied) - 1, np.arange(occupied.shape[1], dtype=np.float64)
+    value, goes = TOUCH * unsafe - place, np.zeros((steps, len(place)), dtype=bool)
+    for k in range(steps - 1, -1, -1):
+        value = value + TOUCH * occupied[k + 1] - EAGER * place
+        onward = np.append(value[1:], np.inf)
+        goes[k], value = onward < value, np.minimum(onward, value)
+    places = np.zeros(steps + 1, dtype=np.intp)
+    for k in range(steps):
+        places[k + 1] = places[k] + goes[k, places[k]]
+    return places
+
+
+def occupancy(s: ControllerSettings, pose: Array, places: Array, movers: Tracks) -> tuple[BoolArray, BoolArray]:
+    """Arguments of :func:`timed` for places (S, 2) along a path, among movers."""
+    times, known = s.dt * np.arange(LOOK + 1), movers.sweeps
+    walk = np.maximum(np.hypot(*movers.velocity.T), s.mover_speed)
+    reach = s.robot_radius + s.disc_clearance + MARGIN + movers.radius
+    gap = _distances(movers.beside(places), places[:, None]) - reach  # (S, m)
+    unsafe = gap < np.where(known, 0.0, walk * s.mover_surprise)
+    ways = movers.centre + times[:, None, None] * movers.expected_velocity(pose[:2])
+    ways[:, known] = movers.at(known).swept(times)
+    room = np.where(known, walk * s.mover_unseen, 0.0) + reach
+    met = _distances(ways[:, None], places[:, None]) < room  # (K + 1, S, m)
+    met[s.horizon :] &= known
+    sure = met.copy()
+    for shift in range(1, EARLY + 1):
+        sure[shift:] |= met[:-shift]
+        sure[:-shift] |= met[shift:]
+    near = gap < walk * np.minimum(times, s.mover_surprise)[:, None, None]
+    return (np.where(known, sure, met | near)).any(axis=-1), unsafe.any(axis=-1)
+
+
+def _distances(first: Array, second: Array) -> Array:
+    offset = first - second
+    found: Array = np.hypot(offset[..., 0], offset[..., 1])
+    return found
