@@ -24,6 +24,7 @@ LOOK_AHEAD = 4.0  # [m] of path checked against tracked discs
 REJOIN = 2.0  # [m] beyond the disc where the detour meets the path again
 WINDOW = 3.0  # [m] of map kept around the detour's ends
 STANDING = 0.15  # [m/s]; faster discs are left to the controller, which predicts them
+UNSEEN = ControllerSettings.mover_unseen  # [s] for which a mover may be elsewhere than it is foretold to be
 GAP = ControllerSettings.disc_clearance  # [m] between hull and disc that a path must leave
 WALL_GAP = ControllerSettings.wall_clearance  # [m] between hull and wall that a path must leave
 ALLOWANCE = 0.04  # [m] added to discs when a detour is planned
@@ -170,7 +171,8 @@ class Route:
                 else:
                     self._detour(pose, float(arc[-1]), tracks.at(~tracks.mover), ALLOWANCE, everywhere=True)
             return True
-        standing = tracks.at(np.hypot(*tracks.velocity.T) < STANDING)
+        standing = tracks.at((np.hypot(*tracks.velocity.T) < STANDING) & ~tracks.sweeps)
+        standing = standing.followed_by(tracks.spread(UNSEEN))
         if not len(standing):
             return False
         ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
@@ -189,6 +191,7 @@ class Route:
                 self._closed += VAIN  # unless the goal comes nearer on it
             return True
         if not closed.any():  # what has moved may go on: where it alone is in the way, the robot waits
+            self._rest = ANYWHERE
             return False
         return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
 

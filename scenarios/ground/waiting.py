@@ -17,7 +17,6 @@ from unifg.typing import Array, BoolArray, IntArray
 LOOK = 60  # steps ahead
 TOUCH = 100.0  # cost of a step where it is occupied, in places of progress at the end
 EAGER = 0.01  # of being one place farther back for a step
-MARGIN = 0.05  # [m] more room than the controller asks for
 EARLY = 2  # steps that a mover may be early or late by
 
 
@@ -43,8 +42,7 @@ def timed(occupied: BoolArray, unsafe: BoolArray) -> IntArray:
 def occupancy(s: ControllerSettings, pose: Array, places: Array, movers: Tracks) -> tuple[BoolArray, BoolArray]:
     """Arguments of :func:`timed` for places (S, 2) along a path, among movers."""
     times, known = s.dt * np.arange(LOOK + 1), movers.sweeps
-    walk = np.maximum(np.hypot(*movers.velocity.T), s.mover_speed)
-    reach = s.robot_radius + s.disc_clearance + MARGIN + movers.radius
+    walk, reach = np.hypot(*movers.velocity.T), s.robot_radius + s.disc_clearance + movers.radius
     gap = _distances(movers.beside(places), places[:, None]) - reach  # (S, m)
     unsafe = gap < np.where(known, 0.0, walk * s.mover_surprise)
     ways = movers.centre + times[:, None, None] * movers.expected_velocity(pose[:2])

@@ -157,7 +157,10 @@ class MotionModel:
             if not tracks.unseen[k]:
                 past.add(self._now, tracks.centre[k], tracks.velocity[k])
             sweep[k] = past.sweep
-        return replace(tracks, sweep=sweep)
+            sweep[k, 4] += sweep[k, 5] * (self._now - past.times[-1])
+        tracks, hidden = replace(tracks, sweep=sweep), tracks.unseen > 0.0
+        tracks.centre[hidden & tracks.sweeps] = tracks.at(hidden & tracks.sweeps).swept(np.zeros(1))[0]
+        return tracks
 
     def _adopted(self, place: Array, names: Array) -> Past:
         """The past of a lost track on whose line a new one begins, or none."""
