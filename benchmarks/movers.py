@@ -7,13 +7,13 @@ a minute.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
-from benchmarks.clairvoyant import earliest_arrival, future
 from benchmarks.comparison import Row, share
 from benchmarks.report import table
 from benchmarks.routes import drawn
@@ -21,7 +21,11 @@ from benchmarks.runner import Study
 from unifg.scenarios.episode import silent
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.navigation import Episode, NavigationSettings
+from unifg.scenarios.perception.tracks import to_and_fro
+from unifg.scenarios.planning.space_time import CELL, Future, quickest
 from unifg.scenarios.simulation.drivetrain import Drivetrain
+from unifg.scenarios.simulation.space import Obstacle
+from unifg.typing import Array
 
 SPEEDS, BASES = (0.3, 0.6, 1.0), (2.5, 1.0)  # [m/s], [m/s^2]
 TURNING = {2.5: 3.2, 1.0: 2.1}  # [rad/s^2] of the bases
@@ -57,16 +61,33 @@ def settings(meeting: Meeting) -> NavigationSettings:
 def measured(meeting: Meeting) -> Row:
     """Drive once."""
     episode = Episode(settings(meeting))
-    arrival = earliest_arrival(
-        episode.occupancy, episode.distance_map, episode.start, episode.goals[-1], episode.controller.robot_radius,
-        future(episode.world.obstacles), episode.controller.speed, LATEST,
+    s = episode.controller
+    way = quickest(
+        episode.occupancy, episode.distance_map, episode.start, episode.goals[-1], s.robot_radius,
+        future(episode.world.obstacles), s.speed, LATEST,
     )  # fmt: skip
     log = episode.run(silent)
     return {
-        "reached": all(log.reached), "touched": touched(log), "outcome": log.outcomes[-1], "arrival": arrival,
+        "reached": all(log.reached), "touched": touched(log), "outcome": log.outcomes[-1],
+        "arrival": math.inf if way is None else (len(way) - 1) * CELL / s.speed,
         "time": log.ticks * log.dt, "clearance": float(log.clearance.min()),
         "reverse": float((log.control[:, 0] < -REST).mean()), "tick": float(np.percentile(log.solve_ms, 99.0)),
     }  # fmt: skip
+
+
+def future(obstacles: Sequence[Obstacle]) -> Future:
+    """True future of obstacles that rest or go to and fro without waiting, from time zero on."""
+
+    def discs(time: float) -> Array:
+        rows = np.zeros((len(obstacles), 3))
+        for row, disc in zip(rows, obstacles, strict=True):
+            end = disc.centre if disc.end is None else disc.end
+            length = max(math.dist(disc.centre, end), 1e-9)
+            share = float(to_and_fro(0.0, length, 0.0, disc.speed, np.array(time))) / length
+            row[:] = *disc.positions(np.array([share]))[0], disc.radius
+        return rows
+
+    return discs
 
 
 def touched(log: EpisodeLog) -> str:

@@ -143,8 +143,9 @@ class Clearance:
         pose, given, chosen = now.present, now.given, nearest(now.given.tracks, now.present, m)
         k, spread = len(chosen), in_world(pose, given.covariance)
         centres, radii, shy = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m)
+        shies = (chosen.mover & ~chosen.sweeps) * s.mover_margin
         limits = np.zeros((n, len(s.hull.discs), m))
-        centres[:, :k], radii[:k], shy[:k] = predicted(s, pose, chosen), chosen.radius, chosen.mover * s.mover_margin
+        centres[:, :k], radii[:k], shy[:k] = predicted(s, pose, chosen), chosen.radius, shies
         limits[:, :, :k] = disc_limits(s, pose, centres[:, :k], chosen, given.evasive.states, spread)
         return {
             "wall clearance": wall_limits(s, self.field, given.evasive.states, given.reference, spread),

@@ -35,6 +35,7 @@ from unifg.typing import Array
 
 COUPLINGS = ("sequential", "joint")
 AT_REST = 0.02  # [m/s]; slower is rest
+HELD = 0.5  # of the way that it could go: a robot that gets no farther is held by movers
 SEARCH_AGAIN = 20  # ticks after a search that found nothing
 FOUND_SIGMA = np.array([0.05, 0.05, 0.02])  # of a pose that a search has found [m, m, rad]
 STOPPED = "stopped"
@@ -193,22 +194,29 @@ class Pilot(Generic[PlannerT]):
         s = self.controller.settings
         if self.planless or share < 1.0:
             self.controller.settings = replace(s, speed=share * s.speed, feasible=-1.0 if self.planless else s.feasible)
-        reference = route.reference(pose, self._stations(pose, route))
+        reference = self._reference(pose, route)
         plan = self.controller.plan(pose, reference, self.tracks, self.estimator.covariance)
         self.controller.settings = s
         self.pose = self.controller.estimate
         return plan
 
-    def _stations(self, pose: Array, route: Route) -> Array:
-        """(N + 1,) how far ahead along the path the reference is, which waits for movers [m]."""
-        stations, movers = self.controller.stations(), self.tracks.at(self.tracks.mover)
-        s = self.controller.settings
-        step = s.dt * min(s.speed, float(s.box[1][0]))
-        if not len(movers) or not step or isinstance(self.controller, PlannerAdapter):
-            return stations
-        places = route.reference(pose, step * np.arange(LOOK + 1))[:, :2]
-        waits: Array = np.minimum(stations, step * timed(*occupancy(s, pose, places, movers))[: len(stations)])
-        return waits
+    def _reference(self, pose: Array, route: Route) -> Array:
+        """(N + 1, 3) poses along the path, which wait for movers."""
+        stations, movers, s = self.controller.stations(), self.tracks.at(self.tracks.mover), self.controller.settings
+        fastest = min(s.speed, float(s.box[1][0]))
+        if not len(movers) or not fastest or isinstance(self.controller, PlannerAdapter):
+            return route.reference(pose, stations)
+
+        def waits() -> Array:
+            places = route.reference(pose, s.dt * fastest * np.arange(LOOK + 1))[:, :2]
+            return s.dt * fastest * timed(*occupancy(s, pose, places, movers))[: len(stations)]
+
+        found = waits()
+        pause = max(fastest - self.driven[0], 0.0) / (2.0 * s.accelerations[0])
+        if found[-1] < HELD * stations[-1] and route.around(pose, self.tracks, fastest, pause):
+            self.controller.forget()
+            found = waits()
+        return route.reference(pose, np.minimum(stations, found))
 
     def _stop(self, plan: Plan, scan: Scan) -> Plan:
         """The plan, its first control slowed where beams say that its braking way is not free."""

@@ -18,6 +18,7 @@ from unifg.scenarios.planning.follow import PathFollower
 from unifg.scenarios.planning.grid import SPACING, plan
 from unifg.scenarios.planning.lattice import plan_poses
 from unifg.scenarios.planning.polyline import headed, path_length, resample
+from unifg.scenarios.planning.space_time import quickest
 from unifg.typing import Array
 
 LOOK_AHEAD = 4.0  # [m] of path checked against tracked discs
@@ -42,6 +43,14 @@ CLOSED = 60  # ticks for which no way is to be had at all since the goal came ne
 VAIN = 6  # of those ticks that a detour counts which does not lead nearer
 STALLED = 400  # ticks without coming nearer to the goal while nothing moves nearby, after which there is no use
 WAITING = 2.0  # [m] from the robot within which something that moves may be what it waits for
+TICK = 0.1  # [s]
+BETWEEN = 10  # ticks between searches for a way between movers
+PERIODS = 3.0  # of a mover after which another way is searched
+BEYOND = 1.0  # [m] beyond a mover's sweep where a way between movers ends
+LONGEST = 12.0  # [s] of such a way
+LATE = 0.1 * np.arange(-2.0, 3.0)  # [s] by which a mover may be late
+SMOOTH = 3  # cells on both sides over which a way of cells is averaged
+KERNEL = np.full(2 * SMOOTH + 1, 1.0 / (2 * SMOOTH + 1))
 FRESH_STARTS = 3  # ways round about, on each of which the goal may be farther off again
 
 
@@ -52,14 +61,18 @@ class Blocked:
     Attributes:
         place: (2,) where the way ends [m].
         clearance: of the robot's centre that no way keeps [m].
+        mover: whether something that moves is there.
     """
 
     place: Array
     clearance: float
+    mover: bool = False
 
     def __str__(self) -> str:
         """For people."""
         x, y = self.place.tolist()
+        if self.mover:
+            return f"kept away by a mover at ({x:.1f}, {y:.1f})"
         return f"blocked near ({x:.1f}, {y:.1f}), no way of clearance {self.clearance:.2f} m"
 
 
@@ -109,7 +122,7 @@ class Route:
         self.repairs = 0
         self.blocked: Blocked | None = None
         self._rest = self._since_anywhere = 0
-        self._closed = self._stalled = 0
+        self._closed = self._stalled = self._held = 0
         self._nearest, self._starts = np.inf, FRESH_STARTS
         self._trail: list[Array] = []
         self._crumbs: list[Array] = []
@@ -172,7 +185,6 @@ class Route:
                     self._detour(pose, float(arc[-1]), tracks.at(~tracks.mover), ALLOWANCE, everywhere=True)
             return True
         standing = tracks.at((np.hypot(*tracks.velocity.T) < STANDING) & ~tracks.sweeps)
-        standing = standing.followed_by(tracks.spread(UNSEEN))
         if not len(standing):
             return False
         ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
@@ -191,9 +203,63 @@ class Route:
                 self._closed += VAIN  # unless the goal comes nearer on it
             return True
         if not closed.any():  # what has moved may go on: where it alone is in the way, the robot waits
-            self._rest = ANYWHERE
             return False
         return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
+
+    def around(self, pose: Array, tracks: Tracks, speed: float, pause: float) -> bool:
+        """Look for a quicker way between movers, called while the robot is held by them; True if found.
+
+        After three periods of a mover that goes to and fro the whole map is searched for a way beside it. Where there
+        is none the goal is given up.
+
+        Args:
+            pose: (3,) of the robot.
+            tracks: of discs.
+            speed: of the robot [m/s].
+            pause: until it has that speed, less what it gets on in the meantime [s].
+        """
+        sweeping = tracks.at(tracks.sweeps)
+        begin = int(self._reached / SPACING)
+        ahead = self.path[begin : begin + round(LOOK_AHEAD / SPACING), :2]
+        gap = np.hypot(*np.moveaxis(sweeping.beside(ahead) - ahead[:, None], -1, 0)) - sweeping.radius - self._radius
+        met = gap < self._disc_gap + UNSEEN * sweeping.sweep[:, 5]
+        if self._oriented or not met.any():
+            return False
+        self._held, self._trail = self._held + 1, []
+        if self._held % BETWEEN != 1:
+            return False
+        first = int(np.argmax(met.any(axis=0)))
+        ends = sweeping.sweep[first, :4]
+        period = 2.0 * float(np.hypot(*(ends[2:] - ends[:2]))) / sweeping.sweep[first, 5]
+        if self._held * TICK > PERIODS * period:
+            self._held = 0
+            staying = tracks.at(~tracks.mover).followed_by(tracks.spread(UNSEEN))
+            if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
+                return True
+            self.blocked = Blocked(sweeping.centre[first], self._radius + self._wall_gap, mover=True)
+            return False
+        index = min(begin + int(np.flatnonzero(met.any(axis=1))[-1] + BEYOND / SPACING), len(self.path) - 1)
+        standing = tracks.at((np.hypot(*tracks.velocity.T) < STANDING) & ~tracks.sweeps)
+
+        def discs(time: float) -> Array:
+            times = time + pause + LATE
+            places = np.concatenate([standing.centre, sweeping.swept(times).reshape(-1, 2)])
+            radii = np.concatenate([standing.radius, np.tile(sweeping.radius, len(times))])
+            return np.column_stack([places, radii + self._disc_gap - self._wall_gap])
+
+        occupancy, walls = self._window(np.stack([pose[:2], *self.path[begin : index + 1, :2]]))
+        gap_free = self._radius + self._wall_gap
+        way = quickest(occupancy, walls, pose, self.path[index], gap_free, discs, speed, LONGEST)
+        if way is None:
+            return False
+        smooth = np.stack([np.convolve(np.pad(x, SMOOTH, mode="edge"), KERNEL, mode="valid") for x in way.T], axis=1)
+        smooth[0] = pose[:2]
+        points = np.concatenate([smooth, self.path[index : index + 1, :2]])
+        moved = np.append(True, np.hypot(*np.diff(points, axis=0).T) > 1e-3)
+        onward = headed(resample(points[moved], SPACING), float(self.path[index, 2]))
+        self._follow(np.concatenate([onward[:-1], self.path[index:]]))
+        self.repairs += 1
+        return True
 
     def _round_about(self, pose: Array, staying: Tracks, place: Array) -> bool:
         """Search another way on the whole map; True if found. After enough failures the goal is given up."""
@@ -210,7 +276,7 @@ class Route:
         """Give up a goal that has not come nearer for long, the time left out in which something moved on the way."""
         left = float(SPACING * len(self.path)) - self._reached
         if left < self._nearest - CRUMB:
-            self._nearest, self._stalled, self._closed = left, 0, 0
+            self._nearest, self._stalled, self._closed, self._held = left, 0, 0, 0
             return
         self._stalled += not self._waits_for_a_mover(pose, tracks)
         if self._stalled > STALLED:

@@ -66,7 +66,7 @@ class Past:
         if spread[1] > ASIDE * np.sqrt(len(along)) or high - low < SHORTEST:
             return
         if known is None or self.axis is None:
-            pace = np.abs((self.velocities @ axes[0]))
+            pace = np.abs(self.velocities @ axes[0])
             guess = np.array([low, high, 0.0, float(np.median(pace[pace > 0.5 * pace.max()]))])
             starts = np.linspace(0.0, 2.0 * (high - low), 40, endpoint=False)
             errors = [np.abs(to_and_fro(*guess[:2], u, guess[3], since) - along).clip(max=0.3).sum() for u in starts]
@@ -76,10 +76,12 @@ class Past:
             axes[0], along = sense * axes[0], sense * along
             moved = (self.axis[0] - middle) @ axes[0]
             step = known[3] * (self.times[-1] - self.times[-2])
-            guess = known + [moved, moved, step, 0.0]
+            guess = known + np.array([moved, moved, step, 0.0])
         wave = self._improved(guess, along, since)
         length = wave[1] - wave[0]
-        turns = np.diff(np.floor((wave[2] + wave[3] * since[BOTH:-BOTH]) / length)) if length >= SHORTEST else np.zeros(1)
+        turns = (
+            np.diff(np.floor((wave[2] + wave[3] * since[BOTH:-BOTH]) / length)) if length >= SHORTEST else np.zeros(1)
+        )
         if turns.sum() >= 2.0 and wave[3] > 0.0:
             wave[2] %= 2.0 * length
             self.wave, self.axis = wave, np.stack([middle, axes[0]])

@@ -61,7 +61,6 @@ class Tracks(Rows):
         velocity: Array = self.velocity - leaving[:, None] * towards
         return velocity
 
-
     @property
     def sweeps(self) -> BoolArray:
         """(m,) whether it is known to go to and fro, and where."""
@@ -76,13 +75,12 @@ class Tracks(Rows):
         return places
 
     def beside(self, place: Array) -> Array:
-        """(..., m, 2) places nearest to ``place`` (..., 2) where movers were lately; their centres where that is unknown."""
+        """(..., m, 2) places nearest to ``place`` (..., 2) where movers were lately; their centres if unknown."""
         first, way = self.sweep[:, :2], self.sweep[:, 2:4] - self.sweep[:, :2]
         length = np.maximum((way**2).sum(axis=1), 1e-12)
         share = np.clip(((place[..., None, :] - first) * way).sum(axis=-1) / length, 0.0, 1.0)
         places: Array = np.where(np.isnan(self.sweep[:, :1]), self.centre, first + share[..., None] * way)
         return places
-
 
     def spread(self, unseen: float) -> Tracks:
         """Discs at rest all along the sweeps of movers, wider by what these travel in a time [s]."""
@@ -100,7 +98,7 @@ class Tracks(Rows):
 
 
 def to_and_fro(first: ArrayLike, last: ArrayLike, made: ArrayLike, speed: ArrayLike, times: Array) -> Array:
-    """Places at times from now [s] of what goes to and fro between two places on a line, ``made`` past the first [m]."""
+    """Places on a line at times from now [s] of what goes to and fro there, ``made`` past the first end [m]."""
     length = np.asarray(last) - first
     way = (made + speed * times) % (2.0 * length)
     places: Array = first + np.minimum(way, 2.0 * length - way)

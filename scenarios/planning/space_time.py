@@ -1,4 +1,4 @@
-"""Earliest arrival of a disc that is told the future: a wave over the map, 0.1 m and 0.1 s a cell, that may wait.
+"""Quickest way of a disc among things whose future is given: a wave over place and time, that may wait.
 
 The wave goes on by the four neighbours of a cell, and by all eight in two steps of five: an octagon, at most 8 % faster
 than the circle. Accelerations and headings are not asked for, so that no robot of this speed arrives earlier.
@@ -6,8 +6,7 @@ than the circle. Accelerations and headings are not asked for, so that no robot 
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from scipy import ndimage
@@ -15,8 +14,9 @@ from scipy import ndimage
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.planning.grid import is_free
-from unifg.scenarios.simulation.space import Obstacle, reflected
 from unifg.typing import Array
+
+__all__ = ["CELL", "Future", "quickest"]
 
 CELL = 0.1  # [m]
 DIAGONAL = (1, 3)  # of five steps, those by all eight neighbours
@@ -24,24 +24,7 @@ Future = Callable[[float], Array]
 """(K, 3) x, y, radius of all discs at a time from now on [m]."""
 
 
-def future(obstacles: Sequence[Obstacle]) -> Future:
-    """True future of obstacles that rest or go to and fro without waiting, from time zero on."""
-
-    def discs(time: float) -> Array:
-        rows = np.zeros((len(obstacles), 3))
-        for row, disc in zip(rows, obstacles, strict=True):
-            share = 0.0
-            if disc.moving:
-                assert disc.end is not None
-                length = math.dist(disc.centre, disc.end)
-                share = reflected(0.0, 1.0, disc.speed * time % (2.0 * length), length)[0] / length
-            row[:] = *disc.positions(np.array([share]))[0], disc.radius
-        return rows
-
-    return discs
-
-
-def earliest_arrival(
+def quickest(
     occupancy: OccupancyMap,
     walls: DistanceMap,
     start: Array,
@@ -50,8 +33,8 @@ def earliest_arrival(
     discs: Future,
     speed: float = 1.0,
     longest: float = 60.0,
-) -> float:
-    """Earliest time at which a disc can be within a cell of ``goal`` (2,), from ``start`` (2,) [s].
+) -> Array | None:
+    """Places (K + 1, 2) of the quickest way to within a cell of ``goal``, ``CELL / speed`` [s] apart; None for no way.
 
     Args:
         occupancy: the map, without a turn; outside of its free cells there is no way.
@@ -62,9 +45,6 @@ def earliest_arrival(
         discs: what else is in the way.
         speed: greatest [m/s].
         longest: time after which the search ends [s].
-
-    Returns:
-        The time, infinite where the goal is not reached by then.
     """
     low = np.array(occupancy.origin[:2])
     counts = np.ceil(np.array(occupancy.shape[::-1]) * occupancy.resolution / CELL).astype(int).tolist()
@@ -72,27 +52,49 @@ def earliest_arrival(
     places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     points = places.reshape(-1, 2)
     free = (is_free(occupancy, points) & (walls.distance(points) >= radius)).reshape(len(x), len(y))
-    four, eight = (ndimage.generate_binary_structure(2, k) for k in (1, 2))
 
     def cell(place: Array) -> tuple[int, int]:
         i, j = ((place[:2] - low) / CELL).astype(int).tolist()
         return i, j
 
-    wave, target = np.zeros_like(free), cell(goal)
-    wave[cell(start)] = free[cell(start)] = free[target] = True  # centres of their cells may be nearer than they are
-    step = CELL / speed
-    for count in range(round(longest / step) + 1):
+    begin, target = cell(start), cell(goal)
+    wave, waves = np.zeros_like(free), []
+    wave[begin] = free[begin] = free[target] = True  # centres of their cells may be nearer to walls than they are
+    for count in range(round(longest * speed / CELL) + 1):
         now = free.copy()
-        for x_disc, y_disc, size in discs(count * step).tolist():
+        for at_x, at_y, size in discs(count * CELL / speed).tolist():
             reach = size + radius
             (i, k), (j, m) = (
-                np.searchsorted(axis, [c - reach, c + reach]).tolist() for axis, c in ((x, x_disc), (y, y_disc))
+                np.searchsorted(axis, [c - reach, c + reach]).tolist() for axis, c in ((x, at_x), (y, at_y))
             )
-            near = places[i:k, j:m] - (x_disc, y_disc)
+            near = places[i:k, j:m] - (at_x, at_y)
             now[i:k, j:m] &= np.hypot(near[..., 0], near[..., 1]) >= reach
-        wave = now & (ndimage.binary_dilation(wave, eight if count % 5 in DIAGONAL else four) if count else wave)
+        wave = now & (ndimage.binary_dilation(wave, _neighbours(count)) if count else wave)
+        waves.append(wave)
         if wave[target]:
-            return count * step
+            return places[tuple(np.array(_back(waves, begin, target)).T)]
         if not wave.any():
             break
-    return math.inf
+    return None
+
+
+def _neighbours(count: int) -> Array:
+    """(3, 3) cells that the wave reaches in a step."""
+    return ndimage.generate_binary_structure(2, 2 if count % 5 in DIAGONAL else 1)
+
+
+def _back(waves: list[Array], begin: tuple[int, int], cell: tuple[int, int]) -> list[tuple[int, int]]:
+    """Cells of all times on a way to a cell of the last wave, that waits as early as it can."""
+    cells = [cell]
+    for count in range(len(waves) - 1, 0, -1):
+        reached = [
+            (cell[0] + i - 1, cell[1] + j - 1)
+            for i, j in np.argwhere(_neighbours(count)).tolist()
+            if 0 <= cell[0] + i - 1 < waves[0].shape[0] and 0 <= cell[1] + j - 1 < waves[0].shape[1]
+        ]
+        cell = min(
+            (each for each in reached if waves[count - 1][each]),
+            key=lambda each: (each[0] - begin[0]) ** 2 + (each[1] - begin[1]) ** 2,
+        )
+        cells.append(cell)
+    return cells[::-1]
