@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,8 +47,8 @@ TICK = 0.1  # [s]
 BETWEEN = 10  # ticks between searches for a way between movers
 PERIODS = 3.0  # of a mover after which another way is searched
 BEYOND = 1.0  # [m] beyond a mover's sweep where a way between movers ends
-LONGEST = 12.0  # [s] of such a way
-LATE = 0.1 * np.arange(-2.0, 3.0)  # [s] by which a mover may be late
+LONGEST = 8.0  # [s] of such a way
+LATE = np.array([-0.2, 0.0, 0.2])  # [s] by which a mover may be late
 SMOOTH = 3  # cells on both sides over which a way of cells is averaged
 KERNEL = np.full(2 * SMOOTH + 1, 1.0 / (2 * SMOOTH + 1))
 FRESH_STARTS = 3  # ways round about, on each of which the goal may be farther off again
@@ -207,10 +207,10 @@ class Route:
         return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
 
     def around(self, pose: Array, tracks: Tracks, speed: float, pause: float) -> bool:
-        """Look for a quicker way between movers, called while the robot is held by them; True if found.
+        """Look for a quicker way, called while movers that go to and fro hold the robot; True if found.
 
-        After three periods of a mover that goes to and fro the whole map is searched for a way beside it. Where there
-        is none the goal is given up.
+        It leads between them, or after three periods of one beside all of them. Where there is none the goal is given
+        up.
 
         Args:
             pose: (3,) of the robot.
@@ -218,8 +218,7 @@ class Route:
             speed: of the robot [m/s].
             pause: until it has that speed, less what it gets on in the meantime [s].
         """
-        sweeping = tracks.at(tracks.sweeps)
-        begin = int(self._reached / SPACING)
+        sweeping, begin = tracks.at(tracks.sweeps), int(self._reached / SPACING)
         ahead = self.path[begin : begin + round(LOOK_AHEAD / SPACING), :2]
         gap = np.hypot(*np.moveaxis(sweeping.beside(ahead) - ahead[:, None], -1, 0)) - sweeping.radius - self._radius
         met = gap < self._disc_gap + UNSEEN * sweeping.sweep[:, 5]
@@ -228,35 +227,37 @@ class Route:
         self._held, self._trail = self._held + 1, []
         if self._held % BETWEEN != 1:
             return False
-        first = int(np.argmax(met.any(axis=0)))
-        ends = sweeping.sweep[first, :4]
-        period = 2.0 * float(np.hypot(*(ends[2:] - ends[:2]))) / sweeping.sweep[first, 5]
-        if self._held * TICK > PERIODS * period:
-            self._held = 0
-            staying = tracks.at(~tracks.mover).followed_by(tracks.spread(UNSEEN))
-            if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
-                return True
-            self.blocked = Blocked(sweeping.centre[first], self._radius + self._wall_gap, mover=True)
-            return False
-        index = min(begin + int(np.flatnonzero(met.any(axis=1))[-1] + BEYOND / SPACING), len(self.path) - 1)
+        first, ends = int(np.argmax(met.any(axis=0))), sweeping.sweep[:, :4].reshape(-1, 2, 2)
+        lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
+        if self._held * TICK <= PERIODS * 2.0 * lengths[first] / sweeping.sweep[first, 5]:
+            last = begin + int(np.flatnonzero(met.any(axis=1))[-1] + BEYOND / SPACING)
+            return self._between(pose, tracks, min(last, len(self.path) - 1), speed, pause)
+        self._held = 0
+        closed = replace(sweeping, centre=ends.mean(axis=1), radius=sweeping.radius + 0.5 * lengths)
+        staying = tracks.at(~tracks.mover).followed_by(closed)
+        if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
+            return True
+        self.blocked = Blocked(sweeping.centre[first], self._radius + self._wall_gap, mover=True)
+        return False
+
+    def _between(self, pose: Array, tracks: Tracks, index: int, speed: float, pause: float) -> bool:
+        """Follow the quickest way in place and time to a pose of the path; True if found. Arguments as of `around`."""
+        sweeping, more = tracks.at(tracks.sweeps), self._disc_gap - self._wall_gap
         standing = tracks.at((np.hypot(*tracks.velocity.T) < STANDING) & ~tracks.sweeps)
 
         def discs(time: float) -> Array:
-            times = time + pause + LATE
-            places = np.concatenate([standing.centre, sweeping.swept(times).reshape(-1, 2)])
-            radii = np.concatenate([standing.radius, np.tile(sweeping.radius, len(times))])
-            return np.column_stack([places, radii + self._disc_gap - self._wall_gap])
+            places = sweeping.swept(time + pause + LATE).reshape(-1, 2)
+            radii = np.concatenate([standing.radius, np.tile(sweeping.radius, len(LATE))])
+            return np.column_stack([np.concatenate([standing.centre, places]), radii + more])
 
-        occupancy, walls = self._window(np.stack([pose[:2], *self.path[begin : index + 1, :2]]))
-        gap_free = self._radius + self._wall_gap
-        way = quickest(occupancy, walls, pose, self.path[index], gap_free, discs, speed, LONGEST)
+        window = self._window(np.stack([pose[:2], *self.path[int(self._reached / SPACING) : index + 1, :2]]))
+        way = quickest(*window, pose, self.path[index], self._radius + self._wall_gap, discs, speed, LONGEST)
         if way is None:
             return False
         smooth = np.stack([np.convolve(np.pad(x, SMOOTH, mode="edge"), KERNEL, mode="valid") for x in way.T], axis=1)
-        smooth[0] = pose[:2]
-        points = np.concatenate([smooth, self.path[index : index + 1, :2]])
-        moved = np.append(True, np.hypot(*np.diff(points, axis=0).T) > 1e-3)
-        onward = headed(resample(points[moved], SPACING), float(self.path[index, 2]))
+        points = np.concatenate([pose[None, :2], smooth[1:], self.path[index : index + 1, :2]])
+        points = points[np.append(True, np.hypot(*np.diff(points, axis=0).T) > STANDING_GAP)]
+        onward = headed(resample(points, SPACING), float(self.path[index, 2]))
         self._follow(np.concatenate([onward[:-1], self.path[index:]]))
         self.repairs += 1
         return True

@@ -67,7 +67,7 @@ class Past:
             return
         if known is None or self.axis is None:
             pace = np.abs(self.velocities @ axes[0])
-            guess = np.array([low, high, 0.0, float(np.median(pace[pace > 0.5 * pace.max()]))])
+            guess = np.array([low, high, 0.0, float(np.median(pace[pace >= 0.5 * pace.max()]))])
             starts = np.linspace(0.0, 2.0 * (high - low), 40, endpoint=False)
             errors = [np.abs(to_and_fro(*guess[:2], u, guess[3], since) - along).clip(max=0.3).sum() for u in starts]
             guess[2] = starts[int(np.argmin(errors))]
@@ -79,10 +79,8 @@ class Past:
             guess = known + np.array([moved, moved, step, 0.0])
         wave = self._improved(guess, along, since)
         length = wave[1] - wave[0]
-        turns = (
-            np.diff(np.floor((wave[2] + wave[3] * since[BOTH:-BOTH]) / length)) if length >= SHORTEST else np.zeros(1)
-        )
-        if turns.sum() >= 2.0 and wave[3] > 0.0:
+        first, last = np.floor((wave[2] + wave[3] * since[[BOTH, -BOTH - 1]]) / length)  # its ways are counted
+        if length >= SHORTEST and last - first >= 2.0:
             wave[2] %= 2.0 * length
             self.wave, self.axis = wave, np.stack([middle, axes[0]])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -10,8 +10,6 @@ from unifg.scenarios.perception.rows import Rows
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 __all__ = ["Tracks", "nearest", "to_and_fro"]
-
-SPREAD = 0.15  # [m] at most between discs along a sweep
 
 
 @dataclass(frozen=True)
@@ -81,20 +79,6 @@ class Tracks(Rows):
         share = np.clip(((place[..., None, :] - first) * way).sum(axis=-1) / length, 0.0, 1.0)
         places: Array = np.where(np.isnan(self.sweep[:, :1]), self.centre, first + share[..., None] * way)
         return places
-
-    def spread(self, unseen: float) -> Tracks:
-        """Discs at rest all along the sweeps of movers, wider by what these travel in a time [s]."""
-        places, which = [self.centre[:0]], [np.zeros(0, dtype=np.intp)]
-        for k in np.flatnonzero(self.sweeps).tolist():
-            ends = self.sweep[k, :4].reshape(2, 2)
-            count = 2 + int(np.hypot(*(ends[1] - ends[0])) / SPREAD)
-            places.append(np.linspace(*ends, count))
-            which.append(np.full(count, k))
-        rows = self.at(np.concatenate(which))
-        return replace(
-            rows, centre=np.concatenate(places), velocity=np.zeros((len(rows), 2)),
-            radius=rows.radius + unseen * rows.sweep[:, 5], sweep=np.full((len(rows), 6), np.nan),
-        )  # fmt: skip
 
 
 def to_and_fro(first: ArrayLike, last: ArrayLike, made: ArrayLike, speed: ArrayLike, times: Array) -> Array:

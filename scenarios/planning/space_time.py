@@ -37,7 +37,7 @@ def quickest(
     """Places (K + 1, 2) of the quickest way to within a cell of ``goal``, ``CELL / speed`` [s] apart; None for no way.
 
     Args:
-        occupancy: the map, without a turn; outside of its free cells there is no way.
+        occupancy: the map; outside of its free cells there is no way.
         walls: distance to them.
         start: (2,) or (3,) [m].
         goal: (2,) or (3,) [m].
@@ -46,15 +46,14 @@ def quickest(
         speed: greatest [m/s].
         longest: time after which the search ends [s].
     """
-    low = np.array(occupancy.origin[:2])
-    counts = np.ceil(np.array(occupancy.shape[::-1]) * occupancy.resolution / CELL).astype(int).tolist()
-    x, y = (a + CELL * (np.arange(n) + 0.5) for a, n in zip(low, counts, strict=True))
-    places = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
-    points = places.reshape(-1, 2)
-    free = (is_free(occupancy, points) & (walls.distance(points) >= radius)).reshape(len(x), len(y))
+    scale = CELL / occupancy.resolution
+    shape = np.ceil(np.array(occupancy.shape[::-1]) / scale).astype(int)
+    places = occupancy.grid_to_world(scale * (np.argwhere(np.ones(shape)) + 0.5))
+    free = (is_free(occupancy, places) & (walls.distance(places) >= radius)).reshape(shape)
+    places = places.reshape(*shape, 2)
 
     def cell(place: Array) -> tuple[int, int]:
-        i, j = ((place[:2] - low) / CELL).astype(int).tolist()
+        i, j = (occupancy.world_to_grid(place[:2]) / scale).astype(int).tolist()
         return i, j
 
     begin, target = cell(start), cell(goal)
@@ -62,13 +61,11 @@ def quickest(
     wave[begin] = free[begin] = free[target] = True  # centres of their cells may be nearer to walls than they are
     for count in range(round(longest * speed / CELL) + 1):
         now = free.copy()
-        for at_x, at_y, size in discs(count * CELL / speed).tolist():
-            reach = size + radius
-            (i, k), (j, m) = (
-                np.searchsorted(axis, [c - reach, c + reach]).tolist() for axis, c in ((x, at_x), (y, at_y))
-            )
-            near = places[i:k, j:m] - (at_x, at_y)
-            now[i:k, j:m] &= np.hypot(near[..., 0], near[..., 1]) >= reach
+        for disc in discs(count * CELL / speed):
+            (i, j), reach = cell(disc), disc[2] + radius
+            span = int(reach / CELL) + 2
+            near = np.s_[max(i - span, 0) : max(i + span, 0), max(j - span, 0) : max(j + span, 0)]
+            now[near] &= np.hypot(*np.moveaxis(places[near] - disc[:2], -1, 0)) >= reach
         wave = now & (ndimage.binary_dilation(wave, _neighbours(count)) if count else wave)
         waves.append(wave)
         if wave[target]:
