@@ -11,7 +11,7 @@ from maps import field, walled
 from unifg.scenarios.ground.drive_parts import disc_limits, predicted
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.route import BETWEEN, PERIODS, TICK, Route
-from unifg.scenarios.ground.waiting import EARLY, LOOK, occupancy, timed
+from unifg.scenarios.ground.waiting import EARLY, LOOK, occupancy, timed, waiting
 from unifg.scenarios.perception.motion_model import GONE, MEMORY, MotionModel
 from unifg.scenarios.perception.tracks import Tracks, nearest, to_and_fro
 from unifg.scenarios.planning.grid import SPACING
@@ -46,7 +46,7 @@ def walk(
 
 def clock(begin: float, end: float) -> Array:
     """Times of the ticks from one time to another [s]."""
-    return np.arange(round(begin / DT), round(end / DT)) * DT
+    return DT * np.arange(float(round(begin / DT)), float(round(end / DT)))
 
 
 # ------------------------------------------------------------------ what is learned
@@ -86,6 +86,8 @@ def test_one_who_walks_on_or_bends_is_not_known() -> None:
 def test_what_is_hidden_is_foretold_and_what_comes_back_is_known() -> None:
     model = MotionModel()
     walk(model, clock(0.0, 6.0), 0.8)
+    begun = MotionModel().update(seen(np.array([9.0, 9.0]), np.zeros(2), unseen=0.1), DT)
+    assert np.allclose(begun.sweep[0, :4], 9.0), "a past may begin out of sight"
     hidden = model.update(seen(np.array([9.0, 9.0]), np.zeros(2), unseen=0.1), DT)
     assert np.hypot(*(hidden.centre[0] - hidden.swept(np.zeros(1))[0, 0])) < 1e-9
     for _ in range(10):
@@ -112,7 +114,7 @@ def sweeping(made: float = 0.0, speed: float = 1.0) -> Tracks:
 def test_a_known_mover_is_kept_off_where_it_will_be() -> None:
     pose, tracks = np.array([3.0, 1.0, 0.0]), sweeping()
     centres = predicted(SETTINGS, pose, tracks)
-    stages = DT * np.arange(1, SETTINGS.horizon + 1)
+    stages = DT * np.arange(1.0, SETTINGS.horizon + 1.0)
     assert np.allclose(centres[:, 0, 1], to_and_fro(0.4, 1.6, 0.0, 1.0, stages))
     resting = np.tile(pose, (SETTINGS.horizon + 1, 1))
     least = disc_limits(SETTINGS, pose, centres, tracks, resting, np.zeros((2, 2)))
@@ -148,9 +150,24 @@ def test_a_known_mover_occupies_places_when_it_is_there_and_none_is_safe_on_its_
     middle = LOOK // 2
     reach = 0.15 + SETTINGS.robot_radius + SETTINGS.disc_clearance
     assert unsafe[middle] and not unsafe[0] and not occupied[:, 0].any()
-    near = np.abs(to_and_fro(0.4, 1.6, 0.6, 0.5, DT * np.arange(LOOK + 1)) - 1.0) < reach + 0.05
+    near = np.abs(to_and_fro(0.4, 1.6, 0.6, 0.5, DT * np.arange(LOOK + 1.0)) - 1.0) < reach + 0.05
     assert occupied[:, middle][near].all() and not occupied[:, middle].all()
     assert np.flatnonzero(~occupied[:, middle])[0] == np.flatnonzero(~near)[0] + EARLY
+
+
+def test_a_robot_waits_for_an_unknown_mover_where_that_is_safe_and_only_there() -> None:
+    places = np.column_stack([0.1 * np.arange(LOOK + 1.0), np.zeros(LOOK + 1)])
+    pose = np.zeros(3)
+
+    def waits(x: float, speed: float) -> bool:
+        mover = Tracks.of_movers(np.array([[x, 0.5]]), np.array([[0.0, speed]]), np.array([RADIUS]))
+        return bool(waiting(SETTINGS, pose, places, mover)[-1] < LOOK)
+
+    assert waits(3.0, -0.5)
+    assert not waits(0.2, -0.5), "it comes to where the robot is"
+    near = replace(sweeping(), sweep=np.array([[0.2, -0.6, 0.2, 0.6, 0.0, 1.0]]))
+    far = replace(sweeping(), sweep=np.array([[3.0, -0.6, 3.0, 0.6, 0.0, 1.0]]))
+    assert waiting(SETTINGS, pose, places, near.followed_by(far))[-1] < 30, "for those that are known nevertheless"
 
 
 def test_an_unknown_mover_occupies_where_it_was_and_where_it_can_be() -> None:
@@ -186,7 +203,7 @@ def test_a_way_between_leads_past_the_end_that_is_free() -> None:
     assert route.around(pose, tracks, 1.0, 0.2)
     assert np.allclose(route.path[0, :2], pose[:2]) and np.array_equal(route.path[-60:], before[-60:])
     assert np.hypot(*np.diff(route.path[:, :2], axis=0).T).max() < 2.0 * SPACING
-    times = 0.2 + SPACING * np.arange(len(route.path))
+    times = 0.2 + SPACING * np.arange(float(len(route.path)))
     apart = np.hypot(*(route.path[:, :2] - tracks.swept(times)[:, 0]).T)
     assert apart.min() > 0.17 + RADIUS, "driven at once it touches nothing"
     assert not route.around(pose, tracks, 1.0, 0.2), "not again at once"

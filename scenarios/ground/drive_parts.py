@@ -205,7 +205,7 @@ def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
     A mover goes straight on, even through the robot. It is not expected to go away, for it may turn round. One that is
     known to go to and fro does so.
     """
-    stages = s.dt * np.arange(1, s.horizon + 1)
+    stages = s.dt * np.arange(1.0, s.horizon + 1.0)
     centres = tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
     known = tracks.sweeps
     centres[:, known] = tracks.at(known).swept(stages)

@@ -23,7 +23,7 @@ from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.ground.relocalise import Relocaliser
 from unifg.scenarios.ground.route import Route
-from unifg.scenarios.ground.waiting import LOOK, occupancy, timed
+from unifg.scenarios.ground.waiting import LOOK, waiting
 from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Supervisor
 from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.perception.disc_tracker import DiscTracker
@@ -206,10 +206,10 @@ class Pilot(Generic[PlannerT]):
         fastest = min(s.speed, float(s.box[1][0]))
         if not len(movers) or not fastest or isinstance(self.controller, PlannerAdapter):
             return route.reference(pose, stations)
+        steps = s.dt * fastest * np.arange(LOOK + 1.0)
 
         def waits() -> Array:
-            places = route.reference(pose, s.dt * fastest * np.arange(LOOK + 1))[:, :2]
-            return s.dt * fastest * timed(*occupancy(s, pose, places, movers))[: len(stations)]
+            return steps[waiting(s, pose, route.reference(pose, steps)[:, :2], movers)[: len(stations)]]
 
         found = waits()
         pause = max(fastest - self.driven[0], 0.0) / (2.0 * s.accelerations[0])

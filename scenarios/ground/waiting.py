@@ -20,6 +20,20 @@ EAGER = 0.01  # of being one place farther back for a step
 EARLY = 2  # steps that a mover may be early or late by
 
 
+def waiting(s: ControllerSettings, pose: Array, places: Array, movers: Tracks) -> IntArray:
+    """Which of places (LOOK + 1, 2) along a path, a step of the controller at full speed apart, to be at in every step.
+
+    Where no wait is safe from all movers those that are not known to go to and fro are left to the controller: beside
+    them there may be room.
+    """
+    for those in (movers, movers.at(movers.sweeps)):
+        occupied, unsafe = occupancy(s, pose, places, those)
+        steps = timed(occupied, unsafe)
+        if not unsafe[steps[-1]] and not occupied[np.arange(len(steps)), steps].any():
+            break
+    return steps
+
+
 def timed(occupied: BoolArray, unsafe: BoolArray) -> IntArray:
     """Places (K + 1,) at every step, from the first place on.
 
@@ -41,7 +55,8 @@ def timed(occupied: BoolArray, unsafe: BoolArray) -> IntArray:
 
 def occupancy(s: ControllerSettings, pose: Array, places: Array, movers: Tracks) -> tuple[BoolArray, BoolArray]:
     """Arguments of :func:`timed` for places (S, 2) along a path, among movers."""
-    times, known = s.dt * np.arange(LOOK + 1), movers.sweeps
+    times: Array = s.dt * np.arange(LOOK + 1.0)
+    known = movers.sweeps
     walk, reach = np.hypot(*movers.velocity.T), s.robot_radius + s.disc_clearance + movers.radius
     gap = _distances(movers.beside(places), places[:, None]) - reach  # (S, m)
     unsafe = gap < np.where(known, 0.0, walk * s.mover_surprise)
@@ -55,7 +70,7 @@ def occupancy(s: ControllerSettings, pose: Array, places: Array, movers: Tracks)
         sure[shift:] |= met[:-shift]
         sure[:-shift] |= met[shift:]
     near = gap < walk * np.minimum(times, s.mover_surprise)[:, None, None]
-    return (np.where(known, sure, met | near)).any(axis=-1), unsafe.any(axis=-1)
+    return np.any(np.where(known, sure, met | near), axis=-1), np.any(unsafe, axis=-1)
 
 
 def _distances(first: Array, second: Array) -> Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unifg.scenarios.perception.tracks import Tracks, to_and_fro
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 
 __all__ = ["UNLIKELY", "MotionModel", "Past"]
 
@@ -69,7 +69,9 @@ class Past:
             pace = np.abs(self.velocities @ axes[0])
             guess = np.array([low, high, 0.0, float(np.median(pace[pace >= 0.5 * pace.max()]))])
             starts = np.linspace(0.0, 2.0 * (high - low), 40, endpoint=False)
-            errors = [np.abs(to_and_fro(*guess[:2], u, guess[3], since) - along).clip(max=0.3).sum() for u in starts]
+            errors = [
+                np.abs(to_and_fro(guess[0], guess[1], u, guess[3], since) - along).clip(max=0.3).sum() for u in starts
+            ]
             guess[2] = starts[int(np.argmin(errors))]
         else:  # the line has turned a little, or its sense was changed
             sense = float(np.sign(axes[0] @ self.axis[1]))
@@ -107,7 +109,8 @@ class Past:
             return
         since = self.times - self.times[-1]
         middle, direction = self.axis
-        foretold = middle + to_and_fro(*self.wave, since)[:, None] * direction
+        low, high, made, speed = self.wave.tolist()
+        foretold = middle + to_and_fro(low, high, made, speed, since)[:, None] * direction
         off = np.hypot(*(foretold - self.places).T)
         if off[-2:].max() > WORST * SIGMA / 2.0:  # it has just done something else
             return
@@ -154,7 +157,7 @@ class MotionModel:
             if name not in self._pasts:
                 self._pasts[name] = self._adopted(tracks.centre[k], tracks.identity)
             past = self._pasts[name]
-            if not tracks.unseen[k]:
+            if not (tracks.unseen[k] and len(past.times)):
                 past.add(self._now, tracks.centre[k], tracks.velocity[k])
             sweep[k] = past.sweep
             sweep[k, 4] += sweep[k, 5] * (self._now - past.times[-1])
@@ -162,7 +165,7 @@ class MotionModel:
         tracks.centre[hidden & tracks.sweeps] = tracks.at(hidden & tracks.sweeps).swept(np.zeros(1))[0]
         return tracks
 
-    def _adopted(self, place: Array, names: Array) -> Past:
+    def _adopted(self, place: Array, names: IntArray) -> Past:
         """The past of a lost track on whose line a new one begins, or none."""
         for name in [name for name in self._pasts if name not in names]:
             past = self._pasts[name]

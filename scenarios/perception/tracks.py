@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
@@ -10,6 +11,8 @@ from unifg.scenarios.perception.rows import Rows
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 __all__ = ["Tracks", "nearest", "to_and_fro"]
+
+Number: TypeAlias = Array | float
 
 
 @dataclass(frozen=True)
@@ -81,11 +84,10 @@ class Tracks(Rows):
         return places
 
 
-def to_and_fro(first: ArrayLike, last: ArrayLike, made: ArrayLike, speed: ArrayLike, times: Array) -> Array:
+def to_and_fro(first: Number, last: Number, made: Number, speed: Number, times: Number) -> Array:
     """Places on a line at times from now [s] of what goes to and fro there, ``made`` past the first end [m]."""
-    length = np.asarray(last) - first
-    way = (made + speed * times) % (2.0 * length)
-    places: Array = first + np.minimum(way, 2.0 * length - way)
+    way = (made + speed * times) % (2.0 * (last - first))
+    places: Array = first + np.minimum(way, 2.0 * (last - first) - way)
     return places
 
 

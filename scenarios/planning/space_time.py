@@ -14,7 +14,7 @@ from scipy import ndimage
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.planning.grid import is_free
-from unifg.typing import Array
+from unifg.typing import Array, BoolArray
 
 __all__ = ["CELL", "Future", "quickest"]
 
@@ -48,7 +48,7 @@ def quickest(
     """
     scale = CELL / occupancy.resolution
     shape = np.ceil(np.array(occupancy.shape[::-1]) / scale).astype(int)
-    places = occupancy.grid_to_world(scale * (np.argwhere(np.ones(shape)) + 0.5))
+    places = occupancy.grid_to_world(scale * (np.argwhere(np.ones(shape)).astype(np.float64) + 0.5))
     free = (is_free(occupancy, places) & (walls.distance(places) >= radius)).reshape(shape)
     places = places.reshape(*shape, 2)
 
@@ -57,7 +57,7 @@ def quickest(
         return i, j
 
     begin, target = cell(start), cell(goal)
-    wave, waves = np.zeros_like(free), []
+    wave, waves = np.zeros_like(free), list[BoolArray]()
     wave[begin] = free[begin] = free[target] = True  # centres of their cells may be nearer to walls than they are
     for count in range(round(longest * speed / CELL) + 1):
         now = free.copy()
@@ -69,18 +69,20 @@ def quickest(
         wave = now & (ndimage.binary_dilation(wave, _neighbours(count)) if count else wave)
         waves.append(wave)
         if wave[target]:
-            return places[tuple(np.array(_back(waves, begin, target)).T)]
+            way: Array = places[tuple(np.transpose(_back(waves, begin, target)))]
+            return way
         if not wave.any():
             break
     return None
 
 
-def _neighbours(count: int) -> Array:
+def _neighbours(count: int) -> BoolArray:
     """(3, 3) cells that the wave reaches in a step."""
-    return ndimage.generate_binary_structure(2, 2 if count % 5 in DIAGONAL else 1)
+    cells: BoolArray = ndimage.generate_binary_structure(2, 2 if count % 5 in DIAGONAL else 1)
+    return cells
 
 
-def _back(waves: list[Array], begin: tuple[int, int], cell: tuple[int, int]) -> list[tuple[int, int]]:
+def _back(waves: list[BoolArray], begin: tuple[int, int], cell: tuple[int, int]) -> list[tuple[int, int]]:
     """Cells of all times on a way to a cell of the last wave, that waits as early as it can."""
     cells = [cell]
     for count in range(len(waves) - 1, 0, -1):
