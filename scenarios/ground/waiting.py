@@ -1,4 +1,4 @@
-"""Where along its path a robot should be when, among movers: a search over path and time.
+"""Waiting for movers: a search over places along a path and times.
 
 Dynamic programming over places a step apart and times a step apart: in a step the robot goes on by one place or waits.
 What is occupied costs, so that a robot that is where a mover comes leaves it soon; of the ways that cost the same the
@@ -21,10 +21,10 @@ EARLY = 2  # steps that a mover may be early or late by
 
 
 def waiting(s: ControllerSettings, pose: Array, places: Array, movers: Tracks) -> IntArray:
-    """Which of places (LOOK + 1, 2) along a path, a step of the controller at full speed apart, to be at in every step.
+    """Indices (LOOK + 1,) of the places along a path to be at in every step of the controller.
 
-    Where no wait is safe from all movers those that are not known to go to and fro are left to the controller: beside
-    them there may be room.
+    The places (LOOK + 1, 2) are a step at full speed apart. Where no wait is safe from all movers those that are not
+    known to go to and fro are left to the controller: beside them there may be room.
     """
     for those in (movers, movers.at(movers.sweeps)):
         occupied, unsafe = occupancy(s, pose, places, those)

@@ -27,6 +27,7 @@ ASIDE = 0.12  # [m] off the line, root mean square, that is still a line
 GONE = 30.0  # [s] after which the motion of a track that was lost is forgotten
 ADOPTED = 0.4  # [m] from the line of a lost track at which a new one goes on with its past
 BOTH = 3  # scans before and after a turn that show it
+STARTS = 40  # places on the round trip from which the fit may begin
 STEPS = 4  # of Gauss-Newton
 
 
@@ -56,7 +57,7 @@ class Past:
 
     def _fit(self) -> None:
         """Fit a triangular wave; none where the track is no line, short, or has not turned round twice."""
-        known, self.wave = self.wave, None
+        self.wave = None
         if len(self.times) < 3 * AHEAD:
             return
         middle = self.places.mean(axis=0)
@@ -65,20 +66,11 @@ class Past:
         low, high = along.min(), along.max()
         if spread[1] > ASIDE * np.sqrt(len(along)) or high - low < SHORTEST:
             return
-        if known is None or self.axis is None:
-            pace = np.abs(self.velocities @ axes[0])
-            guess = np.array([low, high, 0.0, float(np.median(pace[pace >= 0.5 * pace.max()]))])
-            starts = np.linspace(0.0, 2.0 * (high - low), 40, endpoint=False)
-            errors = [
-                np.abs(to_and_fro(guess[0], guess[1], u, guess[3], since) - along).clip(max=0.3).sum() for u in starts
-            ]
-            guess[2] = starts[int(np.argmin(errors))]
-        else:  # the line has turned a little, or its sense was changed
-            sense = float(np.sign(axes[0] @ self.axis[1]))
-            axes[0], along = sense * axes[0], sense * along
-            moved = (self.axis[0] - middle) @ axes[0]
-            step = known[3] * (self.times[-1] - self.times[-2])
-            guess = known + np.array([moved, moved, step, 0.0])
+        pace = np.abs(self.velocities @ axes[0])
+        speed = np.median(pace[pace >= 0.5 * pace.max()])
+        starts = np.linspace(0.0, 2.0 * (high - low), STARTS, endpoint=False)
+        errors = np.minimum(np.abs(to_and_fro(low, high, starts[:, None], speed, since) - along), WORST * SIGMA)
+        guess = np.array([low, high, starts[int(np.argmin(errors.sum(axis=1)))], speed])
         wave = self._improved(guess, along, since)
         length = wave[1] - wave[0]
         first, last = np.floor((wave[2] + wave[3] * since[[BOTH, -BOTH - 1]]) / length)  # its ways are counted
