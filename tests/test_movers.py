@@ -153,7 +153,7 @@ def test_a_known_mover_occupies_places_when_it_is_there_and_none_is_safe_on_its_
     middle = LOOK // 2
     reach = 0.15 + SETTINGS.robot_radius + SETTINGS.disc_clearance
     assert unsafe[middle] and not unsafe[0] and not occupied[:, 0].any()
-    near = np.abs(to_and_fro(0.4, 1.6, 0.6, 0.5, DT * np.arange(LOOK + 1.0)) - 1.0) < reach + 0.05
+    near = np.abs(to_and_fro(0.4, 1.6, 0.6, 0.5, DT * np.arange(LOOK + 1.0)) - 1.0) < reach
     assert occupied[:, middle][near].all() and not occupied[:, middle].all()
     assert np.flatnonzero(~occupied[:, middle])[0] == np.flatnonzero(~near)[0] + EARLY
 

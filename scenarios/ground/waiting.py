@@ -62,8 +62,7 @@ def occupancy(s: ControllerSettings, pose: Array, places: Array, movers: Tracks)
     unsafe = gap < np.where(known, 0.0, walk * s.mover_surprise)
     ways = movers.centre + times[:, None, None] * movers.expected_velocity(pose[:2])
     ways[:, known] = movers.at(known).swept(times)
-    room = np.where(known, walk * s.mover_unseen, 0.0) + reach
-    met = _distances(ways[:, None], places[:, None]) < room  # (K + 1, S, m)
+    met = _distances(ways[:, None], places[:, None]) < reach  # (K + 1, S, m)
     met[s.horizon :] &= known
     sure = met.copy()
     for shift in range(1, EARLY + 1):
