@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import shutil
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -26,6 +28,7 @@ from benchmarks import (
     many_instances,
     marginals,
     moved_goals,
+    movers,
     own_functions,
     pose_graphs,
     runner,
@@ -36,10 +39,13 @@ from benchmarks.report import END, begin, put_results
 from benchmarks.runner import PAGES, RESULTS, Study, Timing
 from benchmarks.section import goal, met
 from benchmarks.timing import interleave, number, ratio, shown, spread
+from maps import walled
 from problems.collection import BACKENDS, CASES, attempt
 from unifg.errors import ScenarioError
 from unifg.pose_graphs import manhattan
 from unifg.scenarios.campaigns.journal import lines_of
+from unifg.scenarios.simulation.plane import World
+from unifg.scenarios.simulation.space import Obstacle
 from unifg.solvers import GaussNewton, InteriorPoint
 
 
@@ -300,3 +306,51 @@ def test_many_instances_are_beside_a_loop() -> None:
 def test_derivatives_are_beside_problems_solved_again() -> None:
     row = derivatives.measure(many_instances.UNICYCLES[1], rounds=1)
     assert row[0] < 1e-6 and len(row) == 7 and min(row[1:]) > 0.0
+
+
+def test_the_future_is_that_of_the_world() -> None:
+    hall = walled(12.0, 12.0, 2)
+    discs = [Obstacle(np.array([6.0, 6.0]), 0.2), Obstacle(np.array([3.0, 9.0]), 0.25, np.array([4.3, 8.2]), 0.7)]
+    world = World(hall, (2.0, 2.0, 0.0), discs, yields=False)
+    for _ in range(70):
+        world.step(0.0, 0.0)
+        assert np.allclose(world.discs()[:, :3], movers.future(discs)(world.time), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("speeds", "contact", "clearance", "kind"),
+    [
+        ([1.0] * 12, None, 0.1, ""),
+        ([1.0] * 12, 9, 0.1, "moving"),
+        ([1.0] * 12, None, -0.01, "moving"),
+        ([0.0] * 12, 9, 0.1, "at rest"),
+        ([0.0] * 7 + [1.0] * 5, 9, 0.1, "moving"),
+    ],
+)
+def test_contacts_are_told_apart_by_the_motion_before(
+    speeds: list[float], contact: int | None, clearance: float, kind: str
+) -> None:
+    ticks = len(speeds)
+    contacts, gaps = np.zeros(ticks, dtype=int), np.full(ticks, 0.1)
+    gaps[9] = clearance
+    if contact is not None:
+        contacts[contact:] = 1
+    pose = np.zeros((ticks, 3))
+    pose[:, 0] = np.cumsum(np.array(speeds) * 0.1)
+    log: Any = SimpleNamespace(contacts=contacts, clearance=gaps, collisions=contacts[-1], true_pose=pose, dt=0.1)
+    assert movers.touched(log) == kind
+
+
+def test_thirty_seeds_are_ten_routes_and_the_next_are_others() -> None:
+    routes = [movers.settings(movers.Meeting(0.3, 2.5, seed)).start for seed in (0, 10, 29, 30, 39)]
+    assert routes[0] == routes[1] and len({*routes}) == 4
+
+
+def test_rows_become_a_table() -> None:
+    row = {
+        "speed": 0.6, "base": 1.0, "seed": 0, "reached": True, "touched": "", "arrival": 20.0, "time": 30.0,
+        "reverse": 0.1, "tick": 9.0,
+    }  # fmt: skip
+    rows = [row, {**row, "touched": "at rest"}, {**row, "reached": False}, {**row, "arrival": math.inf}]
+    line = movers.render(rows).splitlines()[2]
+    assert line == "| 0.6 | 1 | 3 | 1 | 6 .. 79 % | 0 | 1 | 1 | 1.50 | 10 % | 9.0 |"

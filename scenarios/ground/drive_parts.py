@@ -143,8 +143,9 @@ class Clearance:
         pose, given, chosen = now.present, now.given, nearest(now.given.tracks, now.present, m)
         k, spread = len(chosen), in_world(pose, given.covariance)
         centres, radii, shy = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m)
+        shies = (chosen.mover & ~chosen.sweeps) * s.mover_margin
         limits = np.zeros((n, len(s.hull.discs), m))
-        centres[:, :k], radii[:k], shy[:k] = predicted(s, pose, chosen), chosen.radius, chosen.mover * s.mover_margin
+        centres[:, :k], radii[:k], shy[:k] = predicted(s, pose, chosen), chosen.radius, shies
         limits[:, :, :k] = disc_limits(s, pose, centres[:, :k], chosen, given.evasive.states, spread)
         return {
             "wall clearance": wall_limits(s, self.field, given.evasive.states, given.reference, spread),
@@ -201,10 +202,14 @@ def wall_limits(s: ControllerSettings, field: SmoothField, evasive: Array, refer
 def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
     """(N, k, 2) centres along the horizon.
 
-    A mover goes straight on, even through the robot. It is not expected to go away, for it may turn round.
+    A mover goes straight on, even through the robot. It is not expected to go away, for it may turn round. One that is
+    known to go to and fro does so.
     """
-    stages = s.dt * np.arange(1, s.horizon + 1)
-    return tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
+    stages = s.dt * np.arange(1.0, s.horizon + 1.0)
+    centres = tracks.centre + stages[:, None, None] * tracks.expected_velocity(pose[:2])
+    known = tracks.sweeps
+    centres[:, known] = tracks.at(known).swept(stages)
+    return centres
 
 
 def disc_limits(
@@ -214,15 +219,16 @@ def disc_limits(
 
     They are wider by what the estimate (2, 2) may be off towards a disc. A disc that has ever moved is kept off by what
     it can travel in the meantime, or before it is noticed that it goes elsewhere, and what is left of the gap is a
-    barrier that may shrink at the rate ``approach`` from now on; with ``avoidance="barrier"`` that holds for each.
+    barrier that may shrink at the rate ``approach`` from now on; with ``avoidance="barrier"`` that holds for each. Of
+    one that is known to go to and fro only what it travels until it is noticed that it does not is kept off, too.
     """
     stages = s.dt * np.arange(1, s.horizon + 1)[:, None]
     kept = disc_distances(s.hull, evasive[1:], centres) - tracks.radius
-    movers, now = tracks.mover, pose[:2] - tracks.centre
+    movers, known, now = tracks.mover, tracks.sweeps, pose[:2] - tracks.centre
     walk = np.maximum(np.hypot(*tracks.velocity.T), s.mover_speed)
-    allowance = np.where(movers, walk * np.minimum(stages, s.mover_surprise), 0.0)
+    allowance = np.where(movers, walk * np.minimum(stages, np.where(known, s.mover_unseen, s.mover_surprise)), 0.0)
     least = s.robot_radius + s.disc_clearance + s.sigmas * along(spread, now) + allowance
-    guarded = movers | (s.avoidance == "barrier")
+    guarded = (movers & ~known) | (s.avoidance == "barrier")
     gap = disc_distances(s.hull, pose[None], tracks.centre[None])[0].min(axis=0)
     spare = np.where(guarded, np.maximum(gap - tracks.radius - least, 0.0), 0.0)
     # A little nearer is allowed, or a robot beside a disc could not even turn its nose past it; not so to a disc

@@ -23,6 +23,7 @@ from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.ground.relocalise import Relocaliser
 from unifg.scenarios.ground.route import Route
+from unifg.scenarios.ground.waiting import LOOK, waiting
 from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Supervisor
 from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.perception.disc_tracker import DiscTracker
@@ -34,6 +35,7 @@ from unifg.typing import Array
 
 COUPLINGS = ("sequential", "joint")
 AT_REST = 0.02  # [m/s]; slower is rest
+HELD = 0.5  # of the way that it could go: a robot that gets no farther is held by movers
 SEARCH_AGAIN = 20  # ticks after a search that found nothing
 FOUND_SIGMA = np.array([0.05, 0.05, 0.02])  # of a pose that a search has found [m, m, rad]
 STOPPED = "stopped"
@@ -192,11 +194,29 @@ class Pilot(Generic[PlannerT]):
         s = self.controller.settings
         if self.planless or share < 1.0:
             self.controller.settings = replace(s, speed=share * s.speed, feasible=-1.0 if self.planless else s.feasible)
-        reference = route.reference(pose, self.controller.stations())
+        reference = self._reference(pose, route)
         plan = self.controller.plan(pose, reference, self.tracks, self.estimator.covariance)
         self.controller.settings = s
         self.pose = self.controller.estimate
         return plan
+
+    def _reference(self, pose: Array, route: Route) -> Array:
+        """(N + 1, 3) poses along the path, which wait for movers."""
+        stations, movers, s = self.controller.stations(), self.tracks.at(self.tracks.mover), self.controller.settings
+        fastest = min(s.speed, float(s.box[1][0]))
+        if not len(movers) or not fastest or isinstance(self.controller, PlannerAdapter):
+            return route.reference(pose, stations)
+        steps = s.dt * fastest * np.arange(LOOK + 1.0)
+
+        def waits() -> Array:
+            return steps[waiting(s, pose, route.reference(pose, steps)[:, :2], movers)[: len(stations)]]
+
+        found = waits()
+        pause = max(fastest - self.driven[0], 0.0) / (2.0 * s.accelerations[0])
+        if found[-1] < HELD * stations[-1] and route.around(pose, self.tracks, fastest, pause):
+            self.controller.forget()
+            found = waits()
+        return route.reference(pose, np.minimum(stations, found))
 
     def _stop(self, plan: Plan, scan: Scan) -> Plan:
         """The plan, its first control slowed where beams say that its braking way is not free."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,12 +18,14 @@ from unifg.scenarios.planning.follow import PathFollower
 from unifg.scenarios.planning.grid import SPACING, plan
 from unifg.scenarios.planning.lattice import plan_poses
 from unifg.scenarios.planning.polyline import headed, path_length, resample
+from unifg.scenarios.planning.space_time import quickest
 from unifg.typing import Array
 
 LOOK_AHEAD = 4.0  # [m] of path checked against tracked discs
 REJOIN = 2.0  # [m] beyond the disc where the detour meets the path again
 WINDOW = 3.0  # [m] of map kept around the detour's ends
 STANDING = 0.15  # [m/s]; faster discs are left to the controller, which predicts them
+UNSEEN = ControllerSettings.mover_unseen  # [s] for which a mover may be elsewhere than it is foretold to be
 GAP = ControllerSettings.disc_clearance  # [m] between hull and disc that a path must leave
 WALL_GAP = ControllerSettings.wall_clearance  # [m] between hull and wall that a path must leave
 ALLOWANCE = 0.04  # [m] added to discs when a detour is planned
@@ -41,6 +43,14 @@ CLOSED = 60  # ticks for which no way is to be had at all since the goal came ne
 VAIN = 6  # of those ticks that a detour counts which does not lead nearer
 STALLED = 400  # ticks without coming nearer to the goal while nothing moves nearby, after which there is no use
 WAITING = 2.0  # [m] from the robot within which something that moves may be what it waits for
+TICK = 0.1  # [s]
+BETWEEN = 10  # ticks between searches for a way between movers
+PERIODS = 3.0  # of a mover after which another way is searched
+BEYOND = 1.0  # [m] beyond a mover's sweep where a way between movers ends
+LONGEST = 12.0  # [s] of such a way
+LATE = np.array([-0.2, 0.0, 0.2])  # [s] by which a mover may be late
+SMOOTH = 3  # cells on both sides over which a way of cells is averaged
+KERNEL = np.full(2 * SMOOTH + 1, 1.0 / (2 * SMOOTH + 1))
 FRESH_STARTS = 3  # ways round about, on each of which the goal may be farther off again
 
 
@@ -51,14 +61,18 @@ class Blocked:
     Attributes:
         place: (2,) where the way ends [m].
         clearance: of the robot's centre that no way keeps [m].
+        mover: whether something that moves is there.
     """
 
     place: Array
     clearance: float
+    mover: bool = False
 
     def __str__(self) -> str:
         """For people."""
         x, y = self.place.tolist()
+        if self.mover:
+            return f"kept away by a mover at ({x:.1f}, {y:.1f})"
         return f"blocked near ({x:.1f}, {y:.1f}), no way of clearance {self.clearance:.2f} m"
 
 
@@ -108,7 +122,7 @@ class Route:
         self.repairs = 0
         self.blocked: Blocked | None = None
         self._rest = self._since_anywhere = 0
-        self._closed = self._stalled = 0
+        self._closed = self._stalled = self._held = 0
         self._nearest, self._starts = np.inf, FRESH_STARTS
         self._trail: list[Array] = []
         self._crumbs: list[Array] = []
@@ -170,7 +184,7 @@ class Route:
                 else:
                     self._detour(pose, float(arc[-1]), tracks.at(~tracks.mover), ALLOWANCE, everywhere=True)
             return True
-        standing = tracks.at(np.hypot(*tracks.velocity.T) < STANDING)
+        standing = tracks.at((np.hypot(*tracks.velocity.T) < STANDING) & ~tracks.sweeps)
         if not len(standing):
             return False
         ahead = (arc >= self._reached) & (arc <= self._reached + LOOK_AHEAD)
@@ -192,6 +206,62 @@ class Route:
             return False
         return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
 
+    def around(self, pose: Array, tracks: Tracks, speed: float, pause: float) -> bool:
+        """Look for a quicker way, called while movers that go to and fro hold the robot; True if found.
+
+        It leads between them, or after three periods of one beside all of them. Where there is none the goal is given
+        up.
+
+        Args:
+            pose: (3,) of the robot.
+            tracks: of discs.
+            speed: of the robot [m/s].
+            pause: until it has that speed, less what it gets on in the meantime [s].
+        """
+        sweeping, begin = tracks.at(tracks.sweeps), int(self._reached / SPACING)
+        ahead = self.path[begin : begin + round(LOOK_AHEAD / SPACING), :2]
+        gap = np.hypot(*np.moveaxis(sweeping.beside(ahead) - ahead[:, None], -1, 0)) - sweeping.radius - self._radius
+        met = gap < self._disc_gap + UNSEEN * sweeping.sweep[:, 5]
+        if self._oriented or not met.any():
+            return False
+        self._held, self._trail = self._held + 1, []
+        if self._held % BETWEEN != 1:
+            return False
+        first, ends = int(np.argmax(met.any(axis=0))), sweeping.sweep[:, :4].reshape(-1, 2, 2)
+        lengths = np.hypot(*(ends[:, 1] - ends[:, 0]).T)
+        if self._held * TICK <= PERIODS * 2.0 * lengths[first] / sweeping.sweep[first, 5]:
+            last = begin + int(np.flatnonzero(met.any(axis=1))[-1] + BEYOND / SPACING)
+            return self._between(pose, tracks, min(last, len(self.path) - 1), speed, pause)
+        self._held = 0
+        closed = replace(sweeping, centre=ends.mean(axis=1), radius=sweeping.radius + 0.5 * lengths)
+        staying = tracks.at(~tracks.mover).followed_by(closed)
+        if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
+            return True
+        self.blocked = Blocked(sweeping.centre[first], self._radius + self._wall_gap, mover=True)
+        return False
+
+    def _between(self, pose: Array, tracks: Tracks, index: int, speed: float, pause: float) -> bool:
+        """Follow the quickest way in place and time to a pose of the path; True if found. Arguments as of `around`."""
+        sweeping, more = tracks.at(tracks.sweeps), self._disc_gap - self._wall_gap
+        standing = tracks.at((np.hypot(*tracks.velocity.T) < STANDING) & ~tracks.sweeps)
+
+        def discs(time: float) -> Array:
+            places = sweeping.swept(time + pause + LATE).reshape(-1, 2)
+            radii = np.concatenate([standing.radius, np.tile(sweeping.radius, len(LATE))])
+            return np.column_stack([np.concatenate([standing.centre, places]), radii + more])
+
+        window = self._window(np.stack([pose[:2], *self.path[int(self._reached / SPACING) : index + 1, :2]]))
+        way = quickest(*window, pose, self.path[index], self._radius + self._wall_gap, discs, speed, LONGEST)
+        if way is None:
+            return False
+        smooth = np.stack([np.convolve(np.pad(x, SMOOTH, mode="edge"), KERNEL, mode="valid") for x in way.T], axis=1)
+        points = np.concatenate([pose[None, :2], smooth[1:], self.path[index : index + 1, :2]])
+        points = points[np.append(True, np.hypot(*np.diff(points, axis=0).T) > STANDING_GAP)]
+        onward = headed(resample(points, SPACING), float(self.path[index, 2]))
+        self._follow(np.concatenate([onward[:-1], self.path[index:]]))
+        self.repairs += 1
+        return True
+
     def _round_about(self, pose: Array, staying: Tracks, place: Array) -> bool:
         """Search another way on the whole map; True if found. After enough failures the goal is given up."""
         self._closed += PATIENCE + 1
@@ -207,7 +277,7 @@ class Route:
         """Give up a goal that has not come nearer for long, the time left out in which something moved on the way."""
         left = float(SPACING * len(self.path)) - self._reached
         if left < self._nearest - CRUMB:
-            self._nearest, self._stalled, self._closed = left, 0, 0
+            self._nearest, self._stalled, self._closed, self._held = left, 0, 0, 0
             return
         self._stalled += not self._waits_for_a_mover(pose, tracks)
         if self._stalled > STALLED:

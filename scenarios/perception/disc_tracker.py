@@ -16,6 +16,7 @@ import numpy as np
 
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.perception.discs import DiscFinder, Discs
+from unifg.scenarios.perception.motion_model import MotionModel
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.rows import Rows
 from unifg.scenarios.perception.tracks import Tracks
@@ -85,7 +86,7 @@ class DiscTracker:
             distance_map: distance to the surfaces of the map the robot was given.
         """
         self.finder = DiscFinder(distance_map)
-        self._next_identity = 0
+        self._next_identity, self._motion = 0, MotionModel()
         self._rows = _Filters.of(Discs.none(), np.zeros(0, dtype=np.intp))
 
     def update(self, scan: Scan, pose: ArrayLike, dt: float) -> Tracks:
@@ -114,7 +115,7 @@ class DiscTracker:
             identity = self._next_identity + np.arange(len(fresh), dtype=np.intp)
             self._next_identity += len(fresh)
             self._rows = self._rows.followed_by(_Filters.of(fresh, identity))
-        return self.tracks()
+        return self._motion.update(self.tracks(), dt)
 
     def tracks(self) -> Tracks:
         """The confirmed tracks as they stand."""

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
 from unifg.scenarios.perception.rows import Rows
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
-__all__ = ["Tracks", "nearest"]
+__all__ = ["Tracks", "nearest", "to_and_fro"]
+
+Number: TypeAlias = Array | float
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,8 @@ class Tracks(Rows):
         identity: (m,) number of the track, kept for its lifetime.
         unseen: (m,) time since the track was last seen [s].
         mover: (m,) whether it has moved, and not stood in one place since for long; what stands now may go on.
+        sweep: (m, 6) of a mover both ends of where it was lately [m], and if it is known to go to and fro between them
+            the way it has made of a round trip from the first [m], and its speed [m/s]; else not a number.
     """
 
     centre: Array
@@ -31,6 +36,12 @@ class Tracks(Rows):
     identity: IntArray
     unseen: Array
     mover: BoolArray
+    sweep: Array = field(default_factory=lambda: np.zeros((0, 6)))
+
+    def __post_init__(self) -> None:
+        """Know no sweeps unless they are given."""
+        if len(self.sweep) < len(self.radius):
+            object.__setattr__(self, "sweep", np.full((len(self.radius), 6), np.nan))
 
     @classmethod
     def of_movers(cls, centre: Array, velocity: Array, radius: Array) -> Tracks:
@@ -51,6 +62,34 @@ class Tracks(Rows):
         velocity: Array = self.velocity - leaving[:, None] * towards
         return velocity
 
+    @property
+    def sweeps(self) -> BoolArray:
+        """(m,) whether it is known to go to and fro, and where."""
+        return np.isfinite(self.sweep[:, 5])
+
+    def swept(self, times: Array) -> Array:
+        """(N, m, 2) places of movers that go to and fro at times (N,) from now [m]."""
+        first, last, made, speed = np.split(self.sweep, [2, 4, 5], axis=1)
+        length = np.hypot(*(last - first).T)
+        along = to_and_fro(0.0, length, made[:, 0], speed[:, 0], times[:, None])
+        places: Array = first + (along / length)[..., None] * (last - first)
+        return places
+
+    def beside(self, place: Array) -> Array:
+        """(..., m, 2) places nearest to ``place`` (..., 2) where movers were lately; their centres if unknown."""
+        first, way = self.sweep[:, :2], self.sweep[:, 2:4] - self.sweep[:, :2]
+        length = np.maximum((way**2).sum(axis=1), 1e-12)
+        share = np.clip(((place[..., None, :] - first) * way).sum(axis=-1) / length, 0.0, 1.0)
+        places: Array = np.where(np.isnan(self.sweep[:, :1]), self.centre, first + share[..., None] * way)
+        return places
+
+
+def to_and_fro(first: Number, last: Number, made: Number, speed: Number, times: Number) -> Array:
+    """Places on a line at times from now [s] of what goes to and fro there, ``made`` past the first end [m]."""
+    way = (made + speed * times) % (2.0 * (last - first))
+    places: Array = first + np.minimum(way, 2.0 * (last - first) - way)
+    return places
+
 
 def nearest(tracks: Tracks, position: ArrayLike, count: int, horizon: float = 1.5) -> Tracks:
     """The tracks that matter most at a place: those whose hulls are, or will soon be, nearest to it.
@@ -69,5 +108,6 @@ def nearest(tracks: Tracks, position: ArrayLike, count: int, horizon: float = 1.
     travel = horizon * tracks.velocity
     along = np.sum(offset * travel, axis=1) / np.maximum(np.sum(travel**2, axis=1), 1e-12)
     closest = offset - np.clip(along, 0.0, 1.0)[:, None] * travel
+    closest = np.where(tracks.sweeps[:, None], place - tracks.beside(place), closest)
     hull = np.linalg.norm(closest, axis=1) - tracks.radius
     return tracks.at(np.argsort(hull, kind="stable")[:count])

@@ -1,0 +1,169 @@
+"""Motion of movers, learned from their tracks: one goes on, has stopped, or goes to and fro between two places.
+
+Each hypothesis foretells where a disc will be; its weight follows from how far off that was over the last seconds. To
+and fro is a triangular wave along a line, fitted to the track by Gauss-Newton, once it was seen to turn round twice.
+Going on is the hypothesis of a track that nothing else explains: such a mover may stop or turn at any time.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from unifg.scenarios.perception.tracks import Tracks, to_and_fro
+from unifg.typing import Array, IntArray
+
+__all__ = ["UNLIKELY", "MotionModel", "Past"]
+
+UNLIKELY = 0.02  # weight of a hypothesis that need not be kept off
+MEMORY = 160  # places of a track that are kept
+AHEAD = 5  # scans ahead that a hypothesis is held against; so many errors in a row are one
+SIGMA = 0.1  # [m] of what a right hypothesis foretells
+WORST = 3.0  # errors, in SIGMA, beyond which they tell no more
+LATELY = 20  # places where a mover that may turn round may soon be again
+SHORTEST = 0.4  # [m] between ends
+ASIDE = 0.12  # [m] off the line, root mean square, that is still a line
+GONE = 30.0  # [s] after which the motion of a track that was lost is forgotten
+ADOPTED = 0.4  # [m] from the line of a lost track at which a new one goes on with its past
+BOTH = 3  # scans before and after a turn that show it
+STARTS = 40  # places on the round trip from which the fit may begin
+STEPS = 4  # of Gauss-Newton
+
+
+@dataclass
+class Past:
+    """Places (n, 2) and velocities (n, 2) of a track at times (n,), the last of which are kept."""
+
+    times: Array
+    places: Array
+    velocities: Array
+    wave: Array | None = None  # (4,) first and last place along the line, round trip made now [m], speed [m/s]
+    axis: Array | None = None  # (2, 2) middle of the line, and its direction
+    weight: float = 0.0  # of going to and fro
+
+    @classmethod
+    def none(cls) -> Past:
+        """Nothing has been seen."""
+        return cls(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2)))
+
+    def add(self, time: float, place: Array, velocity: Array) -> None:
+        """Take in where the track is now, and judge the hypotheses again."""
+        self.times = np.append(self.times, time)[-MEMORY:]
+        self.places = np.vstack([self.places, place])[-MEMORY:]
+        self.velocities = np.vstack([self.velocities, velocity])[-MEMORY:]
+        self._fit()
+        self._judge()
+
+    def _fit(self) -> None:
+        """Fit a triangular wave; none where the track is no line, short, or has not turned round twice."""
+        self.wave = None
+        if len(self.times) < 3 * AHEAD:
+            return
+        middle = self.places.mean(axis=0)
+        _, spread, axes = np.linalg.svd(self.places - middle, full_matrices=False)
+        along, since = (self.places - middle) @ axes[0], self.times - self.times[-1]
+        low, high = along.min(), along.max()
+        if spread[1] > ASIDE * np.sqrt(len(along)) or high - low < SHORTEST:
+            return
+        pace = np.abs(self.velocities @ axes[0])
+        speed = np.median(pace[pace >= 0.5 * pace.max()])
+        starts = np.linspace(0.0, 2.0 * (high - low), STARTS, endpoint=False)
+        errors = np.minimum(np.abs(to_and_fro(low, high, starts[:, None], speed, since) - along), WORST * SIGMA)
+        guess = np.array([low, high, starts[int(np.argmin(errors.sum(axis=1)))], speed])
+        wave = self._improved(guess, along, since)
+        length = wave[1] - wave[0]
+        first, last = np.floor((wave[2] + wave[3] * since[[BOTH, -BOTH - 1]]) / length)  # its ways are counted
+        if length >= SHORTEST and last - first >= 2.0:
+            wave[2] %= 2.0 * length
+            self.wave, self.axis = wave, np.stack([middle, axes[0]])
+
+    @staticmethod
+    def _improved(wave: Array, along: Array, since: Array) -> Array:
+        """The wave (4,) nearer to places along the line at times before now [s]; far ones do not count."""
+        for _ in range(STEPS):
+            length = max(wave[1] - wave[0], SHORTEST)
+            turns = np.floor((wave[2] + wave[3] * since) / length)
+            back = turns % 2.0
+            rising = 1.0 - 2.0 * back
+            folds = back - rising * turns  # on its k-th way the wave is at low + rising (u + v t) + folds length
+            slopes = np.column_stack([1.0 - folds, folds, rising, rising * since])
+            error = along - to_and_fro(wave[0], wave[0] + length, wave[2], wave[3], since)
+            counts = (np.abs(error) < WORST * SIGMA).astype(np.float64)
+            normal = (slopes * counts[:, None]).T @ slopes + 1e-6 * np.eye(4)
+            wave = wave + np.linalg.solve(normal, slopes.T @ (counts * error))
+        return wave
+
+    def _judge(self) -> None:
+        """Weight of going to and fro against going on and having stopped, by the errors of what they foretell."""
+        self.weight = 0.0
+        if self.wave is None or self.axis is None:
+            return
+        since = self.times - self.times[-1]
+        middle, direction = self.axis
+        low, high, made, speed = self.wave.tolist()
+        foretold = middle + to_and_fro(low, high, made, speed, since)[:, None] * direction
+        off = np.hypot(*(foretold - self.places).T)
+        if off[-2:].max() > WORST * SIGMA / 2.0:  # it has just done something else
+            return
+        lag = (self.times[AHEAD:] - self.times[:-AHEAD])[:, None]
+        before = self.places[:-AHEAD]
+        others = [before + lag * self.velocities[:-AHEAD], before]
+        errors = [off[AHEAD:], *(np.hypot(*(place - self.places[AHEAD:]).T) for place in others)]
+        costs = np.array([np.minimum(error / SIGMA, WORST) ** 2 for error in errors]).sum(axis=1) / (2.0 * AHEAD)
+        weights = np.exp(costs.min() - costs)
+        self.weight = float(weights[0] / weights.sum())
+
+    @property
+    def sweep(self) -> Array:
+        """(6,) row of `Tracks.sweep`: where another hypothesis is likely enough, only the ends of its last places."""
+        if self.wave is None or self.axis is None or self.weight < 1.0 - UNLIKELY:
+            last = self.places[-LATELY:]
+            far = int(np.argmax(np.hypot(*(last - last[-1]).T)))
+            return np.concatenate([last[far], last[-1], [np.nan, np.nan]])
+        low, high, made, speed = self.wave
+        middle, direction = self.axis
+        return np.concatenate([middle + low * direction, middle + high * direction, [made, speed]])
+
+
+class MotionModel:
+    """Pasts of movers by the numbers of their tracks; those of lost ones are kept for tracks that begin there."""
+
+    def __init__(self) -> None:
+        """Begin without a past."""
+        self._now = 0.0
+        self._pasts: dict[int, Past] = {}
+
+    def update(self, tracks: Tracks, dt: float) -> Tracks:
+        """The tracks, with the sweeps of movers that go to and fro.
+
+        Args:
+            tracks: as they are now.
+            dt: time since the last update [s].
+        """
+        self._now += dt
+        self._pasts = {name: past for name, past in self._pasts.items() if self._now - past.times[-1] < GONE}
+        sweep = tracks.sweep.copy()
+        for k in np.flatnonzero(tracks.mover).tolist():
+            name = int(tracks.identity[k])
+            if name not in self._pasts:
+                self._pasts[name] = self._adopted(tracks.centre[k], tracks.identity)
+            past = self._pasts[name]
+            if not (tracks.unseen[k] and len(past.times)):
+                past.add(self._now, tracks.centre[k], tracks.velocity[k])
+            sweep[k] = past.sweep
+            sweep[k, 4] += sweep[k, 5] * (self._now - past.times[-1])
+        tracks, hidden = replace(tracks, sweep=sweep), tracks.unseen > 0.0
+        tracks.centre[hidden & tracks.sweeps] = tracks.at(hidden & tracks.sweeps).swept(np.zeros(1))[0]
+        return tracks
+
+    def _adopted(self, place: Array, names: IntArray) -> Past:
+        """The past of a lost track on whose line a new one begins, or none."""
+        for name in [name for name in self._pasts if name not in names]:
+            past = self._pasts[name]
+            if past.axis is not None and past.wave is not None:
+                offset = place - past.axis[0]
+                along = float(np.clip(offset @ past.axis[1], *past.wave[:2]))
+                if np.hypot(*(offset - along * past.axis[1])) < ADOPTED:
+                    return self._pasts.pop(name)
+        return Past.none()
