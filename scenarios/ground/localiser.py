@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 import unifg as fg
@@ -9,6 +11,8 @@ from unifg.lie import SE2
 from unifg.models import lidar, odometry, unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.planar import Base
+from unifg.scenarios.ground.hypotheses import REACH, Hypothesis, gathered, mixed, weighed
+from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
@@ -26,6 +30,10 @@ LEAST = 0.01  # [m] of a beam's standard deviation, whatever the residuals of a 
 WITHIN = odometry.OdometryNoise(floor=(0.0, 0.0, 0.0))  # of the wheels within a turn of the lidar
 FARTHEST, LEVER = 1e3, 1.0  # [m] standard deviation, and per radian, of what a scan says nothing about
 LARGEST_JUMP = 0.5  # [m]; a correction beyond this is a mistake of the matching, not of the wheels
+SURE = 0.05, 0.03  # [m, rad]; a prediction that is less sure than this begins at several places
+FITS = 0.6  # share of the beams that the map explains, below which there may be a better place
+ASTRAY = np.diag([0.15, 0.15, 0.06]) ** 2  # that a scan which does not fit adds to the covariance [m, m, rad]
+CERTAIN = 0.98  # share of the belief of a hypothesis that stands alone
 
 
 class Localiser:
@@ -56,6 +64,8 @@ class Localiser:
         self.pose = np.asarray(pose, dtype=np.float64)
         self.covariance = self._held = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
         self.iterations, self.refused = 0, ""
+        self._believed: list[Hypothesis] = []
+        self._rng = np.random.default_rng(0)
         self._map, self._skew = distance_map, np.zeros((3, 3))
         self._noise, self._base = odometry.OdometryNoise(), base
         graph = fg.Graph()
@@ -88,39 +98,68 @@ class Localiser:
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
-        self.pose = pose.copy()
+        self.pose, self._believed = pose.copy(), []
         self.covariance = self._held = np.diag(sigma**2)
 
     def predict(self, u: Array, dt: float) -> None:
-        """Move the estimate by the wheels' measured controls (m,)."""
+        """Move the estimate, and what else may be right, by the wheels' measured controls (m,)."""
+        moved = (
+            (odometry.predict(one.pose, one.covariance, u, dt, self._noise, self._base), one.weight)
+            for one in self._believed
+        )
+        self._believed = [Hypothesis(*predicted, weight) for predicted, weight in moved]
         self.covariance = odometry.predict(self.pose, self.covariance, u, dt, self._noise, self._base)[1]
         self.pose, self._held = odometry.predict(self.pose, self._held, u, dt, self._noise, self._base)
 
     def correct(self, scan: Scan) -> None:
         """Register a scan on the map; a scan that says too little leaves the prediction, and ``refused`` says so."""
-        seen = lidar.usable(scan.ranges)
         self.iterations, self.refused = 0, ""
-        if seen.sum() < FEWEST_BEAMS:
+        if lidar.usable(scan.ranges).sum() < FEWEST_BEAMS:
             self.refused = "too few beams"
             return
+        if not self._believed and self._is_sure():
+            corrected, held = self._solve(scan, self.pose, self._held, lidar.DROP_BEYOND)
+            jump = float(np.hypot(*(corrected - self.pose)[:2]))
+            if not jump <= LARGEST_JUMP:
+                self.refused = "it would move the estimate by more than the wheels can be wrong"
+                return
+            if explained(self._map, scan, corrected).share >= FITS:
+                seen_covariance = scan_covariance(self._map, scan, corrected) + self._skew
+                self.pose, self.covariance = corrected, least(self.covariance, seen_covariance)
+                self._held = held
+                return
+            self.covariance = self.covariance + ASTRAY
+        self._spread_out(scan)
+
+    def _is_sure(self) -> bool:
+        """Test whether a prediction is as good as one place to begin at."""
+        spread = float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1])
+        return spread <= SURE[0] ** 2 and float(self.covariance[2, 2]) <= SURE[1] ** 2
+
+    def _solve(self, scan: Scan, pose: Array, held: Array, reach: float) -> tuple[Array, Array]:
+        """Pose (3,) and covariance (3, 3) that a scan makes of a prediction."""
         solution = self._run.solve(
-            {self._x: self.pose[None, :]},
+            {self._x: pose[None, :]},
             data={
-                self._prior: self.pose,
-                self._information: np.linalg.inv(self._held),
-                self._beams: lidar.beam_endpoints(scan.ranges, scan.angles),
-                self._seen: seen,
+                self._prior: pose,
+                self._information: np.linalg.inv(held),
+                self._beams: lidar.beam_endpoints(scan.ranges, scan.angles, reach),
+                self._seen: lidar.usable(scan.ranges, reach),
             },
         )
-        self.iterations = solution.iterations
-        corrected = solution[self._x][0]
-        jump = float(np.hypot(*(corrected - self.pose)[:2]))
-        if not jump <= LARGEST_JUMP:
-            self.refused = "it would move the estimate by more than the wheels can be wrong"
-            return
-        seen_covariance = scan_covariance(self._map, scan, corrected) + self._skew
-        self.pose, self.covariance = corrected, least(self.covariance, seen_covariance)
-        self._held = solution.covariance(self._x)
+        self.iterations += solution.iterations
+        return solution[self._x][0], solution.covariance(self._x)
+
+    def _spread_out(self, scan: Scan) -> None:
+        """Weigh draws from everything that may be right, and register the scan where they gather."""
+        believed = self._believed or [Hypothesis(self.pose, self.covariance)]
+        found = gathered(*weighed(self._map, scan, believed, self._rng))
+        better = []
+        for one in found:
+            pose = self._solve(scan, one.pose, one.covariance, REACH)[0]
+            better.append(replace(one, pose=pose, covariance=one.covariance + self._skew))
+        self.pose, self._held, self.covariance = better[0].pose, better[0].covariance, mixed(better)
+        self._believed = better if better[0].weight < CERTAIN * sum(one.weight for one in better) else []
 
 
 def deskewed(scan: Scan | None, velocity: Array) -> tuple[Scan | None, Array]:
