@@ -50,7 +50,13 @@ class Localiser:
     """
 
     def __init__(
-        self, distance_map: DistanceMap, pose: Array, sigma: Array, beams: int, base: Base = unicycle.BASE
+        self,
+        distance_map: DistanceMap,
+        pose: Array,
+        sigma: Array,
+        beams: int,
+        base: Base = unicycle.BASE,
+        noise: odometry.OdometryNoise | None = None,
     ) -> None:
         """State the graph.
 
@@ -60,6 +66,7 @@ class Localiser:
             sigma: (3,) its standard deviations [m, m, rad].
             beams: number of beams in a scan.
             base: that the odometry is of.
+            noise: of the odometry; None for that of good wheels.
         """
         self.pose = np.asarray(pose, dtype=np.float64)
         self.covariance = self._held = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
@@ -67,7 +74,7 @@ class Localiser:
         self._believed: list[Hypothesis] = []
         self._rng = np.random.default_rng(0)
         self._map, self._skew = distance_map, np.zeros((3, 3))
-        self._noise, self._base = odometry.OdometryNoise(), base
+        self._noise, self._base = noise or odometry.OdometryNoise(), base
         graph = fg.Graph()
         self._x = graph.variables("robot", fg.SE2, 1)
         self._prior = graph.data("predicted pose", np.zeros(3))
@@ -129,7 +136,7 @@ class Localiser:
                 self._held = held
                 return
             self.covariance = self.covariance + ASTRAY
-        self._spread_out(scan)
+        self.spread_out(scan)
 
     def _is_sure(self) -> bool:
         """Test whether a prediction is as good as one place to begin at."""
@@ -150,8 +157,8 @@ class Localiser:
         self.iterations += solution.iterations
         return solution[self._x][0], solution.covariance(self._x)
 
-    def _spread_out(self, scan: Scan) -> None:
-        """Weigh draws from everything that may be right, and register the scan where they gather."""
+    def spread_out(self, scan: Scan) -> None:
+        """Weigh draws from everything that may be right, and register a scan where they gather."""
         believed = self._believed or [Hypothesis(self.pose, self.covariance)]
         found = gathered(*weighed(self._map, scan, believed, self._rng))
         better = []
