@@ -9,31 +9,34 @@ solved whenever closures have come, at the end with graduated non-convexity, and
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import time
+from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from unifg.factors.robust import DCS, TruncatedLeastSquares
-from unifg.files.range_log import RangeLog, read_range_log
-from unifg.files.ros_map import OccupancyMap
-from unifg.lie import SE2, wrap_angle
+from unifg.factors.robust import DCS
+from unifg.files.range_log import RangeLog
+from unifg.lie import SE2
 from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
-from unifg.models.odometry import OdometryNoise
+from unifg.models.planar import base_of
 from unifg.pose_graphs import Edges, PoseGraph
-from unifg.pose_graphs.verdict import Verdict
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.relocalise import nearest_fit
-from unifg.scenarios.options import existing, option
+from unifg.scenarios.options import existing, option, pose, positive
+from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
+from unifg.scenarios.pose_graph import robust_loss
+from unifg.scenarios.range_logs import WHEELS, LogRun, opened, step_of
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
 from unifg.typing import Array, BoolArray, IntArray
 
-WHEELS = OdometryNoise(0.1, 0.1, 0.04)
+__all__ = ["MapSettings", "map_log"]
+
 MOVED = np.array([0.4, 0.4, 0.3])  # motion between keyframes [m, m, rad]
 RECENT = 15  # keyframes that the next one is registered on
 VIEW = 12.0  # [m] of beams that are registered on others
@@ -41,39 +44,130 @@ OLD = 8.0  # [m] driven, after which a place is come back to
 TOGETHER = 4  # keyframes that look for a closure together
 POINTS = 360  # of theirs
 NEAR = 6.0  # [m] from a place, within which keyframes have seen it
-FEWEST = 4  # of them
+FEWEST, MOST = 4, 60  # of them
 DRIFT = (0.3, 0.04, 4.0)  # [m] and its growth with the way since the last closure, up to
 TURNED = (0.1, 0.01, 0.6)  # [rad]
+FOUND = np.diag([0.1, 0.1, 0.04]) ** 2  # of the place of a closure that a search has found
 BEST = 0.75  # share of points that have to end at old ones
 ENDS = 0.12  # [m] from them
+BASE = base_of("omnidirectional")
 EVERY = 5  # closures after which the graph is solved
+SHIFT, TURN = 0.2, 0.05  # [m, rad] by which a closure moves the last pose, after which it is solved at once
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """A log to be made a map of.
+
+    Attributes:
+        log: log with scans and odometry: CARMEN, CSV, MCAP or rosbag2.
+        resolution: side of a cell [m].
+        reach: of the beams that make the map [m].
+        mount: pose of the laser on the robot, where the odometry is that of the robot [m, m, rad].
+        simulated_odometry: the poses in the log are corrected ones: odometry is made of them, with 5 % of scale error and
+            2 % of noise, and they are what errors are counted from.
+        seed: of everything random.
+    """
+
+    log: Path = option(text=existing("a log of a laser"), metavar="LOG")
+    resolution: float = option(0.05, text=positive, metavar="M")
+    reach: float = option(12.0, text=positive, metavar="M")
+    mount: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
+    simulated_odometry: bool = option(False)
+    seed: int = option(0, metavar="S")
+
+
+def map_log(settings: MapSettings, progress: Progress = silent) -> tuple[LogRun, PoseGraph]:
+    """Make a map of a log; an interrupt makes it of what has been read so far.
+
+    Args:
+        settings: of what, and how.
+        progress: called with the share done, and a line of text; may raise KeyboardInterrupt.
+
+    Returns:
+        The map with the poses of all scans, and the solved pose graph of the keyframes.
+
+    Raises:
+        FileFormatError: the log cannot be read.
+        KeyboardInterrupt: when stopped before there are two keyframes.
+    """
+    log, began = opened(settings.log, settings.mount, settings.simulated_odometry, settings.seed), time.perf_counter()
+    start = (log.odometry if log.corrected is None else log.corrected)[0]
+    mapper, chosen, interrupted = Mapper(log.angles, start), [0], False
+    mapper.add(log.ranges[0], np.zeros(3))
+    try:
+        for k in range(1, len(log)):
+            step = step_of(log, chosen[-1], k)
+            if (np.abs(step) > MOVED).any() or (k == len(log) - 1 and len(chosen) == 1):
+                mapper.add(log.ranges[k], step)
+                chosen.append(k)
+                closed = len(mapper.edges) + 1 - len(chosen)
+                progress(0.9 * k / len(log), f"scan {k} of {len(log)}, {closed} loop closures")
+    except KeyboardInterrupt:
+        if len(mapper.poses) < 2:
+            raise
+        interrupted, chosen = True, chosen[: len(mapper.poses)]
+    graph, kept = mapper.solved()
+    with suppress(KeyboardInterrupt):  # there is something to write
+        progress(0.92, "verdict")
+    verdict = graph.verdict(effort="cheap", used=kept, tolerance=1e-4)
+    number = len(log) if not interrupted else chosen[-1] + 1
+    nearest = np.searchsorted(chosen, np.arange(number), side="right") - 1
+    frames = np.array(chosen)[nearest]
+    poses = SE2.compose(graph.poses[nearest], SE2.between(log.odometry[frames], log.odometry[:number]))
+    occupancy = mapped(log.angles, log.ranges[chosen], graph.poses, settings.resolution, settings.reach)
+    around = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
+    share = [explained(around, Scan(log.angles, log.ranges[k]), poses[k]).share for k in range(number)]
+    joined = np.column_stack([graph.edges.first, graph.edges.second])[~graph.edges.odometry & kept]
+    numbers = {
+        "keyframes": len(chosen), "loop_closures": len(joined), "outliers": int((~kept).sum()),
+        "chi2": float(graph.squared_errors()[kept].sum()), "degrees_of_freedom": verdict.judgement.freedom,
+        "claim": verdict.claim, "searches": mapper.searches,
+    }  # fmt: skip
+    run = LogRun(
+        log, "map", occupancy, poses, np.array(share), details=numbers, closures=np.array(chosen)[joined],
+        verdict=verdict.sentence(), succeeded=not interrupted, interrupted=interrupted,
+        seconds=time.perf_counter() - began,
+    )  # fmt: skip
+    return run, graph
 
 
 @dataclass
 class Mapper:
-    """Keyframes and edges, in the making."""
+    """Keyframes and edges, in the making.
+
+    Attributes:
+        angles: (b,) of the beams [rad].
+        start: (3,) first pose [m, m, rad].
+        points: of each keyframe, (k, 2) in its frame [m].
+        poses: of each keyframe, (3,).
+        way: [m] driven until each keyframe.
+        edges: positions of two keyframes, the pose of the second seen from the first, its covariance (3, 3).
+        closed: way at the last loop closure [m].
+        waiting: closures since the graph was solved.
+        searches: for closures.
+    """
 
     angles: Array
-    scans: list[Scan] = field(default_factory=list)
+    start: Array
     points: list[Array] = field(default_factory=list)
     poses: list[Array] = field(default_factory=list)
     way: list[float] = field(default_factory=list)
     edges: list[tuple[int, int, Array, Array]] = field(default_factory=list)
     closed: float = 0.0
     waiting: int = 0
-    tries: int = 0
+    searches: int = 0
 
     def add(self, ranges: Array, step: Array) -> None:
-        """Add a keyframe, its scan (b,) taken a step (3,) by the wheels after the one before."""
+        """Add a keyframe, its scan (b,) taken after body velocities (3,) of one second since the one before."""
         scan, number = Scan(self.angles, ranges), len(self.poses)
-        self.scans.append(scan)
         seen = lidar.usable(ranges, VIEW)
         self.points.append(lidar.beam_endpoints(ranges[seen], self.angles[seen], VIEW))
         if not number:
-            self.poses.append(np.zeros(3))
+            self.poses.append(self.start)
             self.way.append(0.0)
             return
-        predicted, covariance = SE2.compose(self.poses[-1], step), WHEELS.covariance(step, 1.0)
+        predicted, covariance = BASE.step(self.poses[-1][None], step[None], 1.0)[0], WHEELS.covariance(step, 1.0)
         recent = self._seen_from(np.arange(max(0, number - RECENT), number))
         pose, covariance = registered(field_of(recent), scan, predicted, covariance)
         self.edges.append((number - 1, number, SE2.between(self.poses[-1], pose), covariance))
@@ -97,14 +191,14 @@ class Mapper:
         near = np.flatnonzero(old & (away < NEAR + drift))
         if len(near) < FEWEST:
             return
-        self.tries += 1
+        self.searches += 1
         last = np.arange(max(0, number - TOGETHER + 1), number + 1)
         view = SE2.act(SE2.inverse(here), self._seen_from(last))
         view = view[np.linspace(0, len(view) - 1, min(POINTS, len(view))).astype(np.intp)]
         scan = Scan(np.arctan2(view[:, 1], view[:, 0]), np.hypot(*view.T))
-        around = field_of(self._seen_from(near[np.argsort(away[near])[:60]]))
+        around = field_of(self._seen_from(near[np.argsort(away[near])[:MOST]]))
         found = nearest_fit(around, scan, here, drift, turned)
-        pose, covariance = registered(around, scan, found, np.diag([0.1, 0.1, 0.04]) ** 2)
+        pose, covariance = registered(around, scan, found, FOUND)
         ends = np.abs(around.distance(SE2.act(pose, view))) <= ENDS
         if ends.mean() < BEST:
             return
@@ -112,8 +206,9 @@ class Mapper:
         self.edges.append((other, number, SE2.between(self.poses[other], pose), covariance))
         self.closed, self.waiting = self.way[number], self.waiting + 1
         off = np.abs(SE2.between(here, pose))
-        if self.waiting >= EVERY or off[:2].max() > 0.2 or off[2] > 0.05:
-            self.poses, self.waiting = list(self.solved(DCS(1.0)).poses), 0
+        if self.waiting >= EVERY or off[:2].max() > SHIFT or off[2] > TURN:
+            graph, x, guess = self.graph().graph(robust=DCS(1.0))
+            self.poses, self.waiting = list(GaussNewton().solve(graph, guess)[x]), 0
 
     def graph(self) -> PoseGraph:
         """Pose graph of what has been measured so far."""
@@ -121,10 +216,13 @@ class Mapper:
         edges = Edges(first, second, measured, np.linalg.inv(covariance))
         return PoseGraph(np.arange(len(self.poses)), np.array(self.poses), edges)
 
-    def solved(self, loss) -> PoseGraph:
-        before = self.graph()
+    def solved(self) -> tuple[PoseGraph, BoolArray]:
+        """The solved pose graph, and which edges (m,) it keeps."""
+        before, loss = self.graph(), robust_loss("gnc", SE2.dim)
         graph, x, guess = before.graph(robust=loss)
-        return before.with_poses(GaussNewton().solve(graph, guess)[x])
+        after = before.with_poses(GraduatedNonConvexity().solve(graph, guess)[x])
+        weights: Array = np.asarray(loss.weight(after.squared_errors()))
+        return after, (weights >= 0.5) | after.edges.odometry
 
 
 def registered(around: DistanceMap, scan: Scan, pose: Array, covariance: Array) -> tuple[Array, Array]:

@@ -93,6 +93,11 @@ class Localiser:
         )
         self._run = GaussNewton(max_iterations=12, step_tolerance=1e-5).prepare(graph)
 
+    @property
+    def hypotheses(self) -> int:
+        """Number of poses that may be right."""
+        return max(1, len(self._believed))
+
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
         """Move by odometry (m,) since the last scan, None for none, and register a scan, if there is one."""
         if odometry is not None:

@@ -23,13 +23,13 @@ from unifg.files.rosbag import read_rosbag
 from unifg.lie import SE2, wrap_angle
 from unifg.typing import Array
 
-__all__ = ["RangeLog", "read_range_log"]
+__all__ = ["RangeLog", "aligned", "read_range_log"]
 
 logger = logging.getLogger("unifg")
 
 POSE = ("x", "y", "theta")
 FIXED = 0.02  # [m, rad] by which the place of a laser on its robot may seem to change, as logs round
-PARTED = 0.5  # [m] between wheels and poses of scans, from where on the latter have been corrected
+PARTED = 1.0  # [m] between wheels and poses of scans, laid on each other, from where on the latter are corrected
 SLOWEST = 0.005  # [m/s]; who is slower counts time in thousandths
 AT_MOST, OFTEN = 0.99, 0.005  # of the longest range, and the share of ranges there, where it means that nothing was hit
 ROSBAGS = (".mcap", ".bag", ".db3")
@@ -105,6 +105,15 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
     return _in_order(name, scans.time, scans.angles, scans.ranges, scans.maximum, odometry, corrected)
 
 
+def aligned(poses: Array, onto: Array) -> Array:
+    """Poses (n, 3) moved as one whole to where their places are nearest to others (n, 3), by least squares."""
+    middle, other = poses[:, :2].mean(axis=0), onto[:, :2].mean(axis=0)
+    product = (poses[:, :2] - middle).T @ (onto[:, :2] - other)
+    turn = float(np.arctan2(product[0, 1] - product[1, 0], product[0, 0] + product[1, 1]))
+    whole = np.array([*(other - SE2.act(np.array([0.0, 0.0, turn]), middle[None])[0]), turn])
+    return SE2.compose(whole, poses)
+
+
 def _poses(log: CarmenLog, scans: Scans) -> tuple[Array, Array | None]:
     """Odometry of the laser (n, 3), and its corrected poses where these are."""
     mounts = SE2.between(scans.robot, scans.pose)
@@ -115,8 +124,7 @@ def _poses(log: CarmenLog, scans: Scans) -> tuple[Array, Array | None]:
     if len(log.odometry.time) < 2:
         return scans.pose, None
     wheels = SE2.compose(_between_times(log.odometry, scans.time), mounts[0])
-    followed = SE2.compose(scans.pose[0], SE2.between(wheels[0], wheels))
-    parted = float(np.abs(followed - scans.pose)[:, :2].max())
+    parted = float(np.abs(aligned(wheels, scans.pose) - scans.pose)[:, :2].max())
     return (wheels, scans.pose) if parted > PARTED else (scans.pose, None)
 
 
