@@ -10,7 +10,7 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.files.range_log import RangeLog
-from unifg.files.ros_map import OccupancyMap, load_map
+from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap
 from unifg.models.planar import base_of
@@ -22,7 +22,7 @@ from unifg.scenarios.options import existing, option, pose
 from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan
-from unifg.scenarios.range_logs import WHEELS, LogRun, opened, step_of
+from unifg.scenarios.range_logs import WHEELS, LogRun, step_of
 from unifg.typing import Array
 
 __all__ = ["LocaliseSettings", "localise"]
@@ -61,20 +61,19 @@ class LocaliseSettings:
     seed: int = option(0, metavar="S")
 
 
-def localise(settings: LocaliseSettings, progress: Progress = silent) -> LogRun:
-    """Read log and map, find the beginning, and follow the log.
+def localise(log: RangeLog, occupancy: OccupancyMap, settings: LocaliseSettings, progress: Progress = silent) -> LogRun:
+    """Find the beginning of a log on a map, and follow it.
 
     Args:
-        settings: what to localise on what.
+        log: that was read.
+        occupancy: the map.
+        settings: of how.
         progress: called with the share done, and a line of text; may raise KeyboardInterrupt.
 
     Raises:
-        FileFormatError: log or map cannot be read.
         ScenarioError: the place of the first scan on the map is not known.
         KeyboardInterrupt: when stopped before the first scan.
     """
-    log = opened(settings.log, settings.mount, settings.simulated_odometry, settings.seed)
-    occupancy = load_map(settings.map)
     field = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
     progress(0.0, "where the log begins")
     start = np.array(settings.start) if settings.start else beginning(log, occupancy, field)

@@ -31,7 +31,7 @@ from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
 from unifg.scenarios.pose_graph import robust_loss
-from unifg.scenarios.range_logs import WHEELS, LogRun, opened, step_of
+from unifg.scenarios.range_logs import WHEELS, LogRun, step_of
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -77,21 +77,21 @@ class MapSettings:
     seed: int = option(0, metavar="S")
 
 
-def map_log(settings: MapSettings, progress: Progress = silent) -> tuple[LogRun, PoseGraph]:
+def map_log(log: RangeLog, settings: MapSettings, progress: Progress = silent) -> tuple[LogRun, PoseGraph]:
     """Make a map of a log; an interrupt makes it of what has been read so far.
 
     Args:
-        settings: of what, and how.
+        log: that was read.
+        settings: of how.
         progress: called with the share done, and a line of text; may raise KeyboardInterrupt.
 
     Returns:
         The map with the poses of all scans, and the solved pose graph of the keyframes.
 
     Raises:
-        FileFormatError: the log cannot be read.
         KeyboardInterrupt: when stopped before there are two keyframes.
     """
-    log, began = opened(settings.log, settings.mount, settings.simulated_odometry, settings.seed), time.perf_counter()
+    began = time.perf_counter()
     start = (log.odometry if log.corrected is None else log.corrected)[0]
     mapper, chosen, interrupted = Mapper(log.angles, start), [0], False
     mapper.add(log.ranges[0], np.zeros(3))

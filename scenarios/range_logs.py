@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -72,33 +71,48 @@ class LogRun:
 
     @property
     def nees(self) -> Array:
-        """(n,) squared errors against the corrected poses, weighed by the covariances believed; empty without these."""
+        """(n,) squared errors against the corrected poses, after alignment, by the covariances; empty without these."""
         if self.covariance is None or self.log.corrected is None:
             return np.zeros(0)
-        off = SE2.local(self.poses, self.log.corrected[: len(self.poses)])
+        truth = self.log.corrected[: len(self.poses)]
+        off = SE2.local(aligned(self.poses, truth), truth)
         found: Array = np.einsum("ni,ni->n", off, np.linalg.solve(self.covariance, off[:, :, None])[:, :, 0])
         return found
 
 
-def opened(path: Path, mount: Sequence[float] | None, simulated: bool, seed: int) -> RangeLog:
-    """A log as the user wants it.
+class LogSettings(Protocol):
+    """Settings that say which log, and what it holds."""
 
-    Args:
-        path: of the file.
-        mount: (3,) pose of the laser on the robot that the odometry is of; None where it is the laser's.
-        simulated: whether odometry is made of the corrected poses, with errors of wheels.
-        seed: of these errors.
+    @property
+    def log(self) -> Path:
+        """The file."""
+
+    @property
+    def mount(self) -> tuple[float, float, float] | None:
+        """Pose of the laser on the robot that the odometry is of; None where it is the laser's."""
+
+    @property
+    def simulated_odometry(self) -> bool:
+        """True if odometry is made of the corrected poses, with errors of wheels."""
+
+    @property
+    def seed(self) -> int:
+        """Seed of these errors."""
+
+
+def opened(settings: LogSettings) -> RangeLog:
+    """A log as the user wants it.
 
     Raises:
         FileFormatError: the file cannot be read.
     """
-    log = read_range_log(path)
-    if mount is not None:
-        log = log.mounted(np.array(mount))
-    if not simulated:
+    log = read_range_log(settings.log)
+    if settings.mount is not None:
+        log = log.mounted(np.array(settings.mount))
+    if not settings.simulated_odometry:
         return log
     corrected = log.odometry if log.corrected is None else log.corrected
-    steps, rng = SE2.between(corrected[:-1], corrected[1:]), np.random.default_rng(seed)
+    steps, rng = SE2.between(corrected[:-1], corrected[1:]), np.random.default_rng(settings.seed)
     scale = 1.0 + SCALE * rng.standard_normal(2)
     told = steps * (scale[[0, 0, 1]] + NOISE * rng.standard_normal(steps.shape))
     odometry = [corrected[0]]

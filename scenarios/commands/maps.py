@@ -7,6 +7,7 @@ from unifg.files.ros_map import save_map
 from unifg.scenarios import log_map
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.commands.replays import outcome_of
+from unifg.scenarios.range_logs import opened
 
 __all__ = ["SETTINGS", "run"]
 
@@ -15,7 +16,7 @@ SETTINGS = log_map.MapSettings
 
 def run(settings: log_map.MapSettings, progress: Progress) -> Outcome:
     """Make a map of a log."""
-    made, graph = log_map.map_log(settings, progress)
+    made, graph = log_map.map_log(opened(settings), settings, progress)
     return outcome_of(
         made,
         {

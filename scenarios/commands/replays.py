@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from unifg.files.ros_map import load_map
 from unifg.files.tum import write_tum
 from unifg.scenarios import log_drive
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.logs.metrics import errors, spread, table, write_metrics
-from unifg.scenarios.range_logs import LogRun
+from unifg.scenarios.range_logs import LogRun, opened
 from unifg.scenarios.scenes.log_scene import log_scene, picture
 from unifg.style.figures import write_figure
 
@@ -22,7 +23,7 @@ SETTINGS = log_drive.LocaliseSettings
 
 def run(settings: log_drive.LocaliseSettings, progress: Progress) -> Outcome:
     """Follow a log on a map."""
-    return outcome_of(log_drive.localise(settings, progress))
+    return outcome_of(log_drive.localise(opened(settings), load_map(settings.map), settings, progress))
 
 
 def outcome_of(made: LogRun, more: Mapping[str, Writer] | None = None) -> Outcome:

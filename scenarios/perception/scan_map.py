@@ -16,29 +16,30 @@ from unifg.typing import Array
 __all__ = ["field_of", "mapped"]
 
 CELL = 0.05  # [m]
-AROUND = 0.8  # [m] of a point, within which distances are known
+AROUND = 0.6  # [m] of a point, within which distances are known
 OCCUPIED = 0.3  # share of the beams through a cell that have to end there
 
 
 def field_of(points: Array) -> DistanceMap:
-    """Distances to the nearest of points (n, 2) [m], up to 0.8 m."""
+    """Distances to the nearest of points (n, 2) [m], up to 0.6 m."""
     low = points.min(axis=0) - 2.0 * AROUND
     columns, rows = (np.ceil((points.max(axis=0) + 2.0 * AROUND - low) / CELL)).astype(int).tolist()
-    values = np.full((rows, columns), AROUND)
-    _paint((points - low) / CELL, AROUND / CELL, values)
-    return DistanceMap(values - 0.5 * CELL, CELL, (*low.tolist(), 0.0))
+    squared = np.full((rows, columns), (AROUND / CELL) ** 2)
+    _paint((points - low) / CELL - 0.5, AROUND / CELL, squared)
+    return DistanceMap(CELL * (np.sqrt(squared) - 0.5), CELL, (*low.tolist(), 0.0))
 
 
 @compiled
-def _paint(points: Array, reach: float, values: Array) -> None:
-    """Lower the values around points, given in cells."""
+def _paint(points: Array, reach: float, squared: Array) -> None:
+    """Lower the squared distances around points, all in cells from the middle of the first one."""
     for i in range(len(points)):
-        x, y = points[i, 0] - 0.5, points[i, 1] - 0.5
-        for row in range(int(math.ceil(y - reach)), int(y + reach) + 1):
-            for column in range(int(math.ceil(x - reach)), int(x + reach) + 1):
-                away = CELL * math.hypot(column - x, row - y)
-                if away < values[row, column]:
-                    values[row, column] = away
+        x, y = points[i, 0], points[i, 1]
+        if squared[int(y + 0.5), int(x + 0.5)] > 0.25:  # else there is one in this cell
+            for row in range(int(y - reach) + 1, int(y + reach) + 1):
+                for column in range(int(x - reach) + 1, int(x + reach) + 1):
+                    away = (column - x) ** 2 + (row - y) ** 2
+                    if away < squared[row, column]:
+                        squared[row, column] = away
 
 
 def mapped(

@@ -10,7 +10,7 @@ from unifg.lie import SE2
 from unifg.plots.shown import every
 from unifg.scenarios.range_logs import LogRun
 from unifg.style.colours import css
-from unifg.style.figures import face, headline, new_figure
+from unifg.style.figures import face, headline, key_of, new_figure
 from unifg.typing import Array
 from unifg.view import Scene, shapes
 
@@ -42,9 +42,8 @@ def picture(run: LogRun) -> Figure:
         face(below, "Along the way", "")
         below.set_ylim(bottom=-4.0)
         below.set_xlabel("way [m]")
-        below.legend(loc="upper right", ncols=3)
-        figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=5)
-        verb = "a map of" if run.kind == "map" else f"on {run.occupancy.name}:"
+        figure.legend(*key_of((above, below)), loc="outside lower center", ncols=5)
+        verb = "a map of" if run.kind == "map" else f"on {run.occupancy.name}, along"
         headline(figure, f"{verb} {run.log.name}: {len(run.poses)} scans, {along[-1]:.0f} m")
     return figure
 

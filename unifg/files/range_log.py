@@ -92,7 +92,7 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
     path = Path(path)
     if path.suffix == ".csv":
         return _table(path, limits)
-    name = legible(path)
+    name = legible(path.name)
     if path.is_dir() or path.suffix in ROSBAGS:
         return _in_order(name, *read_rosbag(path), None)
     log = read_carmen(path, limits=limits)
@@ -160,7 +160,7 @@ def _in_order(
 
 def _table(path: Path, limits: Limits) -> RangeLog:
     """The log of a CSV file."""
-    name, lines = legible(path), list(csv.reader(io.StringIO(read_text(path, limits), newline="")))
+    name, lines = legible(path.name), list(csv.reader(io.StringIO(read_text(path, limits), newline="")))
     header = [word.strip() for word in lines[0]] if lines else []
     beams = [k for k, word in enumerate(header) if _number(word) is not None]
     if missing := [word for word in ("time", *POSE) if word not in header]:
