@@ -10,6 +10,7 @@ solved whenever closures have come, at the end with graduated non-convexity, and
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +25,7 @@ from unifg.models.distance_map import DistanceMap
 from unifg.models.planar import base_of
 from unifg.pose_graphs import Edges, PoseGraph
 from unifg.scenarios.episode import Progress, silent
+from unifg.scenarios.ground.hypotheses import Hypothesis
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.relocalise import nearest_fit
 from unifg.scenarios.options import existing, option, pose, positive
@@ -39,15 +41,16 @@ __all__ = ["MapSettings", "map_log"]
 
 MOVED = np.array([0.4, 0.4, 0.3])  # motion between keyframes [m, m, rad]
 RECENT = 15  # keyframes that the next one is registered on
-VIEW = 12.0  # [m] of beams that are registered on others
+VIEW = 20.0  # [m] of beams that are registered on others
 OLD = 8.0  # [m] driven, after which a place is come back to
 TOGETHER = 4  # keyframes that look for a closure together
 POINTS = 360  # of theirs
 NEAR = 6.0  # [m] from a place, within which keyframes have seen it
 FEWEST, MOST = 4, 60  # of them
-DRIFT = (0.3, 0.04, 4.0)  # [m] and its growth with the way since the last closure, up to
+DRIFT = (0.7, 0.04, 4.0)  # [m] and its growth with the way since the last closure, up to
 TURNED = (0.1, 0.01, 0.6)  # [rad]
-FOUND = np.diag([0.1, 0.1, 0.04]) ** 2  # of the place of a closure that a search has found
+SLIP, SLIPS = (0.3, 0.36), 0.1  # [m, rad] and the share of belief of wheels that have slipped
+FOUND = np.diag([0.3, 0.3, 0.04]) ** 2  # of a place that a search has found
 BEST = 0.75  # share of points that have to end at old ones
 ENDS = 0.12  # [m] from them
 BASE = base_of("omnidirectional")
@@ -168,8 +171,10 @@ class Mapper:
             self.way.append(0.0)
             return
         predicted, covariance = BASE.step(self.poses[-1][None], step[None], 1.0)[0], WHEELS.covariance(step, 1.0)
-        recent = self._seen_from(np.arange(max(0, number - RECENT), number))
-        pose, covariance = registered(field_of(recent), scan, predicted, covariance)
+        around = field_of(self._seen_from(np.arange(max(0, number - RECENT), number)))
+        slipped, _ = nearest_fit(around, scan, predicted, *SLIP)
+        believed = [Hypothesis(predicted, covariance), Hypothesis(slipped, FOUND, SLIPS)]
+        pose, covariance = registered(around, scan, believed)
         self.edges.append((number - 1, number, SE2.between(self.poses[-1], pose), covariance))
         self.way.append(self.way[-1] + float(np.hypot(*step[:2])))
         self.poses.append(pose)
@@ -197,14 +202,17 @@ class Mapper:
         view = view[np.linspace(0, len(view) - 1, min(POINTS, len(view))).astype(np.intp)]
         scan = Scan(np.arctan2(view[:, 1], view[:, 0]), np.hypot(*view.T))
         around = field_of(self._seen_from(near[np.argsort(away[near])[:MOST]]))
-        found = nearest_fit(around, scan, here, drift, turned)
-        pose, covariance = registered(around, scan, found, FOUND)
+        found, aside = nearest_fit(around, scan, here, drift, turned)
+        pose, covariance = registered(around, scan, [Hypothesis(found, FOUND)])
         ends = np.abs(around.distance(SE2.act(pose, view))) <= ENDS
         if ends.mean() < BEST:
             return
+        if aside.any():  # nobody knows where along a corridor
+            along = np.array([*SE2.act(np.array([0.0, 0.0, -pose[2]]), aside[None])[0] / np.hypot(*aside), 0.0])
+            covariance = covariance + (drift + 1.0) ** 2 * np.outer(along, along)
         other = int(near[np.argmin(np.hypot(*(poses[near, :2] - pose[:2]).T))])
         self.edges.append((other, number, SE2.between(self.poses[other], pose), covariance))
-        self.closed, self.waiting = self.way[number], self.waiting + 1
+        self.closed, self.waiting = self.closed if aside.any() else self.way[number], self.waiting + 1
         off = np.abs(SE2.between(here, pose))
         if self.waiting >= EVERY or off[:2].max() > SHIFT or off[2] > TURN:
             graph, x, guess = self.graph().graph(robust=DCS(1.0))
@@ -225,9 +233,8 @@ class Mapper:
         return after, (weights >= 0.5) | after.edges.odometry
 
 
-def registered(around: DistanceMap, scan: Scan, pose: Array, covariance: Array) -> tuple[Array, Array]:
-    """Pose (3,) and covariance (3, 3) of a scan on a field, from what is predicted."""
-    localiser = Localiser(around, pose, np.ones(3), len(scan.angles))
-    localiser.covariance = covariance
-    localiser.spread_out(scan)
+def registered(around: DistanceMap, scan: Scan, believed: Sequence[Hypothesis]) -> tuple[Array, Array]:
+    """Pose (3,) and covariance (3, 3) of a scan on a field, from where it may be."""
+    localiser = Localiser(around, believed[0].pose, np.ones(3), len(scan.angles))
+    localiser.spread_out(scan, believed)
     return localiser.pose, localiser.covariance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -162,9 +163,9 @@ class Localiser:
         self.iterations += solution.iterations
         return solution[self._x][0], solution.covariance(self._x)
 
-    def spread_out(self, scan: Scan) -> None:
-        """Weigh draws from everything that may be right, and register a scan where they gather."""
-        believed = self._believed or [Hypothesis(self.pose, self.covariance)]
+    def spread_out(self, scan: Scan, believed: Sequence[Hypothesis] = ()) -> None:
+        """Weigh draws from everything that may be right, or from what is given, and register a scan where they gather."""
+        believed = believed or self._believed or [Hypothesis(self.pose, self.covariance)]
         found = gathered(*weighed(self._map, scan, believed, self._rng))
         better = []
         for one in found:
