@@ -15,12 +15,12 @@ from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap
 from unifg.models.planar import base_of
 from unifg.scenarios.episode import Progress, silent
-from unifg.scenarios.ground.localiser import FITS, Localiser
+from unifg.scenarios.ground.localiser import FEWEST_BEAMS, FITS, Localiser
 from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.ground.relocalise import Relocaliser, refine
 from unifg.scenarios.options import existing, option, pose
-from unifg.scenarios.perception.explaining import explained
-from unifg.scenarios.perception.monte_carlo import MonteCarlo
+from unifg.scenarios.perception.explaining import FARTHEST, explained
+from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.range_logs import WHEELS, LogRun, step_of
 from unifg.typing import Array
@@ -47,12 +47,12 @@ class LocaliseSettings:
             the map is searched.
         localiser: that of this library, or a Monte Carlo localiser to compare with.
         mount: pose of the laser on the robot, where the odometry is that of the robot [m, m, rad].
-        simulated_odometry: the poses in the log are corrected ones: odometry is made of them, with 5 % of scale error and
-            2 % of noise, and they are what errors are counted from.
+        simulated_odometry: the poses in the log are corrected ones: odometry is made of them, with 5 % of scale error
+            and 2 % of noise, and they are what errors are counted from.
         seed: of everything random.
     """
 
-    log: Path = option(text=existing("a log of a laser"), metavar="LOG")
+    log: Path = option(text=existing("a log of a laser", folders=True), metavar="LOG")
     map: Path = option(text=existing("the YAML file of a ROS map"), metavar="MAP.yaml")
     start: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
     localiser: str = option("graph", choices=("graph", "amcl"))
@@ -109,7 +109,10 @@ def _estimator(
     settings: LocaliseSettings, occupancy: OccupancyMap, field: DistanceMap, start: Array, beams: int
 ) -> Estimator:
     if settings.localiser == "amcl":
-        return MonteCarlo(occupancy, field, start, SIGMA, np.random.default_rng(settings.seed), base=BASE)
+        rng, trusted = np.random.default_rng(settings.seed), MonteCarloSettings(noise=(0.01,) * 4)
+        return MonteCarlo(occupancy, field, start, SIGMA, rng, trusted, BASE)
+    if settings.localiser != "graph":
+        raise ScenarioError(f"a log is followed by 'graph' or 'amcl', not by '{settings.localiser}'")
     return Localiser(field, start, SIGMA, beams, BASE, WHEELS)
 
 
@@ -130,7 +133,11 @@ def beginning(log: RangeLog, occupancy: OccupancyMap, field: DistanceMap) -> Arr
     for k in np.unique(np.searchsorted(way, np.arange(LOOKED) * 0.5))[:LOOKED].tolist():
         if k == len(log):
             break
-        search.begin(Scan(log.angles, log.ranges[k]))
+        scan = Scan(log.angles, log.ranges[k])
+        if len(scan.within(FARTHEST)) < FEWEST_BEAMS:
+            cause = "too few beams"
+            continue
+        search.begin(scan)
         while (found := search.search()) is None:
             pass
         if found.pose is not None:

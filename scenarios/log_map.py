@@ -2,9 +2,10 @@
 
 Every keyframe is registered on the last ones (:class:`~unifg.scenarios.ground.localiser.Localiser`: a prior by the
 wheels, a factor for every beam); pose and covariance become an edge to the keyframe before. Where older keyframes are
-near, as near as the drift since the last closure may have carried them, the last few scans together are searched for
-among theirs (Olson, *Real-time correlative scan matching*, ICRA 2009), and registered there: a loop closure. The graph is
-solved whenever closures have come, at the end with graduated non-convexity, and judged.
+as near as the drift since the last closure may have carried the robot, the last few scans together are searched for
+among theirs (Olson, *Real-time correlative scan matching*, ICRA 2009), and registered there: a loop closure. Where the
+best place has a rival, as in a corridor, the closure says nothing of the direction to it. The graph is solved whenever
+closures have come, at the end with graduated non-convexity, and judged.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from unifg.factors.robust import DCS
+from unifg.factors.robust import DCS, TruncatedLeastSquares
 from unifg.files.range_log import RangeLog
 from unifg.lie import SE2
 from unifg.models import lidar
@@ -32,7 +33,7 @@ from unifg.scenarios.options import existing, option, pose, positive
 from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
-from unifg.scenarios.pose_graph import robust_loss
+from unifg.scenarios.pose_graph import OUTLIER_WEIGHT, threshold
 from unifg.scenarios.range_logs import WHEELS, LogRun, step_of
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
 from unifg.typing import Array, BoolArray, IntArray
@@ -67,12 +68,12 @@ class MapSettings:
         resolution: side of a cell [m].
         reach: of the beams that make the map [m].
         mount: pose of the laser on the robot, where the odometry is that of the robot [m, m, rad].
-        simulated_odometry: the poses in the log are corrected ones: odometry is made of them, with 5 % of scale error and
-            2 % of noise, and they are what errors are counted from.
+        simulated_odometry: the poses in the log are corrected ones: odometry is made of them, with 5 % of scale error
+            and 2 % of noise, and they are what errors are counted from.
         seed: of everything random.
     """
 
-    log: Path = option(text=existing("a log of a laser"), metavar="LOG")
+    log: Path = option(text=existing("a log of a laser", folders=True), metavar="LOG")
     resolution: float = option(0.05, text=positive, metavar="M")
     reach: float = option(12.0, text=positive, metavar="M")
     mount: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
@@ -226,11 +227,13 @@ class Mapper:
 
     def solved(self) -> tuple[PoseGraph, BoolArray]:
         """The solved pose graph, and which edges (m,) it keeps."""
-        before, loss = self.graph(), robust_loss("gnc", SE2.dim)
+        before, loss = self.graph(), TruncatedLeastSquares(threshold(SE2.dim))
+        if len(self.edges) < len(self.poses):
+            return before, before.edges.odometry  # nothing contradicts the chain
         graph, x, guess = before.graph(robust=loss)
         after = before.with_poses(GraduatedNonConvexity().solve(graph, guess)[x])
-        weights: Array = np.asarray(loss.weight(after.squared_errors()))
-        return after, (weights >= 0.5) | after.edges.odometry
+        weights = np.asarray(loss.weight(after.squared_errors()))
+        return after, (weights >= OUTLIER_WEIGHT) | after.edges.odometry
 
 
 def registered(around: DistanceMap, scan: Scan, believed: Sequence[Hypothesis]) -> tuple[Array, Array]:

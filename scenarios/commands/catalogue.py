@@ -1,4 +1,4 @@
-"""Scenarios that ``unifg run``, ``unifg solve``, ``unifg map``, ``unifg localise`` and campaigns can run, and their modules.
+"""Scenarios that ``unifg run``, ``solve``, ``map``, ``localise`` and campaigns can run, and their modules.
 
 To add one, write a module of `unifg.scenarios.commands` with ``SETTINGS``, a class whose fields are options
 (`unifg.scenarios.options`), and ``run``, which takes them and returns an outcome; then give it a line here.

@@ -164,7 +164,7 @@ class Localiser:
         return solution[self._x][0], solution.covariance(self._x)
 
     def spread_out(self, scan: Scan, believed: Sequence[Hypothesis] = ()) -> None:
-        """Weigh draws from everything that may be right, or from what is given, and register a scan where they gather."""
+        """Weigh draws from all that may be right, or from what is given, and register a scan where they gather."""
         believed = believed or self._believed or [Hypothesis(self.pose, self.covariance)]
         found = gathered(*weighed(self._map, scan, believed, self._rng))
         better = []

@@ -11,7 +11,7 @@ from unifg.plots.shown import every
 from unifg.scenarios.range_logs import LogRun
 from unifg.style.colours import css
 from unifg.style.figures import face, headline, key_of, new_figure
-from unifg.typing import Array
+from unifg.typing import Array, IntArray
 from unifg.view import Scene, shapes
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def log_scene(run: LogRun) -> Scene:
     return scene
 
 
-def _ends(run: LogRun, k: int, beams: Array) -> Array:
+def _ends(run: LogRun, k: int, beams: IntArray) -> Array:
     """(n, 3) where chosen beams of a scan ended, above the walls [m]."""
     ranges, angles = run.log.ranges[k][beams], run.log.angles[beams]
     seen = np.isfinite(ranges)

@@ -2,8 +2,8 @@
 
 A CSV file is one table with a header. ``time`` [s], ``x``, ``y`` [m] and ``theta`` [rad] are the odometry;
 ``corrected_x``, ``corrected_y`` and ``corrected_theta``, where a reference is known, the poses it says; every other
-column is a beam, and its name a number: its direction [rad]. A range that is empty, not a number, or not above zero is a
-beam that is lost; ``inf`` says that nothing was hit.
+column is a beam, and its name a number: its direction [rad]. A range that is empty, not a number, or not above zero
+is a beam that is lost; ``inf`` says that nothing was hit.
 """
 
 from __future__ import annotations
@@ -31,7 +31,9 @@ POSE = ("x", "y", "theta")
 FIXED = 0.02  # [m, rad] by which the place of a laser on its robot may seem to change, as logs round
 PARTED = 1.0  # [m] between wheels and poses of scans, laid on each other, from where on the latter are corrected
 SLOWEST = 0.005  # [m/s]; who is slower counts time in thousandths
-AT_MOST, OFTEN = 0.99, 0.005  # of the longest range, and the share of ranges there, where it means that nothing was hit
+AT_MOST = 0.99  # of the longest range
+OFTEN, PEAK = 0.005, 3.0  # share of the ranges there, and over those a little shorter, if it means that nothing was hit
+LONGEST = 10**6  # characters of a line, which has no blanks
 ROSBAGS = (".mcap", ".bag", ".db3")
 
 
@@ -152,15 +154,19 @@ def _in_order(
     with np.errstate(invalid="ignore"):
         ranges = np.where(ranges > 0.0, ranges, np.nan)  # NaN stays
         seen = ranges[np.isfinite(ranges)]
-        longest = AT_MOST * min(maximum, seen.max(initial=0.0))
-        if np.isfinite(maximum) or (seen >= longest).mean() > OFTEN:
-            ranges = np.where(ranges >= longest, np.inf, ranges)
+        top = min(maximum, seen.max(initial=0.0))
+        longest, shorter = (int((seen > share * top).sum()) for share in (AT_MOST, 2.0 * AT_MOST - 1.0))
+        if np.isfinite(maximum) or longest > max(OFTEN * len(seen), PEAK * (shorter - longest)):
+            ranges = np.where(ranges > AT_MOST * top, np.inf, ranges)
     return RangeLog(name, time / unit, angles[beams], ranges, odometry, corrected)
 
 
 def _table(path: Path, limits: Limits) -> RangeLog:
     """The log of a CSV file."""
-    name, lines = legible(path.name), list(csv.reader(io.StringIO(read_text(path, limits), newline="")))
+    name, lines = (
+        legible(path.name),
+        list(csv.reader(io.StringIO(read_text(path, replace(limits, digits=LONGEST)), newline=""))),
+    )
     header = [word.strip() for word in lines[0]] if lines else []
     beams = [k for k, word in enumerate(header) if _number(word) is not None]
     if missing := [word for word in ("time", *POSE) if word not in header]:

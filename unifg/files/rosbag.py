@@ -87,11 +87,11 @@ def _mcap(path: Path) -> Iterator[tuple[str, str, Any]]:
         raise ImportError(f"reading {path.name} needs mcap and mcap-ros2-support: pip install 'unifg[logs]'") from error
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
-        channels = reader.get_summary().channels.values()  # type: ignore[union-attr]
-        schemas = reader.get_summary().schemas  # type: ignore[union-attr]
-        topics = [one.topic for one in channels if _kind(schemas[one.schema_id].name)]
-        for schema, channel, _, message in reader.iter_decoded_messages(topics=topics):
-            yield channel.topic, _kind(schema.name), message
+        summary: Any = reader.get_summary()
+        kinds = {one.topic: _kind(summary.schemas[one.schema_id].name) for one in summary.channels.values()}
+        wanted = [topic for topic, kind in kinds.items() if kind]
+        for _, channel, _, message in reader.iter_decoded_messages(topics=wanted):
+            yield channel.topic, kinds[channel.topic], message
 
 
 def _bag(path: Path) -> Iterator[tuple[str, str, Any]]:
