@@ -154,7 +154,7 @@ def _in_order(
     with np.errstate(invalid="ignore"):
         ranges = np.where(ranges > 0.0, ranges, np.nan)  # NaN stays
         seen = ranges[np.isfinite(ranges)]
-        top = min(maximum, seen.max(initial=0.0))
+        top = maximum if np.isfinite(maximum) else seen.max(initial=0.0)
         longest, shorter = (int((seen > share * top).sum()) for share in (AT_MOST, 2.0 * AT_MOST - 1.0))
         if np.isfinite(maximum) or longest > max(OFTEN * len(seen), PEAK * (shorter - longest)):
             ranges = np.where(ranges > AT_MOST * top, np.inf, ranges)
