@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -80,39 +80,25 @@ class LogRun:
         return found
 
 
-class LogSettings(Protocol):
-    """Settings that say which log, and what it holds."""
-
-    @property
-    def log(self) -> Path:
-        """The file."""
-
-    @property
-    def mount(self) -> tuple[float, float, float] | None:
-        """Pose of the laser on the robot that the odometry is of; None where it is the laser's."""
-
-    @property
-    def simulated_odometry(self) -> bool:
-        """True if odometry is made of the corrected poses, with errors of wheels."""
-
-    @property
-    def seed(self) -> int:
-        """Seed of these errors."""
-
-
-def opened(settings: LogSettings) -> RangeLog:
+def opened(path: Path, mount: tuple[float, float, float] | None, simulated: bool, seed: int) -> RangeLog:
     """A log as the user wants it.
+
+    Args:
+        path: of the file.
+        mount: pose of the laser on the robot that the odometry is of; None where it is the laser's.
+        simulated: whether odometry is made of the corrected poses, with errors of wheels.
+        seed: of these errors.
 
     Raises:
         FileFormatError: the file cannot be read.
     """
-    log = read_range_log(settings.log)
-    if settings.mount is not None:
-        log = log.mounted(np.array(settings.mount))
-    if not settings.simulated_odometry:
+    log = read_range_log(path)
+    if mount is not None:
+        log = log.mounted(np.array(mount))
+    if not simulated:
         return log
     corrected = log.odometry if log.corrected is None else log.corrected
-    steps, rng = SE2.between(corrected[:-1], corrected[1:]), np.random.default_rng(settings.seed)
+    steps, rng = SE2.between(corrected[:-1], corrected[1:]), np.random.default_rng(seed)
     scale = 1.0 + SCALE * rng.standard_normal(2)
     told = steps * (scale[[0, 0, 1]] + NOISE * rng.standard_normal(steps.shape))
     odometry = [corrected[0]]

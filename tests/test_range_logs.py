@@ -8,7 +8,6 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from unifg.scenarios.ground.hypotheses import Hypothesis, gathered, mixed
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
+from unifg.scenarios.range_logs import opened
 from unifg.typing import Array
 
 ANYWHERE = Path("log")
@@ -390,18 +390,14 @@ def test_a_recorded_drive_needs_a_map_and_a_localiser(made: Path, capsys: pytest
     assert "'graph' or 'amcl'" in capsys.readouterr().err
 
 
-def test_odometry_is_made_of_corrected_poses(made: Path, tmp_path: Path) -> None:
-    from unifg.scenarios.range_logs import opened
-
-    asked = SimpleNamespace(log=made / "log.csv", mount=None, simulated_odometry=True, seed=4)
-    one, again, other = (opened(replace_seed(asked, seed)) for seed in (4, 4, 5))
+def test_odometry_is_made_of_corrected_poses(made: Path) -> None:
+    one, again, other = (opened(made / "log.csv", None, True, seed) for seed in (4, 4, 5))
     assert one.corrected is not None
     np.testing.assert_array_equal(one.odometry, again.odometry)
     assert 0.1 < apart(one.odometry, one.corrected)[-1] and not np.allclose(one.odometry, other.odometry)
-
-
-def replace_seed(asked: Any, seed: int) -> Any:
-    return SimpleNamespace(**{**vars(asked), "seed": seed})
+    plain = opened(made / "log.csv", None, False, 0).odometry
+    mounted = opened(made / "log.csv", (0.3, 0.0, 0.2), False, 0).odometry
+    np.testing.assert_allclose(SE2.between(plain, mounted), np.tile([0.3, 0.0, 0.2], (len(plain), 1)), atol=1e-12)
 
 
 def test_an_interrupt_leaves_the_map_so_far(log: RangeLog) -> None:

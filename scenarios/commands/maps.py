@@ -16,7 +16,8 @@ SETTINGS = log_map.MapSettings
 
 def run(settings: log_map.MapSettings, progress: Progress) -> Outcome:
     """Make a map of a log."""
-    made, graph = log_map.map_log(opened(settings), settings, progress)
+    log = opened(settings.log, settings.mount, settings.simulated_odometry, settings.seed)
+    made, graph = log_map.map_log(log, settings, progress)
     return outcome_of(
         made,
         {

@@ -23,7 +23,8 @@ SETTINGS = log_drive.LocaliseSettings
 
 def run(settings: log_drive.LocaliseSettings, progress: Progress) -> Outcome:
     """Follow a log on a map."""
-    return outcome_of(log_drive.localise(opened(settings), load_map(settings.map), settings, progress))
+    log = opened(settings.log, settings.mount, settings.simulated_odometry, settings.seed)
+    return outcome_of(log_drive.localise(log, load_map(settings.map), settings, progress))
 
 
 def outcome_of(made: LogRun, more: Mapping[str, Writer] | None = None) -> Outcome:
