@@ -50,7 +50,8 @@ def picture(run: LogRun) -> Figure:
 
 def stage(run: LogRun) -> Scene:
     """Static parts: the map, the ways, and the loop closures."""
-    scene = Scene(f"unifg: {run.log.name} on {run.occupancy.name}", counts="scan")
+    place = "a map of it" if run.kind == "map" else run.occupancy.name
+    scene = Scene(f"unifg: {run.log.name} on {place}", counts="scan")
     corners = shapes.known_corners(run.occupancy)
     width = float(np.clip(0.003 * np.ptp(corners, axis=0).max(), 0.03, 0.12))
     scene.around = np.concatenate([np.column_stack([corners, np.full(4, z)]) for z in (0.0, _WALL)])
