@@ -33,6 +33,7 @@ FARTHEST, LEVER = 1e3, 1.0  # [m] standard deviation, and per radian, of what a 
 LARGEST_JUMP = 0.5  # [m]; a correction beyond this is a mistake of the matching, not of the wheels
 SURE = 0.05, 0.03  # [m, rad]; a prediction that is less sure than this begins at several places
 FITS = 0.6  # share of the beams that the map explains, below which there may be a better place
+FOUND = 0.85  # share that it has to explain at another place
 ASTRAY = np.diag([0.15, 0.15, 0.06]) ** 2  # that a scan which does not fit adds to the covariance [m, m, rad]
 ABOUT = 0.3  # [m] of a match, within which a mean is that of its draws
 CERTAIN = 0.98  # share of the belief of a hypothesis that stands alone
@@ -131,19 +132,23 @@ class Localiser:
         if lidar.usable(scan.ranges).sum() < FEWEST_BEAMS:
             self.refused = "too few beams"
             return
-        if not self._believed and self._is_sure():
-            corrected, held = self._solve(scan, self.pose, self._held, lidar.DROP_BEYOND)
-            jump = float(np.hypot(*(corrected - self.pose)[:2]))
-            if not jump <= LARGEST_JUMP:
-                self.refused = "it would move the estimate by more than the wheels can be wrong"
+        kept = self.pose, self.covariance, self._held
+        if self._believed or not self._is_sure():
+            self.spread_out(scan)
+            if explained(self._map, scan, self.pose).share >= FITS:
                 return
-            if explained(self._map, scan, corrected).share >= FITS:
-                seen_covariance = scan_covariance(self._map, scan, corrected) + self._skew
-                self.pose, self.covariance = corrected, least(self.covariance, seen_covariance)
-                self._held = held
+            (self.pose, self.covariance, self._held), self._believed = kept, []
+        corrected, held = self._solve(scan, self.pose, self._held, lidar.DROP_BEYOND)
+        if not float(np.hypot(*(corrected - self.pose)[:2])) <= LARGEST_JUMP:
+            self.refused = "it would move the estimate by more than the wheels can be wrong"
+            return
+        if explained(self._map, scan, corrected).share < FITS:
+            self.spread_out(scan, [Hypothesis(self.pose, self.covariance + ASTRAY)])
+            if explained(self._map, scan, self.pose).share >= FOUND:
                 return
-            self.covariance = self.covariance + ASTRAY
-        self.spread_out(scan)
+            self._believed = []  # a map that is wrong fits somewhere a little better, too
+        seen = scan_covariance(self._map, scan, corrected) + self._skew
+        self.pose, self.covariance, self._held = corrected, least(kept[1], seen), held
 
     def _is_sure(self) -> bool:
         """Test whether a prediction is as good as one place to begin at."""
