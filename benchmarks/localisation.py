@@ -26,13 +26,13 @@ from benchmarks.runner import Study
 from unifg.files.carmen import read_carmen
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2, wrap_angle
-from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.navigation import INITIAL_SIGMA, Episode, NavigationSettings
 from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.perception.scan_map import mapped
 from unifg.typing import Array
 
 SEEDS = range(200, 204)
@@ -191,27 +191,6 @@ def log_of_the_lab() -> tuple[Array, Array, Array] | None:
     scans = read_carmen(path).scans[0]
     ranges = np.where(scans.ranges >= min(scans.maximum, 79.0), np.inf, scans.ranges)
     return scans.angles, ranges, scans.pose
-
-
-def mapped(angles: Array, ranges: Array, poses: Array, resolution: float = 0.05) -> OccupancyMap:
-    """A grid of how often a cell was hit and how often seen through."""
-    low, high = poses[:, :2].min(axis=0) - 12.0, poses[:, :2].max(axis=0) + 12.0
-    shape = np.ceil((high - low) / resolution).astype(int)[::-1]
-    hits, passes = np.zeros(shape), np.zeros(shape)
-    for row, pose in zip(ranges, poses, strict=True):
-        good = lidar.usable(row)
-        bearing = pose[2] + angles[good]
-        ways = np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-        along = np.arange(0.0, lidar.DROP_BEYOND, 0.5 * resolution)
-        before = along[None] < row[good, None] - resolution
-        seen = (pose[:2] + along[None, :, None] * ways[:, None])[before]
-        cells = np.unique(((seen - low) / resolution).astype(int), axis=0)
-        passes[cells[:, 1], cells[:, 0]] += 1.0
-        ends = ((pose[:2] + row[good, None] * ways - low) / resolution).astype(int)
-        np.add.at(hits, (ends[:, 1], ends[:, 0]), 1.0)
-    occupied = hits > 0.3 * (hits + passes)
-    occupied &= hits > 0.0
-    return OccupancyMap(occupied, (passes > 0.0) & ~occupied, resolution, (float(low[0]), float(low[1]), 0.0), "lab")
 
 
 def real_ticks(angles: Array, ranges: Array, poses: Array, rng: np.random.Generator) -> list[Tick]:

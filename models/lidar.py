@@ -73,13 +73,13 @@ def endpoint_loss(sigma: float, resolution: float) -> Reweighted:
     return Reweighted(_Rule(sigma, resolution))
 
 
-def usable(ranges: Array) -> BoolArray:
-    """(n,) beams that take part: a return was measured, and not beyond 10 m."""
+def usable(ranges: Array, reach: float = DROP_BEYOND) -> BoolArray:
+    """(n,) beams that take part: a return was measured, and not beyond a distance [m]."""
     with np.errstate(invalid="ignore"):
-        return np.isfinite(ranges) & (ranges <= DROP_BEYOND)
+        return np.isfinite(ranges) & (ranges <= reach)
 
 
-def beam_endpoints(ranges: Array, angles: Array) -> Array:
+def beam_endpoints(ranges: Array, angles: Array, reach: float = DROP_BEYOND) -> Array:
     """(n, 2) end-points in the sensor frame [m]; unusable beams end at the origin."""
-    lengths = np.where(usable(ranges), ranges, 0.0)
+    lengths = np.where(usable(ranges, reach), ranges, 0.0)
     return np.stack([lengths * np.cos(angles), lengths * np.sin(angles)], axis=1)

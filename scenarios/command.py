@@ -34,7 +34,7 @@ from unifg.codegen.cache_folder import place
 from unifg.codegen.threads import cores
 from unifg.errors import UnifgError
 from unifg.files.contents import legible
-from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
+from unifg.scenarios.commands.catalogue import FROM_FILES, SCENARIOS
 from unifg.scenarios.commands.extras import absent, remedy
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.options import Help, count, settings_of
@@ -116,10 +116,11 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
         one.set_defaults(name=name, does=_run, extras=("view",), parser=one)  # pictures are wanted at the end
         if list(words[:2]) == ["run", name]:
             scenario.add_options(one)
-    solve = commands.add_parser("solve", help="solve a pose graph", description=SOLVE.summary)
-    solve.set_defaults(name="solve", does=_run, extras=(), parser=solve)
-    if list(words[:1]) == ["solve"]:
-        SOLVE.add_options(solve)
+    for name, scenario in FROM_FILES.items():
+        one = commands.add_parser(name, help=scenario.summary, description=scenario.summary)
+        one.set_defaults(name=name, does=_run, extras=scenario.extras, parser=one)
+        if list(words[:1]) == [name]:
+            scenario.add_options(one)
     for name, entry in COMMANDS.items():
         entry.add(commands.add_parser(name, help=entry.summary, description=entry.about))
     return parser
@@ -259,7 +260,8 @@ def _bench(chosen: argparse.Namespace) -> int:
 
 def _run(chosen: argparse.Namespace) -> int:
     """Run the chosen scenario, write what it left and say how it went."""
-    settings = settings_of(chosen.module.SETTINGS, chosen, solver=chosen.solver)
+    solver = {"solver": chosen.solver} if hasattr(chosen, "solver") else {}
+    settings = settings_of(chosen.module.SETTINGS, chosen, **solver)
     if chosen.stated:
         from unifg.scenarios.campaigns.stated_settings import Fields
 

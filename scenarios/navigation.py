@@ -94,6 +94,7 @@ class NavigationSettings:
         world: simulation: "plane", or a class of your own, MODULE:CLASS, with the arguments of
             `unifg.scenarios.simulation.plane.World`.
         faults: what goes wrong; may be repeated.
+        log: recorded drive that the localiser follows on the map, in the place of a simulated one.
     """
 
     map: Path | None = option(None, text=existing("the YAML file of a ROS map"), metavar="F.yaml")
@@ -122,6 +123,7 @@ class NavigationSettings:
     believed: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
     initial_sigma: tuple[float, float, float] = option(INITIAL_SIGMA, text=pose, metavar="X,Y,TH")
     plant: str = option("light", choices=tuple(PLANTS))
+    log: Path | None = option(None, text=existing("a log of a laser", folders=True), metavar="LOG")
 
 
 def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:

@@ -288,12 +288,12 @@ def find_modules_in(folder: Path) -> None:
         sys.path.insert(0, str(folder))
 
 
-def existing(what: str) -> Text:
-    """A file that is there; ``what`` says which would do."""
+def existing(what: str, folders: bool = False) -> Text:
+    """A file that is there, or a folder where these will do; ``what`` says which would do."""
 
     def path(text: str) -> Path:
         found = Path(text)
-        if not found.is_file():
+        if not (found.is_file() or (folders and found.is_dir())):
             raise argparse.ArgumentTypeError(f"{legible(text)}: no such file; give {what}")
         return found
 

@@ -33,7 +33,7 @@ from unifg.solvers import GraduatedNonConvexity, names
 from unifg.solvers.least_squares import MAP
 from unifg.typing import Array, BoolArray
 
-__all__ = ["SolveSettings", "SolvedGraph", "robust_loss", "solve_file"]
+__all__ = ["OUTLIER_WEIGHT", "SolveSettings", "SolvedGraph", "robust_loss", "solve_file", "threshold"]
 
 AUTO = "auto"
 GUESSES: dict[str, Callable[[PoseGraph], PoseGraph]] = {
@@ -296,7 +296,7 @@ def robust_loss(text: str | None, dim: int) -> Loss | None:
     if name not in LOSSES:
         raise ScenarioError(f"--robust {text}: expected one of {', '.join(LOSSES)}, with :PARAMETER if you like")
     if ":" not in text:
-        return LOSSES[name](_DEFAULTS[name] if name in _DEFAULTS else _threshold(dim))
+        return LOSSES[name](_DEFAULTS[name] if name in _DEFAULTS else threshold(dim))
     try:
         value = float(parameter)
     except ValueError:
@@ -306,7 +306,7 @@ def robust_loss(text: str | None, dim: int) -> Loss | None:
     return LOSSES[name](value)
 
 
-def _threshold(dim: int) -> float:
+def threshold(dim: int) -> float:
     """The length of a whitened residual that a share of right measurements stays below."""
     from scipy.special import chdtri  # slow to load, and seldom asked
 

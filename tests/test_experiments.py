@@ -13,7 +13,7 @@ import pytest
 
 from benchmarks.experiments import beside, drives_of, leg_by_leg, rendered
 from benchmarks.kept_rows import ROWS, keep, restore
-from benchmarks.localisation import LOG, made, mapped, real_ticks, replayed
+from benchmarks.localisation import LOG, made, real_ticks, replayed
 from benchmarks.report import CAMPAIGNS
 from unifg.errors import ScenarioError
 from unifg.files.carmen import read_carmen
@@ -23,6 +23,7 @@ from unifg.scenarios.campaigns.sheet import Combination, Sheet, sheet_of
 from unifg.scenarios.campaigns.statement import read
 from unifg.scenarios.campaigns.task import FAILED, OK
 from unifg.scenarios.navigation import INITIAL_SIGMA
+from unifg.scenarios.perception.scan_map import mapped
 from unifg.scenarios.planning.polyline import path_length
 
 Row: TypeAlias = dict[str, Any]

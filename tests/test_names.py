@@ -7,7 +7,7 @@ import pytest
 import unifg as fg
 from unifg import solvers
 from unifg.scenarios import command as shell
-from unifg.scenarios.commands.catalogue import SCENARIOS, SOLVE
+from unifg.scenarios.commands.catalogue import FROM_FILES, SCENARIOS
 from unifg.solvers import names
 
 CLASSES = {getattr(solvers, name) for name in solvers.__all__ if name != "LinearGraphs"}
@@ -64,7 +64,7 @@ def test_options_arrive_and_wrong_ones_are_named() -> None:
 def test_commands_offer_names_with_titles(command: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
     assert shell.main([*command, "--help"]) == 0
     said = " ".join(capsys.readouterr().out.split())
-    scenario = SOLVE if command == ("solve",) else SCENARIOS[command[1]]
+    scenario = FROM_FILES["solve"] if command == ("solve",) else SCENARIOS[command[1]]
     assert names.choices(getattr(names, scenario.solvers)).replace("-", "") in said.replace("- ", "").replace("-", "")
 
 

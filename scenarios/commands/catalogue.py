@@ -1,4 +1,4 @@
-"""Scenarios that ``unifg run``, ``unifg solve`` and campaigns can run, and their modules.
+"""Scenarios that ``unifg run``, ``solve``, ``map``, ``localise`` and campaigns can run, and their modules.
 
 To add one, write a module of `unifg.scenarios.commands` with ``SETTINGS``, a class whose fields are options
 (`unifg.scenarios.options`), and ``run``, which takes them and returns an outcome; then give it a line here.
@@ -15,7 +15,7 @@ from typing import Any
 
 from unifg.scenarios.options import add_options
 
-__all__ = ["SCENARIOS", "SOLVE", "Scenario"]
+__all__ = ["FROM_FILES", "SCENARIOS", "Scenario"]
 
 
 @dataclass(frozen=True)
@@ -27,10 +27,11 @@ class Scenario:
             them, a progress and, where it can be watched, whom to tell where; it raises KeyboardInterrupt when stopped
             before there is anything to write.
         summary: one line for the help.
-        solvers: the list of `unifg.solvers.names` to choose from.
+        solvers: the list of `unifg.solvers.names` to choose from; empty for none.
         defaults: of options, where the command line has others than the settings.
         live: whether it can be watched.
         first: flags that its help shows before the word "all" is given; empty for every one.
+        extras: that it needs, where it is no scenario of ``unifg run``.
     """
 
     module: str
@@ -39,16 +40,19 @@ class Scenario:
     defaults: Mapping[str, Any] = field(default_factory=dict)
     live: bool = True
     first: tuple[str, ...] = ()
+    extras: tuple[str, ...] = ()
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """Load the scenario and add its options."""
         from unifg.solvers import names
 
-        module, solvers = import_module(f"unifg.scenarios.commands.{self.module}"), getattr(names, self.solvers)
+        module = import_module(f"unifg.scenarios.commands.{self.module}")
         add_options(parser, module.SETTINGS, **self.defaults)
-        solver = next(f.default for f in fields(module.SETTINGS) if f.name == "solver")
-        about = f"{names.choices(solvers)} (default: %(default)s)"
-        parser.add_argument("--solver", choices=solvers, default=solver, help=about)
+        if self.solvers:
+            solvers = getattr(names, self.solvers)
+            solver = next(f.default for f in fields(module.SETTINGS) if f.name == "solver")
+            about = f"{names.choices(solvers)} (default: %(default)s)"
+            parser.add_argument("--solver", choices=solvers, default=solver, help=about)
         parser.add_argument(
             "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
         )
@@ -106,5 +110,19 @@ SCENARIOS = {
 }
 """Everything ``unifg run`` can run."""
 
-SOLVE = Scenario("graphs", "Solve a pose graph from a file (g2o or TORO, gzipped or not).", "LEAST_SQUARES", live=False)
-"""``unifg solve``."""
+FROM_FILES = {
+    "solve": Scenario(
+        "graphs", "Solve a pose graph from a file (g2o or TORO, gzipped or not).", "LEAST_SQUARES", live=False
+    ),
+    "map": Scenario(
+        "maps",
+        "Make a map of a log of a lidar and wheels (CARMEN, CSV, MCAP, rosbag2).",
+        "",
+        live=False,
+        extras=("view",),
+    ),
+    "localise": Scenario(
+        "replays", "Follow a log of a lidar and wheels on a map.", "", live=False, extras=("view", "scenarios")
+    ),
+}
+"""Commands that begin with a file: ``unifg solve``, ``unifg map``, ``unifg localise``."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from unifg.errors import ScenarioError
 from unifg.files.tum import write_tum
 from unifg.scenarios import navigation
+from unifg.scenarios.commands import replays
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.drive_log import EpisodeLog
@@ -19,12 +21,19 @@ SETTINGS = navigation.NavigationSettings
 
 
 def run(settings: navigation.NavigationSettings, progress: Progress, announce: Announce | None = None) -> Outcome:
-    """Drive.
+    """Drive, or follow a recorded drive.
 
     Raises:
         KeyboardInterrupt: when stopped before the first tick.
-        ScenarioError: when start, goals or obstacles do not fit the map.
+        ScenarioError: when start, goals or obstacles do not fit the map, or there is none for the log.
     """
+    if settings.log is not None:
+        if settings.map is None:
+            raise ScenarioError("a recorded drive is followed on a map of its place: give --map")
+        replayed = replays.SETTINGS(
+            settings.log, settings.map, settings.start, str(settings.localiser), seed=settings.seed
+        )
+        return replays.run(replayed, progress)
     with watching_ticks(announce, drive_stage, drive_frame):
         log = navigation.run_navigation(settings, progress=progress)
     if log.ticks == 0:

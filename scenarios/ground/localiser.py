@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
 import unifg as fg
@@ -9,6 +12,8 @@ from unifg.lie import SE2
 from unifg.models import lidar, odometry, unicycle
 from unifg.models.distance_map import DistanceMap
 from unifg.models.planar import Base
+from unifg.scenarios.ground.hypotheses import REACH, Hypothesis, gathered, mixed, weighed
+from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
@@ -26,6 +31,12 @@ LEAST = 0.01  # [m] of a beam's standard deviation, whatever the residuals of a 
 WITHIN = odometry.OdometryNoise(floor=(0.0, 0.0, 0.0))  # of the wheels within a turn of the lidar
 FARTHEST, LEVER = 1e3, 1.0  # [m] standard deviation, and per radian, of what a scan says nothing about
 LARGEST_JUMP = 0.5  # [m]; a correction beyond this is a mistake of the matching, not of the wheels
+SURE = 0.05, 0.03  # [m, rad]; a prediction that is less sure than this begins at several places
+FITS = 0.6  # share of the beams that the map explains, below which there may be a better place
+FOUND = 0.85  # share that it has to explain at another place
+ASTRAY = np.diag([0.15, 0.15, 0.06]) ** 2  # that a scan which does not fit adds to the covariance [m, m, rad]
+ABOUT = 0.3  # [m] of a match, within which a mean is that of its draws
+CERTAIN = 0.98  # share of the belief of a hypothesis that stands alone
 
 
 class Localiser:
@@ -42,7 +53,13 @@ class Localiser:
     """
 
     def __init__(
-        self, distance_map: DistanceMap, pose: Array, sigma: Array, beams: int, base: Base = unicycle.BASE
+        self,
+        distance_map: DistanceMap,
+        pose: Array,
+        sigma: Array,
+        beams: int,
+        base: Base = unicycle.BASE,
+        noise: odometry.OdometryNoise | None = None,
     ) -> None:
         """State the graph.
 
@@ -52,12 +69,15 @@ class Localiser:
             sigma: (3,) its standard deviations [m, m, rad].
             beams: number of beams in a scan.
             base: that the odometry is of.
+            noise: of the odometry; None for that of good wheels.
         """
         self.pose = np.asarray(pose, dtype=np.float64)
         self.covariance = self._held = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
         self.iterations, self.refused = 0, ""
+        self._believed: list[Hypothesis] = []
+        self._rng = np.random.default_rng(0)
         self._map, self._skew = distance_map, np.zeros((3, 3))
-        self._noise, self._base = odometry.OdometryNoise(), base
+        self._noise, self._base = noise or odometry.OdometryNoise(), base
         graph = fg.Graph()
         self._x = graph.variables("robot", fg.SE2, 1)
         self._prior = graph.data("predicted pose", np.zeros(3))
@@ -76,6 +96,11 @@ class Localiser:
         )
         self._run = GaussNewton(max_iterations=12, step_tolerance=1e-5).prepare(graph)
 
+    @property
+    def hypotheses(self) -> int:
+        """Number of poses that may be right."""
+        return max(1, len(self._believed))
+
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
         """Move by odometry (m,) since the last scan, None for none, and register a scan, if there is one."""
         if odometry is not None:
@@ -88,39 +113,78 @@ class Localiser:
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
-        self.pose = pose.copy()
+        self.pose, self._believed = pose.copy(), []
         self.covariance = self._held = np.diag(sigma**2)
 
     def predict(self, u: Array, dt: float) -> None:
-        """Move the estimate by the wheels' measured controls (m,)."""
+        """Move the estimate, and what else may be right, by the wheels' measured controls (m,)."""
+        moved = (
+            (odometry.predict(one.pose, one.covariance, u, dt, self._noise, self._base), one.weight)
+            for one in self._believed
+        )
+        self._believed = [Hypothesis(*predicted, weight) for predicted, weight in moved]
         self.covariance = odometry.predict(self.pose, self.covariance, u, dt, self._noise, self._base)[1]
         self.pose, self._held = odometry.predict(self.pose, self._held, u, dt, self._noise, self._base)
 
     def correct(self, scan: Scan) -> None:
         """Register a scan on the map; a scan that says too little leaves the prediction, and ``refused`` says so."""
-        seen = lidar.usable(scan.ranges)
         self.iterations, self.refused = 0, ""
-        if seen.sum() < FEWEST_BEAMS:
+        if lidar.usable(scan.ranges).sum() < FEWEST_BEAMS:
             self.refused = "too few beams"
             return
-        solution = self._run.solve(
-            {self._x: self.pose[None, :]},
-            data={
-                self._prior: self.pose,
-                self._information: np.linalg.inv(self._held),
-                self._beams: lidar.beam_endpoints(scan.ranges, scan.angles),
-                self._seen: seen,
-            },
-        )
-        self.iterations = solution.iterations
-        corrected = solution[self._x][0]
-        jump = float(np.hypot(*(corrected - self.pose)[:2]))
-        if not jump <= LARGEST_JUMP:
+        kept = self.pose, self.covariance, self._held
+        if self._believed or not self._is_sure():
+            self.spread_out(scan)
+            if explained(self._map, scan, self.pose).share >= FITS:
+                return
+            (self.pose, self.covariance, self._held), self._believed = kept, []
+        corrected, held = self._solve(scan, self.pose, self._held, lidar.DROP_BEYOND)
+        if not float(np.hypot(*(corrected - self.pose)[:2])) <= LARGEST_JUMP:
             self.refused = "it would move the estimate by more than the wheels can be wrong"
             return
-        seen_covariance = scan_covariance(self._map, scan, corrected) + self._skew
-        self.pose, self.covariance = corrected, least(self.covariance, seen_covariance)
-        self._held = solution.covariance(self._x)
+        if explained(self._map, scan, corrected).share < FITS:
+            self.spread_out(scan, [Hypothesis(self.pose, self.covariance + ASTRAY)])
+            if explained(self._map, scan, self.pose).share >= FOUND:
+                return
+            self._believed = []  # a map that is wrong fits somewhere a little better, too
+        seen = scan_covariance(self._map, scan, corrected) + self._skew
+        self.pose, self.covariance, self._held = corrected, least(kept[1], seen), held
+
+    def _is_sure(self) -> bool:
+        """Test whether a prediction is as good as one place to begin at."""
+        spread = float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1])
+        return spread <= SURE[0] ** 2 and float(self.covariance[2, 2]) <= SURE[1] ** 2
+
+    def _solve(self, scan: Scan, pose: Array, held: Array, reach: float) -> tuple[Array, Array]:
+        """Pose (3,) and covariance (3, 3) that a scan makes of a prediction."""
+        solution = self._run.solve(
+            {self._x: pose[None, :]},
+            data={
+                self._prior: pose,
+                self._information: np.linalg.inv(held),
+                self._beams: lidar.beam_endpoints(scan.ranges, scan.angles, reach),
+                self._seen: lidar.usable(scan.ranges, reach),
+            },
+        )
+        self.iterations += solution.iterations
+        return solution[self._x][0], solution.covariance(self._x)
+
+    def spread_out(self, scan: Scan, believed: Sequence[Hypothesis] = ()) -> None:
+        """Weigh draws from all that may be right, or from what is given, and register a scan where they gather."""
+        believed = believed or self._believed or [Hypothesis(self.pose, self.covariance)]
+        found = gathered(*weighed(self._map, scan, believed, self._rng))
+        better = []
+        for one in found:
+            pose = self._solve(scan, one.pose, one.covariance, REACH)[0]
+            better.append(replace(one, pose=pose, covariance=one.covariance + self._skew))
+        # The mean of draws about a match is nearer than the match, which leans on the kinks of the field.
+        again = gathered(*weighed(self._map, scan, better, self._rng))
+        for number, one in enumerate(better):
+            nearest = min(again, key=lambda other: float(np.hypot(*(other.pose - one.pose)[:2])))
+            if np.hypot(*(nearest.pose - one.pose)[:2]) < ABOUT:
+                better[number] = replace(one, pose=nearest.pose)
+        self.pose, self._held, self.covariance = better[0].pose, better[0].covariance, mixed(better)
+        self._believed = better if better[0].weight < CERTAIN * sum(one.weight for one in better) else []
 
 
 def deskewed(scan: Scan | None, velocity: Array) -> tuple[Scan | None, Array]:

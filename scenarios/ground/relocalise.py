@@ -21,7 +21,7 @@ from unifg.scenarios.perception.explaining import FARTHEST
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array
 
-__all__ = ["Found", "Relocaliser"]
+__all__ = ["Found", "Relocaliser", "nearest_fit"]
 
 SPACING = 0.2  # [m] between places
 FAN = 2.0 * np.pi * np.arange(48) / 48  # headings [rad]
@@ -35,6 +35,10 @@ END = 0.08  # [m] from a surface, within which a beam ends as it should
 PIERCED = 0.03  # [m] that a beam may be inside of a wall before its end
 ALONG = np.linspace(0.1, 0.95, 18)  # shares of a beam at which it is looked at
 BELIEVED = 0.82  # share of the beams that have to end and to pass as they should
+STEP, TURN = 0.1, 0.04  # [m], [rad] between poses where a neighbourhood is searched
+RIVAL = 0.35  # [m] from the best place, from where another is another
+ALIKE = 0.02  # [m] that beams may end worse at a place that is like the best
+FARTHER = 0.005  # [m] that a beam may end worse, per metre nearer to where the robot is believed to be
 CLEARLY = 0.1  # by which the next best place has to fit worse
 
 
@@ -143,11 +147,30 @@ def refine(distance_map: DistanceMap, scan: Scan, pose: Array) -> Array:
     return np.array([pose[0], pose[1], float(wrap_angle(pose[2]))])
 
 
-def _tips(scan: Scan) -> Array:
-    """(H, n, 2) ends of beams spread over the turn, for every heading of the fan, seen from the robot [m]."""
+def nearest_fit(distance_map: DistanceMap, scan: Scan, about: Array, reach: float, turn: float) -> tuple[Array, Array]:
+    """Pose (3,) that fits best within a reach [m] and a turn [rad] of another (3,), and the way to a rival (2,) [m].
+
+    The way is zero where beams end much farther from surfaces at every other place: in a corridor it leads along it.
+    """
+    side = np.linspace(-reach, reach, 2 * max(1, round(reach / STEP)) + 1)
+    fan = about[2] + np.linspace(-turn, turn, 2 * max(1, round(turn / TURN)) + 1)
+    places = np.ascontiguousarray(np.stack(np.meshgrid(side, side), axis=2).reshape(-1, 2) + about[:2])
+    best = np.empty((len(places), 2))
+    _try_all(distance_map.table, places, _tips(scan, fan), best)
+    # of places that fit alike, as along a corridor, the nearest
+    cost = best[:, 0] + FARTHER * np.hypot(*(places - about[:2]).T)
+    least = int(np.argmin(cost))
+    aside = places - places[least]
+    rival = int(np.argmin(np.where(np.hypot(*aside.T) > RIVAL, best[:, 0], np.inf)))
+    alike = best[rival, 0] < best[least, 0] + ALIKE
+    return np.array([*places[least], fan[int(best[least, 1])]]), aside[rival] if alike else np.zeros(2)
+
+
+def _tips(scan: Scan, fan: Array = FAN) -> Array:
+    """(H, n, 2) ends of beams spread over the turn, for every heading of a fan, seen from the robot [m]."""
     beams = scan.within(FARTHEST)
     chosen = beams[np.linspace(0, len(beams) - 1, min(BEAMS, len(beams))).round().astype(np.intp)]
-    angles, ranges = FAN[:, None] + scan.angles[chosen], scan.ranges[chosen]
+    angles, ranges = fan[:, None] + scan.angles[chosen], scan.ranges[chosen]
     return np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=2)
 
 

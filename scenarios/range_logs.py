@@ -1,0 +1,119 @@
+"""Logs of lasers on the command line: opened with what the user says of them, and what was made of one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from unifg.files.range_log import RangeLog, aligned, read_range_log
+from unifg.files.ros_map import OccupancyMap
+from unifg.lie import SE2, wrap_angle
+from unifg.models.odometry import OdometryNoise
+from unifg.typing import Array
+
+__all__ = ["WHEELS", "LogRun", "opened", "step_of"]
+
+WHEELS = OdometryNoise(0.1, 0.1, 0.04)  # of wheels that nobody has calibrated
+SCALE, NOISE = 0.05, 0.02  # of odometry that is made of corrected poses, as in `OdometryModel`
+
+
+@dataclass(frozen=True, eq=False)
+class LogRun:
+    """A log with the poses that were found, on a map.
+
+    Attributes:
+        log: that was read.
+        kind: "map" or "localise".
+        occupancy: the map, made or given.
+        poses: (n, 3) of the laser [m, m, rad].
+        share: (n,) of the beams of each scan that the map explains.
+        covariance: (n, 3, 3) of the poses in their tangent spaces; None where they are not known one by one.
+        hypotheses: (n,) that were held at each scan.
+        details: further numbers and words, for the metrics.
+        closures: (k, 2) positions of the poses that loop closures join.
+        verdict: on the map, in a sentence.
+        succeeded: whether the result is to be trusted.
+        interrupted: whether the user stopped it.
+        seconds: that it took.
+    """
+
+    log: RangeLog
+    kind: str
+    occupancy: OccupancyMap
+    poses: Array
+    share: Array
+    covariance: Array | None = None
+    hypotheses: Array = field(default_factory=lambda: np.zeros(0))
+    details: dict[str, Any] = field(default_factory=dict)
+    closures: Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.intp))
+    verdict: str = ""
+    succeeded: bool = True
+    interrupted: bool = False
+    seconds: float = 0.0
+
+    @property
+    def odometry(self) -> Array:
+        """(n, 3) the way of the wheels from the first pose that was found."""
+        start = self.log.odometry[: len(self.poses)]
+        return SE2.compose(self.poses[0], SE2.between(start[0], start))
+
+    @property
+    def errors(self) -> tuple[Array, Array] | None:
+        """(n, 3) of the poses against the corrected ones: as they are, and after alignment; None without these."""
+        if self.log.corrected is None:
+            return None
+        truth = self.log.corrected[: len(self.poses)]
+        return _off(self.poses, truth), _off(aligned(self.poses, truth), truth)
+
+    @property
+    def nees(self) -> Array:
+        """(n,) squared errors against the corrected poses, after alignment, by the covariances; empty without these."""
+        if self.covariance is None or self.log.corrected is None:
+            return np.zeros(0)
+        truth = self.log.corrected[: len(self.poses)]
+        off = SE2.local(aligned(self.poses, truth), truth)
+        found: Array = np.einsum("ni,ni->n", off, np.linalg.solve(self.covariance, off[:, :, None])[:, :, 0])
+        return found
+
+
+def opened(path: Path, mount: tuple[float, float, float] | None, simulated: bool, seed: int) -> RangeLog:
+    """A log as the user wants it.
+
+    Args:
+        path: of the file.
+        mount: pose of the laser on the robot that the odometry is of; None where it is the laser's.
+        simulated: whether odometry is made of the corrected poses, with errors of wheels.
+        seed: of these errors.
+
+    Raises:
+        FileFormatError: the file cannot be read.
+    """
+    log = read_range_log(path)
+    if mount is not None:
+        log = log.mounted(np.array(mount))
+    if not simulated:
+        return log
+    corrected = log.odometry if log.corrected is None else log.corrected
+    steps, rng = SE2.between(corrected[:-1], corrected[1:]), np.random.default_rng(seed)
+    scale = 1.0 + SCALE * rng.standard_normal(2)
+    told = steps * (scale[[0, 0, 1]] + NOISE * rng.standard_normal(steps.shape))
+    odometry = [corrected[0]]
+    for step in told:
+        odometry.append(SE2.compose(odometry[-1], step))
+    return replace(log, odometry=np.array(odometry), corrected=corrected)
+
+
+def step_of(log: RangeLog, begin: int, end: int) -> Array:
+    """(3,) motion by the wheels between two scans, as body velocities of one second [m/s, m/s, rad/s]."""
+    x, y, turn = SE2.between(log.odometry[begin], log.odometry[end]).tolist()
+    cosine, sine = math.cos(0.5 * turn), math.sin(0.5 * turn)
+    return np.array([cosine * x + sine * y, cosine * y - sine * x, turn])
+
+
+def _off(poses: Array, truth: Array) -> Array:
+    off = poses - truth
+    return np.column_stack([off[:, :2], wrap_angle(off[:, 2])])

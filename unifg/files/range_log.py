@@ -1,0 +1,192 @@
+"""Logs of a planar laser and of odometry, from whatever file holds them: CARMEN, CSV, MCAP and rosbag2.
+
+A CSV file is one table with a header. ``time`` [s], ``x``, ``y`` [m] and ``theta`` [rad] are the odometry;
+``corrected_x``, ``corrected_y`` and ``corrected_theta``, where a reference is known, the poses it says; every other
+column is a beam, and its name a number: its direction [rad]. A range that is empty, not a number, or not above zero
+is a beam that is lost; ``inf`` says that nothing was hit.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from unifg.errors import FileFormatError
+from unifg.files.carmen import CarmenLog, Odometry, Scans, read_carmen
+from unifg.files.contents import LIMITS, Limits, legible, read_text
+from unifg.files.rosbag import read_rosbag
+from unifg.lie import SE2, wrap_angle
+from unifg.typing import Array
+
+__all__ = ["RangeLog", "aligned", "read_range_log"]
+
+logger = logging.getLogger("unifg")
+
+POSE = ("x", "y", "theta")
+FIXED = 0.02  # [m, rad] by which the place of a laser on its robot may seem to change, as logs round
+PARTED = 1.0  # [m] between wheels and poses of scans, laid on each other, from where on the latter are corrected
+SLOWEST = 0.005  # [m/s]; who is slower counts time in thousandths
+AT_MOST = 0.99  # of the longest range
+OFTEN, PEAK = 0.005, 3.0  # share of the ranges there, and over those a little shorter, if it means that nothing was hit
+LONGEST = 10**6  # characters of a line, which has no blanks
+ROSBAGS = (".mcap", ".bag", ".db3")
+
+
+@dataclass(frozen=True, eq=False)
+class RangeLog:
+    """Scans of one laser, in the order of time.
+
+    Attributes:
+        name: of the file.
+        time: (n,) [s].
+        angles: (b,) directions of the beams in the frame of the laser, rising [rad].
+        ranges: (n, b) [m]; NaN for a beam that is lost, infinite where nothing was hit.
+        odometry: (n, 3) poses of the laser by the wheels [m, m, rad].
+        corrected: (n, 3) poses of the laser that the log takes for right; None where it says nothing of the kind.
+    """
+
+    name: str
+    time: Array
+    angles: Array
+    ranges: Array
+    odometry: Array
+    corrected: Array | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no log.
+
+        Raises:
+            FileFormatError: there are less than two scans, or a time or a pose is not finite.
+        """
+        numbers = np.column_stack([self.time, self.odometry, *([] if self.corrected is None else [self.corrected])])
+        if len(self.time) < 2 or not len(self.angles) or not np.isfinite(numbers).all():
+            raise FileFormatError(f"{self.name}: at least two scans with finite times and poses make a log")
+
+    def __len__(self) -> int:
+        """Number of scans."""
+        return len(self.time)
+
+    def mounted(self, pose: Array) -> RangeLog:
+        """The log of a laser at a pose (3,) on the robot whose odometry this is."""
+        return replace(self, odometry=SE2.compose(self.odometry, np.tile(pose, (len(self), 1))))
+
+
+def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
+    """Read a log: ``.csv``; MCAP, rosbag2 (a folder) and rosbag; anything else as CARMEN, gzipped or not.
+
+    Of several lasers, that with most scans is taken. Of a CARMEN log whose scans bear corrected poses, the odometry is
+    that of the robot, or of the ODOM lines where the robot's poses are corrected, too. Times in milliseconds or smaller
+    units become seconds. Without a stated maximum, the longest range means that nothing was hit where it is frequent.
+
+    Args:
+        path: the file.
+        limits: of what it may hold.
+
+    Raises:
+        FileFormatError: the file cannot be read.
+        ImportError: a package that reads it is not installed; the message names it.
+    """
+    path = Path(path)
+    if path.suffix == ".csv":
+        return _table(path, limits)
+    name = legible(path.name)
+    if path.is_dir() or path.suffix in ROSBAGS:
+        return _in_order(name, *read_rosbag(path), None)
+    log = read_carmen(path, limits=limits)
+    if not log.scans:
+        raise FileFormatError(f"{name}: there is no scan in this log")
+    scans = max(log.scans, key=len)
+    if len(log.scans) > 1:
+        logger.warning("%s: %d kinds of scans, of which %d of one kind are taken", name, len(log.scans), len(scans))
+    odometry, corrected = _poses(log, scans)
+    return _in_order(name, scans.time, scans.angles, scans.ranges, scans.maximum, odometry, corrected)
+
+
+def aligned(poses: Array, onto: Array) -> Array:
+    """Poses (n, 3) moved as one whole to where their places are nearest to others (n, 3), by least squares."""
+    middle, other = poses[:, :2].mean(axis=0), onto[:, :2].mean(axis=0)
+    product = (poses[:, :2] - middle).T @ (onto[:, :2] - other)
+    turn = float(np.arctan2(product[0, 1] - product[1, 0], product[0, 0] + product[1, 1]))
+    whole = np.array([*(other - SE2.act(np.array([0.0, 0.0, turn]), middle[None])[0]), turn])
+    return SE2.compose(whole, poses)
+
+
+def _poses(log: CarmenLog, scans: Scans) -> tuple[Array, Array | None]:
+    """Odometry of the laser (n, 3), and its corrected poses where these are."""
+    mounts = SE2.between(scans.robot, scans.pose)
+    off = mounts - mounts[0]
+    off[:, 2] = wrap_angle(off[:, 2])
+    if np.abs(off).max() > FIXED:
+        return scans.robot, scans.pose
+    if len(log.odometry.time) < 2:
+        return scans.pose, None
+    wheels = SE2.compose(_between_times(log.odometry, scans.time), mounts[0])
+    parted = float(np.abs(aligned(wheels, scans.pose) - scans.pose)[:, :2].max())
+    return (wheels, scans.pose) if parted > PARTED else (scans.pose, None)
+
+
+def _between_times(odometry: Odometry, time: Array) -> Array:
+    """Poses (n, 3) at some times (n,), straight between those that are known."""
+    order = np.argsort(odometry.time, kind="stable")
+    x, y, heading = odometry.pose[order].T
+    columns = (x, y, np.unwrap(heading))
+    return np.column_stack([np.interp(time, odometry.time[order], column) for column in columns])
+
+
+def _in_order(
+    name: str, time: Array, angles: Array, ranges: Array, maximum: float, odometry: Array, corrected: Array | None
+) -> RangeLog:
+    """The log in the order of time and of beams, in seconds, with readings that mean something."""
+    order, beams = np.argsort(time, kind="stable"), np.argsort(angles, kind="stable")
+    time, odometry, ranges = time[order], odometry[order], ranges[np.ix_(order, beams)]
+    corrected = None if corrected is None else corrected[order]
+    way, lasted = np.hypot(*np.diff(odometry[:, :2], axis=0).T).sum(), time[-1] - time[0] if len(time) else 0.0
+    unit = 1.0
+    while way > 1.0 and way < SLOWEST * lasted / unit:
+        unit *= 1e3
+    if unit > 1.0:
+        logger.warning("%s: nothing would move in these times: taken for units of 1/%g s", name, unit)
+    with np.errstate(invalid="ignore"):
+        ranges = np.where(ranges > 0.0, ranges, np.nan)  # NaN stays
+        seen = ranges[np.isfinite(ranges)]
+        top = maximum if np.isfinite(maximum) else seen.max(initial=0.0)
+        longest, shorter = (int((seen > share * top).sum()) for share in (AT_MOST, 2.0 * AT_MOST - 1.0))
+        if np.isfinite(maximum) or longest > max(OFTEN * len(seen), PEAK * (shorter - longest)):
+            ranges = np.where(ranges > AT_MOST * top, np.inf, ranges)
+    return RangeLog(name, time / unit, angles[beams], ranges, odometry, corrected)
+
+
+def _table(path: Path, limits: Limits) -> RangeLog:
+    """The log of a CSV file."""
+    name, lines = (
+        legible(path.name),
+        list(csv.reader(io.StringIO(read_text(path, replace(limits, digits=LONGEST)), newline=""))),
+    )
+    header = [word.strip() for word in lines[0]] if lines else []
+    beams = [k for k, word in enumerate(header) if _number(word) is not None]
+    if missing := [word for word in ("time", *POSE) if word not in header]:
+        raise FileFormatError(f"{name}: the header has no {', '.join(missing)}; it needs time, x, y, theta and beams")
+    rows = [line for line in lines[1:] if line]
+    values = np.empty((len(rows), len(header)))
+    for number, row in enumerate(rows):
+        found = [_number(word or "nan") for word in row]
+        if len(row) != len(header) or None in found:
+            raise FileFormatError(f"{name}: row {number + 1} is not {len(header)} numbers, as in the header")
+        values[number] = found
+    corrected = [f"corrected_{word}" for word in POSE]
+    columns = {word: k for k, word in enumerate(header)}
+    reference = values[:, [columns[word] for word in corrected]] if set(corrected) <= set(header) else None
+    angles, odometry = np.array([float(header[k]) for k in beams]), values[:, [columns[word] for word in POSE]]
+    return _in_order(name, values[:, columns["time"]], angles, values[:, beams], np.inf, odometry, reference)
+
+
+def _number(word: str) -> float | None:
+    try:
+        return float(word)
+    except ValueError:
+        return None

@@ -1,0 +1,127 @@
+"""Laser scans and odometry of ROS recordings, by the packages that read them.
+
+MCAP files are read by ``mcap`` with ``mcap-ros2-support``, folders of rosbag2 and rosbags of ROS 1 by ``rosbags``.
+Messages: ``sensor_msgs/LaserScan``, ``nav_msgs/Odometry`` and, for where the laser is on the robot,
+``tf2_msgs/TFMessage`` on the topic ``/tf_static``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from unifg.errors import FileFormatError
+from unifg.files.contents import legible
+from unifg.lie import SE2
+from unifg.typing import Array
+
+__all__ = ["Recorded", "read_rosbag"]
+
+SCAN, ODOMETRY, FRAMES = "LaserScan", "Odometry", "TFMessage"
+
+
+class Recorded(NamedTuple):
+    """Scans of one laser.
+
+    Attributes:
+        time: (n,) of their stamps [s].
+        angles: (b,) directions of the beams [rad].
+        ranges: (n, b) [m].
+        maximum: of a range [m].
+        odometry: (n, 3) poses of the laser by the wheels, interpolated [m, m, rad].
+    """
+
+    time: Array
+    angles: Array
+    ranges: Array
+    maximum: float
+    odometry: Array
+
+
+def read_rosbag(path: Path) -> Recorded:
+    """Read the topic with most scans, and the one with most odometry.
+
+    Raises:
+        FileFormatError: it cannot be read, or holds no scans or no odometry.
+        ImportError: the package that reads it is not installed.
+    """
+    name, topics, mounts = legible(path), dict[str, dict[str, list[Any]]](), dict[str, Array]()
+    try:
+        for topic, kind, message in _mcap(path) if path.suffix == ".mcap" else _bag(path):
+            if kind == FRAMES:
+                if topic.endswith("tf_static"):
+                    mounts |= {one.child_frame_id: _planar(one.transform) for one in message.transforms}
+            else:
+                topics.setdefault(kind, {}).setdefault(topic, []).append(message)
+    except (ImportError, MemoryError):
+        raise
+    except Exception as error:  # each of these packages lets out whatever its parts raise
+        raise FileFormatError(f"{name}: cannot be read ({type(error).__name__}: {error})") from error
+    if lacking := [kind for kind in (SCAN, ODOMETRY) if kind not in topics]:
+        raise FileFormatError(f"{name}: no message of the kind {' and '.join(lacking)}")
+    scans, wheels = (max(topics[kind].values(), key=len) for kind in (SCAN, ODOMETRY))
+    forms = Counter((len(scan.ranges), scan.angle_min, scan.angle_increment) for scan in scans)
+    (count, first, step), _ = forms.most_common(1)[0]
+    scans = [scan for scan in scans if len(scan.ranges) == count]
+    time, known = (np.array([_stamp(one) for one in messages]) for messages in (scans, wheels))
+    poses = np.array([_planar(one.pose.pose) for one in wheels])[np.argsort(known, kind="stable")]
+    columns = (*poses[:, :2].T, np.unwrap(poses[:, 2]))
+    at = np.column_stack([np.interp(time, np.sort(known), column) for column in columns])
+    mount = mounts.get(scans[0].header.frame_id, np.zeros(3))
+    ranges = np.array([scan.ranges for scan in scans], dtype=np.float64)
+    angles = first + step * np.arange(count, dtype=np.float64)
+    return Recorded(time, angles, ranges, float(scans[0].range_max), SE2.compose(at, mount))
+
+
+def _mcap(path: Path) -> Iterator[tuple[str, str, Any]]:
+    """Topic, kind and content of the messages of an MCAP file that are wanted."""
+    try:
+        from mcap.reader import make_reader
+        from mcap_ros2.decoder import DecoderFactory
+    except ImportError as error:
+        raise ImportError(f"reading {path.name} needs mcap and mcap-ros2-support: pip install 'unifg[logs]'") from error
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        summary: Any = reader.get_summary()
+        kinds = {one.topic: _kind(summary.schemas[one.schema_id].name) for one in summary.channels.values()}
+        wanted = [topic for topic, kind in kinds.items() if kind]
+        for _, channel, _, message in reader.iter_decoded_messages(topics=wanted):
+            yield channel.topic, kinds[channel.topic], message
+
+
+def _bag(path: Path) -> Iterator[tuple[str, str, Any]]:
+    """The same of a folder of rosbag2, or of a rosbag of ROS 1."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise ImportError(f"reading {path.name} needs rosbags: pip install 'unifg[logs]'") from error
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        wanted = [one for one in reader.connections if _kind(one.msgtype)]
+        for connection, _, raw in reader.messages(connections=wanted):
+            yield connection.topic, _kind(connection.msgtype), reader.deserialize(raw, connection.msgtype)
+
+
+def _kind(name: str) -> str:
+    """Last part of the name of a message that is wanted, or nothing."""
+    last = name.rpartition("/")[2]
+    return last if last in (SCAN, ODOMETRY, FRAMES) else ""
+
+
+def _stamp(message: Any) -> float:
+    """Time of a message [s]; ROS 1 and 2 and the packages name nanoseconds in two ways."""
+    stamp = message.header.stamp
+    return float(stamp.sec) + 1e-9 * float(getattr(stamp, "nanosec", 0) or getattr(stamp, "nsec", 0))
+
+
+def _planar(pose: Any) -> Array:
+    """(3,) x, y, heading of a pose or a transform in space."""
+    place = getattr(pose, "position", None) or pose.translation
+    turn = getattr(pose, "orientation", None) or pose.rotation
+    heading = math.atan2(2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2))
+    return np.array([place.x, place.y, heading])
