@@ -130,8 +130,7 @@ class Body:
             for turn in [np.linspace(0.0, 2.0 * np.pi, math.ceil(2.0 * np.pi * radius / spacing), endpoint=False)]
         ]
         points = np.concatenate(rings)
-        found: Array = points[self.gap(points) >= -INSIDE]
-        return found
+        return points[self.gap(points) >= -INSIDE]
 
 
 def _to_polygon(corners: Array, points: Array) -> Array:

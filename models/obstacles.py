@@ -99,8 +99,7 @@ def _short(d: float, numbers: Array) -> tuple[float, float]:
 
 
 def _shortfall(margin: float, d: Array) -> Array:
-    short: Array = np.maximum(margin - d, 0.0)
-    return short
+    return np.maximum(margin - d, 0.0)
 
 
 def shortfall(distance: Residual, margin: float) -> Residual:

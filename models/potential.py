@@ -56,8 +56,7 @@ def _repulsion(d: float, numbers: Array) -> tuple[float, float]:
 
 
 def _push(scale: float, near: float, far: float, d: Array) -> Array:
-    g: Array = scale * (1.0 / np.clip(d, near, far) - 1.0 / far)
-    return g
+    return scale * (1.0 / np.clip(d, near, far) - 1.0 / far)
 
 
 class _Search:

@@ -370,5 +370,4 @@ class _Alone:
 
 def _times(matrices: Array, vectors: Array) -> Array:
     """Matrix times vector, row by row."""
-    product: Array = (matrices @ vectors[..., None])[..., 0]
-    return product
+    return (matrices @ vectors[..., None])[..., 0]

@@ -146,5 +146,4 @@ SO2 = SO2Group()
 
 def wrap_angle(theta: ArrayLike, /) -> Array:
     """Bring angles of any shape [rad] into [-pi, pi), exactly: see :func:`wrap`."""
-    wrapped: Array = over_one(exp, 1, 1)(np.asarray(theta, dtype=np.float64)[..., None])[..., 0][()]
-    return wrapped
+    return over_one(exp, 1, 1)(np.asarray(theta, dtype=np.float64)[..., None])[..., 0][()]
