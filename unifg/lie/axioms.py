@@ -289,13 +289,6 @@ def _group_claims(g: LieGroup, x: Array, y: Array, z: Array, d: Array, units: Ar
     yield _Claim(
         "Jl^-1(d) Jl(d) = I", {"d": short}, lambda: (g.left_jacobian_inverse(short) @ g.left_jacobian(short), one)
     )
-    yield _Claim(
-        "bend(d, v) is the slope of Jr^-1(d) v",
-        {"d": short, "v": units},
-        lambda: (g.bend(short, units), slopes(lambda s: _times(g.right_jacobian_inverse(short + s), units))),
-        False,
-        SLOPES,
-    )
     if g.matrix_dim:
         yield _Claim("matrix(x y) = matrix(x) matrix(y)", xy, lambda: (g.matrix(product), g.matrix(x) @ g.matrix(y)))
         yield _Claim(

@@ -15,7 +15,7 @@ import numpy as np
 
 from unifg.codegen.fingerprint import is_compiled
 from unifg.errors import UnifgError
-from unifg.lie.defaults import RULES, STEP
+from unifg.lie.defaults import RULES
 from unifg.lie.elementwise import LAYOUTS, One, Two, method, stated
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -225,18 +225,6 @@ class LieGroup(ManifoldBase):
     def left_jacobian_inverse(self, d: ArrayLike, /) -> Array:
         """Return (..., dim, dim) ``Jl(d)^-1 = I - ad/2 + ad^2/12 - ...`` in closed form."""
         return self.right_jacobian_inverse(np.negative(d))
-
-    def bend(self, d: ArrayLike, v: ArrayLike, /) -> Array:
-        """Return (..., dim, dim) derivatives of ``Jr^-1(d) v`` along d, at a fixed v, by differences."""
-        d, v = np.broadcast_arrays(np.asarray(d, dtype=np.float64), np.asarray(v, dtype=np.float64))
-        steps = STEP * np.eye(self.dim)
-
-        def slope(times: float) -> Array:
-            ahead, behind = (self.right_jacobian_inverse(d[..., None, :] + s * times * steps) for s in (1.0, -1.0))
-            along: Array = ((ahead - behind) @ v[..., None, :, None])[..., 0]
-            return along / (2.0 * times * STEP)
-
-        return np.swapaxes((4.0 * slope(1.0) - slope(2.0)) / 3.0, -1, -2)
 
     def ad(self, d: ArrayLike, /) -> Array:
         """Return (..., dim, dim) small adjoints: ``Ad(Exp(d)) = expm(ad(d))``, ``ad(a) b = [a, b]``."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.lie.manifold import CompiledGroup
-from unifg.lie.series import c_value, k_slope, k_value, sinc, sinc_and_cos, x_cot_x
+from unifg.lie.series import c_value, k_value, sinc, sinc_and_cos, x_cot_x
 from unifg.lie.so2 import PI, wrap
 from unifg.typing import Array, ArrayLike
 
@@ -208,25 +208,6 @@ def right_jacobian_inverse(d: Array, out: Array) -> None:
     g = x_cot_x(half)
     k = omega * k_value(omega * omega, g)
     with_column(g, half, k * vx + 0.5 * vy, k * vy - 0.5 * vx, out)
-
-
-@compiled
-def bend(d: Array, v: Array, out: Array) -> None:
-    """Write the (3, 3) derivative of ``Jr^-1(d) v`` along d = (vx, vy, omega)."""
-    vx, vy, omega = d[0], d[1], d[2]
-    a, b, turn = v[0], v[1], v[2]
-    t = omega * omega
-    g = x_cot_x(0.5 * omega)
-    value, slope = k_value(t, g), k_slope(t, g)
-    k, k_rate = omega * value, value + t * slope  # of omega k
-    g_rate = -omega * (2.0 * value + t * slope)  # g = 1 - t k
-    out[0, 0] = k * turn
-    out[0, 1] = 0.5 * turn
-    out[0, 2] = g_rate * a - 0.5 * b + k_rate * vx * turn
-    out[1, 0] = -0.5 * turn
-    out[1, 1] = k * turn
-    out[1, 2] = 0.5 * a + g_rate * b + k_rate * vy * turn
-    out[2, 0] = out[2, 1] = out[2, 2] = 0.0
 
 
 class SE2Group(CompiledGroup, methods=globals()):

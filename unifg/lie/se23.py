@@ -142,19 +142,6 @@ def matrix(x: Array, out: Array) -> None:
     out[3, 4] = out[4, 3] = 0.0
 
 
-@compiled
-def bend(d: Array, v: Array, out: Array) -> None:
-    """Write the (9, 9) derivative of ``Jr^-1(d) v`` along d."""
-    part, along, first, second = local_vector(6), local_vector(6), local_matrix(6, 6), local_matrix(6, 6)
-    take(d, 0, part)
-    take(v, 0, along)
-    se3.bend(part, along, first)
-    take(d, 3, part)
-    take(v, 3, along)
-    se3.bend(part, along, second)
-    join_blocks(first, second, out)
-
-
 class ExtendedPoses(CompiledGroup, methods=globals()):
     """Position, velocity and orientation that turn as one; use the ready-made object ``SE23``.
 

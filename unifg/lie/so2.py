@@ -96,15 +96,8 @@ def unit(x: Array, out: Array) -> None:
     out[0, 0] = 1.0
 
 
-@compiled
-def straight(d: Array, v: Array, out: Array) -> None:
-    """Write zeros, (n, n): Jr^-1 = I does not change."""
-    out[:] = 0.0
-
-
 log, retract, local = exp, compose, between
 adjoint = right_jacobian = right_jacobian_inverse = unit
-bend = straight
 
 
 class SO2Group(CompiledGroup, methods=globals()):

@@ -23,7 +23,7 @@ from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
 from unifg.lie.elementwise import over_one
 from unifg.lie.manifold import CompiledGroup
-from unifg.lie.series import TINY, c_value, k_slope, k_value, x_cot_x
+from unifg.lie.series import TINY, c_value, k_value, x_cot_x
 from unifg.lie.so2 import wrap
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -217,33 +217,6 @@ def inverse_coefficient(wx: float, wy: float, wz: float) -> float:
 def right_jacobian_inverse(d: Array, out: Array) -> None:
     """Write Jr^-1, (3, 3); Sola eq. 144; singular at an angle of 2 pi."""
     write_polynomial(0.5, inverse_coefficient(d[0], d[1], d[2]), d[0], d[1], d[2], out, 0)
-
-
-@compiled
-def write_turn(k: float, slope: float, w: Array, y: Array, out: Array, row: int, column: int) -> None:
-    """Write D(w, y), (3, 3), as a block of ``out``."""
-    along = w[0] * y[0] + w[1] * y[1] + w[2] * y[2]
-    t = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    for i in range(3):
-        second = slope * (w[i] * along - t * y[i])
-        for j in range(3):
-            out[row + i, column + j] = k * (w[i] * y[j] - 2.0 * y[i] * w[j]) + second * w[j]
-        out[row + i, column + i] += k * along
-    x0, x1, x2 = 0.5 * y[0], 0.5 * y[1], 0.5 * y[2]
-    out[row, column + 1] += x2
-    out[row, column + 2] -= x1
-    out[row + 1, column] -= x2
-    out[row + 1, column + 2] += x0
-    out[row + 2, column] += x1
-    out[row + 2, column + 1] -= x0
-
-
-@compiled
-def bend(d: Array, v: Array, out: Array) -> None:
-    """Write the (3, 3) derivative of ``Jr^-1(d) v`` along d: D(d, v)."""
-    t = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-    g = x_cot_x(0.5 * math.sqrt(t))
-    write_turn(k_value(t, g), k_slope(t, g), d, v, out, 0, 0)
 
 
 @compiled
