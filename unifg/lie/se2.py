@@ -15,7 +15,7 @@ from unifg.codegen.jit import compiled
 from unifg.lie.manifold import CompiledGroup
 from unifg.lie.series import c_value, k_value, sinc, sinc_and_cos, x_cot_x
 from unifg.lie.so2 import PI, wrap
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array
 
 
 @compiled
@@ -223,29 +223,17 @@ class SE2Group(CompiledGroup, methods=globals()):
     dim = 3
     point_dim = 2
     matrix_dim = 3
+    generators = np.array(
+        [
+            [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+            [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]],
+            [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+        ]
+    )
 
     def identity(self) -> Array:
         """Return the (3,) zero pose."""
         return np.zeros(3)
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) Lie algebra matrices; Sola eq. 153."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 3, 3))
-        result[..., 1, 0] = d[..., 2]
-        result[..., 0, 1] = -d[..., 2]
-        result[..., :2, 2] = d[..., :2]
-        return result
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) small adjoints ``[omega [1]x, -[1]x v; 0, 0]``."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 3, 3))
-        result[..., 1, 0] = d[..., 2]
-        result[..., 0, 1] = -d[..., 2]
-        result[..., 0, 2] = d[..., 1]
-        result[..., 1, 2] = -d[..., 0]
-        return result
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 3) poses: standard normal positions, uniform headings."""

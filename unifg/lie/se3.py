@@ -243,6 +243,8 @@ class SE3Group(CompiledGroup, methods=globals()):
     dim = 6
     point_dim = 3
     matrix_dim = 4
+    generators = np.zeros((6, 4, 4))  # [[omega]x, v; 0, 0]; Sola eq. 169
+    generators[:3, :3, 3], generators[3:, :3, :3] = np.eye(3), SO3.generators
 
     # Constructors, and back.
 
@@ -310,22 +312,6 @@ class SE3Group(CompiledGroup, methods=globals()):
     def identity(self) -> Array:
         """Return (0, 0, 0, 1, 0, 0, 0)."""
         return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., 4, 4) Lie algebra matrices ``[[omega]x, v; 0, 0]``; Sola eq. 169."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 4, 4))
-        result[..., :3, :3] = SO3.hat(d[..., 3:])
-        result[..., :3, 3] = d[..., :3]
-        return result
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., 6, 6) small adjoints ``[[omega]x, [v]x; 0, [omega]x]``."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 6, 6))
-        result[..., :3, :3] = result[..., 3:, 3:] = SO3.hat(d[..., 3:])
-        result[..., :3, 3:] = SO3.hat(d[..., :3])
-        return result
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 7) poses: standard normal positions, uniform rotations."""

@@ -326,6 +326,13 @@ class SO3Group(CompiledGroup, methods=globals()):
     dim = 3
     point_dim = 3
     matrix_dim = 3
+    generators = np.array(
+        [
+            [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
+            [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]],
+            [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+        ]
+    )
 
     # Constructors, and back.
 
@@ -403,18 +410,6 @@ class SO3Group(CompiledGroup, methods=globals()):
     def identity(self) -> Array:
         """Return (1, 0, 0, 0)."""
         return np.array([1.0, 0.0, 0.0, 0.0])
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) skew-symmetric matrices: ``hat(a) b`` is the cross product."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 3, 3))
-        result[..., (2, 0, 1), (1, 2, 0)] = d
-        result[..., (1, 2, 0), (2, 0, 1)] = -d
-        return result
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) small adjoints: the same as :meth:`hat`."""
-        return self.hat(d)
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 4) rotations, uniform: the direction of four normal numbers."""
