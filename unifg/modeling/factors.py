@@ -159,49 +159,27 @@ def _vector_relative(v: Array, p: Array, table: Array, r: Array, J: Array) -> No
 # ---------------------------------------------------------------- any other manifold, evaluated by NumPy
 
 
-class _Batched:
-    """A picklable function of values on one manifold, with derivatives where it is a group."""
-
-    def __init__(self, manifold: Manifold) -> None:
-        self.manifold = manifold
-        self.derivative = self.jacobian if isinstance(manifold, LieGroup) else None
-
-    def after(self, tangent: Array, count: int) -> Array:
-        """(n, d, d) inverse right Jacobians (eq. 79)."""
-        assert isinstance(self.manifold, LieGroup)
-        dim = self.manifold.dim
-        return np.broadcast_to(self.manifold.right_jacobian_inverse(tangent), (count, dim, dim))
-
-    def jacobian(self, *arguments: Array) -> list[Array]:
-        raise NotImplementedError
+def _deviations(manifold: Manifold, x: Array, reference: Array) -> Array:
+    if isinstance(manifold, LieGroup):
+        return np.atleast_2d(manifold.log(manifold.between(reference, x)))
+    return np.atleast_2d(manifold.local(reference, x))
 
 
-def _logarithm(group: LieGroup, x: Array, reference: Array) -> Array:
-    return np.atleast_2d(group.log(group.between(reference, x)))
+def _deviation_slopes(group: LieGroup, x: Array, reference: Array) -> list[Array]:
+    after = group.right_jacobian_inverse(_deviations(group, x, reference))  # eq. 79
+    return [np.broadcast_to(after, (len(x), group.dim, group.dim))]
 
 
-class _Prior(_Batched):
-    def __call__(self, x: Array, reference: Array) -> Array:
-        if isinstance(self.manifold, LieGroup):
-            return _logarithm(self.manifold, x, reference)
-        return np.atleast_2d(self.manifold.local(reference, x))
-
-    def jacobian(self, *arguments: Array) -> list[Array]:
-        return [self.after(self(*arguments), len(arguments[0]))]
+def _relatives(manifold: Manifold, x: Array, y: Array, *measured: Array) -> Array:
+    if not isinstance(manifold, LieGroup):
+        return manifold.local(x, y)
+    seen = manifold.between(x, y)
+    return manifold.log(manifold.between(measured[0], seen) if measured else seen)
 
 
-class _Relative(_Batched):
-    def __call__(self, x: Array, y: Array, measured: Array | None = None) -> Array:
-        if not isinstance(self.manifold, LieGroup):
-            return self.manifold.local(x, y)
-        if measured is None:
-            return self.manifold.log(self.manifold.between(x, y))
-        return self.manifold.log(self.manifold.between(measured, self.manifold.between(x, y)))
-
-    def jacobian(self, *arguments: Array) -> list[Array]:
-        assert isinstance(self.manifold, LieGroup)
-        after = self.after(self(*arguments), len(arguments[0]))
-        return [-after @ self.manifold.adjoint(self.manifold.between(arguments[1], arguments[0])), after]
+def _relative_slopes(group: LieGroup, x: Array, y: Array, *measured: Array) -> list[Array]:
+    after = group.right_jacobian_inverse(_relatives(group, x, y, *measured))
+    return [-after @ group.adjoint(group.between(y, x)), after]
 
 
 @cache
@@ -211,7 +189,7 @@ def _complete(
     arguments: tuple[Any, ...],
     vectors: Callable[..., None],
     groups: Any,
-    batched: Any,
+    batched: tuple[Any, Any],
     second: bool = False,
 ) -> Residual:
     """The kernel for vectors, for groups with compiled functions, or the batched function for all others."""
@@ -222,15 +200,15 @@ def _complete(
     elif isinstance(manifold, LieGroup) and functions is not None:
         written = groups(manifold, functions)
         if second and all(isinstance(leaf, Rn) or leaf in GROUPS for leaf, _, _ in leaves(manifold)):
-            plain = partial(_logarithm, manifold)
+            plain = partial(_deviations, manifold)
             made = residual(_Deviation(plain, arguments, manifold.dim, name=name, written=written))
         else:
             made = residual(Kernel(written, arguments, manifold.dim, name=name))
     elif functions is not None and not isinstance(manifold, LieGroup):
         made = _by_differences(manifold, functions, name)
     else:
-        function = batched(manifold)
-        made = residual(function, function.derivative, name)
+        function, slopes = (partial(one, manifold) for one in batched)
+        made = residual(function, slopes if isinstance(manifold, LieGroup) else None, name)
     return replace(made, elements=tuple((place, manifold) for place in range(len(arguments))))
 
 
@@ -254,7 +232,7 @@ def _build_prior(manifold: Manifold) -> Residual:
         (manifold, (manifold.storage,)),
         _vector_deviation,
         _deviation,
-        _Prior,
+        (_deviations, _deviation_slopes),
         True,
     )
 
@@ -268,14 +246,13 @@ def _build_between(manifold: Manifold) -> Residual:
         (manifold, manifold, (manifold.storage,)),
         _vector_relative,
         _relative,
-        _Relative,
+        (_relatives, _relative_slopes),
     )
 
 
 def _build_difference(manifold: Manifold) -> Residual:
-    return _complete(
-        cast(Hashable, manifold), "difference", (manifold, manifold), _vector_relative, _relative, _Relative
-    )
+    batched = _relatives, _relative_slopes
+    return _complete(cast(Hashable, manifold), "difference", (manifold, manifold), _vector_relative, _relative, batched)
 
 
 _PRIOR = """Difference of a variable from what is believed about it: Log(reference^-1 x) on any manifold.
