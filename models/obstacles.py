@@ -102,6 +102,10 @@ def _shortfall(margin: float, d: Array) -> Array:
     return np.maximum(margin - d, 0.0)
 
 
+def _falling(margin: float, d: Array) -> Array:
+    return np.where(d < margin, -1.0, 0.0)
+
+
 def shortfall(distance: Residual, margin: float) -> Residual:
     """Turn a clearance into a soft margin: max(0, margin - distance), same shape, in metres.
 
@@ -109,4 +113,5 @@ def shortfall(distance: Residual, margin: float) -> Residual:
         distance: a clearance, such as ``disc_clearance``.
         margin: distance below which the cost begins [m]; its square is continuously differentiable there.
     """
-    return of_distance(distance, _short, [margin], f"{distance.name} margin", partial(_shortfall, margin))
+    plain = partial(_shortfall, margin), partial(_falling, margin)
+    return of_distance(distance, _short, [margin], f"{distance.name} margin", *plain)
