@@ -193,7 +193,7 @@ def test_drives_as_a_hard_constraint(form: Method) -> None:
 
 
 def test_unknown_form_is_refused_and_residuals_pickle() -> None:
-    with pytest.raises(fg.ModelError, match="'simplified trapezoid'.*found 'half'"):
+    with pytest.raises(fg.ModelError, match=r"'simplified trapezoid'.*found 'half'"):
         rkmk.integrator(fg.SE2, current, "half")  # type: ignore[arg-type]
     copy = pickle.loads(pickle.dumps(rkmk.integrator(fg.SE2, current)))
     assert np.isfinite(copy(START, CONTROL, START, 0.1)).all()
