@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,7 +13,7 @@ import unifg as fg
 from benchmarks import compiled_peers
 from benchmarks.casadi_peer import available
 from benchmarks.report import listing, words
-from benchmarks.timing import interleave, number
+from benchmarks.timing import clocked, interleave, number
 from problems.control import Formulated, Problem
 
 PEERS = ("ipopt", "fatrop", "fatrop, compiled")
@@ -90,12 +89,10 @@ def attempt(solver: fg.Solver, problem: Formulated) -> Callable[[Outcome], float
     run = solver.prepare(stated.graph)
 
     def solve(outcome: Outcome) -> float:
-        begin = time.thread_time()
-        solution = run.solve(stated.guess)
-        elapsed = 1e3 * (time.thread_time() - begin)
+        solution, seconds = clocked(run.solve, stated.guess)
         outcome.status = words(solution.status)
         outcome.iterations, outcome.cost = solution.iterations, solution.cost
-        return elapsed
+        return 1e3 * seconds
 
     return solve
 

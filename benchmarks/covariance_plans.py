@@ -19,6 +19,7 @@ import unifg as fg
 from benchmarks.comparison import Row, difference, interval, where
 from benchmarks.report import table
 from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from problems import belief_plans
 from problems.belief_plans import Guess, Plan
 
@@ -46,9 +47,8 @@ def attempt(seed: int, way: str) -> Row:
             return belief_plans.lagging(planner, guess, value, RESERVE)
         return planner.solve(guess, RESERVE, k=value)
 
-    begin = time.process_time()
-    plans = belief_plans.sweep(planner, solve, WAYS[way])
-    seconds = (time.process_time() - begin) / len(plans) / len(belief_plans.SIDES)
+    plans, spent = clocked(belief_plans.sweep, planner, solve, WAYS[way], by=time.process_time)
+    seconds = spent / len(plans) / len(belief_plans.SIDES)
     plans_found = []
     for setting, plan in zip(WAYS[way], plans, strict=True):
         measured: Row = {"setting": setting, "seconds": seconds}

@@ -22,6 +22,7 @@ from scipy.stats import binomtest
 from benchmarks.comparison import Row, share, where
 from benchmarks.report import listing, table, words
 from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from unifg.scenarios.course import (
     AVOIDANCES,
     HESSIANS,
@@ -115,9 +116,7 @@ def attempt(method: Method, layout: Layout) -> Outcome:
     graph, x, u = state_problem(settings, layout)
     run = backend(settings).prepare(graph)
     states, controls = course_guess(settings, layout)
-    begin = time.process_time()
-    solution = run.solve({x: states, u: controls})
-    elapsed = time.process_time() - begin
+    solution, elapsed = clocked(run.solve, {x: states, u: controls}, by=time.process_time)
     course = Course(settings, layout, solution, solution[x], solution[u], iterates=np.zeros((0, *states.shape)))
     return Outcome(
         words(solution.status),

@@ -9,7 +9,6 @@ weight 1e-9).
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -22,6 +21,7 @@ import unifg as fg
 from benchmarks.comparison import Row
 from benchmarks.report import table
 from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from problems.control import Stated, Unicycle
 from unifg.models import obstacles
 from unifg.models.potential import Sense, potential
@@ -131,9 +131,7 @@ def measure(seed: int, method: int, backend: str) -> Row:
     way = METHODS[method]
     field, stated = way.stated(seed)
     run = solvers(way.search)[backend].prepare(stated.graph)
-    begin = time.thread_time()
-    solution = run.solve(stated.guess)
-    elapsed = 1e3 * (time.thread_time() - begin)
+    solution, seconds = clocked(run.solve, stated.guess)
     states, (reference, _) = solution[stated.x], field.reference()
     error = potential(obstacles.disc_clearance)(states[1:], field.discs[:, :2], field.discs[:, 2])
     pushed = 0.0 if way.hard else 0.5 * float((error**2).sum()) / way.sigma**2
@@ -145,7 +143,7 @@ def measure(seed: int, method: int, backend: str) -> Row:
         "reached": float(np.linalg.norm(states[-1, :2] - reference[-1, :2])) < NEAR_END,
         "cost": solution.cost - pushed - given,
         "iterations": solution.iterations,
-        "milliseconds": elapsed,
+        "milliseconds": 1e3 * seconds,
     }
 
 

@@ -29,7 +29,7 @@ from benchmarks.own_functions import Way
 from benchmarks.pose_graphs import cases
 from benchmarks.report import CHECKOUT, machine, table, words
 from benchmarks.runner import Timing, Unavailable
-from benchmarks.timing import interleave, number, pin, ratio, shown
+from benchmarks.timing import clocked, interleave, number, pin, ratio, shown
 from problems.cart_pole import CartPole
 from problems.control import Driver, Problem, Quadrotor, Stated, Tick, Unicycle
 from unifg.solvers import SQP, InteriorPoint
@@ -105,9 +105,7 @@ class Ours:
 
     def __call__(self) -> float:
         """Solve; seconds."""
-        begin = thread_time()
-        solution = self._run.solve(self._guess)
-        spent = thread_time() - begin
+        solution, spent = clocked(self._run.solve, self._guess)
         self.status, self.iterations = words(solution.status), solution.iterations
         self.answer = [np.array(solution[family]) for family in self._guess]
         return spent
@@ -227,9 +225,7 @@ def compiled_share(problem: Problem, racer: Race) -> float:
     inside, call = list[float](), vars(method)["call"]
 
     def timed(*given: Any) -> None:
-        begin = thread_time()
-        call(*given)
-        inside.append(thread_time() - begin)
+        inside.append(clocked(call, *given)[1])
 
     def share(state: Array, index: int) -> Tick:
         inside.clear()

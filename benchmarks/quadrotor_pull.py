@@ -20,6 +20,7 @@ from benchmarks.comparison import Row, against, digits, where
 from benchmarks.quadrotor_flights import SOLVERS
 from benchmarks.report import listing
 from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from unifg.models import quadrotor
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.perception.belief import Belief, Landmarks
@@ -82,12 +83,10 @@ def fly(**cell: Any) -> Row:
     clearance, emergencies = np.inf, 0
     for _ in range(round(SECONDS / dt)):
         reading = world.sense()
-        begin = time.process_time()
-        plan = pilot.tick(reading, control)
-        spent = 1e3 * (time.process_time() - begin)
+        plan, spent = clocked(pilot.tick, reading, control, by=time.process_time)
         belief = pilot.belief
         alone = pilot.alone
-        ticks.append({**pulled(belief, alone), **errors(belief, world.state, flight, cylinders), "tick": spent})
+        ticks.append({**pulled(belief, alone), **errors(belief, world.state, flight, cylinders), "tick": 1e3 * spent})
         emergencies += plan.emergency
         control = plan.controls[0]
         world.step(control, dt)

@@ -22,6 +22,7 @@ from benchmarks.gtsam_peer import Peer, as_array, available
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.report import OUT, listing, shared
 from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from problems.closures import Claim, with_wrong_closures
 from unifg.factors.robust import Loss
 from unifg.files.g2o import read_g2o
@@ -120,9 +121,7 @@ def attempt(clean: PoseGraph, share: float, claim: Claim, seed: int, method: str
     right = GaussNewton().solve(graph, guess, check=True)[x]
     dirty, wrong = with_wrong_closures(clean, share, seed, claim)
     closures, place = ~dirty.edges.odometry, 2 if clean.group is SE2 else 3
-    begin = time.process_time()
-    found = METHODS[method](dirty)
-    seconds = time.process_time() - begin
+    found, seconds = clocked(METHODS[method], dirty, by=time.process_time)
     kept = dirty.with_poses(found.poses).squared_errors() <= THRESHOLD[clean.group.dim] ** 2
     good, bad = kept[closures & ~wrong], kept[wrong]
     return {
