@@ -40,9 +40,7 @@ def _bearing_range_second(v: Array, p: Array, table: Array, w: Array, S: Array) 
     """
     R = local_matrix(3, 3)
     so3.write_matrix(v[3], v[4], v[5], v[6], R, 0)
-    for i in range(11):
-        for k in range(11):
-            S[i, k] = 0.0
+    S[:] = 0.0
     dx, dy = v[10] - v[0], v[11] - v[1]
     square = dx * dx + dy * dy
     turn, pull = w[0] / (square * square), w[1] / (square * math.sqrt(square))

@@ -63,8 +63,7 @@ def unit(x: Array, out: Array) -> None:
 def matrix(x: Array, out: Array) -> None:
     """Write the (n + 1, n + 1) homogeneous translation."""
     unit(x, out)
-    for i in range(len(x)):
-        out[i, len(x)] = x[i]
+    out[:-1, -1] = x
 
 
 def _copies(group: Any, x: ArrayLike) -> Array:
