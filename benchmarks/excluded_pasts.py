@@ -102,9 +102,7 @@ def scanned(world: Orchard, chance: float, clutter: float, seed: int) -> Scans:
     rng = np.random.default_rng(seed)
     found, poses = [np.empty((0, 2))], list[int]()
     for k in range(0, STEPS + 1, EVERY):
-        x, y, theta = world.path[k]
-        turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-        places = (world.pillars - [x, y]) @ turn
+        places = SE2.act(SE2.inverse(world.path[k]), world.pillars)
         inside = places[np.hypot(*places.T) < REACH]
         seen = inside[rng.uniform(size=len(inside)) < chance]
         count = rng.poisson(clutter)
@@ -172,10 +170,7 @@ class Estimator:
     def _associated(self, path: Array) -> tuple[Array, Array, float]:
         """Pillar of each sighting (s, 2), whether it has one (s,), and what all this is worth beside the squares."""
         scans, pillars = self.scans, self.world.pillars
-        pose = path[scans.poses]
-        cosine, sine = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        ahead, aside = scans.sightings.T
-        places = pose[:, :2] + np.stack([cosine * ahead - sine * aside, sine * ahead + cosine * aside], axis=1)
+        places = SE2.act(path[scans.poses], scans.sightings)
         distance = np.linalg.norm(places[:, None] - pillars, axis=2)
         nearest = distance.argmin(axis=1)
         matched = distance[np.arange(len(nearest)), nearest] < GATE

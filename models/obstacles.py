@@ -42,11 +42,7 @@ def clearance_of(body: Body) -> Residual:
     table = [(x, y, less) for (x, y, _), less in zip(body.discs, body.smaller.tolist(), strict=True)]
 
     def of_body(x: Array, centre: Array, radius: Array) -> Array:
-        cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
-        rows = []
-        for across, aside, less in table:
-            p = np.stack([x[:, 0] + cosine * across - sine * aside, x[:, 1] + sine * across + cosine * aside], axis=1)
-            rows.append(to_balls(p, centre, radius) + less)
+        rows = [to_balls(SE2.act(x, np.array([[ahead, aside]])), centre, radius) + less for ahead, aside, less in table]
         return np.concatenate(rows, axis=1)
 
     def rows_of(centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
