@@ -120,17 +120,14 @@ def check_manifold(manifold: Manifold, *, reach: float = 3.0, count: int = 8, se
             claims = list(_claims(manifold, reach, count, np.random.default_rng(seed)))
         except Exception as error:  # whatever a user's method raises is what there is to report
             note = f"raises {type(error).__name__}: {error}"
-            return Axioms(manifold.name, ("identity, random and retract",), (_raised(note),))
+            raised = Breach("identity, random and retract can be called", np.nan, 0.0, {}, note)
+            return Axioms(manifold.name, ("identity, random and retract",), (raised,))
         for claim in claims:
             tried.append(claim.axiom)
             breach = _try(manifold, claim)
             if breach is not None and breach.axiom not in (known.axiom for known in breaches):
                 breaches.append(breach)
     return Axioms(manifold.name, tuple(dict.fromkeys(tried)), tuple(breaches))
-
-
-def _raised(note: str) -> Breach:
-    return Breach("identity, random and retract can be called", np.nan, 0.0, {}, note)
 
 
 def _try(manifold: Manifold, claim: _Claim) -> Breach | None:
