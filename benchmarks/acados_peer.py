@@ -11,7 +11,6 @@ import ctypes
 import io
 import os
 import sys
-import time
 from functools import cache
 from typing import Any
 
@@ -21,6 +20,7 @@ from scipy.linalg import block_diag
 from benchmarks.compiled_peers import FLAGS
 from benchmarks.control_peers import MODELS
 from benchmarks.report import OUT
+from benchmarks.timing import clocked
 from problems.control import Problem, Tick
 from unifg.typing import Array
 
@@ -154,9 +154,7 @@ class Acados:
                 solver.set(k, name, value)
             if k < n:
                 solver.cost_set(k, "yref", np.append(zero, cruise[k]))
-        begin = time.thread_time()
-        status = int(self._solve(solver.capsule))
-        spent = time.thread_time() - begin
+        status, spent = clocked(self._solve, solver.capsule)
         self.status, self.iterations = STATUS[status], int(solver.get_stats(self._counted)[-1])
         self.answer = [np.array([solver.get(k, name) for k in range(m)]) for name, m in (("x", n + 1), ("u", n))]
         return min(spent, float(solver.get_stats("time_tot")[0]))

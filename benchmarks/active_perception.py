@@ -10,7 +10,7 @@ intervals are bootstrapped over them.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -19,7 +19,7 @@ import unifg as fg
 from benchmarks.comparison import Row
 from benchmarks.covariance_plans import by_setting, counted, mean, plans_of
 from benchmarks.report import table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from problems import belief_plans
 from problems.belief_plans import SENSOR, Guess, Layout, Plan, Planner
 
@@ -47,14 +47,6 @@ TARGETS = (0.7, 0.5, 0.35)  # errors at the goal, rms [m]
 LONGER = (0.3, 1.0, 3.0)  # than the fastest plan [s]
 
 
-@dataclass(frozen=True)
-class Job:
-    """One layout, planned in one way."""
-
-    seed: int
-    way: str
-
-
 def dark(seed: int) -> Layout:
     """A way in the dark: few discs on it, and two beacons so far beside it that it hardly meets their light."""
     rng, among = np.random.default_rng(seed), belief_plans.layout(seed, DISCS)
@@ -62,11 +54,11 @@ def dark(seed: int) -> Layout:
     return Layout(among.discs, among.radii, beacons)
 
 
-def planned(job: Job) -> list[tuple[str, Plan | None]]:
+def planned(seed: int, way: str) -> list[tuple[str, Plan | None]]:
     """Plans of one way, by the words that name their settings."""
-    world = dark(job.seed)
-    if job.way != "rule":
-        planner = Planner(world, sensor=SENSOR if job.way == "in the cost" else CAUTIOUS)
+    world = dark(seed)
+    if way != "rule":
+        planner = Planner(world, sensor=SENSOR if way == "in the cost" else CAUTIOUS)
 
         def solve(guess: Guess | fg.Solution, weight: float) -> tuple[fg.Solution, Plan | None]:
             return planner.solve(guess, MARGIN, arrival=weight)
@@ -87,14 +79,14 @@ def planned(job: Job) -> list[tuple[str, Plan | None]]:
     return plans
 
 
-def attempt(job: Job) -> Row:
+def attempt(seed: int, way: str) -> Row:
     """Plan in one way, and drive all plans."""
-    world = dark(job.seed)
+    world = dark(seed)
     plans: list[Row] = []
-    for words, plan in planned(job):
+    for words, plan in planned(seed, way):
         if plan is None:
             continue
-        drives = belief_plans.drive(plan, world, DRIVES, job.seed)
+        drives = belief_plans.drive(plan, world, DRIVES, seed)
         plans.append(
             {
                 "setting": words,
@@ -159,9 +151,9 @@ def render(rows: Sequence[Row]) -> str:
     )
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every layout, planned in every way."""
-    return [Job(seed, way) for seed in seeds for way in WAYS]
+    return [{"seed": seed, "way": way} for seed in seeds for way in WAYS]
 
 
 STUDY = Study(cells, attempt, render, range(100, 110))

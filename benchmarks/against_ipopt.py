@@ -9,7 +9,6 @@ initial cost is the paper's. The hard form has the dynamics and the clearance as
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
@@ -25,7 +24,7 @@ from benchmarks.control_peers import unicycle_gap
 from benchmarks.printed import numbers
 from benchmarks.report import table, words
 from benchmarks.runner import Timing
-from benchmarks.timing import interleave, number
+from benchmarks.timing import clocked, interleave, number
 from unifg.models import obstacles, potential, unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
@@ -148,9 +147,8 @@ class Ours:
 
     def __call__(self) -> float:
         """Solve from the guess; processor time [s]."""
-        begin = time.thread_time()
-        self.solution = self.run.solve(self.guess)
-        return time.thread_time() - begin
+        self.solution, spent = clocked(self.run.solve, self.guess)
+        return spent
 
     @property
     def outcome(self) -> Outcome:
@@ -214,16 +212,15 @@ class Casadi:
         self.solver: Any = in_machine_code(solver, self.plugin, chosen) if self.compiled else solver
         free = np.tile([LIMIT, LIMIT, np.inf, np.inf, np.inf], STEPS)
         states, controls = instance.guess
-        self.call = {
+        self.call: dict[str, Any] = {
             "x0": np.hstack([controls, states[1:]]).ravel(), "p": instance.start, "lbx": -free, "ubx": free,
             "lbg": np.zeros(len(equality)), "ubg": np.where(equality, 0.0, np.inf) if equality else np.zeros(0),
         }  # fmt: skip
 
     def __call__(self) -> float:
         """Solve from the guess; processor time [s]."""
-        begin = time.thread_time()
-        self.found = self.solver(**self.call)
-        return time.thread_time() - begin
+        self.found, spent = clocked(self.solver, **self.call)
+        return spent
 
     @property
     def outcome(self) -> Outcome:

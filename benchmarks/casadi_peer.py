@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from benchmarks.timing import clocked
 from unifg.typing import Array
 
 Rows: TypeAlias = Sequence[Any]
@@ -102,9 +102,8 @@ class Staged:
 
     def again(self) -> float:
         """The last solve once more, when everything it needs is in the caches."""
-        begin = time.thread_time()
-        self.answer = self._solver(**self._call)
-        return 1e3 * (time.thread_time() - begin)
+        self.answer, seconds = clocked(self._solver, **self._call)
+        return 1e3 * seconds
 
     @property
     def status(self) -> str:

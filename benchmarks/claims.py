@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
 import unifg as fg
 from benchmarks.comparison import Row
 from benchmarks.report import listing
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
 from problems.twins import KINDS
 from variants import CONSTRAINED, EQUALITIES_ONLY
@@ -42,26 +42,17 @@ class Case:
 Mine: TypeAlias = list[tuple[Case, Answer]]
 
 
-@dataclass(frozen=True)
-class Job:
-    """One problem."""
-
-    kind: str
-    seed: int
-    equalities_only: bool
-
-
-def measure(job: Job) -> Case:
+def measure(kind: str, seed: int, equalities_only: bool) -> Case:
     """State a problem, solve it with everything."""
-    twin = KINDS[job.kind](job.seed, job.equalities_only)
+    twin = KINDS[kind](seed, equalities_only)
     judge = Judge(twin)
     apart = disagreement(twin, judge)
     if apart > AGREED:
         raise RuntimeError(f"{twin.name}: the graph and the casadi statement differ by {apart:.1e}")
-    backends = EQUALITY_BACKENDS if job.equalities_only else CONSTRAINED
+    backends = EQUALITY_BACKENDS if equalities_only else CONSTRAINED
     answers = {name: answer(backend, twin, judge) for name, backend in backends.items()}
     ipopt, fatrop = judge.ipopt(twin.guess, TOLERANCE), judge.fatrop(twin.guess, TOLERANCE)
-    return Case(job.kind, job.seed, job.equalities_only, answers, ipopt, fatrop)
+    return Case(kind, seed, equalities_only, answers, ipopt, fatrop)
 
 
 def summary(cases: list[Case], names: Iterable[str]) -> str:
@@ -129,9 +120,9 @@ def render(cases: list[Case]) -> str:
     return "\n\n".join(parts)
 
 
-def row(job: Job) -> Row:
+def row(**cell: Any) -> Row:
     """All answers to one problem, as the file holds them."""
-    return asdict(measure(job))
+    return asdict(measure(**cell))
 
 
 def restored(row: Row) -> Case:
@@ -141,10 +132,11 @@ def restored(row: Row) -> Case:
     return Case(row["kind"], row["seed"], row["equalities_only"], answers, Peer(**row["ipopt"]), fatrop)
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """A parking for every seed; of the other kinds five, with and without their inequalities."""
-    return [Job("parking", seed, False) for seed in seeds] + [
-        Job(kind, seed, equalities_only)
+    parkings: list[Cell] = [{"kind": "parking", "seed": seed, "equalities_only": False} for seed in seeds]
+    return parkings + [
+        {"kind": kind, "seed": seed, "equalities_only": equalities_only}
         for kind in KINDS if kind != "parking" for equalities_only in (False, True) for seed in seeds[:OTHERS]
     ]  # fmt: skip
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -14,8 +13,8 @@ import unifg as fg
 from benchmarks import compiled_peers
 from benchmarks.casadi_peer import available
 from benchmarks.report import listing, words
-from benchmarks.timing import interleave, number
-from problems.control import Formulated, Problem
+from benchmarks.timing import clocked, interleave, number
+from problems.control import Problem, Stated
 
 PEERS = ("ipopt", "fatrop", "fatrop, compiled")
 """The last one with its functions in machine code, the others in the virtual machine of casadi."""
@@ -84,18 +83,15 @@ Results: TypeAlias = Mapping[Problem, Outcomes]
 Told: TypeAlias = Callable[[Outcome], str]
 
 
-def attempt(solver: fg.Solver, problem: Formulated) -> Callable[[Outcome], float]:
+def attempt(solver: fg.Solver, stated: Stated) -> Callable[[Outcome], float]:
     """A cold solve by one of ours, the graph compiled before; its processor time [ms]."""
-    stated = problem.formulation()
     run = solver.prepare(stated.graph)
 
     def solve(outcome: Outcome) -> float:
-        begin = time.thread_time()
-        solution = run.solve(stated.guess)
-        elapsed = 1e3 * (time.thread_time() - begin)
+        solution, seconds = clocked(run.solve, stated.guess)
         outcome.status = words(solution.status)
         outcome.iterations, outcome.cost = solution.iterations, solution.cost
-        return elapsed
+        return 1e3 * seconds
 
     return solve
 
@@ -118,7 +114,7 @@ def attempt_peer(name: str, problem: Problem, tolerance: float) -> Callable[[Out
 
 def measure(problem: Problem, solvers: Mapping[str, fg.Solver], rules: Rules, rounds: int) -> Outcomes:
     """Solve a problem with every solver, ``rounds`` times after one that is not counted."""
-    attempts = {name: attempt(solver, problem) for name, solver in solvers.items()}
+    attempts = {name: attempt(solver, problem.formulation()) for name, solver in solvers.items()}
     attempts |= {name: attempt_peer(name, problem, rules.tolerance) for name in runnable(rules.peers)}
     outcomes = {name: Outcome(problem, name) for name in attempts}
     times = interleave(

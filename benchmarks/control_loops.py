@@ -80,7 +80,7 @@ def contestant(problem: Problem, name: str) -> Contestant:
     if name == SAFE:
         options = {"step_tolerance": np.inf, "violation_tolerance": CONTACT}
     solver = backend(short, tolerance=TOLERANCE, **options)
-    return Driver(problem, solver, penalties=how != "new penalties")
+    return Driver(problem.formulation(), solver, penalties=how != "new penalties")
 
 
 def drive(problem: Problem, ours: Sequence[str] = OURS, peers: tuple[str, ...] = PEERS) -> dict[str, Drive]:

@@ -6,7 +6,6 @@ CasADi with exact derivatives and MUMPS, and its default options.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +14,7 @@ from tqdm import tqdm
 
 from benchmarks.report import table, words
 from benchmarks.runner import Timing
-from benchmarks.timing import interleave, number, ratio
+from benchmarks.timing import clocked, interleave, number, ratio
 from problems.cops import LEFT_OUT, PROBLEMS, Problem, program
 from problems.scaled import Units, scaled
 from unifg.solvers import InteriorPoint
@@ -44,9 +43,7 @@ class Ours:
 
     def __call__(self) -> float:
         """Solve; processor time [s]."""
-        begin = time.thread_time()
-        solution = self._run.solve(self._guess)
-        spent = time.thread_time() - begin
+        solution, spent = clocked(self._run.solve, self._guess)
         self.status, self.iterations, self.cost = words(solution.status), solution.iterations, solution.cost
         self.iterations += solution.restoration_steps
         return spent
@@ -65,9 +62,7 @@ class Ipopt:
 
     def __call__(self) -> float:
         """Solve; processor time [s]."""
-        begin = time.thread_time()
-        found = self._solver(**self._call)
-        spent = time.thread_time() - begin
+        found, spent = clocked(self._solver, **self._call)
         stats = self._solver.stats()
         self.status = str(stats["return_status"]).replace("_", " ").lower()
         self.iterations, self.cost = int(stats["iter_count"]), float(found["f"])

@@ -12,8 +12,8 @@ from functools import partial
 from itertools import product
 
 from benchmarks.comparison import Read, Row, comparison, where
-from benchmarks.navigation import DEPARTMENT, Case, Drive, drive
-from benchmarks.runner import Study
+from benchmarks.navigation import DEPARTMENT, Case, drive
+from benchmarks.runner import Cell, Study
 
 VARIANTS = {
     "sequential": ("sequential", 1.0),
@@ -60,11 +60,14 @@ def render(rows: list[Row]) -> str:
     return "\n\n".join(parts)
 
 
-def cells(seeds: Sequence[int]) -> list[Drive]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every variant on every route."""
     routes = [name for name, case in ROUTES.items() if case.available]
     variants = product(seeds, SOLVERS, routes, VARIANTS.values())
-    return [Drive(route, solver, coupling, seed, weight) for seed, solver, route, (coupling, weight) in variants]
+    return [
+        {"case": route, "solver": solver, "coupling": coupling, "seed": seed, "weight": weight}
+        for seed, solver, route, (coupling, weight) in variants
+    ]
 
 
 STUDY = Study(cells, partial(drive, cases=ROUTES), render, range(50))

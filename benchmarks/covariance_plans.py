@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,8 @@ import pandas as pd
 import unifg as fg
 from benchmarks.comparison import Row, difference, interval, where
 from benchmarks.report import table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from problems import belief_plans
 from problems.belief_plans import Guess, Plan
 
@@ -35,34 +35,25 @@ DRIVES = 400  # of each plan
 TARGETS = (0.1, 0.05, 0.02)  # shares of drives that may touch something
 
 
-@dataclass(frozen=True)
-class Job:
-    """One layout and all settings of one way."""
-
-    seed: int
-    way: str
-
-
-def attempt(job: Job) -> Row:
+def attempt(seed: int, way: str) -> Row:
     """Plan with every setting, and drive; NaN where there is no plan."""
-    world = belief_plans.layout(job.seed)
-    planner = belief_plans.Planner(world, foresees=job.way == "in the graph")
+    world = belief_plans.layout(seed)
+    planner = belief_plans.Planner(world, foresees=way == "in the graph")
 
     def solve(guess: Guess | fg.Solution, value: float) -> tuple[fg.Solution, Plan | None]:
-        if job.way == "margin":
+        if way == "margin":
             return planner.solve(guess, value)
-        if job.way == "lagging":
+        if way == "lagging":
             return belief_plans.lagging(planner, guess, value, RESERVE)
         return planner.solve(guess, RESERVE, k=value)
 
-    begin = time.process_time()
-    plans = belief_plans.sweep(planner, solve, WAYS[job.way])
-    seconds = (time.process_time() - begin) / len(plans) / len(belief_plans.SIDES)
+    plans, spent = clocked(belief_plans.sweep, planner, solve, WAYS[way], by=time.process_time)
+    seconds = spent / len(plans) / len(belief_plans.SIDES)
     plans_found = []
-    for setting, plan in zip(WAYS[job.way], plans, strict=True):
+    for setting, plan in zip(WAYS[way], plans, strict=True):
         measured: Row = {"setting": setting, "seconds": seconds}
         if plan is not None:
-            drives = belief_plans.drive(plan, world, DRIVES, job.seed)
+            drives = belief_plans.drive(plan, world, DRIVES, seed)
             measured |= {
                 "time": plan.duration,
                 "collisions": drives.collisions,
@@ -156,9 +147,9 @@ def hindsight(plans: pd.DataFrame, target: float) -> dict[str, pd.Series[float]]
     return {str(way): found.droplevel("way") for way, found in times.groupby("way")}
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every layout, planned in every way."""
-    return [Job(seed, way) for seed in seeds for way in WAYS]
+    return [{"seed": seed, "way": way} for seed in seeds for way in WAYS]
 
 
 STUDY = Study(cells, attempt, render, range(12))

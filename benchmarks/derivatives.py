@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import unifg as fg
 from benchmarks.report import table
 from benchmarks.runner import Timing
-from benchmarks.timing import number
+from benchmarks.timing import clocked, number
 from problems.control import Problem, problems, sixteen
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
@@ -26,9 +25,7 @@ def spent(rounds: int, call: Callable[[], Any], before: Callable[[], Any] = lamb
     found = []
     for _ in range(rounds):
         before()
-        begin = time.thread_time()
-        call()
-        found.append(time.thread_time() - begin)
+        found.append(clocked(call)[1])
     return 1e6 * min(found)
 
 

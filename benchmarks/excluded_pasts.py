@@ -8,7 +8,6 @@ estimated with and without what is impossible. Layouts are the random effect: in
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ import unifg as fg
 from benchmarks import impossible_states
 from benchmarks.comparison import Row, bracketed, where
 from benchmarks.report import table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.lie import SE2
 from unifg.models import landmarks, obstacles
 from unifg.solvers import GaussNewton, InteriorPoint
@@ -103,9 +102,7 @@ def scanned(world: Orchard, chance: float, clutter: float, seed: int) -> Scans:
     rng = np.random.default_rng(seed)
     found, poses = [np.empty((0, 2))], list[int]()
     for k in range(0, STEPS + 1, EVERY):
-        x, y, theta = world.path[k]
-        turn = np.array([[np.cos(theta), -np.sin(theta)], [np.sin(theta), np.cos(theta)]])
-        places = (world.pillars - [x, y]) @ turn
+        places = SE2.act(SE2.inverse(world.path[k]), world.pillars)
         inside = places[np.hypot(*places.T) < REACH]
         seen = inside[rng.uniform(size=len(inside)) < chance]
         count = rng.poisson(clutter)
@@ -173,10 +170,7 @@ class Estimator:
     def _associated(self, path: Array) -> tuple[Array, Array, float]:
         """Pillar of each sighting (s, 2), whether it has one (s,), and what all this is worth beside the squares."""
         scans, pillars = self.scans, self.world.pillars
-        pose = path[scans.poses]
-        cosine, sine = np.cos(pose[:, 2]), np.sin(pose[:, 2])
-        ahead, aside = scans.sightings.T
-        places = pose[:, :2] + np.stack([cosine * ahead - sine * aside, sine * ahead + cosine * aside], axis=1)
+        places = SE2.act(path[scans.poses], scans.sightings)
         distance = np.linalg.norm(places[:, None] - pillars, axis=2)
         nearest = distance.argmin(axis=1)
         matched = distance[np.arange(len(nearest)), nearest] < GATE
@@ -226,22 +220,14 @@ def explained(world: Orchard, scans: Scans, chance: float, clutter: float) -> di
     return {name: min(some, key=lambda found: found[0])[1] for name, some in chosen.items()}
 
 
-@dataclass(frozen=True)
-class Job:
-    """One layout and one condition, of the orchard or of one of the simple pasts."""
-
-    seed: int
-    study: str
-
-
-def attempt(job: Job) -> Row:
+def attempt(seed: int, study: str) -> Row:
     """Share of drives that were placed wrong, and their errors, by method."""
-    if job.study in impossible_states.STUDIES:
-        return {"errors": impossible_states.STUDIES[job.study](job.seed, 4 * DRIVES)}
-    world, errors = orchard(job.seed), dict[str, list[float]]()
-    chance, clutter = CONDITIONS[job.study]
+    if study in impossible_states.STUDIES:
+        return {"errors": impossible_states.STUDIES[study](seed, 4 * DRIVES)}
+    world, errors = orchard(seed), dict[str, list[float]]()
+    chance, clutter = CONDITIONS[study]
     for k in range(DRIVES):
-        scans = scanned(world, chance, clutter, 1000 * job.seed + k)
+        scans = scanned(world, chance, clutter, 1000 * seed + k)
         for name, path in explained(world, scans, chance, clutter).items():
             off = np.hypot(*(path - world.path)[:, :2].T)
             errors.setdefault(name, []).append(float(off[-1]))
@@ -295,9 +281,10 @@ def render(rows: list[Row]) -> str:
     return "\n\n".join(parts)
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every layout under every condition."""
-    return [Job(seed, study) for seed in seeds for study in [*CONDITIONS, *impossible_states.STUDIES]]
+    studies = *CONDITIONS, *impossible_states.STUDIES
+    return [{"seed": seed, "study": study} for seed in seeds for study in studies]
 
 
 STUDY = Study(cells, attempt, render, range(12))

@@ -13,7 +13,7 @@ import numpy as np
 import unifg as fg
 from benchmarks.report import table
 from benchmarks.runner import Timing
-from benchmarks.timing import number
+from benchmarks.timing import clocked, number
 from problems.around_a_disc import around_a_disc
 from problems.control import Problem, Quadrotor
 from unifg.solvers import InteriorPoint
@@ -56,9 +56,7 @@ def measure(case: Problem | None, rounds: int) -> tuple[str, ...]:
         data = each[place[1]]
         numbers = np.concatenate([np.ravel(data.get(handle, handle.value)) for handle in handles])
         given = [ctypes.c_void_p(array.ctypes.data) for array in (numbers, *arrays)]
-        begin = time.perf_counter()
-        call(*given)
-        in_c[place] = time.perf_counter() - begin
+        _, in_c[place] = clocked(call, *given, by=time.perf_counter)
         found = prepared.solve(guess, data=data)
         if not np.array_equal(
             arrays[2], np.concatenate([found[family].ravel() for family in prepared.program.families])

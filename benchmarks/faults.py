@@ -11,12 +11,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 from benchmarks.comparison import Row
 from benchmarks.report import table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.flight_log import FlightLog
@@ -37,34 +37,24 @@ REACTION = 2  # ticks: the one in which something is felt, and the one that answ
 START, GOAL = (6.5, 14.0, 0.0), (13.5, 14.1, 0.0)
 
 
-@dataclass(frozen=True)
-class Case:
-    """One episode with one fault."""
-
-    robot: str
-    fault: str
-    duration: float
-    seed: int
-
-
-def episode(case: Case) -> Row:
+def episode(robot: str, fault: str, duration: float, seed: int) -> Row:
     """Run one; an exception is what is looked for, and kept."""
-    fault = Fault(case.fault, BEGIN[case.robot], case.duration)
+    faults = (Fault(fault, BEGIN[robot], duration),)
     braked: float | None = None
     try:
-        if case.robot == "drive":
-            drive = NavigationSettings(start=START, goals=(GOAL,), obstacles=1, seed=case.seed, faults=(fault,))
+        if robot == "drive":
+            drive = NavigationSettings(start=START, goals=(GOAL,), obstacles=1, seed=seed, faults=faults)
             log = run_navigation(drive)
             m = episode_metrics(log)
             said = [k for k, health in enumerate(log.health) if health != "ok"]
             outcome, first = log.outcomes[0], float(log.time[said[0]]) if said else None
         else:
-            flight = run_flight(FlightSettings(seed=case.seed, time_limit=30.0, faults=(fault,)))
+            flight = run_flight(FlightSettings(seed=seed, time_limit=30.0, faults=faults))
             m = flight_metrics(flight)
             said = [k for k, health in enumerate(flight.health) if health != "ok"]
             outcome, first = flight.outcome, float(flight.time[said[0]]) if said else None
             if m["collisions"]:
-                braked = stopped_clear(case, flight)
+                braked = stopped_clear(fault, duration, seed, flight)
     except Exception as error:
         return {"raised": f"{type(error).__name__}: {error}"}
     return {
@@ -74,29 +64,29 @@ def episode(case: Case) -> Row:
     }  # fmt: skip
 
 
-def stopped_clear(case: Case, log: FlightLog) -> float:
+def stopped_clear(fault: str, duration: float, seed: int, log: FlightLog) -> float:
     """Least clearance [m] of the vehicle of a flight that brakes as well as can be, over the time of the fault."""
-    settings = FlightSettings(seed=case.seed)
+    settings = FlightSettings(seed=seed)
     begin = round(BEGIN["flight"] / log.dt)
-    true = draw_conditions(case.seed, settings.mass_error).true
-    gust = GUST if case.fault == "gust" else 0.0
+    true = draw_conditions(seed, settings.mass_error).true
+    gust = GUST if fault == "gust" else 0.0
     true = replace(true, wind=(true.wind[0], true.wind[1] + gust))
-    world = QuadrotorWorld(log.layout, case.seed, true, start=log.truth[begin], disturbance=DisturbanceModel.calm())
+    world = QuadrotorWorld(log.layout, seed, true, start=log.truth[begin], disturbance=DisturbanceModel.calm())
     box, clearance = settings.controller.box, world.clearance()
-    for tick in range(round(min(case.duration, GUST_TIMES[-1]) / log.dt)):
+    for tick in range(round(min(duration, GUST_TIMES[-1]) / log.dt)):
         braking = braking_control(world.state, true, *box)
         world.step(log.controls[begin + tick] if tick < REACTION else braking, log.dt)
         clearance = min(clearance, world.clearance())
     return clearance
 
 
-def cases(seeds: Iterable[int]) -> list[Case]:
+def cases(seeds: Iterable[int]) -> list[Cell]:
     """All of them."""
-    found = []
+    found = list[Cell]()
     for robot, faults in ROBOTS.items():
         for fault, seed in product(faults, seeds):
             times = GUST_TIMES if fault == "gust" else DURATIONS
-            found += [Case(robot, fault, time, seed) for time in times]
+            found += [{"robot": robot, "fault": fault, "duration": time, "seed": seed} for time in times]
     return found
 
 

@@ -12,12 +12,11 @@ import shutil
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.comparison import Row
 from benchmarks.report import CHECKOUT, table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.codegen.cache_folder import VARIABLE
 
 SOURCES = "from pathlib import Path\nfrom unifg.codegen import precompiled\nprecompiled.ARCHIVE = Path('none')\n"
@@ -27,32 +26,21 @@ REPEATS = 3  # of imports, the least of which counts
 COLUMNS = ("first", "second", "from sources", "import numpy, numba", "import unifg", "demo")
 
 
-@dataclass(frozen=True)
-class Cell:
-    """A Python.
-
-    Attributes:
-        python: path of the interpreter.
-    """
-
-    python: str
-
-
 def cells(seeds: Sequence[int]) -> Iterator[Cell]:
     """The Pythons of this machine that run."""
     named = filter(None, os.environ.get("PYTHONS", "").split(":"))
     on_path = filter(None, (shutil.which(f"python3.{minor}") for minor in range(11, 20)))
     for python in dict.fromkeys([*named, *on_path]):
         if subprocess.run([python, "-c", ""], capture_output=True, check=False).returncode == 0:
-            yield Cell(python)
+            yield {"python": python}
 
 
-def measure(cell: Cell) -> Row:
+def measure(python: str) -> Row:
     """Processor times [s] in a new environment."""
     example = (CHECKOUT / "README.md").read_text(encoding="utf-8").split("```python")[1].split("```")[0]
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
-        subprocess.run([cell.python, "-m", "venv", place / "env"], check=True)
+        subprocess.run([python, "-m", "venv", place / "env"], check=True)
         python = str(place / "env" / "bin" / "python")
         install = ["-m", "pip", "--quiet", "--disable-pip-version-check", "install", f"{CHECKOUT}[scenarios]"]
         subprocess.run([python, *install], check=True)

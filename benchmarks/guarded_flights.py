@@ -16,6 +16,7 @@ import numpy as np
 import unifg as fg
 from benchmarks.report import listing, words
 from benchmarks.runner import Timing
+from benchmarks.timing import clocked
 from problems.guarded_flight import PACE, START, VEHICLE, GuardedFlight, figure_eight, gust
 from unifg.models import keeping, quadrotor
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
@@ -69,16 +70,14 @@ def fly(case: GuardedFlight, solver: fg.Solver, ticks: int) -> Flight:
     for tick in range(-WARM, ticks):
         now = (tick + WARM) * case.tick
         data = case.data(state, now)
-        started = time.thread_time()
-        solution = run.solve(plan if age == 0 else plan.values, data=data)
-        taken = 1e3 * (time.thread_time() - started)
+        solution, taken = clocked(run.solve, plan if age == 0 else plan.values, data=data)
         before = case.clearance(state[None])[0]
         plan, age = (solution, 0) if solution.violation < KEPT else (plan, age + 1)
         interval = min(int(np.searchsorted(case.times, (age + 0.5) * case.tick)), case.intervals) - 1
         state = quadrotor.fly(state, plan[case.u][interval], case.tick, VEHICLE, gust(now), substeps=2)
         after = case.clearance(state[None])[0]
         if tick >= 0:
-            seen.add(case, solution, taken)
+            seen.add(case, solution, 1e3 * taken)
             seen.without += age > 0
             seen.clearance.append(after)
             seen.lost.append(np.exp(-case.alpha * case.tick) * before - after)

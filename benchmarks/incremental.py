@@ -9,7 +9,6 @@ a shared machine only ever makes things slower.
 from __future__ import annotations
 
 import gc
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
@@ -20,7 +19,7 @@ import unifg as fg
 from benchmarks.gtsam_peer import as_array, available
 from benchmarks.report import listing, shared
 from benchmarks.runner import Timing
-from benchmarks.timing import interleave
+from benchmarks.timing import clock, interleave
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import PoseGraph, manhattan
 from unifg.pose_graphs.pose_graph import Edges
@@ -146,11 +145,8 @@ def drive(graph: PoseGraph, make: Callable[[], Fed], lag: float, optimum: Array 
     update, state, errors = np.zeros(count), np.zeros(count), []
     for k, pose, edges in one_by_one(graph, lag):
         smoother.guess(k, pose)
-        start = time.process_time()
-        smoother.state(k, edges)
-        begin = time.process_time()
-        smoother.update()
-        update[k], state[k] = time.process_time() - begin, begin - start
+        state[k] = clock(partial(smoother.state, k, edges))
+        update[k] = clock(smoother.update)
         if optimum is not None and k % SPAN == SPAN - 1:
             first = k - int(min(SPAN, lag)) + 2  # GTSAM has dropped the one before
             errors.append(_error(optimum, first, k, *smoother.poses(first, k)))

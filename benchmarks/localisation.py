@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import TypeAlias
 from unittest import mock
@@ -22,7 +22,7 @@ from benchmarks.comparison import Row, difference, where
 from benchmarks.printed import texts
 from benchmarks.report import listing, shared
 from benchmarks.routes import drawn
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.files.carmen import read_carmen
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2, wrap_angle
@@ -63,13 +63,6 @@ VARIANTS = {
     "AMCL, recovery": RECOVERING,
     "AMCL, wheels trusted": MonteCarloSettings(noise=(0.01, 0.01, 0.01, 0.01)),
 }
-
-
-@dataclass(frozen=True)
-class Drive:
-    """One recording, and all that is done with it; seed -1 stands for the real log."""
-
-    seed: int
 
 
 def distances(occupancy: OccupancyMap) -> DistanceMap:
@@ -140,12 +133,12 @@ def rearranged(occupancy: OccupancyMap, share: float, rng: np.random.Generator) 
     return replace(occupancy, occupied=occupied, free=occupancy.free & ~occupied)
 
 
-def measure(job: Drive) -> Row:
-    """All conditions of one recording."""
-    if job.seed < 0:
+def measure(seed: int) -> Row:
+    """All conditions of one recording; seed -1 stands for the real log."""
+    if seed < 0:
         return {"results": real_log()}
-    occupancy, ticks = recorded(job.seed)
-    rng = np.random.default_rng([job.seed, 3])
+    occupancy, ticks = recorded(seed)
+    rng = np.random.default_rng([seed, 3])
     truth, sigma = ticks[0][2], np.array(INITIAL_SIGMA)
     first = ticks[0][0]
     assert first is not None
@@ -155,7 +148,7 @@ def measure(job: Drive) -> Row:
         condition: str, names: Sequence[str], given: OccupancyMap, pose: Array, how: Array, part: list[Tick]
     ) -> None:
         for name in names:
-            estimator = made(name, given, pose, how, beams, job.seed)
+            estimator = made(name, given, pose, how, beams, seed)
             if condition == UNKNOWN:
                 assert isinstance(estimator, MonteCarlo)
                 estimator.everywhere()
@@ -282,9 +275,9 @@ def paired(drives: Sequence[Row]) -> str:
     return " ".join(said)
 
 
-def cells(seeds: Sequence[int]) -> list[Drive]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Recordings, and the real log."""
-    return [*map(Drive, seeds), Drive(-1)]
+    return [{"seed": seed} for seed in (*seeds, -1)]
 
 
 STUDY = Study(cells, measure, render, range(200, 204))

@@ -10,7 +10,7 @@ import numpy as np
 import unifg as fg
 from benchmarks.report import table
 from benchmarks.runner import Timing
-from benchmarks.timing import all_cores, interleave, number, ratio
+from benchmarks.timing import all_cores, clocked, interleave, number, ratio
 from problems.control import Problem, Quadrotor, Unicycle
 from unifg.solvers import InteriorPoint
 
@@ -29,16 +29,13 @@ def measure(case: Problem, rounds: int, count: int = COUNT) -> tuple[str, ...]:
     compiled = []
 
     def loop() -> float:
-        begin = time.process_time()
-        found = [prepared.solve(stated.guess, data=one) for one in each]
-        spent = time.process_time() - begin
+        found, spent = clocked(lambda: [prepared.solve(stated.guess, data=one) for one in each], by=time.process_time)
         compiled.append(sum(part for one in found for name, part in one.times.items() if name != "Python"))
         return spent
 
     def many(threads: int) -> float:
-        begin = time.process_time() if threads == 1 else time.perf_counter()
-        prepared.solve_many(stated.guess, data=data, threads=threads)
-        return (time.process_time() if threads == 1 else time.perf_counter()) - begin
+        by = time.process_time if threads == 1 else time.perf_counter
+        return clocked(prepared.solve_many, stated.guess, data=data, threads=threads, by=by)[1]
 
     spent = interleave({"loop": loop, "many": partial(many, 1)}, rounds)
     with all_cores():

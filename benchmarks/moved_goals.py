@@ -19,7 +19,7 @@ from benchmarks.casadi_peer import available
 from benchmarks.comparison import Row
 from benchmarks.obstacle_fields import Field
 from benchmarks.report import table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.horizon import Context, ControlCost, Dynamics, InitialGuesses, RecedingHorizon, Robot, Term, cheapest
 from unifg.models import obstacles, unicycle
 from unifg.models.detours import detours, headed
@@ -159,16 +159,9 @@ def drive(field: Moving, step: Callable[[Array, Array, int], tuple[float, Array]
     return planned, driven, moved
 
 
-@dataclass(frozen=True)
-class Cell:
-    """The field of a seed."""
-
-    seed: int
-
-
-def measure(cell: Cell) -> Row:
+def measure(seed: int) -> Row:
     """Drive one field in every way."""
-    field = Moving("ahead", True, 50, cell.seed)
+    field = Moving("ahead", True, 50, seed)
     loops, row = {"loop": Loop(field, DEADLINE), "loop, 20 ms": Loop(field, SHORT)}, Row()
     for way in WAYS:
         planned, driven, pose = drive(field, loops.get(way) or Plain(field, way))
@@ -212,7 +205,7 @@ def tables(rows: list[Row]) -> str:
 
 def cells(seeds: Sequence[int]) -> list[Cell]:
     """One for each field."""
-    return [Cell(seed) for seed in seeds]
+    return [{"seed": seed} for seed in seeds]
 
 
 STUDY = Study(cells, measure, tables, range(100, 119))

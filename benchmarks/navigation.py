@@ -11,12 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from benchmarks.comparison import Row, where
 from benchmarks.report import shared, table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.scenarios.ground.drive_pilot import COUPLINGS
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.logs.drive_metrics import episode_metrics
@@ -70,28 +71,17 @@ CASES = {
 }
 
 
-@dataclass(frozen=True)
-class Drive:
-    """One drive of a campaign; ``weight`` is that of the control costs."""
-
-    case: str
-    solver: str
-    coupling: str
-    seed: int
-    weight: float = 1.0
-
-    def settings(self, cases: Mapping[str, Case] = CASES) -> NavigationSettings:
-        """The episode to run."""
-        case, controller = cases[self.case], replace(ControllerSettings(), control_weight=self.weight)
-        return NavigationSettings(
-            case.path, case.start, case.goals, self.solver, self.coupling, case.obstacles, seed=self.seed,
-            controller=controller,
-        )  # fmt: skip
+def settings_of(case: Case, solver: str, coupling: str, seed: int, weight: float = 1.0) -> NavigationSettings:
+    """The episode to run; ``weight`` is that of the control costs."""
+    controller = replace(ControllerSettings(), control_weight=weight)
+    return NavigationSettings(
+        case.path, case.start, case.goals, solver, coupling, case.obstacles, seed=seed, controller=controller
+    )
 
 
-def drive(job: Drive, cases: Mapping[str, Case] = CASES) -> Row:
+def drive(case: str, cases: Mapping[str, Case] = CASES, **how: Any) -> Row:
     """Run one episode: its metrics, and the times and status of every tick."""
-    settings = job.settings(cases)
+    settings = settings_of(cases[case], **how)
     log = run_navigation(settings)
     ticks = {
         "solve_ms": log.solve_ms,
@@ -233,10 +223,11 @@ def tables(rows: list[Row]) -> str:
     return "\n\n".join(parts)
 
 
-def cells(seeds: Sequence[int]) -> list[Drive]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every case that can be driven here, by every backend with every coupling."""
     chosen = [name for name, case in CASES.items() if case.available]
-    return [Drive(*variant) for variant in product(chosen, SOLVERS, COUPLINGS, seeds)]
+    variants = product(chosen, SOLVERS, COUPLINGS, seeds, [1.0])
+    return [dict(zip(("case", "solver", "coupling", "seed", "weight"), one, strict=True)) for one in variants]
 
 
 STUDY = Study(cells, drive, tables, range(5))

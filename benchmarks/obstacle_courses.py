@@ -14,13 +14,15 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks.comparison import Row, share, where
 from benchmarks.report import listing, table, words
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from unifg.scenarios.course import (
     AVOIDANCES,
     HESSIANS,
@@ -62,18 +64,6 @@ METHODS = tuple(
     for avoidance, guess, chosen in product(AVOIDANCES, GUESSES, BACKENDS)
     if guess == EVERYWHERE or chosen[1] == "exact"
 )
-
-
-@dataclass(frozen=True)
-class Attempt(Method):
-    """A method and the layout it is tried on."""
-
-    seed: int
-
-    @property
-    def method(self) -> Method:
-        """The method alone."""
-        return Method(self.avoidance, self.guess, self.solver, self.hessian)
 
 
 @dataclass(frozen=True)
@@ -126,9 +116,7 @@ def attempt(method: Method, layout: Layout) -> Outcome:
     graph, x, u = state_problem(settings, layout)
     run = backend(settings).prepare(graph)
     states, controls = course_guess(settings, layout)
-    begin = time.process_time()
-    solution = run.solve({x: states, u: controls})
-    elapsed = time.process_time() - begin
+    solution, elapsed = clocked(run.solve, {x: states, u: controls}, by=time.process_time)
     course = Course(settings, layout, solution, solution[x], solution[u], iterates=np.zeros((0, *states.shape)))
     return Outcome(
         words(solution.status),
@@ -144,10 +132,10 @@ def attempt(method: Method, layout: Layout) -> Outcome:
     )
 
 
-def attempted(job: Attempt) -> Row:
+def attempted(seed: int, **method: Any) -> Row:
     """The same, as a row."""
-    _compiled(job.method)
-    return vars(attempt(job.method, obstacle_course(job.seed)))
+    _compiled(Method(**method))
+    return vars(attempt(Method(**method), obstacle_course(seed)))
 
 
 @cache
@@ -307,9 +295,9 @@ def _middle(values: Sequence[float]) -> str:
     return f"{np.median(values):.0f}" if values else "-"
 
 
-def cells(seeds: Sequence[int]) -> list[Attempt]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every layout by every method."""
-    return [Attempt(**vars(method), seed=seed) for seed in seeds for method in METHODS]
+    return [{**vars(method), "seed": seed} for seed in seeds for method in METHODS]
 
 
 def tables(rows: list[Row]) -> str:

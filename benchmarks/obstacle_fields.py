@@ -9,7 +9,6 @@ weight 1e-9).
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -21,7 +20,8 @@ import pandas as pd
 import unifg as fg
 from benchmarks.comparison import Row
 from benchmarks.report import table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from problems.control import Stated, Unicycle
 from unifg.models import obstacles
 from unifg.models.potential import Sense, potential
@@ -126,26 +126,15 @@ def solvers(search: int) -> dict[str, fg.Solver]:
     return backends("alm", "sqp", tolerance=TOLERANCE, search_iterations=search)
 
 
-@dataclass(frozen=True)
-class Cell:
-    """A method and a backend on the field of a seed."""
-
-    seed: int
-    method: int
-    backend: str
-
-
-def measure(cell: Cell) -> Row:
+def measure(seed: int, method: int, backend: str) -> Row:
     """Solve one field cold; the cost is that of tracking and effort, without the potential."""
-    method = METHODS[cell.method]
-    field, stated = method.stated(cell.seed)
-    run = solvers(method.search)[cell.backend].prepare(stated.graph)
-    begin = time.thread_time()
-    solution = run.solve(stated.guess)
-    elapsed = 1e3 * (time.thread_time() - begin)
+    way = METHODS[method]
+    field, stated = way.stated(seed)
+    run = solvers(way.search)[backend].prepare(stated.graph)
+    solution, seconds = clocked(run.solve, stated.guess)
     states, (reference, _) = solution[stated.x], field.reference()
     error = potential(obstacles.disc_clearance)(states[1:], field.discs[:, :2], field.discs[:, 2])
-    pushed = 0.0 if method.hard else 0.5 * float((error**2).sum()) / method.sigma**2
+    pushed = 0.0 if way.hard else 0.5 * float((error**2).sum()) / way.sigma**2
     given = 0.5 * float(field.stage @ field.error(states[0], reference[0]) ** 2)  # of the first pose, which is fixed
     return {
         "solved": solution.converged,
@@ -154,7 +143,7 @@ def measure(cell: Cell) -> Row:
         "reached": float(np.linalg.norm(states[-1, :2] - reference[-1, :2])) < NEAR_END,
         "cost": solution.cost - pushed - given,
         "iterations": solution.iterations,
-        "milliseconds": elapsed,
+        "milliseconds": 1e3 * seconds,
     }
 
 
@@ -192,7 +181,8 @@ def tables(rows: list[Row]) -> str:
 
 def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every method with both backends on every field."""
-    return [Cell(*variant) for variant in product(seeds, range(len(METHODS)), BACKENDS)]
+    variants = product(seeds, range(len(METHODS)), BACKENDS)
+    return [{"seed": seed, "method": method, "backend": backend} for seed, method, backend in variants]
 
 
 STUDY = Study(cells, measure, tables, range(100))

@@ -138,18 +138,6 @@ def stated(problem: Problem, way: str) -> Stated:
     return _made(UnicycleGraph, functions, problem)
 
 
-@dataclass(frozen=True)
-class Way:
-    """A problem as one of the ways states it: what :func:`benchmarks.cold.attempt` and a loop ask for."""
-
-    problem: Problem
-    way: str
-
-    def formulation(self) -> Stated:
-        """As a factor graph."""
-        return stated(self.problem, self.way)
-
-
 def problems() -> dict[str, Problem]:
     """Problems by title."""
     found: list[Problem] = [
@@ -208,7 +196,9 @@ class Cold:
 def cold(title: str, problem: Problem, rounds: int) -> dict[str, Cold]:
     """Every way, and fatrop, interleaved."""
     solver = InteriorPoint(tolerance=TOLERANCE)
-    attempts: dict[str, Callable[[Outcome], float]] = {way: attempt(solver, Way(problem, way)) for way in ways(problem)}
+    attempts: dict[str, Callable[[Outcome], float]] = {
+        way: attempt(solver, stated(problem, way)) for way in ways(problem)
+    }
     for peer in runnable(("fatrop", "fatrop, compiled")):
         attempts[peer] = attempt_peer(peer, problem, TOLERANCE)
     outcomes = {way: Outcome(problem, way) for way in attempts}

@@ -25,13 +25,13 @@ from tqdm import tqdm
 import unifg as fg
 from benchmarks.control_loops import CONTACT, STEPS, Drive
 from benchmarks.control_peers import MODELS
-from benchmarks.own_functions import Way
+from benchmarks.own_functions import stated
 from benchmarks.pose_graphs import cases
 from benchmarks.report import CHECKOUT, machine, table, words
 from benchmarks.runner import Timing, Unavailable
-from benchmarks.timing import interleave, number, pin, ratio, shown
+from benchmarks.timing import clocked, interleave, number, pin, ratio, shown
 from problems.cart_pole import CartPole
-from problems.control import Driver, Problem, Quadrotor, Stated, Tick, Unicycle
+from problems.control import Driver, Problem, Quadrotor, Tick, Unicycle
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point import method
 from unifg.solvers.names import backends
@@ -105,9 +105,7 @@ class Ours:
 
     def __call__(self) -> float:
         """Solve; seconds."""
-        begin = thread_time()
-        solution = self._run.solve(self._guess)
-        spent = thread_time() - begin
+        solution, spent = clocked(self._run.solve, self._guess)
         self.status, self.iterations = words(solution.status), solution.iterations
         self.answer = [np.array(solution[family]) for family in self._guess]
         return spent
@@ -115,8 +113,8 @@ class Ours:
 
 def on(problem: Problem, solver: fg.Solver) -> Ours:
     """A backend on a control problem that is stated as NumPy functions."""
-    stated: Stated = Way(problem, "numpy").formulation()
-    return Ours(solver, stated.graph, dict(zip((stated.x, stated.u), problem.guess(), strict=True)))
+    own = stated(problem, "numpy")
+    return Ours(solver, own.graph, dict(zip((own.x, own.u), problem.guess(), strict=True)))
 
 
 class Whole(Driver):
@@ -227,9 +225,7 @@ def compiled_share(problem: Problem, racer: Race) -> float:
     inside, call = list[float](), vars(method)["call"]
 
     def timed(*given: Any) -> None:
-        begin = thread_time()
-        call(*given)
-        inside.append(thread_time() - begin)
+        inside.append(clocked(call, *given)[1])
 
     def share(state: Array, index: int) -> Tick:
         inside.clear()
@@ -253,7 +249,7 @@ def loops(problem: Problem, rounds: int) -> Results:
     """Closed loops of ours and of acados' real-time iteration, which begins at a converged plan."""
     from benchmarks.acados_peer import Acados
 
-    ours = {name: Whole(Way(problem, "numpy"), solver).control for name, solver in LOOPS.items()}
+    ours = {name: Whole(stated(problem, "numpy"), solver).control for name, solver in LOOPS.items()}
     plan, racers = on(problem, InteriorPoint()), dict(ours)
     plan()
     for soft in (False, True)[: 1 + problem.blocked]:

@@ -108,7 +108,7 @@ def measure_case(case: Case, rounds: int) -> Result:
     best_whole = ""
     if available():
         peer = Peer(pose_graph)
-        candidates |= {ordering: partial(_iteration, peer, ordering, count) for ordering in ORDERINGS}
+        candidates |= {ordering: partial(lambda by: peer.iterate(by, count)[0], ordering) for ordering in ORDERINGS}
         best_whole = min(ORDERINGS, key=lambda ordering: min(peer.solve(ordering)[0] for _ in range(2)))
         candidates["GTSAM, whole"] = lambda: _whole(peer, best_whole, ends)
     times = interleave(candidates, rounds)
@@ -163,10 +163,6 @@ def measure_file(case: Case, rounds: int) -> Result:
             "gtsam_chi2": ends[best][1], "ratio": ratio(times[best], times["ours"]),
         }  # fmt: skip
     return result
-
-
-def _iteration(peer: Peer, ordering: str, count: int) -> float:
-    return peer.iterate(ordering, count)[0]
 
 
 def _whole(peer: Peer, ordering: str, ends: list[tuple[int, float]]) -> float:

@@ -6,7 +6,6 @@ is measured and left out, so nothing is held against these solvers that a compil
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any, TypeVar
@@ -14,6 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from benchmarks.control_peers import MODELS
+from benchmarks.timing import clocked
 from problems.control import Problem
 from unifg.typing import Array
 
@@ -48,9 +48,8 @@ class Called(ABC):
 
     def __call__(self) -> float:
         """Solve from the cold guess; seconds outside Python's functions."""
-        self._seconds, begin = 0.0, time.thread_time()
-        *self.answer, done, self.iterations = self._solve()
-        spent = time.thread_time() - begin
+        self._seconds = 0.0
+        (*self.answer, done, self.iterations), spent = clocked(self._solve)
         self.status, self.inside = "converged" if done else "failed", self._seconds / spent
         return spent - self._seconds
 
@@ -58,9 +57,8 @@ class Called(ABC):
         """The function, its time left out."""
 
         def timed(*given: Any) -> R:
-            begin = time.thread_time()
-            result = function(*given)
-            self._seconds += time.thread_time() - begin
+            result, spent = clocked(function, *given)
+            self._seconds += spent
             return result
 
         return timed

@@ -9,12 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from benchmarks.comparison import Row
 from benchmarks.quadrotor_tables import HEADLINE, render
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics
@@ -53,13 +54,13 @@ class Job:
         )
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """All flights.
 
     Backends other than the headline's fly sequential and joint; potential costs, unknown association and movers are
     flown sequential.
     """
-    jobs: list[Job] = []
+    jobs: list[Cell] = []
     for study, solver in product(STUDIES, SOLVERS):
         first, plain = solver == HEADLINE, Job(study, solver, "sequential", 0)
         variants = {
@@ -73,12 +74,13 @@ def cells(seeds: Sequence[int]) -> list[Job]:
             ],
         }[study]  # fmt: skip
         some = seeds[: FEWER.get(study)]
-        jobs += [replace(job, seed=seed) for job in variants for seed in some]
+        jobs += [vars(replace(job, seed=seed)) for job in variants for seed in some]
     return jobs
 
 
-def fly(job: Job) -> Row:
+def fly(**cell: Any) -> Row:
     """Fly once and keep what tables need."""
+    job = Job(**cell)
     if job.study == "timing":
         run_flight(replace(job.settings(), time_limit=0.5))  # compiles what this process has not compiled yet
     log = run_flight(job.settings())
@@ -111,4 +113,4 @@ def _contact(log: FlightLog) -> Row | None:
     }
 
 
-STUDY = Study(cells, fly, render, CORRIDOR_SEEDS, alone=lambda job: job.study == "timing")
+STUDY = Study(cells, fly, render, CORRIDOR_SEEDS, alone=lambda job: job["study"] == "timing")

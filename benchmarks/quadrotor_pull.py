@@ -12,13 +12,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from typing import Any
 
 import numpy as np
 
 from benchmarks.comparison import Row, against, digits, where
 from benchmarks.quadrotor_flights import SOLVERS
 from benchmarks.report import listing
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from unifg.models import quadrotor
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.perception.belief import Belief, Landmarks
@@ -46,7 +48,7 @@ class Job:
     avoidance: Avoidance = "clearance"
 
 
-def jobs_of(seeds: Sequence[int]) -> list[Job]:
+def jobs_of(seeds: Sequence[int]) -> list[Cell]:
     """All variants on some seeds."""
     jobs = []
     for seed in seeds:
@@ -56,7 +58,7 @@ def jobs_of(seeds: Sequence[int]) -> list[Job]:
         jobs += [replace(plain, weight=weight, pull=pull) for pull, weight in product(PULLS, WEIGHTS)]
         jobs += [replace(ta, pull=pull) for pull in PULLS]
         jobs += [replace(plain, solver=solver) for solver in SOLVERS if solver != plain.solver]
-    return jobs
+    return list(map(vars, jobs))
 
 
 def flight_of(job: Job) -> Flight:
@@ -71,9 +73,9 @@ def flight_of(job: Job) -> Flight:
     return flight
 
 
-def fly(job: Job) -> Row:
+def fly(**cell: Any) -> Row:
     """Fly for some seconds and measure, at every tick, the pull and the errors."""
-    flight = flight_of(job)
+    flight = flight_of(Job(**cell))
     world, pilot, dt = flight.world, flight.pilot, flight.settings.controller.dt
     control: Array | None = None
     ticks: list[dict[str, float]] = []
@@ -81,12 +83,10 @@ def fly(job: Job) -> Row:
     clearance, emergencies = np.inf, 0
     for _ in range(round(SECONDS / dt)):
         reading = world.sense()
-        begin = time.process_time()
-        plan = pilot.tick(reading, control)
-        spent = 1e3 * (time.process_time() - begin)
+        plan, spent = clocked(pilot.tick, reading, control, by=time.process_time)
         belief = pilot.belief
         alone = pilot.alone
-        ticks.append({**pulled(belief, alone), **errors(belief, world.state, flight, cylinders), "tick": spent})
+        ticks.append({**pulled(belief, alone), **errors(belief, world.state, flight, cylinders), "tick": 1e3 * spent})
         emergencies += plan.emergency
         control = plan.controls[0]
         world.step(control, dt)

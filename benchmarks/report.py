@@ -16,6 +16,7 @@ from typing import TypeVar
 
 import unifg
 from unifg.scenarios.campaigns.markdown import table as table
+from unifg.scenarios.commands.host import processor
 
 T = TypeVar("T")
 Words = TypeVar("Words", bound=tuple[str, ...])
@@ -60,7 +61,7 @@ def machine(codes: Iterable[str] = ()) -> str:
         codes: commits whose rows are shown, when these are not all of the present one.
     """
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    where = f"{platform.system()} {platform.machine()} ({_processor()}, {os.cpu_count()} cores; one BLAS thread)"
+    where = f"{platform.system()} {platform.machine()} ({processor()}, {os.cpu_count()} cores; one BLAS thread)"
     others = "".join(f", some rows at `{code}`" for code in sorted(set(codes) - {commit()}))
     python = platform.python_version()
     return f"Measured at commit `{commit()}`{others}, {today}, on {where}, Python {python}, {versions()}."
@@ -124,13 +125,3 @@ def put_results(page: Path, name: str, text: str) -> None:
     if not found:
         raise ValueError(f"{page}: '{marker}' has no '{END}' after it; add the line where the results end")
     page.write_text(f"{before}{marker}\n{text.strip()}\n{END}{after}", encoding="utf-8", newline="\n")
-
-
-def _processor() -> str:
-    """Marketing name of the processor where the system gives it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or "unknown processor"
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else "unknown processor"

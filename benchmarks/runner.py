@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import Field, dataclass, fields
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, TypeAlias
 
 from tqdm import tqdm
 
@@ -25,13 +25,8 @@ from unifg.scenarios.workers import Workers, finished
 RESULTS = CHECKOUT / "docs" / "results"
 
 
-class Cell(Protocol):
-    """A dataclass whose fields, strings and numbers, name a problem, a contestant and a seed."""
-
-    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
-
-
-C = TypeVar("C", bound=Cell)
+Cell: TypeAlias = Mapping[str, Any]
+"""Arguments of a measurement by name, strings and numbers: a problem, a contestant and a seed."""
 
 
 class Unavailable(Exception):
@@ -39,22 +34,22 @@ class Unavailable(Exception):
 
 
 @dataclass(frozen=True)
-class Study(Generic[C]):
+class Study:
     """Cells that are measured one by one, and the tables of their rows.
 
     Attributes:
         cells: all cells for some seeds.
-        measure: a row of one cell; a function that can be pickled.
+        measure: a row of one cell, which are its arguments; a function that can be pickled.
         tables: Markdown of all rows.
         seeds: of the page.
         alone: cells that are measured one at a time, after the others.
     """
 
-    cells: Callable[[Sequence[int]], Iterable[C]]
-    measure: Callable[[C], Row]
+    cells: Callable[[Sequence[int]], Iterable[Cell]]
+    measure: Callable[..., Row]
     tables: Callable[[list[Row]], str]
     seeds: Sequence[int] = range(1)
-    alone: Callable[[C], bool] = lambda cell: False
+    alone: Callable[[Cell], bool] = lambda cell: False
 
     def run(self, name: str, chosen: argparse.Namespace) -> str:
         """Measure the cells that are missing on file; the tables of all rows of these seeds.
@@ -64,7 +59,7 @@ class Study(Generic[C]):
             chosen: command line.
         """
         seeds = chosen.seeds or self.seeds
-        cells = {tuple(stated(cell).values()): cell for cell in self.cells(seeds)}
+        cells = {tuple(cell.values()): cell for cell in self.cells(seeds)}
         rows = dict[Key, Row]()
         for workers, alone in ((chosen.workers, False), (1, True)):
             batch = {key: cell for key, cell in cells.items() if self.alone(cell) is alone}
@@ -116,21 +111,16 @@ PAGES: dict[str, dict[str, float]] = {
 """Pages of docs/results: the studies of each, and about how many hours they take on two cores."""
 
 
-def stated(cell: Cell) -> Row:
-    """Fields of a cell."""
-    return {field.name: getattr(cell, field.name) for field in fields(cell)}
-
-
-def row_of(measure: Callable[[C], Row], workers: int, cell: C) -> Row:
-    """Row of a cell: its fields, the number of workers, and what was measured or why that was refused."""
+def row_of(measure: Callable[..., Row], workers: int, cell: Cell) -> Row:
+    """Row of a cell: its arguments, the number of workers, and what was measured or why that was refused."""
     try:
-        return {**stated(cell), "workers": workers, **measure(cell)}
+        return {**cell, "workers": workers, **measure(**cell)}
     except UnifgError as error:
-        return {**stated(cell), "workers": workers, "error": str(error)}
+        return {**cell, "workers": workers, "error": str(error)}
 
 
 def recorded(
-    name: str, task: Callable[[C], Row], cells: dict[Key, C], chosen: argparse.Namespace, workers: int
+    name: str, task: Callable[[Cell], Row], cells: dict[Key, Cell], chosen: argparse.Namespace, workers: int
 ) -> dict[Key, Row]:
     """Rows on file by key, after measuring the cells that are missing there.
 
@@ -155,7 +145,7 @@ def recorded(
     return rows
 
 
-def measured(task: Callable[[C], Row], cells: dict[Key, C], workers: int) -> Iterator[tuple[Key, Row]]:
+def measured(task: Callable[[Cell], Row], cells: dict[Key, Cell], workers: int) -> Iterator[tuple[Key, Row]]:
     """Rows of cells as they come."""
     if workers == 1:
         yield from ((key, task(cell)) for key, cell in cells.items())
@@ -196,7 +186,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(f"{page:14} {', '.join(studies)}; about {sum(studies.values()):g} h")
         for name in studies:
             if {"all", page, name} & set(chosen.names):
-                study: Study[Any] | Timing = import_module(f"benchmarks.{name}").STUDY
+                study: Study | Timing = import_module(f"benchmarks.{name}").STUDY
                 whole = chosen.seeds is None and chosen.rounds is None
                 try:
                     publish(RESULTS / f"{page}.md", name, study.run(name, chosen), whole)

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
 from benchmarks.comparison import Row, difference, where
 from benchmarks.report import table
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.models.quadrotor import GRAVITY
 from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.quadrotor.oracle import Answer, Authority, Threat, exists
@@ -117,8 +117,9 @@ def judged(flight: SafeFlight, log: SafeLog) -> Row:
     }
 
 
-def fly(job: Job) -> Row:
+def fly(**cell: Any) -> Row:
     """Fly once and keep what tables need."""
+    job = Job(**cell)
     flight = job.flight()
     log = flight.run()
     metrics = safe_metrics(log)
@@ -133,7 +134,7 @@ def fly(job: Job) -> Row:
     return row
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """All flights."""
     many: dict[str, list[Job]] = {
         "campaign": [Job("campaign", case, seed=seed) for case in RANDOM for seed in seeds],
@@ -153,7 +154,7 @@ def cells(seeds: Sequence[int]) -> list[Job]:
         ],
         "ball": [Job("ball", "ball", alpha=3.0, speed=3.2, seed=seed) for seed in (-1, *range(1, 11))],
     }
-    return [job for jobs in many.values() for job in jobs]
+    return [vars(job) for jobs in many.values() for job in jobs]
 
 
 def times_of(rows: list[Row]) -> list[str]:

@@ -12,12 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from benchmarks.comparison import Row, difference, paired, where
 from benchmarks.report import listing
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.episode import silent
@@ -59,16 +60,6 @@ class NominalDynamics(Dynamics):
         return replace(own, estimated=(), noise_sigma=sigma)
 
 
-@dataclass(frozen=True)
-class Job:
-    """One flight: dynamics of the past, parameters of the plan, and whether there is an accelerometer."""
-
-    seed: int
-    past: str
-    plan: str
-    accelerometer: bool
-
-
 class Divided(Pilot):
     """Estimates the state by one past, and plans with parameters that need not be its own.
 
@@ -94,25 +85,25 @@ class Divided(Pilot):
         return self.controller.plan(self.belief, Tracks.none())
 
 
-def prepared(job: Job) -> Flight:
-    """The flight of a job, ready to be flown."""
-    window = WindowSettings(force_sigma=FORCE_SIGMA if job.accelerometer else None)
+def prepared(seed: int, past: str, plan: str, accelerometer: bool) -> Flight:
+    """A flight with these dynamics of the past and parameters of the plan, ready to be flown."""
+    window = WindowSettings(force_sigma=FORCE_SIGMA if accelerometer else None)
     settings = EstimatorSettings(window=window)
-    flight = Flight(FlightSettings("ipm", "sequential", job.seed, time_limit=FLIGHT, estimator=settings))
+    flight = Flight(FlightSettings("ipm", "sequential", seed, time_limit=FLIGHT, estimator=settings))
     found, known = flight.conditions, flight.pilot.estimator
     estimator = known
-    if job.past != "unknown":
-        nominal = NominalDynamics(found.nominal, MISTRUST[job.accelerometer])
-        model = nominal if job.past == "nominal" else DeadReckoning(found.nominal)
+    if past != "unknown":
+        nominal = NominalDynamics(found.nominal, MISTRUST[accelerometer])
+        model = nominal if past == "nominal" else DeadReckoning(found.nominal)
         estimator = Estimator(known.window.present, found.nominal, settings, found.layout.corners, model)
-    adviser = known if job.plan == "estimated" else None
+    adviser = known if plan == "estimated" else None
     flight.pilot = Divided(estimator, flight.pilot.controller, found.nominal, adviser)
     return flight
 
 
-def fly(job: Job) -> Row:
+def fly(**cell: Any) -> Row:
     """Fly once."""
-    log = prepared(job).run(silent)
+    log = prepared(**cell).run(silent)
     metrics = dict(flight_metrics(log))
     return {
         "reached": bool(log.reached),
@@ -196,10 +187,10 @@ def render(rows: Sequence[Row]) -> str:
     return "\n\n".join(parts)
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every combination on every seed."""
     return [
-        Job(seed, past, plan, accelerometer)
+        {"seed": seed, "past": past, "plan": plan, "accelerometer": accelerometer}
         for seed in seeds for accelerometer in (False, True) for past in PASTS for plan in PLANS
         if past != "none" or plan == "nominal"
     ]  # fmt: skip

@@ -11,13 +11,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from scipy.stats import bootstrap
 
 from unifg.typing import Array
 
+R = TypeVar("R")
 Spread: TypeAlias = list[float]
 """Median, lower and upper bound; a list because results are written as JSON."""
 
@@ -42,11 +43,18 @@ def all_cores() -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
+def clocked(
+    function: Callable[..., R], *given: Any, by: Callable[[], float] = time.thread_time, **named: Any
+) -> tuple[R, float]:
+    """Result of a call and the time it took, by a clock: processor time of this thread, or another [s]."""
+    begin = by()
+    result = function(*given, **named)
+    return result, by() - begin
+
+
 def clock(action: Callable[[], Any]) -> float:
     """Processor time of one call [s]."""
-    start = time.process_time()
-    action()
-    return time.process_time() - start
+    return clocked(action, by=time.process_time)[1]
 
 
 def timed(action: Callable[[], Any], per: float = 1.0) -> Callable[[], float]:

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from benchmarks.comparison import Row, where
 from benchmarks.report import listing
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from benchmarks.wrong_closures import published
 from problems.closures import adrift, aliased, drive, slipped
 from unifg.pose_graphs import Cluster, PoseGraph, Verdict, best_guess, manhattan, sphere
@@ -30,15 +30,6 @@ MADE = ("city", "drive", "drive over hills")
 WORSE = 8.0  # times the standard deviation of a cluster: what the others know, where it is unsupported by construction
 ROUNDS = 5
 PUBLISHED = 20  # seeds with which published graphs are planted in
-
-
-@dataclass(frozen=True)
-class Job:
-    """A graph, and what is wrong in it: nothing, clusters by their number, a drift, a slip; or "time"."""
-
-    graph: str
-    fault: str
-    seed: int
 
 
 def clean(graph: str, seed: int) -> tuple[PoseGraph, Array]:
@@ -65,38 +56,36 @@ def optimum(pose_graph: PoseGraph) -> PoseGraph:
     return pose_graph.with_poses(LevenbergMarquardt(tolerance="map").solve(graph, guess)[x])
 
 
-def dirty(job: Job) -> tuple[PoseGraph, list[IntArray]]:
+def dirty(graph: str, fault: str, seed: int) -> tuple[PoseGraph, list[IntArray]]:
     """The graph of a job, and the edges of each fault."""
-    pose_graph, poses = clean(job.graph, job.seed)
-    if job.fault == "none":
+    pose_graph, poses = clean(graph, seed)
+    if fault == "none":
         return pose_graph, []
-    if job.fault == "adrift":
-        return adrift(drive(1500, job.seed, spatial=job.graph != "drive"), job.seed)
-    if job.fault == "slip":
-        rng = np.random.default_rng(job.seed)
+    if fault == "adrift":
+        return adrift(drive(1500, seed, spatial=graph != "drive"), seed)
+    if fault == "slip":
+        rng = np.random.default_rng(seed)
         at, by = int(rng.integers(len(poses) // 4, len(poses) // 2)), np.zeros(pose_graph.group.dim)
         by[0], by[-1] = rng.uniform(1.0, 3.0), rng.uniform(-0.3, 0.3)
         return slipped(pose_graph, at, by), [np.array([at])]
-    return aliased(pose_graph, poses, int(job.fault.split()[0]), job.seed)
+    return aliased(pose_graph, poses, int(fault.split()[0]), seed)
 
 
-def judged(job: Job) -> Row:
+def judged(graph: str, fault: str, seed: int) -> Row:
     """Verdict on the graph of a job."""
-    if job.fault == "time":
-        return timed(job)
-    pose_graph, faults = dirty(job)
+    if fault == "time":
+        return timed(graph, seed)
+    pose_graph, faults = dirty(graph, fault, seed)
     verdict = optimum(pose_graph).verdict(effort="cheap")
-    kind = {"adrift": verdict.of("unsupported"), "slip": verdict.of("slipped")}.get(
-        job.fault, verdict.of("contradicted")
-    )
+    kind = {"adrift": verdict.of("unsupported"), "slip": verdict.of("slipped")}.get(fault, verdict.of("contradicted"))
     named = np.concatenate([np.zeros(0, dtype=np.intp), *(one.edges for one in kind)])
     planted = np.concatenate([np.zeros(0, dtype=np.intp), *faults])
     return {
-        "found": all(np.isin(fault, named).mean() > 0.5 for fault in faults),
+        "found": all(np.isin(edges, named).mean() > 0.5 for edges in faults),
         "contradicted": len(verdict.of("contradicted")),
         "right ones contradicted": sum(not np.isin(one.edges, planted).any() for one in verdict.of("contradicted")),
         "unsupported": len(verdict.of("unsupported")),
-        "not so by construction": 0 if faults else not_so(pose_graph, clean(job.graph, job.seed)[1], verdict),
+        "not so by construction": 0 if faults else not_so(pose_graph, clean(graph, seed)[1], verdict),
     }
 
 
@@ -128,13 +117,13 @@ def _rest(pose_graph: PoseGraph, cluster: Cluster) -> float:
     return float(np.sqrt(np.linalg.eigvals(own @ spread).real.max()))
 
 
-def timed(job: Job) -> Row:
+def timed(graph: str, seed: int) -> Row:
     """Processor time of a solve from nothing, first guesses included, and of the verdict on its map, in turn."""
-    pose_graph, rows = clean(job.graph, job.seed)[0], []
+    pose_graph, rows = clean(graph, seed)[0], []
     for _ in range(ROUNDS):
         begin = time.process_time()
-        graph, x, guess = pose_graph.with_poses(best_guess(pose_graph)[1]).graph()
-        after = pose_graph.with_poses(GaussNewton().solve(graph, guess)[x])
+        stated, x, guess = pose_graph.with_poses(best_guess(pose_graph)[1]).graph()
+        after = pose_graph.with_poses(GaussNewton().solve(stated, guess)[x])
         between = time.process_time()
         verdict = after.verdict(effort="cheap")
         rows.append((between - begin, time.process_time() - between))
@@ -144,16 +133,16 @@ def timed(job: Job) -> Row:
     return {"poses": len(pose_graph.poses), "cold": float(np.median(cold)), "ratio": ratio, **parts}
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """All faults on all graphs; published graphs are planted in with fewer seeds, and clean once."""
     faults = ("none", "1 cluster", "3 clusters", "slip", "adrift")
     jobs = [
-        Job(graph, fault, seed) for graph in WORLDS for fault in faults for seed in seeds
+        {"graph": graph, "fault": fault, "seed": seed} for graph in WORLDS for fault in faults for seed in seeds
         if not (fault == "adrift" and graph not in ("drive", "drive over hills"))
         and not (fault == "slip" and graph not in ("city", "M3500", "intel"))
         and not (graph not in MADE and seed not in seeds[: 1 if fault == "none" else PUBLISHED])
     ]  # fmt: skip
-    return [*jobs, *(Job(graph, "time", seeds[0]) for graph in LARGE)]
+    return [*jobs, *({"graph": graph, "fault": "time", "seed": seeds[0]} for graph in LARGE)]
 
 
 def tables(rows: list[Row]) -> str:
@@ -190,4 +179,4 @@ def _part(name: str, rows: list[Row]) -> str:
     return str(rows[0][name])
 
 
-STUDY = Study(cells, judged, tables, range(100, 200), alone=lambda job: job.fault == "time")
+STUDY = Study(cells, judged, tables, range(100, 200), alone=lambda job: job["fault"] == "time")

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
@@ -21,7 +21,8 @@ from benchmarks.comparison import Row, where
 from benchmarks.gtsam_peer import Peer, as_array, available
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.report import OUT, listing, shared
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
+from benchmarks.timing import clocked
 from problems.closures import Claim, with_wrong_closures
 from unifg.factors.robust import Loss
 from unifg.files.g2o import read_g2o
@@ -114,26 +115,13 @@ METHODS: dict[str, Callable[[PoseGraph], Found]] = {
 }
 
 
-@dataclass(frozen=True)
-class Job:
-    """A method, and the wrong closures it is to find; see :func:`problems.closures.with_wrong_closures`."""
-
-    graph: str
-    share: float
-    claim: Claim
-    seed: int
-    method: str
-
-
-def attempt(clean: PoseGraph, job: Job) -> Row:
-    """Result of a method on a graph with wrong closures."""
+def attempt(clean: PoseGraph, share: float, claim: Claim, seed: int, method: str) -> Row:
+    """Result of a method on a graph with wrong closures, see :func:`problems.closures.with_wrong_closures`."""
     graph, x, guess = clean.graph()
     right = GaussNewton().solve(graph, guess, check=True)[x]
-    dirty, wrong = with_wrong_closures(clean, job.share, job.seed, job.claim)
+    dirty, wrong = with_wrong_closures(clean, share, seed, claim)
     closures, place = ~dirty.edges.odometry, 2 if clean.group is SE2 else 3
-    begin = time.process_time()
-    found = METHODS[job.method](dirty)
-    seconds = time.process_time() - begin
+    found, seconds = clocked(METHODS[method], dirty, by=time.process_time)
     kept = dirty.with_poses(found.poses).squared_errors() <= THRESHOLD[clean.group.dim] ** 2
     good, bad = kept[closures & ~wrong], kept[wrong]
     return {
@@ -161,9 +149,9 @@ def aligned_error(found: Array, right: Array) -> float:
     return float(np.sqrt(np.mean(np.sum((turned - there) ** 2, axis=1))))
 
 
-def attempted(job: Job) -> Row:
+def attempted(graph: str, share: float, claim: Claim, seed: int, method: str) -> Row:
     """The same on a graph by its name."""
-    return attempt(published(job.graph), job)
+    return attempt(published(graph), share, claim, seed, method)
 
 
 @cache
@@ -206,11 +194,11 @@ OVER_SEEDS: dict[str, Callable[[list[Row]], str]] = {
 STORE, ARCHIVE = OUT / "wrong_closures.jsonl", ROWS / "wrong_closures.jsonl.xz"
 
 
-def cells(seeds: Sequence[int]) -> list[Job]:
+def cells(seeds: Sequence[int]) -> list[Cell]:
     """Every method on every graph with every share of wrong closures, half of the seeds with either claim."""
     restore(ARCHIVE, STORE)
     return [
-        Job(name, share, CLAIMS[seed % 2], seed, method)
+        {"graph": name, "share": share, "claim": CLAIMS[seed % 2], "seed": seed, "method": method}
         for name in GRAPHS for share in SHARES for seed in seeds for method in METHODS
         if method != "GTSAM" or available()
     ]  # fmt: skip

@@ -40,8 +40,7 @@ def to_balls(p: Array, centre: Array, radius: Array) -> Array:
 
 
 def _length(square: Array) -> Array:
-    length: Array = np.sqrt(np.maximum(square, NEAR * NEAR))
-    return length
+    return np.sqrt(np.maximum(square, NEAR * NEAR))
 
 
 def count(name: str, dimension: int, what: str, centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
@@ -101,8 +100,7 @@ def _to_segments(p: Array, segments: Array, margin: Array) -> Array:
     across = np.where(beside, wall[..., 0] * start[..., 1] - wall[..., 1] * start[..., 0], 0.0)
     away = np.where((along < square) | (square == 0.0), np.sum(start * start, axis=-1), np.sum(end * end, axis=-1))
     beside_it = np.abs(across) / np.sqrt(np.where(beside, square, 1.0))
-    distance: Array = np.where(beside, beside_it, _length(away)) - margin
-    return distance
+    return np.where(beside, beside_it, _length(away)) - margin
 
 
 def _segments(segments: tuple[int, ...], margin: tuple[int, ...]) -> int:
@@ -149,8 +147,7 @@ def _root(nearest: float, d: Array) -> Array:
     """sqrt(2 phi)."""
     depth, beyond = d / nearest - 1.0, d >= nearest
     phi = np.where(beyond, 1.0 / np.where(beyond, d, 1.0), (1.0 - depth + depth * depth) / nearest)
-    root: Array = np.sqrt(2.0 * phi)
-    return root
+    return np.sqrt(2.0 * phi)
 
 
 def inverse_distance(clearance: Residual, nearest: float = 0.1, weight: float = 1.0) -> Callable[..., Array]:

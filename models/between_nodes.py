@@ -41,8 +41,7 @@ def sag(travel: ArrayLike, radius: ArrayLike, acceleration: float = 0.0, dt: Arr
             raise ModelError(f"sag: {name} must be finite and not negative, found {part}")
     length, rho, a, step = parts
     bend = a * step**2 / 8.0
-    margin: Array = np.hypot(rho + bend, 0.5 * length) - rho
-    return margin
+    return np.hypot(rho + bend, 0.5 * length) - rho
 
 
 def passing(p: Array, p_next: Array, centre: Array, centre_next: Array, radius: Any) -> Array:

@@ -14,6 +14,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from unifg.errors import ModelError
+from unifg.lie import SE2
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["Body", "body_of"]
@@ -95,11 +96,7 @@ class Body:
         """(..., K, 2) centres of the discs of bodies at poses (..., 3) [m]."""
         if self.round:
             return poses[..., None, :2]
-        centres = np.array(self.discs)[:, :2]
-        cosine, sine = np.cos(poses[..., 2, None]), np.sin(poses[..., 2, None])
-        turned = [cosine * centres[:, 0] - sine * centres[:, 1], sine * centres[:, 0] + cosine * centres[:, 1]]
-        found: Array = poses[..., None, :2] + np.stack(turned, axis=-1)
-        return found
+        return SE2.act(poses[..., None, :], np.array(self.discs)[:, :2])
 
     def gap(self, points: Array) -> Array:
         """Signed distance (...) of points (..., 2) in the body's axes from its hull [m]."""
@@ -130,8 +127,7 @@ class Body:
             for turn in [np.linspace(0.0, 2.0 * np.pi, math.ceil(2.0 * np.pi * radius / spacing), endpoint=False)]
         ]
         points = np.concatenate(rings)
-        found: Array = points[self.gap(points) >= -INSIDE]
-        return found
+        return points[self.gap(points) >= -INSIDE]
 
 
 def _to_polygon(corners: Array, points: Array) -> Array:

@@ -14,7 +14,6 @@ import numpy as np
 from unifg.codegen.calls import local_matrix
 from unifg.codegen.jit import compiled
 from unifg.factors.autodiff.stated import StatedKernel
-from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import residual
 from unifg.lie import SO3, Rn, so3, wrap_angle
 from unifg.models.quadrotor import STATE
@@ -41,9 +40,7 @@ def _bearing_range_second(v: Array, p: Array, table: Array, w: Array, S: Array) 
     """
     R = local_matrix(3, 3)
     so3.write_matrix(v[3], v[4], v[5], v[6], R, 0)
-    for i in range(11):
-        for k in range(11):
-            S[i, k] = 0.0
+    S[:] = 0.0
     dx, dy = v[10] - v[0], v[11] - v[1]
     square = dx * dx + dy * dy
     turn, pull = w[0] / (square * square), w[1] / (square * math.sqrt(square))
@@ -89,21 +86,15 @@ height = residual(
 )
 
 
-@compiled
-def _tilt(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """R' e3 is the last row of R; a turn t changes it by q x t."""
-    w, x, y, z = v[0], v[1], v[2], v[3]
-    q0, q1, q2 = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
-    r[0], r[1], r[2] = q0 - p[0], q1 - p[1], q2 - p[2]
-    if len(J):
-        J[0, 0], J[0, 1], J[0, 2] = 0.0, -q2, q1
-        J[1, 0], J[1, 1], J[1, 2] = q2, 0.0, -q0
-        J[2, 0], J[2, 1], J[2, 2] = -q1, q0, 0.0
+def _tilt(R: Array, z: Array) -> Array:
+    """R' e3 is the last row of R."""
+    w, a, b, c = R[:, 0], R[:, 1], R[:, 2], R[:, 3]
+    return np.stack([2.0 * (a * c - w * b), 2.0 * (b * c + w * a), 1.0 - 2.0 * (a * a + b * b)], axis=1) - z
 
 
 @compiled
 def _tilt_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
-    """Of w . t x (t x q) / 2."""
+    """Of w . t x (t x q) / 2: a turn t changes q = R' e3 by q x t."""
     a, x, y, z = v[0], v[1], v[2], v[3]
     q0, q1, q2 = 2.0 * (x * z - a * y), 2.0 * (y * z + a * x), 1.0 - 2.0 * (x * x + y * y)
     inner = w[0] * q0 + w[1] * q1 + w[2] * q2
@@ -114,7 +105,7 @@ def _tilt_second(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
 
 
 tilt = residual(
-    Kernel(_tilt, (SO3, (3,)), 3, name="tilt", second=_tilt_second),
+    StatedKernel(_tilt, (SO3, (3,)), 3, name="tilt", second=_tilt_second),
     about="""``tilt(R, z)``: R' e3 - z, (n, 3): the vertical as the body sees it, less z (3,) or (n, 3); takes ``x.R``.
 
 With z = (0, 0, 1) it is Ta's cost that keeps the vehicle level: 1/2 |r|^2 = 1 - cos(tilt), whatever the heading.

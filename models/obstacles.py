@@ -42,11 +42,7 @@ def clearance_of(body: Body) -> Residual:
     table = [(x, y, less) for (x, y, _), less in zip(body.discs, body.smaller.tolist(), strict=True)]
 
     def of_body(x: Array, centre: Array, radius: Array) -> Array:
-        cosine, sine = np.cos(x[:, 2]), np.sin(x[:, 2])
-        rows = []
-        for across, aside, less in table:
-            p = np.stack([x[:, 0] + cosine * across - sine * aside, x[:, 1] + sine * across + cosine * aside], axis=1)
-            rows.append(to_balls(p, centre, radius) + less)
+        rows = [to_balls(SE2.act(x, np.array([[ahead, aside]])), centre, radius) + less for ahead, aside, less in table]
         return np.concatenate(rows, axis=1)
 
     def rows_of(centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
@@ -99,8 +95,11 @@ def _short(d: float, numbers: Array) -> tuple[float, float]:
 
 
 def _shortfall(margin: float, d: Array) -> Array:
-    short: Array = np.maximum(margin - d, 0.0)
-    return short
+    return np.maximum(margin - d, 0.0)
+
+
+def _falling(margin: float, d: Array) -> Array:
+    return np.where(d < margin, -1.0, 0.0)
 
 
 def shortfall(distance: Residual, margin: float) -> Residual:
@@ -110,4 +109,5 @@ def shortfall(distance: Residual, margin: float) -> Residual:
         distance: a clearance, such as ``disc_clearance``.
         margin: distance below which the cost begins [m]; its square is continuously differentiable there.
     """
-    return of_distance(distance, _short, [margin], f"{distance.name} margin", partial(_shortfall, margin))
+    plain = partial(_shortfall, margin), partial(_falling, margin)
+    return of_distance(distance, _short, [margin], f"{distance.name} margin", *plain)

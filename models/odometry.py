@@ -116,5 +116,4 @@ def held(time: ArrayLike, velocity: ArrayLike, at: ArrayLike) -> Array:
     valid = np.searchsorted(since, ends[:-1], side="right") - 1
     moving = np.concatenate([np.zeros((1, 2)), speed])[valid + 1]
     path = driven(moving * np.diff(ends)[:, None])
-    found: Array = path[np.searchsorted(ends, when)]
-    return found
+    return path[np.searchsorted(ends, when)]

@@ -181,8 +181,7 @@ def _advance_all(where: int, x: Array, u: Array, dt: Array, out: Array) -> None:
 
 def ramp(last: Array, u: Array) -> Array:
     """Mean controls (n, m) of steps at whose ends the controls are u (n, m), from ``last`` (m,) on."""
-    means: Array = 0.5 * (np.concatenate([last[None], u[:-1]]) + u)
-    return means
+    return 0.5 * (np.concatenate([last[None], u[:-1]]) + u)
 
 
 def _rows(part: ArrayLike, moved: Array, size: int) -> Array:

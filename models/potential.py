@@ -56,8 +56,11 @@ def _repulsion(d: float, numbers: Array) -> tuple[float, float]:
 
 
 def _push(scale: float, near: float, far: float, d: Array) -> Array:
-    g: Array = scale * (1.0 / np.clip(d, near, far) - 1.0 / far)
-    return g
+    return scale * (1.0 / np.clip(d, near, far) - 1.0 / far)
+
+
+def _slope(scale: float, near: float, far: float, d: Array) -> Array:
+    return np.where((near < d) & (d < far), -scale / (d * d), 0.0)
 
 
 class _Search:
@@ -113,6 +116,6 @@ def potential(
         raise ModelError(
             f"potential: sense must be 'circulate', or 'aside' with a positive vortex; found {sense!r}, {vortex}"
         )
-    push, name = partial(_push, scale, near, far), f"{distance.name} potential"
-    true = of_distance(distance, _repulsion, [scale, near, far], name, push)
+    push, slope = (partial(plain, scale, near, far) for plain in (_push, _slope))
+    true = of_distance(distance, _repulsion, [scale, near, far], f"{distance.name} potential", push, slope)
     return true if vortex == 0.0 else replace(true, search=_Search(true, vortex, sense == "aside"))

@@ -56,41 +56,16 @@ def first_order(distance: Callable[..., None], profile: Profile, count: int) -> 
     return kernel
 
 
-@cache
-def _loop(profile: Profile) -> Callable[..., None]:
-    @compiled
-    def loop(distance: Array, numbers: Array, value: Array, slope: Array) -> None:
-        for i in range(len(distance)):
-            value[i], slope[i] = profile(distance[i], numbers)
-
-    return loop
-
-
-class _Batched:
-    """The same for a distance without a kernel whose Jacobian is attached."""
-
-    def __init__(self, distance: Residual, profile: Profile, numbers: Array) -> None:
-        self.distance, self.profile, self.numbers = distance, profile, numbers
-
-    def both(self, *arguments: Array) -> tuple[Array, Array]:
-        """Values and slopes, (n, m)."""
-        distance = np.ascontiguousarray(self.distance.function(*arguments), dtype=np.float64)
-        value, slope = np.empty(distance.size), np.empty(distance.size)
-        _loop(self.profile)(distance.ravel(), self.numbers, value, slope)
-        return value.reshape(distance.shape), slope.reshape(distance.shape)
-
-    def __call__(self, *arguments: Array) -> Array:
-        return self.both(*arguments)[0]
-
-    def jacobian(self, *arguments: Array) -> list[Array]:
-        assert self.distance.jacobian is not None
-        slope = self.both(*arguments)[1]
-        return [slope[:, :, None] * block for block in self.distance.jacobian(*arguments)]
+def _chained(slope: Callable[[Array], Array], distance: Residual, *arguments: Array) -> list[Array]:
+    assert distance.jacobian is not None
+    slopes = slope(np.asarray(distance.function(*arguments), dtype=np.float64))[:, :, None]
+    return [slopes * block for block in distance.jacobian(*arguments)]
 
 
 def of_distance(
-    distance: Residual, profile: Profile, numbers: list[float], name: str, function: Callable[[Array], Array]
-) -> Residual:
+    distance: Residual, profile: Profile, numbers: list[float], name: str, function: Callable[[Array], Array],
+    slope: Callable[[Array], Array],
+) -> Residual:  # fmt: skip
     """``g(distance(...))``, same shape.
 
     Args:
@@ -99,14 +74,14 @@ def of_distance(
         numbers: that it reads.
         name: of the residual.
         function: g, plain.
+        slope: g', plain.
     """
     made = plain(distance, function, name)
     if made is not None:
         return made
     first, kernel = np.array(numbers, dtype=np.float64), distance.kernel
     if kernel is None:
-        batched = _Batched(distance, profile, first)
-        return residual(batched, batched.jacobian, name)
+        return residual(partial(_composed, function, distance.function), partial(_chained, slope, distance), name)
     table = np.concatenate([first, kernel.table])
     composed = first_order(kernel.function, profile, len(first))
     return residual(replace(kernel, function=composed, table=table, name=name, linear=False))

@@ -174,9 +174,7 @@ def _straight(x: Array, after: int, blow: tuple[float, float, float], h: float, 
         r[i] = minus(minus(x[after + i], x[i]), half * (x[7 + i] + x[after + 7 + i]))
         r[6 + i] = x[after + 7 + i] - x[7 + i] - h * blow[i]
     if len(J):
-        for i in range(9):
-            for k in range(J.shape[1]):
-                J[i, k] = 0.0
+        J[:] = 0.0
         for i in range(3):
             J[i, i] = J[6 + i, 6 + i] = -1.0
             J[i, to + i] = J[6 + i, to + 6 + i] = 1.0

@@ -61,8 +61,7 @@ def held(gain: float, lag: float, durations: ArrayLike) -> Array:
 
 def _pushed(x: Array, thrust: Array, mass: Array, drag: Array) -> Array:
     """(n, 3) acceleration by the rotors and the air [m/s^2]."""
-    pushed: Array = SO3.act(x[:, R], thrust * UP - drag * SO3.act(SO3.inverse(x[:, R]), x[:, V])) / mass
-    return pushed
+    return SO3.act(x[:, R], thrust * UP - drag * SO3.act(SO3.inverse(x[:, R]), x[:, V])) / mass
 
 
 def defect(x: Array, u: Array, mass: Array, drag: Array, gust: Array, x_next: Array, dt: Any, loops: Array) -> Array:

@@ -155,17 +155,10 @@ def _end(
 
 
 @compiled
-def _clear(S: Array) -> None:
-    for i in range(len(S)):
-        for k in range(len(S)):
-            S[i, k] = 0.0
-
-
-@compiled
 def dynamics(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
     """Write the Hessian of w' defect for v = (x, u, x+)."""
     half = -0.5 * p[7]
-    _clear(S)
+    S[:] = 0.0
     _attitude(v, AFTER, w[3], w[4], w[5], S, AFTER_COLUMN)
     drive, pull = (v[13], p[0], p[1], p[2], p[3]), (half * w[6], half * w[7], half * w[8])
     _end(v, 0, drive, pull, S, 0, -1)
@@ -176,7 +169,7 @@ def dynamics(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
 def disturbed_dynamics(v: Array, p: Array, table: Array, w: Array, S: Array) -> None:
     """Write the Hessian of w' defect for v = (x, u, w, mass, drag, wind, updraft, x+)."""
     half = -0.5 * p[0]
-    _clear(S)
+    S[:] = 0.0
     _attitude(v, DISTURBED_AFTER, w[3], w[4], w[5], S, DISTURBED_COLUMN)
     drive, pull = (v[13], v[20], v[21], v[22], v[23]), (half * w[6], half * w[7], half * w[8])
     _end(v, 0, drive, pull, S, 0, 19)

@@ -47,11 +47,10 @@ from unifg.lie.functions import functions_of
 from unifg.models.tableau import METHODS, Tableau
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["advance", "integrator", "rollout", "trapezoid", "unicycle_field"]
+__all__ = ["advance", "integrator", "rollout", "unicycle_field"]
 
 Field: TypeAlias = Callable[..., Array]
 Rows: TypeAlias = Sequence[Sequence[float]]
-Form: TypeAlias = Literal["full", "simplified"]
 Method: TypeAlias = (
     Literal[
         "explicit euler",
@@ -89,24 +88,6 @@ def integrator(group: LieGroup, field: Field, method: Method = "full trapezoid")
     """
     tableau = _tableau(method)
     return residual(partial(step_defect, group, field, tableau.numbers), name=tableau.name)
-
-
-def trapezoid(group: LieGroup, field: Field, form: Form = "full") -> Residual:
-    """``trapezoid(group, F)(x, u, x_next, h)``: :func:`integrator` with one of Ta's two trapezoids.
-
-    Args:
-        group: as there.
-        field: as there.
-        form: "full" with dexp_inv, "simplified" without; both of second order in the step h [s].
-
-    Raises:
-        ModelError: on an unknown form.
-    """
-    if form == "full":
-        return integrator(group, field, "full trapezoid")
-    if form == "simplified":
-        return integrator(group, field, "simplified trapezoid")
-    raise ModelError(f"trapezoid: form must be 'full' or 'simplified', found {form!r}")
 
 
 def _tableau(method: Method) -> Tableau:

@@ -40,7 +40,6 @@ __all__ = ["CubicTrajectory"]
 
 Function: TypeAlias = Callable[[Array, Array, Array, Array, Array], Array]
 ORDER = 4  # control poses that hold a moment
-NUDGE = 1e-3  # of the differences that brackets are rounded from
 
 
 class Places(NamedTuple):
@@ -160,7 +159,7 @@ class CubicTrajectory:
 def _functions(hashable: Hashable, spacing: float) -> tuple[Function, Function, Function]:
     """Of four control poses: pose, velocity, acceleration."""
     group = cast(LieGroup, hashable)
-    bracket = brackets(group)
+    bracket = np.swapaxes(group.ad(np.eye(group.dim)), 1, 2)  # [e_i, e_j] = sum_k c_ijk e_k
 
     def pose(a: Array, b: Array, c: Array, d: Array, u: Array) -> Array:
         at = a
@@ -187,28 +186,6 @@ def _functions(hashable: Hashable, spacing: float) -> tuple[Function, Function, 
         return rates(a, b, c, d, u, True)
 
     return pose, velocity, acceleration
-
-
-def brackets(group: LieGroup) -> Array:
-    """(dim, dim, dim) structure constants: [e_i, e_j] = sum_k c_ijk e_k; whole numbers in all common bases.
-
-    Raises:
-        ModelError: where they are not, so that differences of the adjoint are none of them.
-    """
-    return _brackets(cast(Hashable, group))
-
-
-@cache
-def _brackets(hashable: Hashable) -> Array:
-    group = cast(LieGroup, hashable)
-    moved = NUDGE * np.eye(group.dim)
-    slope = (group.adjoint(group.exp(moved)) - group.adjoint(group.exp(-moved))) / (2.0 * NUDGE)  # [e_i, e_j]_k at ikj
-    found = np.swapaxes(slope, 1, 2)
-    rounded: Array = np.round(found)
-    if np.abs(found - rounded).max(initial=0.0) > 0.01:
-        raise ModelError(f"trajectory: the brackets of {group.name} are not whole numbers in its basis")
-    rounded.setflags(write=False)
-    return rounded
 
 
 def _weights(u: Array) -> tuple[tuple[Array, ...], tuple[Array, ...], tuple[Array, ...]]:

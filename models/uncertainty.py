@@ -65,10 +65,7 @@ def updated(covariance: Array, information: Array) -> Array:
 
 def pose_transition(x: Array, after: Array) -> Array:
     """(n, 3, 3) F: how errors of poses x (n, 3) in SE(2) arrive at the next ones: the adjoint of after^-1 x."""
-    moved = SE2.compose(SE2.inverse(after), x)
-    cosine, sine, zero = np.cos(moved[:, 2]), np.sin(moved[:, 2]), 0.0 * moved[:, 2]
-    rows = ([cosine, -sine, moved[:, 1]], [sine, cosine, -moved[:, 0]], [zero, zero, zero + 1.0])
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    return SE2.adjoint(SE2.between(after, x))
 
 
 @dataclass(frozen=True)

@@ -50,8 +50,7 @@ def _defect(x: Array, u: Array, x_next: Array, dt: Any) -> Array:
 
 
 def _consistency(x: Array, x_next: Array, dt: Any) -> Array:
-    moved: Array = x_next[:, P] - x[:, P] - 0.5 * np.reshape(dt, (-1, 1)) * (x[:, V] + x_next[:, V])
-    return moved
+    return x_next[:, P] - x[:, P] - 0.5 * np.reshape(dt, (-1, 1)) * (x[:, V] + x_next[:, V])
 
 
 def _increments(x: Array, u: Array, x_next: Array, dt: Any) -> Array:
@@ -103,8 +102,7 @@ def covariance(dt: float, sigma_a: float, sigma_omega: float) -> Array:
 
 def excess(u: Array, lower: Array, upper: Array) -> Array:
     """``max(u - upper, 0) + max(lower - u, 0)``, (n, m): how far controls are beyond their limits (eq. 12)."""
-    beyond: Array = np.maximum(u - upper, 0.0) + np.maximum(lower - u, 0.0)
-    return beyond
+    return np.maximum(u - upper, 0.0) + np.maximum(lower - u, 0.0)
 
 
 def step(x: Array, u: Array, dt: Any) -> Array:

@@ -101,7 +101,7 @@ def test_closed_loop_takes_fewer_iterations_with_its_penalties() -> None:
     problem = Unicycle("straight", True, 50)
     spent = {}
     for carried in (True, False):
-        driver = Driver(problem, AugmentedLagrangian(tolerance=1e-4), penalties=carried)
+        driver = Driver(problem.formulation(), AugmentedLagrangian(tolerance=1e-4), penalties=carried)
         pose, spent[carried] = problem.start, 0
         for index in range(30):
             control, _, iterations, status = driver.control(pose, index)

@@ -8,7 +8,7 @@ import math
 import os
 import shutil
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -149,22 +149,14 @@ def test_every_way_to_state_a_problem_is_the_same_problem(title: str) -> None:
         assert solution.cost == pytest.approx(first.cost, rel=1e-7)
 
 
-@dataclass(frozen=True)
-class Cell:
-    """A cell of a made-up study."""
-
-    seed: int
-    alone: bool = False
-
-
-def doubled(cell: Cell) -> Row:
-    if cell.seed == 9:
+def doubled(seed: int, alone: bool) -> Row:
+    if seed == 9:
         raise ScenarioError("no wind today")
-    return {"double": 2 * cell.seed}
+    return {"double": 2 * seed}
 
 
-def cells(seeds: Sequence[int]) -> list[Cell]:
-    return [Cell(seed, alone) for seed in seeds for alone in (False, True)]
+def cells(seeds: Sequence[int]) -> list[runner.Cell]:
+    return [{"seed": seed, "alone": alone} for seed in seeds for alone in (False, True)]
 
 
 def told(rows: list[Row]) -> str:
@@ -175,7 +167,7 @@ def test_a_study_measures_the_cells_that_are_missing(tmp_path: Path, monkeypatch
     """In two processes, but for those that are measured alone, and in one."""
     monkeypatch.setattr(runner, "OUT", tmp_path)
     monkeypatch.setattr(runner, "machine", lambda codes: "here")
-    study = Study(cells, doubled, told, range(2), alone=lambda cell: cell.alone)
+    study = Study(cells, doubled, told, range(2), alone=lambda cell: bool(cell["alone"]))
 
     def run(code: str, seeds: range | None = None, workers: int = 1, **chosen: bool) -> str:
         monkeypatch.setattr(runner, "commit", lambda: code)
@@ -216,7 +208,7 @@ def test_studies_state_their_cells(name: str) -> None:
     if isinstance(study, Timing):
         assert study.rounds > 0
         return
-    keys = [tuple(runner.stated(cell).values()) for cell in study.cells(study.seeds)]
+    keys = [tuple(cell.values()) for cell in study.cells(study.seeds)]
     assert len(set(keys)) == len(keys) > 0
     assert [tuple(key) for key in json.loads(json.dumps(keys))] == keys
 
@@ -282,7 +274,7 @@ def test_flights_are_compared_seed_by_seed() -> None:
 @pytest.mark.parametrize("seed", [102, 104])
 @pytest.mark.product(1)
 def test_a_moved_goal_among_discs_costs_no_more_than_with_twenty_starts(seed: int) -> None:
-    row = moved_goals.measure(moved_goals.Cell(seed))
+    row = moved_goals.measure(seed)
     assert row["warm, plan"] > 1.5 * row["best"] and row["loop, plan"] <= 1.02 * row["best"]
     assert row["loop, drive"] <= 1.02 * row["20 starts, drive"] and not row["not solved"]
     assert row["more"] < 16, "ordinary ticks try one start"

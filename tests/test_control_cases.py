@@ -77,7 +77,7 @@ def test_random_starts(problem: Problem) -> None:
 
 @pytest.mark.parametrize("problem", [Unicycle("straight", True, 50), Quadrotor("figure8", True, 20)])
 def test_closed_loop_is_cheap_and_safe(problem: Problem) -> None:
-    driver = Driver(problem, InteriorPoint(tolerance=1e-4))
+    driver = Driver(problem.formulation(), InteriorPoint(tolerance=1e-4))
     state, iterations = problem.start, []
     for index in range(31):
         control, _, count, status = driver.control(state, index)
@@ -90,7 +90,7 @@ def test_closed_loop_is_cheap_and_safe(problem: Problem) -> None:
 
 def test_one_iteration_a_step_is_an_option() -> None:
     problem = Quadrotor("goto", False, 20)
-    driver = Driver(problem, InteriorPoint(tolerance=1e-4, max_iterations=1))
+    driver = Driver(problem.formulation(), InteriorPoint(tolerance=1e-4, max_iterations=1))
     state, cost = problem.start, 0.0
     for index in range(101):
         control, _, count, _ = driver.control(state, index)
@@ -106,7 +106,7 @@ def test_a_single_step_becomes_as_many_as_the_obstacles_ask_for(problem: Problem
     deepest, costs, taken = {}, {}, {}
     rules: dict[str, dict[str, float]] = {"safe": {"step_tolerance": np.inf, "violation_tolerance": 1e-4}, "whole": {}}
     for name, options in rules.items():
-        driver = Driver(problem, InteriorPoint(tolerance=1e-4, **options))  # type: ignore[arg-type]
+        driver = Driver(problem.formulation(), InteriorPoint(tolerance=1e-4, **options))  # type: ignore[arg-type]
         state, cost, depth, iterations = problem.start, 0.0, -np.inf, 0
         for index in range(60):
             control, _, count, status = driver.control(state, index)

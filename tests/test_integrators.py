@@ -12,8 +12,6 @@ import pytest
 import unifg as fg
 from moving import FLYER, Carried, drag_and_thrust, with_held_rate
 from unifg.factors.differences import jacobian
-from unifg.lie import so3
-from unifg.lie.functions import functions_of
 from unifg.models import rkmk
 from unifg.models.rkmk import Method
 from unifg.models.tableau import METHODS, Tableau
@@ -161,30 +159,6 @@ def test_jacobians(group: fg.LieGroup, method: Method) -> None:
     found, blocks = linearized(defect, points, manifolds, 0.3)
     np.testing.assert_allclose(found, defect(*points, 0.3), atol=1e-14 * 30)
     np.testing.assert_allclose(blocks, numerical, atol=1e-8)
-
-
-@pytest.mark.parametrize("group", [*GROUPS, fg.SO2, fg.Rn(2)], ids=lambda g: g.name)
-def test_the_bend_of_dexp_inv(group: fg.LieGroup) -> None:
-    """In closed form, against differences of fourth order; on both sides of where series take over."""
-    functions = functions_of(group)
-    assert functions is not None
-    for length in (0.0, 1e-3, 0.49, 0.51, 1.0, 3.0):
-        tangent, velocity, found = RNG.normal(size=group.dim), RNG.normal(size=group.dim), np.empty((group.dim,) * 2)
-        if group in (fg.SE2, fg.SO3, fg.SE3):
-            turn = tangent[2:] if group == fg.SE2 else tangent[-3:]
-            turn *= length / np.linalg.norm(turn)
-        functions.bend(tangent, velocity, found)
-        np.testing.assert_allclose(found, fg.LieGroup.bend(group, tangent, velocity), atol=2e-12)
-
-
-def test_the_bend_is_in_the_algebra_over_dual_numbers() -> None:
-    """se(3) is so(3) over dual numbers, so dexp_inv there holds the derivative of dexp_inv here."""
-    found = np.empty((3, 3))
-    for length in (0.0, 1e-3, 1.0, 3.0):
-        omega, velocity = length * np.array([0.6, -0.64, 0.48]), RNG.normal(size=3)
-        so3.bend(omega, velocity, found)
-        blocks = [fg.SE3.right_jacobian_inverse([*direction, *omega])[:3, 3:] for direction in np.eye(3)]
-        np.testing.assert_allclose(found, np.stack([block @ velocity for block in blocks], axis=1), atol=2e-15)
 
 
 def test_steps_may_differ_and_inputs_be_shared() -> None:

@@ -108,12 +108,12 @@ NEARBY = fg.SE2.retract(poses(), RNG.normal(size=(COUNT, 3)))
 STEP = [poses(), vectors(2), NEARBY]
 MOVING = fg.Product(pose=fg.SE2, v=fg.Rn(2))
 MOTION = [MOVING.random(RNG, (COUNT,)), vectors(2), MOVING.random(RNG, (COUNT,))]
-CASES["rkmk.trapezoid"] = (rkmk.trapezoid(fg.SE2, current), STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3])
+CASES["rkmk.trapezoid"] = (rkmk.integrator(fg.SE2, current), STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3])
 CASES["rkmk.trapezoid, simplified"] = (
-    rkmk.trapezoid(fg.SE2, current, "simplified"), STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3],
+    rkmk.integrator(fg.SE2, current, "simplified trapezoid"), STEP, [fg.SE2, fg.Rn(2), fg.SE2], [0.3],
 )  # fmt: skip
 CASES["rkmk.trapezoid, pose and velocity"] = (
-    rkmk.trapezoid(MOVING, accelerated), MOTION, [MOVING, fg.Rn(2), MOVING], [0.3],
+    rkmk.integrator(MOVING, accelerated), MOTION, [MOVING, fg.Rn(2), MOVING], [0.3],
 )  # fmt: skip
 
 
@@ -147,7 +147,7 @@ CASES["quadrotor.disturbed_dynamics"] = (
     quadrotor.disturbed_dynamics, [*FLIGHT, *UNKNOWN, LANDED], MANIFOLDS, [0.3],
 )  # fmt: skip
 CASES["rkmk.trapezoid, quadrotor"] = (
-    rkmk.trapezoid(quadrotor.STATE, quadrotor.field), [*FLIGHT, *UNKNOWN, LANDED], MANIFOLDS, [0.3],
+    rkmk.integrator(quadrotor.STATE, quadrotor.field), [*FLIGHT, *UNKNOWN, LANDED], MANIFOLDS, [0.3],
 )  # fmt: skip
 CASES["bicycle.dynamics"] = (
     bicycle.dynamics(bicycle.Bicycle()),

@@ -360,3 +360,21 @@ def test_stated_kernels_take_second_derivatives_that_are_given() -> None:
     np.testing.assert_allclose(
         given.second_derivatives(weights, x, mark, seen), derived.second_derivatives(weights, x, mark, seen), atol=1e-12
     )
+
+
+@pytest.mark.parametrize(
+    "manifold", [fg.SO2, fg.SE2, fg.SO3, fg.SE3, fg.SE23, fg.Product(x=fg.SE2, v=fg.Rn(2))], ids=str
+)
+def test_a_prior_bends_as_its_slopes_say(manifold: fg.LieGroup) -> None:
+    """Its rows are written by hand, its Hessian is derived from a function of NumPy; at zero and far away."""
+    rng = np.random.default_rng(5)
+    x = manifold.random(rng, (4,))
+    d = np.array([0.0, 1e-3, 0.5, 1.2])[:, None] * rng.standard_normal((4, manifold.dim)) / 1.5
+    reference, weights, eye = manifold.retract(x, d), rng.standard_normal((4, manifold.dim)), np.eye(manifold.dim)
+    kernel = fg.prior.on(manifold).kernel
+    assert kernel is not None
+    found = kernel.second_derivatives(weights, x, reference)
+    sides = (kernel.jacobian(manifold.retract(x, sign * 1e-5 * e), reference)[0] for e in eye for sign in (1.0, -1.0))
+    pulled = [np.einsum("nij,ni->nj", side, weights) for side in sides]
+    slopes = np.stack([(a - b) / 2e-5 for a, b in zip(pulled[::2], pulled[1::2], strict=True)], axis=1)
+    np.testing.assert_allclose(found, 0.5 * (slopes + np.swapaxes(slopes, 1, 2)), atol=1e-8)

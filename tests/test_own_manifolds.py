@@ -47,7 +47,7 @@ def test_axioms_hold(manifold: fg.Manifold) -> None:
 @pytest.mark.product(1)
 def test_what_follows_is_exact(group: fg.LieGroup, rng: Generator) -> None:
     """Everything but four functions is derived; against exponentials of matrices, to rounding."""
-    x, (d, v) = group.random(rng, (20,)), 0.9 * rng.standard_normal((2, 20, group.dim))
+    x, d = group.random(rng, (20,)), 0.9 * rng.standard_normal((20, group.dim))
     dim, matrix = group.dim, group.matrix(x)
     moved = matrix @ group.hat(d) @ np.linalg.inv(matrix)
     along = group.hat((group.adjoint(x) @ d[..., None])[..., 0])
@@ -58,7 +58,6 @@ def test_what_follows_is_exact(group: fg.LieGroup, rng: Generator) -> None:
     for sign, found in ((-1.0, group.right_jacobian(d)), (1.0, group.left_jacobian(d))):
         block[:, :dim, :dim], block[:, :dim, dim:] = sign * small, np.eye(dim)
         np.testing.assert_allclose(found, expm(block)[:, :dim, dim:], atol=1e-13 * np.abs(found).max())
-    np.testing.assert_allclose(group.bend(d, v), fg.LieGroup.bend(group, d, v), atol=1e-10)
 
 
 # ---------------------------------------------------------------- mutants
@@ -121,11 +120,6 @@ def in_haste(x: Array, y: Array, out: Array) -> None:
     out[1] = x[1] + s * y[0] + c * y[1]
 
 
-def no_bend(d: Array, v: Array, out: Array) -> None:
-    """Second derivatives of a group that commutes."""
-    out[:] = 0.0
-
-
 MUTANTS: list[tuple[fg.Manifold, str, Callable[..., None], str]] = [
     (XYZW, "exp", backwards, "Log(Exp(d)) = d"),
     (XYZW, "exp", without_series, "Exp(0) = e"),
@@ -137,7 +131,6 @@ MUTANTS: list[tuple[fg.Manifold, str, Callable[..., None], str]] = [
     (fg.SE2, "right_jacobian_inverse", of_the_other_side, "Jr^-1(d) Jr(d) = I"),
     (fg.SE2, "inverse", of_the_other_sign, "x x^-1 = e"),
     (fg.SE2, "compose", in_haste, "the compiled compose may write over argument 1"),
-    (fg.SE2, "bend", no_bend, "bend(d, v) is the slope of Jr^-1(d) v"),
 ]
 
 

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("casadi", reason="the judge evaluates with casadi, which comes with the extra 'bench'")
 from benchmarks import peers, runner
 from benchmarks.control_loops import STEPS
-from benchmarks.own_functions import Way
+from benchmarks.own_functions import stated
 from benchmarks.peers import HOME, compared, rendered
 from problems.control import Tick, Unicycle
 from unifg.solvers import InteriorPoint
@@ -66,7 +66,7 @@ def test_judge_knows_an_optimum_and_what_is_outside() -> None:
 
 def test_loops_are_driven_in_turn_and_failures_end_the_comparison() -> None:
     problem = peers.problems()[0]
-    ours = peers.Whole(Way(problem, "numpy"), peers.LOOPS["InteriorPoint, safe"])
+    ours = peers.Whole(stated(problem, "numpy"), peers.LOOPS["InteriorPoint, safe"])
 
     def broken(state: Any, index: int) -> Tick:
         return Tick(ours.control(state, 0).control, 1.0, 1, "QP failure" if index == 7 else "converged")

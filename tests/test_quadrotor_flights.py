@@ -28,7 +28,7 @@ def short_rows() -> dict[str, Row]:
         patch.setattr(quadrotor_flights, "run_flight", moment)
         for coupling in quadrotor_tables.VARIANTS:
             job = Job("flights", "ipm", coupling, 1006)
-            row = {**asdict(job), **quadrotor_flights.fly(job)}
+            row = {**asdict(job), **quadrotor_flights.fly(**asdict(job))}
             rows[coupling] = json.loads(json.dumps(row, allow_nan=False))
     return rows
 
@@ -39,7 +39,7 @@ def moment(settings: FlightSettings) -> FlightLog:
 
 
 def test_every_study_flies_what_it_should() -> None:
-    jobs = cells(range(100))
+    jobs = [Job(**cell) for cell in cells(range(100))]
     count = {study: sum(job.study == study for job in jobs) for study in STUDIES}
     assert count == {
         "flights": 7 * 100, "potential": 3 * 100, "association": 100, "movers": 100,

@@ -345,7 +345,7 @@ def test_the_pull_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quadrotor_pull, "SECONDS", 0.5)
     strong = quadrotor_pull.Job(SEED, weight=10.0, pull=np.inf)
     weak = replace(strong, weight=1e-6)
-    rows = {job.weight: {**asdict(job), **quadrotor_pull.fly(job)} for job in (strong, weak)}
+    rows = {job.weight: {**asdict(job), **quadrotor_pull.fly(**asdict(job))} for job in (strong, weak)}
     assert rows[10.0]["mean"]["sigma"] > 0.5 > 1e-2 > rows[1e-6]["max"]["sigma"]
     groups: quadrotor_pull.Groups = {(str(weight),): [row] for weight, row in rows.items()}
     for text in (quadrotor_pull.pull_table(groups, ["weight"]), quadrotor_pull.error_table(groups, ["weight"])):

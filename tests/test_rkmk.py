@@ -11,12 +11,12 @@ import pytest
 import unifg as fg
 from unifg.factors.differences import jacobian
 from unifg.models import rkmk, unicycle
-from unifg.models.rkmk import Form
+from unifg.models.rkmk import Method
 from unifg.solvers import SQP, LevenbergMarquardt
 from unifg.typing import Array
 
 RNG = np.random.default_rng(11)
-FORMS: tuple[Form, ...] = ("full", "simplified")
+FORMS: tuple[Method, ...] = ("full trapezoid", "simplified trapezoid")
 GROUPS: list[fg.LieGroup] = [fg.SE2, fg.SO2, fg.Rn(2), fg.Product(pose=fg.SE2, v=fg.Rn(2))]
 
 
@@ -32,12 +32,10 @@ def current(x: Array, u: Array) -> Array:
     )
 
 
-def implicit_step(form: Form, x: Array, u: Array, h: float) -> Array:
+def implicit_step(form: Method, x: Array, u: Array, h: float) -> Array:
     """Solve the trapezoid for the next state by Newton's method."""
-    after = rkmk.advance(
-        fg.SE2, current, x, u, h=h, method="full trapezoid" if form == "full" else "simplified trapezoid"
-    )
-    assert np.abs(rkmk.trapezoid(fg.SE2, current, form)(x, u, after, h)).max() < 1e-13
+    after = rkmk.advance(fg.SE2, current, x, u, h=h, method=form)
+    assert np.abs(rkmk.integrator(fg.SE2, current, form)(x, u, after, h)).max() < 1e-13
     return after
 
 
@@ -62,18 +60,18 @@ START, CONTROL = np.array([[0.3, -0.2, 0.5]]), np.array([[1.0, 0.8]])
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_held_control_gives_the_exponential(form: Form) -> None:
+def test_held_control_gives_the_exponential(form: Method) -> None:
     """With F constant over the step X Exp(hF) is exact in both forms."""
     x = fg.SE2.random(RNG, (200,))
     u = RNG.normal(size=(200, 2))
     for h in (0.02, 0.1, 0.7):
         exact = fg.SE2.retract(x, h * rkmk.unicycle_field(x, u))
-        defect = rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, form)(x, u, exact, h)
+        defect = rkmk.integrator(fg.SE2, rkmk.unicycle_field, form)(x, u, exact, h)
         assert np.abs(defect).max() < 1e-14
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_the_constraint_leads_to_the_exponential(form: Form) -> None:
+def test_the_constraint_leads_to_the_exponential(form: Method) -> None:
     """Solved for the next pose from a guess elsewhere, the answer is X Exp(hF)."""
     x = np.array([[0.2, -0.3, 3.0]])
     u, h = np.array([[0.9, 0.8]]), 0.5
@@ -83,7 +81,7 @@ def test_the_constraint_leads_to_the_exponential(form: Form) -> None:
     graph.fix(nodes[0], x[0])
     graph.fix(control, u[0])
     graph.minimize(
-        rkmk.trapezoid(fg.SE2, rkmk.unicycle_field, form),
+        rkmk.integrator(fg.SE2, rkmk.unicycle_field, form),
         nodes[:-1], control, nodes[1:], h,
     )  # fmt: skip
     solution = LevenbergMarquardt(tolerance=1e-15).solve(graph, {nodes: np.tile(x, (2, 1)), control: u})
@@ -94,12 +92,12 @@ def test_the_constraint_leads_to_the_exponential(form: Form) -> None:
 def test_midpoint_model_is_close_but_not_the_same() -> None:
     """Bazzana's kinematics takes the chord v h for the arc: it differs from Exp by v h (1 - sinc(omega h / 2))."""
     x, u, h = np.zeros((1, 3)), np.array([[1.0, 1.0]]), 0.1
-    defect = rkmk.trapezoid(fg.SE2, rkmk.unicycle_field)(x, u, unicycle.step(x, u, h), h)
+    defect = rkmk.integrator(fg.SE2, rkmk.unicycle_field)(x, u, unicycle.step(x, u, h), h)
     assert np.linalg.norm(defect) == pytest.approx(h * (1.0 - np.sin(0.05) / 0.05), rel=1e-2)
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_second_order_when_the_field_depends_on_the_state(form: Form) -> None:
+def test_second_order_when_the_field_depends_on_the_state(form: Method) -> None:
     time, errors = 1.0, []
     exact = flow(START, CONTROL, time)
     for steps in (8, 16, 32, 64):
@@ -148,7 +146,7 @@ def test_sign_inside_the_residual() -> None:
     x = fg.SE2.random(RNG, (20,))
     tangent = 0.01 * RNG.normal(size=(20, 3))
     after, u, h = fg.SE2.retract(x, tangent), RNG.normal(size=(20, 2)), 0.3
-    full, simplified = (rkmk.trapezoid(fg.SE2, current, form)(x, u, after, h) for form in FORMS)
+    full, simplified = (rkmk.integrator(fg.SE2, current, form)(x, u, after, h) for form in FORMS)
     leading = -0.25 * h * np.einsum("nij,nj->ni", fg.SE2.ad(tangent), current(after, u))
     np.testing.assert_allclose(full - simplified, leading, atol=1e-4 * h)
     assert np.abs(leading).max() > 1e-3 * h
@@ -164,7 +162,7 @@ def test_exponential_coordinates_obey_their_equation() -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_vector_spaces_have_the_ordinary_trapezoid(form: Form) -> None:
+def test_vector_spaces_have_the_ordinary_trapezoid(form: Method) -> None:
     space, h = fg.Rn(2), 0.2
 
     def pendulum(x: Array, u: Array) -> Array:
@@ -172,11 +170,11 @@ def test_vector_spaces_have_the_ordinary_trapezoid(form: Form) -> None:
 
     x, after, u = (RNG.normal(size=(5, n)) for n in (2, 2, 1))
     expected = after - x - 0.5 * h * (pendulum(x, u) + pendulum(after, u))
-    np.testing.assert_allclose(rkmk.trapezoid(space, pendulum, form)(x, u, after, h), expected, atol=1e-15)
+    np.testing.assert_allclose(rkmk.integrator(space, pendulum, form)(x, u, after, h), expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_drives_as_a_hard_constraint(form: Form) -> None:
+def test_drives_as_a_hard_constraint(form: Method) -> None:
     """A vehicle in a current reaches a goal with hard trapezoid dynamics; the defect is met everywhere."""
     count, h = 10, 0.2
     graph = fg.Graph()
@@ -184,7 +182,7 @@ def test_drives_as_a_hard_constraint(form: Form) -> None:
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, x[-1], [1.5, 0.5, 0.4], sigma=0.1)
     graph.minimize(fg.prior, u, [0.5, 0.0])
-    dynamics = rkmk.trapezoid(fg.SE2, current, form)
+    dynamics = rkmk.integrator(fg.SE2, current, form)
     graph.constrain(dynamics, x[:-1], u, x[1:], h, lower=0.0, upper=0.0, name="dynamics")
     start = {x: np.zeros((count + 1, 3)), u: np.zeros((count, 2))}
     solution = SQP().solve(graph, start)
@@ -195,9 +193,9 @@ def test_drives_as_a_hard_constraint(form: Form) -> None:
 
 
 def test_unknown_form_is_refused_and_residuals_pickle() -> None:
-    with pytest.raises(fg.ModelError, match="'full' or 'simplified', found 'half'"):
-        rkmk.trapezoid(fg.SE2, current, "half")  # type: ignore[arg-type]
-    copy = pickle.loads(pickle.dumps(rkmk.trapezoid(fg.SE2, current)))
+    with pytest.raises(fg.ModelError, match=r"'simplified trapezoid'.*found 'half'"):
+        rkmk.integrator(fg.SE2, current, "half")  # type: ignore[arg-type]
+    copy = pickle.loads(pickle.dumps(rkmk.integrator(fg.SE2, current)))
     assert np.isfinite(copy(START, CONTROL, START, 0.1)).all()
 
 

@@ -13,7 +13,7 @@ import pytest
 
 import unifg as fg
 from benchmarks import gtsam_peer
-from benchmarks.wrong_closures import COLUMNS, METHODS, Job, aligned_error, attempt
+from benchmarks.wrong_closures import COLUMNS, METHODS, aligned_error, attempt
 from problems.closures import Claim, with_wrong_closures
 from unifg.errors import BackendError, GraphError
 from unifg.factors.robust import Graduated, Loss
@@ -416,7 +416,7 @@ def test_the_study_of_wrong_closures_counts_what_each_method_keeps() -> None:
     assert aligned_error(path @ turn.T + 5.0, path) < 1e-12 < 0.1 < aligned_error(-path, path)
     methods = [method for method in METHODS if method != "GTSAM" or gtsam_peer.available()]
     for clean in (manhattan(100, 1).pose_graph, sphere(5, 8).pose_graph):
-        found = {method: attempt(clean, Job("toy", 0.3, "anywhere", 0, method)) for method in methods}
+        found = {method: attempt(clean, 0.3, "anywhere", 0, method) for method in methods}
         for method, row in found.items():
             assert (
                 row["wrong"] == round(0.3 / 0.7 * len(clean.closures)) and row["trajectory"] <= row["distance"] + 1e-9
@@ -435,7 +435,7 @@ def test_the_study_of_wrong_closures_counts_what_each_method_keeps() -> None:
 def test_wrong_closures_of_a_long_drive(shared_data: Path, name: str, wrong: int) -> None:
     """One wrong closure of M3500 that paid by the cost as stated left the answer 6 m off."""
     clean = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz")
-    row = attempt(clean, Job(name, 0.1, "anywhere", 0, "unifg"))
+    row = attempt(clean, 0.1, "anywhere", 0, "unifg")
     assert row["remark"] == "CONVERGED"
     assert [tell(row) for tell in COLUMNS.values()][:4] == ["0.000", "1.0000", f"0 of {wrong}", "1.0000"]
 

@@ -113,7 +113,7 @@ def test_ways_are_compared_at_equal_error_and_at_equal_time() -> None:
 @pytest.mark.parametrize("past", ["nominal", "unknown"])
 @pytest.mark.parametrize("plan", ["nominal", "estimated"])
 def test_past_and_plan_are_chosen_apart(past: str, plan: str) -> None:
-    flight = shared_dynamics.prepared(shared_dynamics.Job(1000, past, plan, accelerometer=plan == "nominal"))
+    flight = shared_dynamics.prepared(1000, past, plan, accelerometer=plan == "nominal")
     pilot, nominal, control = cast(Any, flight.pilot), flight.conditions.nominal, None
     for _ in range(4):
         control = pilot.tick(flight.world.sense(), control).control

@@ -29,7 +29,7 @@ from tqdm import tqdm
 
 import unifg as fg
 from benchmarks import control_cases, ecg2o, incremental, pose_graphs
-from benchmarks.navigation import CASES, Drive
+from benchmarks.navigation import CASES, settings_of
 from benchmarks.report import OUT
 from problems import collection
 from problems.control import Problem, blocked, problems
@@ -40,7 +40,7 @@ from unifg.pose_graphs import PoseGraph
 from unifg.scenarios import manoeuvres
 from unifg.scenarios.course import CourseSettings, run_course
 from unifg.scenarios.flight import FlightSettings, run_flight
-from unifg.scenarios.navigation import run_navigation
+from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.solvers import DogLeg, GaussNewton, GraduatedNonConvexity
 from unifg.solvers.names import backends
 from unifg.typing import Array
@@ -141,9 +141,9 @@ def manoeuvred(case: manoeuvres.Case, solver: str) -> Row:
     return row_of(manoeuvres.run_manoeuvre(case, solver).solution)
 
 
-def driven(drive: Drive) -> Row:
+def driven(settings: NavigationSettings) -> Row:
     """A drive in closed loop."""
-    log = run_navigation(drive.settings())
+    log = run_navigation(settings)
     status = f"{sum(log.reached)} of {len(log.goals)} goals, {log.collisions} collisions"
     far = float(np.linalg.norm(log.true_pose))
     return Row(status, len(log.time), far, digest(log.true_pose, log.estimate, log.control))
@@ -223,7 +223,7 @@ def of_drives() -> Rows:
     for (name, case), seeds in zip(CASES.items(), ((0, 1), (0,), (0,), (0, 1)), strict=True):
         for seed, (solver, coupling) in product(seeds, (("alm", "sequential"), ("sqp", "joint"))):
             if case.available:
-                drive = Drive(name, solver, coupling, seed)
+                drive = settings_of(case, solver, coupling, seed)
                 yield f"{name}, {solver}, {coupling}, seed {seed}", partial(driven, drive)
 
 

@@ -101,8 +101,7 @@ class DynamicWindow:
         speeds, turns = (np.linspace(low[i], high[i], own.samples[i]) for i in range(2))
         inside = (low[1] <= 0.0 <= high[1]) * np.ones(1)  # straight on is always tried, if it can be
         turns = np.append(turns, 0.0) if inside.any() else turns
-        grid: Array = np.stack(np.meshgrid(speeds, turns, indexing="ij"), axis=-1).reshape(-1, 2)
-        return grid
+        return np.stack(np.meshgrid(speeds, turns, indexing="ij"), axis=-1).reshape(-1, 2)
 
     def admissible(self, tried: Array, hit: BoolArray) -> BoolArray:
         """(M,) True if the robot can stop before the first place (M, K) where it hits something (eq. 14)."""
@@ -122,8 +121,7 @@ class DynamicWindow:
         aligned = float(now.along()[-1] > own.aligned_beyond)
         near = clearance.min(axis=1)
         occupied = np.where(near < own.inflation, FULL * np.exp(-own.decay * np.maximum(near, 0.0)), 0.0)
-        total: Array = (
+        return (
             own.path_distance * away + own.goal_distance * left + own.obstacle * occupied
             + aligned * (own.path_align * nose_away + own.goal_align * nose_left)
         )  # fmt: skip
-        return total

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from draw_covariance_plans import drawn
 
-from benchmarks.active_perception import Job, dark, planned
+from benchmarks.active_perception import dark, planned
 from problems import belief_plans
 from unifg.style.colours import css
 from unifg.style.figures import new_figure, write_figure
@@ -19,7 +19,7 @@ SEED = 104
 def main() -> None:
     """Write the picture."""
     world = dark(SEED)
-    chosen = {way: [plan for _, plan in planned(Job(SEED, way)) if plan is not None][-1] for way in WORDS}
+    chosen = {way: [plan for _, plan in planned(SEED, way) if plan is not None][-1] for way in WORDS}
     with new_figure((7.6, 8.6)) as figure:
         for ax, (way, plan) in zip(figure.subplots(2, 1, sharex=True), chosen.items(), strict=True):
             drawn(ax, world, plan)

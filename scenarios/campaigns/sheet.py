@@ -74,8 +74,7 @@ class Sheet:
         """(n,) numbers of a measure, of all episodes or of those that ended in one way."""
         mine = self.of(combination)
         mine = mine if outcome is None else mine[mine["outcome"] == outcome]
-        found: Array = np.asarray(self.by_episode(measure).reindex(mine.index).dropna(), dtype=np.float64)
-        return found
+        return np.asarray(self.by_episode(measure).reindex(mine.index).dropna(), dtype=np.float64)
 
     def by_episode(self, measure: str) -> pd.Series[float]:
         """Numbers of a measure by episode; empty for one that no episode has."""

@@ -8,18 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["machine"]
+__all__ = ["machine", "processor"]
+
+
+def processor() -> str:
+    """Marketing name of the processor where the system gives it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):  # systems that tell otherwise, or nothing
+        return platform.processor() or platform.machine()
 
 
 def machine() -> str:
     """Properties that two comparable ratios share."""
-    name = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        pass  # systems that tell otherwise, or nothing
-    python = (
-        f"{platform.python_implementation()} {platform.python_version_tuple()[0]}.{platform.python_version_tuple()[1]}"
-    )
-    return f"{platform.system()}, {name}, {python}, numpy {np.__version__}, numba {metadata.version('numba')}"
+    python = f"{platform.python_implementation()} {'.'.join(platform.python_version_tuple()[:2])}"
+    return f"{platform.system()}, {processor()}, {python}, numpy {np.__version__}, numba {metadata.version('numba')}"

@@ -137,8 +137,7 @@ class EpisodeLog(StoredLog):
     @property
     def tick_ms(self) -> Array:
         """(T,) all that a tick takes [ms]."""
-        total: Array = self.localise_ms + self.perceive_ms + self.route_ms + self.plan_ms
-        return total
+        return self.localise_ms + self.perceive_ms + self.route_ms + self.plan_ms
 
     @property
     def hull(self) -> Body:

@@ -12,7 +12,6 @@ from unifg.models import quadrotor
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.metrics import errors as norms
 from unifg.scenarios.logs.metrics import statistics, timing
-from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array, BoolArray
 
 __all__ = [
@@ -121,17 +120,13 @@ def landmark_errors(log: FlightLog) -> Array:
     Landmarks farther than 1 m from all of them are left out: they stand for something that moves, or for nothing.
     """
     means = log.landmarks[-1]["mean"]
-    things = _things(log.layout)
+    things = np.concatenate([log.layout.cylinders[:, :2], log.layout.corners.reshape(-1, 2)])
     if not len(means) or not len(things):
         return np.zeros((0, 2))
     errors = means[:, None, :] - things[None]
     nearest = errors[np.arange(len(means)), np.linalg.norm(errors, axis=2).argmin(axis=1)]
     matched: Array = nearest[np.linalg.norm(nearest, axis=1) <= _SAME]
     return matched
-
-
-def _things(layout: Layout) -> Array:
-    return np.concatenate([layout.cylinders[:, :2], layout.corners.reshape(-1, 2)])
 
 
 def _coverage(log: FlightLog, errors: Array, active: BoolArray) -> dict[str, float]:

@@ -82,8 +82,7 @@ class SafeLog:
     @property
     def error(self) -> Array:
         """(T, 3) from the path [m]."""
-        found: Array = self.states[:, :3] - self.wanted[:, :3]
-        return found
+        return self.states[:, :3] - self.wanted[:, :3]
 
     @property
     def arrived(self) -> bool:

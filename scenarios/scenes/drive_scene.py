@@ -202,10 +202,8 @@ def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
     """World points (n, 2) [m] where the chosen beams of a tick really ended; dropouts and misses are left out."""
     ranges = log.scan[tick][beams]
     returned = np.isfinite(ranges)
-    x, y, heading = log.true_pose[tick]
-    angles = log.scan_angles[beams][returned] + heading
-    hits: Array = np.column_stack([np.cos(angles), np.sin(angles)]) * ranges[returned, None] + np.array([x, y])
-    return hits
+    angles = log.scan_angles[beams][returned]
+    return SE2.act(log.true_pose[tick], ranges[returned, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
 
 
 def _robots(scene: Scene, hull: Body, pin: float) -> None:

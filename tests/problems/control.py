@@ -14,7 +14,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -181,14 +181,6 @@ class Problem(ABC):
         for _ in range(count):
             moved = self.manifold.retract(states, of_states * rng.standard_normal((len(states), len(of_states))))
             yield moved, controls + of_controls * rng.standard_normal(controls.shape)
-
-
-class Formulated(Protocol):
-    """Interface of anything that can be stated as a factor graph: a problem, or one way to state it."""
-
-    def formulation(self) -> Stated:
-        """As a factor graph."""
-        ...
 
 
 class Stated(ABC):
@@ -449,18 +441,16 @@ class Tick(NamedTuple):
 class Driver:
     """A backend in closed loop: every solve begins at its own last answer, moved by one stage."""
 
-    def __init__(
-        self, problem: Formulated, solver: fg.Solver, multipliers: bool = True, penalties: bool = True
-    ) -> None:
+    def __init__(self, stated: Stated, solver: fg.Solver, multipliers: bool = True, penalties: bool = True) -> None:
         """Prepare the graph; the first solve is to the end for a backend that is stopped early in the others.
 
         Args:
-            problem: to be driven.
+            stated: problem to be driven.
             solver: the backend.
             multipliers: whether they go from step to step.
             penalties: whether those of an augmented Lagrangian do, too.
         """
-        self._stated = problem.formulation()
+        self._stated = stated
         self._cold = type(solver)(tolerance=solver.tolerance).prepare(self._stated.graph)
         self._warm = solver.prepare(self._stated.graph)
         self._kept = multipliers, penalties

@@ -137,8 +137,7 @@ class Table:
         """(n,) the rows by the times in the first column of numbers; one warning where the file has another order."""
         time = self.numbers[:, 0]
         self.remark_order(": lines are sorted")
-        order: IntArray = np.argsort(time, kind="stable")
-        return order
+        return np.argsort(time, kind="stable")
 
     def remark_order(self, done: str = "") -> None:
         """Warn of times in the first column of numbers that run backwards."""
@@ -289,8 +288,7 @@ def norms(quaternions: Array, place: Callable[[int], str], say: Callable[[str], 
             f"{far.size} of {len(quaternions)} quaternions have norms farther than {NEAR:g} from one and were "
             f"normalised, first {place(int(far[0]))} of norm {np.sqrt(squared[far[0]]):.6g}"
         )
-    found: Array = np.where(np.abs(squared - 1.0) <= _UNIT, 1.0, np.sqrt(squared))
-    return found
+    return np.where(np.abs(squared - 1.0) <= _UNIT, 1.0, np.sqrt(squared))
 
 
 def _line_ends(data: NDArray[np.uint8]) -> IntArray:

@@ -1,7 +1,7 @@
 """Operations derived from the exponential, the logarithm, the product and the inverse of a group, for one element.
 
-A group of one's own states these four; whatever else it does not state is made of them here. Nothing is differenced but
-the second derivatives. With Ad(x) d = Log(x Exp(d) x^-1), which holds for every d within the reach of the logarithm,
+A group of one's own states these four; whatever else it does not state is made of them here, and nothing is
+differenced. With Ad(x) d = Log(x Exp(d) x^-1), which holds for every d within the reach of the logarithm,
 
     Jr(d) = int_0^1 Ad(Exp(-s d)) ds
 
@@ -22,7 +22,6 @@ from unifg.lie.elementwise import Scalar
 from unifg.typing import Array
 
 REACH = 0.5  # length of the tangent vectors of which adjoints are read
-STEP = 2.0**-10  # of derivatives from four points; their error, STEP^4 / 30, is below the rounding
 _nodes, _weights = np.polynomial.legendre.leggauss(12)
 NODES = tuple(float(node) for node in 0.5 * (1.0 + _nodes))  # in [0, 1]
 WEIGHTS = tuple(float(weight) for weight in 0.5 * _weights)
@@ -133,28 +132,6 @@ def _mirrored(storage: int, dim: int, right: Scalar) -> Scalar:
     return left
 
 
-def _bend(storage: int, dim: int, right_jacobian_inverse: Scalar) -> Scalar:
-    @compiled
-    def bend(d: Array, v: Array, out: Array) -> None:
-        """Differences from four points."""
-        near, J = local_vector(dim), local_matrix(dim, dim)
-        out[:] = 0.0
-        for k in range(dim):
-            near[k] = d[k]
-        for j in range(dim):
-            for times, weight in ((1.0, 8.0), (-1.0, -8.0), (2.0, -1.0), (-2.0, 1.0)):
-                near[j] = d[j] + times * STEP
-                right_jacobian_inverse(near, J)
-                for i in range(dim):
-                    for k in range(dim):
-                        out[i, j] += weight * J[i, k] * v[k]
-            near[j] = d[j]
-            for i in range(dim):
-                out[i, j] /= 12.0 * STEP
-
-    return bend
-
-
 @compiled
 def invert(a: Array, out: Array) -> None:
     """Write the inverse of ``a``, (n, n), which is overwritten: Gauss and Jordan's elimination with row pivots."""
@@ -192,6 +169,5 @@ RULES: Mapping[str, Rule] = {
     "right_jacobian_inverse": Rule(("right_jacobian",), _right_jacobian_inverse),
     "left_jacobian": Rule(("right_jacobian",), _mirrored),
     "left_jacobian_inverse": Rule(("right_jacobian_inverse",), _mirrored),
-    "bend": Rule(("right_jacobian_inverse",), _bend),
 }
 """In an order in which all that is needed stands further up."""

@@ -46,7 +46,6 @@ LAYOUTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "right_jacobian_inverse": ((DIM,), (DIM, DIM)),
     "left_jacobian": ((DIM,), (DIM, DIM)),
     "left_jacobian_inverse": ((DIM,), (DIM, DIM)),
-    "bend": ((DIM, DIM), (DIM, DIM)),
 }
 """Functions of one element: the sizes of the arguments, and of the result, as attributes of the manifold."""
 

@@ -9,15 +9,18 @@ from __future__ import annotations
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from functools import cache
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from unifg.codegen.fingerprint import is_compiled
 from unifg.errors import UnifgError
-from unifg.lie.defaults import RULES, STEP
+from unifg.lie.defaults import RULES
 from unifg.lie.elementwise import LAYOUTS, One, Two, method, stated
 from unifg.typing import Array, ArrayLike, BoolArray
+
+WHOLE = 1e-12  # from a whole number that an entry of small adjoints stands for
 
 
 @runtime_checkable
@@ -138,10 +141,12 @@ class LieGroup(ManifoldBase):
         dim: dimension of the tangent space.
         point_dim: dimension of the points that :meth:`act` moves; 0 where it moves none.
         matrix_dim: size of :meth:`matrix`; 0 where there is none.
+        generators: (dim, matrix_dim, matrix_dim) matrices of the unit tangent vectors, of which :meth:`hat` is made.
     """
 
     point_dim: int = 0
     matrix_dim: int = 0
+    generators: Array | None = None
 
     def __init_subclass__(cls, methods: Mapping[str, Any] | None = None, **options: Any) -> None:
         """Add the methods given, and derive what follows from the compiled functions that the class states or inherits.
@@ -226,25 +231,9 @@ class LieGroup(ManifoldBase):
         """Return (..., dim, dim) ``Jl(d)^-1 = I - ad/2 + ad^2/12 - ...`` in closed form."""
         return self.right_jacobian_inverse(np.negative(d))
 
-    def bend(self, d: ArrayLike, v: ArrayLike, /) -> Array:
-        """Return (..., dim, dim) derivatives of ``Jr^-1(d) v`` along d, at a fixed v, by differences."""
-        d, v = np.broadcast_arrays(np.asarray(d, dtype=np.float64), np.asarray(v, dtype=np.float64))
-        steps = STEP * np.eye(self.dim)
-
-        def slope(times: float) -> Array:
-            ahead, behind = (self.right_jacobian_inverse(d[..., None, :] + s * times * steps) for s in (1.0, -1.0))
-            along: Array = ((ahead - behind) @ v[..., None, :, None])[..., 0]
-            return along / (2.0 * times * STEP)
-
-        return np.swapaxes((4.0 * slope(1.0) - slope(2.0)) / 3.0, -1, -2)
-
     def ad(self, d: ArrayLike, /) -> Array:
         """Return (..., dim, dim) small adjoints: ``Ad(Exp(d)) = expm(ad(d))``, ``ad(a) b = [a, b]``."""
-        unit = np.eye(self.dim)
-        forward = self.adjoint(self.exp(0.25 * unit))
-        z = np.linalg.solve(forward + unit, forward - unit)  # log A = 2 artanh((A + I)^-1 (A - I))
-        basis = sum(np.linalg.matrix_power(z, k) / k for k in range(1, 25, 2)) * 8.0
-        found: Array = np.einsum("...k,kij->...ij", np.asarray(d, dtype=np.float64), basis)
+        found: Array = np.einsum("...k,kij->...ij", np.asarray(d, dtype=np.float64), _small_adjoints(self))
         return found
 
     # A group that moves points, or has matrices, states these.
@@ -259,7 +248,10 @@ class LieGroup(ManifoldBase):
 
     def hat(self, d: ArrayLike, /) -> Array:
         """Return (..., matrix_dim, matrix_dim) algebra matrices: ``matrix(Exp(d)) = expm(hat(d))``."""
-        raise UnifgError(f"{self.name} states no hat")
+        if self.generators is None:
+            raise UnifgError(f"{self.name} states neither hat nor generators")
+        found: Array = np.einsum("...k,kij->...ij", np.asarray(d, dtype=np.float64), self.generators)
+        return found
 
 
 class CompiledGroup(LieGroup):
@@ -277,3 +269,14 @@ def identities(like: Array, dim: int) -> Array:
     diagonal = np.arange(dim)
     result[..., diagonal, diagonal] = 1.0
     return result
+
+
+@cache
+def _small_adjoints(group: LieGroup) -> Array:
+    """(dim, dim, dim) small adjoints of the unit tangent vectors; entries that are whole but for rounding are whole."""
+    unit = np.eye(group.dim)
+    forward = group.adjoint(group.exp(0.25 * unit))
+    z = np.linalg.solve(forward + unit, forward - unit)  # log A = 2 artanh((A + I)^-1 (A - I))
+    basis: Array = 8.0 * np.sum([np.linalg.matrix_power(z, k) / k for k in range(1, 25, 2)], axis=0)
+    whole = np.round(basis)
+    return np.where(np.abs(basis - whole) < WHOLE, whole, basis)

@@ -175,7 +175,7 @@ def _componentwise(name: str) -> Callable[..., Array]:
 
 COMPONENTWISE = (
     "exp", "log", "compose", "inverse", "act", "matrix", "hat", "adjoint", "ad", "right_jacobian",
-    "right_jacobian_inverse", "bend",
+    "right_jacobian_inverse",
 )  # fmt: skip
 
 

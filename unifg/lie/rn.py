@@ -11,7 +11,6 @@ from unifg.codegen.jit import compiled, in_order
 from unifg.errors import UnifgError
 from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup, identities
-from unifg.lie.so2 import straight
 from unifg.typing import Array, ArrayLike
 
 
@@ -64,8 +63,7 @@ def unit(x: Array, out: Array) -> None:
 def matrix(x: Array, out: Array) -> None:
     """Write the (n + 1, n + 1) homogeneous translation."""
     unit(x, out)
-    for i in range(len(x)):
-        out[i, len(x)] = x[i]
+    out[:-1, -1] = x
 
 
 def _copies(group: Any, x: ArrayLike) -> Array:
@@ -95,10 +93,6 @@ def _translations(group: Any, x: ArrayLike) -> Array:
     return result
 
 
-def _zeros(group: Any, d: ArrayLike, v: ArrayLike) -> Array:
-    return np.zeros((*np.broadcast_shapes(np.shape(d), np.shape(v)), group.dim))
-
-
 class Rn(LieGroup):
     """Vectors of length n; equal n makes equal objects.
 
@@ -116,7 +110,6 @@ class Rn(LieGroup):
     matrix = elementwise(matrix, _translations)
     adjoint = right_jacobian = right_jacobian_inverse = elementwise(unit, _units)
     left_jacobian = left_jacobian_inverse = elementwise(unit, _units)
-    bend = elementwise(straight, _zeros)
 
     def __init__(self, n: SupportsIndex) -> None:
         """Describe R^n."""

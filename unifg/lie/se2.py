@@ -13,9 +13,9 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.lie.manifold import CompiledGroup
-from unifg.lie.series import c_value, k_slope, k_value, sinc, sinc_and_cos, x_cot_x
+from unifg.lie.series import c_value, k_value, sinc, sinc_and_cos, x_cot_x
 from unifg.lie.so2 import PI, wrap
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array
 
 
 @compiled
@@ -210,25 +210,6 @@ def right_jacobian_inverse(d: Array, out: Array) -> None:
     with_column(g, half, k * vx + 0.5 * vy, k * vy - 0.5 * vx, out)
 
 
-@compiled
-def bend(d: Array, v: Array, out: Array) -> None:
-    """Write the (3, 3) derivative of ``Jr^-1(d) v`` along d = (vx, vy, omega)."""
-    vx, vy, omega = d[0], d[1], d[2]
-    a, b, turn = v[0], v[1], v[2]
-    t = omega * omega
-    g = x_cot_x(0.5 * omega)
-    value, slope = k_value(t, g), k_slope(t, g)
-    k, k_rate = omega * value, value + t * slope  # of omega k
-    g_rate = -omega * (2.0 * value + t * slope)  # g = 1 - t k
-    out[0, 0] = k * turn
-    out[0, 1] = 0.5 * turn
-    out[0, 2] = g_rate * a - 0.5 * b + k_rate * vx * turn
-    out[1, 0] = -0.5 * turn
-    out[1, 1] = k * turn
-    out[1, 2] = 0.5 * a + g_rate * b + k_rate * vy * turn
-    out[2, 0] = out[2, 1] = out[2, 2] = 0.0
-
-
 class SE2Group(CompiledGroup, methods=globals()):
     """Rigid motions of the plane; use the ready-made object ``SE2``.
 
@@ -242,29 +223,17 @@ class SE2Group(CompiledGroup, methods=globals()):
     dim = 3
     point_dim = 2
     matrix_dim = 3
+    generators = np.array(
+        [
+            [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+            [[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, 0.0]],
+            [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+        ]
+    )
 
     def identity(self) -> Array:
         """Return the (3,) zero pose."""
         return np.zeros(3)
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) Lie algebra matrices; Sola eq. 153."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 3, 3))
-        result[..., 1, 0] = d[..., 2]
-        result[..., 0, 1] = -d[..., 2]
-        result[..., :2, 2] = d[..., :2]
-        return result
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) small adjoints ``[omega [1]x, -[1]x v; 0, 0]``."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 3, 3))
-        result[..., 1, 0] = d[..., 2]
-        result[..., 0, 1] = -d[..., 2]
-        result[..., 0, 2] = d[..., 1]
-        result[..., 1, 2] = -d[..., 0]
-        return result
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 3) poses: standard normal positions, uniform headings."""

@@ -142,19 +142,6 @@ def matrix(x: Array, out: Array) -> None:
     out[3, 4] = out[4, 3] = 0.0
 
 
-@compiled
-def bend(d: Array, v: Array, out: Array) -> None:
-    """Write the (9, 9) derivative of ``Jr^-1(d) v`` along d."""
-    part, along, first, second = local_vector(6), local_vector(6), local_matrix(6, 6), local_matrix(6, 6)
-    take(d, 0, part)
-    take(v, 0, along)
-    se3.bend(part, along, first)
-    take(d, 3, part)
-    take(v, 3, along)
-    se3.bend(part, along, second)
-    join_blocks(first, second, out)
-
-
 class ExtendedPoses(CompiledGroup, methods=globals()):
     """Position, velocity and orientation that turn as one; use the ready-made object ``SE23``.
 
@@ -167,6 +154,9 @@ class ExtendedPoses(CompiledGroup, methods=globals()):
     dim = 9
     point_dim = 3
     matrix_dim = 5
+    generators = np.zeros((9, 5, 5))  # [[omega]x, nu, rho; 0, 0, 0; 0, 0, 0]
+    generators[:3, :3, 4] = generators[3:6, :3, 3] = np.eye(3)
+    generators[6:, :3, :3] = SO3.generators
 
     # Constructors, and back.
 
@@ -200,22 +190,6 @@ class ExtendedPoses(CompiledGroup, methods=globals()):
     def identity(self) -> Array:
         """Return (0, 0, 0, 0, 0, 0, 1, 0, 0, 0)."""
         return np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., 5, 5) Lie algebra matrices ``[[omega]x, nu, rho; 0, 0, 0; 0, 0, 0]``."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 5, 5))
-        result[..., :3, :3] = SO3.hat(d[..., 6:])
-        result[..., :3, 3], result[..., :3, 4] = d[..., 3:6], d[..., :3]
-        return result
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., 9, 9) small adjoints ``[[omega]x, 0, [rho]x; 0, [omega]x, [nu]x; 0, 0, [omega]x]``."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 9, 9))
-        result[..., :3, :3] = result[..., 3:6, 3:6] = result[..., 6:, 6:] = SO3.hat(d[..., 6:])
-        result[..., :3, 6:], result[..., 3:6, 6:] = SO3.hat(d[..., :3]), SO3.hat(d[..., 3:6])
-        return result
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 10) elements: standard normal positions and velocities, uniform rotations."""

@@ -19,11 +19,10 @@ import math
 
 import numpy as np
 
-from unifg.codegen.calls import vector
 from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
 from unifg.lie.manifold import CompiledGroup
-from unifg.lie.series import b_slope, c_slope, c_value, k_curve, k_slope, k_value, x_cot_x
+from unifg.lie.series import b_slope, c_slope, c_value, k_slope, k_value, x_cot_x
 from unifg.lie.so3 import (
     SO3,
     Order,
@@ -36,7 +35,6 @@ from unifg.lie.so3 import (
     write_matrix,
     write_polynomial,
     write_product,
-    write_turn,
 )
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -223,30 +221,6 @@ def right_jacobian_inverse(d: Array, out: Array) -> None:
     write_dual(0.5, k_value(t, g), 0.0, k_slope(t, g), d, out)
 
 
-@compiled
-def bend(d: Array, v: Array, out: Array) -> None:
-    """Write the (6, 6) derivative of ``Jr^-1(d) v`` along d = (v, omega), for a vector (y, z)."""
-    p, w, y, z = vector(d, 0, 3), vector(d, 3, 3), vector(v, 0, 3), vector(v, 3, 3)
-    t = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    g = x_cot_x(0.5 * math.sqrt(t))
-    k, slope = k_value(t, g), k_slope(t, g)
-    curve = k_curve(t, g, slope)
-    write_turn(k, slope, w, z, out, 0, 0)
-    write_turn(k, slope, w, y, out, 0, 3)
-    write_turn(k, slope, w, z, out, 3, 3)
-    wz = w[0] * z[0] + w[1] * z[1] + w[2] * z[2]
-    wp = w[0] * p[0] + w[1] * p[1] + w[2] * p[2]
-    pz = p[0] * z[0] + p[1] * z[1] + p[2] * z[2]
-    for i in range(3):
-        square = w[i] * wz - t * z[i]  # W^2 z
-        first = slope * (p[i] * wz + w[i] * pz - 2.0 * z[i] * wp) + curve * wp * square
-        for j in range(3):
-            out[3 + i, j] = 0.0
-            out[i, 3 + j] += k * (p[i] * z[j] - 2.0 * z[i] * p[j]) + first * w[j] + slope * square * p[j]
-            out[i, 3 + j] += slope * wp * (w[i] * z[j] - 2.0 * z[i] * w[j])
-        out[i, 3 + i] += k * pz + slope * wp * wz
-
-
 def _rows(pose: ArrayLike) -> Array:
     """Poses as an array with a last axis of 7."""
     x = np.asarray(pose, dtype=np.float64)
@@ -269,6 +243,8 @@ class SE3Group(CompiledGroup, methods=globals()):
     dim = 6
     point_dim = 3
     matrix_dim = 4
+    generators = np.zeros((6, 4, 4))  # [[omega]x, v; 0, 0]; Sola eq. 169
+    generators[:3, :3, 3], generators[3:, :3, :3] = np.eye(3), SO3.generators
 
     # Constructors, and back.
 
@@ -336,22 +312,6 @@ class SE3Group(CompiledGroup, methods=globals()):
     def identity(self) -> Array:
         """Return (0, 0, 0, 1, 0, 0, 0)."""
         return np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., 4, 4) Lie algebra matrices ``[[omega]x, v; 0, 0]``; Sola eq. 169."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 4, 4))
-        result[..., :3, :3] = SO3.hat(d[..., 3:])
-        result[..., :3, 3] = d[..., :3]
-        return result
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., 6, 6) small adjoints ``[[omega]x, [v]x; 0, [omega]x]``."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 6, 6))
-        result[..., :3, :3] = result[..., 3:, 3:] = SO3.hat(d[..., 3:])
-        result[..., :3, 3:] = SO3.hat(d[..., :3])
-        return result
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 7) poses: standard normal positions, uniform rotations."""

@@ -99,13 +99,3 @@ def k_slope(t: float, g: float) -> float:
         )
         return 1 / 360 + t * (1 / 7560 + t * (1 / 201600 + t * (1 / 5987520 + t * tail)))
     return (g * g + g + 0.25 * t - 2.0) / (t * t)
-
-
-@compiled
-def k_curve(t: float, g: float, slope: float) -> float:
-    """Return (k' / theta)' / theta given g = h cot h and k' / theta; the series lacks a term below 1e-17."""
-    if t < SERIES_BELOW:
-        tail = 1 / 622702080 + t * (3617 / 63515612160000 + t * (43867 / 22808456326656000))
-        return 1 / 3780 + t * (1 / 50400 + t * (1 / 997920 + t * (691 / 16345929600 + t * tail)))
-    g_rate = (g - g * g - 0.25 * t) / (2.0 * t)  # by t
-    return 2.0 * (((2.0 * g + 1.0) * g_rate + 0.25) / (t * t) - 2.0 * slope / t)

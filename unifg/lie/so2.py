@@ -96,15 +96,8 @@ def unit(x: Array, out: Array) -> None:
     out[0, 0] = 1.0
 
 
-@compiled
-def straight(d: Array, v: Array, out: Array) -> None:
-    """Write zeros, (n, n): Jr^-1 = I does not change."""
-    out[:] = 0.0
-
-
 log, retract, local = exp, compose, between
 adjoint = right_jacobian = right_jacobian_inverse = unit
-bend = straight
 
 
 class SO2Group(CompiledGroup, methods=globals()):
@@ -119,22 +112,11 @@ class SO2Group(CompiledGroup, methods=globals()):
     dim = 1
     point_dim = 2
     matrix_dim = 2
+    generators = np.array([[[0.0, -1.0], [1.0, 0.0]]])
 
     def identity(self) -> Array:
         """Return the zero angle, (1,)."""
         return np.zeros(1)
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., 2, 2) skew-symmetric matrices."""
-        omega = np.asarray(d, dtype=np.float64)[..., 0]
-        result = np.zeros((*omega.shape, 2, 2))
-        result[..., 1, 0] = omega
-        result[..., 0, 1] = -omega
-        return result
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., 1, 1) zeros; the group commutes."""
-        return np.zeros((*np.shape(d)[:-1], 1, 1))
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 1) uniform angles in [-pi, pi)."""
@@ -146,5 +128,4 @@ SO2 = SO2Group()
 
 def wrap_angle(theta: ArrayLike, /) -> Array:
     """Bring angles of any shape [rad] into [-pi, pi), exactly: see :func:`wrap`."""
-    wrapped: Array = over_one(exp, 1, 1)(np.asarray(theta, dtype=np.float64)[..., None])[..., 0][()]
-    return wrapped
+    return over_one(exp, 1, 1)(np.asarray(theta, dtype=np.float64)[..., None])[..., 0][()]

@@ -23,7 +23,7 @@ from unifg.codegen.jit import compiled
 from unifg.errors import UnifgError
 from unifg.lie.elementwise import over_one
 from unifg.lie.manifold import CompiledGroup
-from unifg.lie.series import TINY, c_value, k_slope, k_value, x_cot_x
+from unifg.lie.series import TINY, c_value, k_value, x_cot_x
 from unifg.lie.so2 import wrap
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -220,33 +220,6 @@ def right_jacobian_inverse(d: Array, out: Array) -> None:
 
 
 @compiled
-def write_turn(k: float, slope: float, w: Array, y: Array, out: Array, row: int, column: int) -> None:
-    """Write D(w, y), (3, 3), as a block of ``out``."""
-    along = w[0] * y[0] + w[1] * y[1] + w[2] * y[2]
-    t = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    for i in range(3):
-        second = slope * (w[i] * along - t * y[i])
-        for j in range(3):
-            out[row + i, column + j] = k * (w[i] * y[j] - 2.0 * y[i] * w[j]) + second * w[j]
-        out[row + i, column + i] += k * along
-    x0, x1, x2 = 0.5 * y[0], 0.5 * y[1], 0.5 * y[2]
-    out[row, column + 1] += x2
-    out[row, column + 2] -= x1
-    out[row + 1, column] -= x2
-    out[row + 1, column + 2] += x0
-    out[row + 2, column] += x1
-    out[row + 2, column + 1] -= x0
-
-
-@compiled
-def bend(d: Array, v: Array, out: Array) -> None:
-    """Write the (3, 3) derivative of ``Jr^-1(d) v`` along d: D(d, v)."""
-    t = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-    g = x_cot_x(0.5 * math.sqrt(t))
-    write_turn(k_value(t, g), k_slope(t, g), d, v, out, 0, 0)
-
-
-@compiled
 def normalise(x: Array, out: Array) -> None:
     """Bring a quaternion of any length to unit norm and w >= 0; one without direction gives NaN."""
     write(x[0], x[1], x[2], x[3], out, 0)
@@ -353,6 +326,13 @@ class SO3Group(CompiledGroup, methods=globals()):
     dim = 3
     point_dim = 3
     matrix_dim = 3
+    generators = np.array(
+        [
+            [[0.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]],
+            [[0.0, 0.0, 1.0], [0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]],
+            [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]],
+        ]
+    )
 
     # Constructors, and back.
 
@@ -430,18 +410,6 @@ class SO3Group(CompiledGroup, methods=globals()):
     def identity(self) -> Array:
         """Return (1, 0, 0, 0)."""
         return np.array([1.0, 0.0, 0.0, 0.0])
-
-    def hat(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) skew-symmetric matrices: ``hat(a) b`` is the cross product."""
-        d = np.asarray(d, dtype=np.float64)
-        result = np.zeros((*d.shape[:-1], 3, 3))
-        result[..., (2, 0, 1), (1, 2, 0)] = d
-        result[..., (1, 2, 0), (2, 0, 1)] = -d
-        return result
-
-    def ad(self, d: ArrayLike, /) -> Array:
-        """Return (..., 3, 3) small adjoints: the same as :meth:`hat`."""
-        return self.hat(d)
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, 4) rotations, uniform: the direction of four normal numbers."""

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
+from itertools import accumulate
 from typing import cast
 
 import numpy as np
@@ -71,9 +72,9 @@ def _complete(manifolds: tuple[Manifold, ...], offset: bool) -> Residual:
                 linear=all(isinstance(leaf, Rn) for leaf in parts),
             )
         )
-    batched = _Stacked(manifolds)
-    known = all(isinstance(manifold, LieGroup) for manifold in manifolds)
-    return residual(batched, batched.jacobian if known else None, "joint prior")
+    groups = [manifold for manifold in manifolds if isinstance(manifold, LieGroup)]
+    slopes = partial(_slopes, groups) if len(groups) == len(manifolds) else None
+    return residual(partial(_differences, manifolds), slopes, "joint prior")
 
 
 def _kind(leaf: Manifold) -> int | None:
@@ -127,35 +128,23 @@ def _stacked(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
             r[i] -= p[at + i]
 
 
-class _Stacked:
-    """The same for manifolds that only have batched methods; picklable."""
+def _differences(manifolds: Sequence[Manifold], *arguments: Array) -> Array:
+    """(n, D) the same of variables (n, storage_k) and references (n, S) or (S,) in NumPy, for other manifolds."""
+    *points, reference = arguments
+    bounds = list(accumulate((manifold.storage for manifold in manifolds), initial=0))
+    parts = zip(manifolds, points, bounds, bounds[1:], strict=False)
+    found = [np.atleast_2d(manifold.local(reference[..., a:b], point)) for manifold, point, a, b in parts]
+    count, offset = max(map(len, found)), reference[..., bounds[-1] :]
+    stacked = np.concatenate([np.broadcast_to(part, (count, part.shape[-1])) for part in found], axis=1)
+    return stacked - offset if offset.shape[-1] else stacked
 
-    def __init__(self, manifolds: Sequence[Manifold]) -> None:
-        self.manifolds = manifolds
-        self.bounds = np.cumsum([0, *(manifold.storage for manifold in manifolds)]).tolist()
 
-    def __call__(self, *arguments: Array) -> Array:
-        """(n, D) stacked differences of variables (n, storage_k) from references (n, S) or (S,), less the offset."""
-        differences = np.concatenate(self._differences(arguments), axis=1)
-        offset = arguments[-1][..., self.bounds[-1] :]
-        return differences - offset if offset.shape[-1] else differences
-
-    def jacobian(self, *arguments: Array) -> list[Array]:
-        """One (n, D, d_k) array per variable."""
-        differences = self._differences(arguments)
-        count, total = len(differences[0]), sum(part.shape[1] for part in differences)
-        blocks, row = [], 0
-        for manifold, difference in zip(self.manifolds, differences, strict=True):
-            assert isinstance(manifold, LieGroup)
-            block = np.zeros((count, total, manifold.dim))
-            block[:, row : row + manifold.dim] = manifold.right_jacobian_inverse(difference)
-            blocks.append(block)
-            row += manifold.dim
-        return blocks
-
-    def _differences(self, arguments: Sequence[Array]) -> list[Array]:
-        *points, reference = arguments
-        parts = zip(self.manifolds, points, self.bounds, self.bounds[1:], strict=False)
-        found = [manifold.local(reference[..., a:b], point) for manifold, point, a, b in parts]
-        count = max(len(np.atleast_2d(part)) for part in found)
-        return [np.broadcast_to(np.atleast_2d(part), (count, part.shape[-1])) for part in found]
+def _slopes(groups: Sequence[LieGroup], *arguments: Array) -> list[Array]:
+    """One (n, D, d_k) array per variable."""
+    *points, reference = arguments
+    total, blocks = _differences(groups, *points, reference[..., : sum(group.storage for group in groups)]), []
+    for group, row in zip(groups, accumulate((group.dim for group in groups), initial=0), strict=False):
+        block = np.zeros((*total.shape, group.dim))
+        block[:, row : row + group.dim] = group.right_jacobian_inverse(total[:, row : row + group.dim])
+        blocks.append(block)
+    return blocks

@@ -208,8 +208,7 @@ def _rotation_information(information: Array, dim: int) -> Array:
     """Information about the rotation where the first ``dim`` coordinates are free: the Schur complement, (m, k, k)."""
     cross = information[:, dim:, :dim]
     inner = np.linalg.pinv(information[:, :dim, :dim], hermitian=True)
-    result: Array = information[:, dim:, dim:] - cross @ inner @ np.swapaxes(cross, 1, 2)
-    return result
+    return information[:, dim:, dim:] - cross @ inner @ np.swapaxes(cross, 1, 2)
 
 
 def _tree_headings(pose_graph: PoseGraph, fixed: IntArray, variance: Array) -> Array:

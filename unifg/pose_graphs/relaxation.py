@@ -146,8 +146,7 @@ class Relaxation:
 
     def errors(self, point: Array) -> Array:
         """(m, d + 1, r) whitened errors of the edges."""
-        result: Array = self.by_first @ point[self.first] + self.by_second @ point[self.second]
-        return result
+        return self.by_first @ point[self.first] + self.by_second @ point[self.second]
 
     def cost(self, point: Array) -> float:
         """Sum of the squared errors: chi2 of the chordal residual."""
@@ -235,8 +234,7 @@ def _greatest(blocks: Array) -> Array:
 
 def _close(found: Array, wanted: Array | float, size: Array | None = None) -> BoolArray:
     """(m,) whether blocks are as wanted, measured by their own size or by another (m,)."""
-    near: BoolArray = _greatest(found - wanted) <= ISOTROPIC * (_greatest(found) if size is None else size)
-    return near
+    return _greatest(found - wanted) <= ISOTROPIC * (_greatest(found) if size is None else size)
 
 
 def _tangents(point: Array, spins: list[tuple[int, int]]) -> Array:

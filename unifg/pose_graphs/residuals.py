@@ -102,8 +102,7 @@ order in the plane, not in space. measured is (storage,) or (n, storage).
 
 def _position(pose: Array, measured: Array) -> Array:
     """Position (n, 2) of planar poses (n, 3) less what was measured (n, 2) [m]: g2o's EdgeSE2XYPrior."""
-    error: Array = pose[:, :2] - measured
-    return error
+    return pose[:, :2] - measured
 
 
 position = residual(_position, name="position")

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
-from unifg.lie import SE3
+from unifg.lie import SE2, SE3
 from unifg.plots.shown import every
 from unifg.typing import Array
 from unifg.view import bodies, shapes
@@ -164,8 +164,7 @@ def draw_arrows(stage: Surface, path: str, most: int, layer: Layer, *, poses: Ar
     """Arrow heads at poses in the plane (n, 3), pointing along their x."""
     kept = poses[every(len(poses), most)]
     size = 8.0 * stage.stroke if length is None else length
-    cosine, sine, zero = np.cos(kept[:, 2]), np.sin(kept[:, 2]), np.zeros(len(kept))
-    turns = np.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, zero + 1.0], axis=1).reshape(-1, 3, 3)
+    turns = SE2.matrix(kept * (0.0, 0.0, 1.0))
     places = np.column_stack([kept[:, :2], np.full(len(kept), lift(stage, layer))])
     stage.mesh(path, shapes.copies(shapes.wedge(size, 0.0), places, turns), layer.colour)
 
