@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.comparison import Row, share
 from benchmarks.report import table
 from benchmarks.routes import drawn
-from benchmarks.runner import Study
+from benchmarks.runner import Cell, Study
 from unifg.scenarios.episode import silent
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.navigation import Episode, NavigationSettings
@@ -35,32 +35,21 @@ REST, RESTING = 0.05, 0.5  # [m/s], [s] for which a robot that was run over at r
 LATEST = 60.0  # clairvoyant arrival of drives that count [s]
 
 
-@dataclass(frozen=True)
-class Meeting:
+def meetings(seeds: Sequence[int]) -> list[Cell]:
+    """All drives: of thirty seeds, ten routes three times each."""
+    return [{"speed": speed, "base": base, "seed": seed} for speed, base, seed in product(SPEEDS, BASES, seeds)]
+
+
+def settings(speed: float, base: float, seed: int) -> NavigationSettings:
     """One drive; ``seed`` draws the discs and, with its tens, the route."""
-
-    speed: float
-    base: float
-    seed: int
-
-
-def meetings(seeds: Sequence[int]) -> list[Meeting]:
-    """All of them: of thirty seeds, ten routes three times each."""
-    return [Meeting(*each) for each in product(SPEEDS, BASES, seeds)]
+    start, goal = drawn(FIRST + seed // (3 * ROUTES) * ROUTES + seed % ROUTES)
+    plant = replace(Drivetrain(), acceleration=base, turning=TURNING[base])
+    return NavigationSettings(start=start, goals=(goal,), obstacles=6, mover_speed=speed, seed=seed, drivetrain=plant)
 
 
-def settings(meeting: Meeting) -> NavigationSettings:
-    """The drive."""
-    start, goal = drawn(FIRST + meeting.seed // (3 * ROUTES) * ROUTES + meeting.seed % ROUTES)
-    base = replace(Drivetrain(), acceleration=meeting.base, turning=TURNING[meeting.base])
-    return NavigationSettings(
-        start=start, goals=(goal,), obstacles=6, mover_speed=meeting.speed, seed=meeting.seed, drivetrain=base
-    )
-
-
-def measured(meeting: Meeting) -> Row:
+def measured(speed: float, base: float, seed: int) -> Row:
     """Drive once."""
-    episode = Episode(settings(meeting))
+    episode = Episode(settings(speed, base, seed))
     s = episode.controller
     way = quickest(
         episode.occupancy, episode.distance_map, episode.start, episode.goals[-1], s.robot_radius,

@@ -11,6 +11,7 @@ from time import perf_counter
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Circle
 
 import unifg as fg
 from unifg.models import obstacles, unicycle
@@ -27,10 +28,9 @@ graph.constrain(obstacles.disc_clearance, x[1:], np.array([[1.0, 0.05]]), np.arr
 graph.bound(u, lower=[-0.2, -2.0], upper=[1.0, 2.0], name="limits")
 run = InteriorPoint(tolerance=1e-4, max_iterations=60).prepare(graph)
 last = run.solve({x: np.column_stack([s, np.sin(1.5 * s), 0 * s]), u: np.tile([1.0, 0.0], (N, 1))}, check=True)
-folder = Path(*sys.argv[1:] or ["out"])
-header, *_, library = run.export(folder / "plan", name="plan")
-size = {name: int(number) for name, number in re.findall(r"PLAN_(\w+) = (\d+),", header.read_text())}
-in_c = ctypes.CDLL(str(library.resolve())).plan_solve
+files = run.export((folder := Path(*sys.argv[1:] or ["out"])) / "plan", name="plan")
+size = {name: int(number) for name, number in re.findall(r"PLAN_(\w+) = (\d+),", files[0].read_text())}
+in_c = ctypes.CDLL(str(files[-1].resolve())).plan_solve
 values, multipliers = (np.concatenate([a.ravel() for a in own.values()]) for own in (last.values, last.multipliers))
 pose, report, memory = np.zeros(3), np.zeros(size["REPORT"]), ctypes.create_string_buffer(size["WORKSPACE"] + 64)
 workspace = ctypes.c_void_p(ctypes.addressof(memory) // 64 * 64 + 64)
@@ -38,22 +38,22 @@ arrays = [a.ctypes.data_as(ctypes.c_void_p) for a in (pose, *2 * (values, multip
 
 rows, same = [], True
 for _ in range(60):
-    began, status, between = perf_counter(), in_c(*arrays, workspace), perf_counter()
+    began, answer, between = perf_counter(), in_c(*arrays, workspace), perf_counter()
     last = run.solve(last, data={here: pose}, check=True)
     same = (
-        same and status == size["CONVERGED"] and np.array_equal(values, np.concatenate([last[x], last[u]], axis=None))
+        same and answer == size["CONVERGED"] and np.array_equal(values, np.concatenate([last[x], last[u]], axis=None))
     )
     rows.append([*pose, 1e6 * (between - began), 1e6 * (perf_counter() - between)])
     pose[:] = fg.SE2.retract(pose, 0.1 * np.insert(last[u][0], 1, 0.0)).ravel()
-rows = np.array(rows)
-c, python = np.median(rows[:, 3:], axis=0)
+drive = np.array(rows)
+c, python = np.median(drive[:, 3:], axis=0)
 print(f"the same bits in all ticks: {same}; a tick takes {c:.0f} us in C and {python:.0f} in Python, in the median")
 
 figure, (plan, over) = plt.subplots(2, layout="constrained", figsize=(6.0, 4.6))
-plan.add_patch(plt.Circle((1.0, 0.05), 0.4, color="0.8"))
-plan.plot(*rows[:, :2].T)
+plan.add_patch(Circle((1.0, 0.05), 0.4, color="0.8"))
+plan.plot(*drive[:, :2].T)
 plan.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-over.semilogy(0.1 * np.arange(60), rows[:, 3:], label=["in C", "in Python"])
+over.semilogy(0.1 * np.arange(60), drive[:, 3:], label=["in C", "in Python"])
 over.set(xlabel="time [s]", ylabel="a tick takes [us]")
 over.legend()
 figure.savefig(folder / "deployed_loop.png", dpi=80)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.patches import Circle
 
 import unifg as fg
 from unifg.models import obstacles, unicycle
@@ -42,7 +43,7 @@ for what, data in (("radius", {radius: [0.399]}), ("speed", {most: [1.051, 1.5]}
     print(f"{what}, loosened by 0.001: {0.001 * abs(foretold[what]):.5f} foretold, {saved[what]:.5f} saved")
 
 figure, (plan, over) = plt.subplots(2, layout="constrained", figsize=(6.0, 4.6), height_ratios=[2, 1])
-plan.add_patch(plt.Circle(centre[0], 0.4, color="0.8"))
+plan.add_patch(Circle(centre[0], 0.4, color="0.8"))
 plan.plot(*solution[x][:, :2].T, "k-", linewidth=1)
 plan.scatter(*solution[x][1:, :2].T, s=4 + 60 * disc / disc.max(), c="tab:red", label="held by the disc")
 plan.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import Normalize
+from matplotlib.patches import Circle
 
 import unifg as fg
 from unifg.models import obstacles, unicycle
@@ -45,10 +47,10 @@ figure, ax = plt.subplots(figsize=(6.4, 3.6), layout="constrained")
 colour = plt.get_cmap("viridis")((found.cost - found.cost.min()) / np.ptp(found.cost))
 for path, shade in zip(found[x], colour, strict=True):
     ax.plot(*path[:, :2].T, color=shade, linewidth=0.5, alpha=0.5)
-ax.add_patch(plt.Circle(centre[0], radius[0], color="0.6"))
+ax.add_patch(Circle(centre[0], radius[0], color="0.6"))
 ax.plot(*places[:, :2].T, "k.", markersize=1.5)
 ax.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-scale = plt.cm.ScalarMappable(plt.Normalize(found.cost.min(), found.cost.max()), "viridis")
+scale = plt.cm.ScalarMappable(Normalize(found.cost.min(), found.cost.max()), "viridis")
 figure.colorbar(scale, ax=ax, label="cost of the plan")
 (folder := Path(*sys.argv[1:] or ["out"])).mkdir(parents=True, exist_ok=True)
 figure.savefig(folder / "many_plans.png", dpi=80)

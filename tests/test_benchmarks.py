@@ -334,7 +334,7 @@ def test_contacts_are_told_apart_by_the_motion_before(
 
 
 def test_thirty_seeds_are_ten_routes_and_the_next_are_others() -> None:
-    routes = [movers.settings(movers.Meeting(0.3, 2.5, seed)).start for seed in (0, 10, 29, 30, 39)]
+    routes = [movers.settings(0.3, 2.5, seed).start for seed in (0, 10, 29, 30, 39)]
     assert routes[0] == routes[1] and len({*routes}) == 4
 
 

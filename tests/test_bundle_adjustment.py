@@ -23,9 +23,7 @@ def scene(cameras: int = 8, size: int = 60, noise: float = 0.5, seed: int = 0) -
     intrinsics = np.tile([800.0, -0.05, 0.01], (cameras, 1))
     camera, point = np.nonzero(rng.random((cameras, size)) < 0.7)
     pixels = project(poses[camera], intrinsics[camera], points[point])
-    return BundleAdjustment(
-        camera, point, pixels + rng.normal(0.0, noise, pixels.shape), poses, intrinsics, points
-    )
+    return BundleAdjustment(camera, point, pixels + rng.normal(0.0, noise, pixels.shape), poses, intrinsics, points)
 
 
 def test_the_camera_looks_along_its_negative_axis() -> None:

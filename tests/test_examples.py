@@ -348,7 +348,7 @@ def test_deployed_loop(run: Run) -> None:
     if shutil.which("cc") is None:
         pytest.skip("there is no C compiler")
     ran = run("deployed_loop")
-    assert ran["same"] and ran["rows"][-1, 0] > 1.8
+    assert ran["same"] and ran["drive"][-1, 0] > 1.8
 
 
 @run_by_draw
