@@ -28,6 +28,7 @@ from unifg.typing import Array
 __all__ = ["LocaliseSettings", "localise"]
 
 SIGMA = np.array([0.1, 0.1, 0.05])  # of a pose to begin at [m, m, rad]
+SURE = 0.05, 0.03  # [m, rad] of a prediction that is one place to begin at: scans of logs lie apart
 STILL = 0.05  # [m] and [rad], up to which a robot has not moved, and sees nothing new
 LOOKED = 30  # scans at most whose places are searched for on the map
 RADIUS = 0.1  # [m] that a laser keeps from walls
@@ -113,7 +114,7 @@ def _estimator(
         return MonteCarlo(occupancy, field, start, SIGMA, rng, trusted, BASE)
     if settings.localiser != "graph":
         raise ScenarioError(f"a log is followed by 'graph' or 'amcl', not by '{settings.localiser}'")
-    return Localiser(field, start, SIGMA, beams, BASE, WHEELS)
+    return Localiser(field, start, SIGMA, beams, BASE, WHEELS, SURE)
 
 
 def beginning(log: RangeLog, occupancy: OccupancyMap, field: DistanceMap) -> Array:

@@ -31,7 +31,7 @@ LEAST = 0.01  # [m] of a beam's standard deviation, whatever the residuals of a 
 WITHIN = odometry.OdometryNoise(floor=(0.0, 0.0, 0.0))  # of the wheels within a turn of the lidar
 FARTHEST, LEVER = 1e3, 1.0  # [m] standard deviation, and per radian, of what a scan says nothing about
 LARGEST_JUMP = 0.5  # [m]; a correction beyond this is a mistake of the matching, not of the wheels
-SURE = 0.05, 0.03  # [m, rad]; a prediction that is less sure than this begins at several places
+SURE = 0.12, 0.06  # [m, rad]; a prediction that is less sure than this begins at several places
 FITS = 0.6  # share of the beams that the map explains, below which there may be a better place
 FOUND = 0.85  # share that it has to explain at another place
 ASTRAY = np.diag([0.15, 0.15, 0.06]) ** 2  # that a scan which does not fit adds to the covariance [m, m, rad]
@@ -60,6 +60,7 @@ class Localiser:
         beams: int,
         base: Base = unicycle.BASE,
         noise: odometry.OdometryNoise | None = None,
+        sure: tuple[float, float] = SURE,
     ) -> None:
         """State the graph.
 
@@ -70,11 +71,13 @@ class Localiser:
             beams: number of beams in a scan.
             base: that the odometry is of.
             noise: of the odometry; None for that of good wheels.
+            sure: standard deviations [m, rad] up to which a prediction is one place to begin at.
         """
         self.pose = np.asarray(pose, dtype=np.float64)
         self.covariance = self._held = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
         self.iterations, self.refused = 0, ""
         self._believed: list[Hypothesis] = []
+        self._sure = sure
         self._rng = np.random.default_rng(0)
         self._map, self._skew = distance_map, np.zeros((3, 3))
         self._noise, self._base = noise or odometry.OdometryNoise(), base
@@ -153,7 +156,7 @@ class Localiser:
     def _is_sure(self) -> bool:
         """Test whether a prediction is as good as one place to begin at."""
         spread = float(np.linalg.eigvalsh(self.covariance[:2, :2])[-1])
-        return spread <= SURE[0] ** 2 and float(self.covariance[2, 2]) <= SURE[1] ** 2
+        return spread <= self._sure[0] ** 2 and float(self.covariance[2, 2]) <= self._sure[1] ** 2
 
     def _solve(self, scan: Scan, pose: Array, held: Array, reach: float) -> tuple[Array, Array]:
         """Pose (3,) and covariance (3, 3) that a scan makes of a prediction."""
