@@ -201,8 +201,6 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = 0
 
     class Once:
-        solver = run.solver
-
         def solve(self, guess: fg.Guess, **options: Any) -> Any:
             nonlocal calls
             calls += 1

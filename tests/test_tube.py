@@ -94,7 +94,8 @@ def test_other_terms_are_refused_by_name() -> None:
     graph = fg.Graph()
     q = graph.variables("q", fg.SO3, 2)
     graph.minimize(lambda q: q[:, :3] / q[:, 3:], q, name="lean")
-    graph.minimize(fg.prior, q, [0.0, 0.0, 0.0, 1.0], sigma=1.0, name="level")
+    graph.minimize(fg.prior, q, [0.0, 0.0, 0.0, 1.0], sigma=1.0)
+    graph.minimize(fg.between, q[0], q[1], [0.0, 0.0, 0.0, 1.0], sigma=1.0, name="level")
     turned = InteriorPoint().solve(graph, {q: np.tile([0.0, 0.0, 0.0, 1.0], (2, 1))})
     for term, why in (("lean", "leave SO3"), ("level", "has no tape")):
         with pytest.raises(fg.GraphError, match=why):

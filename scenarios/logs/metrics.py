@@ -16,6 +16,7 @@ import numpy as np
 
 from unifg.atomic_write import write_atomically
 from unifg.scenarios.logs.columns import columns
+from unifg.solution.history import subproblems
 from unifg.solution.solution import Solution
 from unifg.typing import Array, IntArray
 
@@ -86,7 +87,7 @@ def of_solution(solution: Solution) -> dict[str, Any]:
         "converged": solution.converged,
         "cost": float(solution.cost),
         "iterations": solution.iterations,
-        "subproblems": solution.history.subproblems,
+        "subproblems": subproblems(solution.history),
         "stationarity": float(solution.stationarity),
         "violation": float(solution.violation),
         "complementarity": float(solution.complementarity),

@@ -23,6 +23,7 @@ from unifg.horizon.window import Window
 from unifg.locks import ReentrantLock
 from unifg.modeling.variables import Data
 from unifg.solution.graph import Graph
+from unifg.solution.history import subproblems
 from unifg.solution.solution import Guess, Solution
 from unifg.solution.solver import Prepared, Solver
 from unifg.solution.status import Status
@@ -193,6 +194,7 @@ class RecedingHorizon:
         self.guess: Guess | None = None
         self.solution: Solution | None = None
         self.subproblems: Counter[str] = Counter()
+        self._counting = any(asked is not None and asked.states_subproblems for asked in (solver, second))
         self._solved_by: Prepared | None = self.warm
         self._verification_time = 0.0
         self.sent: Array = np.zeros((delay, robot.control.storage))
@@ -343,8 +345,8 @@ class RecedingHorizon:
         self.solution = solution
         self._solved_by = self.second if rescued else run if solution is first else None
         self.statuses[solution.status] += 1
-        if (self.second if rescued and self.second is not None else run).solver.states_subproblems:
-            self.subproblems.update(solution.history.subproblems)
+        if self._counting:
+            self.subproblems.update(subproblems(solution.history))
         choice = self.decide(solution, now, late=self._clock() - begin > self._deadline)
         self._believe(solution, choice, present)
         decided = np.concatenate([self.sent, choice.controls[:1]])

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from html import escape
 from typing import TYPE_CHECKING
@@ -174,14 +174,14 @@ class History(list[Iteration]):
         """The table, for notebooks."""
         return f"<pre>{escape(str(self))}</pre>"
 
-    @property
-    def subproblems(self) -> dict[str, int]:
-        """Number of quadratic programs by the solver whose answer was taken; empty of backends without any."""
-        return dict(Counter(str(row.details["qp"]) for row in self if "qp" in row.details))
-
     def column(self, name: str) -> Array:
         """(k,) numbers of one attribute of all rows."""
         return np.array([getattr(row, name) for row in self], dtype=np.float64)
+
+
+def subproblems(rows: Iterable[Iteration]) -> dict[str, int]:
+    """Number of quadratic programs by the solver whose answer was taken; empty for backends without any."""
+    return dict(Counter(str(row.details["qp"]) for row in rows if "qp" in row.details))
 
 
 logger = logging.getLogger("unifg")
