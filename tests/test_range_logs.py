@@ -263,6 +263,7 @@ def test_a_map_of_true_poses_is_the_building(log: RangeLog) -> None:
         ({"view": 1.5 * math.pi, "beams": 270, "noise": 0.08, "slips": 3}, 0.15),
     ],
 )
+@pytest.mark.product(1)
 def test_a_map_from_poor_odometry_is_consistent(kind: dict[str, Any], most: float) -> None:
     log = recorded(*corridors(seed=1), seed=1, **kind)
     assert log.corrected is not None
@@ -313,6 +314,7 @@ def test_draws_that_lie_together_are_one_hypothesis() -> None:
     "kind", [{}, {"step": 1.0, "noise": 0.06, "slips": 4}, {"step": 0.2, "reach": 8.0}, {"reach": 50.0, "beams": 361}]
 )
 @pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.product(3)
 def test_a_log_is_followed_to_its_end_on_a_map_of_other_scans(kind: dict[str, Any], seed: int) -> None:
     log = recorded(*corridors(seed=seed), seed=seed, **kind)
     assert log.corrected is not None
