@@ -263,7 +263,7 @@ def test_a_map_of_true_poses_is_the_building(log: RangeLog) -> None:
         ({"view": 1.5 * math.pi, "beams": 270, "noise": 0.08, "slips": 3}, 0.15),
     ],
 )
-@pytest.mark.product(1)
+@pytest.mark.product(2, of="maps of logs")
 def test_a_map_from_poor_odometry_is_consistent(kind: dict[str, Any], most: float) -> None:
     log = recorded(*corridors(seed=1), seed=1, **kind)
     assert log.corrected is not None
@@ -365,6 +365,7 @@ def test_a_start_that_nobody_knows_is_searched_for(log: RangeLog) -> None:
 # ---------------------------------------------------------------- the command
 
 
+@pytest.mark.product(2, of="maps of logs")
 def test_a_map_is_written_and_localised_on(made: Path, log: RangeLog, capsys: pytest.CaptureFixture[str]) -> None:
     numbers = json.loads((made / "metrics.json").read_text())
     assert numbers["aligned_error_m"]["rms"] < 0.15 and numbers["loop_closures"] > 10
@@ -415,6 +416,7 @@ def test_an_interrupt_leaves_the_map_so_far(log: RangeLog) -> None:
 
 
 @pytest.mark.data
+@pytest.mark.product(2, of="maps of logs")
 def test_the_log_of_a_lab_becomes_a_map(shared_data: Path) -> None:
     whole = read_range_log(shared_data / "lidar" / "intel-corrected.log.gz")
     part = slice(0, 240)
