@@ -60,14 +60,14 @@ def best_guess(
         program.bind(data or {})
         start = program.values_from(values_of(guess))
         growth = _Growth(graph, start, along or _longest_chain(graph), dict(data or {}))
-        best, enough = start, GOOD * max(program.table.residuals - program.size, 1)
+        best, least = start, program.evaluate(start).cost
         for factor in GROWTHS:
-            found = program.columns.values(growth.run(factor))
-            program.bind(data or {})
-            best = min(best, found, key=lambda values: program.evaluate(values).cost)
-            if 2.0 * program.evaluate(best).cost <= enough:
+            found = program.values_from(growth.run(factor))
+            cost = program.evaluate(found).cost
+            best, least = (found, cost) if cost < least else (best, least)
+            if 2.0 * least <= GOOD * max(program.table.residuals - program.size, 1):
                 break
-    return Guess({family: array.copy() for family, array in best.items()})
+    return Guess({family: best[family].copy() for family in graph.families.values()})
 
 
 def _longest_chain(graph: Graph) -> Family:
@@ -104,12 +104,13 @@ def _planned(graph: Graph, along: Family) -> Plan:
             continue
         member, when, rows = (np.concatenate(part) for part in zip(*seen, strict=True))
         order = np.lexsort((when, member))
-        needed = family.manifold.dim
-        for one in np.unique(member).tolist():
-            own = order[member[order] == one]
-            enough = np.flatnonzero(np.cumsum(rows[own]) >= needed + (rows[own[0]] < needed))
-            if len(enough):
-                members[family][one] = max(when[own[enough[0]]], 0)
+        member, when, rows = member[order], when[order], rows[order]
+        first = np.flatnonzero(np.diff(member, prepend=-1))
+        among = np.repeat(first, np.diff(first, append=len(member)))
+        total, needed = np.cumsum(rows), family.manifold.dim
+        enough = total - total[among] + rows[among] >= needed + (rows[among] < needed)
+        earliest = np.minimum.reduceat(np.where(enough, when, count), first)
+        members[family][member[first]] = np.clip(earliest, 0, count - 1)
     factors = {}
     for term in costs:
         latest = [members[s.family][s.indices] for s in term.selections if s.family not in held]
@@ -123,8 +124,10 @@ class _Growth:
     def __init__(self, graph: Graph, start: Values, along: Family, data: dict[Data, Numbers]) -> None:
         """State the graph anew, with a flag for each factor and a prior for each member."""
         self._guess, self._along, self._plan = start, along, _planned(graph, along)
-        still = {family: np.zeros((family.count, family.manifold.dim)) for family in start}
-        self._first = {f: np.asarray(f.manifold.retract(array, still[f])) for f, array in start.items()}
+        self._first = {
+            f: np.asarray(f.manifold.retract(start[f], np.zeros((f.count, f.manifold.dim))))  # headings within a turn
+            for f in graph.families.values()
+        }
         self._graph = graph.snapshot()
         self._flags: dict[str, tuple[Data, BoolArray]] = {}
         self._priors: dict[Family, tuple[Data, Data, Array]] = {}
@@ -134,16 +137,17 @@ class _Growth:
                 continue
             active = data.get(term.active, term.active.value) if isinstance(term.active, Data) else term.active
             stated = np.ones(term.count, dtype=bool) if active is None else np.asarray(active, dtype=bool)
-            flag = self._graph.data(f"{term.name}: in", np.zeros(term.count, dtype=bool))
+            flag = self._graph.data(f"best_guess: {term.name}, in", np.zeros(term.count, dtype=bool))
             self._graph.replace(term.name, active=flag)
             self._flags[term.name] = flag, stated
         for family in self._first:
-            size = self._size(family)
-            place = self._graph.data(f"{family.name}: place", self._first[family])
-            sigma = self._graph.data(f"{family.name}: sigma", np.tile(size, (family.count, 1)))
-            self._graph.minimize(prior, family, place, sigma=sigma, name=f"{family.name}: prior")
+            size, name = self._size(family), f"best_guess: {family.name}"
+            place = self._graph.data(f"{name}, place", self._first[family])
+            sigma = self._graph.data(f"{name}, sigma", np.tile(size, (family.count, 1)))
+            self._graph.minimize(prior, family, place, sigma=sigma, name=name)
             self._priors[family] = place, sigma, size
         used = {handle for term in self._graph.terms for handle in term.data}
+        used |= {handle for fix in self._graph.fixes for handle in fix.data}
         self._given = {handle: value for handle, value in data.items() if handle in used}
         self._run: Prepared = LevenbergMarquardt(max_iterations=STEPS, tolerance=1e-3).prepare(self._graph)
 

@@ -196,3 +196,29 @@ def test_a_file_without_poses_begins_with_a_map_that_grows(tmp_path: Path) -> No
     assert len(found["incremental"].landmarks) == len(unplaced.landmarks)
     placed = replace(unplaced, placed=True)
     assert "incremental" not in {start.name for start in starts(placed)}
+
+
+def chain(at: Any = (0.0, 0.0, 0.0)) -> tuple[fg.Graph, fg.Family]:
+    """Five poses, a metre apart."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.SE2, 5)
+    graph.fix(x[0], at(graph) if callable(at) else at)
+    graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0, 0.0], sigma=0.1)
+    return graph, x
+
+
+def test_a_fixed_pose_has_the_place_that_data_give_it() -> None:
+    graph, x = chain(lambda graph: graph.data("at", np.zeros(3)))
+    handle = graph.fixes[0].data[0]
+    found = fg.best_guess(graph, {x: np.zeros((5, 3))}, data={handle: [7.0, 1.0, 0.0]})
+    np.testing.assert_allclose(found.values[x][:, 0], 7.0 + np.arange(5), atol=1e-6)
+
+
+def test_soft_constraints_and_names_of_the_caller_are_no_obstacle() -> None:
+    graph, x = chain()
+    place = graph.data("x: place", np.zeros(3))
+    graph.minimize(fg.prior, x[0], place, sigma=1.0, name="x: prior")
+    graph.constrain(lambda p: p[:, :1], x, upper=2.0, soft=1e-3, name="wall")
+    found = fg.best_guess(graph, {x: np.zeros((5, 3))})
+    assert list(found.values) == [x]
+    assert fg.solve(graph, found).converged
