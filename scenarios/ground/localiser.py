@@ -98,6 +98,8 @@ class Localiser:
             name="lidar",
         )
         self._run = GaussNewton(max_iterations=12, step_tolerance=1e-5).prepare(graph)
+        several = np.zeros((2, 3))  # what hypotheses need is loaded here, not in the tick that first has them
+        SE2.compose(several, SE2.exp(SE2.local(several, several)))
 
     @property
     def hypotheses(self) -> int:
