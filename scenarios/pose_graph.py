@@ -69,8 +69,8 @@ class SolveSettings:
             with its parameter after a colon if it is not the usual one.
         robust_on: the measurements with this loss: loop closures, or odometry and sightings of landmarks as well. All
             can be wrong then, and gnc begins at several first guesses.
-        init: first guess: poses of the file, a spanning tree, LAGO (2D) or chordal relaxation; or the one of them
-            that costs least, but for the tree.
+        init: first guess: poses of the file, a spanning tree, LAGO (2D), chordal relaxation, or a map that grows along
+            the odometry; or the one of them that costs least, but for the tree.
         residual: full logarithm, as GTSAM, or the chart of g2o; their optima differ in 3D.
         tolerance: "optimum", to all digits, or "map", until a step would lower the cost by less than 1e-5 of it.
         repair_information: what to do about information matrices with negative eigenvalues: leave these measurements

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 
 from unifg.files.range_log import RangeLog, aligned, read_range_log
 from unifg.files.ros_map import OccupancyMap
-from unifg.lie import SE2, wrap_angle
+from unifg.lie import SE2
 from unifg.models.odometry import OdometryNoise
+from unifg.scenarios.logs.drive_metrics import pose_errors
 from unifg.typing import Array
 
 __all__ = ["WHEELS", "LogRun", "opened", "step_of"]
@@ -61,21 +63,22 @@ class LogRun:
         start = self.log.odometry[: len(self.poses)]
         return SE2.compose(self.poses[0], SE2.between(start[0], start))
 
-    @property
+    @cached_property
+    def truth(self) -> Array | None:
+        """(n, 3) corrected poses of the log, as far as poses were found; None where it has none."""
+        return None if self.log.corrected is None else self.log.corrected[: len(self.poses)]
+
+    @cached_property
     def errors(self) -> tuple[Array, Array] | None:
-        """(n, 3) of the poses against the corrected ones: as they are, and after alignment; None without these."""
-        if self.log.corrected is None:
-            return None
-        truth = self.log.corrected[: len(self.poses)]
-        return _off(self.poses, truth), _off(aligned(self.poses, truth), truth)
+        """(n,) distances from the corrected poses [m], and (n,) from headings [rad]; None without these."""
+        return None if self.truth is None else pose_errors(self.poses, self.truth)
 
     @property
     def nees(self) -> Array:
         """(n,) squared errors against the corrected poses, after alignment, by the covariances; empty without these."""
-        if self.covariance is None or self.log.corrected is None:
+        if self.covariance is None or self.truth is None:
             return np.zeros(0)
-        truth = self.log.corrected[: len(self.poses)]
-        off = SE2.local(aligned(self.poses, truth), truth)
+        off = SE2.local(aligned(self.poses, self.truth), self.truth)
         found: Array = np.einsum("ni,ni->n", off, np.linalg.solve(self.covariance, off[:, :, None])[:, :, 0])
         return found
 
@@ -112,8 +115,3 @@ def step_of(log: RangeLog, begin: int, end: int) -> Array:
     x, y, turn = SE2.between(log.odometry[begin], log.odometry[end]).tolist()
     cosine, sine = math.cos(0.5 * turn), math.sin(0.5 * turn)
     return np.array([cosine * x + sine * y, cosine * y - sine * x, turn])
-
-
-def _off(poses: Array, truth: Array) -> Array:
-    off = poses - truth
-    return np.column_stack([off[:, :2], wrap_angle(off[:, 2])])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from unifg.files.range_log import aligned
 from unifg.files.ros_map import load_map
 from unifg.files.tum import write_tum
 from unifg.scenarios import log_drive
@@ -57,11 +58,10 @@ def metrics(made: LogRun) -> dict[str, Any]:
     }
     if made.hypotheses.any():
         numbers["scans_with_hypotheses"] = int((made.hypotheses > 1).sum())
-    if made.errors is not None:
-        off, fitted = made.errors
-        away = np.hypot(*off[:, :2].T)
-        numbers |= {"end_error_m": float(away[-1]), "error_m": spread(away), "error_rad": spread(np.abs(off[:, 2]))}
-        numbers["aligned_error_m"] = errors(fitted[:, :2])
+    if made.errors is not None and made.truth is not None:
+        away, turned = made.errors
+        numbers |= {"end_error_m": float(away[-1]), "error_m": spread(away), "error_rad": spread(turned)}
+        numbers["aligned_error_m"] = errors((aligned(made.poses, made.truth) - made.truth)[:, :2])
         if made.covariance is not None:
             numbers["nees"] = float(np.mean(made.nees))
     return numbers

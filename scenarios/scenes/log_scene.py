@@ -34,8 +34,7 @@ def picture(run: LogRun) -> Figure:
         along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(run.poses[:, :2], axis=0).T))])
         below.plot(along, 100.0 * run.share, color=css("horizon"), lw=0.9, label="beams explained [%]")
         if run.errors is not None:
-            off = 100.0 * np.hypot(*run.errors[0][:, :2].T)
-            below.plot(along, off, color=css("estimate"), lw=1.1, label="error [cm]")
+            below.plot(along, 100.0 * run.errors[0], color=css("estimate"), lw=1.1, label="error [cm]")
         several = np.flatnonzero(run.hypotheses > 1)
         if len(several):
             below.plot(along[several], np.zeros(len(several)), "|", color=css("outlier"), label="several hypotheses")
@@ -60,9 +59,8 @@ def stage(run: LogRun) -> Scene:
     inside = (np.abs(wheels[:, :2] - corners.mean(axis=0)) < 0.75 * np.ptp(corners, axis=0)).all(axis=1)
     dots = wheels[inside][every(int(inside.sum()), 500), :2]
     scene.points("odometry", dots, pixels=2.5, colour="odometry", legend="wheels alone")
-    if run.errors is not None and run.log.corrected is not None:
-        truth = run.log.corrected[: len(run.poses), :2]
-        scene.way("corrected", truth, width=width, colour="goal", legend="corrected poses of the log")
+    if run.truth is not None:
+        scene.way("corrected", run.truth[:, :2], width=width, colour="goal", legend="corrected poses of the log")
     scene.way("found", run.poses[:, :2], width=width, colour="estimate", legend="poses found")
     if len(run.closures):
         scene.lines("closures", run.poses[run.closures][:, :, :2], colour="closure", legend="loop closures")
@@ -88,7 +86,7 @@ def log_scene(run: LogRun) -> Scene:
         if len(run.hypotheses):
             frame.readout("hypotheses", str(int(run.hypotheses[k])), alarm=bool(run.hypotheses[k] > 1))
         if run.errors is not None:
-            frame.readout("error", f"{100.0 * np.hypot(*run.errors[0][k, :2]):.1f} cm")
+            frame.readout("error", f"{100.0 * run.errors[0][k]:.1f} cm")
     scene.outcome, scene.good = ("followed to the end" if run.succeeded else "lost"), run.succeeded
     if run.kind == "map":
         scene.outcome = "interrupted" if run.interrupted else "mapped"

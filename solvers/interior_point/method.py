@@ -228,9 +228,7 @@ class InteriorPoint(Solver):
         program, work, now = run.program, workspace.work, workspace.now
         assisted, begun, run.begun = now["assisted"], run.begun, False
         now["watched"], now["stage"] = not run.alone, state.LINEARIZED
-        if begun:
-            pass
-        elif run.alone:
+        if run.alone and not begun:
             if assisted:
                 workspace.take(program.linearize(program.columns.view(work.values.copy())))
             elif len(program.fixed_rows()):
@@ -240,14 +238,15 @@ class InteriorPoint(Solver):
             run.look_at_fixed(work.constraints)
             if run.status is not None:
                 return None
-        else:
+        elif not begun:
             if not np.array_equal(run.lin.values.flat, work.values):
                 run.begin_at(program.linearize(program.columns.view(work.values.copy())))
                 if run.status is not None:
                     return None
             workspace.take(run.lin)
         interrupted, seen = begun and workspace.interrupted, now["iteration"]
-        now["answer"] = now["answer"] if begun else NO_ANSWER
+        if not begun:
+            now["answer"] = NO_ANSWER
         try:
             while not begun and workspace.asks():
                 if run.alone:
