@@ -13,6 +13,7 @@ from unifg.lie import Product
 from unifg.models.odometry import driven, held
 from unifg.pose_graphs import starts
 from unifg.solvers import LevenbergMarquardt
+from unifg.solvers.continuation import _planned
 from unifg.typing import Array
 
 
@@ -156,6 +157,26 @@ def test_points_in_space_velocities_and_constraints() -> None:
     start = fg.SE3.act(np.array(noisy)[node[first]], z[first])
     found = fg.best_guess(graph, {x: np.array(noisy), m: start, v: np.tile(state.identity(), (2, 1))})
     assert np.linalg.norm(found.values[m] - points, axis=1).max() < 0.1
+
+
+def test_members_come_in_when_enough_says_where_they_are() -> None:
+    """A point by ranges with the third one, and by what ties it to two poses with the later of them."""
+    graph = fg.Graph()
+    x, near = graph.variables("x", fg.SE2, 6), graph.variables("near", fg.Rn(2), 1)
+    far, long = graph.variables("far", fg.Rn(2), 1), graph.variables("long", fg.Rn(1), 1)
+    graph.minimize(fg.between, x[:-1], x[1:], np.zeros((5, 3)), name="steps")
+    graph.minimize(
+        lambda x, p, c: np.hypot(*(x[:, :2] - p).T)[:, None] + c, x[[4, 1, 3, 5]], near[[0] * 4], long, name="ranges"
+    )
+    graph.minimize(lambda x, y, p: x[:, :2] + y[:, :2] - p, x[5], x[2], far, name="amid")
+    plan = _planned(graph, x)
+    assert {family.name: when.tolist() for family, when in plan.members.items() if family is not x} == {
+        "near": [4], "far": [5], "long": [5],
+    }  # fmt: skip
+    assert {name: when.tolist() for name, when in plan.factors.items()} == {
+        "steps": [1, 2, 3, 4, 5], "ranges": [4, 4, 4, 5], "amid": [5],
+    }  # fmt: skip
+    assert plan.held == {long}
 
 
 def test_no_chain_is_an_error_with_a_remedy() -> None:

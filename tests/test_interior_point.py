@@ -20,9 +20,10 @@ from unifg.codegen.clock import clock
 from unifg.factors.robust import Loss
 from unifg.models import avoidance, quadrotor
 from unifg.problem.columns import Values
-from unifg.solution.optimality import optimality
+from unifg.solution.optimality import optimality, read_numbers
 from unifg.solution.solver import SolveState
 from unifg.solvers import SQP, InteriorPoint
+from unifg.solvers.interior_point import method
 from unifg.solvers.interior_point.method import Workspace
 from unifg.typing import Array, ArrayLike
 
@@ -581,3 +582,35 @@ def test_a_tick_is_one_call_until_something_changes(monkeypatch: pytest.MonkeyPa
     assert loose.tolerance == 1e-3 and loose.iterations < first.iterations
     prepared.solve(guess, callback=lambda row: None)
     assert len(begun) == 3
+
+
+def test_a_call_is_judged_before_its_answer_is_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A solve goes on in parts if its answer, converged by the loop, does not pass the judge of all backends."""
+    graph, guess = driving()
+    prepared = InteriorPoint().prepare(graph)
+    expected = prepared.solve(guess)
+    asked: list[Any] = []
+
+    def doubted(found: Array, cost: float) -> Any:
+        asked.append(read_numbers(found, cost))
+        return asked[0]._replace(stationarity=1.0) if len(asked) == 1 else asked[-1]
+
+    monkeypatch.setattr(method, "read_numbers", doubted)
+    found = prepared.solve(guess)
+    assert asked and found.converged and found.stationarity == expected.stationarity
+
+
+def test_one_call_says_what_parts_say_where_a_stop_rule_and_a_limit_meet() -> None:
+    graph, guess = driving()
+    options: dict[str, Any] = {"tolerance": 1e-12, "step_tolerance": 1e-2}
+    last = InteriorPoint(**options).solve(graph, guess).iterations
+    said = []
+    for limit in (last - 1, last, last + 1):
+        solver = InteriorPoint(max_iterations=limit, **options)
+        used, fresh = solver.prepare(graph), solver.prepare(graph)
+        used.solve(guess)
+        one, other = used.solve(guess), fresh.solve(guess)
+        assert one.status is other.status and one.iterations == other.iterations
+        np.testing.assert_array_equal(one._lin.stored, other._lin.stored)
+        said.append(one.status)
+    assert said == [fg.Status.ITERATION_LIMIT, fg.Status.ITERATION_LIMIT, fg.Status.STOP_RULE]

@@ -351,6 +351,26 @@ def test_several_hypotheses_are_held_until_a_corridor_ends() -> None:
     assert localiser.hypotheses == 1
 
 
+def test_a_scan_that_does_not_fit_makes_hypotheses_of_which_one_has_to_fit_well(log: RangeLog) -> None:
+    """A robot that was pushed is found nearby; one before which people stand is not looked for elsewhere."""
+    building, truth, rng = corridors()[0], log.corrected, np.random.default_rng(0)
+    assert truth is not None
+    field = DistanceMap.from_occupancy(building.occupied, building.resolution, building.origin)
+    sigma = np.array([0.05, 0.05, 0.03])
+    pushed: list[float] = []
+    hidden: list[float] = []
+    for k in range(10, len(truth), 15):
+        ranges = log.ranges[k]
+        start = SE2.compose(truth[k], SE2.exp(np.array([0.5, 0.3, 0.3])))
+        before = np.where(rng.random(180) < 0.55, 0.6, 1.0) * ranges
+        for found, begin, scan in ((pushed, start, ranges), (hidden, truth[k].copy(), before)):
+            localiser = Localiser(field, begin, sigma, 180)
+            for _ in range(2):
+                localiser.update(Scan(log.angles, scan), np.zeros(2), 0.1)
+            found.append(apart(localiser.pose[None], truth[k : k + 1])[0])
+    assert np.mean(np.array(pushed) < 0.1) > 0.5 and max(hidden) < 0.05
+
+
 def test_a_start_that_nobody_knows_is_searched_for(log: RangeLog) -> None:
     truth, occupancy = log.corrected, corridors()[0]
     assert truth is not None
