@@ -19,6 +19,7 @@ from unifg.horizon.past import Arrival
 from unifg.horizon.receding_horizon import InitialGuesses, RecedingHorizon
 from unifg.horizon.robot import Constant, Robot
 from unifg.horizon.terms import Context, ControlCost, Dynamics, Measurement, Resetting, Term
+from unifg.horizon.tree import Tree, tree_of
 from unifg.horizon.window import Window
 
 __all__ = [
@@ -42,9 +43,11 @@ __all__ = [
     "Resetting",
     "Robot",
     "Term",
+    "Tree",
     "Window",
     "cheapest",
     "plan_on_mesh",
+    "tree_of",
 ]
 
 

@@ -19,6 +19,7 @@ from unifg.horizon.history import instant
 from unifg.horizon.multistart import LEAST_TIME, Jumps, cheapest
 from unifg.horizon.robot import Robot, numbers
 from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
+from unifg.horizon.tree import BranchedSelection, ExpectedCost, Tree
 from unifg.horizon.window import Window
 from unifg.locks import ReentrantLock
 from unifg.modeling.variables import Data
@@ -64,7 +65,10 @@ class RecedingHorizon:
     Attributes:
         robot: who moves.
         steps: N of the future.
+        tree: order of its nodes.
+        path: (K + 1,) nodes whose plan is applied and kept: all, or those that lead to the end of the last tail.
         times: (N + 1,) of its nodes from the present on [s]; 0, 1, ..., N in ticks where none were given.
+        probabilities: (N + 1,) of its nodes in the last tick.
         coupling: of estimation and control.
         window: of the past; None where the present is given to :meth:`plan`.
         tie: what ties the horizon to the past.
@@ -93,9 +97,10 @@ class RecedingHorizon:
     def __init__(
         self,
         robot: Robot,
-        steps: int,
+        steps: int | Tree,
         terms: Sequence[Term],
         *,
+        probabilities: Callable[[Context[Any]], ArrayLike] | None = None,
         times: ArrayLike | None = None,
         solver: Solver,
         cold: Solver | None = None,
@@ -117,8 +122,11 @@ class RecedingHorizon:
 
         Args:
             robot: who moves.
-            steps: N of the future.
+            steps: N of the future, or a tree of its nodes. The plan that is applied and kept is then that of its last
+                tail: let that be the one that holds whatever happens. The others are in ``solution``.
             terms: of the nodes and controls of the future.
+            probabilities: ``probabilities(now)`` gives those of the tails (L,), by which costs are weighted; prices of
+                soft constraints are not. They are constants of a solve. None: every cost counts fully.
             times: (N + 1,) of the nodes from the present on [s], from zero and of any spacing, the first step being as
                 long as a tick. Warm starts, kept plans and rollouts go by them. None: every step is a tick.
             solver: for a solve with a warm start.
@@ -151,8 +159,9 @@ class RecedingHorizon:
         """
         if coupling not in COUPLINGS:
             raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
-        if steps < 1:
+        if not isinstance(steps, Tree) and steps < 1:
             raise GraphError(f"a horizon needs at least one step, found steps={steps}")
+        tree = steps if isinstance(steps, Tree) else Tree(tuple(range(steps)))
         if not deadline > 0.0:
             raise GraphError(f"the deadline must be positive, got {deadline} s")
         if not (control_weight > 0.0 and np.isfinite(control_weight)):
@@ -163,25 +172,33 @@ class RecedingHorizon:
                 "'joint', where the future begins at the present"
             )
         self._lock = ReentrantLock()
-        self.times = _node_times(times, steps, robot)
-        self.robot, self.steps, self.coupling, self.window, self.delay = robot, steps, coupling, window, delay
+        self.times = _node_times(times, tree, robot)
+        self.tree, self.path = tree, tree.paths[-1]
+        self.robot, self.steps, self.coupling, self.window, self.delay = robot, len(tree), coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
         between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
         graph = Graph()
         self.tie: PresentCoupling = self._tied(graph, pull)
-        self.x, self.u = self.tie.ahead, graph.variables("u", robot.control, steps)
+        self.x, self.u = self.tie.ahead, graph.variables("u", robot.control, self.steps)
         before, tied = len(graph.terms), handles_of(graph)
+        branches = len(tree.paths) > 1
+        nodes = (BranchedSelection(self.x, tree), BranchedSelection(self.u[:], tree)) if branches else (self.x, self.u)
         for term in self._terms:
-            term.state(graph, self.x, self.u)
+            term.state(graph, *nodes)
         weigh(graph.terms[before:], control_weight)
         self._handles, self._families = handles_of(graph), dict(graph.families)
+        self._expected: ExpectedCost | None = None
+        self.probabilities, self._branches = np.ones(self.steps + 1), tree if branches else None
+        if probabilities is not None:
+            self._expected = ExpectedCost(graph, graph.terms[before:], tree, self.x, self.u)
+        self._probabilities = probabilities
         self._said = [handle for name, handle in self._handles.items() if name not in tied]
         backends = solver, cold or solver, second or solver
         timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in backends]
         self._limits = [own.time_limit for own in timed]
         self.warm, self.cold = (own.prepare(graph) for own in timed[:2])
         self.second = None if second is None else timed[2].prepare(graph)
-        self.kept = LastPlan(self.times, robot, between)
+        self.kept = LastPlan(self.times[self.path], robot, between)
         self.judge: AcceptancePolicy = judge or LastPlanThenBrake(robot)
         self.starts: InitialGuesses = starts or InitialGuesses()
         self._believable = believable or _close
@@ -258,7 +275,7 @@ class RecedingHorizon:
         for name, value in seen.items():
             window.record(name, value)
         window.estimate(given)
-        return self._plan(replace(window.now(given, last), times=self.times), begin)
+        return self._plan(replace(window.now(given, last), times=self.times, tree=self._branches), begin)
 
     def plan(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Plan:
         """Plan from a present state (storage,) that is estimated elsewhere.
@@ -318,7 +335,8 @@ class RecedingHorizon:
         )
         stated = {name: self._constant(name, value, known) for name, value in (constants or {}).items()}
         known = {name: values.copy() for name, values in known.items()} | stated
-        return Context(given, np.array(present, dtype=np.float64), self.applied.copy(), known, history, self.times)
+        here = np.array(present, dtype=np.float64)
+        return Context(given, here, self.applied.copy(), known, history, self.times, self._branches)
 
     def _constant(self, name: str, value: ArrayLike, known: Mapping[str, Array]) -> Array:
         """A value (count, storage) of a static."""
@@ -328,7 +346,11 @@ class RecedingHorizon:
 
     def data(self, now: Context[Any]) -> dict[Data, ArrayLike]:
         """Data of the whole graph."""
-        return self.tie.data(now) | values_of(self._terms, now, self._handles)
+        found = self.tie.data(now) | values_of(self._terms, now, self._handles)
+        if self._probabilities is not None and self._expected is not None:
+            self.probabilities = self.tree.probabilities(self._probabilities(now))
+            found |= self._expected.data(self.probabilities)
+        return found
 
     def _plan(self, present: Context[Any], begin: float) -> Plan:
         """Solve, judge, and remember."""
@@ -385,7 +407,12 @@ class RecedingHorizon:
 
     def _refuses(self, solution: Solution, now: Context[Any]) -> bool:
         """Test whether the judge would have something else applied than the plan."""
-        return self.judge(solution, solution[self.x], solution[self.u], now, self.kept).source != "solved"
+        return self.judge(solution, *self._planned(solution), now, self.kept).source != "solved"
+
+    def _planned(self, solution: Solution) -> tuple[Array, Array]:
+        """States (K + 1, storage) and controls (K, m) of the path that is applied."""
+        states, controls = solution[self.x], solution[self.u]
+        return (states, controls) if self._branches is None else (states[self.path], controls[self.path[1:] - 1])
 
     def _ask(
         self, other: Prepared, first: Solution, now: Context[Any], data: dict[Data, ArrayLike], begin: float
@@ -411,7 +438,7 @@ class RecedingHorizon:
             now: what the terms were asked with.
             late: whether the deadline has passed, so that the plan serves the next tick only.
         """
-        states, controls = solution[self.x], solution[self.u]
+        states, controls = self._planned(solution)
         self.kept.age += float(self.times[1])
         choice = self.judge(solution, states, controls, now, self.kept)
         if late and choice.source == "solved":
@@ -449,8 +476,12 @@ class RecedingHorizon:
         return np.tile(now.present, (self.steps + 1, 1)), np.zeros((self.steps, self.robot.control.storage))
 
     def guess_of(self, states: Array, controls: Array, now: Context[Any]) -> Guess:
-        """A guess for the graph, from states (N + 1, storage) and controls (N, m) of the future."""
+        """A guess for the graph, from states and controls of all nodes, or of the path that is applied."""
         x = self.x.family
+        if len(controls) < self.steps and len(controls) == len(self.path) - 1:
+            path, begins = self.times[self.path], np.append(self.times[self.tree.begins], 0.0)
+            acting = self.robot.between(path, states, controls, begins)[1]
+            states, controls = self.robot.between(path, states, controls, self.times)[0], acting
         nodes = np.tile(now.present, (len(x), 1))
         nodes[len(x) - self.steps - 1 :] = states
         values = {x: nodes, self.u: np.asarray(controls, dtype=np.float64)}
@@ -473,6 +504,9 @@ class RecedingHorizon:
         whole steps: by those that a tick is nearest to, on average over the horizon.
         """
         along = *self.tie.along, self.u
+        if self._branches is not None:
+            guess = solution.shifted(*along, by=0)
+            return self._resampled(guess, solution[self.x], solution[self.u], self.times + self.times[1])
         if np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0):
             return solution.shifted(*along)
         joint = len(self.x.family) > self.steps + 1
@@ -482,8 +516,11 @@ class RecedingHorizon:
 
     def _resampled(self, guess: Guess, states: Array, controls: Array, at: Array) -> Guess:
         """A guess with the states and controls of a plan on the nodes of now at other times (N + 1,)."""
-        nodes = guess.values[self.x.family].copy()
-        nodes[len(nodes) - self.steps - 1 :], acting = self.robot.between(self.times, states, controls, at)
+        nodes, acting = guess.values[self.x.family].copy(), np.empty_like(controls)
+        ahead = nodes[len(nodes) - self.steps - 1 :]
+        for path in sorted(self.tree.paths, key=lambda path: self.probabilities[path[-1]]):  # the likeliest last
+            steps = path[1:] - 1
+            ahead[path], acting[steps] = self.robot.between(self.times[path], states[path], controls[steps], at[path])
         return replace(guess, values={**guess.values, self.x.family: nodes, self.u: acting})
 
     def set_times(self, times: ArrayLike) -> None:
@@ -500,11 +537,11 @@ class RecedingHorizon:
             BackendError: while another thread plans.
         """
         with self._alone():
-            found = _node_times(times, self.steps, self.robot)
+            found = _node_times(times, self.tree, self.robot)
             if self.guess is not None:
                 states = self.guess.values[self.x.family][-self.steps - 1 :]
                 self.guess = self._resampled(self.guess, states, self.guess.values[self.u], found)
-            self.times = self.kept.times = found
+            self.times, self.kept.times = found, found[self.path]
 
     def _believe(self, solution: Solution, choice: Decision, now: Context[Any]) -> None:
         said = self.tie.believed(solution) if self._believable(solution, choice) else None
@@ -560,14 +597,14 @@ class RecedingHorizon:
         self.constants, self.believed = {static.name: static.values for static in self.robot.constants}, False
 
 
-def _node_times(times: ArrayLike | None, steps: int, robot: Robot) -> Array:
+def _node_times(times: ArrayLike | None, tree: Tree, robot: Robot) -> Array:
     """(N + 1,) times of the nodes."""
     if times is None:
-        return np.arange(steps + 1.0) * (robot.tick or 1.0)
-    nodes = np.array(times, dtype=np.float64)
-    growing = nodes.shape == (steps + 1,) and nodes[0] == 0.0 and (np.diff(nodes) > 0.0).all() and nodes[-1] < np.inf
-    if not growing:
-        raise GraphError(f"the times must be {steps + 1} growing numbers from 0 on, one for each node; got {times}")
+        return tree.depths.astype(np.float64) * (robot.tick or 1.0)
+    nodes, count = np.array(times, dtype=np.float64), len(tree) + 1
+    growing = nodes.shape == (count,) and nodes[0] == 0.0 and np.isfinite(nodes).all()
+    if not (growing and (nodes[1:] > nodes[tree.begins]).all()):
+        raise GraphError(f"the times must be {count} growing numbers from 0 on, one for each node; got {times}")
     if robot.predict is not None and robot.tick is None:
         raise GraphError("node times need the robot's tick: its predict(x, u, seconds) is given the length of a step")
     if robot.tick is not None and not np.isclose(robot.tick, nodes[1], rtol=1e-9, atol=0.0):

@@ -17,6 +17,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.horizon.history import History
+from unifg.horizon.tree import Tree, tree_of
 from unifg.modeling.factors import difference, prior
 from unifg.modeling.model import AnyResidual
 from unifg.modeling.variables import Data, Family, Selection
@@ -37,6 +38,7 @@ class Context(Generic[G]):
         constants: (count, storage) values by the past alone, by name.
         history: what was done and measured; None without a window.
         times: (N + 1,) of the nodes of the future from the present on [s]; empty for a window.
+        tree: order of these nodes; None where each follows the one before it.
     """
 
     given: G
@@ -45,6 +47,13 @@ class Context(Generic[G]):
     constants: Mapping[str, Array] = field(default_factory=dict)
     history: History | None = None
     times: Array = field(default_factory=lambda: np.zeros(0))
+    tree: Tree | None = None
+
+    @property
+    def lengths(self) -> Array:
+        """(N,) lengths of the steps of the future [s]."""
+        found: Array = self.times[1:] - (self.times[:-1] if self.tree is None else self.times[self.tree.begins])
+        return found
 
     @property
     def past(self) -> History:
@@ -67,7 +76,10 @@ class Term(Protocol):
         Args:
             graph: which also holds the robot's constants, and of the past its steps, in ``graph.families``.
             x: the nodes: of the past L + 1, the present being the last; of the future N + 1, the present the first.
-            u: (L,) controls that were applied, which are data; or the family of the N controls to come.
+            u: (L,) controls that were applied, which are data; or the N controls to come.
+
+        Which node follows which, :func:`unifg.horizon.tree_of` tells of x; in a horizon that branches slices as
+        ``x[:-1]`` are refused.
         """
         ...
 
@@ -180,7 +192,7 @@ class Dynamics:
             if isinstance(u, Data):
                 raise GraphError(f"the past needs the step of '{self.name}': give it a length [s]", term=self.name)
             step = graph.data(f"{self.name}: step", np.ones(len(u)), each=True)
-        arguments, name = (x[:-1], u, *shared, x[1:], step), self.name
+        arguments, name = (x[tree_of(x).begins], u, *shared, x[1:], step), self.name
         if isinstance(u, Data):
             name = f"past {name}"
         if self.sigma is not None:
@@ -190,7 +202,7 @@ class Dynamics:
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         """Lengths of the steps, where they may change."""
-        return {} if self.step is not None else {f"{self.name}: step": np.diff(now.times)}
+        return {} if self.step is not None else {f"{self.name}: step": now.lengths}
 
 
 @dataclass(frozen=True)
@@ -217,7 +229,8 @@ class ControlCost:
             last = graph.data("last control", np.zeros(shape[1]))
             graph.minimize(prior, u[0], last, sigma=self.change, name="first change")
             if shape[0] > 1:
-                graph.minimize(difference, u[:-1], u[1:], sigma=self.change, name="change")
+                tree = tree_of(x)
+                graph.minimize(difference, u[tree.earlier], u[tree.later], sigma=self.change, name="change")
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         """The control applied last, and those wanted now."""
