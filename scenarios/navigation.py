@@ -309,6 +309,7 @@ class Episode:
         control = self.decide(number)
         if control is None:
             return None
+        self.world.computing = sum(self.pilot.clock.seconds.values())
         self.world.step(*control, dt=self.settings.controller.dt)
         return self._driven / path_length(self.path), f"goal {self._goal + 1}/{len(self.goals)}"
 

@@ -11,7 +11,7 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
-from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
+from unifg.scenarios.simulation.drivetrain import COMPUTED, Drivetrain, Wheels, latency_of
 from unifg.scenarios.simulation.plane import LidarModel, OdometryModel, World
 
 QUIET, EXACT = LidarModel(sigma=0.0, dropout=0.0), OdometryModel(scale_sigma=0.0, noise_sigma=0.0)
@@ -101,6 +101,17 @@ def test_a_command_acts_after_its_latency(latency: float) -> None:
     assert speeds[begin : begin + 20] == [1.0] * 20
     assert speeds[begin + 20 : begin + 40] == [0.5] * 20
     assert not any(speeds[begin + 40 :])
+
+
+def test_a_command_acts_when_it_is_computed() -> None:
+    """A tick that takes longer than its period delays the next one, which does not overtake it."""
+    wheels = Wheels(Drivetrain(latency=COMPUTED, **IDEAL))
+    speeds = []
+    for command, computing in ((1.0, 0.03), (0.5, 0.15), (0.2, 0.02), (0.1, 0.02)):
+        wheels.tell((command, 0.0), computing)
+        speeds += [wheels.advance(SUBSTEP)[0] for _ in range(20)]
+    assert speeds == [0.0] * 6 + [1.0] * 44 + [0.5] * 4 + [0.2] * 10 + [0.1] * 16
+    assert latency_of("auto") == COMPUTED and latency_of("0.1") == 0.1
 
 
 # ---------------------------------------------------------------- in the world

@@ -31,7 +31,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         ``odometry_error_m`` is the error of dead reckoning. ``outcomes`` says what became of every goal, ``health``
         and ``causes`` count ticks by what the supervisor made of them, ``dropped_samples`` what was not let in, and
         ``last_stops`` ticks in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate, perception,
-        repair of the route and plan.
+        repair of the route and plan; ``late_ticks`` took longer than their period.
 
     Raises:
         ScenarioError: the episode has no tick.
@@ -84,6 +84,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "last_stops": int(np.count_nonzero(log.emergency_stop)),
         "explained_share": {"mean": float(np.mean(log.explained)), "min": float(np.min(log.explained))},
         "tick_ms": timing(log.tick_ms),
+        "late_ticks": int(np.count_nonzero(log.tick_ms > 1e3 * log.dt)),
         **statistics(log),
     }
 

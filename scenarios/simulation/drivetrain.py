@@ -21,7 +21,14 @@ from unifg.models.planar import Base
 from unifg.scenarios.options import not_negative, option, positive, share
 from unifg.typing import Array
 
-__all__ = ["PLANTS", "Drivetrain", "Wheels", "followed", "plant"]
+__all__ = ["COMPUTED", "PLANTS", "Drivetrain", "Wheels", "followed", "plant"]
+
+COMPUTED = -1.0  # latency that is the measured time of each tick
+
+
+def latency_of(text: str) -> float:
+    """Seconds, or "auto" for `COMPUTED`."""
+    return COMPUTED if text == "auto" else not_negative(text)
 
 
 @dataclass(frozen=True)
@@ -36,7 +43,8 @@ class Drivetrain:
         turning: greatest change of the turning rate [rad/s^2].
         load: mass carried, as a share of the base's own: forces stay what they are, so accelerations shrink.
         lag: time constant of the motors [s].
-        latency: from a command, or from what it was computed of, to its effect [s].
+        latency: from a command, or from what it was computed of, to its effect [s]; "auto", -1, for the measured time
+            of each tick, so that a drive depends on the clock. What is not yet computed delays what comes after it.
         slip: share of the wheels' motion that the floor takes.
         skid: outward drift of a base that turns, per lateral acceleration [(m/s)/(m/s^2)].
     """
@@ -45,7 +53,7 @@ class Drivetrain:
     turning: float = option(3.2, text=positive, metavar="RAD/S2")
     load: float = option(0.0, text=not_negative, metavar="SHARE")
     lag: float = option(0.0, text=not_negative, metavar="S")
-    latency: float = option(0.0, text=not_negative, metavar="S")
+    latency: float = option(0.0, text=latency_of, metavar="S")
     slip: float = option(0.0, text=share, metavar="SHARE")
     skid: float = option(0.0, text=not_negative, metavar="S")
 
@@ -60,6 +68,7 @@ class Drivetrain:
             least_excluded = field.name in ("acceleration", "turning")
             most = 1.0 if field.name == "slip" else math.inf
             inside = (0.0 < value <= most) if least_excluded else (0.0 <= value < most)
+            inside = inside or (field.name == "latency" and value == COMPUTED)
             if not inside:
                 bounds = f"{'above zero' if least_excluded else 'zero or more'}{' and below 1' if most == 1.0 else ''}"
                 raise ScenarioError(f"{field.name} of a drivetrain must be {bounds}, got {value}")
@@ -105,12 +114,15 @@ class Wheels:
             self._most[-1] = base.steering[1]
         self._coming: deque[tuple[float, Array]] = deque()
         self._told = np.zeros(base.size)
-        self._now = 0.0
+        self._now = self._computed = 0.0
         self.velocity = np.zeros(base.size)
 
-    def tell(self, command: Sequence[float]) -> None:
-        """Send a command (m,) now; it acts after the latency, until another does."""
-        self._coming.append((self._now + self._drivetrain.latency, np.array(command)))
+    def tell(self, command: Sequence[float], computing: float = 0.0) -> None:
+        """Send a command (m,) now, which took so long to compute [s]; it acts after the latency, until another does."""
+        latency = self._drivetrain.latency
+        if latency == COMPUTED:
+            self._computed = max(self._computed, self._now) + computing
+        self._coming.append((self._computed if latency == COMPUTED else self._now + latency, np.array(command)))
 
     def advance(self, dt: float) -> Array:
         """Let time pass; (m,) mean controls over ``dt`` [s].

@@ -155,6 +155,7 @@ class World(Space):
         self._steered = 0.0
         self._velocities = base.of(np.zeros(size)).tolist()
         self._left, self._spun, self._gripped = 0, 0.0, 0.0
+        self.computing = 0.0  # [s] of the tick that decided the next control
         super().__init__(pose, body or Body.disc(robot_radius), yields)
         self._boundary = self.body.boundary(HULL_SPACING)
         self._add_walls()
@@ -206,7 +207,7 @@ class World(Space):
             raise ScenarioError(
                 f"the control {control} is not {self.base.size} finite numbers; stop the robot, do not drive on it"
             )
-        self._wheels.tell(control)
+        self._wheels.tell(control, self.computing)
         before, heading_before = self.vehicle.position, self.vehicle.angle
         self._spun = self._gripped = self._steered = 0.0
         self._trail = [entry for entry in self._trail if entry[0] >= self.time - self.lidar.turn]
