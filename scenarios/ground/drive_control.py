@@ -26,9 +26,10 @@ from unifg.scenarios.ground.drive_parts import (
 )
 from unifg.scenarios.ground.drive_past import robot
 from unifg.scenarios.ground.drive_settings import SECOND, ControllerSettings, backend
+from unifg.scenarios.ground.futures import futures, horizon_of
 from unifg.scenarios.ground.repulsion import Repulsion
 from unifg.scenarios.ground.stopping import evasions, stopped
-from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.perception.tracks import Tracks, nearest
 from unifg.typing import Array
 
 COLD_PATIENCE = 3  # a tick without a warm start may iterate longer
@@ -60,13 +61,14 @@ class Controller:
         self._evasion: int | None = None  # number of the evasion that was the last tick's way out
         terms: list[Term] = [
             *following(s),
-            ControlCost(s.every(s.control_sigma), s.every(s.rate_sigma), wanted=lambda now: now.given.wanted),
+            ControlCost(s.every(s.control_sigma), s.every(s.rate_sigma), wanted=wanted_controls),
             Motion(s),
             Limits(s),
             Repulsion(s, self.field) if s.avoidance in ("potential", "vortex") else Clearance(s, self.field),
         ]
         self.loop = RecedingHorizon(
-            robot(s.dt, s.kind) if window is None else window.robot, s.horizon, terms, solver=backend(solver, s),
+            robot(s.dt, s.kind) if window is None else window.robot, horizon_of(s), terms, solver=backend(solver, s),
+            probabilities=None if s.futures != "tree" else lambda now: now.given.futures.probabilities,
             cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND, s, COLD_PATIENCE), window=window,
             coupling="sequential" if window is None else "joint", pull=s.pull, limits=s.box, judge=self.judge,
             starts=InitialGuesses(self.along, self.leaving), believable=is_believable, patience=PATIENCE,
@@ -97,7 +99,9 @@ class Controller:
     def given(self, pose: Array, reference: Array, tracks: Tracks, covariance: Array | None = None) -> Drive:
         """Context of the terms; arguments as of :meth:`plan`."""
         spread = np.zeros((3, 3)) if covariance is None else covariance
-        return Drive(self._cruise(reference), reference, tracks, spread, self._evasion_from(pose, tracks))
+        s, evasion = self.settings, self._evasion_from(pose, tracks)
+        expected = None if s.futures == "worst" else futures(s, nearest(tracks, pose, s.discs))
+        return Drive(self._cruise(reference), reference, tracks, spread, evasion, expected)
 
     def _cruise(self, reference: Array) -> Array:
         """(N, m) controls of the speeds along a reference (N + 1, 3)."""
@@ -228,6 +232,12 @@ class Controller:
             states[k + 1] = s.kind.step(pose[None], 0.5 * (last + controls[k])[None], s.dt)[0]
             last = controls[k]
         return states, controls
+
+
+def wanted_controls(now: Context[Drive]) -> Array:
+    """(N, m) controls that would follow the reference, those of a stage for all nodes of the stage."""
+    wanted: Array = now.given.wanted if now.tree is None else now.given.wanted[now.tree.depths[1:] - 1]
+    return wanted
 
 
 def is_behind(states: Array, reference: Array) -> bool:

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import Context, Term
+from unifg.horizon import Context, Term, tree_of
 from unifg.models import obstacles, unicycle
 from unifg.models.barriers import share
 from unifg.models.distance_map import SmoothField
 from unifg.models.footprint import Body
 from unifg.scenarios.ground.drive_settings import ControllerSettings
+from unifg.scenarios.ground.futures import Futures
 from unifg.scenarios.perception.tracks import Tracks, nearest
 from unifg.scenarios.planning.reference_cost import ReferenceCost
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array, ArrayLike, IntArray
 
 FAR_AWAY = 1e3  # [m]; where an unused disc waits
 ENDS = "least controls", "greatest controls"
@@ -50,6 +51,7 @@ class Drive:
         tracks: discs the robot has seen.
         covariance: (3, 3) of the present pose by the past alone, in its tangent space.
         evasive: what is driven when no plan is found.
+        futures: of the nearest tracks, that the plan prepares for; None for the worst alone.
     """
 
     wanted: Array
@@ -57,15 +59,16 @@ class Drive:
     tracks: Tracks
     covariance: Array
     evasive: EvasiveTrajectory
+    futures: Futures | None = None
 
 
 def following(settings: ControllerSettings) -> list[Term]:
     """Costs of leaving the reference (eq. 8), the one at its end apart."""
     pose, end = settings.weighted(settings.pose_sigma), settings.weighted(settings.terminal_sigma)
-    tracking, between, last = unicycle.tracking, (1, -1), (-1, None)
+    tracking = unicycle.tracking
     return [
-        ReferenceCost("path", pose, lambda now: now.given.reference[1:-1], nodes=between, residual=tracking),
-        ReferenceCost("end of path", end, lambda now: now.given.reference[-1], nodes=last, residual=tracking),
+        ReferenceCost("path", pose, lambda now: now.given.reference[1:-1], ends=False, residual=tracking),
+        ReferenceCost("end of path", end, lambda now: now.given.reference[-1], ends=True, residual=tracking),
     ]
 
 
@@ -80,7 +83,8 @@ class Motion:
         base, dt = self.settings.kind, self.settings.dt
         now = graph.data("velocities now", np.zeros(base.size))
         graph.constrain(base.ramped, x[0], now, u[0], x[1], dt, lower=0.0, upper=0.0, name="first step")
-        motion = x[1:-1], u[:-1], u[1:], x[2:], dt
+        tree = tree_of(x)
+        motion = x[tree.begins[tree.later]], u[tree.earlier], u[tree.later], x[tree.later + 1], dt
         graph.constrain(base.ramped, *motion, lower=0.0, upper=0.0, name="dynamics")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
@@ -97,19 +101,22 @@ class Limits:
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         """Bound the controls, and how they change."""
         s = self.settings
+        tree = tree_of(x)
         low, high = (
-            graph.data(name, np.tile(side, (s.horizon, 1)), each=True) for name, side in zip(ENDS, s.box, strict=True)
+            graph.data(name, np.tile(side, (len(tree), 1)), each=True) for name, side in zip(ENDS, s.box, strict=True)
         )
         graph.bound(u, lower=low, upper=high, name="limits")
-        graph.constrain(s.kind.rate, u[:-1], u[1:], lower=-s.most, upper=s.most, name="accelerations")
+        changes = u[tree.earlier], u[tree.later]
+        graph.constrain(s.kind.rate, *changes, lower=-s.most, upper=s.most, name="accelerations")
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
         """Controls that are reachable in the first step, and from which rest is reachable after the last."""
         s = self.settings
         least, most = s.box
-        low, high = np.tile(least, (s.horizon, 1)), np.tile(most, (s.horizon, 1))
-        falls = s.kind.resting
-        low[-1, falls], high[-1, falls] = np.maximum(least, -s.most)[falls], np.minimum(most, s.most)[falls]
+        count, last = (s.horizon, [-1]) if now.tree is None else (len(now.tree), now.tree.leaves - 1)
+        low, high = np.tile(least, (count, 1)), np.tile(most, (count, 1))
+        falls = np.ix_(last, np.flatnonzero(s.kind.resting))
+        low[falls], high[falls] = np.maximum(low, -s.most)[falls], np.minimum(high, s.most)[falls]
         low[0], high[0] = np.maximum(low[0], now.last - s.most), np.minimum(high[0], now.last + s.most)
         return dict(zip(ENDS, (low, high), strict=True))
 
@@ -123,7 +130,7 @@ class Clearance:
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         """Add margins and limits."""
-        s, n, m = self.settings, self.settings.horizon, self.settings.discs
+        s, n, m = self.settings, len(tree_of(x)), self.settings.discs
         parts = len(s.hull.discs)
         wall_limit = graph.data("wall clearance", np.zeros((n, parts)), each=True)
         disc_limit = graph.data("disc clearance", np.zeros((n, parts * m)), each=True)
@@ -139,21 +146,37 @@ class Clearance:
 
     def data(self, now: Context[Drive]) -> Mapping[str, ArrayLike]:
         """Predicted positions of the discs, and the clearance that the evasive trajectory keeps."""
-        s, n, m = self.settings, self.settings.horizon, self.settings.discs
+        s, m, tree = self.settings, self.settings.discs, now.tree
+        n, stages = (s.horizon, slice(None)) if tree is None else (len(tree), tree.depths[1:] - 1)
         pose, given, chosen = now.present, now.given, nearest(now.given.tracks, now.present, m)
         k, spread = len(chosen), in_world(pose, given.covariance)
         centres, radii, shy = np.full((n, m, 2), FAR_AWAY), np.zeros(m), np.zeros(m)
         shies = (chosen.mover & ~chosen.sweeps) * s.mover_margin
         limits = np.zeros((n, len(s.hull.discs), m))
-        centres[:, :k], radii[:k], shy[:k] = predicted(s, pose, chosen), chosen.radius, shies
-        limits[:, :, :k] = disc_limits(s, pose, centres[:, :k], chosen, given.evasive.states, spread)
+        radii[:k], shy[:k] = chosen.radius, shies
+        for steps, expected in self._tails(now, chosen):
+            places = predicted(s, pose, expected)
+            centres[steps, :k] = places
+            limits[steps, :, :k] = disc_limits(s, pose, places, expected, given.evasive.states, spread)
         return {
-            "wall clearance": wall_limits(s, self.field, given.evasive.states, given.reference, spread),
+            "wall clearance": wall_limits(s, self.field, given.evasive.states, given.reference, spread)[stages],
             "disc clearance": limits.reshape(n, -1),
             "disc centres": centres,
             "disc radii": radii,
             "disc radii for the margin": radii + shy,
         }
+
+    def _tails(self, now: Context[Drive], tracks: Tracks) -> Iterator[tuple[IntArray | slice, Tracks]]:
+        """Steps of each tail, from the present on, and what is expected there; the last one is for what may happen."""
+        if now.tree is not None:
+            expected = (*now.given.futures.tracks, *(tracks,) * len(now.tree.paths))
+            for path, each in zip(now.tree.paths[:-1], expected, strict=False):
+                yield path[1:] - 1, each
+            yield now.tree.paths[-1][1:] - 1, tracks
+        elif now.given.futures is not None and now.given.futures.tracks:
+            yield slice(None), now.given.futures.tracks[0]
+        else:
+            yield slice(None), tracks
 
 
 def in_world(pose: Array, covariance: Array) -> Array:

@@ -23,6 +23,7 @@ SECOND = "ipm"
 often than others, and within some 7 ms where an SQP takes 15 to 70 ms and an augmented Lagrangian 6 to 36 ms."""
 
 AVOIDANCES = ("clearance", "barrier", "potential", "vortex")
+FUTURES = ("worst", "likeliest", "tree")
 SEARCH = 5  # iterations with the tangent vector
 
 
@@ -57,6 +58,10 @@ class ControllerSettings:
         avoidance: of walls and discs: "clearance" as a constraint, with a barrier to discs that have ever moved;
             "barrier", the same with a barrier to everything; "potential" as a cost (Bazzana et al., eq. 9) and no
             constraint; "vortex", that potential, searched with his tangent vector.
+        futures: of movers that a plan prepares for: "worst", all that they can do; "likeliest", one; "tree", a tail of
+            the horizon for each of the likeliest and one for the worst.
+        tails: of such a tree.
+        shared: steps before they part.
         potential_sigma: of the potential's error; its weight is the inverse square.
         squeeze: how much nearer than at rest a plan may pass a standing disc where the clearance is violated [m].
         margin: distance of the hull below which the soft costs begin [m].
@@ -89,6 +94,9 @@ class ControllerSettings:
     mover_margin: float = 0.3
     approach: float = -math.log(0.88) / 0.1
     avoidance: str = option("clearance", choices=AVOIDANCES)
+    futures: str = option("worst", choices=FUTURES)
+    tails: int = 3
+    shared: int = 5
     potential_sigma: float = 0.2
     squeeze: float = 0.03
     margin: float = 0.2
@@ -105,8 +113,16 @@ class ControllerSettings:
             object.__setattr__(self, "robot_radius", self.hull.radius)
         if not self.hull.round and self.avoidance in ("potential", "vortex"):
             raise ScenarioError(f"avoidance '{self.avoidance}' is one of discs about their axis; leave --body out")
-        if self.avoidance not in AVOIDANCES:
-            raise ScenarioError(f"unknown avoidance '{self.avoidance}': choose {', '.join(AVOIDANCES)}")
+        for name, value, known in (("avoidance", self.avoidance, AVOIDANCES), ("futures", self.futures, FUTURES)):
+            if value not in known:
+                raise ScenarioError(f"unknown {name} '{value}': choose {', '.join(known)}")
+        if self.futures != "worst" and self.avoidance in ("potential", "vortex"):
+            raise ScenarioError(f"futures '{self.futures}' are of constraints: choose --avoidance clearance or barrier")
+        if not (self.tails >= 2 and 1 <= self.shared < self.horizon):
+            raise ScenarioError(
+                f"a tree has two tails or more, and shares 1 to {self.horizon - 1} of {self.horizon} steps: found "
+                f"{self.tails} tails, {self.shared} shared"
+            )
 
     @property
     def kind(self) -> Base:

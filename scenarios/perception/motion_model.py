@@ -7,7 +7,7 @@ Going on is the hypothesis of a track that nothing else explains: such a mover m
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -29,6 +29,7 @@ ADOPTED = 0.4  # [m] from the line of a lost track at which a new one goes on wi
 BOTH = 3  # scans before and after a turn that show it
 STARTS = 40  # places on the round trip from which the fit may begin
 STEPS = 4  # of Gauss-Newton
+GOES_ON = np.array([0.0, 1.0, 0.0])
 
 
 @dataclass
@@ -40,7 +41,7 @@ class Past:
     velocities: Array
     wave: Array | None = None  # (4,) first and last place along the line, round trip made now [m], speed [m/s]
     axis: Array | None = None  # (2, 2) middle of the line, and its direction
-    weight: float = 0.0  # of going to and fro
+    weights: Array = field(default_factory=lambda: GOES_ON)  # of going to and fro, going on, standing
 
     @classmethod
     def none(cls) -> Past:
@@ -95,35 +96,43 @@ class Past:
         return wave
 
     def _judge(self) -> None:
-        """Weight of going to and fro against going on and having stopped, by the errors of what they foretell."""
-        self.weight = 0.0
-        if self.wave is None or self.axis is None:
-            return
-        since = self.times - self.times[-1]
-        middle, direction = self.axis
-        low, high, made, speed = self.wave.tolist()
-        foretold = middle + to_and_fro(low, high, made, speed, since)[:, None] * direction
-        off = np.hypot(*(foretold - self.places).T)
-        if off[-2:].max() > WORST * SIGMA / 2.0:  # it has just done something else
+        """Weights of going to and fro, going on and standing, by the errors of what they foretell."""
+        self.weights = GOES_ON
+        if len(self.times) <= AHEAD:
             return
         lag = (self.times[AHEAD:] - self.times[:-AHEAD])[:, None]
         before = self.places[:-AHEAD]
-        others = [before + lag * self.velocities[:-AHEAD], before]
-        errors = [off[AHEAD:], *(np.hypot(*(place - self.places[AHEAD:]).T) for place in others)]
-        costs = np.array([np.minimum(error / SIGMA, WORST) ** 2 for error in errors]).sum(axis=1) / (2.0 * AHEAD)
-        weights = np.exp(costs.min() - costs)
-        self.weight = float(weights[0] / weights.sum())
+        errors = np.full((3, len(before)), np.inf)
+        for row, place in zip(errors[1:], (before + lag * self.velocities[:-AHEAD], before), strict=True):
+            row[:] = np.hypot(*(place - self.places[AHEAD:]).T)
+        if self.wave is not None and self.axis is not None:
+            middle, direction = self.axis
+            low, high, made, speed = self.wave.tolist()
+            along = to_and_fro(low, high, made, speed, self.times - self.times[-1])
+            off = np.hypot(*(middle + along[:, None] * direction - self.places).T)
+            if off[-2:].max() <= WORST * SIGMA / 2.0:  # else it has just done something else
+                errors[0] = off[AHEAD:]
+        costs = (np.minimum(errors / SIGMA, WORST) ** 2).sum(axis=1) / (2.0 * AHEAD)
+        weights = np.where(np.isfinite(errors[:, -1]), np.exp(costs.min() - costs), 0.0)
+        self.weights = weights / weights.sum()
+
+    @property
+    def round_trip(self) -> Array:
+        """(6,) row of `Tracks.wave`."""
+        if self.wave is None or self.axis is None:
+            return np.full(6, np.nan)
+        low, high, made, speed = self.wave
+        middle, direction = self.axis
+        return np.concatenate([middle + low * direction, middle + high * direction, [made, speed]])
 
     @property
     def sweep(self) -> Array:
         """(6,) row of `Tracks.sweep`: where another hypothesis is likely enough, only the ends of its last places."""
-        if self.wave is None or self.axis is None or self.weight < 1.0 - UNLIKELY:
-            last = self.places[-LATELY:]
-            far = int(np.argmax(np.hypot(*(last - last[-1]).T)))
-            return np.concatenate([last[far], last[-1], [np.nan, np.nan]])
-        low, high, made, speed = self.wave
-        middle, direction = self.axis
-        return np.concatenate([middle + low * direction, middle + high * direction, [made, speed]])
+        if self.weights[0] >= 1.0 - UNLIKELY:
+            return self.round_trip
+        last = self.places[-LATELY:]
+        far = int(np.argmax(np.hypot(*(last - last[-1]).T)))
+        return np.concatenate([last[far], last[-1], [np.nan, np.nan]])
 
 
 class MotionModel:
@@ -143,7 +152,7 @@ class MotionModel:
         """
         self._now += dt
         self._pasts = {name: past for name, past in self._pasts.items() if self._now - past.times[-1] < GONE}
-        sweep = tracks.sweep.copy()
+        sweep, wave, weights = tracks.sweep.copy(), tracks.wave.copy(), tracks.weights.copy()
         for k in np.flatnonzero(tracks.mover).tolist():
             name = int(tracks.identity[k])
             if name not in self._pasts:
@@ -151,9 +160,10 @@ class MotionModel:
             past = self._pasts[name]
             if not (tracks.unseen[k] and len(past.times)):
                 past.add(self._now, tracks.centre[k], tracks.velocity[k])
-            sweep[k] = past.sweep
-            sweep[k, 4] += sweep[k, 5] * (self._now - past.times[-1])
-        tracks, hidden = replace(tracks, sweep=sweep), tracks.unseen > 0.0
+            sweep[k], wave[k], weights[k] = past.sweep, past.round_trip, past.weights
+            for row in (sweep[k], wave[k]):
+                row[4] += row[5] * (self._now - past.times[-1])
+        tracks, hidden = replace(tracks, sweep=sweep, wave=wave, weights=weights), tracks.unseen > 0.0
         tracks.centre[hidden & tracks.sweeps] = tracks.at(hidden & tracks.sweeps).swept(np.zeros(1))[0]
         return tracks
 

@@ -28,6 +28,8 @@ class Tracks(Rows):
         mover: (m,) whether it has moved, and not stood in one place since for long; what stands now may go on.
         sweep: (m, 6) of a mover both ends of where it was lately [m], and if it is known to go to and fro between them
             the way it has made of a round trip from the first [m], and its speed [m/s]; else not a number.
+        wave: (m, 6) the same of one that may go to and fro; not a number where nothing like that was seen.
+        weights: (m, 3) of a mover: that it goes to and fro, goes on, stands.
     """
 
     centre: Array
@@ -37,11 +39,15 @@ class Tracks(Rows):
     unseen: Array
     mover: BoolArray
     sweep: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    wave: Array = field(default_factory=lambda: np.zeros((0, 6)))
+    weights: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
-        """Know no sweeps unless they are given."""
-        if len(self.sweep) < len(self.radius):
-            object.__setattr__(self, "sweep", np.full((len(self.radius), 6), np.nan))
+        """Know no motion but going on unless it is given."""
+        unknown = np.full(6, np.nan)
+        for name, row in (("sweep", unknown), ("wave", unknown), ("weights", np.array([0.0, 1.0, 0.0]))):
+            if len(getattr(self, name)) < len(self.radius):
+                object.__setattr__(self, name, np.tile(row, (len(self.radius), 1)))
 
     @classmethod
     def of_movers(cls, centre: Array, velocity: Array, radius: Array) -> Tracks:

@@ -154,14 +154,14 @@ def level(belief: Belief) -> Array:
 
 def following(settings: ControllerSettings) -> list[Term]:
     """Costs of leaving the reference in position and velocity, others at its end."""
-    s, between, end = settings, (1, -1), (-1, None)
+    s = settings
     last = np.sqrt(s.terminal_weight)
     position, velocity = s.weighted(s.position_sigma), s.weighted(s.velocity_sigma)
     return [
-        ReferenceCost("way", position, lambda now: now.given.reference.positions[1:-1], "p", between),
-        ReferenceCost("pace", velocity, lambda now: now.given.reference.velocities[1:-1], "v", between),
-        ReferenceCost("end of way", position / last, lambda now: now.given.reference.positions[-1], "p", end),
-        ReferenceCost("final pace", velocity / last, lambda now: now.given.reference.velocities[-1], "v", end),
+        ReferenceCost("way", position, lambda now: now.given.reference.positions[1:-1], "p", ends=False),
+        ReferenceCost("pace", velocity, lambda now: now.given.reference.velocities[1:-1], "v", ends=False),
+        ReferenceCost("end of way", position / last, lambda now: now.given.reference.positions[-1], "p", ends=True),
+        ReferenceCost("final pace", velocity / last, lambda now: now.given.reference.velocities[-1], "v", ends=True),
     ]
 
 

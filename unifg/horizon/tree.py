@@ -102,6 +102,11 @@ class Tree:
         return np.array([path[-1] for path in self.paths], dtype=np.intp)
 
     @cached_property
+    def inner(self) -> IntArray:
+        """(N - L,) nodes between the present and the leaves."""
+        return np.unique(self.begins)[1:]
+
+    @cached_property
     def depths(self) -> IntArray:
         """(N + 1,) number of steps from the present to each node."""
         found = np.zeros(len(self) + 1, dtype=np.intp)
