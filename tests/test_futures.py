@@ -101,7 +101,7 @@ def test_settings_of_trees() -> None:
         ({"shared": 30}, "shares 1 to 29 of 30 steps"),
     ):
         with pytest.raises(ScenarioError, match=said):
-            ControllerSettings(**wrong)  # type: ignore[arg-type]
+            ControllerSettings(**wrong)
 
 
 def reference() -> Array:

@@ -113,9 +113,10 @@ class Limits:
         """Controls that are reachable in the first step, and from which rest is reachable after the last."""
         s = self.settings
         least, most = s.box
-        count, last = (s.horizon, [-1]) if now.tree is None else (len(now.tree), now.tree.leaves - 1)
+        leaves = np.array([s.horizon]) if now.tree is None else now.tree.leaves
+        count = s.horizon if now.tree is None else len(now.tree)
         low, high = np.tile(least, (count, 1)), np.tile(most, (count, 1))
-        falls = np.ix_(last, np.flatnonzero(s.kind.resting))
+        falls = np.ix_(leaves - 1, np.flatnonzero(s.kind.resting))
         low[falls], high[falls] = np.maximum(low, -s.most)[falls], np.minimum(high, s.most)[falls]
         low[0], high[0] = np.maximum(low[0], now.last - s.most), np.minimum(high[0], now.last + s.most)
         return dict(zip(ENDS, (low, high), strict=True))
@@ -168,15 +169,13 @@ class Clearance:
 
     def _tails(self, now: Context[Drive], tracks: Tracks) -> Iterator[tuple[IntArray | slice, Tracks]]:
         """Steps of each tail, from the present on, and what is expected there; the last one is for what may happen."""
-        if now.tree is not None:
-            expected = (*now.given.futures.tracks, *(tracks,) * len(now.tree.paths))
-            for path, each in zip(now.tree.paths[:-1], expected, strict=False):
-                yield path[1:] - 1, each
-            yield now.tree.paths[-1][1:] - 1, tracks
-        elif now.given.futures is not None and now.given.futures.tracks:
-            yield slice(None), now.given.futures.tracks[0]
-        else:
-            yield slice(None), tracks
+        expected = () if now.given.futures is None else now.given.futures.tracks
+        if now.tree is None:
+            yield slice(None), (*expected, tracks)[0]
+            return
+        *others, last = (path[1:] - 1 for path in now.tree.paths)
+        yield from zip(others, (*expected, *(tracks,) * len(others)), strict=False)
+        yield last, tracks
 
 
 def in_world(pose: Array, covariance: Array) -> Array:
