@@ -1,8 +1,8 @@
 """Drives among movers as fast as the robot, and how much later they arrive than a disc that knows the future.
 
 Routes through the building that nobody chose, three seeds each, with six discs on the path of which two go to and fro
-without regard for the robot, at three speeds and on two bases. A drive counts where the clairvoyant one arrives within
-a minute.
+without regard for the robot, at three speeds and on two bases, each time with plans for the worst that they can do, for
+what is likeliest, and for a tree of futures. A drive counts where the clairvoyant one arrives within a minute.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from itertools import product
 
 import numpy as np
 
-from benchmarks.comparison import Row, share
+from benchmarks.comparison import Row, difference, share, where
 from benchmarks.report import table
 from benchmarks.routes import drawn
 from benchmarks.runner import Cell, Study
 from unifg.scenarios.episode import silent
+from unifg.scenarios.ground.drive_settings import FUTURES, ControllerSettings
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.perception.tracks import to_and_fro
@@ -37,19 +38,25 @@ LATEST = 60.0  # clairvoyant arrival of drives that count [s]
 
 def meetings(seeds: Sequence[int]) -> list[Cell]:
     """All drives: of thirty seeds, ten routes three times each."""
-    return [{"speed": speed, "base": base, "seed": seed} for speed, base, seed in product(SPEEDS, BASES, seeds)]
+    return [
+        {"speed": speed, "base": base, "futures": futures, "seed": seed}
+        for speed, base, seed, futures in product(SPEEDS, BASES, seeds, FUTURES)
+    ]
 
 
-def settings(speed: float, base: float, seed: int) -> NavigationSettings:
+def settings(speed: float, base: float, seed: int, futures: str = "worst") -> NavigationSettings:
     """One drive; ``seed`` draws the discs and, with its tens, the route."""
     start, goal = drawn(FIRST + seed // (3 * ROUTES) * ROUTES + seed % ROUTES)
     plant = replace(Drivetrain(), acceleration=base, turning=TURNING[base])
-    return NavigationSettings(start=start, goals=(goal,), obstacles=6, mover_speed=speed, seed=seed, drivetrain=plant)
+    return NavigationSettings(
+        start=start, goals=(goal,), obstacles=6, mover_speed=speed, seed=seed, drivetrain=plant,
+        controller=ControllerSettings(futures=futures),
+    )  # fmt: skip
 
 
-def measured(speed: float, base: float, seed: int) -> Row:
+def measured(speed: float, base: float, futures: str, seed: int) -> Row:
     """Drive once."""
-    episode = Episode(settings(speed, base, seed))
+    episode = Episode(settings(speed, base, seed, futures))
     s = episode.controller
     way = quickest(
         episode.occupancy, episode.distance_map, episode.start, episode.goals[-1], s.robot_radius,
@@ -92,19 +99,21 @@ def touched(log: EpisodeLog) -> str:
 def render(rows: list[Row]) -> str:
     """The table and what its columns mean."""
     head = (
-        "mover [m/s]", "base [m/s^2]", "drives", "without contact at the goal", "95 %", "contacts", "run over at rest",
-        "not reached", "arrival / clairvoyant", "in reverse", "99 % of ticks [ms]",
+        "mover [m/s]", "base [m/s^2]", "plans for", "drives", "without contact at the goal", "95 %", "contacts",
+        "run over at rest", "not reached", "arrival / clairvoyant", "in reverse", "99 % of ticks [ms]",
     )  # fmt: skip
     lines = []
-    for speed, base in product(SPEEDS, BASES):
-        mine = [r for r in rows if (r["speed"], r["base"]) == (speed, base) and r.get("arrival", np.inf) <= LATEST]
+    counted = [row for row in rows if row.get("arrival", np.inf) <= LATEST]
+    for speed, base, futures in product(SPEEDS, BASES, FUTURES):
+        mine = where(counted, speed=speed, base=base, futures=futures)
         if not mine:
             continue
         good = [r for r in mine if r["reached"] and not r["touched"]]
         low, high = share(len(good), len(mine))
         regret = f"{np.median([r['time'] / r['arrival'] for r in good]):.2f}" if good else "-"
         lines.append((
-            f"{speed:g}", f"{base:g}", str(len(mine)), str(len(good)), f"{100 * low:.0f} .. {100 * high:.0f} %",
+            f"{speed:g}", f"{base:g}", futures, str(len(mine)), str(len(good)),
+            f"{100 * low:.0f} .. {100 * high:.0f} %",
             *(str(sum(r["touched"] == kind for r in mine)) for kind in ("moving", "at rest")),
             str(sum(not r["reached"] for r in mine)), regret,
             f"{100 * np.mean([r['reverse'] for r in mine]):.0f} %", f"{np.median([r['tick'] for r in mine]):.1f}",
@@ -114,7 +123,22 @@ def render(rows: list[Row]) -> str:
         f"{REST:g} m/s for {RESTING:g} s, *contacts* the others. Arrivals are medians over drives at the goal without "
         "contact, divided by the earliest arrival of a disc of 1 m/s without accelerations that knows the future."
     )
+    words += "".join(f" {_later(counted, futures)}" for futures in FUTURES[1:])
     return f"{table(head, lines, text=0)}\n\n{words}"
+
+
+def _later(rows: list[Row], futures: str) -> str:
+    """Sentence about drives with other plans beside those for the worst, where both end at the goal without contact."""
+    good = [row for row in where(rows) if row["reached"] and not row["touched"]]
+    ends = {(row["speed"], row["base"], row["seed"], row["futures"]): row["time"] for row in good}
+    pairs = [(time, ends.get((*key, "worst"))) for (*key, kind), time in ends.items() if kind == futures]
+    differences = np.array([mine - worst for mine, worst in pairs if worst is not None])
+    if not len(differences):
+        return f"No drive with plans for the {futures} has a pair."
+    return (
+        f"With plans for the {futures} the robot arrives {difference(differences)} s later than with those for the "
+        f"worst ({len(differences)} pairs)."
+    )
 
 
 STUDY = Study(meetings, measured, render, range(3 * ROUTES))

@@ -340,9 +340,12 @@ def test_thirty_seeds_are_ten_routes_and_the_next_are_others() -> None:
 
 def test_rows_become_a_table() -> None:
     row = {
-        "speed": 0.6, "base": 1.0, "seed": 0, "reached": True, "touched": "", "arrival": 20.0, "time": 30.0,
-        "reverse": 0.1, "tick": 9.0,
+        "speed": 0.6, "base": 1.0, "futures": "worst", "seed": 0, "reached": True, "touched": "", "arrival": 20.0,
+        "time": 30.0, "reverse": 0.1, "tick": 9.0,
     }  # fmt: skip
     rows = [row, {**row, "touched": "at rest"}, {**row, "reached": False}, {**row, "arrival": math.inf}]
-    line = movers.render(rows).splitlines()[2]
-    assert line == "| 0.6 | 1 | 3 | 1 | 6 .. 79 % | 0 | 1 | 1 | 1.50 | 10 % | 9.0 |"
+    earlier = {**row, "futures": "tree", "time": 27.0}
+    lines = movers.render([*rows, earlier, {**earlier, "seed": 1}]).splitlines()
+    assert lines[2] == "| 0.6 | 1 | worst | 3 | 1 | 6 .. 79 % | 0 | 1 | 1 | 1.50 | 10 % | 9.0 |"
+    assert "No drive with plans for the likeliest has a pair." in lines[-1]
+    assert "for the tree the robot arrives -3 (-3 .. -3) s later than" in lines[-1] and "(1 pairs)" in lines[-1]

@@ -444,11 +444,12 @@ def test_after_a_failure_the_guess_is_the_way_out_until_it_is_forgotten(controll
     now = loop.now(OPEN, controller.given(OPEN, ahead(), tracks()))
     run, guess = loop.begin(now)
     assert run is loop.warm
-    assert np.array_equal(guess.values[loop.u], now.given.evasive.controls)
-    assert np.array_equal(guess.values[loop.x.family], now.given.evasive.states)
+    for tail in loop.tree.paths:
+        assert np.array_equal(guess.values[loop.u][tail[1:] - 1], now.given.evasive.controls)
+        assert np.array_equal(guess.values[loop.x.family][tail], now.given.evasive.states)
     controller.forget()
     run, guess = loop.begin(now)
-    assert run is loop.cold and not np.array_equal(guess.values[loop.u], now.given.evasive.controls)
+    assert run is loop.cold and not np.array_equal(guess.values[loop.u][loop.path[1:] - 1], now.given.evasive.controls)
 
 
 def test_another_backend_is_asked_before_the_robot_brakes(controller: Controller) -> None:

@@ -93,10 +93,10 @@ def test_nothing_is_branched_where_nothing_is_open(tracks: Tracks, count: int) -
 def test_settings_of_trees() -> None:
     tree = horizon_of(TREE)
     assert isinstance(tree, Tree) and [len(path) for path in tree.paths] == [31, 31, 31]
-    assert horizon_of(ControllerSettings(futures="likeliest")) == 30
+    for chain in ({"futures": "likeliest"}, {"avoidance": "potential"}):
+        assert horizon_of(ControllerSettings(**chain)) == 30  # type: ignore[arg-type]
     for wrong, said in (
         ({"futures": "best"}, "unknown futures 'best'"),
-        ({"futures": "tree", "avoidance": "potential"}, "are of constraints"),
         ({"tails": 1}, "two tails or more"),
         ({"shared": 30}, "shares 1 to 29 of 30 steps"),
     ):

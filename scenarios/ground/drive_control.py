@@ -68,7 +68,7 @@ class Controller:
         ]
         self.loop = RecedingHorizon(
             robot(s.dt, s.kind) if window is None else window.robot, horizon_of(s), terms, solver=backend(solver, s),
-            probabilities=None if s.futures != "tree" else lambda now: now.given.futures.probabilities,
+            probabilities=(lambda now: now.given.futures.probabilities) if s.branches else None,
             cold=backend(solver, s, COLD_PATIENCE), second=backend(SECOND, s, COLD_PATIENCE), window=window,
             coupling="sequential" if window is None else "joint", pull=s.pull, limits=s.box, judge=self.judge,
             starts=InitialGuesses(self.along, self.leaving), believable=is_believable, patience=PATIENCE,

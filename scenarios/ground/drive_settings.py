@@ -59,7 +59,7 @@ class ControllerSettings:
             "barrier", the same with a barrier to everything; "potential" as a cost (Bazzana et al., eq. 9) and no
             constraint; "vortex", that potential, searched with his tangent vector.
         futures: of movers that a plan prepares for: "worst", all that they can do; "likeliest", one; "tree", a tail of
-            the horizon for each of the likeliest and one for the worst.
+            the horizon for each of the likeliest and one for the worst. A potential knows the worst alone.
         tails: of such a tree.
         shared: steps before they part.
         potential_sigma: of the potential's error; its weight is the inverse square.
@@ -94,8 +94,8 @@ class ControllerSettings:
     mover_margin: float = 0.3
     approach: float = -math.log(0.88) / 0.1
     avoidance: str = option("clearance", choices=AVOIDANCES)
-    futures: str = option("worst", choices=FUTURES)
-    tails: int = 3
+    futures: str = option("tree", choices=FUTURES)
+    tails: int = 2
     shared: int = 5
     potential_sigma: float = 0.2
     squeeze: float = 0.03
@@ -116,13 +116,16 @@ class ControllerSettings:
         for name, value, known in (("avoidance", self.avoidance, AVOIDANCES), ("futures", self.futures, FUTURES)):
             if value not in known:
                 raise ScenarioError(f"unknown {name} '{value}': choose {', '.join(known)}")
-        if self.futures != "worst" and self.avoidance in ("potential", "vortex"):
-            raise ScenarioError(f"futures '{self.futures}' are of constraints: choose --avoidance clearance or barrier")
         if not (self.tails >= 2 and 1 <= self.shared < self.horizon):
             raise ScenarioError(
                 f"a tree has two tails or more, and shares 1 to {self.horizon - 1} of {self.horizon} steps: found "
                 f"{self.tails} tails, {self.shared} shared"
             )
+
+    @property
+    def branches(self) -> bool:
+        """True for a horizon that is a tree."""
+        return self.futures == "tree" and self.avoidance in ("clearance", "barrier")
 
     @property
     def kind(self) -> Base:

@@ -38,7 +38,7 @@ class Futures:
 
 def horizon_of(s: ControllerSettings) -> Tree | int:
     """Steps of the horizon, a tree where movers have several futures."""
-    if s.futures != "tree":
+    if not s.branches:
         return s.horizon
     return Tree.branched(s.shared, (s.horizon - s.shared,) * s.tails)
 
@@ -46,7 +46,7 @@ def horizon_of(s: ControllerSettings) -> Tree | int:
 def futures(s: ControllerSettings, tracks: Tracks) -> Futures:
     """The likeliest joint hypotheses of tracks, without unlikely ones; fewer than tails where there are no more."""
     free = np.flatnonzero(tracks.mover & ~tracks.sweeps).tolist()
-    count = s.tails - 1 if s.futures == "tree" else 1
+    count = s.tails - 1 if s.branches else 1
     joint = list(product(*([k for k in range(3) if tracks.weights[mover, k] > UNLIKELY] for mover in free)))
     likely = np.array([np.prod(tracks.weights[free, list(kinds)]) for kinds in joint])
     found = np.argsort(-likely, kind="stable")[: count if free else 0]
