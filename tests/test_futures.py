@@ -93,7 +93,7 @@ def test_nothing_is_branched_where_nothing_is_open(tracks: Tracks, count: int) -
 def test_settings_of_trees() -> None:
     tree = horizon_of(TREE)
     assert isinstance(tree, Tree) and [len(path) for path in tree.paths] == [31, 31, 31]
-    for chain in ({"futures": "likeliest"}, {"avoidance": "potential"}):
+    for chain in ({"futures": "likeliest"}, {"futures": "tree", "avoidance": "potential"}):
         assert horizon_of(ControllerSettings(**chain)) == 30  # type: ignore[arg-type]
     for wrong, said in (
         ({"futures": "best"}, "unknown futures 'best'"),

@@ -284,9 +284,9 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 32_078, "scenarios": 11_739, "benchmarks": 4_762, "tests": 36_306,
+    "unifg solvers models": 32_295, "scenarios": 11_739, "benchmarks": 4_762, "tests": 36_456,
     "docs examples": 1_944, "unifg/factors": 4_306, "unifg/problem": 3_436, "models": 2_457,
-    "unifg/elimination": 2_155, "solvers": 5_062, "unifg/solution": 3_100, "unifg/smoothing": 1_619,
+    "unifg/elimination": 2_155, "solvers": 5_062, "unifg/solution": 3_100, "unifg/smoothing": 1_829,
     "unifg/lie": 1_440, "unifg/view": 1_403, "unifg/files": 1_216, "unifg/pose_graphs": 1_357,
     "unifg/horizon": 1_349, "unifg/modeling": 1_031, "unifg/codegen": 1_320, "unifg/plots": 418,
     "scenarios/scenes": 1_385, "scenarios/simulation": 1_183, "scenarios/campaigns": 922,

@@ -264,3 +264,10 @@ def _smooth(simulated: Simulated) -> None:
             smoother.update({x: pose})
         smoother.covariance(x[-1])
         smoother.estimate(x[-1], best=True)
+    revocable = Incremental()
+    x = revocable.variables("x", group)
+    for k, pose in enumerate(poses[:3]):
+        revocable.minimize(prior, x[k], pose, sigma=0.1)
+        revocable.update({x: pose})
+    revocable.minimize(between, x[0], x[2], group.identity(), sigma=0.1, revocable=3.0)
+    revocable.update()

@@ -94,7 +94,7 @@ class ControllerSettings:
     mover_margin: float = 0.3
     approach: float = -math.log(0.88) / 0.1
     avoidance: str = option("clearance", choices=AVOIDANCES)
-    futures: str = option("tree", choices=FUTURES)
+    futures: str = option("worst", choices=FUTURES)
     tails: int = 2
     shared: int = 5
     potential_sigma: float = 0.2

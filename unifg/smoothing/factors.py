@@ -63,6 +63,7 @@ class Staged:
     name: str
     term: CompiledTerm | None = None
     items: IntArray = field(default_factory=lambda: NOBODY)
+    limit: float = 0.0
 
     def keep(self, wanted: BoolArray) -> None:
         """Leave out the others."""

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
+from unifg.errors import GraphError
 from unifg.locks import synchronized
+from unifg.modeling.model import AnyResidual
+from unifg.smoothing.factors import FIELD
 from unifg.smoothing.families import GrowingFamily
+from unifg.smoothing.revocable import LEAST, Revocable, limit_of
 from unifg.smoothing.smoother import Effort, Smoother
 from unifg.typing import Numbers
 
@@ -36,6 +41,47 @@ class Incremental(Smoother):
         super().__init__(relinearize, every, wildfire)
 
     @synchronized
+    def minimize(self, function: AnyResidual, *arguments: Any, revocable: float | None = None, **options: Any) -> None:
+        """State factors as :meth:`Smoother.minimize` does, which may be revocable.
+
+        Args:
+            function: residual.
+            *arguments: members, data and constants.
+            revocable: threshold c of |W r|, for closures that may be wrong: they count while the rest agrees, and are
+                taken back where it does not (:mod:`unifg.smoothing.revocable`). None for factors that always count.
+            **options: sigma, information, robust, active and name.
+
+        Raises:
+            GraphError: when arguments do not fit; for a threshold that is not positive, a robust loss besides it, or a
+                function that cannot be compiled.
+        """
+        if revocable is None:
+            super().minimize(function, *arguments, **options)
+            return
+        if options.get("robust") is not None:
+            raise GraphError("a revocable factor has the truncated loss: leave robust out")
+        if options.get("information") is None:
+            options["sigma"] = 1.0 if options.get("sigma") is None else options["sigma"]
+        super().minimize(function, *arguments, **options)
+        staged = self._staged[-1]
+        row = self._types.fields[staged.kind]
+        if staged.term is not None or not row[FIELD["whitening"]]:
+            self._staged.pop()
+            raise GraphError(
+                f"term '{staged.name}': a revocable factor needs a function that can be traced or compiled",
+                term=staged.name,
+            )
+        staged.limit = limit_of(revocable, staged.name)
+        staged.data = staged.data.copy()
+        staged.data[:, int(row[FIELD["parameters"]]) :] *= LEAST**0.5
+
+    @property
+    @synchronized
+    def revocable(self) -> list[Revocable]:
+        """Revocable factors in the order in which they came, and which of them count."""
+        return self._revocables.listed(self)
+
+    @synchronized
     def update(self, values: Mapping[GrowingFamily, Numbers] | None = None, *, iterations: int = 1) -> Effort:
         """Take in what was stated since the last update and improve all estimates.
 
@@ -50,5 +96,8 @@ class Incremental(Smoother):
             GraphError: naming a member without value, a value that is not on its manifold, or a member that no factor
                 determines. Only in the last case are values and factors kept, for another try.
         """
+        first = len(self._revocables)
         self._update(values, None, iterations)
+        if len(self._revocables):
+            self._revocables.settle(self, first, iterations > 1)
         return self._effort()

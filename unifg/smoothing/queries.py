@@ -9,7 +9,7 @@ from unifg.codegen.jit import compiled
 from unifg.codegen.loops import copy_to
 from unifg.codegen.vectors import Address
 from unifg.elimination.ordering import filled
-from unifg.smoothing.linear import cost_of, length_of, retract
+from unifg.smoothing.linear import cost_of, evaluate, length_of, retract
 from unifg.smoothing.memory import found, grown, more, next_row, take_list, take_numbers
 from unifg.smoothing.state import BY_PYTHON, FRESH, SLOTS_MAX, opened
 from unifg.smoothing.tree import paths
@@ -174,6 +174,27 @@ def total_cost(memory: Address) -> float:
         if state.factors[f].used:
             total += cost_of(memory, f, scratch)
     return total
+
+
+@compiled
+def squared_errors(memory: Address, chosen: IntArray, out: Array) -> None:
+    """Squared norms (n,) of the whitened residuals of some factors at the estimates."""
+    scratch = np.empty(opened(memory).counters[0].scratch)
+    for k in range(len(chosen)):
+        out[k] = evaluate(memory, chosen[k], True, scratch)[1]
+
+
+@compiled
+def factor_rows(memory: Address, f: int, out: Array) -> None:
+    """Whitened residual of a factor at the estimates, and its Jacobian at the linearisation points: (m, 1 + width)."""
+    scratch, (m, columns) = np.empty(opened(memory).counters[0].scratch), out.shape
+    at, _ = evaluate(memory, f, False, scratch)
+    for a in range(m):
+        for d in range(columns - 1):
+            out[a, 1 + d] = scratch[at + m + a * (columns - 1) + d]
+    at, _ = evaluate(memory, f, True, scratch)
+    for a in range(m):
+        out[a, 0] = scratch[at + a]
 
 
 @compiled

@@ -28,6 +28,7 @@ from unifg.smoothing.queries import (
     full_steps,
     total_cost,
 )
+from unifg.smoothing.revocable import Revocables
 from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, Records, State, empty_state
 from unifg.smoothing.tree import give_up
 from unifg.smoothing.undetermined import enough
@@ -95,6 +96,7 @@ class Smoother:
         self._memory = self._words.ctypes.data
         self._hold(empty_state())
         self._order: list[GrowingFamily] = []
+        self._revocables = Revocables()
         self._written = 0  # types of factors that compiled code knows
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -295,6 +297,8 @@ class Smoother:
             number = self._batches.add(_batch(item, touched)) if item.term is not None else 0
             lists, numbers = add_factors(self._memory, item.kind, touched, item.data, number, item.items)
             self._move(lists, numbers)
+            if item.limit:
+                self._revocables.add(self, item, item.limit)
         self._staged.clear()
         for _ in range(iterations):
             self._solve()
