@@ -144,6 +144,9 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios" / "simulation").glob(kind)]
     assert {path.suffix for path in maps} == {".pgm", ".yaml"}, "no map is shipped"
     expected |= {f"unifg/scenarios/simulation/{path.name}" for path in maps}
+    papers = [path for path in (source / "scenarios" / "papers").iterdir() if path.suffix in (".png", ".toml", ".yaml")]
+    assert {path.name for path in papers} >= {"papers.toml", "department.png", "factory.yaml"}
+    expected |= {f"unifg/scenarios/papers/{path.name}" for path in papers}
     expected |= {
         "unifg/py.typed",
         "unifg/view/live.js",
