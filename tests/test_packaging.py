@@ -223,6 +223,21 @@ def test_console_script(clean: Path) -> None:
     assert config()["project"]["version"] in run(clean / "unifg", "--version", cwd=clean)
 
 
+def test_a_table_of_a_paper_from_the_wheel(clean: Path, tmp_path: Path) -> None:
+    for extra in EXTRAS:
+        pytest.importorskip(extra)
+    out = run(clean / "unifg", "reproduce", "ecg2o", "--table", "1", cwd=tmp_path)
+    assert "| iterations, KKT, steps below 1e-3 | 5 | 7.33 | +2.33 |" in out
+    assert "--table III" in run(clean / "unifg", "reproduce", cwd=tmp_path) and not list(tmp_path.iterdir())
+    where = run(
+        clean / "python", "-I", "-c",
+        "from unifg.scenarios.papers import bazzana\n"
+        "print(*(len(bazzana.campaign(name)) for name in bazzana.ROMAN))",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert where.split() == ["480", "240"], "the campaigns and their maps"
+
+
 @pytest.mark.parametrize("installed", [False, True], ids=["not installed", "installed"])
 @pytest.mark.parametrize("links", ["text files", "missing"])
 @pytest.mark.product(1)

@@ -14,8 +14,6 @@ from unifg.scenarios.quadrotor.situations import Kind
 from unifg.scenarios.safe_flight import Controller, Knowledge, SafeFlight, SafeSettings, flights
 from unifg.scenarios.simulation.bodies import Ellipse, Thrown
 
-__all__ = ["Job", "fly"]
-
 Row: TypeAlias = dict[str, Any]
 
 VEHICLE = 5.0  # horizontal acceleration at a tilt of 27 degrees [m/s^2]

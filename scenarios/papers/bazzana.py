@@ -6,6 +6,7 @@ as long as the paper's.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,9 +26,8 @@ from unifg.scenarios.papers.measuring import interleave
 from unifg.scenarios.papers.printed import FOLDER, numbers, pairs, texts
 from unifg.solvers import AugmentedLagrangian
 
-__all__ = ["figure_6", "figure_7", "table_i", "table_ii", "table_iii"]
-
 RUNS = 30
+PATIENCE = 240.0  # of a quick campaign [s]
 LENGTH, DURATION = "path_length_m", "duration_s"
 CLEARANCE, CONTACTS, TICK = "min_clearance_m", "collisions", "tick_ms.p50"
 POSITION, HEADING = "localisation_error_m.mean", "localisation_error_rad.mean"
@@ -69,7 +69,7 @@ def driven(effort: Effort, name: str, few: int, legs: Sequence[str] = ()) -> pd.
     """Drives of a campaign with the sequential coupling, run where they are not on file.
 
     Args:
-        effort: quick or full.
+        effort: quick or full; a quick one ends after `PATIENCE` with the drives there are.
         name: of the campaign.
         few: seeds of a quick one.
         legs: of a quick one; none for all.
@@ -81,8 +81,14 @@ def driven(effort: Effort, name: str, few: int, legs: Sequence[str] = ()) -> pd.
         for axis in whole.axes
     )
     part = replace(whole, axes=axes, seeds=whole.seeds[: effort.of(few, RUNS)])
-    folder = effort.folder / f"bazzana-{name}"
-    run_campaign(part, folder, workers=effort.workers, progress=effort.progress)
+    folder, end = effort.folder / f"bazzana-{name}", time.monotonic() + (PATIENCE if effort.quick else np.inf)
+
+    def progress(done: float, text: str) -> None:
+        effort.progress(done, text)
+        if time.monotonic() > end:
+            raise KeyboardInterrupt  # ends the campaign, what is done stays
+
+    run_campaign(part, folder, workers=effort.workers, progress=progress)
     return drives_of(load(folder, failed_too=True), name)
 
 
@@ -92,7 +98,7 @@ def _long_legs(effort: Effort, name: str, few: int) -> Comparison:
         for leg, mine in succeeded(drives).groupby("leg", sort=False):
             mean, deviation = PAPER[name][measure][0][str(leg)]
             lines.append(measured(f"{leg}, {what}", [mean], mine[measure], deviation=deviation))
-    runs = drives["seed"].nunique()
+    runs = " to ".join(dict.fromkeys(str(end) for end in drives.groupby("leg").size().agg(["min", "max"])))
     text = f"{runs} runs of each leg (paper: {RUNS}), {len(succeeded(drives))} of {len(drives)} drives succeeded."
     return Comparison(lines, f"{text} The paper gives neither map nor accelerations.")
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from importlib import import_module
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.stated_settings import nearest
 from unifg.scenarios.papers.comparison import Comparison, Effort
 from unifg.scenarios.papers.printed import printed
 
@@ -117,5 +116,5 @@ def found(name: str, kind: str, number: str) -> Callable[[Effort], Comparison]:
 
 def _paper(name: str) -> Paper:
     if name not in PAPERS:
-        raise ScenarioError(f"there is no paper {name!r}; {nearest(name, list(PAPERS))}")
+        raise ScenarioError(f"there is no paper {name!r} that can be reproduced; there are {', '.join(PAPERS)}")
     return PAPERS[name]

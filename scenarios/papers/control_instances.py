@@ -22,8 +22,6 @@ from unifg.scenarios.papers.measuring import clocked, words
 from unifg.scenarios.papers.printed import numbers
 from unifg.typing import Array
 
-__all__ = ["LOOP", "PAPER", "Instance", "Ours", "bearings"]
-
 Row: TypeAlias = tuple[float, tuple[float, int, float], tuple[float, int, float]]
 
 

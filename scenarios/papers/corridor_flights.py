@@ -12,8 +12,6 @@ from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics
 from unifg.scenarios.quadrotor.flight_settings import Avoidance
 
-__all__ = ["Job", "fly"]
-
 MARKS = (1.0, 2.0, 5.0, 10.0)  # [s] at which the mass is looked at
 TOUCH = 0.01  # [m]; a hull nearer than this has touched, or will
 

@@ -21,8 +21,6 @@ from unifg.scenarios.course import (
 from unifg.scenarios.papers.measuring import clocked, words
 from unifg.scenarios.simulation.layouts import Layout, obstacle_course
 
-__all__ = ["Method", "Outcome", "attempted"]
-
 
 @dataclass(frozen=True)
 class Method:

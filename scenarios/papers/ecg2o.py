@@ -22,8 +22,6 @@ from unifg.scenarios.velocity_tracking import TrackingSettings, state_problem
 from unifg.solvers import KKT, AugmentedLagrangian, GaussNewton, Penalty
 from unifg.typing import Array
 
-__all__ = ["figure_3", "figure_4", "figure_5", "table_1"]
-
 Stated: TypeAlias = tuple[fg.Graph, fg.Guess | dict[fg.Family, Array]]
 
 LENGTHS = (50, 100, 200, 385)

@@ -13,8 +13,6 @@ from unifg.scenarios.papers.comparison import Comparison, Effort, Line, counted,
 from unifg.scenarios.papers.printed import numbers, texts
 from unifg.typing import Array
 
-__all__ = ["figure_5", "figure_6", "figure_7", "figure_8", "figure_10", "figure_11"]
-
 DESCRIBED = -1  # seed of the flight as the paper describes it
 
 

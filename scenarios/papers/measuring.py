@@ -15,8 +15,6 @@ import numpy as np
 from unifg.solution.status import Status
 from unifg.typing import Array
 
-__all__ = ["clock", "clocked", "interleave", "words"]
-
 R = TypeVar("R")
 
 

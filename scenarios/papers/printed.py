@@ -9,8 +9,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["FOLDER", "numbers", "pairs", "printed", "shared", "texts"]
-
 FOLDER = Path(__file__).resolve().parent
 SPELLED = {"two": "2", "five": "5"}
 

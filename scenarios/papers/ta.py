@@ -11,8 +11,6 @@ from unifg.scenarios.papers.courses import Method, attempted
 from unifg.scenarios.papers.printed import texts
 from unifg.scenarios.simulation.layouts import CORRIDOR_SEEDS, COURSE_SEEDS
 
-__all__ = ["figure_3", "figure_5"]
-
 GUESSES: tuple[Start, ...] = ("hover", "line", "way")
 OFTEN = 0.5  # share from which on a flight often succeeds
 
