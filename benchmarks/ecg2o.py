@@ -55,7 +55,10 @@ LEVENBERG = KKT(globalization="levenberg-marquardt")
 def steps(solver: fg.Solver, problem: Stated, multiplier: float | None = None) -> str:
     """Iterations of a solve, marked with a dagger when it ended without the KKT conditions."""
     found = iterations(solver, problem, multiplier)
-    return "-" if found is None else f"{found[0]}{'' if found[1] else '†'}"
+    if found is None:
+        return "-"
+    count, honest = found
+    return str(count) if honest else f"{count}†"
 
 
 def listed(values: Iterable[float]) -> dict[tuple[str], float]:

@@ -18,9 +18,6 @@ from unifg.scenarios.quadrotor.situations import Kind
 
 STUDIES = ("campaign", "static", "ellipse", "eights", "times", "sight", "ball")
 RANDOM: tuple[Kind, ...] = ("static", "ellipse", "cluttered")
-FIGURES: dict[Kind, str] = {
-    "static": "Fig. 4 and 5", "ellipse": "Fig. 6", "cluttered": "Fig. 8", "figure8": "Fig. 10", "ball": "Fig. 11 b",
-}  # fmt: skip
 MARGINS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.55, 0.7)
 SPLINES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0)
 STEPS = (0.05, 0.1)

@@ -20,7 +20,7 @@ from unifg.scenarios.papers import bazzana, catalogue, corridor_flights, ecg2o, 
 from unifg.scenarios.papers.comparison import Comparison, Effort, Line, counted, measured, paired, stated
 from unifg.scenarios.papers.printed import numbers, pairs, printed
 
-ITEMS = [(paper, item) for paper, found in catalogue.PAPERS.items() for item in found.items]
+ITEMS = [(paper, item) for paper, found in catalogue.PAPERS.items() for item in found]
 # Legs of 170 m take minutes: `test_a_quick_campaign_...` looks at what is run, `--figure 6` runs three of them.
 ERRORS = (bazzana.POSITION, bazzana.HEADING)
 SHORT = [(paper, item) for paper, item in ITEMS if item.option not in ("--table I", "--table II")]
@@ -56,8 +56,8 @@ def test_all_tables_and_figures_are_listed(capsys: pytest.CaptureFixture[str]) -
     assert command.main(["reproduce"]) == 0
     text = capsys.readouterr().out
     for paper, found in catalogue.PAPERS.items():
-        assert f"{paper}: {printed()[found.key]['title']}" in text
-        for item in found.items:
+        assert f"{paper}: {printed()[paper]['title']}" in text
+        for item in found:
             assert re.search(rf"  {item.option} +{re.escape(item.summary)}", text)
     assert command.main(["reproduce", "ta"]) == 0
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == ["ta:", "--figure", "--figure"]
@@ -67,8 +67,8 @@ def test_every_listed_item_has_a_function_and_the_reverse() -> None:
     for paper, found in catalogue.PAPERS.items():
         module = import_module(f"unifg.scenarios.papers.{paper}")
         functions = {name for name in vars(module) if re.match(r"(table|figure)_", name)}
-        assert functions == {f"{item.kind}_{item.number.lower()}" for item in found.items}
-        assert catalogue.found(paper, found.items[0].kind, found.items[0].number.lower()).__name__ in functions
+        assert functions == {f"{item.kind}_{item.number.lower()}" for item in found}
+        assert catalogue.found(paper, found[0].kind, found[0].number.lower()).__name__ in functions
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_a_table_is_printed_beside_the_paper(
     assert [row[1] for row in rows] == ["5", "20", "20", "72", "73"]
     assert rows[0][2:4] == ["7.33", "+2.33"] and all(consistent(Line(*row)) for row in rows)
     assert "6 starts" in lines[-1][0]
-    monkeypatch.setitem(printed()["abdelkarim"]["section 5.2, Table 1"], "kkt", "average of 9 iterations")
+    monkeypatch.setitem(printed()["ecg2o"]["section 5.2, Table 1"], "kkt", "average of 9 iterations")
     changed = ecg2o.table_1(effort(tmp_path)).lines[0]
     assert (changed.paper, changed.difference) == ("9", "-1.67")
 
@@ -139,7 +139,7 @@ def test_an_item_runs(paper: str, item: catalogue.Item, tmp_path: Path) -> None:
     except ScenarioError as error:
         assert "velocity_profile_388.csv" in str(error)
         pytest.skip("the profile of the paper is not here")
-    texts = {text for place in printed()[catalogue.PAPERS[paper].key].values() if isinstance(place, dict)
+    texts = {text for place in printed()[paper].values() if isinstance(place, dict)
              for text in place.values()}  # fmt: skip
     assert found.lines and found.runs and str(found).count("\n") == len(found.lines) + 3
     for line in found.lines:
@@ -231,7 +231,7 @@ def test_efforts_are_smaller_when_quick(tmp_path: Path, monkeypatch: pytest.Monk
             flown.clear()
             results[function.__name__] = function(Effort(quick, tmp_path, 1, lambda done, text: None))
             assert len(flown) == count, (function.__name__, quick)
-    (far,) = numbers("yang", "Fig. 5", "far")
+    (far,) = numbers("factormpc", "Fig. 5", "far")
     beside = factormpc.figure_5(effort(tmp_path)).lines
     assert beside[1] == Line(f"least distance, alpha {far:g} [mm]", "-", "1000", "-", "1000 to 1000")
     assert beside[2].ours == "750" and beside[2].difference == "agrees"

@@ -10,7 +10,7 @@ from unifg.errors import ScenarioError
 from unifg.scenarios.papers.comparison import Comparison, Effort
 from unifg.scenarios.papers.printed import printed
 
-__all__ = ["PAPERS", "Item", "Paper", "found", "listed"]
+__all__ = ["PAPERS", "Item", "found", "listed"]
 
 
 @dataclass(frozen=True)
@@ -35,46 +35,34 @@ class Item:
         return f"--{self.kind} {self.number}"
 
 
-@dataclass(frozen=True)
-class Paper:
-    """Paper, whose module of this package has a function ``kind_number`` for each of its items.
-
-    Attributes:
-        key: in papers.toml.
-        items: tables and figures.
-    """
-
-    key: str
-    items: tuple[Item, ...]
-
-
 PAPERS = {
-    "bazzana": Paper("bazzana", (
+    "bazzana": (
         Item("table", "I", "path length and duration of eight legs of a department", "30 runs a leg, an hour"),
         Item("table", "II", "path length and duration of four legs of a factory", "30 runs a leg, half an hour"),
         Item("table", "III", "six control problems: cost, iterations, time", "15 rounds, a minute"),
         Item("figure", "6", "error of localisation", "30 runs of eight legs, an hour; those of Table I"),
         Item("figure", "7", "manoeuvres: a cusp, and a turn past an obstacle", "two solves, seconds"),
-    )),
-    "ta": Paper("ta", (
+    ),
+    "ta": (
         Item("figure", "3", "optimal control past three walls and a cylinder", "200 layouts, minutes"),
         Item("figure", "5", "estimation and control through unknown cylinders", "50 flights, ten minutes"),
-    )),
-    "factormpc": Paper("yang", (
+    ),
+    "factormpc": (
         Item("figure", "5", "distance from a cylinder against alpha", "20 flights for each, minutes"),
         Item("figure", "6", "distance from a moving sphere against gamma", "20 flights for each, minutes"),
         Item("figure", "7", "times with and without barriers, at 100 Hz", "10 flights each, minutes"),
         Item("figure", "8", "flights among many obstacles", "100 flights, a quarter of an hour"),
         Item("figure", "10", "figure eights beside control by flatness", "10 flights for each speed, minutes"),
         Item("figure", "11", "a thrown ball", "11 throws, a minute"),
-    )),
-    "ecg2o": Paper("abdelkarim", (
+    ),
+    "ecg2o": (
         Item("table", "1", "iterations of the second case study", "six starts, seconds"),
         Item("figure", "3", "iterations of the first case study", "one solve for each length, seconds"),
         Item("figure", "4", "time per iteration of the first case study", "1000 solves, a minute"),
         Item("figure", "5", "inner iterations of the second case study", "six starts, seconds"),
-    )),
+    ),
 }  # fmt: skip
+"""Items of each paper, whose module of this package has a function ``kind_number`` for each of them."""
 
 
 def listed(name: str | None = None) -> str:
@@ -88,8 +76,8 @@ def listed(name: str | None = None) -> str:
     """
     lines = list[str]()
     for paper in PAPERS if name is None else [name]:
-        lines.append(f"{paper}: {printed()[_paper(paper).key]['title']}")
-        lines += [f"  {item.option:11}  {item.summary} (--full: {item.full})" for item in PAPERS[paper].items]
+        items = [f"  {item.option:11}  {item.summary} (--full: {item.full})" for item in _items(paper)]
+        lines += [f"{paper}: {printed()[paper]['title']}", *items]
     return "\n".join(lines)
 
 
@@ -104,7 +92,7 @@ def found(name: str, kind: str, number: str) -> Callable[[Effort], Comparison]:
     Raises:
         ScenarioError: there is no such paper, table or figure.
     """
-    items = _paper(name).items
+    items = _items(name)
     if not any((item.kind, item.number.lower()) == (kind, number.lower()) for item in items):
         there = ", ".join(item.option for item in items)
         raise ScenarioError(f"{name} has no {kind} {number!r} that can be reproduced; there are {there}")
@@ -114,7 +102,7 @@ def found(name: str, kind: str, number: str) -> Callable[[Effort], Comparison]:
     return function
 
 
-def _paper(name: str) -> Paper:
+def _items(name: str) -> tuple[Item, ...]:
     if name not in PAPERS:
         raise ScenarioError(f"there is no paper {name!r} that can be reproduced; there are {', '.join(PAPERS)}")
     return PAPERS[name]

@@ -134,7 +134,7 @@ def seconds_an_iteration(solvers: Mapping[str, fg.Solver], length: int, rounds: 
 
 def table_1(effort: Effort) -> Comparison:
     """Iterations of the second study, mean over its starts."""
-    printed = partial(numbers, "abdelkarim", "section 5.2, Table 1")
+    printed = partial(numbers, "ecg2o", "section 5.2, Table 1")
     penalty, lagrangian = printed("penalty_gtsam")
     cases: tuple[tuple[str, list[float], fg.Solver], ...] = (
         ("KKT, steps below 1e-3", printed("kkt"), PAPERS_RULE),
@@ -157,7 +157,7 @@ def _counts(solver: fg.Solver) -> list[float]:
 
 def figure_3(effort: Effort) -> Comparison:
     """Iterations of the first study against its length."""
-    printed = partial(numbers, "abdelkarim", "section 5.1, Fig. 3")
+    printed = partial(numbers, "ecg2o", "section 5.1, Fig. 3")
     lines = list[Line]()
     for what, name, solver, drag in (
         ("KKT, linear drag", "linear", RULE, "linear"),
@@ -172,7 +172,7 @@ def figure_3(effort: Effort) -> Comparison:
 
 def figure_4(effort: Effort) -> Comparison:
     """Times of an iteration of the first study."""
-    rounds = effort.of(50, int(texts("abdelkarim", "section 5.1, Fig. 4")["rounds"].split()[1].replace(",", "")))
+    rounds = effort.of(50, int(texts("ecg2o", "section 5.1, Fig. 4")["rounds"].split()[1].replace(",", "")))
     lines = list[Line]()
     for number, length in enumerate(LENGTHS):
         effort.progress(number / len(LENGTHS), f"N = {length}")
@@ -180,7 +180,7 @@ def figure_4(effort: Effort) -> Comparison:
         lines += [measured(f"{name}, N = {length} [ms]", [], 1e3 * found, 4) for name, found in each.items()]
         ratio = each["AL, literal"] / each["KKT, full steps"]
         shown = measured("", [], ratio)
-        text = texts("abdelkarim", "section 5.1, Fig. 4")["lower"].partition(" than")[0]
+        text = texts("ecg2o", "section 5.1, Fig. 4")["lower"].partition(" than")[0]
         holds = SLIGHTLY <= float(ratio.mean()) < 1.0
         lines.append(stated(f"AL over KKT, N = {length}", text, shown.ours, holds, shown.interval))
     return Comparison(lines, f"{rounds} cold solves (paper: 1000), which take turns; processor times.")
@@ -188,7 +188,7 @@ def figure_4(effort: Effort) -> Comparison:
 
 def figure_5(effort: Effort) -> Comparison:
     """Inner iterations of the second study with few and many of them allowed."""
-    limits = map(int, numbers("abdelkarim", "section 5.2, Fig. 5", "limits"))
+    limits = map(int, numbers("ecg2o", "section 5.2, Fig. 5", "limits"))
     solvers = {f"at most {limit} inner ones": AugmentedLagrangian(inner_iterations=limit) for limit in limits}
     lines = [measured(f"iterations, {name}", [], _counts(solver)) for name, solver in solvers.items()]
     return Comparison(lines, f"{len(STARTS)} starts; the paper draws the counts and prints none.")

@@ -43,27 +43,27 @@ def _farther(effort: Effort, what: str, text: str, jobs: Sequence[tuple[str, Job
 
 def figure_5(effort: Effort) -> Comparison:
     """Distance from a cylinder with two values of alpha."""
-    near, far = (numbers("yang", "Fig. 5", name)[0] for name in ("near", "far"))
+    near, far = (numbers("factormpc", "Fig. 5", name)[0] for name in ("near", "far"))
     jobs = [(f"alpha {alpha:g}", Job("static", "static", alpha=alpha)) for alpha in (near, far)]
-    return _farther(effort, "least distance", texts("yang", "Fig. 5")["farther"], jobs)
+    return _farther(effort, "least distance", texts("factormpc", "Fig. 5")["farther"], jobs)
 
 
 def figure_6(effort: Effort) -> Comparison:
     """Distance from a sphere on an ellipse without and with its velocity in the barrier."""
-    (largest,) = numbers("yang", "Fig. 6", "largest")
+    (largest,) = numbers("factormpc", "Fig. 6", "largest")
     jobs = [(f"gamma {gamma:g}", Job("ellipse", "ellipse", gamma=gamma)) for gamma in (0.0, largest)]
-    return _farther(effort, "least distance", texts("yang", "Fig. 6")["farther"], jobs)
+    return _farther(effort, "least distance", texts("factormpc", "Fig. 6")["farther"], jobs)
 
 
 def figure_7(effort: Effort) -> Comparison:
     """Times of a decision past a sphere, with barriers and without, at 100 Hz."""
-    (most,), (mean,) = numbers("yang", "Fig. 7", "most"), numbers("yang", "section IV-B", "mean_time")
-    within, limit = numbers("yang", "section IV-B", "within_10_ms")
+    (most,), (mean,) = numbers("factormpc", "Fig. 7", "most"), numbers("factormpc", "section IV-B", "mean_time")
+    within, limit = numbers("factormpc", "section IV-B", "within_10_ms")
     seeds = [DESCRIBED, *range(1, effort.of(3, 10))]
     rows = _flown(effort, [Job("times", "ellipse", slots=slots, seed=seed) for slots in (5, 0) for seed in seeds])
     barriers, none = ([np.array(row["decide_ms"]) for row in some] for some in (rows[: len(seeds)], rows[len(seeds) :]))
     worst = max(float(one.max()) for one in barriers)
-    text = texts("yang", "Fig. 7")["most"]
+    text = texts("factormpc", "Fig. 7")["most"]
     lines = [
         measured("with barriers, mean of a flight [ms]", [], [one.mean() for one in barriers]),
         stated("with barriers, most [ms]", text, f"{worst:.2f}", worst < most),
@@ -79,7 +79,7 @@ def figure_8(effort: Effort) -> Comparison:
     rows = _flown(effort, [Job("campaign", "cluttered", seed=seed) for seed in range(1, effort.of(6, 101))])
     kept = sum(row["margin_kept"] and row["arrived"] for row in rows)
     lines = [
-        counted("arrived with the margin kept", texts("yang", "Fig. 8")["cluttered"], kept, len(rows)),
+        counted("arrived with the margin kept", texts("factormpc", "Fig. 8")["cluttered"], kept, len(rows)),
         measured("least distance [mm]", [], _least(rows), 0),
         measured("decision, median of a flight [ms]", [], [float(np.median(row["decide_ms"])) for row in rows]),
     ]
@@ -89,7 +89,7 @@ def figure_8(effort: Effort) -> Comparison:
 def figure_10(effort: Effort) -> Comparison:
     """Errors of figure eights with a plan, beside control by differential flatness."""
     seeds, lines = EIGHTS[: effort.of(2, len(EIGHTS))], list[Line]()
-    text = texts("yang", "Fig. 10")["smaller"].partition(" compared")[0]
+    text = texts("factormpc", "Fig. 10")["smaller"].partition(" compared")[0]
     for speed in (1.0, 2.0, 3.0):
         jobs = [
             Job("eights", "figure8", who, speed=speed, seed=seed, duration=12.0)
@@ -111,7 +111,7 @@ def figure_11(effort: Effort) -> Comparison:
     rows = _flown(effort, [Job("ball", "ball", alpha=3.0, speed=3.2, seed=seed) for seed in seeds])
     kept = sum(row["margin_kept"] and row["arrived"] for row in rows)
     lines = [
-        counted("margin kept and back in place", texts("yang", "Fig. 11")["ball"], kept, len(rows)),
+        counted("margin kept and back in place", texts("factormpc", "Fig. 11")["ball"], kept, len(rows)),
         measured("least distance [mm]", [], _least(rows), 0),
     ]
     return Comparison(lines, f"The throw of the paper and {len(rows) - 1} others (page: 10).")
