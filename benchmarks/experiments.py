@@ -34,6 +34,7 @@ from unifg.scenarios.papers.bazzana import (
     TICK,
     campaign,
     drives_of,
+    relative,
     succeeded,
 )
 from unifg.scenarios.papers.printed import numbers
@@ -120,12 +121,6 @@ def leg_by_leg(drives: pd.DataFrame) -> str:
                 _spread(good[DURATION]), f"{1e3 * mine[CLEARANCE].min():.0f}", f"{mine[CONTACTS].sum():.0f}",
             ))  # fmt: skip
     return table(head, rows, 2)
-
-
-def relative(good: pd.DataFrame) -> pd.DataFrame:
-    """Standard deviations of length and duration in per cent of the mean, by planner and leg."""
-    values = good.groupby(["planner", "table", "leg"])[[LENGTH, DURATION]]
-    return 100.0 * values.std() / values.mean()
 
 
 def reported(

@@ -166,22 +166,32 @@ def test_a_quick_campaign_ends_in_time(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setattr(bazzana, "load", lambda folder, failed_too: None)
     monkeypatch.setattr(bazzana, "drives_of", lambda sheet, name: drives(1))
     assert len(bazzana.driven(effort(tmp_path), "department", 2)) == 9
-    monkeypatch.setattr(bazzana, "PATIENCE", -1.0)
-    assert len(bazzana.driven(effort(tmp_path, quick=False), "department", 2)) == 9
+    assert len(bazzana.driven(effort(tmp_path, quick=False), "department", 2, patience=-1.0)) == 9
     with pytest.raises(KeyboardInterrupt):  # run_campaign takes it for the end
-        bazzana.driven(effort(tmp_path), "department", 2)
+        bazzana.driven(effort(tmp_path), "department", 2, patience=-1.0)
 
 
 def test_legs_are_compared_with_their_own_column(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bazzana, "driven", lambda *given: drives(4))
+    asked: list[tuple[Any, ...]] = []
+
+    def driven(*given: Any) -> pd.DataFrame:
+        asked.append(given)
+        return drives(4 if "light" in given else 2)
+
+    monkeypatch.setattr(bazzana, "driven", driven)
     found = bazzana.table_i(effort(tmp_path))
     lines = {line.what: line for line in found.lines}
-    assert len(lines) == 16 and all(map(consistent, found.lines))
+    assert len(lines) == 2 * (16 + 2) and all(map(consistent, found.lines))
+    assert [given[4] for given in asked] == ["light", "harsh"] and sum(given[5] for given in asked) < 280.0
     assert lines["AC, length [m]"] == Line(
         "AC, length [m]", "175.42 ± 0.68", "176.92 ± 0.58", "+1.50", "176.42 to 177.42"
     )
     assert lines["EA, duration [s]"].paper == "108.74 ± 1.37" and lines["EA, duration [s]"].difference == "-8.74"
-    assert "4 to 5 runs of each leg (paper: 30), 32 of 33 drives succeeded" in found.runs
+    assert lines["AC, length [m], lagging and slipping base"].ours == "176.92 ± 0.71"
+    spread = lines["deviation of length, mean of legs [%]"]
+    means = [mean for mean, _ in pairs("bazzana", "Table I (a), Ours").values()]
+    assert spread.paper == "0.6" and spread.ours == f"{np.mean([100.0 / 3.0**0.5 / (m + 1.5) for m in means]):.2f}"
+    assert found.runs.startswith("4 to 5 runs of each leg, 32 of 33 succeeded; 2 to 3 runs of each leg, lagging and")
 
 
 @pytest.mark.parametrize("quick", [True, False])
@@ -195,7 +205,8 @@ def test_a_quick_campaign_is_a_part_of_the_whole_one(
     for function in (bazzana.table_i, bazzana.table_ii, bazzana.figure_6):
         function(effort(tmp_path, quick))
     whole = [bazzana.campaign(name) for name in ("department", "factory", "department")]
-    for part, campaign, legs in zip(ran, whole, (8, 4, 3 if quick else 8), strict=True):
+    assert [part.fixed.get("plant") for part in ran] == [None, "harsh"] * 2 + [None]
+    for part, campaign, legs in zip(ran[::2], whole, (8, 4, 3 if quick else 8), strict=True):
         assert part.seeds == campaign.seeds[: 2 if quick else 30]
         assert {episode.labels["coupling"] for episode in part.episodes()} == {"sequential"}
         assert len({episode.labels["leg"] for episode in part.episodes()}) == legs

@@ -27,7 +27,8 @@ from unifg.scenarios.papers.printed import FOLDER, numbers, pairs, texts
 from unifg.solvers import AugmentedLagrangian
 
 RUNS = 30
-PATIENCE = 240.0  # of a quick campaign [s]
+BASES = {"light": "", "harsh": ", lagging and slipping base"}
+PATIENCE = (170.0, 100.0)  # of a quick campaign on each of them [s]
 LENGTH, DURATION = "path_length_m", "duration_s"
 CLEARANCE, CONTACTS, TICK = "min_clearance_m", "collisions", "tick_ms.p50"
 POSITION, HEADING = "localisation_error_m.mean", "localisation_error_rad.mean"
@@ -65,14 +66,24 @@ def succeeded(drives: pd.DataFrame) -> pd.DataFrame:
     return drives[drives["outcome"] == OK]
 
 
-def driven(effort: Effort, name: str, few: int, legs: Sequence[str] = ()) -> pd.DataFrame:
+def relative(good: pd.DataFrame) -> pd.DataFrame:
+    """Standard deviations of length and duration in per cent of the mean, by planner and leg."""
+    values = good.groupby(["planner", "table", "leg"])[[LENGTH, DURATION]]
+    return 100.0 * values.std() / values.mean()
+
+
+def driven(
+    effort: Effort, name: str, few: int, legs: Sequence[str] = (), plant: str = "light", patience: float = 240.0
+) -> pd.DataFrame:
     """Drives of a campaign with the sequential coupling, run where they are not on file.
 
     Args:
-        effort: quick or full; a quick one ends after `PATIENCE` with the drives there are.
+        effort: quick or full.
         name: of the campaign.
         few: seeds of a quick one.
         legs: of a quick one; none for all.
+        plant: one of `unifg.scenarios.simulation.drivetrain.PLANTS`.
+        patience: after which a quick one ends with the drives there are [s].
     """
     whole = campaign(name)
     keep = {"coupling": ["sequential"], "leg": legs if effort.quick and legs else list(PAPER[name][LENGTH][0])}
@@ -80,8 +91,9 @@ def driven(effort: Effort, name: str, few: int, legs: Sequence[str] = ()) -> pd.
         replace(axis, values={label: given for label, given in axis.values.items() if label in keep[axis.name]})
         for axis in whole.axes
     )
-    part = replace(whole, axes=axes, seeds=whole.seeds[: effort.of(few, RUNS)])
-    folder, end = effort.folder / f"bazzana-{name}", time.monotonic() + (PATIENCE if effort.quick else np.inf)
+    fixed = whole.fixed if plant == "light" else {**whole.fixed, "plant": plant}
+    part = replace(whole, axes=axes, seeds=whole.seeds[: effort.of(few, RUNS)], fixed=fixed)
+    folder, end = effort.folder / f"bazzana-{name}-{plant}", time.monotonic() + (patience if effort.quick else np.inf)
 
     def progress(done: float, text: str) -> None:
         effort.progress(done, text)
@@ -92,25 +104,33 @@ def driven(effort: Effort, name: str, few: int, legs: Sequence[str] = ()) -> pd.
     return drives_of(load(folder, failed_too=True), name)
 
 
-def _long_legs(effort: Effort, name: str, few: int) -> Comparison:
-    drives, lines = driven(effort, name, few), list[Line]()
-    for measure, what in ((LENGTH, "length [m]"), (DURATION, "duration [s]")):
-        for leg, mine in succeeded(drives).groupby("leg", sort=False):
-            mean, deviation = PAPER[name][measure][0][str(leg)]
-            lines.append(measured(f"{leg}, {what}", [mean], mine[measure], deviation=deviation))
-    runs = " to ".join(dict.fromkeys(str(end) for end in drives.groupby("leg").size().agg(["min", "max"])))
-    text = f"{runs} runs of each leg (paper: {RUNS}), {len(succeeded(drives))} of {len(drives)} drives succeeded."
-    return Comparison(lines, f"{text} The paper gives neither map nor accelerations.")
+def _long_legs(effort: Effort, name: str, legs: Sequence[str]) -> Comparison:
+    """Comparison of all legs, and of some of them in a quick one on the other base."""
+    lines, counts = list[Line](), list[str]()
+    for (plant, base), some, few, patience in zip(BASES.items(), ((), legs), (2, 3), PATIENCE, strict=True):
+        drives = driven(effort, name, few, some, plant, patience)
+        good = succeeded(drives)
+        for measure, what in ((LENGTH, "length"), (DURATION, "duration")):
+            unit = "m" if measure == LENGTH else "s"
+            for leg, mine in good.groupby("leg", sort=False):
+                mean, deviation = PAPER[name][measure][0][str(leg)]
+                lines.append(measured(f"{leg}, {what} [{unit}]{base}", [mean], mine[measure], deviation=deviation))
+            (spread, _) = numbers("bazzana", "section VII-B", f"mean_spread_{what}")
+            lines.append(measured(f"deviation of {what}, mean of legs [%]{base}", [spread], relative(good)[measure]))
+        runs = " to ".join(dict.fromkeys(str(end) for end in drives.groupby("leg").size().agg(["min", "max"])))
+        counts.append(f"{runs} runs of each leg{base}, {len(good)} of {len(drives)} succeeded")
+    text = f"{'; '.join(counts)} (paper: {RUNS} runs). The paper gives neither map nor accelerations."
+    return Comparison(lines, text)
 
 
 def table_i(effort: Effort) -> Comparison:
     """Path lengths and durations of eight legs of a department."""
-    return _long_legs(effort, "department", 2)
+    return _long_legs(effort, "department", ("DE", "AB", "CD"))
 
 
 def table_ii(effort: Effort) -> Comparison:
     """Path lengths and durations of four legs of a factory; the paper exchanges the durations of BC and CD."""
-    found = _long_legs(effort, "factory", 2)
+    found = _long_legs(effort, "factory", ("BC",))
     return replace(found, runs=f"{found.runs} Durations of BC and CD are exchanged in the paper.")
 
 

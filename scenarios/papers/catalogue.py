@@ -37,10 +37,10 @@ class Item:
 
 PAPERS = {
     "bazzana": (
-        Item("table", "I", "path length and duration of eight legs of a department", "30 runs a leg, an hour"),
-        Item("table", "II", "path length and duration of four legs of a factory", "30 runs a leg, half an hour"),
+        Item("table", "I", "length and duration of eight legs of a department", "30 runs a leg, two bases, two hours"),
+        Item("table", "II", "length and duration of four legs of a factory", "30 runs a leg, two bases, an hour"),
         Item("table", "III", "six control problems: cost, iterations, time", "15 rounds, a minute"),
-        Item("figure", "6", "error of localisation", "30 runs of eight legs, an hour; those of Table I"),
+        Item("figure", "6", "error of localisation", "30 runs of eight legs, those of Table I"),
         Item("figure", "7", "manoeuvres: a cusp, and a turn past an obstacle", "two solves, seconds"),
     ),
     "ta": (
