@@ -118,8 +118,8 @@ def _long_legs(effort: Effort, name: str, legs: Sequence[str]) -> Comparison:
             (spread, _) = numbers("bazzana", "section VII-B", f"mean_spread_{what}")
             lines.append(measured(f"deviation of {what}, mean of legs [%]{base}", [spread], relative(good)[measure]))
         runs = " to ".join(dict.fromkeys(str(end) for end in drives.groupby("leg").size().agg(["min", "max"])))
-        counts.append(f"{runs} runs of each leg{base}, {len(good)} of {len(drives)} succeeded")
-    text = f"{'; '.join(counts)} (paper: {RUNS} runs). The paper gives neither map nor accelerations."
+        counts.append(f"Runs of each leg{base}: {runs}, {len(good)} of {len(drives)} succeeded")
+    text = f"{'. '.join(counts)}. Paper: {RUNS} runs; it gives neither map nor accelerations."
     return Comparison(lines, text)
 
 
