@@ -1,29 +1,37 @@
-"""Both case studies of ecg2o (Abdelkarim et al. 2026), every backend on both.
-
-The profile of the first study is looked for in ``$UNIFG_DATA`` or ``../shared/data`` beside the checkout; without it
-nothing is measured, because the page compares with costs on that profile.
-"""
+"""Both case studies of ecg2o (Abdelkarim et al. 2026), every backend on both: tables of the page."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from pathlib import Path
-from typing import TypeAlias
 
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import listing, shared, table
+from benchmarks.report import listing, table
 from benchmarks.runner import Timing
-from benchmarks.timing import clock, interleave, number
-from problems.known import STARTS, Guess, ecg2o_inequality
-from problems.known import ecg2o as small
-from unifg.errors import ScenarioError
-from unifg.scenarios.velocity_tracking import TrackingSettings, state_problem
-from unifg.solvers import KKT, SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, Penalty
+from benchmarks.timing import number
+from problems.known import ecg2o_inequality
+from unifg.scenarios.papers.ecg2o import (
+    FREE,
+    LENGTHS,
+    LITERAL,
+    LITERAL_BOTH,
+    LITERAL_SMALL,
+    PAPERS_RULE,
+    RULE,
+    STARTS,
+    TUNED,
+    Stated,
+    damped,
+    drive,
+    iterations,
+    literal,
+    seconds_an_iteration,
+    small,
+)
+from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 
-LENGTHS = (50, 100, 200, 385)
 COSTS = {  # J of the first study, worked out independently with IPOPT and Newton's method
     "quadratic": (34481.995068, 75967.385885, 168678.611533, 345514.797577),
     "linear": (36170.076602, 79709.258534, 177608.498404, 361318.221800),
@@ -36,10 +44,6 @@ BOUNDED = {(50, "quadratic"): 35297.4202, (385, "quadratic"): 384058.6892,
 # a QpProblem or a QcqpProblem, whose costs and constraints are quadratic; a CustomFactor ends in "qcqpFactors is not
 # implemented", and PenaltyOptimizer is not wrapped.
 REFERENCE = {"kkt": (5, 7, 8, 8, 6, 10), "gtsam-al": (19, 19, 21, 20, 19, 20), "gtsam-pen": (75, 79, 76, 80, 50, 82)}
-STEP = 1e-3  # stop rule of the paper, on the norm of the step
-STRICT = 1e-18  # a tolerance that leaves the end to the stop rule
-LITERAL = 1e4  # rho of the literal loop in the first study, found by trying powers of ten
-LITERAL_SMALL = 10.0  # the same in the second study
 PENALTIES = (1e2, 1e3, 1e4, 1e5, 1e6)
 MULTIPLIERS = (0.0, 1.0, 1e2, 1e4, 1e6)
 INNER = (1, 5, 50)
@@ -48,57 +52,13 @@ SMALL_PENALTIES = (0.1, 1.0, 10.0, 1e2, 1e3, 1e4)
 LEVENBERG = KKT(globalization="levenberg-marquardt")
 
 
-Stated: TypeAlias = tuple[fg.Graph, fg.Guess | Guess]
-
-
-def profile() -> Path:
-    """The paper's profile.
-
-    Raises:
-        ScenarioError: it is not there.
-    """
-    path = (shared("profiles") or Path("profiles")) / "velocity_profile_388.csv"
-    if not path.is_file():
-        raise ScenarioError(
-            f"the first study drives the paper's profile, and there is no {path}: set UNIFG_DATA to the folder that "
-            "has profiles/velocity_profile_388.csv"
-        )
-    return path
-
-
-def drive(
-    length: int, drag: str = "quadratic", bounds: tuple[float, float] | None = None, constrained: bool = True
-) -> tuple[fg.Graph, fg.Guess]:
-    """The first study."""
-    settings = TrackingSettings(length, profile=profile(), linear=drag == "linear", force_bounds=bounds)
-    graph, _, _, guess = state_problem(settings, settings.speeds(), constrained)
-    return graph, guess
-
-
-def literal(penalty: float, step: float = 0.0, tolerance: float = 1e-6) -> AugmentedLagrangian:
-    """One primal and one dual step in turn, constant rho: the paper's tuned augmented Lagrangian."""
-    return AugmentedLagrangian(schedule="bazzana", penalty=penalty, step_tolerance=step, tolerance=tolerance)
-
-
-def damped(penalty: float) -> AugmentedLagrangian:
-    """The same loop with Levenberg-Marquardt steps."""
-    return AugmentedLagrangian(schedule="bazzana-damped", penalty=penalty)
-
-
 def steps(solver: fg.Solver, problem: Stated, multiplier: float | None = None) -> str:
     """Iterations of a solve, marked with a dagger when it ended without the KKT conditions."""
-    graph, guess = problem
-    duals = None
-    if multiplier is not None:
-        force = graph.families.get("force")
-        count, name = (1, "curve") if force is None else (force.count, "dynamics")
-        duals = {name: np.full((count, 1), multiplier)}
-    try:
-        solution = solver.solve(graph, guess, duals=duals)
-    except fg.BackendError:
+    found = iterations(solver, problem, multiplier)
+    if found is None:
         return "-"
-    honest = solution.converged or solution.status is fg.Status.STOP_RULE
-    return str(solution.iterations) if honest else f"{solution.iterations}†"
+    count, honest = found
+    return str(count) if honest else f"{count}†"
 
 
 def listed(values: Iterable[float]) -> dict[tuple[str], float]:
@@ -108,8 +68,6 @@ def listed(values: Iterable[float]) -> dict[tuple[str], float]:
 
 def iterations_by_length() -> str:
     """Fig. 3: the paper's stop rule, then our own KKT test."""
-    rule = KKT(full_steps=True, step_tolerance=STEP, tolerance=STRICT)
-    free = GaussNewton(line_search=False, step_tolerance=STEP, tolerance=STRICT)
     ours: dict[str, fg.Solver] = {
         "KKT": KKT(),
         "AL, literal": literal(LITERAL),
@@ -122,10 +80,10 @@ def iterations_by_length() -> str:
         return lambda n: steps(solver, drive(n))
 
     columns: dict[str, Callable[[int], str]] = {
-        "costs alone": lambda n: steps(free, drive(n, constrained=False)),
-        "KKT, linear drag, step rule": lambda n: steps(rule, drive(n, "linear")),
-        "KKT, step rule": of(rule),
-        "AL, step rule": of(literal(LITERAL, STEP, STRICT)),
+        "costs alone": lambda n: steps(FREE, drive(n, constrained=False)),
+        "KKT, linear drag, step rule": lambda n: steps(RULE, drive(n, "linear")),
+        "KKT, step rule": of(RULE),
+        "AL, step rule": of(TUNED),
         **{name: of(solver) for name, solver in ours.items()},
     }
     return listing(["N"], {(str(n),): n for n in LENGTHS}, columns)
@@ -208,7 +166,7 @@ def inner() -> str:
 def case_study_2() -> tuple[str, str]:
     """Table 1: all starts, all backends; the average below. And the variant with an inequality."""
     solvers: dict[str, fg.Solver] = {
-        "KKT, step < 1e-3": KKT(full_steps=True, step_tolerance=STEP),
+        "KKT, step < 1e-3": PAPERS_RULE,
         "KKT, full steps": KKT(full_steps=True),
         "KKT": KKT(),
         "KKT, Levenberg": LEVENBERG,
@@ -238,29 +196,14 @@ def case_study_2() -> tuple[str, str]:
 
 def times(solves: int) -> str:
     """Fig. 4: mean time per iteration over many solves from the cold guess."""
-    kinds: dict[str, fg.Solver] = {
-        "KKT, full steps": KKT(full_steps=True),
-        "KKT": KKT(),
-        "AL, literal": literal(LITERAL),
-        "AL": AugmentedLagrangian(),
-        "IPM": InteriorPoint(),
-    }
+    kinds = {**LITERAL_BOTH, "KKT": KKT(), "AL": AugmentedLagrangian(), "IPM": InteriorPoint()}
+    order = ("KKT, full steps", "KKT", "AL, literal", "AL", "IPM")
     rows = []
     for length in LENGTHS:
-        candidates: dict[str, Callable[[], float]] = {}
-        taken: dict[str, int] = {}
-        for name, solver in kinds.items():
-            graph, guess = drive(length)
-            run = solver.prepare(graph)
-            taken[name] = run.solve(guess, check=True).iterations
-
-            candidates[name] = partial(clock, partial(run.solve, guess))
-        seconds = interleave(candidates, solves, warm=5)
-        each = {name: 1e3 * float(seconds[name].mean()) / taken[name] for name in kinds}
-        ratio = float(np.median(seconds["KKT, full steps"] / seconds["AL, literal"]))
-        ratio *= taken["AL, literal"] / taken["KKT, full steps"]
-        rows.append([str(length), *(number(value) for value in each.values()), number(ratio)])
-    return table(["N", *(f"{name} [ms]" for name in kinds), "KKT / AL, both literal"], rows, 0)
+        each = seconds_an_iteration({name: kinds[name] for name in order}, length, solves)
+        ratio = float(np.median(each["KKT, full steps"] / each["AL, literal"]))
+        rows.append([str(length), *(number(1e3 * float(each[name].mean())) for name in order), number(ratio)])
+    return table(["N", *(f"{name} [ms]" for name in order), "KKT / AL, both literal"], rows, 0)
 
 
 def report(solves: int) -> str:

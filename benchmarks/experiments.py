@@ -1,9 +1,8 @@
 """Bazzana's path lengths and durations, on maps with legs as long as his.
 
-The campaigns are benchmarks/campaigns/department.toml (his Table I) and factory.toml (Table II), and for the same legs
-with other planners department-others.toml and factory-others.toml. Drives on file in out/benchmarks/campaigns or kept
-in benchmarks/campaigns/rows are not repeated. Thirty runs a leg with two couplings take some two hours of one core,
-those of the four other planners some six.
+The campaigns are those of :mod:`unifg.scenarios.papers.bazzana`, and the same legs with :data:`BASELINES`. Drives on
+file in out/benchmarks/campaigns or kept in benchmarks/campaigns/rows are not repeated. Thirty runs a leg with two
+couplings take some two hours of one core, those of the four other planners some six.
 """
 
 from __future__ import annotations
@@ -17,31 +16,48 @@ import pandas as pd
 
 from benchmarks.comparison import interval, share
 from benchmarks.kept_rows import ROWS, keep, restore
-from benchmarks.printed import numbers, pairs
-from benchmarks.report import CAMPAIGNS, OUT, table
+from benchmarks.report import OUT, table
 from benchmarks.runner import Timing
 from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, replay_command, run_campaign, write_manifest
 from unifg.scenarios.campaigns.report import PAIRED, differences
 from unifg.scenarios.campaigns.sheet import Sheet, load
-from unifg.scenarios.campaigns.statement import read
+from unifg.scenarios.campaigns.statement import Statement, stated
 from unifg.scenarios.campaigns.task import OK
+from unifg.scenarios.papers.bazzana import (
+    CLEARANCE,
+    CONTACTS,
+    DURATION,
+    LENGTH,
+    PAPER,
+    ROMAN,
+    RUNS,
+    TICK,
+    campaign,
+    drives_of,
+    relative,
+    succeeded,
+)
+from unifg.scenarios.papers.printed import numbers
 
-RUNS = 30
-LENGTH, DURATION = "path_length_m", "duration_s"
-CLEARANCE, CONTACTS, TICK = "min_clearance_m", "collisions", "tick_ms.p50"
 OTHERS = "-others"  # ends the name of the campaign of the same legs with other planners
-ROMAN = {"department": "I", "factory": "II"}  # tables of the paper
-WHO = ("Ours", "ROS Navigation Stack")
-PAPER = {
-    name: {
-        measure: [pairs("bazzana", f"Table {number} ({part}), {who}") for who in WHO]
-        for measure, part in ((LENGTH, "a"), (DURATION, "b"))
-    }
-    for name, number in ROMAN.items()
-}
-"""Mean and standard deviation by campaign, measure, solver and leg, as printed."""
 TITLES = {"department": "Table I: eight legs of a department", "factory": "Table II: four legs of a factory"}
 CAMPAIGN_NAMES = (*PAPER, *(name + OTHERS for name in PAPER))
+BASELINES = {
+    "teb": "elastic_band:ElasticBand", "mppi": "path_integral:PathIntegral", "dwa": "dynamic_window:DynamicWindow",
+    "pursuit": "pure_pursuit:PurePursuit",
+}  # fmt: skip
+"""Other local planners, within the same limits of speed and acceleration, in benchmarks.baselines."""
+
+
+def statement(name: str) -> Statement:
+    """Campaign by name; with other planners the same legs on the same seeds."""
+    whole = campaign(name.removesuffix(OTHERS))
+    if not name.endswith(OTHERS):
+        return whole
+    others = [{"name": label, "planner": f"benchmarks.baselines.{made}"} for label, made in BASELINES.items()]
+    grid = {**whole.given["grid"], "coupling": ["sequential"], "baseline": others}
+    title = f"{whole.title}, other planners"
+    return stated({**whole.given, "title": title, "grid": grid}, whole.base, name)
 
 
 def rendered(sheets: Mapping[str, Sheet]) -> str:
@@ -58,23 +74,6 @@ def rendered(sheets: Mapping[str, Sheet]) -> str:
         parts += ["### The same legs with other planners", beside(drives), leg_by_leg(drives)]
         parts += [part for name, sheet in sheets.items() if name not in PAPER for part in _failed(sheet)]
     return "\n\n".join(parts)
-
-
-def drives_of(sheet: Sheet, name: str) -> pd.DataFrame:
-    """Drives of a campaign: planner (of this library, the coupling), table, leg, seed, outcome and measures."""
-    found = []
-    for combination in sheet.combinations:
-        labels = dict(zip(sheet.axes, combination, strict=True))
-        planner = labels.get("baseline", f"ours, {labels['coupling']}")
-        mine = sheet.of(combination).join(sheet.values)
-        found.append(mine.assign(planner=planner, table=ROMAN[name], leg=labels["leg"]))
-    measures = [LENGTH, DURATION, CLEARANCE, CONTACTS, TICK]
-    return pd.concat(found).reindex(columns=["planner", "table", "leg", "seed", "outcome", *measures])
-
-
-def succeeded(drives: pd.DataFrame) -> pd.DataFrame:
-    """Drives that succeeded."""
-    return drives[drives["outcome"] == OK]
 
 
 def beside(drives: pd.DataFrame) -> str:
@@ -122,12 +121,6 @@ def leg_by_leg(drives: pd.DataFrame) -> str:
                 _spread(good[DURATION]), f"{1e3 * mine[CLEARANCE].min():.0f}", f"{mine[CONTACTS].sum():.0f}",
             ))  # fmt: skip
     return table(head, rows, 2)
-
-
-def relative(good: pd.DataFrame) -> pd.DataFrame:
-    """Standard deviations of length and duration in per cent of the mean, by planner and leg."""
-    values = good.groupby(["planner", "table", "leg"])[[LENGTH, DURATION]]
-    return 100.0 * values.std() / values.mean()
 
 
 def reported(
@@ -213,7 +206,7 @@ def tables(runs: int) -> str:
     sheets = {}
     for name in CAMPAIGN_NAMES:
         folder, archive = OUT / "campaigns" / name, ROWS / f"{name}.jsonl.xz"
-        whole = read(CAMPAIGNS / f"{name}.toml")
+        whole = statement(name)
         restore(archive, folder / EPISODES)
         run_campaign(replace(whole, seeds=whole.seeds[:runs]), folder, any_code=True)
         keep(folder / EPISODES, archive)

@@ -19,7 +19,6 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks.comparison import Row, difference, where
-from benchmarks.printed import texts
 from benchmarks.report import listing, shared
 from benchmarks.routes import drawn
 from benchmarks.runner import Cell, Study
@@ -30,6 +29,7 @@ from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.navigation import INITIAL_SIGMA, Episode, NavigationSettings
+from unifg.scenarios.papers.printed import texts
 from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import mapped

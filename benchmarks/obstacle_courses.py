@@ -8,11 +8,9 @@ start, the straight line to the target, and a shortest way. Weights were chosen 
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cache
+from dataclasses import fields, replace
 from itertools import pairwise, product
 from typing import Any
 
@@ -20,21 +18,11 @@ import numpy as np
 from scipy.stats import binomtest
 
 from benchmarks.comparison import Row, share, where
-from benchmarks.report import listing, table, words
+from benchmarks.report import listing, table
 from benchmarks.runner import Cell, Study
-from benchmarks.timing import clocked
-from unifg.scenarios.course import (
-    AVOIDANCES,
-    HESSIANS,
-    Avoidance,
-    Course,
-    CourseSettings,
-    Hessian,
-    Start,
-    backend,
-    course_guess,
-    state_problem,
-)
+from unifg.scenarios.course import AVOIDANCES, HESSIANS, Avoidance, Start
+from unifg.scenarios.papers.courses import Method, Outcome
+from unifg.scenarios.papers.courses import attempted as outcome
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.layouts import COURSE_SEEDS, Layout, obstacle_course
 
@@ -44,21 +32,6 @@ EVERYWHERE: Start = "hover"  # the guess from which all backends begin; the othe
 GUESSES: tuple[Start, ...] = ("hover", "line", "way")
 
 
-@dataclass(frozen=True)
-class Method:
-    """One way to solve a layout."""
-
-    avoidance: Avoidance
-    guess: Start
-    solver: str
-    hessian: Hessian
-
-    @property
-    def words(self) -> tuple[str, str, str]:
-        """For tables."""
-        return self.avoidance, self.guess, f"{self.solver}, {self.hessian}"
-
-
 METHODS = tuple(
     Method(avoidance, guess, *chosen)
     for avoidance, guess, chosen in product(AVOIDANCES, GUESSES, BACKENDS)
@@ -66,82 +39,12 @@ METHODS = tuple(
 )
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Result on one layout.
-
-    Attributes:
-        status: of the solver.
-        converged: whether the KKT test passed.
-        arrived: whether the end is near the target.
-        clear: whether nothing is touched, at nodes and between them.
-        flyable: whether states follow from controls within the limits.
-        cost: the objective.
-        distance: from the end to the target [m].
-        clearance: least one of the hull on the way [m].
-        iterations: of the solver.
-        milliseconds: of the processor, for the solve.
-    """
-
-    status: str
-    converged: bool
-    arrived: bool
-    clear: bool
-    flyable: bool
-    cost: float
-    distance: float
-    clearance: float
-    iterations: int
-    milliseconds: float
-
-    @property
-    def safe(self) -> bool:
-        """True if it can be flown to the target without a collision, optimal or not."""
-        return self.arrived and self.clear and self.flyable
-
-    @property
-    def minimum(self) -> bool:
-        """True for a local minimum of the problem."""
-        return self.converged and self.flyable
-
-
 Results = dict[Method, list[Outcome]]
 
 
-def attempt(method: Method, layout: Layout) -> Outcome:
-    """Solve one layout cold; the processor's time is counted, without that of building the graph."""
-    settings = CourseSettings(
-        avoidance=method.avoidance, guess=method.guess, solver=method.solver, hessian=method.hessian
-    )
-    graph, x, u = state_problem(settings, layout)
-    run = backend(settings).prepare(graph)
-    states, controls = course_guess(settings, layout)
-    solution, elapsed = clocked(run.solve, {x: states, u: controls}, by=time.process_time)
-    course = Course(settings, layout, solution, solution[x], solution[u], iterates=np.zeros((0, *states.shape)))
-    return Outcome(
-        words(solution.status),
-        solution.converged,
-        course.arrived,
-        course.clear,
-        course.flyable,
-        float(solution.cost),
-        course.target_distance,
-        course.clearance_between,
-        solution.iterations,
-        1e3 * elapsed,
-    )
-
-
 def attempted(seed: int, **method: Any) -> Row:
-    """The same, as a row."""
-    _compiled(Method(**method))
-    return vars(attempt(Method(**method), obstacle_course(seed)))
-
-
-@cache
-def _compiled(method: Method) -> None:
-    """The first solve of a method in a process compiles: the nominal course, which is no result."""
-    attempt(method, obstacle_course())
+    """Outcome of a method, its fields, on a layout, as a row."""
+    return vars(outcome(Method(**method), seed))
 
 
 def results_of(rows: Sequence[Row]) -> Results:

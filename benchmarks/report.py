@@ -14,9 +14,10 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TypeVar
 
-import unifg
 from unifg.scenarios.campaigns.markdown import table as table
 from unifg.scenarios.commands.host import processor
+from unifg.scenarios.papers.measuring import words as words
+from unifg.scenarios.papers.printed import shared as shared
 
 T = TypeVar("T")
 Words = TypeVar("Words", bound=tuple[str, ...])
@@ -35,17 +36,6 @@ def command(doc: str | None) -> argparse.ArgumentParser:
     assert doc is not None
     named = re.search(r"python -m [\w.]+", doc)
     return argparse.ArgumentParser(prog=named and named[0], description=doc.split("\n")[0], allow_abbrev=False)
-
-
-def shared(folder: str) -> Path | None:
-    """Folder of the data sets beside the checkout or in ``$UNIFG_DATA``, None if it is missing."""
-    path = Path(os.environ.get("UNIFG_DATA", CHECKOUT.parent / "shared" / "data")) / folder
-    return path if path.is_dir() else None
-
-
-def words(status: unifg.Status) -> str:
-    """Status as tables name it."""
-    return status.name.lower().replace("_", " ")
 
 
 def listing(head: Sequence[str], groups: Mapping[Words, T], columns: Mapping[str, Callable[[T], str]]) -> str:

@@ -1,24 +1,21 @@
-"""Times of contestants in turn, many rounds in random order, and ratios within a round.
-
-On a shared machine milliseconds move by a factor of two from one minute to the next. Contestants that run right after
-one another meet the same machine, so their ratio is what counts.
-"""
+"""Cores that are timed on, and spreads and ratios of times (:mod:`unifg.scenarios.papers.measuring`)."""
 
 from __future__ import annotations
 
 import os
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.stats import bootstrap
 
+from unifg.scenarios.papers.measuring import clock as clock
+from unifg.scenarios.papers.measuring import clocked as clocked
+from unifg.scenarios.papers.measuring import interleave as interleave
 from unifg.typing import Array
 
-R = TypeVar("R")
 Spread: TypeAlias = list[float]
 """Median, lower and upper bound; a list because results are written as JSON."""
 
@@ -43,48 +40,9 @@ def all_cores() -> Iterator[None]:
         os.sched_setaffinity(0, before)
 
 
-def clocked(
-    function: Callable[..., R], *given: Any, by: Callable[[], float] = time.thread_time, **named: Any
-) -> tuple[R, float]:
-    """Result of a call and the time it took, by a clock: processor time of this thread, or another [s]."""
-    begin = by()
-    result = function(*given, **named)
-    return result, by() - begin
-
-
-def clock(action: Callable[[], Any]) -> float:
-    """Processor time of one call [s]."""
-    return clocked(action, by=time.process_time)[1]
-
-
 def timed(action: Callable[[], Any], per: float = 1.0) -> Callable[[], float]:
     """Contestant of :func:`interleave`: the time of an action over a number, such as its iterations [s]."""
     return lambda: clock(action) / per
-
-
-def interleave(
-    contestants: Mapping[str, Callable[[], float]], rounds: int, warm: int = 1, slow: float = np.inf
-) -> dict[str, Array]:
-    """Run every contestant once a round, in shuffled order; (rounds,) of what each returns.
-
-    Args:
-        contestants: each returns the time that counts, so that its preparations do not.
-        rounds: that count.
-        warm: rounds before them, for compilation and caches.
-        slow: a contestant that once took longer does not run again, and has fewer rounds.
-    """
-    rng = np.random.default_rng(0)
-    names = list(contestants)
-    result: dict[str, list[float]] = {name: [] for name in names}
-    for index in range(-warm, rounds):
-        for k in rng.permutation(len(names)):
-            name = names[k]
-            if max(result[name], default=0.0) > slow:
-                continue
-            value = contestants[name]()
-            if index >= 0:
-                result[name].append(value)
-    return {name: np.array(values) for name, values in result.items()}
 
 
 def spread(values: Array) -> Spread:

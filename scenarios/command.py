@@ -6,8 +6,8 @@ written all the same); SIGTERM interrupts, too.
 
 ``unifg campaign`` runs many episodes (0 if every one of them succeeded), ``unifg report`` reports on them,
 ``unifg replay`` repeats one of them, ``unifg mcap`` writes a drive for other tools. ``unifg doctor`` examines the
-installation, ``unifg bench`` times it. What can be run stands in `unifg.scenarios.commands.catalogue`; only the
-scenario that is named is loaded.
+installation, ``unifg bench`` times it, ``unifg reproduce`` computes tables and figures of the papers again. What can be
+run stands in `unifg.scenarios.commands.catalogue`; only the scenario that is named is loaded.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Command:
         summary: a few words for the list of commands.
         about: a sentence for its own help.
         arguments: names and options of each, as for `argparse.ArgumentParser.add_argument`.
-        exclusive: of these arguments at most one may be given.
+        exclusive: groups of arguments of which at most one may be given.
         extras: that it needs.
     """
 
@@ -61,14 +61,18 @@ class Command:
     summary: str
     about: str
     arguments: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    exclusive: tuple[str, ...] = ()
+    exclusive: tuple[tuple[str, ...], ...] = ()
     extras: tuple[str, ...] = ()
 
     def add(self, parser: argparse.ArgumentParser) -> None:
         """Add the arguments."""
-        group = parser.add_mutually_exclusive_group() if self.exclusive else parser
+        groups = {
+            name: group
+            for names, group in ((names, parser.add_mutually_exclusive_group()) for names in self.exclusive)
+            for name in names
+        }
         for name, options in self.arguments.items():
-            (group if name in self.exclusive else parser).add_argument(name, **options)
+            groups.get(name, parser).add_argument(name, **options)
         parser.set_defaults(does=self.does, extras=self.extras, parser=parser)
 
 
@@ -258,6 +262,24 @@ def _bench(chosen: argparse.Namespace) -> int:
     return FAILED if slower and chosen.strict else SUCCEEDED
 
 
+def _reproduce(chosen: argparse.Namespace) -> int:
+    """List tables and figures of the papers, or compute one again beside what is printed."""
+    from unifg.scenarios.papers import catalogue
+    from unifg.scenarios.papers.comparison import Effort
+
+    asked = [(kind, number) for kind in ("table", "figure") if (number := getattr(chosen, kind)) is not None]
+    if chosen.paper is None or not asked:
+        if asked:
+            chosen.parser.error(f"name the paper of --{asked[0][0]} {asked[0][1]}: {', '.join(catalogue.PAPERS)}")
+        print(catalogue.listed(chosen.paper))
+        return SUCCEEDED
+    (kind, number), *_ = asked
+    compute = catalogue.found(chosen.paper, kind, number)
+    with _progress_bar(f"{chosen.paper} {kind} {number}") as progress:
+        print(compute(Effort(not chosen.full, chosen.out, chosen.workers, progress)))
+    return SUCCEEDED
+
+
 def _run(chosen: argparse.Namespace) -> int:
     """Run the chosen scenario, write what it left and say how it went."""
     solver = {"solver": chosen.solver} if hasattr(chosen, "solver") else {}
@@ -400,6 +422,9 @@ class _Parser(argparse.ArgumentParser):
 
 
 _ANY_CODE = {"action": "store_true", "help": "episodes that other states of the code have run count, too"}
+_WORKERS = {
+    "type": partial(count, least=1), "default": 1, "metavar": "N", "help": "processes, one thread each (default: 1)",
+}  # fmt: skip
 _LIVE = {"action": "store_true", "help": "show it in a browser while it runs; says where"}
 
 COMMANDS = {
@@ -410,7 +435,7 @@ COMMANDS = {
             "--ship": {"action": "store_true", "help": "write the half compiled kernels that come with unifg anew"},
             "--check": {"action": "store_true", "help": "list those that are out of date; compile nothing"},
         },
-        ("--ship", "--check"),
+        (("--ship", "--check"),),
     ),
     "cache": Command(
         _cache, "name or delete what is kept of compiled functions",
@@ -419,7 +444,7 @@ COMMANDS = {
             "--where": {"action": "store_true", "help": "print the folder (the default)"},
             "--clear": {"action": "store_true", "help": "delete it: what is needed is generated or compiled anew"},
         },
-        ("--where", "--clear"),
+        (("--where", "--clear"),),
     ),
     "doctor": Command(
         _doctor, "examine the installation",
@@ -441,17 +466,32 @@ COMMANDS = {
         {
             "file": {"type": Path, "metavar": "FILE.toml", "help": "what to run"},
             "--out": {"type": Path, "metavar": "DIR", "help": "folder for results (default: out/campaigns/FILE)"},
-            "--workers": {
-                "type": partial(count, least=1), "default": 1, "metavar": "N",
-                "help": "processes, one thread each (default: 1)",
-            },
+            "--workers": _WORKERS,
             "--scheduler": {
                 "metavar": "ADDRESS", "help": "of a dask.distributed cluster, such as tcp://10.0.0.1:8786",
             },
             "--again": {"action": "store_true", "help": "repeat episodes that ended in an error or were lost"},
             "--any-code": {"action": "store_true", "help": "keep episodes that other states of the code have run"},
         },
-        ("--workers", "--scheduler"),
+        (("--workers", "--scheduler"),),
+    ),
+    "reproduce": Command(
+        _reproduce, "compute tables and figures of the papers again",
+        "Compute a table or figure of one of the four papers again, and print it beside the printed numbers: paper, "
+        "ours, difference, interval. Without arguments, list them.",
+        {
+            "paper": {"nargs": "?", "metavar": "PAPER", "help": "bazzana, ta, factormpc or ecg2o"},
+            "--table": {"metavar": "N", "help": "table, as the paper numbers it"},
+            "--figure": {"metavar": "N", "help": "figure, as the paper numbers it"},
+            "--quick": {"action": "store_true", "help": "a few runs, within five minutes (the default)"},
+            "--full": {"action": "store_true", "help": "as many runs as on the page of results"},
+            "--workers": _WORKERS,
+            "--out": {
+                "type": Path, "default": Path("out") / "reproduce", "metavar": "DIR",
+                "help": "folder for runs, which are not repeated (default: %(default)s)",
+            },
+        },
+        (("--table", "--figure"), ("--quick", "--full")),
     ),
     "report": Command(
         _report, "report on a campaign",

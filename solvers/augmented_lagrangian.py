@@ -17,6 +17,7 @@ be long where rho is large.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Literal
 
@@ -35,11 +36,14 @@ from unifg.solvers.globalize.feasibility_restoration import leave, resume, settl
 from unifg.solvers.globalize.norms import largest, norm
 from unifg.typing import Array, IntArray
 
+logger = logging.getLogger("unifg")
+
 LARGEST_PENALTY = 1e10
 LARGEST_EASY = 1e6  # up to here rho grows after subproblems of one step
 COLD_PENALTY = 10.0  # Birgin and Martinez
 FALL = 0.25  # of the change of multipliers over rho, between outer iterations; else rho grows
 FALLING = 0.9  # of the violation, between outer iterations: progress where rho cannot grow
+STEADY = 20  # steps of the literal loop without a lower violation, before a warning
 PATIENCE = 3  # outer iterations in which it did not fall, before another way is looked for
 WARM_PENALTY = 100.0
 UNSEEN = 1e-11  # of the largest coordinate: steps as short as this are rounding, unless the gradient falls
@@ -112,11 +116,23 @@ class AugmentedLagrangian(Solver):
     def _literal(self, run: SolveState, primal: Primal, rho: float, weights: Array) -> Status | None:
         """One Gauss-Newton step, one dual step, constant rho.
 
-        With Levenberg and Marquardt's damping a primal step has to lower the augmented objective.
+        With Levenberg and Marquardt's damping a primal step has to lower the augmented objective. Where the violation
+        does not fall for `STEADY` steps, a warning names the penalty.
         """
         run.penalties = penalty = rho * weights
         damping, damped = Damping(self.damping), self.schedule == "bazzana-damped"
+        lowest, since = np.inf, 0  # violation, and steps without a lower one
         while run.status is None:
+            violation = run.optimality.violation
+            since = 0 if violation <= max(FALLING * lowest, run.tolerances.violation) else since + 1
+            lowest = violation if since == 0 else lowest
+            if since == STEADY:
+                logger.warning(
+                    "%s: in %d steps with the constant penalty %g the violation has not fallen below %.2g; %s may do, "
+                    "and schedule='bcl' chooses its own penalties", self.name, STEADY, rho, lowest,
+                    "a larger penalty" if damped else "schedule='bazzana-damped'",
+                )  # fmt: skip
+                lowest = -np.inf  # once is enough
             lin, multipliers, rejected = run.lin, run.multipliers, 0
             if not damped:
                 curvature = primal.curvature(lin, multipliers, penalty)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import pytest
@@ -256,6 +257,31 @@ def test_the_damped_loop_of_the_paper_does_not_run_away(penalty: float) -> None:
         literal = AugmentedLagrangian(schedule="bazzana", penalty=penalty).solve(graph, guess)
         assert literal.history[-1].violation > 1e3
         assert literal.violation <= literal.history[0].violation  # handed back is the best of it
+
+
+Schedule: TypeAlias = Literal["bcl", "bazzana", "bazzana-damped"]
+
+
+@pytest.mark.parametrize(
+    ("schedule", "penalty", "remedy"),
+    [("bazzana-damped", 10.0, "a larger penalty"), ("bazzana", 10.0, "schedule='bazzana-damped'"),
+     ("bazzana-damped", 1e4, None), ("bcl", 10.0, None)],
+)  # fmt: skip
+def test_a_constant_penalty_that_does_not_do_is_named_once(
+    schedule: Schedule, penalty: float, remedy: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The manoeuvre of the test above needs 1e3; after twenty steps without a lower violation the loop says so."""
+    graph, _, _, guess = state_problem(CASES["behind"], ManoeuvreSettings())
+    solution = AugmentedLagrangian(schedule=schedule, penalty=penalty).solve(graph, guess)
+    assert solution.converged == (remedy is None)
+    said = [record.getMessage() for record in caplog.records if "constant penalty" in record.getMessage()]
+    assert len(said) == (remedy is not None)
+    if remedy is not None:
+        lowest = float(re.findall(r"below ([\d.e-]+)", said[0])[0])
+        violations = [row.violation for row in solution.history]
+        assert f"penalty {penalty:g} " in said[0] and f"; {remedy} may do" in said[0]
+        assert any(v == pytest.approx(lowest, rel=0.05) and min(violations[k : k + 21]) > 0.9 * lowest * 0.95
+                   for k, v in enumerate(violations[:-20]))  # fmt: skip
 
 
 def test_the_damped_loop_that_cannot_move_says_so() -> None:

@@ -11,18 +11,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.experiments import beside, drives_of, leg_by_leg, rendered
+from benchmarks.experiments import beside, leg_by_leg, rendered, statement
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.localisation import LOG, made, real_ticks, replayed
-from benchmarks.report import CAMPAIGNS
 from unifg.errors import ScenarioError
 from unifg.files.carmen import read_carmen
 from unifg.scenarios.campaigns.campaign import EPISODES
 from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.sheet import Combination, Sheet, sheet_of
-from unifg.scenarios.campaigns.statement import read
 from unifg.scenarios.campaigns.task import FAILED, OK
 from unifg.scenarios.navigation import INITIAL_SIGMA
+from unifg.scenarios.papers.bazzana import drives_of
 from unifg.scenarios.perception.scan_map import mapped
 from unifg.scenarios.planning.polyline import path_length
 
@@ -112,7 +111,7 @@ def test_a_page_without_other_planners_has_no_table_of_them() -> None:
 
 def test_others_drive_the_same_legs_on_the_same_seeds() -> None:
     for name in ("department", "factory"):
-        ours, others = read(CAMPAIGNS / f"{name}.toml"), read(CAMPAIGNS / f"{name}-others.toml")
+        ours, others = statement(name), statement(f"{name}-others")
         assert others.seeds == ours.seeds and others.fixed == ours.fixed
         legs = [next(axis for axis in made.axes if axis.name == "leg") for made in (ours, others)]
         assert legs[0] == legs[1]
@@ -147,7 +146,7 @@ def test_rows_that_are_kept_come_back_once(keys: tuple[object, object], tmp_path
 def test_rows_in_the_checkout_are_of_the_campaigns(name: str, tmp_path: Path) -> None:
     if not restore(ROWS / f"{name}.jsonl.xz", tmp_path / EPISODES):
         pytest.skip("none is kept")
-    known = {episode.key for episode in read(CAMPAIGNS / f"{name}.toml").episodes()}
+    known = {episode.key for episode in statement(name).episodes()}
     keys = [row["key"] for row in lines_of(tmp_path / EPISODES)]
     assert known.issuperset(keys) and len(set(keys)) == len(keys)
 

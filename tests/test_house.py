@@ -54,6 +54,7 @@ STOREYS: tuple[tuple[str, ...], ...] = (
     ("scenes",),
     ("commands",),
     ("campaigns",),
+    ("papers",),
     ("command",),
 )
 STOREY = {room: floor for floor, rooms in enumerate(STOREYS) for room in rooms}

@@ -11,6 +11,8 @@ from benchmarks.report import CAMPAIGNS
 from unifg.models import distance_map
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.campaigns.statement import read
+from unifg.scenarios.papers.bazzana import PAPER
+from unifg.scenarios.papers.printed import FOLDER
 
 
 def test_a_field_measured_in_pieces_is_the_field(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -34,6 +36,9 @@ def test_a_field_is_kept_once() -> None:
     np.testing.assert_array_equal(around, np.pad(np.arange(12.0).reshape(3, 4), 2, mode="edge"))
 
 
-@pytest.mark.parametrize("file", sorted(CAMPAIGNS.glob("*.toml")), ids=lambda path: Path(path).stem)
+FILES = [*sorted(CAMPAIGNS.glob("*.toml")), *(FOLDER / f"{name}.toml" for name in PAPER)]
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda path: Path(path).stem)
 def test_campaigns_can_be_run(file: Path) -> None:
     assert len(read(file)) > 0

@@ -144,6 +144,9 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     maps = [path for kind in ("*.pgm", "*.yaml") for path in (source / "scenarios" / "simulation").glob(kind)]
     assert {path.suffix for path in maps} == {".pgm", ".yaml"}, "no map is shipped"
     expected |= {f"unifg/scenarios/simulation/{path.name}" for path in maps}
+    papers = [path for path in (source / "scenarios" / "papers").iterdir() if path.suffix in (".png", ".toml", ".yaml")]
+    assert {path.name for path in papers} >= {"papers.toml", "department.png", "factory.yaml"}
+    expected |= {f"unifg/scenarios/papers/{path.name}" for path in papers}
     expected |= {
         "unifg/py.typed",
         "unifg/view/live.js",
@@ -218,6 +221,21 @@ def test_console_script(clean: Path) -> None:
     for extra in EXTRAS:
         pytest.importorskip(extra)
     assert config()["project"]["version"] in run(clean / "unifg", "--version", cwd=clean)
+
+
+def test_a_table_of_a_paper_from_the_wheel(clean: Path, tmp_path: Path) -> None:
+    for extra in EXTRAS:
+        pytest.importorskip(extra)
+    out = run(clean / "unifg", "reproduce", "ecg2o", "--table", "1", cwd=tmp_path)
+    assert "| iterations, KKT, steps below 1e-3 | 5 | 7.33 | +2.33 |" in out
+    assert "--table III" in run(clean / "unifg", "reproduce", cwd=tmp_path) and not list(tmp_path.iterdir())
+    where = run(
+        clean / "python", "-I", "-c",
+        "from unifg.scenarios.papers import bazzana\n"
+        "print(*(len(bazzana.campaign(name)) for name in bazzana.ROMAN))",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert where.split() == ["480", "240"], "the campaigns and their maps"
 
 
 @pytest.mark.parametrize("installed", [False, True], ids=["not installed", "installed"])

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from benchmarks import ecg2o
-from benchmarks.against_ipopt import PAPER as ROWS
-from benchmarks.experiments import PAPER as LEGS
-from benchmarks.printed import numbers, pairs, printed, texts
 from unifg.errors import ScenarioError
+from unifg.scenarios.papers.bazzana import PAPER as LEGS
+from unifg.scenarios.papers.control_instances import PAPER as ROWS
+from unifg.scenarios.papers.ecg2o import drive
+from unifg.scenarios.papers.printed import numbers, pairs, printed, texts
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 PAPERS = CHECKOUT.parent / "shared" / "papers"
@@ -49,7 +50,8 @@ def test_no_generator_holds_such_a_number_itself() -> None:
     """Each stands once: in the file."""
     values = {word for paper, place in PLACES for text in texts(paper, place).values() for word in text.split()}
     long = {word for word in values if re.fullmatch(r"\d+\.\d{2,}", word)}
-    for path in sorted((CHECKOUT / "benchmarks").glob("*.py")):
+    folders = CHECKOUT / "benchmarks", CHECKOUT / "scenarios" / "papers"
+    for path in sorted(path for folder in folders for path in folder.glob("*.py")):
         held = set(re.findall(r"\d+\.\d{2,}", path.read_text(encoding="utf-8"))) & long
         assert not {word for word in held if float(word) > 1.0}, path.name
 
@@ -75,7 +77,7 @@ def test_pages_show_what_is_printed() -> None:
 def test_the_papers_profile_is_not_replaced_by_another(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("UNIFG_DATA", str(tmp_path))
     with pytest.raises(ScenarioError, match=r"velocity_profile_388\.csv.*UNIFG_DATA"):
-        ecg2o.drive(50)
+        drive(50)
     (tmp_path / "profiles").mkdir()
     with pytest.raises(ScenarioError, match=r"velocity_profile_388\.csv.*UNIFG_DATA"):
         ecg2o.report(1)

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks import quadrotor_flights, quadrotor_tables
+from benchmarks import quadrotor_tables
 from benchmarks.comparison import against, paired, share
-from benchmarks.quadrotor_flights import STUDIES, Job, cells
+from benchmarks.quadrotor_flights import STUDIES, cells
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.papers import corridor_flights
+from unifg.scenarios.papers.corridor_flights import Job
 
 Row = dict[str, Any]
 
@@ -25,10 +27,10 @@ def short_rows() -> dict[str, Row]:
     """A row of each coupling, of flights that last a moment; through JSON, as they are stored."""
     rows = {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quadrotor_flights, "run_flight", moment)
+        patch.setattr(corridor_flights, "run_flight", moment)
         for coupling in quadrotor_tables.VARIANTS:
             job = Job("flights", "ipm", coupling, 1006)
-            row = {**asdict(job), **quadrotor_flights.fly(**asdict(job))}
+            row = {**asdict(job), **corridor_flights.fly(**asdict(job))}
             rows[coupling] = json.loads(json.dumps(row, allow_nan=False))
     return rows
 

@@ -11,7 +11,7 @@ import pytest
 
 import unifg as fg
 from benchmarks.comparison import share
-from benchmarks.obstacle_courses import METHODS, Method, Outcome, distinct, lowest, render
+from benchmarks.obstacle_courses import METHODS, distinct, lowest, render
 from judge import judge
 from unifg.errors import BackendError, ScenarioError
 from unifg.models import avoidance, quadrotor
@@ -28,6 +28,7 @@ from unifg.scenarios.course import (
     run_course,
     state_problem,
 )
+from unifg.scenarios.papers.courses import Method, Outcome
 from unifg.scenarios.scenes.course_log import course_log
 from unifg.scenarios.scenes.course_plot import chosen_iterates, picture, plot_above
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS

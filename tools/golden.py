@@ -28,19 +28,18 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks import control_cases, ecg2o, incremental, pose_graphs
+from benchmarks import control_cases, incremental, pose_graphs
 from benchmarks.navigation import CASES, settings_of
 from benchmarks.report import OUT
 from problems import collection
 from problems.control import Problem, blocked, problems
-from problems.known import STARTS
-from problems.known import ecg2o as small
 from unifg.errors import UnifgError
 from unifg.pose_graphs import PoseGraph
 from unifg.scenarios import manoeuvres
 from unifg.scenarios.course import CourseSettings, run_course
 from unifg.scenarios.flight import FlightSettings, run_flight
 from unifg.scenarios.navigation import NavigationSettings, run_navigation
+from unifg.scenarios.papers import ecg2o
 from unifg.solvers import DogLeg, GaussNewton, GraduatedNonConvexity
 from unifg.solvers.names import backends
 from unifg.typing import Array
@@ -188,9 +187,9 @@ def of_ecg2o() -> Rows:
         for length in ecg2o.LENGTHS:
             for name, solver in solvers.items():
                 yield f"drive {drag} {length}, {name}", partial(built, solver, partial(ecg2o.drive, length, drag))
-    for start in STARTS:
+    for start in ecg2o.STARTS:
         for name, solver in {**solvers, "literal": ecg2o.literal(10.0), "damped": ecg2o.damped(10.0)}.items():
-            yield f"small {start}, {name}", partial(built, solver, partial(small, start))
+            yield f"small {start}, {name}", partial(built, solver, partial(ecg2o.small, start))
 
 
 def of_graphs() -> Rows:

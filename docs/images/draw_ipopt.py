@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.against_ipopt import DT, LIMIT, PAPER, RHO, STEPS, STOP, Casadi, Instance, Ours, bearings
+from benchmarks.against_ipopt import Casadi
+from unifg.scenarios.papers.control_instances import DT, LIMIT, PAPER, RHO, STEPS, STOP, Instance, Ours, bearings
 from unifg.solvers import AugmentedLagrangian
 from unifg.style.colours import css
 from unifg.style.figures import new_figure, write_figure

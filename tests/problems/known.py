@@ -10,9 +10,11 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import obstacles, unicycle
+from unifg.scenarios.papers import ecg2o as study
 from unifg.typing import Array
 
 Guess = dict[fg.Family, Array]
+ecg2o, STARTS = study.small, study.STARTS
 
 
 @dataclass(frozen=True)
@@ -42,25 +44,6 @@ def line(count: int = 4) -> tuple[fg.Graph, fg.Family]:
     """An empty graph over ``count`` points of the plane."""
     graph = fg.Graph()
     return graph, graph.variables("x", fg.Rn(2), count)
-
-
-def ecg2o_residual(x: Array) -> Array:
-    """Residuals of ecg2o's second case study."""
-    return np.stack([x[:, 0] + np.exp(-x[:, 1]), x[:, 0] ** 2 + 2.0 * x[:, 1] + 1.0], axis=1)
-
-
-def ecg2o_equality(x: Array) -> Array:
-    """Its constraint."""
-    return (x[:, 0] + x[:, 0] ** 3 + x[:, 1] + x[:, 1] ** 2)[:, None]
-
-
-def ecg2o(start: tuple[float, float]) -> tuple[fg.Graph, Guess]:
-    """ecg2o case study 2 from one of its starts."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
-    graph.minimize(ecg2o_residual, x, name="cost")
-    graph.constrain(ecg2o_equality, x, lower=0.0, upper=0.0, name="curve")
-    return graph, {x: np.array([start])}
 
 
 def ecg2o_inequality() -> tuple[fg.Graph, Guess]:
@@ -282,7 +265,6 @@ def inverse_distance() -> tuple[fg.Graph, Guess]:
     return graph, {x: np.array([[3.0]])}
 
 
-STARTS = [(-0.2, -0.2), (-1.2, -1.0), (1.0, 1.0), (-2.0, -2.0), (0.5, -0.5), (2.0, 2.0)]
 ROOT5 = 5.0**-0.5
 INLIERS = (0.8 / 3.0) ** 2 + (0.2 / 3.0) ** 2 + (0.5 / 3.0) ** 2
 HUBER = 0.5 * (INLIERS + 2.0 * 0.5 * (8.0 - 0.8 / 3.0) - 0.25)

@@ -1,0 +1,1 @@
+"""Tables and figures of the four papers, computed again beside the printed numbers: ``unifg reproduce``."""
