@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from html import escape
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,10 +19,7 @@ from unifg.errors import GraphError, UnifgError
 from unifg.modeling.variables import Family
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
-from unifg.typing import Array
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Figure
 
 
 class FactorNorms(dict[str, Array]):
