@@ -55,6 +55,8 @@ __all__ = [
 STATE = Product(p=Rn(3), R=SO3, v=Rn(3))
 """Storage (p, quaternion wxyz, v), 10 numbers; tangent (p, rotation vector, v), 9."""
 
+P, R, V = (STATE.component(name).storage for name in ("p", "R", "v"))
+
 CONTROL = Rn(4)
 """Body rates [rad/s], 3, and thrust [N]."""
 
@@ -135,8 +137,7 @@ class Parameters:
 
 def pushed(x: Array, thrust: Array, mass: Array, drag: Array) -> Array:
     """(n, 3) acceleration by the rotors, whose thrust is (n, 1), and the air [m/s^2]."""
-    attitude = x[:, 3:7]
-    return SO3.act(attitude, thrust * UP - drag * SO3.act(SO3.inverse(attitude), x[:, 7:10])) / mass
+    return SO3.act(x[:, R], thrust * UP - drag * SO3.act(SO3.inverse(x[:, R]), x[:, V])) / mass
 
 
 def field(x: Array, u: Array, w: Array, mass: Array, drag: Array, wind: Array, updraft: Array) -> Array:
@@ -274,9 +275,9 @@ def _defect(
     """(n, 9) rows of the trapezoid, given what the air adds to the acceleration (n, 3)."""
     h = np.reshape(dt, (-1, 1))
     push = 0.5 * (pushed(x, thrust, mass, drag) + pushed(x_next, thrust, mass, drag))
-    moved = x_next[:, :3] - x[:, :3] - 0.5 * h * (x[:, 7:] + x_next[:, 7:])
-    turned = SO3.log(SO3.compose(SO3.inverse(x[:, 3:7]), x_next[:, 3:7])) - h * rates
-    return np.concatenate([moved, turned, x_next[:, 7:] - x[:, 7:] - h * (push - GRAVITY * UP + blow)], axis=1)
+    moved = x_next[:, P] - x[:, P] - 0.5 * h * (x[:, V] + x_next[:, V])
+    turned = SO3.log(SO3.compose(SO3.inverse(x[:, R]), x_next[:, R])) - h * rates
+    return np.concatenate([moved, turned, x_next[:, V] - x[:, V] - h * (push - GRAVITY * UP + blow)], axis=1)
 
 
 def _calm(x: Array, u: Array, x_next: Array, rho: Array, dt: Array) -> Array:
