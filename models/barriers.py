@@ -30,6 +30,7 @@ from unifg.factors.autodiff.rates import rate
 from unifg.factors.residuals import Residual
 from unifg.lie import Manifold
 from unifg.models import quadrotor
+from unifg.models.quadrotor import P, V
 from unifg.typing import Array
 
 __all__ = [
@@ -56,7 +57,6 @@ Flow: TypeAlias = Callable[[Array, Array], Array]
 
 AMBIGUOUS = "say many=True for a function of a set of obstacles, many=False for one of a single one"
 
-P, V = quadrotor.STATE.component("p").storage, quadrotor.STATE.component("v").storage
 DOWN = np.array([0.0, 0.0, -quadrotor.GRAVITY])  # [m/s^2]
 
 

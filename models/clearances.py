@@ -14,12 +14,10 @@ import numpy as np
 from unifg.errors import ModelError
 from unifg.factors.residuals import Residual
 from unifg.lie import SO3
-from unifg.models import quadrotor
+from unifg.models.quadrotor import P, R
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["inside_sphere", "on_body", "polyhedron", "to_point"]
-
-P, R = quadrotor.STATE.component("p").storage, quadrotor.STATE.component("R").storage
 
 
 def inside_sphere(p: Array, centre: Array, radius: Any) -> Array:

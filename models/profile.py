@@ -32,7 +32,7 @@ def plain(distance: Residual, profile: Callable[[Array], Array], name: str) -> R
     composed = partial(_composed, profile, function)
     if kernel is None:
         return residual(composed, name=name)
-    return residual(replace(kernel, function=composed, name=name, linear=False, second=None))
+    return residual(replace(kernel, function=composed, name=name, linear=False))
 
 
 def _composed(profile: Callable[[Array], Array], function: Callable[..., Array], *arguments: Array) -> Array:

@@ -9,7 +9,11 @@ the product group R3 x SO(3) x R3,
 
 The dynamics of a graph are the implicit trapezoid on that group (Ta III-B). The rate is held over a step, so that
 the logarithm of the turn is parallel to it, dexp_inv leaves it alone, and the full and the simplified trapezoid have
-the same solutions; the rows are those of the simplified one. The attitude they lead to, R Exp(h omega), is exact.
+the same solutions; the rows are those of the simplified one,
+
+    p+ - p - h/2 (v + v+),    Log(R^-1 R+) - h (omega + w_omega),    v+ - v - h/2 (a(x) + a(x+))
+
+with the acceleration a, the last three numbers of F. The attitude they lead to, R Exp(h omega), is exact.
 
 Log(Exp(-h omega) R' R+) would vanish in the same places. Ta's row is linear in the rate, and its second derivatives are
 exact wherever it is evaluated and not only where it vanishes.
@@ -23,10 +27,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from unifg.errors import ModelError
-from unifg.factors.kernel import Kernel
+from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import residual
 from unifg.lie import SO3, Product, Rn
-from unifg.models import quadrotor_dynamics, quadrotor_second
+from unifg.models import quadrotor_dynamics
 from unifg.models.quadrotor_dynamics import GRAVITY
 from unifg.models.rkmk import alike
 from unifg.typing import Array, ArrayLike
@@ -51,6 +55,8 @@ __all__ = [
 STATE = Product(p=Rn(3), R=SO3, v=Rn(3))
 """Storage (p, quaternion wxyz, v), 10 numbers; tangent (p, rotation vector, v), 9."""
 
+P, R, V = (STATE.component(name).storage for name in ("p", "R", "v"))
+
 CONTROL = Rn(4)
 """Body rates [rad/s], 3, and thrust [N]."""
 
@@ -68,6 +74,9 @@ WIND = Rn(2)
 
 UPDRAFT = Rn(1)
 """What the wind adds to the vertical acceleration [m/s^2]. At hover it cannot be told from the mass: fix one."""
+
+UP = np.array([0.0, 0.0, 1.0])
+"""The vertical, and the axis of the thrust in the body."""
 
 
 @dataclass(frozen=True)
@@ -126,16 +135,19 @@ class Parameters:
         return cls(mass, (rest[0], rest[1], rest[2]), (rest[3], rest[4]), rest[5])
 
 
+def pushed(x: Array, thrust: Array, mass: Array, drag: Array) -> Array:
+    """(n, 3) acceleration by the rotors, whose thrust is (n, 1), and the air [m/s^2]."""
+    return SO3.act(x[:, R], thrust * UP - drag * SO3.act(SO3.inverse(x[:, R]), x[:, V])) / mass
+
+
 def field(x: Array, u: Array, w: Array, mass: Array, drag: Array, wind: Array, updraft: Array) -> Array:
     """F, (n, 9), for :func:`unifg.models.rkmk.integrator` on :data:`STATE`; an argument with one row is shared by all.
 
     The trapezoid made of it has the defect of :data:`disturbed_dynamics`; the other integrators are there to compare.
     """
     x, u, w, mass, drag, wind, updraft = alike(x, u, w, mass, drag, wind, updraft)
-    attitude, speed, up = x[:, 3:7], x[:, 7:], np.array([0.0, 0.0, 1.0])
-    force = u[:, 3:] * up - drag * SO3.act(SO3.inverse(attitude), speed)
-    acceleration = SO3.act(attitude, force) / mass - GRAVITY * up + np.concatenate([wind, updraft], axis=1) + w[:, 3:]
-    return np.concatenate([speed, u[:, :3] + w[:, :3], acceleration], axis=1)
+    acceleration = pushed(x, u[:, 3:], mass, drag) - GRAVITY * UP + np.concatenate([wind, updraft], axis=1) + w[:, 3:]
+    return np.concatenate([x[:, 7:], u[:, :3] + w[:, :3], acceleration], axis=1)
 
 
 def step(x: ArrayLike, u: ArrayLike, dt: ArrayLike, parameters: Parameters) -> Array:
@@ -257,14 +269,30 @@ def _samples(dt: ArrayLike, moved: Array) -> Array:
     return np.ascontiguousarray(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)))
 
 
+def _defect(
+    x: Array, rates: Array, thrust: Array, blow: Array, mass: Array, drag: Array, x_next: Array, dt: Array
+) -> Array:
+    """(n, 9) rows of the trapezoid, given what the air adds to the acceleration (n, 3)."""
+    h = np.reshape(dt, (-1, 1))
+    push = 0.5 * (pushed(x, thrust, mass, drag) + pushed(x_next, thrust, mass, drag))
+    moved = x_next[:, P] - x[:, P] - 0.5 * h * (x[:, V] + x_next[:, V])
+    turned = SO3.log(SO3.compose(SO3.inverse(x[:, R]), x_next[:, R])) - h * rates
+    return np.concatenate([moved, turned, x_next[:, V] - x[:, V] - h * (push - GRAVITY * UP + blow)], axis=1)
+
+
+def _calm(x: Array, u: Array, x_next: Array, rho: Array, dt: Array) -> Array:
+    return _defect(x, u[:, :3], u[:, 3:], rho[:, 4:], rho[:, :1], rho[:, 1:4], x_next, dt)
+
+
+def _disturbed(
+    x: Array, u: Array, w: Array, mass: Array, drag: Array, wind: Array, updraft: Array, x_next: Array, dt: Array
+) -> Array:
+    blow = np.concatenate([wind, updraft], axis=1) + w[:, 3:]
+    return _defect(x, u[:, :3] + w[:, :3], u[:, 3:], blow, mass, drag, x_next, dt)
+
+
 dynamics = residual(
-    Kernel(
-        quadrotor_dynamics.dynamics,
-        (STATE, CONTROL, STATE, (7,), 0),
-        9,
-        name="quadrotor dynamics",
-        second=quadrotor_second.dynamics,
-    ),
+    StatedKernel(_calm, (STATE, CONTROL, STATE, (7,), ()), 9, name="quadrotor dynamics"),
     about="""
 ``dynamics(x, u, x_next, parameters, dt)``: defects of position [m], attitude [rad] and velocity [m/s], (n, 9).
 
@@ -273,12 +301,11 @@ parameters: (7,) or (n, 7), as :attr:`Parameters.packed` gives them; constants o
 )
 
 disturbed_dynamics = residual(
-    Kernel(
-        quadrotor_dynamics.disturbed_dynamics,
-        (STATE, CONTROL, NOISE, MASS, DRAG, WIND, UPDRAFT, STATE, 0),
+    StatedKernel(
+        _disturbed,
+        (STATE, CONTROL, NOISE, MASS, DRAG, WIND, UPDRAFT, STATE, ()),
         9,
         name="disturbed quadrotor dynamics",
-        second=quadrotor_second.disturbed_dynamics,
     ),
     about="""``disturbed_dynamics(x, u, w, mass, drag, wind, updraft, x_next, dt)``: the same defects, (n, 9).
 

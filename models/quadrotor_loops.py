@@ -27,7 +27,6 @@ STATE = Product(p=Rn(3), R=SO3, v=Rn(3), rate=Rn(3), spin=Rn(3), thrust=Rn(1))
 """Storage 17 numbers, of which the first ten are those of :data:`unifg.models.quadrotor.STATE`; tangent 16."""
 
 P, R, V, RATE, SPIN, THRUST = (STATE.component(name).storage for name in ("p", "R", "v", "rate", "spin", "thrust"))
-UP = np.array([0.0, 0.0, 1.0])
 
 
 def held(gain: float, lag: float, durations: ArrayLike) -> Array:
@@ -59,11 +58,6 @@ def held(gain: float, lag: float, durations: ArrayLike) -> Array:
     return found
 
 
-def _pushed(x: Array, thrust: Array, mass: Array, drag: Array) -> Array:
-    """(n, 3) acceleration by the rotors and the air [m/s^2]."""
-    return SO3.act(x[:, R], thrust * UP - drag * SO3.act(SO3.inverse(x[:, R]), x[:, V])) / mass
-
-
 def defect(x: Array, u: Array, mass: Array, drag: Array, gust: Array, x_next: Array, dt: Any, loops: Array) -> Array:
     """(n, 16) by what a step from x with the command u misses x_next.
 
@@ -84,12 +78,12 @@ def defect(x: Array, u: Array, mass: Array, drag: Array, gust: Array, x_next: Ar
     turned = told + loops[:, 5:6] * miss + loops[:, 6:7] * spin
     twisted = loops[:, 2:3] * miss + loops[:, 3:4] * spin
     mean = pushed + loops[:, 7:8] * short
-    push = 0.5 * (_pushed(x, mean, mass, drag) + _pushed(x_next, mean, mass, drag))
+    push = 0.5 * (quadrotor.pushed(x, mean, mass, drag) + quadrotor.pushed(x_next, mean, mass, drag))
     return np.concatenate(
         [
             x_next[:, P] - x[:, P] - 0.5 * h * (x[:, V] + x_next[:, V]),
             SO3.log(SO3.compose(SO3.inverse(x[:, R]), x_next[:, R])) - h * turned,
-            x_next[:, V] - x[:, V] - h * (push - quadrotor.GRAVITY * UP + gust),
+            x_next[:, V] - x[:, V] - h * (push - quadrotor.GRAVITY * quadrotor.UP + gust),
             x_next[:, RATE] - rate,
             x_next[:, SPIN] - twisted,
             x_next[:, THRUST] - pushed - loops[:, 4:5] * short,
@@ -100,6 +94,6 @@ def defect(x: Array, u: Array, mass: Array, drag: Array, gust: Array, x_next: Ar
 
 def field(x: Array, u: Array, mass: Array, drag: Array, gust: Array, gain: float, lag: float) -> Array:
     """F, (n, 16): x' in the tangent space of :data:`STATE`, for finite gains."""
-    push = _pushed(x, x[:, THRUST], mass, drag) - quadrotor.GRAVITY * UP + gust
+    push = quadrotor.pushed(x, x[:, THRUST], mass, drag) - quadrotor.GRAVITY * quadrotor.UP + gust
     twist = gain * (u[:, :3] - x[:, RATE]) - x[:, SPIN] / lag
     return np.concatenate([x[:, V], x[:, RATE], push, x[:, SPIN] / lag, twist, (u[:, 3:] - x[:, THRUST]) / lag], axis=1)

@@ -28,12 +28,11 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import residual
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.models.barriers import Barrier, P, V
+from unifg.models.barriers import Barrier
+from unifg.models.quadrotor import P, R, V
 from unifg.typing import Array
 
 __all__ = ["brakeable", "resting"]
-
-R = quadrotor.STATE.component("R").storage
 
 
 def _resting(x: Array) -> Array:

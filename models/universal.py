@@ -26,13 +26,11 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import residual
 from unifg.lie import SO3, Rn
 from unifg.models import quadrotor
+from unifg.models.quadrotor import UP, P, R, V
 from unifg.typing import Array, ArrayLike
 
 CONTROL = Rn(6)
 """Rates [rad/s], 3, and accelerations without gravity [m/s^2], 3, along the axes of the body."""
-
-P, R, V = (quadrotor.STATE.component(name).storage for name in ("p", "R", "v"))
-UP = np.array([0.0, 0.0, 1.0])
 
 
 def field(x: Array, u: Array) -> Array:

@@ -146,7 +146,7 @@ def state_problem(settings: CourseSettings, layout: Layout) -> tuple[fg.Graph, f
     graph.minimize(fg.prior, ahead.p, layout.target, sigma=s.goal**-0.5, name="goal")
     graph.minimize(fg.prior, x[-1].p, layout.target, sigma=s.end**-0.5, name="end")
     graph.minimize(fg.prior, x[-1].v, np.zeros(3), sigma=s.rest**-0.5, name="rest")
-    graph.minimize(landmarks.tilt, ahead.R, np.array([0.0, 0.0, 1.0]), sigma=s.level**-0.5, name="level")
+    graph.minimize(landmarks.tilt, ahead.R, quadrotor.UP, sigma=s.level**-0.5, name="level")
     effort = np.array([s.rate, s.rate, s.rate, s.thrust]) ** -0.5
     graph.minimize(fg.prior, u, quadrotor.hover(s.vehicle), sigma=effort, name="effort")
     motion = (x[:-1], u, ahead, s.vehicle.packed, s.dt)

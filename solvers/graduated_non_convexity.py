@@ -57,7 +57,7 @@ from unifg.solution.solver import Backend, Callback, Prepared, Solver
 from unifg.solution.status import Status
 from unifg.solvers.gating import CHANCE, Innovations, VarianceFactor, groups_of
 from unifg.solvers.least_squares import GaussNewton, LevenbergMarquardt
-from unifg.typing import Array, BoolArray, IntArray, Numbers
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers
 
 logger = logging.getLogger("unifg")
 
@@ -84,26 +84,17 @@ class _Held:
 
     held = False
 
-    def __init__(self, weights: Array) -> None:
-        self.weights = weights
+    def __init__(self, weights: ArrayLike) -> None:
+        self.weights: Array = np.asarray(weights, dtype=np.float64)
 
     def value(self, squared: Array) -> Array:
         return self.weights * squared
 
     def weight(self, squared: Array) -> Array:
-        return self.weights
+        return np.broadcast_to(self.weights, squared.shape)
 
 
-class _Square:
-    """No loss: where the graduation begins."""
-
-    held = False
-
-    def value(self, squared: Array) -> Array:
-        return squared
-
-    def weight(self, squared: Array) -> Array:
-        return np.ones_like(squared)
+NO_LOSS = _Held(1.0)  # where the graduation begins
 
 
 class _Stage:
@@ -113,7 +104,7 @@ class _Stage:
 
     def __init__(self, goal: Graduated) -> None:
         self.goal = goal
-        self.now: Loss = _Square()
+        self.now: Loss = NO_LOSS
         self.squared = np.zeros(0)
         self.largest = 0.0
 
@@ -293,7 +284,7 @@ class _Search:
         """Without the losses, then through their surrogates."""
         stages = self._stages
         for stage in stages:
-            stage.now, stage.largest = _Square(), 0.0
+            stage.now, stage.largest = NO_LOSS, 0.0
         self._plain = solution = self._from(guess)
         # The largest residual on the way from the guess: the solution without losses may hide an outlier by spreading
         # it over many weak measurements.
@@ -351,7 +342,7 @@ class _Search:
         factorization = program.systems.normal()
         for _ in range(ROUNDS):
             for stage in self._stages:
-                stage.now = _Square()
+                stage.now = NO_LOSS
             values = answer.solution.values
             plain = self._run.program.linearize(values)
             innovations = Innovations(program, factorization, program.linearize(values).hessian)

@@ -15,8 +15,7 @@ from test_derive import Open, compared, curved, evaluated, numpy_of_casadi
 from test_jacobians import BOX, CAR, CASES, COUNT, GRID, MOUNT, slopes_of
 from unifg.factors.autodiff.lookup import Lookup
 from unifg.factors.autodiff.rows import traced
-from unifg.factors.kernel import Argument, evaluate_rows
-from unifg.factors.residuals import Residual
+from unifg.factors.kernel import Argument
 from unifg.lie import SE2, SE3, SO2, SO3, Rn, wrap_angle
 from unifg.models import bicycle, cart_pole, manipulator, quadrotor
 from unifg.models.distance_map import HEADER, RING
@@ -710,28 +709,12 @@ def test_shipped_residuals_are_their_definitions_with_casadis_derivatives(name: 
 
     compared(r, case.function(*points, *constants))
     compared(J, np.concatenate(slopes_of(name), axis=2))
-    if case.kernel is not None and case.kernel.second is not None and name not in TABLES:
-        compared(H, shipped_hessian(case, points, manifolds, parameters, weights))
+    if case.kernel is not None and case.kernel.derived:
+        compared(H, case.kernel.second_derivatives(weights, *points, *constants))
     if name not in TABLES:
         slopes, bends = of_casadi(name, manifolds, variables, [shape_of(c) for c in constants], shared, weights)
         compared(J, slopes)
         compared(H, bends)
-
-
-def shipped_hessian(
-    case: Residual, points: list[Array], manifolds: list[fg.Manifold], parameters: list[Array], weights: Array
-) -> Array:
-    assert case.kernel is not None
-    variables, width = np.concatenate(points, axis=1), sum(m.dim for m in manifolds)
-    S = np.zeros((COUNT, width, width))
-    for k in range(COUNT):
-        own = [p[k] if p.shape[:1] == (COUNT,) else p for p in parameters]
-        flat = np.concatenate([np.zeros(0), *(np.ravel(p) for p in own)])[None]
-        evaluate_rows(
-            case.kernel.second_address, variables[k : k + 1].copy(), flat, case.kernel.table, weights[k : k + 1].copy(),
-            S[k : k + 1],
-        )  # fmt: skip
-    return S
 
 
 def of_casadi(

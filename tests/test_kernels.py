@@ -19,11 +19,10 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import Huber
-from unifg.models import landmarks, lidar, unicycle
+from unifg.models import lidar, unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.obstacles import disc_clearance, shortfall, wall_distance
 from unifg.models.potential import potential
-from unifg.models.quadrotor import STATE
 from unifg.typing import Array
 
 RNG = np.random.default_rng(23)
@@ -348,18 +347,6 @@ def test_stated_kernels_are_derived_when_they_are_needed() -> None:
     np.testing.assert_array_equal(copy(x, 2.0), kernel(x, 2.0))
     with pytest.raises(GraphError, match=r"bowl: argument 0 has shape \(2, 3\), expected \(n, 2\) for Rn\(2\)"):
         kernel(np.zeros((2, 3)), 2.0)
-
-
-def test_stated_kernels_take_second_derivatives_that_are_given() -> None:
-    assert landmarks.bearing_range.kernel is not None
-    given = landmarks.bearing_range.kernel
-    assert isinstance(given, StatedKernel) and not given.derived
-    derived = replace(given, second=None)
-    x, mark, seen = STATE.random(np.random.default_rng(0), (4,)), np.full((4, 2), 3.0), np.zeros(2)
-    weights = np.random.default_rng(1).normal(size=(4, 2))
-    np.testing.assert_allclose(
-        given.second_derivatives(weights, x, mark, seen), derived.second_derivatives(weights, x, mark, seen), atol=1e-12
-    )
 
 
 @pytest.mark.parametrize(

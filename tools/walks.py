@@ -122,7 +122,7 @@ def front() -> Walk:
 def _factorised(file: str, name: str, event: str) -> bool:
     if file != FACTORISED:
         return False
-    return (event == "return" and name in ("factor", "factor_solve")) or (event == "call" and name == "adopt")
+    return (event == "return" and name == "factor") or (event == "call" and name == "adopt")
 
 
 def guess() -> Walk:

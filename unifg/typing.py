@@ -1,9 +1,15 @@
-"""Array types shared by the whole package."""
+"""Types of arrays and pictures shared by the whole package."""
 
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:  # matplotlib is loaded where something is drawn
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+else:
+    Axes = Figure = Any
 
 Array: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.intp]
@@ -11,4 +17,4 @@ BoolArray: TypeAlias = NDArray[np.bool_]
 Numbers: TypeAlias = Any
 """What becomes an array, as a value of a dictionary: ``{x: array, tree: [[1, 2.0]]}`` has no `ArrayLike` in common."""
 
-__all__ = ["Array", "ArrayLike", "BoolArray", "IntArray", "Numbers"]
+__all__ = ["Array", "ArrayLike", "Axes", "BoolArray", "Figure", "IntArray", "Numbers"]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from unifg.scenarios.campaigns.comparison import interval, share
@@ -11,10 +9,7 @@ from unifg.scenarios.campaigns.sheet import Combination, Sheet
 from unifg.scenarios.campaigns.task import OK
 from unifg.style.colours import INK, css
 from unifg.style.figures import face, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Axes, Figure
 
 __all__ = ["outcomes_picture", "values_picture"]
 

@@ -26,7 +26,7 @@ def braking_control(
     wanted[2] = np.clip(wanted[2], -LIFT, LIFT)
     lift = wanted + np.array([-parameters.wind[0], -parameters.wind[1], quadrotor.GRAVITY - parameters.updraft])
     lift += SO3.act(rotation, np.array(parameters.drag) * SO3.act(SO3.inverse(rotation), velocity)) / parameters.mass
-    up = SO3.act(rotation, np.array([0.0, 0.0, 1.0]))
+    up = SO3.act(rotation, quadrotor.UP)
     thrust = parameters.mass * float(lift @ up)
     # The shortest turn of the body that brings its third axis along the lift.
     aim = SO3.act(SO3.inverse(rotation), lift / np.linalg.norm(lift))

@@ -25,7 +25,6 @@ from unifg.typing import Array
 __all__ = ["TUNED", "FlatnessController", "Gains", "flat_flight"]
 
 _AHEAD = np.array([1.0, 0.0, 0.0])  # where the nose points
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 def flat_flight(flown: Flown, parameters: quadrotor.Parameters) -> tuple[Array, Array]:
@@ -36,7 +35,7 @@ def flat_flight(flown: Flown, parameters: quadrotor.Parameters) -> tuple[Array, 
     mass, (dx, dy, dz) = parameters.mass, parameters.drag
     across = 0.5 * (dx + dy)
     blow = np.array([*parameters.wind, parameters.updraft])
-    force = mass * (flown.acceleration + quadrotor.GRAVITY * _UP - blow) + across * flown.velocity
+    force = mass * (flown.acceleration + quadrotor.GRAVITY * quadrotor.UP - blow) + across * flown.velocity
     change = mass * flown.jerk + across * flown.acceleration
     size = np.linalg.norm(force, axis=1, keepdims=True)
     up = force / size
@@ -113,7 +112,7 @@ class FlatnessController:
         turn = 2.0 * np.array([0.0, 0.0, z]) / max(tip, 1e-9)
         fed = SO3.act(error, controls[0, :3])
         rates = fed + self.gains.tilt * tilt + self.gains.heading * turn
-        along = SO3.act(state[3:7], _UP)
-        thrust = controls[0, 3] * max(float(along @ SO3.act(meant, _UP)), 0.0)
+        along = SO3.act(state[3:7], quadrotor.UP)
+        thrust = controls[0, 3] * max(float(along @ SO3.act(meant, quadrotor.UP)), 0.0)
         control: Array = np.clip(np.concatenate([rates, [thrust]]), self.least, self.most)
         return control

@@ -21,7 +21,6 @@ from unifg.scenarios.quadrotor.guide import Reference
 from unifg.scenarios.quadrotor.slots import FAR_AWAY, SPARE, SlotObstacles
 from unifg.typing import Array, ArrayLike, BoolArray
 
-UP = np.array([0.0, 0.0, 1.0])
 SLOWING = 0.3  # [s] in which a speed above the limit is to fade
 
 
@@ -142,7 +141,7 @@ class Limits:
 
 def upright(now: Context[FlightInput]) -> Array:
     """(3,) vertical axis in the body at hover."""
-    return SO3.act(SO3.inverse(level(now.given.belief)), UP)
+    return SO3.act(SO3.inverse(level(now.given.belief)), quadrotor.UP)
 
 
 def level(belief: Belief) -> Array:

@@ -6,7 +6,7 @@ row, along its way.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -17,11 +17,7 @@ from unifg.scenarios.scenes.panels import shade_distance
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import face, ground, headline, key_of, new_figure
-from unifg.typing import Array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Axes, Figure
 
 __all__ = ["chosen_iterates", "picture", "plot_above", "plot_numbers", "plot_space"]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from unifg.plots.shown import every
@@ -14,10 +12,7 @@ from unifg.scenarios.scenes.drive_scene import drive_stage, place_movers
 from unifg.scenarios.scenes.panels import over_time, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import css
 from unifg.style.figures import headline, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Axes, Figure
 
 __all__ = ["overview", "plot_controls", "plot_localisation", "plot_map"]
 

@@ -9,7 +9,7 @@ three greatest rates [rad/s], and ``thrust_limits``, least and greatest thrust [
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -22,11 +22,7 @@ from unifg.scenarios.scenes.flight_scene import flight_frame, flight_stage, sens
 from unifg.scenarios.scenes.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import INK, css
 from unifg.style.figures import ground, headline, key_of, new_figure
-from unifg.typing import Array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Axes, Figure
 
 __all__ = [
     "control",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +15,8 @@ from unifg.scenarios.pose_graph import SolvedGraph
 from unifg.scenarios.scenes.graph_scene import declare_layers, draw_graph, draw_points, line_width, segments
 from unifg.style.colours import INK
 from unifg.style.figures import headline, key_of, new_figure
-from unifg.typing import BoolArray
+from unifg.typing import Axes, BoolArray, Figure
 from unifg.view import Scene
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["picture", "plot_cost", "plot_graph"]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from unifg.lie import SE2
@@ -11,11 +9,8 @@ from unifg.plots.shown import every
 from unifg.scenarios.range_logs import LogRun
 from unifg.style.colours import css
 from unifg.style.figures import face, headline, key_of, new_figure
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, Figure, IntArray
 from unifg.view import Scene, shapes
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 __all__ = ["log_scene", "picture"]
 

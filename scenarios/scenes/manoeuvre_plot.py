@@ -6,8 +6,6 @@ optimum is blue. Nothing is told by colour alone: the guess is dashed, the optim
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from unifg.plots.descent import draw_errors
@@ -15,14 +13,10 @@ from unifg.scenarios.manoeuvres import Manoeuvre
 from unifg.scenarios.scenes.panels import plot_held, shade_distance
 from unifg.style.colours import INK, css
 from unifg.style.figures import face, ground, headline, new_figure
-from unifg.typing import Array
+from unifg.typing import Array, Axes, Figure
 from unifg.view import Part, Scene
 from unifg.view.bodies import body_of
 from unifg.view.shapes import merge, ring, wedge
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 __all__ = ["picture", "plot_control", "plot_iterates", "plot_violation", "shades"]
 

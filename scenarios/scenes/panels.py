@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from textwrap import fill
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from unifg.style.colours import GREY, css
 from unifg.style.figures import dashes, face
-from unifg.typing import Array, ArrayLike
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from unifg.typing import Array, ArrayLike, Axes
 
 __all__ = [
     "over_time",

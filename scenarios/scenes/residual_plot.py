@@ -9,18 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unifg.errors import UnifgError
 from unifg.solution.history import Iteration
 from unifg.style.figures import new_figure, write_figure
-from unifg.typing import Array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Axes, Figure
 
 __all__ = ["ResidualMonitor", "plot_residuals", "residual_picture"]
 

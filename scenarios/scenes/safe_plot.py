@@ -6,7 +6,6 @@ After FactorMPC, Fig. 4 to 7 and 10: the speed of the path is the dashed curve, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,11 +13,7 @@ from unifg.scenarios.logs.safe_log import SafeLog
 from unifg.scenarios.scenes.safe_scene import place_bodies, resting, safe_stage
 from unifg.style.colours import GREY, css
 from unifg.style.figures import face, ground, headline, new_figure
-from unifg.typing import Array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Axes, Figure
 
 __all__ = ["picture", "plot_above", "plot_distance", "plot_error", "plot_speed", "plot_time"]
 

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from unifg.plots.descent import draw_errors
 from unifg.scenarios.scenes.panels import plot_held
 from unifg.scenarios.velocity_tracking import Drive, metrics
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import face, headline, new_figure
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Axes, Figure
 
 __all__ = ["picture", "plot_error", "plot_force", "plot_numbers", "plot_speed"]
 

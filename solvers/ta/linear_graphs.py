@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -45,10 +45,7 @@ from unifg.solvers.ta.elimination import (
     Undetermined,
     eliminate,
 )
-from unifg.typing import Array, BoolArray, IntArray, Numbers
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from unifg.typing import Array, Axes, BoolArray, IntArray, Numbers
 
 
 @dataclass(frozen=True, eq=False)

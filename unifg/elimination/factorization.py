@@ -117,7 +117,7 @@ class Factorization:
 
     @property
     def plan(self) -> Plan:
-        """Arguments of the compiled kernels `fronts.factor`, `substitution.solve` and `substitution.factor_solve`."""
+        """Arguments of the compiled kernels `fronts.factor` and `substitution.solve`."""
         if self._plan is None:
             self._plan = self.structure.with_memory()
         return self._plan
@@ -146,27 +146,6 @@ class Factorization:
         """
         self._forget()
         self._ready = success
-
-    def factor_solve(self, data: Array, added: Array | None, right: Array, out: Array) -> bool:
-        """Factorise and solve in one compiled call.
-
-        Args:
-            data: (nnz,) entries in the order of the pattern.
-            added: (n,) numbers added to the diagonal, or None.
-            right: (n,).
-            out: (n,) contiguous doubles, receives the solution; untouched when the answer is False.
-
-        Raises:
-            UnifgError: an array has the wrong shape, or the structure asked for makes no sense.
-        """
-        data = _numbers(data, self.pattern.nnz, "data")
-        added = NOTHING if added is None else _numbers(added, self.pattern.size, "added")
-        right = _numbers(right, self.pattern.size, "the right-hand side")
-        if out.shape != right.shape or out.dtype != np.float64 or not out.flags.c_contiguous:
-            raise UnifgError(f"out must be {len(right)} contiguous doubles")
-        self._forget()
-        self._ready = bool(substitution.factor_solve(self.plan, data, added, right, out))
-        return self._ready
 
     def solve(self, right: Array) -> Array:
         """Solve for one right-hand side (n,) or several (n, k).

@@ -19,7 +19,7 @@ POSITIVE, NEGATIVE, ZERO, FAILED = range(4)
 
 
 class Plan(NamedTuple):
-    """Arguments of the compiled kernels `factor`, `solve` and `factor_solve`.
+    """Arguments of the compiled kernels `factor` and `solve`.
 
     A front eliminates its pivots and passes an update matrix on the ``rows`` scalars it shares with later fronts. Its
     panel is a (pivots, pivots + rows) matrix of which the entries on and right of the diagonal are the factor:

@@ -9,7 +9,6 @@ import numpy as np
 from unifg.codegen.jit import compiled
 from unifg.codegen.loops import copy_to
 from unifg.codegen.vectors import Address, address, blend, get, load, minus, plus_products, put, splat, store, total
-from unifg.elimination.fronts import factor
 from unifg.elimination.plan import ADJACENT, FIRST, FRONTS, INDEX, PANEL, PIVOTS, ROWS, SCALARS, STRIDE, Plan
 from unifg.typing import Array, IntArray
 
@@ -134,15 +133,6 @@ def solve(plan: Plan, right: Array, out: Array) -> None:
                         put(x, get(rows, index + i), get(x, local + width + i))
     for i in range(scalars):
         put(out, get(order, i), get(x, i))
-
-
-@compiled
-def factor_solve(plan: Plan, data: Array, added: Array, right: Array, out: Array) -> bool:
-    """Factorise and solve; arguments as for `fronts.factor` and `solve`. ``out`` is untouched when this fails."""
-    if not factor(plan, data, added):
-        return False
-    solve(plan, right, out)
-    return True
 
 
 @compiled

@@ -74,52 +74,6 @@ def between(x: Array, y: Array, out: Array) -> None:
 
 
 @compiled
-def write_relative(x: Array, y: Array, p: Array, r: Array, J: Array) -> None:
-    """Write ``Log(p^-1 x^-1 y)`` and, unless J is empty, its (3, 6) derivatives; p may be empty for the identity.
-
-    What `between`, `log`, `right_jacobian_inverse` and `adjoint` make of it one after the other, with each angle's sine
-    and cosine found once: they are most of what an edge of a map costs.
-    """
-    theta = x[2]
-    dx, dy, turn = y[0] - x[0], y[1] - x[1], wrap(y[2] - theta)
-    c, s = math.cos(theta), math.sin(theta)
-    tx, ty = c * dx + s * dy, c * dy - s * dx
-    ex, ey, omega = tx, ty, turn
-    if len(p):
-        c, s = math.cos(p[2]), math.sin(p[2])
-        dx, dy, omega = tx - p[0], ty - p[1], wrap(turn - p[2])
-        ex, ey = c * dx + s * dy, c * dy - s * dx
-    half = 0.5 * omega
-    g = x_cot_x(half)
-    vx, vy = g * ex + half * ey, g * ey - half * ex
-    r[0] = vx
-    r[1] = vy
-    r[2] = omega
-    if len(J):
-        k = omega * k_value(omega * omega, g)
-        a, b = k * vx + 0.5 * vy, k * vy - 0.5 * vx
-        # Ad of the inverse of (t, turn) is [R', (-t sin, cos ...); 0, 1].
-        c, s = math.cos(turn), math.sin(turn)
-        first, second = s * tx - c * ty, c * tx + s * ty
-        J[0, 0] = -half * s - g * c
-        J[0, 1] = half * c - g * s
-        J[0, 2] = half * second - g * first - a
-        J[1, 0] = g * s - half * c
-        J[1, 1] = -half * s - g * c
-        J[1, 2] = -half * first - g * second - b
-        J[2, 0] = J[2, 1] = 0.0
-        J[2, 2] = -1.0
-        J[0, 3] = g
-        J[0, 4] = -half
-        J[0, 5] = a
-        J[1, 3] = half
-        J[1, 4] = g
-        J[1, 5] = b
-        J[2, 3] = J[2, 4] = 0.0
-        J[2, 5] = 1.0
-
-
-@compiled
 def retract(x: Array, d: Array, out: Array) -> None:
     """``x Exp(d)``: the chord of the arc has length |v| sin(h)/h and direction theta + h."""
     px, py, theta = x[0], x[1], x[2]

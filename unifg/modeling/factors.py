@@ -23,7 +23,7 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.kernel import Kernel
 from unifg.factors.per_factor import per_factor
 from unifg.factors.residuals import Residual, residual
-from unifg.lie import LieGroup, Manifold, Rn, rn, se2
+from unifg.lie import LieGroup, Manifold, Rn, rn
 from unifg.lie.functions import Functions, functions_of
 from unifg.lie.product import leaves
 from unifg.typing import Array
@@ -65,8 +65,6 @@ def _relative(group: LieGroup, functions: Functions) -> Callable[..., None]:
     storage, dim = group.storage, group.dim
     between, log, adjoint = functions.between, functions.log, functions.adjoint
     inverse_jacobian = functions.right_jacobian_inverse
-    if (between, log, adjoint, inverse_jacobian) == (se2.between, se2.log, se2.adjoint, se2.right_jacobian_inverse):
-        return _planar_relative
 
     @compiled
     def kernel(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
@@ -92,12 +90,6 @@ def _relative(group: LieGroup, functions: Functions) -> Callable[..., None]:
                     J[i, dim + k] = after[i, k]
 
     return kernel
-
-
-@compiled
-def _planar_relative(v: Array, p: Array, table: Array, r: Array, J: Array) -> None:
-    """The same in the plane."""
-    se2.write_relative(vector(v, 0, 3), vector(v, 3, 3), p, r, J)
 
 
 def _deviation(group: LieGroup, functions: Functions) -> Callable[..., None]:

@@ -16,7 +16,7 @@ from typing import Any, Final, TypeAlias, TypeVar
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.factors.residuals import Residual, as_residual, residual
+from unifg.factors.residuals import Residual, as_residual
 from unifg.factors.robust import Loss
 from unifg.lie import Manifold, Rn
 from unifg.lie.product import Product
@@ -24,7 +24,7 @@ from unifg.modeling.duplicates import doubles
 from unifg.modeling.elements import on_manifolds
 from unifg.modeling.factors import ManifoldResidual
 from unifg.modeling.probing import rows_of
-from unifg.modeling.soft import Slack, Soft, slack_of
+from unifg.modeling.soft import Soft, slack_of
 from unifg.modeling.summary import inventory
 from unifg.modeling.terms import Constraint, Cost, Fix, Parameter, ScalarCost, Term, prepare_arguments
 from unifg.modeling.variables import (
@@ -358,6 +358,26 @@ class Model:
 
     # ---------------------------------------------------------------- statements, looked at before they are kept
 
+    def _begun(
+        self,
+        name: str | None,
+        function: AnyResidual,
+        arguments: tuple[Any, ...],
+        active: Any,
+        replaced: bool,
+        default: str = "",
+        scalar: bool = False,
+    ) -> dict[str, Any]:
+        """Parts that every kind of term has, by their names in :class:`Term`."""
+        wrapped = complete(function, arguments, name)
+        unique = self._unique(name, default or wrapped.name, replaced)
+        normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
+        size = rows_of(unique, wrapped, normal, count, scalar=scalar)
+        return {
+            "name": unique, "residual": wrapped, "arguments": normal, "active": active, "count": count, "size": size,
+            "rows": rows,
+        }  # fmt: skip
+
     def _cost(
         self,
         name: str | None,
@@ -372,17 +392,15 @@ class Model:
         with placed(name, arguments):
             if sigma is not None and information is not None:
                 raise GraphError(f"term '{name or title(function)}': give sigma or information, not both", term=name)
-            wrapped = complete(function, arguments, name)
-            unique = self._unique(name, wrapped.name, replaced)
-            normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
+            parts = self._begun(name, function, arguments, active, replaced)
+            unique = parts["name"]
             if robust is not None and (isinstance(robust, type) or not hasattr(robust, "weight")):
                 raise GraphError(
                     f"term '{unique}': robust= must be a loss such as fg.Huber(1.345), found {robust!r}", term=unique
                 )
-            size = rows_of(unique, wrapped, normal, count)
-            sigma, information = check_weights(unique, sigma, information, count, size)
+            sigma, information = check_weights(unique, sigma, information, parts["count"], parts["size"])
             self._own_data(unique, sigma, information)
-            return Cost(unique, wrapped, normal, active, count, size, sigma, information, robust, rows=rows)
+            return Cost(**parts, sigma=sigma, information=information, robust=robust)
 
     def _scalar_cost(
         self,
@@ -393,11 +411,7 @@ class Model:
         replaced: bool = False,
     ) -> ScalarCost:
         with placed(name, arguments):
-            wrapped = complete(function, arguments, name)
-            unique = self._unique(name, wrapped.name, replaced)
-            normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
-            size = rows_of(unique, wrapped, normal, count, scalar=True)
-            return ScalarCost(unique, wrapped, normal, active, count, size, rows=rows)
+            return ScalarCost(**self._begun(name, function, arguments, active, replaced, scalar=True))
 
     def _constraint(
         self,
@@ -409,33 +423,18 @@ class Model:
         active: Any,
         soft: Soft | Parameter | None,
         replaced: bool = False,
+        default: str = "",
     ) -> Constraint:
+        is_bound = function is itself
         with placed(name, arguments):
-            wrapped = complete(function, arguments, name)
-            unique = self._unique(name, wrapped.name, replaced)
-            normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
-            size = rows_of(unique, wrapped, normal, count)
-            lower, upper = _given("a constraint", unique, lower, upper)
-            lower, upper = check_limits(unique, lower, upper, count, size)
+            parts = self._begun(name, function, arguments, active, replaced, default)
+            unique, wrapped, shape = parts["name"], parts["residual"], (parts["count"], parts["size"])
+            lower, upper = _given("a bound" if is_bound else "a constraint", unique, lower, upper)
+            lower, upper = check_limits(unique, lower, upper, *shape)
             self._own_data(unique, lower, upper)
-            slack = self._slack(unique, wrapped, lower, upper, count, size, soft)
-            return Constraint(unique, wrapped, normal, active, count, size, lower, upper, slack=slack, rows=rows)
-
-    def _slack(
-        self,
-        name: str,
-        wrapped: Residual,
-        lower: Parameter,
-        upper: Parameter,
-        count: int,
-        size: int,
-        soft: Soft | Parameter | None,
-    ) -> Slack | None:
-        if soft is None:
-            return None
-        slack = slack_of(name, soft, lower, upper, count, size, wrapped)
-        self._own_data(name, *slack.soft.data)
-        return slack
+            slack = None if soft is None else slack_of(unique, soft, lower, upper, *shape, wrapped)
+            self._own_data(unique, *(slack.soft.data if slack is not None else ()))
+            return Constraint(**parts, lower=lower, upper=upper, is_bound=is_bound, slack=slack)
 
     def _bound(
         self,
@@ -447,22 +446,15 @@ class Model:
         replaced: bool = False,
     ) -> Constraint:
         selection = _one_variable("a bound", stated, name)
-        with placed(name, (selection,)):
-            if not isinstance(selection.manifold, Rn):
-                raise GraphError(
-                    f"bound on family '{selection.family.name}': {selection.manifold.name} is not Rn; bound a "
-                    "component, or use constrain with a function",
-                    family=selection.family.name,
-                )
-            unique, wrapped = self._unique(name, f"{selection.family.name} bounds", replaced), residual(itself)
-            normal, rows, active, count = self._arguments(unique, wrapped, (selection,), None)
-            size = selection.manifold.dim
-            lower, upper = _given("a bound", unique, lower, upper)
-            lower, upper = check_limits(unique, lower, upper, count, size)
-            self._own_data(unique, lower, upper)
-            slack = self._slack(unique, wrapped, lower, upper, count, size, soft)
-            parts = (unique, wrapped, normal, active, count, size, lower, upper)
-            return Constraint(*parts, is_bound=True, slack=slack, rows=rows)
+        family = selection.family.name
+        if not isinstance(selection.manifold, Rn):
+            raise GraphError(
+                f"bound on family '{family}': {selection.manifold.name} is not Rn; bound a component, or use constrain "
+                "with a function",
+                term=name,
+                family=family,
+            )
+        return self._constraint(name, itself, (selection,), lower, upper, None, soft, replaced, f"{family} bounds")
 
     def _fix(self, name: str | None, stated: tuple[Any, ...], replaced: Fix | None = None) -> Fix:
         if len(stated) != 2:

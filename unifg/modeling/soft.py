@@ -65,16 +65,21 @@ class Slack:
 
     def signed(self, values: Array) -> Array:
         """(n, m) violation: positive above an upper limit, negative below a lower one."""
-        if self.sides != UPPER | LOWER:
-            return values if self.sides == UPPER else -values
-        size = values.shape[1] // 2
-        return values[:, :size] - values[:, size:]
+        return signed(values, self.sides)
 
     def stored(self, above: Array, below: Array) -> Array:
         """Values of the family, of (n, m) violations of the upper and the lower limits."""
         if self.sides != UPPER | LOWER:
             return above if self.sides == UPPER else below
         return np.concatenate([above, below], axis=1)
+
+
+def signed(values: Array, sides: int) -> Array:
+    """(n, m) violation that slacks stand for: positive above an upper limit, negative below a lower one."""
+    if sides != UPPER | LOWER:
+        return values if sides == UPPER else -values
+    size = values.shape[1] // 2
+    return values[:, :size] - values[:, size:]
 
 
 def slack_of(

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from unifg.errors import ViewError
 from unifg.style.colours import GREY, css
 from unifg.style.figures import face, new_figure
-from unifg.typing import Array
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Axes, Figure
 
 WIDE = 10.0  # ratio of the largest to the smallest cost from which on its axis is logarithmic
 COLOURS = {"stationarity": "robot", "violation": "moving", "complementarity": "fixed", "step": "odometry"}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -20,11 +20,7 @@ from unifg.modeling.terms import Cost, Fix, Term
 from unifg.modeling.variables import Data, Family
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import headline, new_figure
-from unifg.typing import Array, BoolArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Axes, BoolArray, Figure
 
 NODES = 500  # variables and factors that are drawn one by one
 ROWS = 16  # lines of terms, before those that are alike share one

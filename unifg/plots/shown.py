@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -19,11 +19,7 @@ from unifg.errors import ViewError
 from unifg.lie import SE2, SE3, SE23, SO2, SO3, Manifold, Product
 from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import face, headline, new_figure
-from unifg.typing import Array, IntArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Axes, Figure, IntArray
 
 SIGMAS = 2.0  # standard deviations that ellipses and bands show
 ARROWS = 45  # headings along one path

@@ -15,7 +15,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.factors.residuals import Residual, residual
 from unifg.modeling.model import Model, itself
-from unifg.modeling.soft import LOWER, UPPER, Slack
+from unifg.modeling.soft import LOWER, UPPER, Slack, signed
 from unifg.modeling.terms import Constraint, Cost, ScalarCost, Term
 from unifg.modeling.variables import Data
 from unifg.typing import Array
@@ -91,36 +91,17 @@ def _argument(weight: Any) -> tuple[Any, bool]:
 
 def _with_slack(own: Residual, sides: int) -> Residual:
     """A residual with slacks as its last argument."""
-    function = _WITH[sides](own if own.kernel is not None else own.function)
+    function = _less_slack(own if own.kernel is not None else own.function, sides)
     jacobian = None if own.jacobian is None or own.kernel is not None else _beside(own.jacobian, sides)
     made = residual(function, jacobian, name=own.name, derivatives=own.derivatives or None)  # type: ignore[arg-type]
     return replace(made, elements=own.elements)
 
 
-def _less_upper(own: Callable[..., Any]) -> Callable[..., Any]:
+def _less_slack(own: Callable[..., Any], sides: int) -> Callable[..., Any]:
     def with_slack(*arguments: Any) -> Any:
-        return own(*arguments[:-1]) - arguments[-1]
+        return own(*arguments[:-1]) - signed(arguments[-1], sides)
 
     return with_slack
-
-
-def _plus_lower(own: Callable[..., Any]) -> Callable[..., Any]:
-    def with_slack(*arguments: Any) -> Any:
-        return own(*arguments[:-1]) + arguments[-1]
-
-    return with_slack
-
-
-def _between(own: Callable[..., Any]) -> Callable[..., Any]:
-    def with_slack(*arguments: Any) -> Any:
-        slack = arguments[-1]
-        size = slack.shape[1] // 2
-        return own(*arguments[:-1]) - slack[:, :size] + slack[:, size:]
-
-    return with_slack
-
-
-_WITH = {UPPER: _less_upper, LOWER: _plus_lower, UPPER | LOWER: _between}
 
 
 def _beside(own: Callable[..., Sequence[Array]], sides: int) -> Callable[..., Sequence[Array]]:

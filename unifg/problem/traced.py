@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import logging
-import pickle
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -138,23 +137,20 @@ class Trace:
         inputs: places of the arguments that the kernel takes.
         reached: named arrays of the function that the kernel takes after these.
         reach: what else the function reaches, which is compiled in.
-        fixed, free: arrays of the user that are compiled in, or are parameters, and what stood in them.
+        free: arrays of the user that are parameters, and what stood in them.
         each: places of the arguments with a row for each factor.
         whole: whether it holds for batches of this length only.
-        given: what other arguments that are compiled in reach.
-        lists: lists, dictionaries and tuples of numbers among them, and what stood in them.
+        given: what arguments that are compiled in reach.
     """
 
     kernel: DerivedKernel
     inputs: tuple[int, ...]
     reached: tuple[Array, ...]
     reach: Captured
-    fixed: Contents
     free: Contents
     each: tuple[int, ...] = ()
     whole: bool = False
     given: tuple[Captured, ...] = ()
-    lists: tuple[tuple[Any, bytes], ...] = ()
 
     @property
     def layout(self) -> tuple[Any, ...]:
@@ -164,14 +160,12 @@ class Trace:
     @property
     def constant(self) -> bool:
         """True if there is nothing that could change."""
-        return not (self.fixed or self.free or self.lists) and all(r.fixed for r in (self.reach, *self.given))
+        return not self.free and all(reach.fixed for reach in (self.reach, *self.given))
 
     @property
     def outdated(self) -> bool:
         """True if something has changed that is compiled in."""
-        if self.reach.changed or _changed(self.fixed) or any(reach.changed for reach in self.given):
-            return True
-        return any(_listed(value) != content for value, content in self.lists)
+        return any(reach.changed for reach in (self.reach, *self.given))
 
     @property
     def moved(self) -> bool:
@@ -314,7 +308,7 @@ def _traced(
     reach = captured_by(function, [array for array, _ in reached]) if reached else everything
     if reach.size > max(at_all, per_factor * batch.count) and not asked:
         raise TraceError(f"it reaches {reach.size} numbers, which would be looked at again before each solve")
-    beyond, lists, refusal = _reached_by(given, reach)
+    beyond, refusal = _reached_by(given, reach)
     if refusal and not asked:
         raise TraceError(refusal)
     name, rows = getattr(function, "__name__", "residual"), batch.size if batch.single else 0
@@ -327,45 +321,23 @@ def _traced(
     if kernel.rows != batch.size:
         raise TraceError(f"it returns {kernel.rows} rows for one factor and {batch.size} for {batch.count}")
     inputs = tuple(k for k, part in enumerate(given) if not isinstance(part, Fixed))
-    arrays = {k: a for k, a in enumerate(batch.arguments) if isinstance(a, np.ndarray) and not a.dtype.hasobject}
-    fixed = [array for k, array in arrays.items() if k not in inputs]
-    free = [*(array for k, array in arrays.items() if k in inputs), *(array for array, _ in reached)]
+    arrays = (batch.arguments[k] for k in inputs if isinstance(batch.arguments[k], np.ndarray))
+    free = [*(array for array in arrays if not array.dtype.hasobject), *(array for array, _ in reached)]
     named = tuple(array for array, _ in reached)
     each = tuple(k for k, part in enumerate(given) if isinstance(part, Each))
-    return Trace(kernel, inputs, named, reach, _contents(fixed), _contents(free), each, whole, beyond, lists)
+    return Trace(kernel, inputs, named, reach, _contents(free), each, whole, beyond)
 
 
-def _reached_by(
-    given: Sequence[Given], function: Captured
-) -> tuple[tuple[Captured, ...], tuple[tuple[Any, bytes], ...], str]:
-    """Captured variables of arguments that are compiled in, the content of lists, and values that may change unseen."""
-    beyond, lists, refusal = [], [], ""
+def _reached_by(given: Sequence[Given], function: Captured) -> tuple[tuple[Captured, ...], str]:
+    """Captured variables of arguments that are compiled in, and why one of them may change unseen."""
+    beyond, refusal = [], ""
     for place, part in enumerate(given):
-        if not isinstance(part, Fixed) or isinstance(part.value, np.ndarray):
-            continue
-        reach = captured_by(lambda value=part.value: value, (), function.attributes)
-        if not reach.refusal:
+        if isinstance(part, Fixed):
+            reach = captured_by(lambda value=part.value: value, (), function.attributes)
             beyond.append(reach)
-        elif (content := _listed(part.value)) is not None:
-            lists.append((part.value, content))
-        else:
-            refusal = refusal or f"its argument {place} may change with nobody noticing: {reach.refusal}"
-    return tuple(beyond), tuple(lists), refusal
-
-
-def _listed(value: Any) -> bytes | None:
-    """The content of lists, tuples and dictionaries of numbers, text and arrays; None of anything else."""
-
-    def plain(part: Any) -> bool:
-        if type(part) in (list, tuple):
-            return all(map(plain, part))
-        if type(part) is dict:
-            return all(map(plain, part)) and all(map(plain, part.values()))
-        if isinstance(part, np.ndarray):
-            return not part.dtype.hasobject
-        return part is None or isinstance(part, bool | int | float | complex | str | bytes | np.generic)
-
-    return pickle.dumps(value) if plain(value) else None
+            if reach.refusal:
+                refusal = refusal or f"its argument {place} may change with nobody noticing: {reach.refusal}"
+    return tuple(beyond), refusal
 
 
 def _differs_anywhere(trace: Trace, batch: Batch) -> bool:

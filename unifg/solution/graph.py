@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +13,7 @@ from unifg.modeling.variables import Data
 from unifg.problem.compiled_problem import CompiledProblem, compile_graph
 from unifg.solution.check import Report, check_graph
 from unifg.solution.solution import AnyGuess, values_of
-from unifg.typing import Numbers
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from unifg.typing import Figure, Numbers
 
 
 class Graph(Model):

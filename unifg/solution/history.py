@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from html import escape
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,44 +19,23 @@ from unifg.errors import GraphError, UnifgError
 from unifg.modeling.variables import Family
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
-from unifg.typing import Array
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from unifg.typing import Array, Figure
 
 
-class FactorNorms(Mapping[str, Array]):
-    """Norms (n,) of the factors of every term, by its name, in the order of the graph."""
+class FactorNorms(dict[str, Array]):
+    """Norms (n,) of the factors of every term, by its name, in the order of the graph; zero for inactive factors."""
 
-    def __init__(self, parts: dict[str, Array]) -> None:
-        """Keep one array per term."""
-        self._parts = parts
-
-    def __getitem__(self, term: str) -> Array:
-        """(n,) norms of a term's factors; zero where a factor is inactive.
+    def __missing__(self, term: str) -> Array:
+        """Refuse a name.
 
         Raises:
-            GraphError: when no term has that name.
+            GraphError: no term has it.
         """
-        if term not in self._parts:
-            raise GraphError(f"no term is called '{term}' (there are: {', '.join(self._parts) or 'none'})", term=term)
-        return self._parts[term]
-
-    def __contains__(self, term: object) -> bool:
-        """Test whether a term has that name."""
-        return term in self._parts
-
-    def __iter__(self) -> Iterator[str]:
-        """Names of the terms."""
-        return iter(self._parts)
-
-    def __len__(self) -> int:
-        """Number of terms."""
-        return len(self._parts)
+        raise GraphError(f"no term is called '{term}' (there are: {', '.join(self) or 'none'})", term=term)
 
     def __repr__(self) -> str:
         """Terms with their numbers of factors."""
-        return f"<FactorNorms {', '.join(f'{name}: {len(part)}' for name, part in self._parts.items())}>"
+        return f"<FactorNorms {', '.join(f'{name}: {len(part)}' for name, part in self.items())}>"
 
 
 def factor_norms(program: CompiledProblem, lin: Linearization, outside: Array) -> FactorNorms:

@@ -34,11 +34,9 @@ from unifg.solution.status import Found, Status
 from unifg.solution.tube import tube
 from unifg.solution.verify import Verified, verified
 from unifg.solution.warm_start import Shifts
-from unifg.typing import Array, BoolArray, Numbers
+from unifg.typing import Array, BoolArray, Figure, Numbers
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
     from unifg.plots.shown import Shown
 
 GIVEN_WAY = 1e-6  # of a slack variable, from which on it is reported

@@ -9,18 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from unifg.atomic_write import replacing
 from unifg.errors import ViewError
 from unifg.style.colours import GREY, INK
-from unifg.typing import Array, ArrayLike
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+from unifg.typing import Array, ArrayLike, Axes, Figure
 
 __all__ = [
     "dashes",

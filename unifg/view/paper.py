@@ -6,7 +6,7 @@ What is drawn is what a browser is sent; what lies higher hides what lies below 
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,14 +14,11 @@ from unifg.lie import SO3
 from unifg.style.colours import css
 from unifg.style.figures import ground as set_ground
 from unifg.style.figures import word
-from unifg.typing import Array
+from unifg.typing import Array, Axes
 from unifg.view.content import Content, Shot
 from unifg.view.recording import ground_of, keys_of
 from unifg.view.shapes import Mesh, copies
 from unifg.view.things import draw_way
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 __all__ = ["draw_frame"]
 

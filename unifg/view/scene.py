@@ -11,7 +11,6 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from unifg.modeling.variables import Family, Variable
 from unifg.solution.solution import Solution
 from unifg.style.colours import rgb
 from unifg.style.figures import new_axes
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array, ArrayLike, Axes
 from unifg.view.bodies import Part, body_of
 from unifg.view.canvas import Canvas, Frame
 from unifg.view.content import Body, Content
@@ -31,9 +30,6 @@ from unifg.view.page import Label, Plot, View
 from unifg.view.paper import draw_frame
 from unifg.view.recording import recorded
 from unifg.view.solutions import Recipe, recipe_of
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 __all__ = ["Scene"]
 

@@ -17,16 +17,15 @@ from unifg.factors.kernel import Kernel
 class StatedKernel(Kernel):
     """A kernel whose ``function`` is batched NumPy: it is run once on symbols, in the shapes of ``arguments``.
 
-    Where some of these are numbers of axes, it is run for every shape that is used. A second derivative that is given
-    takes the place of the derived one.
+    Where some of these are numbers of axes, it is run for every shape that is used.
     """
 
     function: Callable[..., Any]
 
     @property
     def derived(self) -> bool:
-        """They are, unless they are given."""
-        return self.second is None
+        """They are."""
+        return True
 
     def of_shapes(self, shapes: Sequence[tuple[int, ...]]) -> Kernel:
         """The kernel for parameters of these shapes, for one factor."""
@@ -61,8 +60,6 @@ class StatedKernel(Kernel):
     @cached_property
     def second_address(self) -> int:
         """Of the machine code of second derivatives, 0 where all of them are zero."""
-        if self.second is not None:
-            return Kernel.second_address.func(self)  # type: ignore[attr-defined, no-any-return]
         return 0 if self.linear or all(self.expression.linear_rows) else self.expression.second().address
 
     def __getstate__(self) -> dict[str, Any]:
