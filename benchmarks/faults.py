@@ -26,7 +26,7 @@ from unifg.scenarios.quadrotor.braking import braking_control
 from unifg.scenarios.simulation.air import QuadrotorWorld
 from unifg.scenarios.simulation.conditions import draw_conditions
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
-from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, GUST, Fault
+from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, SIZES, Fault
 
 SEEDS = range(5)
 ROBOTS = {"drive": DRIVE_FAULTS, "flight": FLIGHT_FAULTS}
@@ -69,7 +69,7 @@ def stopped_clear(fault: str, duration: float, seed: int, log: FlightLog) -> flo
     settings = FlightSettings(seed=seed)
     begin = round(BEGIN["flight"] / log.dt)
     true = draw_conditions(seed, settings.mass_error).true
-    gust = GUST if fault == "gust" else 0.0
+    gust = SIZES["gust"] if fault == "gust" else 0.0
     true = replace(true, wind=(true.wind[0], true.wind[1] + gust))
     world = QuadrotorWorld(log.layout, seed, true, start=log.truth[begin], disturbance=DisturbanceModel.calm())
     box, clearance = settings.controller.box, world.clearance()

@@ -155,7 +155,6 @@ class Flight:
         self.watch = FlightWatch(settings.controller.dt, settings.estimator.parameters_sigma(drawn.nominal))
         self.pilot.pushed = self.watch.pushed
         self._speed = self.pilot.controller.guide.settings
-        self._wind = self.world.parameters.wind
         if not rehearsal:
             avoidance, association = settings.controller.avoidance, settings.estimator.association
             kind = SCENARIO, settings.coupling, settings.solver, avoidance, association, settings.movers > 0
@@ -195,7 +194,9 @@ class Flight:
         if self._reached:
             return None
         now, (gust_x, gust_y) = world.time, self.faults.wind(world.time)
-        world.parameters = replace(world.parameters, wind=(self._wind[0] + gust_x, self._wind[1] + gust_y))
+        empty, load = self.conditions.true, 1.0 + self.faults.load(now)
+        wind = empty.wind[0] + gust_x, empty.wind[1] + gust_y
+        world.parameters = replace(empty, mass=load * empty.mass, wind=wind)
         world.step(self.faults.control(self._control, now), self.settings.controller.dt)
         self._landed = self.watch.lands and world.grounded
         if self._landed or world.collisions >= COLLISIONS:
