@@ -28,6 +28,9 @@ RAMPS: Mapping[str, Ramp] = {
     "lag": Ramp("the motors follow late", 0.05, 0.3, least=0.5),  # [s]; half as fast, braking is as short as without
     "slip": Ramp("the wheels slip", 0.25, 0.6, least=0.4),  # share of the way
     "odometry": Ramp("no odometry", 0.15, 1.0, least=0.3),  # [s]
+    "mount": Ramp("the lidar has turned in its mount", 0.02, 0.15, least=0.4),  # [rad]
+    "bias": Ramp("the lidar measures too far or too near", 0.02, 0.2, least=0.4),  # [m]
+    "scale": Ramp("the scale of the wheels has jumped", 0.15, 0.4, least=0.8),  # share of the way
 }
 """By signal."""
 
@@ -38,6 +41,8 @@ LATELY = 4  # ticks whose commands may still be on their way to the wheels
 WAY = 8  # ticks over which slip is summed up
 TRAVELLED = 0.2  # [m] in that time, below which nothing is said
 HELD = 1e6  # what a wheel that is not trusted misses
+MOVING = 0.1, 0.3  # [m/s, rad/s]; slower is rest, which does no harm
+DISOBEYED = 0.3  # [s] for which motors may do something else before their power is to be cut
 HOLD = 2.0  # [s] for which wheels are not trusted again, twice as long every time
 
 
@@ -46,6 +51,7 @@ class DriveSignals:
 
     Attributes:
         motors: how late they follow.
+        power_off: true from when the robot has moved, and not as it is told, for 0.3 s: a command does not stop it.
     """
 
     def __init__(self, dt: float, most: Array, base: Base = unicycle.BASE) -> None:
@@ -63,6 +69,7 @@ class DriveSignals:
         self._shifts: deque[tuple[float, float]] = deque(maxlen=WAY)
         self._fixed: Array | None = None
         self._held, self._hold = 0.0, HOLD
+        self._disobeyed, self.power_off = 0, False
 
     def note(
         self,
@@ -108,6 +115,10 @@ class DriveSignals:
             done.append(np.array([*moved, turned]) / self._dt)
         self._fixed = pose.copy() if corrected else None
         self._missed.append(min(self._misses(did) for did in done))
+        moves = all((np.abs(did) > [*[MOVING[0]] * (len(did) - 1), MOVING[1]]).any() for did in done)
+        disobeys = moves and not any(self.motors.obey(did) for did in done)
+        self._disobeyed = self._disobeyed + 1 if disobeys else 0
+        self.power_off |= self._disobeyed * self._dt > DISOBEYED - 0.5 * self._dt
         self._held = max(0.0, self._held - self._dt)
         if self._distrust() >= RAMPS["wheels"].ends and not self._held:
             self._held, self._hold = self._hold, 2.0 * self._hold
@@ -148,7 +159,7 @@ class DriveSignals:
             "spread": self._spread,
             "plan": self._plan,
             "tick": self._took / self._dt,
-            "wheels": HELD if self._held else self._distrust(),
+            "wheels": HELD if self._held or self.power_off else self._distrust(),
             "lag": self.motors.seconds,
             "slip": slip,
             "odometry": self._odometry,

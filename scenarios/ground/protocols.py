@@ -49,6 +49,9 @@ class World(Protocol):
     def odometry(self) -> Sequence[float]:
         """Mean control (m,) over the last step as measured."""
 
+    def power_off(self) -> None:
+        """Cut the power of the motors for good."""
+
     def carry(self, pose: ArrayLike) -> None:
         """Put the robot down at another pose (3,), at rest."""
 

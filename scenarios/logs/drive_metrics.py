@@ -30,7 +30,8 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         second backend had one and the first had not, and ``plan_status`` counts the status words of all ticks.
         ``odometry_error_m`` is the error of dead reckoning. ``outcomes`` says what became of every goal, ``health``
         and ``causes`` count ticks by what the supervisor made of them, ``dropped_samples`` what was not let in, and
-        ``last_stops`` ticks in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate, perception,
+        ``power_off_s``
+        when the motors' power was asked to be cut, None for never, ``last_stops`` ticks in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate, perception,
         repair of the route and plan.
 
     Raises:
@@ -81,6 +82,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "causes": dict(sorted(Counter(cause for cause in log.cause if cause).items())),
         "dropped_samples": dict(sorted(log.dropped.items())),
         "subproblems": dict(sorted(log.subproblems.items())),
+        "power_off_s": float(log.time[np.argmax(log.power_off)]) if log.power_off.any() else None,
         "last_stops": int(np.count_nonzero(log.emergency_stop)),
         "explained_share": {"mean": float(np.mean(log.explained)), "min": float(np.min(log.explained))},
         "tick_ms": timing(log.tick_ms),
