@@ -220,8 +220,9 @@ class Flight:
         plan: Plan | None = None
         told: Reading | None = None
         with counting() as new:
+            applied = None if self._control is None else watch.felt.expected(self._control)
             with self._going_on():
-                told = pilot.recognise(reading, self._control, watch.felt.push)
+                told = pilot.recognise(reading, applied, watch.felt.push)
             watch.judge(told, pilot.belief)
             verdict, guide = watch.verdict, pilot.controller.guide
             guide.settings = replace(self._speed, speed=max(verdict.share, SLOWEST_SHARE) * self._speed.speed)
@@ -238,6 +239,7 @@ class Flight:
             pilot.controller.loop.applied = control.copy()
         else:
             control = plan.control
+        control = watch.felt.asked(control, float(settings.box[1][3]))
         marks = belief.landmarks
         recorder.add(
             truth=world.state,
