@@ -32,7 +32,7 @@ __all__ = ["Calibration"]
 MOUNT, BIAS, SCALE = range(3)
 FIRST = np.array([0.02, 0.02, 0.1])  # [rad, m, 1] standard deviations at the start
 WALK = np.array([0.002, 0.002, 0.002])  # the same of the random walks, per root of a second
-NAMED = np.array([0.05, 0.06])  # [rad, m]; less is a tolerance of a good robot
+NAMED = np.array([0.04, 0.045])  # [rad, m]; less is a tolerance of a good robot
 SURE = 4.0  # standard deviations that a state is from zero where it is named
 GRID = (math.radians(2.0), 10), (0.1, 5)  # [rad, m] between mounts and biases that are tried, and how many each way
 FINER = 17  # that are tried about one of them once a jump is sure
@@ -124,7 +124,7 @@ class Calibration:
 
         Args:
             scan: that has been put right and has corrected the estimate; None where none has, or the pose is not known
-                to centimetres.
+                to a decimetre.
             predicted: (3,) pose by the wheels [m, m, rad].
             pose: (3,) pose after the scan.
             wheels: (m,) controls they have measured; None where they have not.

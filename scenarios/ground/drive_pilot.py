@@ -39,7 +39,7 @@ AT_REST = 0.02  # [m/s]; slower is rest
 HELD = 0.5  # of the way that it could go: a robot that gets no farther is held by movers
 SEARCH_AGAIN = 20  # ticks after a search that found nothing
 FOUND_SIGMA = np.array([0.05, 0.05, 0.02])  # of a pose that a search has found [m, m, rad]
-CENTIMETRES = np.array([0.04, 0.04, 0.03])  # standard deviations of a pose that calibration goes by [m, m, rad]
+DECIMETRE = np.array([0.12, 0.12, 0.05])  # standard deviations of a pose that calibration goes by [m, m, rad]
 STOPPED = "stopped"
 """Source of a plan that the supervisor has made: come to rest."""
 
@@ -218,7 +218,7 @@ class Pilot(Generic[PlannerT]):
     def _calibrate(self, scan: Scan | None, predicted: Array, wheels: Array | None) -> dict[str, float]:
         """Signals of the calibration, after a scan that was put right, and a pose (3,) predicted by the wheels."""
         known, spread = self.calibration, np.sqrt(np.diag(self.estimator.covariance))
-        sure = not self.estimator.refused and bool((spread < CENTIMETRES).all())
+        sure = not self.estimator.refused and bool((spread < DECIMETRE).all())
         trusted = "wheels" not in self.validator.refused and not self.recalibrated
         known.note(scan if sure else None, predicted, self.estimator.pose, wheels if trusted else None)
         mount, bias = np.abs(known.used).tolist()
