@@ -28,7 +28,7 @@ FLOWN = ("payload", "thrust-loss", "gust")
 SIGNED = ("lidar-turned", "range-bias")
 BEGINS = {"drive": (0.0, 6.0), "flight": (1.0, 12.0)}  # [s]
 ROUNDS, DRAWS, BEST = 3, 4, 2
-NARROW = 0.25  # of the span; standard deviation of the draws about the best of a round, half as much in each that follows
+NARROW = 0.25  # of the span; standard deviation of draws about the best, half as much in each round that follows
 
 
 def search(kind: str, seed: int) -> Row:
@@ -93,7 +93,8 @@ def render(rows: list[Row]) -> str:
     )
     head = (
         "fault", "sizes", "evaluations", "contacts", "before a name", "least that touches",
-        "least that touches before a name", "least clearance before a name [m]", "never named", "named after at most [s]",
+        "least that touches before a name", "least clearance before a name [m]", "never named",
+        "named after at most [s]",
     )  # fmt: skip
     return f"{sums}\n\n{table(head, lines, text=2)}"
 

@@ -59,7 +59,7 @@ REACHED = "reached"
 MPC = "mpc"
 LOCALISERS = ("graph", "amcl")
 PLANE = "plane"
-OF_WORLD = ("step(*control, dt)", "power_off()", "scan()", "odometry()", "discs()", "clearance()")
+OF_WORLD = ("step(*control, dt)", "power(on)", "scan()", "odometry()", "discs()", "clearance()")
 LARGEST = Limits(pixels=200_000_000)  # of a map that a user names: 700 m by 700 m at 0.05 m
 
 
@@ -309,8 +309,7 @@ class Episode:
         control = self.decide(number)
         if control is None:
             return None
-        if self.pilot.power_off:
-            self.world.power_off()
+        self.world.power(not self.pilot.power_off)
         self.world.step(*control, dt=self.settings.controller.dt)
         return self._driven / path_length(self.path), f"goal {self._goal + 1}/{len(self.goals)}"
 

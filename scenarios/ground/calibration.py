@@ -44,7 +44,7 @@ TIMES = 3  # ticks in a row
 DOUBT = 10  # ticks after which a scan is believed as it is
 LOOK = 4  # ticks over which motion is compared
 WAY = 0.2  # [m] of them, below which nothing is said
-PLACE = 0.01  # [m] standard deviation of a place that a scan finds
+PLACE = 0.004  # [m] standard deviation of a place that a scan finds
 SKID = 0.06  # [s] drift of a base that turns, per lateral acceleration
 KNOWN = 0.03  # standard deviation of the scale, from which on a jump can be told
 SCANNED = 0.03  # [m] standard deviation of the bias that a scan says: scans share the errors of the map
@@ -57,14 +57,14 @@ class Calibration:
         state: (3,) mount, to the left [rad], bias [m], and scale of the wheels, as they are believed.
         variance: (3,) of it.
         used: (2,) mount and bias as far as they are named, by which scans are put right; zeros for a good lidar.
-        scale_jump: by how much the wheels' scale of just now differs from the state.
+        scale_jump: by how much the wheels' scale has differed from the state in the last ticks, at least.
         pose: (3,) where wheels have taken the robot since its pose was last not in doubt; None where it is unknown.
     """
 
     def __init__(self, distance_map: DistanceMap, dt: float, base: Base) -> None:
         """Begin with a robot that is calibrated, on a map, with ticks of ``dt`` [s]."""
         self.state, self.variance, self.used = np.zeros(3), FIRST**2, np.zeros(2)
-        self.scale_jump = 0.0
+        self.scale_jump, self._off = 0.0, tuple[float, ...]()
         self.pose: Array | None = None
         self._map, self._dt, self._base = distance_map, dt, base
         self._doubt, self._change = 0, np.zeros(2)
@@ -129,7 +129,8 @@ class Calibration:
             pose: (3,) pose after the scan.
             wheels: (m,) controls they have measured; None where they have not.
         """
-        self.scale_jump = 0.0
+        self.scale_jump, before = 0.0, self._off
+        self._off = ()
         if 0 < self._doubt <= DOUBT:
             self._moved.clear()
             return
@@ -147,7 +148,8 @@ class Calibration:
             return
         variance = LOOK * np.array([2.0 * PLACE**2 + drift**2, 2.0 * PLACE**2]) / way**2  # of windows that overlap
         if self.variance[SCALE] < KNOWN**2:
-            self.scale_jump = abs(float(ahead / way - self.state[SCALE]))
+            self._off = (*before, abs(float(ahead / way - self.state[SCALE])))[-TIMES:]
+            self.scale_jump = min(self._off) if len(self._off) == TIMES else 0.0
         self._learn(MOUNT, self.used[MOUNT] - left / way, variance[0])
         self._learn(SCALE, ahead / way, variance[1])
 

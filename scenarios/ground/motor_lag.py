@@ -30,7 +30,7 @@ SCALE = 0.06  # relative standard deviation of what wheels say of their velociti
 FLOOR = (0.02, 0.05)  # the same at rest [m/s, rad/s]
 OUTLIER = 9.0  # a squared normalised residual counts as no more than this
 OBEYING = 4  # models, up to a lag of 0.3 s, between which motors are that obey
-LEEWAY = 0.2, (0.05, 0.1)  # of velocities, and of rest [m/s, rad/s], by which they may differ: scale and noise of wheels
+LEEWAY = 0.2, (0.05, 0.1)  # of velocities, and of rest [m/s, rad/s], by which they may differ, as wheels are not exact
 
 
 class MotorLag:

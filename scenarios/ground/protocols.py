@@ -49,8 +49,8 @@ class World(Protocol):
     def odometry(self) -> Sequence[float]:
         """Mean control (m,) over the last step as measured."""
 
-    def power_off(self) -> None:
-        """Cut the power of the motors for good."""
+    def power(self, on: bool) -> None:
+        """Give the motors power, or cut it."""
 
     def carry(self, pose: ArrayLike) -> None:
         """Put the robot down at another pose (3,), at rest."""

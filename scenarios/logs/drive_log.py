@@ -132,7 +132,7 @@ class EpisodeLog(StoredLog):
     emergency_stop: BoolArray = column(dtype=np.bool_)
     """True where beams alone have slowed the robot below what was planned."""
     power_off: BoolArray = column(dtype=np.bool_)
-    """True from when the robot asked for the power of its motors to be cut."""
+    """True where the robot asks for the power of its motors to be cut."""
     fault: list[str] = words()
     """What was made to go wrong just then."""
 

@@ -95,6 +95,7 @@ class Wheels:
 
     Attributes:
         velocity: (m,) of the motors now: of a unicycle forward and turning [m/s, rad/s].
+        powered: false while brakes hold the wheels, whatever they are told.
     """
 
     def __init__(self, drivetrain: Drivetrain, base: Base = unicycle.BASE) -> None:
@@ -106,13 +107,7 @@ class Wheels:
         self._coming: deque[tuple[float, Array]] = deque()
         self._told = np.zeros(base.size)
         self._now = 0.0
-        self._powered = True
-        self.velocity = np.zeros(base.size)
-
-    def cut(self) -> None:
-        """Cut the power for good: brakes hold the wheels, whatever they are told."""
-        self._powered = False
-        self._told = np.zeros_like(self._told)
+        self.velocity, self.powered = np.zeros(base.size), True
 
     def tell(self, command: Sequence[float]) -> None:
         """Send a command (m,) now; it acts after the latency, until another does."""
@@ -124,11 +119,10 @@ class Wheels:
         A command takes effect at the beginning of the interval in which its time comes, half an interval early or late.
         """
         while self._coming and self._coming[0][0] <= self._now + 0.5 * dt:
-            command = self._coming.popleft()[1]
-            self._told = command if self._powered else self._told
+            self._told = self._coming.popleft()[1]
         self._now += dt
-        lag = self._drivetrain.lag if self._powered else 0.0
-        self.velocity, mean = followed(self._told, self.velocity, lag, self._most * dt, dt)
+        told, lag = (self._told, self._drivetrain.lag) if self.powered else (np.zeros_like(self._told), 0.0)
+        self.velocity, mean = followed(told, self.velocity, lag, self._most * dt, dt)
         return mean
 
 

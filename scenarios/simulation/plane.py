@@ -258,9 +258,9 @@ class World(Space):
             made[-1] = self._steered / dt
         self._measured = made * (self._scale + noise)
 
-    def power_off(self) -> None:
-        """Cut the power of the motors for good; brakes bring the wheels to rest."""
-        self._wheels.cut()
+    def power(self, on: bool) -> None:
+        """Give the motors power, or cut it: brakes bring the wheels to rest."""
+        self._wheels.powered = on
 
     def carry(self, pose: ArrayLike) -> None:
         """Put the robot down at another pose (3,) [m, m, rad], at rest; its wheels do not turn."""
