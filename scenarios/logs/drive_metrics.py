@@ -30,9 +30,9 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         second backend had one and the first had not, and ``plan_status`` counts the status words of all ticks.
         ``odometry_error_m`` is the error of dead reckoning. ``outcomes`` says what became of every goal, ``health``
         and ``causes`` count ticks by what the supervisor made of them, ``dropped_samples`` what was not let in,
-        ``power_off_s`` is when the motors' power was first asked to be cut, None for never, and ``last_stops`` counts ticks
-        in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate, perception, repair of the route
-        and plan.
+        ``power_off_s`` is the time at which the robot first asked for its motors' power to be cut, None for never, and
+        ``last_stops`` counts ticks in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate,
+        perception, repair of the route and plan.
 
     Raises:
         ScenarioError: the episode has no tick.

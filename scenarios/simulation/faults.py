@@ -118,8 +118,8 @@ class _Faults:
 
     def size(self, kind: str, time: float) -> float | None:
         """Size of the fault of this kind that is active at a time [s]; None where none is."""
-        fault = next((fault for fault in self._faults if fault.kind == kind and fault.holds(time)), None)
-        return fault and (SIZES[kind] if fault.size is None else fault.size)
+        sizes = (fault.size for fault in self._faults if fault.kind == kind and fault.holds(time))
+        return next((SIZES[kind] if size is None else size for size in sizes), None)
 
     def names(self, time: float) -> str:
         """Those that hold, for pictures."""
