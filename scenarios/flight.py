@@ -75,7 +75,7 @@ class FlightSettings:
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     faults: tuple[Fault, ...] = option(
-        (), text=one_of(FLIGHT_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
+        (), text=one_of(FLIGHT_FAULTS), metavar="KIND[=SIZE]@SECONDS[:DURATION]", flag="fault", many=True
     )
 
     def __post_init__(self) -> None:

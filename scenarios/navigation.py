@@ -118,7 +118,7 @@ class NavigationSettings:
     localiser: str | type = option(LOCALISERS[0], text=str, metavar="NAME|MODULE:CLASS")
     world: str | type = option(PLANE, text=str, metavar="MODULE:CLASS")
     faults: tuple[Fault, ...] = option(
-        (), text=one_of(DRIVE_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
+        (), text=one_of(DRIVE_FAULTS), metavar="KIND[=SIZE]@SECONDS[:DURATION]", flag="fault", many=True
     )
     believed: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
     initial_sigma: tuple[float, float, float] = option(INITIAL_SIGMA, text=pose, metavar="X,Y,TH")
