@@ -41,7 +41,6 @@ FAR = 0.3  # [m] from a surface; beams farther off count as that
 GAIN = 0.03  # [m] by which a scan that is put right is nearer to the map, on average
 FITS = 0.6  # of the distance that it has as it is
 TIMES = 3  # ticks in a row
-DOUBT = 10  # ticks after which a scan is believed as it is
 LOOK = 4  # ticks over which motion is compared
 WAY = 0.2  # [m] of them, below which nothing is said
 PLACE = 0.004  # [m] standard deviation of a place that a scan finds
@@ -70,15 +69,22 @@ class Calibration:
         self._doubt, self._change = 0, np.zeros(2)
         self._moved: deque[Array] = deque(maxlen=LOOK)
 
+    def take_over(self, other: Calibration) -> None:
+        """Go on with what another one, on another map, has learnt."""
+        self.state, self.variance, self.used = other.state, other.variance, other.used
+
     def right(self, scan: Scan) -> Scan:
         """The scan as a good lidar had taken it."""
         mount, bias = self.used.tolist()
-        return replace(scan, angles=scan.angles + mount, ranges=scan.ranges - bias) if mount or bias else scan
+        if not (mount or bias):
+            return scan
+        return replace(scan, angles=scan.angles + mount, ranges=np.maximum(scan.ranges - bias, 0.0))
 
     def jumps(self, scan: Scan, wheels: Array) -> bool:
         """Move on by the wheels (m,) to the time of a scan, which has been put right; True where a state jumps."""
         self.variance = self.variance + WALK**2 * self._dt
         if self.pose is None:
+            self._doubt = 0
             return False
         self.pose = self._base.step(self.pose[None], wheels[None], self._dt)[0]
         as_it_is = float(self._missed(scan, np.zeros((1, 2)))[0])
@@ -87,7 +93,7 @@ class Calibration:
             change, missed = self._best(scan, *(step * np.arange(-most, most + 1.0) for step, most in GRID))
         again = bool((np.abs(change - self._change) < [1.5 * step for step, _ in GRID]).all())
         better = as_it_is - missed > GAIN and missed < FITS * as_it_is
-        self._doubt = (self._doubt + 1 if again else 1) if better else 0
+        self._doubt = self._doubt + 1 if better and (again or not self._doubt) else 0
         self._change = change
         if self._doubt < TIMES:
             return False
@@ -131,7 +137,7 @@ class Calibration:
         """
         self.scale_jump, before = 0.0, self._off
         self._off = ()
-        if 0 < self._doubt <= DOUBT:
+        if self._doubt and self.pose is not None:
             self._moved.clear()
             return
         self.pose = None if scan is None else pose.copy()

@@ -206,6 +206,7 @@ class Pilot(Generic[PlannerT]):
         known = self.calibration
         self.recalibrated = False
         if scan is None or wheels is None:
+            known.pose = None
             return scan
         right = known.right(scan)
         self.recalibrated = known.jumps(right, wheels)
@@ -291,13 +292,14 @@ class Pilot(Generic[PlannerT]):
         if result.pose is None:
             return
         self.estimator.reset(result.pose, FOUND_SIGMA)
-        self.pose, self.relocated = self.estimator.pose, True
+        self.pose, self.relocated, self.calibration.pose = self.estimator.pose, True, None
         self._forget_tracks()
 
     def take_over(self, other: Pilot[PlannerT]) -> None:
         """Go on where another pilot, with another map, was."""
         self.validator, self.supervisor, self._signals = other.validator, other.supervisor, other._signals
         self.driven, self.share = other.driven, other.share
+        self.calibration.take_over(other.calibration)
 
 
 def make_pilot(
