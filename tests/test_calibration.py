@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import maps
-from benchmarks import fault_search
 from unifg.lie import SE2
 from unifg.models import unicycle
 from unifg.scenarios.flight import FlightSettings, run_flight
@@ -99,7 +98,7 @@ def test_a_doubt_that_does_not_last_is_forgotten_and_one_that_lasts_without_a_ju
     known = standing(scan)
     assert not known.jumps(wrong, still) and not known.jumps(spoiled(scan, "lidar-turned", -0.17), still)
     known.note(scan, PLACE, PLACE + np.array([0.1, 0.0, 0.0]), still)
-    assert known.pose is not None and known.pose[0] == PLACE[0] + 0.1, "doubts that contradict each other do not hold the pose"
+    assert known.pose is not None and known.pose[0] == PLACE[0] + 0.1, "these contradict each other"
 
 
 def test_a_bias_that_is_put_right_leaves_no_range_below_zero() -> None:
@@ -372,30 +371,3 @@ def test_a_vehicle_that_is_loaded_in_flight_flies_on(seed: int) -> None:
     assert 3.0 <= named[0] <= 3.5 and set(filter(None, log.causes)) == {"the thrust is not what is asked for"}
     assert log.collisions == 0 and log.truth[:, 2].min() > 1.2 and log.truth[-1, 2] == pytest.approx(1.5, abs=0.1)
     assert log.controls[-1, 3] == pytest.approx(1.4 * 9.81, rel=0.1)
-
-
-# ------------------------------------------------------------------------- search
-
-
-def test_the_search_finds_the_least_fault_that_harms(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A world in which a bias beyond 0.2 m that begins in the first half touches before it is named."""
-    asked = []
-
-    def run(robot: str, fault: Fault, seed: int) -> SimpleNamespace:
-        size = abs(fault.size or 0.0)
-        asked.append(size)
-        touches = size > 0.2 and fault.begin < 3.0
-        clearance = np.array([0.3, -0.1 if touches else 0.3 - 0.2 * min(size, 0.2), 0.2])
-        return SimpleNamespace(
-            time=np.array([0.0, 3.5, 4.0]), health=["ok", "ok", "degraded"], clearance=clearance, collisions=touches
-        )
-
-    monkeypatch.setattr(fault_search, "run", run)
-    row = {"kind": "range-bias", **fault_search.search("range-bias", 0)}
-    assert len(asked) == 12 and min(asked) >= 0.03 and max(asked) <= 0.8
-    harming = [one for one in row["evaluations"] if one["unnamed"] <= 0.0]
-    assert len(harming) > 1 and np.std(np.log(asked[8:])) < 0.5 * np.std(np.log(asked[:4])), "it narrows down"
-    assert f"{min(abs(one['size']) for one in harming):.2f} m at " in fault_search.least(harming, "m")
-    assert fault_search.least([], "m") == "none"
-    page = fault_search.render([row, *({**row, "kind": kind} for kind in fault_search.SPANS if kind != "range-bias")])
-    assert f"{12 * len(fault_search.SPANS)} evaluations" in page

@@ -30,7 +30,7 @@ RAMPS: Mapping[str, Ramp] = {
     "odometry": Ramp("no odometry", 0.15, 1.0, least=0.3),  # [s]
     "mount": Ramp("the lidar has turned in its mount", 0.02, 0.15, least=0.4),  # [rad]
     "bias": Ramp("the lidar measures too far or too near", 0.02, 0.2, least=0.4),  # [m]
-    "scale": Ramp("the scale of the wheels has jumped", 0.15, 0.4, least=0.8),  # share of the way
+    "scale": Ramp("the scale of the wheels has jumped", 0.12, 0.4, least=0.8),  # share of the way
 }
 """By signal."""
 
