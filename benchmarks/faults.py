@@ -18,6 +18,7 @@ from benchmarks.comparison import Row
 from benchmarks.report import table
 from benchmarks.runner import Cell, Study
 from unifg.scenarios.flight import FlightSettings, run_flight
+from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics
@@ -26,7 +27,7 @@ from unifg.scenarios.quadrotor.braking import braking_control
 from unifg.scenarios.simulation.air import QuadrotorWorld
 from unifg.scenarios.simulation.conditions import draw_conditions
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
-from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, GUST, Fault
+from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, SIZES, Fault
 
 SEEDS = range(5)
 ROBOTS = {"drive": DRIVE_FAULTS, "flight": FLIGHT_FAULTS}
@@ -37,24 +38,28 @@ REACTION = 2  # ticks: the one in which something is felt, and the one that answ
 START, GOAL = (6.5, 14.0, 0.0), (13.5, 14.1, 0.0)
 
 
+def run(robot: str, fault: Fault, seed: int) -> EpisodeLog | FlightLog:
+    """Drive or fly with one fault."""
+    if robot == "drive":
+        return run_navigation(NavigationSettings(start=START, goals=(GOAL,), obstacles=1, seed=seed, faults=(fault,)))
+    return run_flight(FlightSettings(seed=seed, time_limit=30.0, faults=(fault,)))
+
+
+def first_named(log: EpisodeLog | FlightLog) -> float | None:
+    """Time of the first tick that is not well [s]."""
+    return next((float(time) for time, health in zip(log.time, log.health, strict=True) if health != "ok"), None)
+
+
 def episode(robot: str, fault: str, duration: float, seed: int) -> Row:
     """Run one; an exception is what is looked for, and kept."""
-    faults = (Fault(fault, BEGIN[robot], duration),)
     braked: float | None = None
     try:
-        if robot == "drive":
-            drive = NavigationSettings(start=START, goals=(GOAL,), obstacles=1, seed=seed, faults=faults)
-            log = run_navigation(drive)
-            m = episode_metrics(log)
-            said = [k for k, health in enumerate(log.health) if health != "ok"]
-            outcome, first = log.outcomes[0], float(log.time[said[0]]) if said else None
-        else:
-            flight = run_flight(FlightSettings(seed=seed, time_limit=30.0, faults=faults))
-            m = flight_metrics(flight)
-            said = [k for k, health in enumerate(flight.health) if health != "ok"]
-            outcome, first = flight.outcome, float(flight.time[said[0]]) if said else None
-            if m["collisions"]:
-                braked = stopped_clear(fault, duration, seed, flight)
+        log = run(robot, Fault(fault, BEGIN[robot], duration), seed)
+        m = episode_metrics(log) if isinstance(log, EpisodeLog) else flight_metrics(log)
+        outcome = log.outcomes[0] if isinstance(log, EpisodeLog) else log.outcome
+        first = first_named(log)
+        if isinstance(log, FlightLog) and m["collisions"]:
+            braked = stopped_clear(fault, duration, seed, log)
     except Exception as error:
         return {"raised": f"{type(error).__name__}: {error}"}
     return {
@@ -69,7 +74,7 @@ def stopped_clear(fault: str, duration: float, seed: int, log: FlightLog) -> flo
     settings = FlightSettings(seed=seed)
     begin = round(BEGIN["flight"] / log.dt)
     true = draw_conditions(seed, settings.mass_error).true
-    gust = GUST if fault == "gust" else 0.0
+    gust = SIZES["gust"] if fault == "gust" else 0.0
     true = replace(true, wind=(true.wind[0], true.wind[1] + gust))
     world = QuadrotorWorld(log.layout, seed, true, start=log.truth[begin], disturbance=DisturbanceModel.calm())
     box, clearance = settings.controller.box, world.clearance()

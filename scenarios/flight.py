@@ -75,7 +75,7 @@ class FlightSettings:
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
     faults: tuple[Fault, ...] = option(
-        (), text=one_of(FLIGHT_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
+        (), text=one_of(FLIGHT_FAULTS), metavar="KIND[=SIZE]@SECONDS[:DURATION]", flag="fault", many=True
     )
 
     def __post_init__(self) -> None:
@@ -155,7 +155,6 @@ class Flight:
         self.watch = FlightWatch(settings.controller.dt, settings.estimator.parameters_sigma(drawn.nominal))
         self.pilot.pushed = self.watch.pushed
         self._speed = self.pilot.controller.guide.settings
-        self._wind = self.world.parameters.wind
         if not rehearsal:
             avoidance, association = settings.controller.avoidance, settings.estimator.association
             kind = SCENARIO, settings.coupling, settings.solver, avoidance, association, settings.movers > 0
@@ -195,7 +194,9 @@ class Flight:
         if self._reached:
             return None
         now, (gust_x, gust_y) = world.time, self.faults.wind(world.time)
-        world.parameters = replace(world.parameters, wind=(self._wind[0] + gust_x, self._wind[1] + gust_y))
+        empty, load = self.conditions.true, 1.0 + self.faults.load(now)
+        wind = empty.wind[0] + gust_x, empty.wind[1] + gust_y
+        world.parameters = replace(empty, mass=load * empty.mass, wind=wind)
         world.step(self.faults.control(self._control, now), self.settings.controller.dt)
         self._landed = self.watch.lands and world.grounded
         if self._landed or world.collisions >= COLLISIONS:
@@ -219,8 +220,9 @@ class Flight:
         plan: Plan | None = None
         told: Reading | None = None
         with counting() as new:
+            applied = None if self._control is None else watch.felt.expected(self._control)
             with self._going_on():
-                told = pilot.recognise(reading, self._control, watch.felt.push)
+                told = pilot.recognise(reading, applied, watch.felt.push)
             watch.judge(told, pilot.belief)
             verdict, guide = watch.verdict, pilot.controller.guide
             guide.settings = replace(self._speed, speed=max(verdict.share, SLOWEST_SHARE) * self._speed.speed)
@@ -237,6 +239,7 @@ class Flight:
             pilot.controller.loop.applied = control.copy()
         else:
             control = plan.control
+        control = watch.felt.asked(control, float(settings.box[1][3]))
         marks = belief.landmarks
         recorder.add(
             truth=world.state,

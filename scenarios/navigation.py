@@ -59,7 +59,7 @@ REACHED = "reached"
 MPC = "mpc"
 LOCALISERS = ("graph", "amcl")
 PLANE = "plane"
-OF_WORLD = ("step(*control, dt)", "scan()", "odometry()", "discs()", "clearance()")
+OF_WORLD = ("step(*control, dt)", "power(on)", "scan()", "odometry()", "discs()", "clearance()")
 LARGEST = Limits(pixels=200_000_000)  # of a map that a user names: 700 m by 700 m at 0.05 m
 
 
@@ -118,7 +118,7 @@ class NavigationSettings:
     localiser: str | type = option(LOCALISERS[0], text=str, metavar="NAME|MODULE:CLASS")
     world: str | type = option(PLANE, text=str, metavar="MODULE:CLASS")
     faults: tuple[Fault, ...] = option(
-        (), text=one_of(DRIVE_FAULTS), metavar="KIND@SECONDS[:DURATION]", flag="fault", many=True
+        (), text=one_of(DRIVE_FAULTS), metavar="KIND[=SIZE]@SECONDS[:DURATION]", flag="fault", many=True
     )
     believed: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
     initial_sigma: tuple[float, float, float] = option(INITIAL_SIGMA, text=pose, metavar="X,Y,TH")
@@ -309,6 +309,7 @@ class Episode:
         control = self.decide(number)
         if control is None:
             return None
+        self.world.power(not self.pilot.power_off)
         self.world.computing = sum(self.pilot.clock.seconds.values())
         self.world.step(*control, dt=self.settings.controller.dt)
         return self._driven / path_length(self.path), f"goal {self._goal + 1}/{len(self.goals)}"
@@ -448,6 +449,7 @@ class Episode:
             allowed=verdict.share,
             explained=pilot.share,
             emergency_stop=pilot.slowed,
+            power_off=pilot.power_off,
             fault=self.faults.names(world.time),
         )
 

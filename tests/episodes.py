@@ -98,6 +98,7 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         allowed=np.where(emergency, 0.5, 1.0),
         explained=np.full(ticks, 0.9),
         emergency_stop=np.zeros(ticks, dtype=bool),
+        power_off=np.zeros(ticks, dtype=bool),
         fault=[""] * ticks,
     )
 

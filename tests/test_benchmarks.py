@@ -23,6 +23,7 @@ from benchmarks import (
     derivatives,
     elimination,
     exported,
+    fault_search,
     gtsam_peer,
     horizon_and_velocity,
     many_instances,
@@ -44,6 +45,7 @@ from problems.collection import BACKENDS, CASES, attempt
 from unifg.errors import ScenarioError
 from unifg.pose_graphs import manhattan
 from unifg.scenarios.campaigns.journal import lines_of
+from unifg.scenarios.simulation.faults import Fault
 from unifg.scenarios.simulation.plane import World
 from unifg.scenarios.simulation.space import Obstacle
 from unifg.solvers import GaussNewton, InteriorPoint
@@ -349,3 +351,27 @@ def test_rows_become_a_table() -> None:
     assert lines[2] == "| 0.6 | 1 | worst | 3 | 1 | 6 .. 79 % | 0 | 1 | 1 | 1.50 | 10 % | 9.0 |"
     assert "No drive with plans for the likeliest has a pair." in lines[-1]
     assert "for the tree the robot arrives -3 (-3 .. -3) s later than" in lines[-1] and "(1 pairs)" in lines[-1]
+
+
+def test_the_search_finds_the_least_fault_that_harms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A world in which a bias beyond 0.2 m that begins in the first half touches before it is named."""
+    asked = []
+
+    def run(robot: str, fault: Fault, seed: int) -> SimpleNamespace:
+        size = abs(fault.size or 0.0)
+        asked.append(size)
+        touches = size > 0.2 and fault.begin < 3.0
+        clearance = np.array([0.3, -0.1 if touches else 0.3 - 0.2 * min(size, 0.2), 0.2])
+        return SimpleNamespace(
+            time=np.array([0.0, 3.5, 4.0]), health=["ok", "ok", "degraded"], clearance=clearance, collisions=touches
+        )
+
+    monkeypatch.setattr(fault_search, "run", run)
+    row = {"kind": "range-bias", **fault_search.search("range-bias", 0)}
+    assert len(asked) == 12 and min(asked) >= 0.03 and max(asked) <= 0.8
+    harming = [one for one in row["evaluations"] if one["unnamed"] <= 0.0]
+    assert len(harming) > 1 and np.std(np.log(asked[8:])) < 0.5 * np.std(np.log(asked[:4])), "it narrows down"
+    assert f"{min(abs(one['size']) for one in harming):.2f} m at " in fault_search.least(harming, "m")
+    assert fault_search.least([], "m") == "none"
+    page = fault_search.render([row, *({**row, "kind": kind} for kind in fault_search.SPANS if kind != "range-bias")])
+    assert f"{12 * len(fault_search.SPANS)} evaluations" in page

@@ -210,7 +210,7 @@ def test_a_fault_is_stated_by_its_word() -> None:
 
     with pytest.raises(ScenarioError, match="unknown fault 'gust'"):
         made("lidar-nan@2:1")
-    for wrong, message in ((3, "cannot be stated in a file but by a word"), ("lidar-nan", "is not KIND@SECONDS")):
+    for wrong, message in ((3, "cannot be stated in a file but by a word"), ("lidar-nan", "is not KIND")):
         with pytest.raises(ScenarioError, match=message):
             stated({"scenario": "navigation", "seeds": [0], "settings": {"fault": wrong}})
     one, same, other = (

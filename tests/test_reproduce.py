@@ -84,9 +84,7 @@ def test_every_listed_item_has_a_function_and_the_reverse() -> None:
         (["ta", "--figure", "5", "--quick", "--full"], "argument --full: not allowed with argument --quick"),
     ],
 )  # fmt: skip
-def test_unknown_names_are_refused_by_name(
-    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_unknown_names_are_refused_by_name(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["reproduce", *arguments]) == 2
     assert said in capsys.readouterr().err
 

@@ -211,7 +211,8 @@ def test_wheels_that_slip_are_told_from_wheels_that_do_not_obey() -> None:
     here = there = elsewhere = np.array([2.0, 1.0, 0.5])
     commands = [np.array([min(1.0, 0.25 * k), 0.0]) for k in range(12)]
     for k in range(8):
-        here = note(slipping, asked, asked, 1.6 * asked, here)
+        driven = commands[max(0, k - 1)]
+        here = note(slipping, commands[k], driven, 1.6 * driven, here)
         there = note(dead, asked, np.array([0.5, -3.3]), np.array([0.5, -3.3]), there)
         behind = commands[max(0, k - 2)]
         elsewhere = note(late, commands[k], behind, behind, elsewhere)

@@ -13,6 +13,7 @@ from unifg.errors import ScenarioError, UnifgError
 from unifg.files.ros_map import OccupancyMap
 from unifg.horizon import Plan
 from unifg.models.distance_map import DistanceMap
+from unifg.scenarios.ground.calibration import Calibration
 from unifg.scenarios.ground.drive_control import Controller
 from unifg.scenarios.ground.drive_past import Smoother
 from unifg.scenarios.ground.drive_settings import ControllerSettings
@@ -38,6 +39,7 @@ AT_REST = 0.02  # [m/s]; slower is rest
 HELD = 0.5  # of the way that it could go: a robot that gets no farther is held by movers
 SEARCH_AGAIN = 20  # ticks after a search that found nothing
 FOUND_SIGMA = np.array([0.05, 0.05, 0.02])  # of a pose that a search has found [m, m, rad]
+DECIMETRE = np.array([0.12, 0.12, 0.05])  # standard deviations of a pose that calibration goes by [m, m, rad]
 STOPPED = "stopped"
 """Source of a plan that the supervisor has made: come to rest."""
 
@@ -67,6 +69,8 @@ class Pilot(Generic[PlannerT]):
         slowed: true if the emergency stop has changed the control of the last tick.
         driven: (m,) control of the last tick.
         search_said: why the last search has not found the robot, "" where it has.
+        calibration: slow states of the sensors.
+        recalibrated: true if one of them has jumped in the last tick.
         planless: whether no solve is to give a plan: a planner that is out of time.
     """
 
@@ -92,6 +96,7 @@ class Pilot(Generic[PlannerT]):
         self.driven = np.zeros(s.kind.size)
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
         self._signals = DriveSignals(s.dt, s.most, s.kind)
+        self.calibration, self.recalibrated = Calibration(distance_map, s.dt, s.kind), False
         self._pause, self.search_said = 0, ""
         self._awake = False
         self._first: Scan | None = None
@@ -105,6 +110,11 @@ class Pilot(Generic[PlannerT]):
     def verdict(self) -> HealthReport:
         """Report of the supervisor at the last tick."""
         return self.supervisor.verdict
+
+    @property
+    def power_off(self) -> bool:
+        """Request that the power of the motors be cut: they do not do what they are told."""
+        return self._signals.power_off
 
     @property
     def planless_for(self) -> float:
@@ -153,7 +163,9 @@ class Pilot(Generic[PlannerT]):
             self.estimator.pose if wheels is None else s.kind.step(self.estimator.pose[None], wheels[None], s.dt)[0]
         )
         if not looked:
-            self.estimator.update(seen, wheels, s.dt)
+            seen = self._put_right(seen, wheels)
+            predicted = self.estimator.pose if self.recalibrated else predicted
+            self.estimator.update(seen, None if self.recalibrated else wheels, s.dt)
         if seen is not None and wheels is not None:
             seen = seen.deskewed(s.kind.of(wheels))
         pose = self.pose = self.estimator.pose
@@ -174,7 +186,7 @@ class Pilot(Generic[PlannerT]):
         )  # fmt: skip
         refused = self.validator.refused
         why = {"fix": refused.get("lidar", "") or self.estimator.refused, "odometry": refused.get("wheels", "")}
-        verdict = self.supervisor.judge(signals.values(), why)
+        verdict = self.supervisor.judge({**signals.values(), **self._calibrate(seen, predicted, wheels)}, why)
         self._find_again(seen)
         if verdict.rests:
             plan = self._rest(pose)
@@ -188,6 +200,35 @@ class Pilot(Generic[PlannerT]):
                 plan = self._stop(plan, seen)
         self.clock.split("plan")
         return plan
+
+    def _put_right(self, scan: Scan | None, wheels: Array | None) -> Scan | None:
+        """The scan as a good lidar had taken it; where calibration jumps, the estimate begins anew by the wheels."""
+        known = self.calibration
+        self.recalibrated = False
+        if scan is None or wheels is None:
+            known.pose = None
+            return scan
+        right = known.right(scan)
+        self.recalibrated = known.jumps(right, wheels)
+        if known.pose is None or not self.recalibrated:
+            return right
+        self.estimator.reset(known.pose, FOUND_SIGMA)
+        self._forget_tracks()
+        return known.right(scan)
+
+    def _calibrate(self, scan: Scan | None, predicted: Array, wheels: Array | None) -> dict[str, float]:
+        """Signals of the calibration, after a scan that was put right, and a pose (3,) predicted by the wheels."""
+        known, spread = self.calibration, np.sqrt(np.diag(self.estimator.covariance))
+        sure = not self.estimator.refused and bool((spread < DECIMETRE).all())
+        trusted = "wheels" not in self.validator.refused and not self.recalibrated
+        known.note(scan if sure else None, predicted, self.estimator.pose, wheels if trusted else None)
+        mount, bias = np.abs(known.used).tolist()
+        return {"mount": mount, "bias": bias, "scale": known.scale_jump}
+
+    def _forget_tracks(self) -> None:
+        """Begin anew with what no map shows."""
+        self.tracker, self.points = DiscTracker(self._map), PointWatch()
+        self.tracks = Tracks.none()
 
     def _plan(self, pose: Array, route: Route, share: float) -> Plan:
         """Along the route, at a share of the speed."""
@@ -251,14 +292,14 @@ class Pilot(Generic[PlannerT]):
         if result.pose is None:
             return
         self.estimator.reset(result.pose, FOUND_SIGMA)
-        self.pose, self.relocated = self.estimator.pose, True
-        self.tracker, self.points = DiscTracker(self._map), PointWatch()
-        self.tracks = Tracks.none()
+        self.pose, self.relocated, self.calibration.pose = self.estimator.pose, True, None
+        self._forget_tracks()
 
     def take_over(self, other: Pilot[PlannerT]) -> None:
         """Go on where another pilot, with another map, was."""
         self.validator, self.supervisor, self._signals = other.validator, other.supervisor, other._signals
         self.driven, self.share = other.driven, other.share
+        self.calibration.take_over(other.calibration)
 
 
 def make_pilot(

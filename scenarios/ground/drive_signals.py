@@ -28,6 +28,9 @@ RAMPS: Mapping[str, Ramp] = {
     "lag": Ramp("the motors follow late", 0.05, 0.3, least=0.5),  # [s]; half as fast, braking is as short as without
     "slip": Ramp("the wheels slip", 0.25, 0.6, least=0.4),  # share of the way
     "odometry": Ramp("no odometry", 0.15, 1.0, least=0.3),  # [s]
+    "mount": Ramp("the lidar has turned in its mount", 0.02, 0.15, least=0.4),  # [rad]
+    "bias": Ramp("the lidar measures too far or too near", 0.02, 0.2, least=0.4),  # [m]
+    "scale": Ramp("the scale of the wheels has jumped", 0.12, 0.4, least=0.8),  # share of the way
 }
 """By signal."""
 
@@ -38,6 +41,9 @@ LATELY = 4  # ticks whose commands may still be on their way to the wheels
 WAY = 8  # ticks over which slip is summed up
 TRAVELLED = 0.2  # [m] in that time, below which nothing is said
 HELD = 1e6  # what a wheel that is not trusted misses
+MOVING = 0.1, 0.3  # [m/s, rad/s]; slower is rest, which does no harm
+DISOBEYED = 0.3  # [s] for which motors may do something else before their power is to be cut
+PAUSE, CHANCE = 4.0, 1.0  # [s] of rest after that, the last of them with power: motors that move then are given up
 HOLD = 2.0  # [s] for which wheels are not trusted again, twice as long every time
 
 
@@ -63,6 +69,7 @@ class DriveSignals:
         self._shifts: deque[tuple[float, float]] = deque(maxlen=WAY)
         self._fixed: Array | None = None
         self._held, self._hold = 0.0, HOLD
+        self._disobeyed, self._off, self._obeyed = 0, 0.0, base.of(np.zeros(base.size))
 
     def note(
         self,
@@ -108,11 +115,34 @@ class DriveSignals:
             done.append(np.array([*moved, turned]) / self._dt)
         self._fixed = pose.copy() if corrected else None
         self._missed.append(min(self._misses(did) for did in done))
+        self._watch_power(done)
         self._held = max(0.0, self._held - self._dt)
         if self._distrust() >= RAMPS["wheels"].ends and not self._held:
             self._held, self._hold = self._hold, 2.0 * self._hold
         shift = forward(predicted, pose) if corrected and trusted else 0.0
         self._shifts.append((shift, float(wheels[0]) * self._dt))
+
+    @property
+    def power_off(self) -> bool:
+        """True while the power of the motors is to be cut: for 0.3 s the robot has moved, and not as it is told.
+
+        For good if it has gone on as before, whatever it was told. If something else has set it in motion, or a wheel
+        is dead, the motors have another chance once it rests.
+        """
+        return self._off > CHANCE
+
+    def _watch_power(self, done: list[Array]) -> None:
+        """Compare body velocities (k,), by wheels and by scans, with commands; both have to say that motors disobey."""
+        moves = all((np.abs(did) > [*[MOVING[0]] * (len(did) - 1), MOVING[1]]).any() for did in done)
+        obeys = any(self.motors.obey(did) for did in done)
+        self._disobeyed = self._disobeyed + 1 if moves and not obeys else 0
+        self._obeyed = done[0] if obeys else self._obeyed
+        if self._off:
+            lurches = moves and self._off <= CHANCE
+            self._off = math.inf if lurches else max(0.0, self._off - self._dt)
+        elif self._disobeyed * self._dt > DISOBEYED - 0.5 * self._dt:
+            same = np.abs(done[0] - self._obeyed) < [*[MOVING[0]] * (len(done[0]) - 1), MOVING[1]]
+            self._off = math.inf if same.all() else PAUSE
 
     def _moved(self, one: Array, other: Array) -> Array:
         """(1,) distance ahead, or (2,) ahead and to the left, from a pose (3,) to another [m]."""
@@ -148,7 +178,7 @@ class DriveSignals:
             "spread": self._spread,
             "plan": self._plan,
             "tick": self._took / self._dt,
-            "wheels": HELD if self._held else self._distrust(),
+            "wheels": HELD if self._held or self._off else self._distrust(),
             "lag": self.motors.seconds,
             "slip": slip,
             "odometry": self._odometry,

@@ -49,6 +49,9 @@ class World(Protocol):
     def odometry(self) -> Sequence[float]:
         """Mean control (m,) over the last step as measured."""
 
+    def power(self, on: bool) -> None:
+        """Give the motors power, or cut it."""
+
     def carry(self, pose: ArrayLike) -> None:
         """Put the robot down at another pose (3,), at rest."""
 

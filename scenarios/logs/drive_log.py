@@ -131,6 +131,8 @@ class EpisodeLog(StoredLog):
     """Of the beams of the last scan that ended near something on the map."""
     emergency_stop: BoolArray = column(dtype=np.bool_)
     """True where beams alone have slowed the robot below what was planned."""
+    power_off: BoolArray = column(dtype=np.bool_)
+    """True where the robot asks for the power of its motors to be cut."""
     fault: list[str] = words()
     """What was made to go wrong just then."""
 

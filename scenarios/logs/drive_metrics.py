@@ -29,9 +29,10 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         plan, in which the robot braked (``emergency_ticks``, the same ticks), ``rescued_ticks`` those for which the
         second backend had one and the first had not, and ``plan_status`` counts the status words of all ticks.
         ``odometry_error_m`` is the error of dead reckoning. ``outcomes`` says what became of every goal, ``health``
-        and ``causes`` count ticks by what the supervisor made of them, ``dropped_samples`` what was not let in, and
-        ``last_stops`` ticks in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate, perception,
-        repair of the route and plan; ``late_ticks`` took longer than their period.
+        and ``causes`` count ticks by what the supervisor made of them, ``dropped_samples`` what was not let in,
+        ``power_off_s`` is the time at which the robot first asked for its motors' power to be cut, None for never, and
+        ``last_stops`` counts ticks in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate,
+        perception, repair of the route and plan; ``late_ticks`` took longer than their period.
 
     Raises:
         ScenarioError: the episode has no tick.
@@ -81,6 +82,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "causes": dict(sorted(Counter(cause for cause in log.cause if cause).items())),
         "dropped_samples": dict(sorted(log.dropped.items())),
         "subproblems": dict(sorted(log.subproblems.items())),
+        "power_off_s": float(log.time[np.argmax(log.power_off)]) if log.power_off.any() else None,
         "last_stops": int(np.count_nonzero(log.emergency_stop)),
         "explained_share": {"mean": float(np.mean(log.explained)), "min": float(np.min(log.explained))},
         "tick_ms": timing(log.tick_ms),

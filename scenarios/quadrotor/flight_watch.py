@@ -83,7 +83,7 @@ class FlightWatch:
         """
         seen = self.validator.reading(reading, now, np.zeros(4) if applied is None else applied)
         if applied is not None:
-            self.felt.note(seen.force, float(applied[3]), belief)
+            self.felt.note(seen.force, float(self.felt.expected(applied)[3]), belief)
         return seen
 
     def judge(self, told: Reading | None, belief: Belief) -> None:
@@ -105,7 +105,8 @@ class FlightWatch:
         signals = {
             "sight": self._sight, "spread": math.sqrt(max(spread, 0.0)), "plan": self._plan,
             "strangers": float(sum(self._strangers)), "inertial": self._inertial,
-            "push": float(np.hypot(*self.felt.push)), "thrust": abs(self.felt.missing),
+            "push": float(np.hypot(*self.felt.push)),
+            "thrust": max(abs(self.felt.missing), abs(1.0 - self.felt.thrust_yield)),
         }  # fmt: skip
         verdict = self.supervisor.judge(signals, {"sight": self.validator.refused.get("detector", "")})
         waits = verdict.rests or self._plan > RAMPS["plan"].ends

@@ -104,6 +104,7 @@ class Wheels:
 
     Attributes:
         velocity: (m,) of the motors now: of a unicycle forward and turning [m/s, rad/s].
+        powered: false while brakes hold the wheels, whatever they are told.
     """
 
     def __init__(self, drivetrain: Drivetrain, base: Base = unicycle.BASE) -> None:
@@ -115,7 +116,7 @@ class Wheels:
         self._coming: deque[tuple[float, Array]] = deque()
         self._told = np.zeros(base.size)
         self._now = self._computed = 0.0
-        self.velocity = np.zeros(base.size)
+        self.velocity, self.powered = np.zeros(base.size), True
 
     def tell(self, command: Sequence[float], computing: float = 0.0) -> None:
         """Send a command (m,) now, which took so long to compute [s]; it acts after the latency, until another does."""
@@ -132,7 +133,8 @@ class Wheels:
         while self._coming and self._coming[0][0] <= self._now + 0.5 * dt:
             self._told = self._coming.popleft()[1]
         self._now += dt
-        self.velocity, mean = followed(self._told, self.velocity, self._drivetrain.lag, self._most * dt, dt)
+        told, lag = (self._told, self._drivetrain.lag) if self.powered else (np.zeros_like(self._told), 0.0)
+        self.velocity, mean = followed(told, self.velocity, lag, self._most * dt, dt)
         return mean
 
 

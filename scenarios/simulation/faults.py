@@ -1,7 +1,8 @@
 """Injected faults between a simulated world and the robot in it.
 
-A fault is stated as ``KIND@SECONDS[:DURATION]``; without a duration it stays. Faults of sensors change what arrives,
-those of actuators what is done, and the robot is told of none.
+A fault is stated as ``KIND[=SIZE]@SECONDS[:DURATION]``; without a duration it stays, and without a size it is as large
+as usual. Faults of sensors change what arrives, those of actuators and of the plant what is done, and the robot is told
+of none.
 """
 
 from __future__ import annotations
@@ -22,29 +23,37 @@ from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.typing import Array
 
-__all__ = ["DRIVE_FAULTS", "FLIGHT_FAULTS", "DriveFaults", "Fault", "FlightFaults", "one_of"]
+__all__ = ["DRIVE_FAULTS", "FLIGHT_FAULTS", "SIZES", "DriveFaults", "Fault", "FlightFaults", "one_of"]
 
 DRIVE_FAULTS = (
     "lidar-nan", "lidar-inf", "lidar-max", "lidar-negative", "lidar-frozen", "lidar-dropped", "lidar-delayed",
     "lidar-blind", "beams-missing", "odometry-nan", "odometry-slip", "wheel-dead", "kidnapped", "wrong-map",
-    "solver-timeout", "actuator-lag",
+    "solver-timeout", "actuator-lag", "actuator-stuck", "lidar-turned", "range-bias", "wheel-scale",
 )  # fmt: skip
 """Of the driving robot."""
 
-FLIGHT_FAULTS = ("detector-lost", "detector-false", "thrust-loss", "gust", "solver-timeout")
+FLIGHT_FAULTS = ("detector-lost", "detector-false", "thrust-loss", "gust", "solver-timeout", "payload")
 """Of the quadrotor."""
+
+SIZES = {
+    "odometry-slip": 1.6,  # wheels that slip turn so many times as far as the robot goes
+    "wheel-scale": 1.3,  # wheels measure so many times what they do, of the way and of the turn
+    "actuator-lag": 0.3,  # [s]; time constant of a motor that lags
+    "lidar-turned": math.radians(10.0),  # [rad] of its mount, to the left; ten beams
+    "range-bias": 0.3,  # [m] that is added to every range
+    "thrust-loss": 0.1,  # of the thrust that is missing
+    "gust": 4.0,  # [m/s^2]
+    "payload": 0.4,  # of the vehicle's own mass
+}
+"""Usual size by kind; the others have none."""
 
 BLIND = 0.3  # [rad] to both sides of straight ahead, where a lidar that is half covered sees nothing
 LATE = 0.4  # [s] by which a delayed scan comes late
 RANGE_MAX = 12.0  # [m]; what a lidar that sees nothing may say
-SPIN = 1.6  # wheels that slip turn so many times as far as the robot goes
 AXLE = 0.3  # [m] between the wheels
-LAG = 0.3  # [s]; time constant of a motor that lags
 CARRIED = 3.0  # [m]; a robot is carried at least so far
 ROOM = 0.5  # [m] from walls where it is put down
 PHANTOMS = 3  # things that are not there and are seen
-THRUST = 0.9  # of the thrust that is left
-GUST = 4.0  # [m/s^2]
 
 
 @dataclass(frozen=True)
@@ -55,15 +64,18 @@ class Fault:
         kind: what.
         begin: when [s].
         duration: how long [s].
+        size: in the unit of its kind; None for the usual one.
     """
 
     kind: str
     begin: float
     duration: float = math.inf
+    size: float | None = None
 
     def __str__(self) -> str:
         """As it is stated."""
-        return f"{self.kind}@{self.begin:g}" + (f":{self.duration:g}" if math.isfinite(self.duration) else "")
+        size = "" if self.size is None else f"={self.size:g}"
+        return f"{self.kind}{size}@{self.begin:g}" + (f":{self.duration:g}" if math.isfinite(self.duration) else "")
 
     def holds(self, time: float) -> bool:
         """Return True if it is active at a time [s]."""
@@ -74,14 +86,17 @@ def one_of(kinds: Sequence[str]) -> Callable[[str], Fault]:
     """Reads a fault of one of some kinds from a word of the command line."""
 
     def read(text: str) -> Fault:
-        kind, _, when = text.partition("@")
+        stated, _, when = text.partition("@")
+        kind, _, size = stated.partition("=")
         begin, _, duration = when.partition(":")
         try:
-            fault = Fault(kind, float(begin), float(duration) if duration else math.inf)
+            fault = Fault(kind, float(begin), float(duration or math.inf), float(size) if size else None)
         except ValueError:
             fault = Fault(kind, math.nan)
-        if not (0.0 <= fault.begin < math.inf and fault.duration > 0.0):
-            raise argparse.ArgumentTypeError(f"{text!r} is not KIND@SECONDS[:DURATION], such as {kinds[0]}@5:2")
+        if not (0.0 <= fault.begin < math.inf and fault.duration > 0.0 and math.isfinite(fault.size or 0.0)):
+            raise argparse.ArgumentTypeError(f"{text!r} is not KIND[=SIZE]@SECONDS[:DURATION], such as {kinds[0]}@5:2")
+        if size and kind in kinds and kind not in SIZES:
+            raise argparse.ArgumentTypeError(f"a fault {kind!r} has no size: leave '={size}' out")
         if kind not in kinds:
             raise argparse.ArgumentTypeError(f"unknown fault {kind!r}: choose {', '.join(kinds)}")
         return fault
@@ -100,6 +115,11 @@ class _Faults:
     def hold(self, kind: str, time: float) -> bool:
         """Return True if a fault of this kind is active at a time [s]."""
         return any(fault.kind == kind and fault.holds(time) for fault in self._faults)
+
+    def size(self, kind: str, time: float) -> float | None:
+        """Size of the fault of this kind that is active at a time [s]; None where none is."""
+        sizes = (fault.size for fault in self._faults if fault.kind == kind and fault.holds(time))
+        return next((SIZES[kind] if size is None else size for size in sizes), None)
 
     def names(self, time: float) -> str:
         """Those that hold, for pictures."""
@@ -125,6 +145,11 @@ class DriveFaults(_Faults):
 
     def scan(self, scan: Scan, now: float) -> Scan | None:
         """Scan that arrives."""
+        turned, bias = self.size("lidar-turned", now), self.size("range-bias", now)
+        if turned is not None:
+            scan = _turned(scan, turned)
+        if bias is not None:
+            scan = replace(scan, ranges=scan.ranges + bias)
         self._scans.append(scan)
         if not self.hold("lidar-frozen", now):
             self._frozen = scan
@@ -146,13 +171,17 @@ class DriveFaults(_Faults):
         """Odometry (m,) that arrives."""
         if self.hold("odometry-nan", now):
             return np.full(len(measured), math.nan)
-        return measured * [*[SPIN] * (len(measured) - 1), 1.0] if self.hold("odometry-slip", now) else measured
+        spin = self.size("odometry-slip", now) or 1.0
+        return measured * [*[spin] * (len(measured) - 1), 1.0] * (self.size("wheel-scale", now) or 1.0)
 
     def control(self, asked: Array, now: float, dt: float) -> Array:
         """Controls (m,) that the motors make of those asked for over ``dt`` [s]."""
         done = asked
-        if self.hold("actuator-lag", now):
-            done = self._driven + (1.0 - math.exp(-dt / LAG)) * (asked - self._driven)
+        lag = self.size("actuator-lag", now)
+        if lag:
+            done = self._driven + (1.0 - math.exp(-dt / lag)) * (asked - self._driven)
+        if self.hold("actuator-stuck", now):
+            done = self._driven
         if self.hold("wheel-dead", now):  # the right one
             left = float(done[0] - 0.5 * AXLE * done[1])
             done = np.array([0.5 * left, -left / AXLE])
@@ -173,6 +202,15 @@ class DriveFaults(_Faults):
         chosen = chosen if len(chosen) else places[room]
         place = chosen[int(self._rng.integers(len(chosen)))] if len(chosen) else pose[:2]
         return np.array([*place, self._rng.uniform(-np.pi, np.pi)])
+
+
+def _turned(scan: Scan, by: float) -> Scan:
+    """The scan of a lidar whose mount is turned to the left [rad], to the next beam."""
+    beams = round(by / scan.spacing)
+    ranges = np.roll(scan.ranges, -beams)
+    if not scan.closed and beams:
+        ranges[slice(-beams, None) if beams > 0 else slice(-beams)] = math.nan
+    return replace(scan, ranges=ranges)
 
 
 class FlightFaults(_Faults):
@@ -199,8 +237,12 @@ class FlightFaults(_Faults):
 
     def control(self, asked: Array, now: float) -> Array:
         """Body rates and thrust (4,) that the motors make of those asked for."""
-        return asked * [1.0, 1.0, 1.0, THRUST] if self.hold("thrust-loss", now) else asked
+        return asked * [1.0, 1.0, 1.0, 1.0 - (self.size("thrust-loss", now) or 0.0)]
 
     def wind(self, now: float) -> tuple[float, float]:
         """Wind that a gust adds [m/s^2]."""
-        return (0.0, GUST) if self.hold("gust", now) else (0.0, 0.0)
+        return 0.0, self.size("gust", now) or 0.0
+
+    def load(self, now: float) -> float:
+        """Mass that is carried, as a share of the vehicle's own."""
+        return self.size("payload", now) or 0.0

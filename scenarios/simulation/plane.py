@@ -259,6 +259,10 @@ class World(Space):
             made[-1] = self._steered / dt
         self._measured = made * (self._scale + noise)
 
+    def power(self, on: bool) -> None:
+        """Give the motors power, or cut it: brakes bring the wheels to rest."""
+        self._wheels.powered = on
+
     def carry(self, pose: ArrayLike) -> None:
         """Put the robot down at another pose (3,) [m, m, rad], at rest; its wheels do not turn."""
         place = np.asarray(pose, dtype=np.float64)
