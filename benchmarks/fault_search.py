@@ -75,33 +75,27 @@ def cells(seeds: Iterable[int]) -> list[Cell]:
 
 def render(rows: list[Row]) -> str:
     """The table of the least faults that harm, and the sums above it."""
-    lines = []
+    lines, tried, touching, unseen = [], 0, 0, 0
     for kind, (low, high, unit) in SPANS.items():
         mine = [one for row in rows if row["kind"] == kind for one in row["evaluations"]]
-        worst = min(mine, key=lambda one: one["unnamed"])
+        contacts = [one for one in mine if one["contact"]]
+        harmful = [one for one in mine if one["unnamed"] <= 0.0]
         after = [one["after"] for one in mine if one["after"] is not None]
-        lines.append((
-            kind, f"{low:g} to {high:g} {unit}" if unit else "-", str(len(mine)),
-            str(sum(one["contact"] for one in mine)), str(sum(_harms(one) for one in mine)),
-            least([one for one in mine if one["contact"]], unit), least([one for one in mine if _harms(one)], unit),
-            f"{worst['unnamed']:.2f}", str(len(mine) - len(after)), f"{max(after):.2f}" if after else "-",
-        ))  # fmt: skip
-    tried = [one for row in rows for one in row["evaluations"]]
-    sums = (
-        f"{len(tried)} evaluations: {sum(one['contact'] for one in tried)} with a contact, "
-        f"{sum(_harms(one) for one in tried)} of them before a cause was named."
-    )
+        clearance = min(one["unnamed"] for one in mine)
+        sizes = f"{low:g} to {high:g} {unit}" if unit else "-"
+        latest = f"{max(after):.2f}" if after else "-"
+        found = kind, sizes, len(mine), len(contacts), len(harmful), least(contacts, unit), least(harmful, unit)
+        lines.append([*map(str, found), f"{clearance:.2f}", str(len(mine) - len(after)), latest])
+        tried += len(mine)
+        touching += len(contacts)
+        unseen += len(harmful)
+    sums = f"{tried} evaluations: {touching} with a contact, {unseen} of them before a cause was named."
     head = (
         "fault", "sizes", "evaluations", "contacts", "before a name", "least that touches",
         "least that touches before a name", "least clearance before a name [m]", "never named",
         "named after at most [s]",
     )  # fmt: skip
     return f"{sums}\n\n{table(head, lines, text=2)}"
-
-
-def _harms(one: Row) -> bool:
-    """Return True for a contact before a name."""
-    return bool(one["unnamed"] <= 0.0)
 
 
 def least(harmful: list[Row], unit: str) -> str:

@@ -13,6 +13,7 @@ from dataclasses import replace
 from itertools import product
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.comparison import Row, difference, share, where
 from benchmarks.report import table
@@ -102,37 +103,31 @@ def render(rows: list[Row]) -> str:
         "mover [m/s]", "base [m/s^2]", "plans for", "drives", "without contact at the goal", "95 %", "contacts",
         "run over at rest", "not reached", "arrival / clairvoyant", "in reverse", "99 % of ticks [ms]",
     )  # fmt: skip
-    lines = []
-    counted = [row for row in rows if row.get("arrival", np.inf) <= LATEST]
-    for speed, base, futures in product(SPEEDS, BASES, FUTURES):
-        mine = where(counted, speed=speed, base=base, futures=futures)
-        if not mine:
-            continue
-        good = [r for r in mine if r["reached"] and not r["touched"]]
-        low, high = share(len(good), len(mine))
-        regret = f"{np.median([r['time'] / r['arrival'] for r in good]):.2f}" if good else "-"
-        lines.append((
-            f"{speed:g}", f"{base:g}", futures, str(len(mine)), str(len(good)),
-            f"{100 * low:.0f} .. {100 * high:.0f} %",
-            *(str(sum(r["touched"] == kind for r in mine)) for kind in ("moving", "at rest")),
-            str(sum(not r["reached"] for r in mine)), regret,
-            f"{100 * np.mean([r['reverse'] for r in mine]):.0f} %", f"{np.median([r['tick'] for r in mine]):.1f}",
-        ))  # fmt: skip
+    counted = pd.DataFrame(where(rows)).query(f"arrival <= {LATEST}")
+    good, lines = counted[counted["reached"] & (counted["touched"] == "")], []
+    for (speed, base, futures), mine in counted.groupby(["speed", "base", "futures"], sort=False):
+        touched, ours = mine["touched"].value_counts(), good.loc[good.index.intersection(mine.index)]
+        low, high = share(len(ours), len(mine))
+        regret = (ours["time"] / ours["arrival"]).median()
+        found = (
+            speed, base, futures, len(mine), len(ours), f"{100 * low:.0f} .. {100 * high:.0f} %",
+            touched.get("moving", 0), touched.get("at rest", 0), (~mine["reached"]).sum(), f"{regret:.2f}",
+            f"{100 * mine['reverse'].mean():.0f} %", f"{mine['tick'].median():.1f}",
+        )  # fmt: skip
+        lines.append([f"{value:g}" if isinstance(value, float) else str(value) for value in found])
     words = (
         "A contact is a hull nearer than 0; *run over at rest* are those before which the robot was slower than "
         f"{REST:g} m/s for {RESTING:g} s, *contacts* the others. Arrivals are medians over drives at the goal without "
         "contact, divided by the earliest arrival of a disc of 1 m/s without accelerations that knows the future."
     )
-    words += "".join(f" {_later(counted, futures)}" for futures in FUTURES[1:])
+    ends = good.pivot_table("time", ["speed", "base", "seed"], "futures").reindex(columns=FUTURES)
+    words += "".join(f" {_later(ends, futures)}" for futures in FUTURES[1:])
     return f"{table(head, lines, text=0)}\n\n{words}"
 
 
-def _later(rows: list[Row], futures: str) -> str:
-    """Sentence about drives with other plans beside those for the worst, where both end at the goal without contact."""
-    good = [row for row in where(rows) if row["reached"] and not row["touched"]]
-    ends = {(row["speed"], row["base"], row["seed"], row["futures"]): row["time"] for row in good}
-    pairs = [(time, ends.get((*key, "worst"))) for (*key, kind), time in ends.items() if kind == futures]
-    differences = np.array([mine - worst for mine, worst in pairs if worst is not None])
+def _later(ends: pd.DataFrame, futures: str) -> str:
+    """Sentence about times (drives, futures) at the goal without contact, beside those of plans for the worst."""
+    differences = (ends[futures] - ends["worst"]).dropna().to_numpy()
     if not len(differences):
         return f"No drive with plans for the {futures} has a pair."
     return (

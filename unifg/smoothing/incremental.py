@@ -8,9 +8,9 @@ from typing import Any
 from unifg.errors import GraphError
 from unifg.locks import synchronized
 from unifg.modeling.model import AnyResidual
-from unifg.smoothing.factors import FIELD
+from unifg.smoothing.factors import FIELD, Staged
 from unifg.smoothing.families import GrowingFamily
-from unifg.smoothing.revocable import LEAST, Revocable, limit_of
+from unifg.smoothing.revocable import LEAST, Revocable, Revocables, limit_of
 from unifg.smoothing.smoother import Effort, Smoother
 from unifg.typing import Numbers
 
@@ -39,6 +39,11 @@ class Incremental(Smoother):
             GraphError: when a number is out of range.
         """
         super().__init__(relinearize, every, wildfire)
+        self._revocables = Revocables()
+
+    def _watch(self, item: Staged) -> None:
+        """Remember revocable factors."""
+        self._revocables.add(self, item, item.limit)
 
     @synchronized
     def minimize(self, function: AnyResidual, *arguments: Any, revocable: float | None = None, **options: Any) -> None:

@@ -11,18 +11,16 @@ tried is kept if the truncated cost has become less.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.smoothing.factors import Staged
 from unifg.smoothing.queries import covariance_root, factor_rows, squared_errors
+from unifg.smoothing.smoother import Smoother
 from unifg.smoothing.state import STALE
 from unifg.typing import Array, IntArray
-
-if TYPE_CHECKING:
-    from unifg.smoothing.factors import Staged
-    from unifg.smoothing.smoother import Smoother
 
 LEAST = 1e-12  # weight of a factor that does not count
 NEWEST = 8  # left out ones with which a new one is tried

@@ -28,7 +28,6 @@ from unifg.smoothing.queries import (
     full_steps,
     total_cost,
 )
-from unifg.smoothing.revocable import Revocables
 from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, Records, State, empty_state
 from unifg.smoothing.tree import give_up
 from unifg.smoothing.undetermined import enough
@@ -96,7 +95,6 @@ class Smoother:
         self._memory = self._words.ctypes.data
         self._hold(empty_state())
         self._order: list[GrowingFamily] = []
-        self._revocables = Revocables()
         self._written = 0  # types of factors that compiled code knows
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -298,7 +296,7 @@ class Smoother:
             lists, numbers = add_factors(self._memory, item.kind, touched, item.data, number, item.items)
             self._move(lists, numbers)
             if item.limit:
-                self._revocables.add(self, item, item.limit)
+                self._watch(item)
         self._staged.clear()
         for _ in range(iterations):
             self._solve()
@@ -309,6 +307,9 @@ class Smoother:
     def _stamps(self, family: GrowingFamily, count: int, time: float | None) -> Array:
         """Ages of new members; they matter only where the order is chronological."""
         return np.zeros(count)
+
+    def _watch(self, item: Staged) -> None:
+        """Remember factors with a limit, which have just been added."""
 
     def _late(self, item: Staged, gone: BoolArray) -> None:
         """Factors with a variable that was marginalised: (n,) which of them."""
