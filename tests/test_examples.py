@@ -320,6 +320,16 @@ def test_first_order_tick(run: Run) -> None:
 
 
 @run_by_draw
+def test_branching_plan(run: Run) -> None:
+    """Both cases are left room for, at less than a fifth of the time that plans for the worst lose."""
+    driven, line = run("branching_plan")["driven"], 12.0
+    free = {kind: len(driven(kind, False)) for kind in ("the worst", "the likeliest", "both")}
+    assert free["both"] - free["the likeliest"] < 0.2 * (free["the worst"] - free["the likeliest"])
+    stopped = {kind: driven(kind, True)[-1, 0] for kind in free}
+    assert max(stopped["the worst"], stopped["both"]) < line + 1e-3 and stopped["the likeliest"] > line + 0.5
+
+
+@run_by_draw
 def test_many_plans(run: Run) -> None:
     ran = run("many_plans")
     assert ran["found"].converged and 0.2 * ran["K"] < ran["above"].sum() < 0.8 * ran["K"]
