@@ -44,6 +44,7 @@ COLD_PENALTY = 10.0  # Birgin and Martinez
 FALL = 0.25  # of the change of multipliers over rho, between outer iterations; else rho grows
 FALLING = 0.9  # of the violation, between outer iterations: progress where rho cannot grow
 STEADY = 20  # steps of the literal loop without a lower violation, before a warning
+KEPT = 1e-9  # violation of constraints that hold but for rounding, whatever the tolerance
 PATIENCE = 3  # outer iterations in which it did not fall, before another way is looked for
 WARM_PENALTY = 100.0
 UNSEEN = 1e-11  # of the largest coordinate: steps as short as this are rounding, unless the gradient falls
@@ -124,7 +125,7 @@ class AugmentedLagrangian(Solver):
         lowest, since = np.inf, 0  # violation, and steps without a lower one
         while run.status is None:
             violation = run.optimality.violation
-            since = 0 if violation <= max(FALLING * lowest, run.tolerances.violation) else since + 1
+            since = 0 if violation <= max(FALLING * lowest, run.tolerances.violation, KEPT) else since + 1
             lowest = violation if since == 0 else lowest
             if since == STEADY:
                 logger.warning(

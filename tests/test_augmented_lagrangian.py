@@ -284,6 +284,18 @@ def test_a_constant_penalty_that_does_not_do_is_named_once(
                    for k, v in enumerate(violations[:-20]))  # fmt: skip
 
 
+def test_a_constant_penalty_that_does_is_not_named_for_rounding(caplog: pytest.LogCaptureFixture) -> None:
+    """A guess that keeps the constraint is no lower violation to be reached again: what is left then is rounding."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize(fg.prior, x, [0.1])
+    graph.constrain(lambda x: x**2 - 2.0, x, lower=0.0, upper=0.0)
+    backend = AugmentedLagrangian(schedule="bazzana", penalty=1e3, tolerance=1e-300, max_iterations=100)
+    solution = backend.solve(graph, {x: [[np.sqrt(2.0)]]})
+    assert solution.iterations > 50 and solution.violation < 1e-9
+    assert not [record for record in caplog.records if "constant penalty" in record.getMessage()]
+
+
 def test_the_damped_loop_that_cannot_move_says_so() -> None:
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(1), 1)
