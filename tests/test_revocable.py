@@ -197,6 +197,41 @@ def test_what_is_stated_as_always_counting_is_as_it_was() -> None:
     )
 
 
+def test_one_that_came_with_a_failing_update_is_judged_by_the_next() -> None:
+    smoother = Incremental()
+    x = smoother.variables("x", fg.SE2)
+    smoother.minimize(fg.between, x[0], x[1], STEP, sigma=SIGMA)
+    smoother.minimize(fg.between, x[0], x[1], STEP + 0.05, sigma=SIGMA, revocable=C)
+    with pytest.raises(GraphError, match="not determined"):
+        smoother.update({x: [np.zeros(3), STEP]})
+    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.01)
+    smoother.update()
+    assert accepted(smoother) == [True]
+
+
+def test_a_trial_that_cannot_be_solved_is_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two closures far off are tried together; when that raises, the map is as it was."""
+    smoother, x = loop(40)
+    for j in (39, 38):
+        closure(smoother, x, 0, j, 0.0)
+    smoother.update()
+    closure(smoother, x, 0, 37, 30.0)
+    smoother.update()
+    place, solve, calls = smoother.estimate(x[39]), Incremental._solve, []
+
+    def failing(self: Incremental) -> None:
+        solve(self)
+        calls.append(1)
+        if len(calls) == 2:  # the update itself is the first
+            raise GraphError("x[3] is determined by its factors, but lost to rounding")
+
+    monkeypatch.setattr(Incremental, "_solve", failing)
+    closure(smoother, x, 0, 36, 30.0)
+    smoother.update()
+    assert len(calls) > 2 and accepted(smoother) == [True, True, False, False]
+    assert smoother.estimate(x[39]) == pytest.approx(place, abs=5e-3)  # where it is linear has moved
+
+
 def test_a_copy_goes_on() -> None:
     smoother, x = loop()
     closure(smoother, x, 0, 19, 30.0)

@@ -101,8 +101,7 @@ class Incremental(Smoother):
             GraphError: naming a member without value, a value that is not on its manifold, or a member that no factor
                 determines. Only in the last case are values and factors kept, for another try.
         """
-        first = len(self._revocables)
         self._update(values, None, iterations)
         if len(self._revocables):
-            self._revocables.settle(self, first, iterations > 1)
+            self._revocables.settle(self, iterations > 1)
         return self._effort()

@@ -20,7 +20,7 @@ from unifg.smoothing.factors import Staged
 from unifg.smoothing.queries import covariance_root, factor_rows, squared_errors
 from unifg.smoothing.smoother import Smoother
 from unifg.smoothing.state import STALE
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, BoolArray, IntArray
 
 LEAST = 1e-12  # weight of a factor that does not count
 NEWEST = 8  # left out ones with which a new one is tried
@@ -64,6 +64,7 @@ class Revocables:
         self._group = np.zeros(0, dtype=np.int64)  # of each; those that belong together have one
         self._ends = np.zeros((0, 2), dtype=np.int64)  # first and last variable of the latest factor of each group
         self._hidden = np.zeros(0)  # times |W r|^2 of a group is at least what the rest would cost less without it
+        self._settled = 0  # factors that have been judged at least once
 
     def __len__(self) -> int:
         """Number of factors."""
@@ -114,9 +115,9 @@ class Revocables:
             for label, accepted, error in zip(self._labels, self.accepted, squared, strict=True)
         ]
 
-    def settle(self, smoother: Smoother, first: int, several: bool) -> None:
-        """Accept, revoke and try after an update of one or several passes, in which those from ``first`` on came."""
-        before = self.accepted.copy()
+    def settle(self, smoother: Smoother, several: bool) -> None:
+        """Accept, revoke and try after an update of one or several passes."""
+        before, first, self._settled = self.accepted.copy(), self._settled, len(self)
         for new in range(first, len(self)):
             if self._innovation(smoother, [new]) <= self._limits[new]:
                 self.accepted[new] = True
@@ -152,12 +153,9 @@ class Revocables:
                     worst, excess = counting, less / limits[number]
             if not worst:
                 return
-            before, cost = self.accepted.copy(), self._cost(smoother)
-            self.accepted[worst] = False
-            self._apply(smoother, before, PASSES)
-            if not self._cost(smoother) < cost:
-                last, self.accepted = self.accepted, before
-                self._apply(smoother, last, PASSES)
+            wanted = counts.copy()
+            wanted[worst] = False
+            if not self._better(smoother, wanted, [], 1):
                 return
 
     def _deletion(self, smoother: Smoother, number: int, counting: list[int]) -> float:
@@ -178,19 +176,28 @@ class Revocables:
         earlier = [k for k in left_out[-NEWEST:] if group[k] or self._explains(smoother, new, alone, k)]
         if not earlier:
             return
-        before, cost = self.accepted.copy(), self._cost(smoother)
-        wanted = before.copy()
+        wanted = self.accepted.copy()
         wanted[[*earlier, new]] = True
-        for number in range(ROUNDS):
-            last, self.accepted = self.accepted, wanted
-            self._apply(smoother, last, PASSES)
-            wanted = self._squared(smoother) <= self._limits
-            wanted[[*earlier, new]] |= number == 0  # the others give way first
-            if np.array_equal(wanted, self.accepted):
-                break
-        if not self._cost(smoother) < cost:
+        self._better(smoother, wanted, [*earlier, new], ROUNDS)
+
+    def _better(self, smoother: Smoother, wanted: BoolArray, tried: list[int], rounds: int) -> bool:
+        """Let those that are wanted count, and what agrees with them then; all is as it was unless that costs less."""
+        before, cost = self.accepted.copy(), self._cost(smoother)
+        try:
+            for number in range(rounds):
+                last, self.accepted = self.accepted, wanted
+                self._apply(smoother, last, PASSES)
+                wanted = self._squared(smoother) <= self._limits
+                wanted[tried] |= number == 0  # the others give way first
+                if np.array_equal(wanted, self.accepted):
+                    break
+            better = self._cost(smoother) < cost
+        except GraphError:  # too far to be solved
+            better = False
+        if not better:
             last, self.accepted = self.accepted, before
             self._apply(smoother, last, PASSES)
+        return better
 
     def _explains(self, smoother: Smoother, new: int, alone: float, k: int) -> bool:
         """Test whether most of the disagreement of a factor would be gone if another one counted."""
