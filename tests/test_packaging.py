@@ -165,6 +165,7 @@ def test_sdist_holds_the_examples(source: Path, wheel: Path) -> None:
     assert names >= {path.name for path in (CHECKOUT / "examples").glob("*.py")}
 
 
+@pytest.mark.product(1, of="wheels")
 def test_wheel_is_the_same_without_links(source: Path, wheel: Path, tmp_path: Path) -> None:
     """Git on Windows, and some archives, turn a link into a small text file that holds its target."""
     bare = copy_checkout(source, tmp_path / "unifg")
@@ -223,6 +224,7 @@ def test_console_script(clean: Path) -> None:
     assert config()["project"]["version"] in run(clean / "unifg", "--version", cwd=clean)
 
 
+@pytest.mark.product(1, of="wheels")
 def test_a_table_of_a_paper_from_the_wheel(clean: Path, tmp_path: Path) -> None:
     for extra in EXTRAS:
         pytest.importorskip(extra)
