@@ -133,7 +133,8 @@ class DriveSignals:
 
     def _watch_power(self, done: list[Array]) -> None:
         """Compare body velocities (k,), by wheels and by scans, with commands; both have to say that motors disobey."""
-        moves = all((np.abs(did) > [*[MOVING[0]] * (len(did) - 1), MOVING[1]]).any() for did in done)
+        rest = [*[MOVING[0]] * (len(done[0]) - 1), MOVING[1]]
+        moves = all((np.abs(did) > rest).any() for did in done)
         obeys = any(self.motors.obey(did) for did in done)
         self._disobeyed = self._disobeyed + 1 if moves and not obeys else 0
         self._obeyed = done[0] if obeys else self._obeyed
@@ -141,7 +142,7 @@ class DriveSignals:
             lurches = moves and self._off <= CHANCE
             self._off = math.inf if lurches else max(0.0, self._off - self._dt)
         elif self._disobeyed * self._dt > DISOBEYED - 0.5 * self._dt:
-            same = np.abs(done[0] - self._obeyed) < [*[MOVING[0]] * (len(done[0]) - 1), MOVING[1]]
+            same = np.abs(done[0] - self._obeyed) < rest
             self._off = math.inf if same.all() else PAUSE
 
     def _moved(self, one: Array, other: Array) -> Array:

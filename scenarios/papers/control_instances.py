@@ -41,7 +41,7 @@ STOP = 1e-4
 RHO = 1000.0  # of the loops with a constant one: of the powers of ten, the damped loop does best with it
 LOOP: dict[str, Any] = {"penalty": RHO, "step_tolerance": STOP, "tolerance": 1e-18, "max_iterations": 1000}
 Outcome: TypeAlias = tuple[str, float, int]
-"""How it ended, cost, iterations."""
+"""Outcome, cost, iterations."""
 
 
 @dataclass(frozen=True)

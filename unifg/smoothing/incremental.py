@@ -43,7 +43,7 @@ class Incremental(Smoother):
 
     def _watch(self, item: Staged) -> None:
         """Remember revocable factors."""
-        self._revocables.add(self, item, item.limit)
+        self._revocables.add(self, item)
 
     @synchronized
     def minimize(self, function: AnyResidual, *arguments: Any, revocable: float | None = None, **options: Any) -> None:

@@ -70,7 +70,7 @@ class Revocables:
         """Number of factors."""
         return len(self._rows)
 
-    def add(self, smoother: Smoother, item: Staged, limit: float) -> None:
+    def add(self, smoother: Smoother, item: Staged) -> None:
         """Take in staged factors that have just been added, which do not count yet."""
         state, count = smoother._state, len(item.data)
         row, rows = int(state.counters["new_factors"][0]), []
@@ -78,7 +78,7 @@ class Revocables:
             rows.append(row)
             row = int(state.factors["next"][row])
         self._rows = np.append(self._rows, rows[::-1])
-        self._limits = np.append(self._limits, np.full(count, limit))
+        self._limits = np.append(self._limits, np.full(count, item.limit))
         self.accepted = np.append(self.accepted, np.zeros(count, dtype=bool))
         for k in range(count):
             members = [
