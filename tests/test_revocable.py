@@ -162,6 +162,22 @@ def test_one_that_the_rest_contradicts_later_is_taken_back() -> None:
     assert smoother.estimate(x[39])[0, 1] == pytest.approx(0.0, abs=0.1)
 
 
+@pytest.mark.parametrize(("aside", "last", "counts"), [(1.5, 24, True), (1.5, 28, False), (2.5, 24, False)])
+def test_leverage_hides_no_contradiction(aside: float, last: int, counts: bool) -> None:
+    """Odometry behind the right closures bears it all: no residual is large, and all fits without the first one."""
+    smoother, x = loop(40)
+    closure(smoother, x, 0, 39, aside)
+    smoother.update()
+    assert accepted(smoother) == [True]
+    for j in range(3, last, 2):
+        closure(smoother, x, 0, j, 0.0)
+        smoother.update()
+        assert max(each.squared for each in smoother.revocable if each.accepted) < 0.5 * C**2
+    first, *others = accepted(smoother)
+    assert first is counts and all(others)
+    assert (2.0 * smoother.cost < 0.1) is not counts and 2.0 * smoother.cost < C**2
+
+
 def test_two_that_agree_prevail_over_one_that_was_first() -> None:
     """One alone does not."""
     smoother, x = loop(40)
