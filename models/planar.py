@@ -128,7 +128,7 @@ class Base:
         return self.rollout(pose, ramp(last, controls), dt)
 
     def _advance(self, x: Array, u: ArrayLike, dt: ArrayLike, moved: Array) -> None:
-        times = np.ascontiguousarray(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)))
+        times = np.array(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)), order="C")
         _advance_all(self.moving.address, x, _rows(u, moved, self.size), times, moved)
 
 
@@ -186,7 +186,7 @@ def ramp(last: Array, u: Array) -> Array:
 
 def _rows(part: ArrayLike, moved: Array, size: int) -> Array:
     """One contiguous row per result."""
-    return np.ascontiguousarray(np.broadcast_to(np.asarray(part, dtype=np.float64), (len(moved), size)))
+    return np.array(np.broadcast_to(np.asarray(part, dtype=np.float64), (len(moved), size)), order="C")
 
 
 def ackermann(wheelbase: float = 0.3, steering: float = 0.6, rate: float = 2.0) -> Base:

@@ -160,7 +160,7 @@ def preintegrate(
         if not (np.isfinite(part).all() and (np.diff(part) > 0.0).all()):
             raise ModelError(f"preintegrate: {name} must be finite and increase")
     n = len(at) - 1
-    b = np.ascontiguousarray(np.broadcast_to(np.asarray(bias, dtype=np.float64), (n, 6)))
+    b = np.array(np.broadcast_to(np.asarray(bias, dtype=np.float64), (n, 6)), order="C")
     if not (np.isfinite(w).all() and np.isfinite(a).all() and np.isfinite(b).all()):
         raise ModelError("preintegrate: rates, forces and biases must be finite; leave out samples that are not")
     density = np.array([noise.gyro, noise.accelerometer])

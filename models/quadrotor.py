@@ -261,12 +261,12 @@ def _rows(given: ArrayLike, size: int, what: str) -> Array:
 
 def _spread(part: Array, moved: Array) -> Array:
     """One contiguous row per result."""
-    return np.ascontiguousarray(np.broadcast_to(part, (len(moved), part.shape[1])))
+    return np.array(np.broadcast_to(part, (len(moved), part.shape[1])), order="C")
 
 
 def _samples(dt: ArrayLike, moved: Array) -> Array:
     """One sampling time per result."""
-    return np.ascontiguousarray(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)))
+    return np.array(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)), order="C")
 
 
 def _defect(

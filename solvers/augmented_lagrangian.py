@@ -129,8 +129,9 @@ class AugmentedLagrangian(Solver):
             lowest = violation if since == 0 else lowest
             if since == STEADY:
                 logger.warning(
-                    "%s: in %d steps with the constant penalty %g the violation has not fallen below %.2g; %s may do, "
-                    "and schedule='bcl' chooses its own penalties", self.name, STEADY, rho, lowest,
+                    "%s: in %d steps with the constant penalty %g the violation, at last of '%s' (factor %d), has not "
+                    "fallen below %.2g; %s may do, and schedule='bcl' chooses its own penalties", self.name, STEADY,
+                    rho, *run.program.row_name(run.optimality.worst_row), lowest,
                     "a larger penalty" if damped else "schedule='bazzana-damped'",
                 )  # fmt: skip
                 lowest = -np.inf  # once is enough

@@ -280,6 +280,7 @@ def test_a_constant_penalty_that_does_not_do_is_named_once(
         lowest = float(re.findall(r"below ([\d.e-]+)", said[0])[0])
         violations = [row.violation for row in solution.history]
         assert f"penalty {penalty:g} " in said[0] and f"; {remedy} may do" in said[0]
+        assert re.search(r"of '(\w+)' \(factor \d+\)", said[0])[1] in {term.name for term in graph.terms}  # type: ignore[index]
         assert any(v == pytest.approx(lowest, rel=0.05) and min(violations[k : k + 21]) > 0.9 * lowest * 0.95
                    for k, v in enumerate(violations[:-20]))  # fmt: skip
 

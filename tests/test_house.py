@@ -285,7 +285,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 31_928, "scenarios": 12_545, "benchmarks": 4_528, "tests": 36_908,
+    "unifg solvers models": 31_983, "scenarios": 12_545, "benchmarks": 4_528, "tests": 36_923,
     "docs examples": 1_978, "unifg/factors": 4_304, "unifg/problem": 3_407, "models": 2_223,
     "unifg/elimination": 2_141, "solvers": 5_066, "unifg/solution": 3_088, "unifg/smoothing": 1_834,
     "unifg/lie": 1_403, "unifg/view": 1_401, "unifg/files": 1_216, "unifg/pose_graphs": 1_329,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from functools import partial
@@ -13,8 +14,12 @@ import pytest
 from unifg import precompile
 from unifg.codegen import precompiled
 from unifg.codegen.compile_counter import tally
+from unifg.files.g2o import write_g2o
+from unifg.pose_graphs import manhattan
 from unifg.scenarios import command
 from unifg.scenarios.commands.warm import missing
+
+EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
 
 
 @pytest.fixture
@@ -124,3 +129,48 @@ def test_the_library_is_compiled_without_extras() -> None:
     assert done.stdout.startswith("library 2\n")
     assert "scenarios are left out, they need pymunk: pip install 'unifg[scenarios]'" in done.stdout
     assert missing() == ""
+
+
+FIRST_USE = """
+import runpy, sys
+from unifg.codegen import jit, precompiled
+
+found, names = jit._Cache.load_overload, set()
+
+def look(self, signature, target):
+    names.add(f"{self._py_func.__module__}:{self._py_func.__qualname__}")
+    return found(self, signature, target)
+
+jit._Cache.load_overload = look
+import matplotlib
+matplotlib.use("Agg")
+sys.argv = sys.argv[1:]
+try:
+    runpy.run_path(sys.argv[0], run_name="__main__")
+finally:
+    mine = {name for name in names if name.startswith("unifg.") and precompiled._present(name)}
+    shipped = precompiled.archive().about["functions"]
+    print("looked for", len(mine), "and compiled", *sorted(mine - set(shipped) - {"unifg.lie.so2:compose"}))
+"""
+COMMAND = """
+import sys
+from unifg.scenarios.command import main
+main(["solve", "map.g2o", "--effort", "full", "--out", "."])
+"""
+
+
+@pytest.mark.product(2)
+@pytest.mark.parametrize("script", ["unifg solve", *sorted(path.stem for path in EXAMPLES)])
+def test_a_first_use_compiles_nothing_that_could_have_come(script: str, tmp_path: Path) -> None:
+    """Functions of unifg that scripts call are in the archive; if one is not, unifg/precompile.py lacks a job."""
+    path = tmp_path / "script.py"
+    if script == "unifg solve":
+        write_g2o(tmp_path / "map.g2o", manhattan(60).pose_graph)
+        path.write_text(COMMAND, encoding="utf-8")
+    else:
+        path = EXAMPLES[0].parent / f"{script}.py"
+    run = [sys.executable, "-c", FIRST_USE, str(path), str(tmp_path)]
+    done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said = done.stdout.splitlines()[-1]
+    assert re.fullmatch(r"looked for \d\d+ and compiled", said.strip()), f"{said}: add a job, then make kernels"

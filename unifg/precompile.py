@@ -16,6 +16,7 @@ from functools import partial
 from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,21 +32,28 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import DCS, Cauchy, GemanMcClure, Huber, TruncatedLeastSquares, Tukey
+from unifg.files.g2o import read_g2o, write_g2o
 from unifg.lie import SE2, SE3, SE23, SO2, SO3, Product, Rn
 from unifg.lie.elementwise import LAYOUTS, STORAGE
 from unifg.lie.manifold import LieGroup
 from unifg.modeling.factors import between, difference, prior
-from unifg.models import obstacles, unicycle
+from unifg.modeling.joint_prior import joint_prior
+from unifg.models import obstacles, quadrotor, unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
+from unifg.models.inertial import InertialMeasurements
+from unifg.models.interpolation import cubic
 from unifg.models.lidar import endpoint, endpoint_loss
-from unifg.models.preintegration import ImuNoise, preintegrate
+from unifg.models.preintegration import BIAS, ImuNoise, predict, preintegrate
+from unifg.models.stamped import StampedMeasurements
 from unifg.pose_graphs import Simulated, manhattan, sphere
+from unifg.pose_graphs.initialise import starts
 from unifg.smoothing import FixedLag, Incremental
 from unifg.solution.graph import Graph
 from unifg.solution.solver import Solver
 from unifg.solution.warmup_run import rehearse
 from unifg.solvers import SQP, AugmentedLagrangian, GraduatedNonConvexity, InteriorPoint
 from unifg.solvers.names import TABLE, backend
+from unifg.typing import Array
 
 Job: TypeAlias = tuple[str, Callable[[], object]]
 Progress: TypeAlias = Callable[[float, str], object]
@@ -134,6 +142,7 @@ def jobs() -> Iterator[Job]:
         yield f"group {group.name}", partial(_use, group)
     yield "models", _models
     yield "driving", _drive
+    yield "questions to an answer", _question
     yield "inertial", _integrate
     for simulated, name in ((manhattan(60, outliers=0.1), "plane"), (sphere(4, 8, outliers=0.1), "space")):
         yield f"pose graph in {name}", partial(_pose_graph, simulated)
@@ -148,6 +157,7 @@ def _backends() -> Iterator[tuple[Solver, str]]:
             yield backend(name), ""
     yield SQP(hessian="exact"), "exact"
     yield SQP(qp="graph"), "graph"
+    yield SQP(qp="graph", hessian="exact"), "graph, exact"
     yield InteriorPoint(hessian="gauss-newton"), "Gauss-Newton"
     yield AugmentedLagrangian(hessian="gauss-newton"), "Gauss-Newton"
     yield AugmentedLagrangian(schedule="bazzana"), "Bazzana"
@@ -159,7 +169,17 @@ def _check() -> None:
     x = graph.variables("x", SE2, 3)
     graph.minimize(prior, x[0], [0.0, 0.0, 0.0], sigma=0.1)
     graph.minimize(between, x[:-1], x[1:], [1.0, 0.0, 0.1], sigma=0.1)
+    graph.minimize(joint_prior(SE2, SE2), x[0], x[2], np.zeros(6), sigma=1.0)
+    graph.minimize(_decide, x)
     graph.check({x: np.zeros((3, 3))})
+    prepared = backend("gn").prepare(graph)
+    for k in range(3):  # later answers are verified where a comparison comes out anew
+        prepared.solve({x: np.full((3, 3), float(k))})
+
+
+def _decide(pose: Array) -> Array:
+    """A comparison of what is unknown, which answers are asked about."""
+    return np.where(pose[:, :1] > 0.5, pose[:, :1], 0.5 * pose[:, :1])
 
 
 def _use(group: LieGroup) -> None:
@@ -174,6 +194,8 @@ def _use(group: LieGroup) -> None:
             continue
     for residual in (prior, between, difference):
         _compile(residual.on(group))
+    if group is SO3:
+        SO3.to_rpy(SO3.from_rpy(*np.zeros((3, 1))))
 
 
 def _models() -> None:
@@ -181,6 +203,8 @@ def _models() -> None:
     for module in pkgutil.walk_packages(import_module("unifg.models").__path__, "unifg.models."):
         for value in vars(import_module(module.name)).values():
             _compile(value)
+    vehicle = quadrotor.Parameters()
+    quadrotor.fly(quadrotor.STATE.identity(), quadrotor.hover(vehicle), 0.1, vehicle)
 
 
 def _compile(found: Any) -> None:
@@ -212,9 +236,55 @@ def _drive() -> None:
         solver.prepare(graph).solve_many([{x: start, u: np.full((steps, 2), 0.5)}] * 2)
 
 
+def _question() -> None:
+    """Derivatives of answers by data, with limits that act and with a robust loss, and an answer judged anew."""
+    graph = Graph()
+    x, u = graph.variables("x", SE2, 5), graph.variables("u", Rn(2), 4)
+    here, goal = graph.data("here", np.zeros(3)), graph.data("goal", [0.5, 0.0, 0.0])
+    graph.fix(x[0], here)
+    graph.minimize(prior, x[1:], goal, sigma=[0.5, 0.5, 1.0], robust=Huber(0.3), name="goal")
+    graph.minimize(prior, u, [0.0, 0.0], sigma=1.0, name="effort")
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.1, lower=0, upper=0, name="motion")
+    graph.bound(u, lower=-0.5, upper=0.5, name="limits")
+    prepared, guess = InteriorPoint(tolerance=1e-9).prepare(graph), {x: np.zeros((5, 3)), u: np.zeros((4, 2))}
+    prepared.solve_many([guess] * 2)
+    solution = prepared.solve(guess)
+    solution.sensitivity(u[0], here)
+    solution.gains(x, u)
+    solution.verify()
+    solution.explain()
+    free = Graph()
+    y = free.variables("y", SE2, 4)
+    measured = free.data("measured", [[1.0, 0.0, 0.1]] * 3)
+    free.minimize(prior, y[0], [0.0, 0.0, 0.0], sigma=0.1)
+    free.minimize(between, y[:-1], y[1:], measured, sigma=0.1, robust=Huber(1.0))
+    backend("lm").prepare(free).solve({y: np.zeros((4, 3))}).sensitivity(y[-1], measured)
+
+
 def _integrate() -> None:
-    """Samples of an IMU."""
-    preintegrate([0.0], [[0.0, 0.0, 0.1]], [[0.0, 0.0, 9.8]], [0.0, 0.1], ImuNoise(), np.zeros(6))
+    """Samples of an IMU, as increments and as measurements between states."""
+    times, rates, forces = [0.0, 0.05, 0.1], np.zeros((3, 3)), np.tile([0.0, 0.0, 9.8], (3, 1))
+    preintegrate(times[:1], rates[:1], forces[:1], [0.0, 0.1], ImuNoise(), np.zeros(6))
+    graph = Graph()
+    x, b = graph.variables("x", SE23, 2), graph.variables("bias", BIAS, 2)
+    imu, fixes = (
+        InertialMeasurements(ImuNoise()),
+        StampedMeasurements(_off, 3, capacity=1, sigma=0.1, between=cubic(SE23), name="positions"),
+    )
+    imu.state(graph, x)
+    fixes.state(graph, x)
+    graph.minimize(prior, b[0], np.zeros(6), sigma=0.1)
+    graph.minimize(prior, x[0], SE23.identity(), sigma=0.1)
+    imu.add(times, rates, forces)
+    fixes.add([0.04], [[0.0, 0.0, 0.0]])
+    start = predict(SE23.identity(), imu.integrated([0.0, 0.1], np.zeros((1, 6))))
+    data = imu.at(graph, [0.0, 0.1], np.zeros((1, 6))) | fixes.at(graph, [0.0, 0.1])
+    backend("lm").prepare(graph).solve({x: start, b: np.zeros((2, 6))}, data=data).marginals(x)
+
+
+def _off(state: Array, position: Array) -> Array:
+    """Position of a state, less a measured one."""
+    return state[:, :3] - position
 
 
 def _pose_graph(simulated: Simulated) -> None:
@@ -233,6 +303,11 @@ def _pose_graph(simulated: Simulated) -> None:
         solution.report()
     graph, x, guess = found.graph(robust=TruncatedLeastSquares(1.0))
     GraduatedNonConvexity().solve(graph, guess)
+    with TemporaryDirectory() as folder:
+        write_g2o(Path(folder) / "map.g2o", found)
+        found = read_g2o(Path(folder) / "map.g2o")
+    starts(found)
+    found.verdict(effort="full")
 
 
 def _share() -> None:
