@@ -12,6 +12,7 @@ import unifg as fg
 from unifg.models import landmarks, obstacles, quadrotor, space_landmarks, unicycle
 from unifg.models.inertial import motion
 from unifg.solvers import LevenbergMarquardt
+from unifg.typing import Array
 
 TURNED = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]  # the identity with its quaternion x first
 FLYING = "m, m, m, wxyz, m/s, m/s, m/s"
@@ -205,12 +206,12 @@ def test_functions_of_ones_own_declare_what_they_take() -> None:
 
 
 def test_declarations_change_no_bit(caplog: pytest.LogCaptureFixture) -> None:
-    def solved(**declared: str) -> np.ndarray:
+    def solved(**declared: str) -> Array:
         graph = fg.Graph()
         x = graph.variables("x", fg.SE2, 3, **declared)
         graph.minimize(fg.prior, x[0], [0.0, 0.1, 0.2], sigma=0.1)
         graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0, 0.3], sigma=[0.1, 0.1, 0.05])
-        found: np.ndarray = LevenbergMarquardt().solve(graph, {x: np.zeros((3, 3))})[x]
+        found: Array = LevenbergMarquardt().solve(graph, {x: np.zeros((3, 3))})[x]
         return found
 
     with caplog.at_level(logging.WARNING, "unifg"):

@@ -72,7 +72,7 @@ def _driven(solved: manoeuvres.Manoeuvre) -> SolvedLog:
     control, settings = held(solved.controls), solved.settings
     return SolvedLog(
         discs=np.array(solved.case.discs).reshape(-1, 3),
-        time=settings.dt * np.arange(len(control)),
+        time=settings.dt * np.arange(len(control), dtype=np.float64),
         pose=solved.states,
         wanted=solved.case.reference(settings),
         speed=control[:, 0],

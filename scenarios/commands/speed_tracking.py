@@ -47,7 +47,7 @@ def _driven(drive: velocity_tracking.Drive) -> SolvedLog:
         ways.append(np.column_stack([way, np.zeros((len(way), 2))]))
     return SolvedLog(
         discs=np.zeros((0, 3)),
-        time=dt * np.arange(len(drive.speed)),
+        time=dt * np.arange(len(drive.speed), dtype=np.float64),
         pose=ways[0],
         wanted=ways[1],
         speed=drive.speed,

@@ -74,7 +74,7 @@ def serve_by_viser(content: Content, port: int) -> Any:
         thing.put(still, content.layers[name].path, _MOST, content.layers[name])
     centre = 0.5 * (ground.low + ground.high)
     server.initial_camera.look_at = centre
-    server.initial_camera.position = centre + ground.size * np.array([0.1, -0.8, 0.9])
+    server.initial_camera.position = centre + ground.size * np.array([0.05, -0.55, 0.6])
     slider = server.gui.add_slider(content.counts, 0, max(1, len(shots) - 1), 1, 0)
 
     def show(_: object = None) -> None:
