@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -11,6 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from unifg.scenarios.episode import Progress
 from unifg.solution.history import Iteration
 
+logger = logging.getLogger("unifg")
 if TYPE_CHECKING:
     from unifg.scenarios.logs.mcap_log import Log
 
@@ -45,6 +47,8 @@ class Outcome:
         """Let :meth:`write` write the logs as MCAP, too."""
         from unifg.scenarios.logs.mcap_log import write_mcap
 
+        if not self.logs:
+            logger.warning("--mcap: a recorded drive is not recorded again")
         self.files.update({f"{stem}.mcap": partial(write_mcap, log=log) for stem, log in self.logs.items()})
 
     def write(self, folder: Path, progress: Progress) -> list[Path]:

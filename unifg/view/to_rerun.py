@@ -75,6 +75,7 @@ def log_to_rerun(content: Content, path: str | Path | None) -> Any:
     else:
         recording.save(Path(path))
     stage.static = True
+    stage.log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for name, thing in content.things.items():
         thing.put(stage, content.layers[name].path, _MOST, content.layers[name])
     for name, body in content.bodies.items():

@@ -70,6 +70,8 @@ def serve_by_viser(content: Content, port: int) -> Any:
     ground = ground_of(content, shots)
     server: Any = viser.ViserServer(host="127.0.0.1", port=port, label=content.title, verbose=False)
     still, moving = ViserStage(server.scene, ground.stroke), ViserStage(server.scene, ground.stroke)
+    server.scene.configure_environment_map(None)  # which makes colours pale
+    server.scene.add_light_ambient("/ambient", intensity=1.6)
     for name, thing in content.things.items():
         thing.put(still, content.layers[name].path, _MOST, content.layers[name])
     centre = 0.5 * (ground.low + ground.high)
