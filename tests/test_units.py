@@ -187,8 +187,8 @@ def test_shipped_models_declare_what_they_take() -> None:
 
 
 def test_functions_of_ones_own_declare_what_they_take() -> None:
-    def position(pose: np.ndarray, fix: np.ndarray) -> np.ndarray:
-        return np.subtract(pose[:, :2], fix)
+    def position(pose: Array, fix: Array) -> Array:
+        return pose[:, :2] - fix
 
     graph, x = plane()
     stated = fg.residual(position, takes=("m, m, rad in W_T_B", "m, m in W"))
