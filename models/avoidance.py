@@ -64,6 +64,7 @@ def _balls(name: str, dimension: int) -> StatedKernel:
 
 cylinder_clearance = residual(
     _balls("cylinder clearance", 2),
+    takes=("m in W", "m in W", "m"),
     about="""``cylinder_clearance(p, centre, radius)``: |(p_x, p_y) - c| - radius [m], one column per cylinder, (n, M).
 
 p: (n, 3) positions. centre: (M, 2), or (n, M, 2) for moving ones. radius: (M,) or (n, M), with the vehicle's added.
@@ -72,6 +73,7 @@ p: (n, 3) positions. centre: (M, 2), or (n, M, 2) for moving ones. radius: (M,) 
 
 sphere_clearance = residual(
     _balls("sphere clearance", 3),
+    takes=("m in W", "m in W", "m"),
     about="""
 ``sphere_clearance(p, centre, radius)``: |p - c| - radius [m] in space, (n, M), for centres (M, 3), radii (M,).""",
 )
@@ -83,6 +85,7 @@ def _to_landmark(p: Array, l: Array, radius: Array) -> Array:  # noqa: E741
 
 landmark_clearance = residual(
     StatedKernel(_to_landmark, (Rn(3), Rn(2), ()), 1, name="landmark clearance"),
+    takes=("m in W", "m in W", "m"),
     about="""``landmark_clearance(p, l, radius)``: |(p_x, p_y) - l| - radius [m], (n, 1).
 
 p: (n, 3) positions. l: (n, 2) centres of cylinders, variables of the map or constants. radius: a number or (n,).
@@ -114,6 +117,7 @@ def _segments(segments: tuple[int, ...], margin: tuple[int, ...]) -> int:
 
 segment_clearance = residual(
     StatedKernel(_to_segments, (Rn(3), 3, 1), _segments, name="segment clearance"),
+    takes=("m in W", "in W", "m"),
     about="""
 ``segment_clearance(p, segments, margin)``: distance to walls less a margin [m], one column per wall, (n, W).
 

@@ -53,7 +53,8 @@ def motion(state: Manifold = SE23, gravity: tuple[float, float, float] = GRAVITY
     Raises:
         ModelError: for another manifold.
     """
-    return residual(_kernel(cast(Hashable, state), _down(gravity)))
+    takes = ("in W_T_B", "in W_T_B", "in B", None, None, "in B", "s")
+    return residual(_kernel(cast(Hashable, state), _down(gravity)), takes=takes)
 
 
 def _down(gravity: tuple[float, float, float]) -> tuple[float, ...]:
@@ -99,7 +100,8 @@ def specific_force(state: Manifold = SE23, gravity: tuple[float, float, float] =
     Raises:
         ModelError: for another manifold.
     """
-    return residual(_felt(cast(Hashable, state), _down(gravity)))
+    takes = ("in W_T_B", "in W_T_B", "m/s^2 in B", "1/s")
+    return residual(_felt(cast(Hashable, state), _down(gravity)), takes=takes)
 
 
 @cache

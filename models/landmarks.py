@@ -12,7 +12,7 @@ import numpy as np
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import residual
 from unifg.lie import SO3, Rn, wrap_angle
-from unifg.models.quadrotor import STATE
+from unifg.models.quadrotor import STATE, TAKES
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["bearing_range", "height", "observe", "offset", "tilt"]
@@ -29,6 +29,7 @@ def _bearing_range(x: Array, l: Array, z: Array) -> Array:  # noqa: E741
 
 bearing_range = residual(
     StatedKernel(_bearing_range, (STATE, Rn(2), (2,)), 2, name="landmark bearing and range"),
+    takes=(TAKES, "m in W", "rad, m in B"),
     about="""``bearing_range(x, l, z)``: bearing [rad], wrapped, and range [m], less z (2,) or (n, 2): (n, 2).
 
 x: quadrotor states. l: (n, 2) landmarks on the ground plane. Not finite where x stands on l.
@@ -42,6 +43,7 @@ def _height(p: Array, z: Array) -> Array:
 
 height = residual(
     StatedKernel(_height, (Rn(3), ()), 1, name="height", linear=True),
+    takes=("m in W", "m in W"),
     about="""``height(p, z)``: p_z - z [m], (n, 1), for positions (n, 3), as ``x.p``, and z a number or (n,).""",
 )
 
@@ -54,6 +56,7 @@ def _tilt(R: Array, z: Array) -> Array:
 
 tilt = residual(
     StatedKernel(_tilt, (SO3, (3,)), 3, name="tilt"),
+    takes=("rad in W_T_B", "in B"),
     about="""``tilt(R, z)``: R' e3 - z, (n, 3): the vertical as the body sees it, less z (3,) or (n, 3); takes ``x.R``.
 
 With z = (0, 0, 1) it is Ta's cost that keeps the vehicle level: 1/2 |r|^2 = 1 - cos(tilt), whatever the heading.

@@ -18,6 +18,7 @@ from unifg.factors.residuals import Residual, residual
 from unifg.factors.robust import Reweighted
 from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap, bilinear
+from unifg.models.planar import POSE
 from unifg.typing import Array, BoolArray
 
 __all__ = ["endpoint", "endpoint_loss", "in_world"]
@@ -49,7 +50,7 @@ def endpoint(distance_map: DistanceMap) -> Residual:
     Returns:
         A residual of SE(2) poses x (n, 3) and end-points (n, 2) [m] in the sensor frame.
     """
-    return residual(Kernel(_endpoint, (SE2, (2,)), 1, distance_map.table, "lidar end-points"))
+    return residual(Kernel(_endpoint, (SE2, (2,)), 1, distance_map.table, "lidar end-points"), takes=(POSE, "m in B"))
 
 
 def in_world(x: Array, points: Array) -> Array:

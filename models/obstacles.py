@@ -16,13 +16,17 @@ from unifg.lie import SE2
 from unifg.models.avoidance import count, to_balls
 from unifg.models.distance_map import SmoothField, smooth
 from unifg.models.footprint import Body
+from unifg.models.planar import POSE
 from unifg.models.profile import of_distance
 from unifg.typing import Array
 
 __all__ = ["clearance_of", "disc_clearance", "shortfall", "wall_distance"]
 
+TAKES = POSE, "m in W", "m"  # units and frames of pose, centres and radii
+
 disc_clearance = residual(
     StatedKernel(to_balls, (SE2, 2, 1), partial(count, "disc clearance", 2, "pose"), name="disc clearance"),
+    takes=TAKES,
     about="""``disc_clearance(x, centre, radius)``: |p - c| - r [m], one column per disc, (n, M).
 
 x: (n, 3) SE(2) poses. centre: (M, 2) shared by all poses or (n, M, 2), one set for each, as for moving discs.
@@ -48,7 +52,7 @@ def clearance_of(body: Body) -> Residual:
     def rows_of(centre: tuple[int, ...], radius: tuple[int, ...]) -> int:
         return len(table) * count("disc clearance", 2, "pose", centre, radius)
 
-    return residual(StatedKernel(of_body, (SE2, 2, 1), rows_of, name="disc clearance of a body"))
+    return residual(StatedKernel(of_body, (SE2, 2, 1), rows_of, name="disc clearance of a body"), takes=TAKES)
 
 
 @compiled

@@ -28,6 +28,7 @@ from unifg.typing import Array, ArrayLike, BoolArray
 
 __all__ = ["BASES", "Base", "ackermann", "base_of"]
 
+POSE = "m, m, rad in W_T_B"  # units and frame of a pose
 BASES = ("unicycle", "ackermann", "omnidirectional")
 
 
@@ -83,14 +84,18 @@ class Base:
     def dynamics(self) -> Residual:
         """``dynamics(x, u, x_next, dt)``: x_next - f(x, u), (n, 3) [m, m, rad]."""
         kinds = SE2, Rn(self.size), SE2, ()
-        return residual(StatedKernel(partial(_defect, self.velocities), kinds, 3, name=f"dynamics{self._suffix}"))
+        return residual(
+            StatedKernel(partial(_defect, self.velocities), kinds, 3, name=f"dynamics{self._suffix}"),
+            takes=(POSE, "in B", POSE, "s"),
+        )
 
     @cached_property
     def ramped(self) -> Residual:
         """``ramped(x, before, u, x_next, dt)``: the same of controls that change steadily from ``before`` to ``u``."""
         control = Rn(self.size)
         kinds, name = (SE2, control, control, SE2, ()), f"ramped dynamics{self._suffix}"
-        return residual(StatedKernel(partial(_ramped_defect, self.velocities), kinds, 3, name=name))
+        kernel = StatedKernel(partial(_ramped_defect, self.velocities), kinds, 3, name=name)
+        return residual(kernel, takes=(POSE, "in B", "in B", POSE, "s"))
 
     @cached_property
     def rate(self) -> Residual:

@@ -31,8 +31,8 @@ def plain(distance: Residual, profile: Callable[[Array], Array], name: str) -> R
         return None
     composed = partial(_composed, profile, function)
     if kernel is None:
-        return residual(composed, name=name)
-    return residual(replace(kernel, function=composed, name=name, linear=False))
+        return residual(composed, name=name, takes=distance.takes)
+    return residual(replace(kernel, function=composed, name=name, linear=False), takes=distance.takes)
 
 
 def _composed(profile: Callable[[Array], Array], function: Callable[..., Array], *arguments: Array) -> Array:
@@ -81,7 +81,8 @@ def of_distance(
         return made
     first, kernel = np.array(numbers, dtype=np.float64), distance.kernel
     if kernel is None:
-        return residual(partial(_composed, function, distance.function), partial(_chained, slope, distance), name)
+        values, slopes = partial(_composed, function, distance.function), partial(_chained, slope, distance)
+        return residual(values, slopes, name, takes=distance.takes)
     table = np.concatenate([first, kernel.table])
     composed = first_order(kernel.function, profile, len(first))
-    return residual(replace(kernel, function=composed, table=table, name=name, linear=False))
+    return residual(replace(kernel, function=composed, table=table, name=name, linear=False), takes=distance.takes)

@@ -291,8 +291,14 @@ def _disturbed(
     return _defect(x, u[:, :3] + w[:, :3], u[:, 3:], blow, mass, drag, x_next, dt)
 
 
+TAKES = "m, m, m, wxyz, m/s, m/s, m/s in W_T_B"
+"""Units and frame of :data:`STATE`; W of its positions and velocities."""
+
+_RATES = "rad/s, rad/s, rad/s"
+_RHO = "kg, kg/s, kg/s, kg/s, m/s^2, m/s^2, m/s^2"
 dynamics = residual(
     StatedKernel(_calm, (STATE, CONTROL, STATE, (7,), ()), 9, name="quadrotor dynamics"),
+    takes=(TAKES, f"{_RATES}, N in B", TAKES, _RHO, "s"),
     about="""
 ``dynamics(x, u, x_next, parameters, dt)``: defects of position [m], attitude [rad] and velocity [m/s], (n, 9).
 
@@ -306,6 +312,17 @@ disturbed_dynamics = residual(
         (STATE, CONTROL, NOISE, MASS, DRAG, WIND, UPDRAFT, STATE, ()),
         9,
         name="disturbed quadrotor dynamics",
+    ),
+    takes=(
+        TAKES,
+        f"{_RATES}, N in B",
+        f"{_RATES}, m/s^2, m/s^2, m/s^2",
+        "kg",
+        "kg/s in B",
+        "m/s^2 in W",
+        "m/s^2 in W",
+        TAKES,
+        "s",
     ),
     about="""``disturbed_dynamics(x, u, w, mass, drag, wind, updraft, x_next, dt)``: the same defects, (n, 9).
 

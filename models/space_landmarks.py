@@ -29,6 +29,7 @@ from unifg.typing import Array, ArrayLike
 
 __all__ = ["bearing_3d", "bearing_range_3d", "observe_3d"]
 
+_TAKES = "in W_T_B", "in W", "in S"
 ACROSS = 1e-12  # sine below which a direction straight behind is taken to be off along the first axis
 
 
@@ -44,7 +45,7 @@ def bearing_range_3d(state: Manifold = SE3, body_T_sensor: ArrayLike | None = No
     Raises:
         ModelError: for another manifold, or a place that is none.
     """
-    return residual(_kernel(cast(Hashable, state), _mounted(body_T_sensor), True))
+    return residual(_kernel(cast(Hashable, state), _mounted(body_T_sensor), True), takes=_TAKES)
 
 
 def bearing_3d(state: Manifold = SE3, body_T_sensor: ArrayLike | None = None) -> Residual:
@@ -57,7 +58,7 @@ def bearing_3d(state: Manifold = SE3, body_T_sensor: ArrayLike | None = None) ->
     Raises:
         ModelError: for another manifold, or a place that is none.
     """
-    return residual(_kernel(cast(Hashable, state), _mounted(body_T_sensor), False))
+    return residual(_kernel(cast(Hashable, state), _mounted(body_T_sensor), False), takes=_TAKES)
 
 
 def observe_3d(

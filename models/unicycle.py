@@ -13,7 +13,7 @@ import numpy as np
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import residual
 from unifg.lie import SE2, wrap_angle
-from unifg.models.planar import base_of
+from unifg.models.planar import POSE, base_of
 from unifg.typing import Array
 
 __all__ = ["dynamics", "rate", "rollout", "step", "tracking"]
@@ -21,6 +21,7 @@ __all__ = ["dynamics", "rate", "rollout", "step", "tracking"]
 state = SE2
 """Manifold of the state."""
 
+CONTROL = "m/s, rad/s in B"  # units and frame of a control
 BASE = base_of("unicycle")
 moving, step, rollout, followed = BASE.moving, BASE.step, BASE.rollout, BASE.followed
 
@@ -33,11 +34,13 @@ def _deviation(x: Array, reference: Array) -> Array:
 assert BASE.dynamics.kernel is not None and BASE.ramped.kernel is not None and BASE.rate.kernel is not None
 dynamics = residual(
     BASE.dynamics.kernel,
+    takes=(POSE, CONTROL, POSE, "s"),
     about="""``dynamics(x, u, x_next, dt)``: x_next - f(x, u), (n, 3) [m, m, rad] (Bazzana eq. 11-14).""",
 )
 
 ramped = residual(
     BASE.ramped.kernel,
+    takes=(POSE, CONTROL, CONTROL, POSE, "s"),
     about="""
 ``ramped(x, before, u, x_next, dt)``: x_next - f(x, (before + u) / 2), (n, 3) [m, m, rad]: u is reached at the end of
 the step, from ``before`` at its beginning, as by a base of limited accelerations.""",
@@ -45,11 +48,13 @@ the step, from ``before`` at its beginning, as by a base of limited acceleration
 
 tracking = residual(
     StatedKernel(_deviation, (SE2, (3,)), 3, name="tracking"),
+    takes=(POSE, POSE),
     about="""
 ``tracking(x, reference)``: deviation from a reference pose in world axes, (n, 3) [m, m, rad] (Bazzana eq. 8).""",
 )
 
 rate = residual(
     replace(BASE.rate.kernel, name="rate"),
+    takes=(CONTROL, CONTROL),
     about="""``rate(u, u_next)``: change of control, (n, 2) [m/s, rad/s].""",
 )

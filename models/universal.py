@@ -60,21 +60,25 @@ def _increments(x: Array, u: Array, x_next: Array, dt: Any) -> Array:
 
 
 STEP = quadrotor.STATE, CONTROL, quadrotor.STATE, ()
+_TAKES = quadrotor.TAKES, "rad/s, rad/s, rad/s, m/s^2, m/s^2, m/s^2 in B", quadrotor.TAKES, "s"
 
 dynamics = residual(
     StatedKernel(_defect, STEP, 9, name="universal dynamics"),
+    takes=_TAKES,
     about="""
 ``dynamics(x, u, x_next, dt)``: eq. 10, (n, 9): position [m], attitude [rad] and velocity [m/s] in body axes.""",
 )
 
 consistency = residual(
     StatedKernel(_consistency, (quadrotor.STATE, quadrotor.STATE, ()), 3, name="consistency"),
+    takes=(quadrotor.TAKES, quadrotor.TAKES, "s"),
     about="""
 ``consistency(x, x_next, dt)``: p_next - p - dt (v + v_next) / 2, (n, 3) [m]; what no noise explains, an equality.""",
 )
 
 increments = residual(
     StatedKernel(_increments, STEP, 6, name="increments"),
+    takes=_TAKES,
     about="""``increments(x, u, x_next, dt)``: rows of attitude and velocity of :data:`dynamics` per second, (n, 6).
 
 Rates [rad/s] and accelerations [m/s^2]: with ``sigma=[sigma_omega] * 3 + [sigma_a] * 3``, and :data:`consistency` as an

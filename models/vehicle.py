@@ -78,4 +78,5 @@ def _defect(car: Vehicle, v: Array, force: Array, after: Array, dt: Array, slope
 def dynamics(vehicle: Vehicle) -> Residual:
     """The residual ``f(v, force, v_next, dt, slope)``: v_next minus the speed predicted, (n, 1) [m/s]."""
     arguments = SPEED, FORCE, SPEED, (), ()
-    return residual(StatedKernel(partial(_defect, vehicle), arguments, 1, name="vehicle.dynamics"))
+    takes = "m/s", "N", "m/s", "s", "rad"
+    return residual(StatedKernel(partial(_defect, vehicle), arguments, 1, name="vehicle.dynamics"), takes=takes)

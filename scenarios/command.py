@@ -5,7 +5,7 @@ its limits), 1 if not, 2 for arguments that cannot be served, 130 after an inter
 written all the same); SIGTERM interrupts, too.
 
 ``unifg campaign`` runs many episodes (0 if every one of them succeeded), ``unifg report`` reports on them,
-``unifg replay`` repeats one of them, ``unifg mcap`` writes a drive for other tools. ``unifg doctor`` examines the
+``unifg replay`` repeats one of them, ``unifg mcap`` writes a log for other tools. ``unifg doctor`` examines the
 installation, ``unifg bench`` times it, ``unifg reproduce`` computes tables and figures of the papers again. What can be
 run stands in `unifg.scenarios.commands.catalogue`; only the scenario that is named is loaded.
 """
@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         chosen, unknown = _parser(arguments).parse_known_args(arguments)
         if unknown:
             chosen.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
-        if lacking := absent(*chosen.extras):
+        if lacking := absent(*chosen.extras, *(["mcap"] if getattr(chosen, "mcap", False) else [])):
             return _refuse(str(remedy(lacking)))
         does: Callable[[argparse.Namespace], int] = chosen.does
         return does(chosen)
@@ -168,14 +168,16 @@ def _replay(chosen: argparse.Namespace) -> int:
 
 
 def _mcap(chosen: argparse.Namespace) -> int:
-    """Write a drive's log for other tools."""
+    """Write the log of a drive or a flight for other tools."""
     from unifg.scenarios.logs.drive_log import EpisodeLog
-    from unifg.scenarios.logs.drive_mcap import write_mcap
+    from unifg.scenarios.logs.flight_log import FlightLog
+    from unifg.scenarios.logs.mcap_log import write_mcap
 
-    stored: Path = chosen.folder / "drive.npz" if chosen.folder.is_dir() else chosen.folder
+    stored: Path = chosen.folder
+    if stored.is_dir():
+        stored /= "flight.npz" if (stored / "flight.npz").is_file() else "drive.npz"
     out: Path = chosen.out or stored.with_suffix(".mcap")
-    log = EpisodeLog.load(stored)
-    write_mcap(out, log)
+    write_mcap(out, (FlightLog if stored.name == "flight.npz" else EpisodeLog).load(stored))
     print(legible(out))
     return SUCCEEDED
 
@@ -303,6 +305,8 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
         with _bar(name) as show:
             show(0.0, "preparing")
             outcome: Outcome = module.run(settings, told(show), **watched)
+        if getattr(chosen, "mcap", False):
+            outcome.record()
         try:
             # each file is written whole, also after a signal
             with _bar("writing", interval=0.0) as show:
@@ -534,11 +538,11 @@ COMMANDS = {
         },
     ),
     "mcap": Command(
-        _mcap, "export a drive",
-        "Write the log of a drive, drive.npz, as messages that Foxglove, PlotJuggler and mcap's tools play.",
+        _mcap, "export a drive or a flight",
+        "Write a log, drive.npz or flight.npz, as messages that Foxglove, PlotJuggler and mcap's tools play.",
         {
-            "folder": {"type": Path, "metavar": "DIR", "help": "results of unifg run navigation, or the log itself"},
-            "--out": {"type": Path, "metavar": "FILE", "help": "to write (default: drive.mcap beside the log)"},
+            "folder": {"type": Path, "metavar": "DIR", "help": "results of unifg run, or the log itself"},
+            "--out": {"type": Path, "metavar": "FILE", "help": "to write (default: beside the log)"},
         },
     ),
 }  # fmt: skip

@@ -13,10 +13,14 @@ import numpy as np
 import pytest
 
 from episodes import episode
+from test_quadrotor_scene import flight
 from unifg.scenarios.command import main
 from unifg.scenarios.logs.columns import columns
 from unifg.scenarios.logs.drive_log import EpisodeLog
-from unifg.scenarios.logs.drive_mcap import write_mcap
+from unifg.scenarios.logs.mcap_log import write_mcap
+from unifg.scenarios.manoeuvres import CASES, run_manoeuvre
+from unifg.scenarios.safe_flight import SafeSettings, run_safe_flights
+from unifg.scenarios.velocity_tracking import TrackingSettings, run_tracking
 
 Recorded = dict[str, list[tuple[int, dict[str, Any]]]]
 
@@ -69,7 +73,7 @@ def test_every_tick_is_there_at_its_time(tmp_path: Path) -> None:
     units = {"control": "m/s, rad/s", "solve_ms": "ms"}
     with open(tmp_path / "drive.mcap", "rb") as file:
         summary = pytest.importorskip("mcap.reader").make_reader(file).get_summary()
-    declared = next(json.loads(s.data) for s in summary.schemas.values() if s.name == "unifg.DriveTick")["properties"]
+    declared = next(json.loads(s.data) for s in summary.schemas.values() if s.name == "unifg.Tick")["properties"]
     assert {name: declared[name]["description"] for name in units} == units
 
 
@@ -120,3 +124,69 @@ def test_without_mcap_it_says_what_to_install(
     assert main(["mcap", str(tmp_path)]) == 2
     assert "pip install 'unifg[mcap]'" in capsys.readouterr().err
     assert not (tmp_path / "drive.mcap").exists()
+
+
+def places(messages: list[tuple[int, dict[str, Any]]], child: str) -> Any:
+    """(T, 7) positions and quaternions (w, x, y, z) of a frame."""
+    rows = []
+    for _, message in messages:
+        frame = next(one for one in message["transforms"] if one["child_frame_id"] == child)
+        place, turn = frame["translation"], frame["rotation"]
+        rows.append([place["x"], place["y"], place["z"], turn["w"], turn["x"], turn["y"], turn["z"]])
+    return np.array(rows)
+
+
+def ways(messages: list[tuple[int, dict[str, Any]]]) -> Any:
+    return [[list(pose["position"].values()) for pose in message["poses"]] for _, message in messages]
+
+
+def test_a_flight_is_read_back(tmp_path: Path) -> None:
+    log = flight(6)
+    log.save(tmp_path / "flight.npz")
+    assert main(["mcap", str(tmp_path)]) == 0
+    found = recorded(tmp_path / "flight.mcap")
+    np.testing.assert_array_equal(places(found["/tf"], "truth"), log.truth[:, :7])
+    np.testing.assert_array_equal(places(found["/tf"], "estimate"), log.believed[:, :7])
+    np.testing.assert_array_equal(ways(found["/plan"]), log.plans)
+    assert [np.shape(way) for way in ways(found["/past"])] == [np.shape(past) for past in log.pasts]
+    solids = found["/obstacles"][0][1]["entities"][0]["cylinders"]
+    rows = [[one["pose"]["position"]["x"], one["pose"]["position"]["y"], one["size"]["x"] / 2] for one in solids]
+    np.testing.assert_allclose(rows, np.concatenate([log.layout.cylinders, log.movers[0]]))
+    for k, (stamp, tick) in enumerate(found["/tick"]):
+        assert stamp == round(1e9 * log.time[k]) and tick["controls"] == log.controls[k].tolist()
+        assert tick["statuses"] == log.statuses[k] and "landmarks" not in tick
+
+
+def test_a_flight_past_bodies_is_read_back(tmp_path: Path) -> None:
+    def stop(done: float, text: str) -> None:
+        if done > 0.05:
+            raise KeyboardInterrupt
+
+    (log,) = run_safe_flights(SafeSettings(case="ball", controller=("flatness",)), stop)
+    write_mcap(tmp_path / "flight.mcap", log)
+    found = recorded(tmp_path / "flight.mcap")
+    np.testing.assert_allclose(places(found["/tf"], "truth"), log.states[:, :7], atol=1e-12)
+    np.testing.assert_allclose(ways(found["/plan"]), log.plans, atol=1e-9)
+    for (_, message), bodies in zip(found["/obstacles"], log.bodies, strict=False):
+        entity = message["entities"][0]
+        solids = [*entity["cylinders"], *entity["spheres"]]
+        radii = np.concatenate([log.radii[log.upright], log.radii[~log.upright]])
+        np.testing.assert_allclose([one["size"]["x"] / 2 for one in solids], radii)
+        x = [one["pose"]["position"]["x"] for one in entity["spheres"]]
+        np.testing.assert_allclose(x, bodies[~log.upright, 0], atol=1e-12)
+
+
+def test_every_scenario_writes_one(tmp_path: Path) -> None:
+    """Numbers of the file are those of the run, which is repeated."""
+    pytest.importorskip("mcap")
+    assert main(["run", "manoeuvres", "--case", "obstacle", "--mcap", "--out", str(tmp_path)]) == 0
+    solved = run_manoeuvre(CASES["obstacle"])
+    found = recorded(tmp_path / "obstacle.mcap")
+    np.testing.assert_allclose(places(found["/tf"], "truth")[:, :2], solved.states[:, :2], atol=1e-12)
+    np.testing.assert_allclose([tick["control"] for _, tick in found["/tick"]][:-1], solved.controls, atol=1e-12)
+    assert main(["run", "velocity-tracking", "--length", "20", "--mcap", "--out", str(tmp_path)]) == 0
+    drive = run_tracking(TrackingSettings(length=20))
+    ticks = [tick for _, tick in recorded(tmp_path / "drive.mcap")["/tick"]]
+    np.testing.assert_allclose([tick["speed"] for tick in ticks], drive.speed, atol=1e-12)
+    assert main(["run", "quadrotor-obstacles", "--mcap", "--out", str(tmp_path)]) == 0
+    assert len(recorded(tmp_path / "flight.mcap")["/plan"]) > 10

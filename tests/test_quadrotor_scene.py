@@ -159,7 +159,7 @@ def test_cylinders_are_faint_until_seen(page: str, log: FlightLog) -> None:
     }  # fmt: skip
 
     def middles(path: str) -> set[float]:
-        rows = _vertices(commands, path).reshape(-1, 24 * 4 + 25, 3)  # of one cylinder
+        rows = _vertices(commands, path).reshape(-1, 48 * 4 + 49, 3)  # of one cylinder
         return {round(float(x), 3) for x in 0.5 * (rows[:, :, 0].min(axis=1) + rows[:, :, 0].max(axis=1))}
 
     assert middles("seen/0") == {3.0} and middles("seen/10") == {3.0, 6.0}

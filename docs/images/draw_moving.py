@@ -43,7 +43,7 @@ async def film(scene: Path) -> list[Image.Image]:
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         raise SystemExit("Chromium is needed to film a scene; none of these is there: " + ", ".join(BROWSERS))
-    with tempfile.TemporaryDirectory() as home:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as home:  # the browser may still be writing
         size = f"--window-size={PAGE[0]},{PAGE[1]}"
         process = subprocess.Popen(
             [browser, *QUIET, size, f"--user-data-dir={home}", scene.resolve().as_uri()],

@@ -61,6 +61,9 @@ class Scenario:
             help="any setting by its name, such as controller.margin=0.3; may be repeated",
         )  # fmt: skip
         if self.live:
+            parser.add_argument(
+                "--mcap", action="store_true", help="write the log as MCAP, too, which Foxglove and PlotJuggler play"
+            )
             parser.add_argument("--live", action="store_true", help="show it in a browser while it runs; says where")
         parser.set_defaults(module=module)
 

@@ -33,7 +33,8 @@ def run(settings: courses.CourseSettings, progress: Progress, announce: Announce
     progress(1.0, "solved")
     interrupted = course.solution.status is Status.INTERRUPTED
     numbers = course_metrics(course)
-    return Outcome(course.succeeded, interrupted, summary(course), numbers, results(course))
+    flown = {"flight": course_log(course)}
+    return Outcome(course.succeeded, interrupted, summary(course), numbers, results(course), flown)
 
 
 def course_metrics(course: Course) -> dict[str, Any]:

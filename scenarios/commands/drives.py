@@ -39,7 +39,7 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
     if log.ticks == 0:
         raise KeyboardInterrupt
     numbers = episode_metrics(log)
-    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log))
+    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log), {"drive": log})
 
 
 def results(log: EpisodeLog) -> dict[str, Writer]:

@@ -28,6 +28,7 @@ PACKAGES = {
     "pandas": Package("pandas", "scenarios", "tables of campaigns"),
     "pymunk": Package("pymunk", "scenarios", "simulated worlds"),
     "PIL": Package("pillow", "scenarios", "maps and scenarios"),
+    "mcap": Package("mcap", "mcap", "recordings in MCAP"),
     "yaml": Package("pyyaml", "scenarios", "ROS maps"),
     "tqdm": Package("tqdm", "scenarios", "progress bars"),
     "casadi": Package("casadi", "casadi", "functions of CasADi"),

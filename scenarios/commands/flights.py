@@ -33,7 +33,7 @@ def run(settings: flight.FlightSettings, progress: Progress, announce: Announce 
     if log.ticks == 0:
         raise KeyboardInterrupt
     numbers = flight_metrics(log)
-    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log, numbers))
+    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log, numbers), {"flight": log})
 
 
 def results(log: FlightLog, metrics: Mapping[str, object]) -> dict[str, Writer]:

@@ -6,10 +6,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from unifg.scenarios import manoeuvres
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.logs.metrics import write_metrics
+from unifg.scenarios.logs.solved_log import SolvedLog, held
 from unifg.scenarios.options import option
 from unifg.scenarios.scenes.manoeuvre_plot import picture
 from unifg.scenarios.scenes.manoeuvre_scene import manoeuvre_iterate, manoeuvre_scene, manoeuvre_stage
@@ -60,7 +63,21 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
     for one in solved:
         files[f"{one.case.name}.png"] = partial(_draw, one)
         files[f"{one.case.name}.html"] = partial(_show, one)
-    return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), numbers, files)
+    logs = {one.case.name: _driven(one) for one in solved}
+    return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), numbers, files, logs)
+
+
+def _driven(solved: manoeuvres.Manoeuvre) -> SolvedLog:
+    """The plan as if it had been driven."""
+    control, settings = held(solved.controls), solved.settings
+    return SolvedLog(
+        discs=np.array(solved.case.discs).reshape(-1, 3),
+        time=settings.dt * np.arange(len(control), dtype=np.float64),
+        pose=solved.states,
+        wanted=solved.case.reference(settings),
+        speed=control[:, 0],
+        control=control,
+    )
 
 
 def _draw(solved: manoeuvres.Manoeuvre, path: Path) -> None:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from unifg.scenarios.episode import Progress
 from unifg.solution.history import Iteration
+
+logger = logging.getLogger("unifg")
+if TYPE_CHECKING:
+    from unifg.scenarios.logs.mcap_log import Log
 
 __all__ = ["Outcome", "Progress", "Writer", "by_iterations"]
 
@@ -27,6 +33,7 @@ class Outcome:
         metrics: numbers and words for programs, as ``metrics.json`` holds them.
         files: results by file name, in the order they are written: the cheapest and most precious first, in case the
             user loses patience.
+        logs: what ``--mcap`` writes, by file name without its end.
     """
 
     succeeded: bool
@@ -34,6 +41,15 @@ class Outcome:
     summary: str
     metrics: Mapping[str, Any]
     files: dict[str, Writer]
+    logs: Mapping[str, Log] = field(default_factory=dict)
+
+    def record(self) -> None:
+        """Let :meth:`write` write the logs as MCAP, too."""
+        from unifg.scenarios.logs.mcap_log import write_mcap
+
+        if not self.logs:
+            logger.warning("--mcap: a recorded drive is not recorded again")
+        self.files.update({f"{stem}.mcap": partial(write_mcap, log=log) for stem, log in self.logs.items()})
 
     def write(self, folder: Path, progress: Progress) -> list[Path]:
         """Write the results into an existing folder, where files of the same names are replaced.

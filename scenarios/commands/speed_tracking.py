@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from unifg.scenarios import velocity_tracking
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.logs.metrics import write_metrics
+from unifg.scenarios.logs.solved_log import SolvedLog, held
 from unifg.scenarios.scenes.velocity_plot import picture
 from unifg.scenarios.scenes.velocity_scene import velocity_scene, velocity_stage
 from unifg.solution.status import Status
@@ -31,4 +34,22 @@ def run(settings: velocity_tracking.TrackingSettings, progress: Progress, announ
         "scene.html": lambda path: velocity_scene(drive).save(path),
     }
     interrupted = drive.solution.status is Status.INTERRUPTED
-    return Outcome(drive.succeeded, interrupted, velocity_tracking.table(drive), numbers, files)
+    return Outcome(
+        drive.succeeded, interrupted, velocity_tracking.table(drive), numbers, files, {"drive": _driven(drive)}
+    )
+
+
+def _driven(drive: velocity_tracking.Drive) -> SolvedLog:
+    """The drive along a straight road."""
+    dt, ways = drive.profile.dt, []
+    for speed in (drive.speed, drive.profile.speed):
+        way = dt * np.concatenate([[0.0], np.cumsum(0.5 * (speed[:-1] + speed[1:]))])
+        ways.append(np.column_stack([way, np.zeros((len(way), 2))]))
+    return SolvedLog(
+        discs=np.zeros((0, 3)),
+        time=dt * np.arange(len(drive.speed), dtype=np.float64),
+        pose=ways[0],
+        wanted=ways[1],
+        speed=drive.speed,
+        control=held(np.reshape(drive.force, (-1, 1))),
+    )

@@ -9,7 +9,7 @@ from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
 from unifg.scenarios.logs.metrics import collision_words, one_graph
 from unifg.scenarios.scenes.drive_scene import drive_stage, place_movers
-from unifg.scenarios.scenes.panels import over_time, plot_clearance, plot_times, shade_trouble
+from unifg.scenarios.scenes.panels import over_time, plot_clearance, plot_times, shade_trouble, timed_way
 from unifg.style.colours import css
 from unifg.style.figures import headline, new_figure
 from unifg.typing import Axes, Figure
@@ -43,7 +43,6 @@ def overview(log: EpisodeLog) -> Figure:
 def plot_map(log: EpisodeLog, ax: Axes) -> Axes:
     """The scene of the end of the drive from above, with the ways of the estimate, of the wheels and of what moves."""
     scene = drive_stage(log, log.outcomes)
-    scene.way("trail", log.true_pose[:, :2])
     thin = 0.3 * (scene.layers["trail"].width or 0.0)
     movers = {f"way {k}": log.obstacles[:, k, :2] for k in np.flatnonzero(log.obstacle_moves)}
     for name, way in movers.items():
@@ -58,6 +57,7 @@ def plot_map(log: EpisodeLog, ax: Axes) -> Axes:
     frame.place("robot", log.true_pose[-1])
     place_movers(frame, log, log.ticks - 1)
     scene.draw(ax)
+    timed_way(ax, log.true_pose[:, :2], log.time, "way driven, at")
     ax.set_title("Where it went")
     return ax
 

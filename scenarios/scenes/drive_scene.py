@@ -19,7 +19,7 @@ from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.metrics import collision_words, health, one_graph
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
-from unifg.scenarios.scenes.parts import draw_way, pillar, standing
+from unifg.scenarios.scenes.parts import CLEAR, draw_way, pillar, standing
 from unifg.typing import Array, IntArray
 from unifg.view import Frame, Part, Scene, shapes
 
@@ -247,7 +247,7 @@ def _obstacles(scene: Scene, log: Any) -> None:
     moves, places = log.obstacle_moves, log.obstacles[0]
     if (~moves).any():
         words = "obstacle not on the map"
-        scene.discs("obstacles", places[~moves], height=_WALL, colour="fixed", legend=words)
+        scene.discs("obstacles", places[~moves], height=_WALL, colour="fixed", opacity=CLEAR, legend=words)
     for index in np.flatnonzero(moves).tolist():
         parts = [pillar(float(places[index, 2]), _WALL, "moving")]
         scene.body(f"obstacle {index}", parts, colour="moving", legend="obstacle that moves")

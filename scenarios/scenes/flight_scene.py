@@ -17,7 +17,7 @@ from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.logs.metrics import collision_words, health, one_graph
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
-from unifg.scenarios.scenes.parts import draw_way, layout, pillar, vehicle
+from unifg.scenarios.scenes.parts import CLEAR, draw_way, layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
@@ -104,6 +104,8 @@ def flight_scene(log: FlightLog) -> Scene:
     """
     sensed, estimated = sensor_reach(log) is not None, has_estimate(log)
     scene = filled(log, partial(flight_stage, log, sensed=sensed, estimated=estimated), flight_frame)
+    if scene.around is not None:
+        scene.around = np.concatenate([scene.around, log.truth[:, :3]])
     m = flight_metrics(log)
     settings, error, tick_ms = m["settings"], m["position_error_m"], m["tick_ms"]
     reached = "target reached" if m["reached"] else f"{m['target_distance_m']:.1f} m short of the target"
@@ -208,7 +210,7 @@ def _cylinders(frame: Frame, log: Any, tick: int, sensed: bool) -> None:
     for ids in log.seen[: tick + 1]:
         known[ids[ids < len(rows)]] = True
     if known.any():
-        frame.discs("seen", rows[known], height=_HEIGHT)
+        frame.discs("seen", rows[known], height=_HEIGHT, opacity=CLEAR)
         rims = [shapes.ring(row[:2], float(row[2]) - 0.03, 0.03, _HEIGHT + 0.01, corners=32) for row in rows[known]]
         frame.mesh("rims", shapes.merge(rims))
     if not known.all():

@@ -22,6 +22,7 @@ __all__ = [
     "shade",
     "shade_distance",
     "shade_trouble",
+    "timed_way",
 ]
 
 
@@ -53,6 +54,19 @@ def over_time(
     ax.set_ylim(*(bounds or ax.get_ylim()))
     shade(ax, log.emergency, log.dt, "#000000", 0.12)
     return face(ax, title, y)
+
+
+def timed_way(ax: Axes, way: Array, time: Array, name: str) -> None:
+    """Draw a way (n, 2) [m] in the colours of its times (n,) [s], with a bar: pacing shows."""
+    from matplotlib import colormaps
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import ListedColormap
+
+    shades = ListedColormap(colormaps["viridis"](np.linspace(0.0, 0.92, 256)))  # without the yellow, pale on a floor
+    steps = list(np.stack([way[:-1], way[1:]], axis=1))
+    line = LineCollection(steps, array=time[1:], cmap=shades, linewidths=2.6, capstyle="round", zorder=9)
+    ax.add_collection(line, autolim=False)
+    ax.figure.colorbar(line, ax=ax, shrink=0.6, pad=0.01, label=f"{name} [s]")
 
 
 def padded(*values: ArrayLike, share: float = 0.08, least: float = 1e-9) -> tuple[float, float]:

@@ -11,7 +11,10 @@ from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["draw_way", "floor", "layout", "pillar", "standing", "vehicle"]
+__all__ = ["CLEAR", "draw_way", "floor", "layout", "pillar", "standing", "vehicle"]
+
+CLEAR = 0.6
+"""Opacity of obstacles: ways and vehicles behind them are seen."""
 
 _NODES = 16  # of a way that changes from frame to frame
 _FLOOR = -0.02  # height of the floor, clear of what stands on it [m]
@@ -43,7 +46,7 @@ def layout(scene: Scene, placed: Layout, height: float) -> None:
     start, target = placed.start, placed.target
     scene.mesh("start", shapes.ring(start[:2], 0.18, 0.07, 0.012, corners=32), colour="start", legend="")
     rings = [shapes.ring(target[:2], r, 0.07, 0.012, corners=40) for r in (0.12, 0.4)]
-    ball = shapes.copies(shapes.sphere(), target[None], 0.16 * np.eye(3)[None])
+    ball = shapes.copies(shapes.sphere(12, 24), target[None], 0.16 * np.eye(3)[None])
     scene.mesh("target", shapes.merge([*rings, ball]), colour="goal", swatch="disc", legend="target")
     scene.label("start", start[:2])
     scene.label("target", target)
@@ -73,8 +76,8 @@ def draw_way(frame: Frame, name: str, way: Array) -> Array:
 
 
 def pillar(radius: float, height: float, colour: str) -> Part:
-    """Upright cylinder [m]."""
-    return standing(Body.disc(radius), height, colour)
+    """Upright cylinder [m] that hides nothing."""
+    return standing(Body.disc(radius), height, colour)._replace(opacity=CLEAR)
 
 
 def standing(body: Body, height: float, colour: str, wider: float = 0.0) -> Part:

@@ -11,7 +11,7 @@ import numpy as np
 
 from unifg.scenarios.logs.safe_log import SafeLog
 from unifg.scenarios.scenes.numbers import Number, declare, filled, show
-from unifg.scenarios.scenes.parts import draw_way, floor, pillar, vehicle
+from unifg.scenarios.scenes.parts import CLEAR, draw_way, floor, pillar, vehicle
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 from unifg.view.bodies import body_of
@@ -79,7 +79,7 @@ def _begun(log: SafeLog) -> Scene:
     scene = safe_stage(log, resting(log))
     low, high = _extent(log)
     corners = [[x, y, z] for z in (0.0, _HEIGHT) for x in (low[0], high[0]) for y in (low[1], high[1])]
-    scene.around, scene.ground = np.array(corners), False
+    scene.around, scene.ground = np.concatenate([corners, log.states[:, :3]]), False
     floor(scene, low, high)
     if not _rests(log.wanted[:, :3]):
         scene.way("path", shapes.thin(log.wanted[:, :3], 200))
@@ -117,7 +117,11 @@ def _bodies(scene: Scene, log: Any, still: list[bool]) -> None:
     for index, (radius, upright) in enumerate(zip(log.radii.tolist(), log.upright.tolist(), strict=True)):
         colour = "fixed" if still[index] else "moving"
         name, words = f"body {index}", {"fixed": "at rest", "moving": "moves"}[colour]
-        parts = [pillar(radius, _HEIGHT, colour)] if upright else body_of("ball", radius, colour)
+        parts = (
+            [pillar(radius, _HEIGHT, colour)]
+            if upright
+            else [part._replace(opacity=CLEAR) for part in body_of("ball", radius, colour)]
+        )
         if upright or still[index]:
             edge = shapes.ring(np.zeros(2), radius + log.hull + log.margin - 0.02, 0.02, 0.014, corners=48)
             parts.append(Part("margin", edge, "moving", False))

@@ -34,6 +34,7 @@ class Residual:
         rows: m, of a ``function`` that a user has compiled for one factor.
         derivatives: "trace" to insist on exact ones, "differences" to refuse them, empty for what is possible.
         elements: place and manifold of arguments that are elements of one, where a kernel does not say so.
+        takes: units and frame of each argument, as in ``"m, m, rad in W_T_B"``; None for any.
     """
 
     function: Function
@@ -44,6 +45,7 @@ class Residual:
     rows: int = 0
     derivatives: str = ""
     elements: tuple[tuple[int, Manifold], ...] = field(default=(), compare=False, repr=False)
+    takes: tuple[str | None, ...] = field(default=(), compare=False, repr=False)
 
     def __call__(self, *arguments: Any) -> Array:
         """Evaluate the residual."""
@@ -58,6 +60,7 @@ def residual(
     rows: int = 0,
     derivatives: Derivatives | None = None,
     about: str = "",
+    takes: Sequence[str | None] = (),
 ) -> Residual:
     """Attach a Jacobian and a name to a function.
 
@@ -81,6 +84,10 @@ def residual(
             that reach what cannot be watched (its present content is compiled in) and those with a Jacobian, which
             then only serves comparison. "differences" leaves the function as it is.
         about: what ``help`` says of the residual; defaults to the docstring of the function.
+        takes: units and frame of each argument, ``"m, m, rad in W_T_B"``, ``"rad"`` or ``"in W"``; None for any. A
+            single capital letter stands for one frame, whichever, in all arguments; the two of ``W_T_B`` differ.
+            ``*`` stands for any units, alike in all arguments that have it. Compared with what ``graph.variables``,
+            ``graph.data``, ``fg.each`` and ``fg.shared`` declare, when a term is added.
 
     Raises:
         GraphError: for a compiled function without ``rows``.
@@ -94,7 +101,7 @@ def residual(
             f"the residual '{getattr(function, '__name__', name)}' is compiled: say how many numbers it writes, rows="
         )
     if isinstance(function, Kernel) and jacobian is None:
-        made = Residual(function, function.jacobian, name or function.name, search, function)
+        made = Residual(function, function.jacobian, name or function.name, search, function, takes=tuple(takes))
     else:
         made = Residual(
             function,
@@ -103,6 +110,7 @@ def residual(
             search,
             rows=rows if own else 0,
             derivatives=derivatives or "",
+            takes=tuple(takes),
         )
     if about:  # help shows it instead of the text of the class
         object.__setattr__(made, "__doc__", cleandoc(about))

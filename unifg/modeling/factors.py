@@ -201,7 +201,10 @@ def _complete(
     else:
         function, slopes = (partial(one, manifold) for one in batched)
         made = residual(function, slopes if isinstance(manifold, LieGroup) else None, name)
-    return replace(made, elements=tuple((place, manifold) for place in range(len(arguments))))
+    between = name == "between" and not isinstance(manifold, Rn)
+    frames = ("A_T_B", "A_T_C", "B") if between else ("A_T_B",) * 3
+    takes = tuple(f"* in {frame}" for frame in frames[: len(arguments)])
+    return replace(made, elements=tuple((place, manifold) for place in range(len(arguments))), takes=takes)
 
 
 def _by_differences(manifold: Manifold, functions: Functions, name: str) -> Residual:

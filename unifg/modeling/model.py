@@ -21,12 +21,15 @@ from unifg.factors.robust import Loss
 from unifg.lie import Manifold, Rn
 from unifg.lie.product import Product
 from unifg.modeling.duplicates import doubles
-from unifg.modeling.elements import on_manifolds
+from unifg.modeling.elements import elements_of, on_manifolds
 from unifg.modeling.factors import ManifoldResidual
 from unifg.modeling.probing import rows_of
+from unifg.modeling.quantities import quantity
 from unifg.modeling.soft import Soft, slack_of
 from unifg.modeling.summary import inventory
 from unifg.modeling.terms import Constraint, Cost, Fix, Parameter, ScalarCost, Term, prepare_arguments
+from unifg.modeling.units import SAME as ALIKE
+from unifg.modeling.units import compare
 from unifg.modeling.variables import (
     RESERVED,
     Data,
@@ -91,11 +94,22 @@ class Model:
         self.compiled: object | None = None
         self.edition = 0
 
-    def variables(self, name: str, manifold: Manifold, count: int) -> Family:
+    def variables(
+        self, name: str, manifold: Manifold, count: int, *, units: str | None = None, frame: str | None = None
+    ) -> Family:
         """Add a family of ``count`` unknowns.
 
+        Args:
+            name: unique.
+            manifold: of every member.
+            count: number of them.
+            units: of the tangent coordinates, as in ``"m, m, rad"``; compared with those of data, constants and
+                functions in every term that declares both.
+            frame: a name such as ``"map"``, or ``"map_T_base"`` for poses of the base in the map; compared likewise.
+
         Raises:
-            GraphError: when the name is taken, ``count`` is no positive integer, or ``manifold`` is no manifold.
+            GraphError: when the name is taken, ``count`` is no positive integer, ``manifold`` is no manifold, or the
+                units do not fit it.
         """
         _require_name("family", name)
         if name in self.families:
@@ -117,12 +131,20 @@ class Model:
             raise GraphError(f"family '{name}' needs a whole number of members, found count={count!r}") from None
         if count < 1:
             raise GraphError(f"family '{name}' needs at least one member, found count={count}", family=name)
-        family = Family(name, manifold, count)
+        family = Family(name, manifold, count, quantity(f"family '{name}'", units, frame, manifold))
         self.families[name] = family
         self._changed()
         return family
 
-    def data(self, name: str, value: ArrayLike, *, each: bool | None = None) -> Data:
+    def data(
+        self,
+        name: str,
+        value: ArrayLike,
+        *,
+        each: bool | None = None,
+        units: str | None = None,
+        frame: str | None = None,
+    ) -> Data:
         """Declare an array that may be replaced between solves.
 
         Args:
@@ -130,6 +152,8 @@ class Model:
             value: default; its shape (and whether it is boolean) is kept.
             each: True where the first axis runs over the factors of the terms that use it, False where all factors
                 share it; None leaves it to the structure of each term's function.
+            units: of the numbers of a row, as in ``"m, m, rad"``; ``wxyz`` or ``xyzw`` for a quaternion.
+            frame: as for :meth:`variables`.
 
         Raises:
             GraphError: when the name is taken, or the value is not made of real numbers or booleans.
@@ -137,7 +161,7 @@ class Model:
         _require_name("data", name)
         if name in self._data:
             raise GraphError(f"data '{name}' exists already: choose another name")
-        handle = Data(name, value, each)
+        handle = Data(name, value, each, quantity(f"data '{name}'", units, frame))
         self._data[name] = handle
         return handle
 
@@ -373,9 +397,10 @@ class Model:
         unique = self._unique(name, default or wrapped.name, replaced)
         normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
         size = rows_of(unique, wrapped, normal, count, scalar=scalar)
+        compare(unique, wrapped.name, arguments, wrapped.takes, elements_of(wrapped))
         return {
             "name": unique, "residual": wrapped, "arguments": normal, "active": active, "count": count, "size": size,
-            "rows": rows,
+            "rows": rows, "given": arguments,
         }  # fmt: skip
 
     def _cost(
@@ -432,6 +457,8 @@ class Model:
             lower, upper = _given("a bound" if is_bound else "a constraint", unique, lower, upper)
             lower, upper = check_limits(unique, lower, upper, *shape)
             self._own_data(unique, lower, upper)
+            if is_bound:
+                compare(unique, "bound", (*parts["arguments"], lower, upper), ALIKE, {})
             slack = None if soft is None else slack_of(unique, soft, lower, upper, *shape, wrapped)
             self._own_data(unique, *(slack.soft.data if slack is not None else ()))
             return Constraint(**parts, lower=lower, upper=upper, is_bound=is_bound, slack=slack)
@@ -467,6 +494,7 @@ class Model:
         self._own(selection, unique)
         self._own_data(unique, held)
         check_fix(unique, selection, held.value if isinstance(held, Data) else held)
+        compare(unique, "fix", (selection, held), ALIKE, {1: selection.manifold})
         for other in self.fixes:
             if other is not replaced and other.selection.family is selection.family:
                 if _overlap(other.selection, selection):
@@ -477,8 +505,8 @@ class Model:
 
     def _restated(self, old: Term, stated: tuple[Any, ...], parts: dict[str, Any]) -> Term:
         """A term of the same kind and name with other parts."""
-        function, arguments = (stated[0], stated[1:]) if stated else (old.residual, old.arguments)
-        arguments = arguments or old.arguments
+        function, arguments = (stated[0], stated[1:]) if stated else (old.residual, old.given)
+        arguments = arguments or old.given
         if isinstance(old, Cost):
             if (parts.get("sigma") is None) != (parts.get("information") is None):  # one takes the other's place
                 parts = {"sigma": None, "information": None, **parts}

@@ -14,7 +14,7 @@ import numpy as np
 
 from unifg.factors.robust import Loss
 from unifg.modeling.terms import Constraint, Cost, Fix, Term
-from unifg.modeling.variables import Data, Family, Selection
+from unifg.modeling.variables import Data, Family, Selection, quantity_of
 
 Lines: TypeAlias = list[tuple[str, ...]]
 MANY = 40  # terms from which on those that are alike share a line
@@ -87,21 +87,21 @@ def inventory(
     parts = [f"Graph of {counted(len(families), 'family', 'families')} and {counted(len(terms), 'term')}: "
              + ", ".join(sizes)]  # fmt: skip
     tables = [
-        _aligned("<><>>>", _families(families, held)),
+        _aligned("<><>>><<", _families(families, held)),
         _aligned("<<>><<<<", _terms(terms, routes)),
         _aligned("<<<", [("fix", "variables", "data"), *((f.name, _selected(f.selection), _listed(f)) for f in fixes)]),
-        _aligned("<<<<", _data(data, [*terms, *fixes])),
+        _aligned("<<<<<<", _data(data, [*terms, *fixes])),
     ]
     parts += filter(None, tables)
     return "\n\n".join(parts)
 
 
 def _families(families: Sequence[Family], held: Mapping[Family, int]) -> Lines:
-    lines: Lines = [("family", "members", "manifold", "stored", "tangent", "unknown")]
+    lines: Lines = [("family", "members", "manifold", "stored", "tangent", "unknown", "units", "frame")]
     for family in families:
         manifold, width = family.manifold, family.count * family.manifold.dim - held[family]
         sizes = f"{manifold.storage}", f"{manifold.dim}", f"{width}"
-        lines.append((family.name, f"{family.count}", manifold.name, *sizes))
+        lines.append((family.name, f"{family.count}", manifold.name, *sizes, *_declared(family)))
     return lines
 
 
@@ -116,12 +116,19 @@ def _terms(terms: Sequence[Term], routes: Mapping[str, str]) -> Lines:
 
 
 def _data(data: Sequence[Data], stated: Sequence[Term | Fix]) -> Lines:
-    lines: Lines = [("data", "shape", "each", "used by")]
+    lines: Lines = [("data", "shape", "each", "units", "frame", "used by")]
     for handle in data:
         users = [one.name for one in stated if handle in one.data]
         shown = ", ".join(users[:FEW]) + (f", ... ({len(users)})" if len(users) > FEW else "")
-        lines.append((handle.name, f"{handle.value.shape}", "yes" if handle.each else "", shown or "nothing"))
+        each = "yes" if handle.each else ""
+        lines.append((handle.name, f"{handle.value.shape}", each, *_declared(handle), shown or "nothing"))
     return lines
+
+
+def _declared(given: Family | Data) -> tuple[str, str]:
+    """Units and frame of a family or data."""
+    found = quantity_of(given)
+    return ", ".join(found.units), found.frame
 
 
 def _listed(stated: Term | Fix) -> str:

@@ -30,6 +30,7 @@ class Term:
         count: number of factors n.
         size: rows m of each of them.
         rows: for each argument, whether it is declared to have a row for each factor; None where nothing is declared.
+        given: the arguments as they were given, with what ``fg.each``, ``fg.shared`` and data declare.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Term:
     count: int
     size: int
     rows: tuple[bool | None, ...] = field(kw_only=True)
+    given: tuple[Any, ...] = field(default=(), kw_only=True)
 
     @property
     def kind(self) -> str:

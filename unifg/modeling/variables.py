@@ -11,6 +11,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.lie import Manifold, Product
 from unifg.modeling.duplicates import doubles
+from unifg.modeling.quantities import NOTHING, Quantity, quantity
 from unifg.typing import Array, ArrayLike, IntArray
 
 Index: TypeAlias = int | slice | Sequence[int] | IntArray
@@ -72,11 +73,15 @@ class Family:
         count: number of members.
     """
 
-    def __init__(self, name: str, manifold: Manifold, count: int) -> None:
+    _quantity: Quantity = NOTHING
+
+    def __init__(self, name: str, manifold: Manifold, count: int, quantity: Quantity = NOTHING) -> None:
         """Describe ``count`` unknowns on ``manifold``."""
         self.name = name
         self.manifold = manifold
         self.count = count
+        if quantity.declared:
+            self._quantity = quantity
 
     def __len__(self) -> int:
         """Number of members."""
@@ -107,12 +112,17 @@ class Data:
         value: present default; a solve may override it.
         each: whether the first axis runs over the factors of every term that uses it; None where each term's function
             says so.
+        quantity: declared units and frame.
     """
 
-    def __init__(self, name: str, value: ArrayLike, each: bool | None) -> None:
+    quantity: Quantity = NOTHING
+
+    def __init__(self, name: str, value: ArrayLike, each: bool | None, quantity: Quantity = NOTHING) -> None:
         """Hold a default value; made by :meth:`unifg.Graph.data`."""
         self.name = name
         self.each = each
+        if quantity.declared:
+            self.quantity = quantity
         self.value: Array = np.array(doubles(f"data '{name}'", value, flags=True))
         if each and self.value.ndim == 0:
             raise GraphError(f"data '{name}' is declared each=True but is a scalar: give it one row per factor")
@@ -156,10 +166,13 @@ class Declared:
 
     value: Array
     each: bool
+    quantity: Quantity = NOTHING
 
 
-def each(value: ArrayLike) -> Declared:
+def each(value: ArrayLike, *, units: str | None = None, frame: str | None = None) -> Declared:
     """Declare that the first axis of a constant argument runs over the factors of its term.
+
+    ``units`` and ``frame`` are those of :meth:`unifg.Graph.data`.
 
     Raises:
         GraphError: it is a scalar, or not made of real numbers or booleans.
@@ -167,16 +180,19 @@ def each(value: ArrayLike) -> Declared:
     array = doubles("an argument of fg.each", value, flags=True)
     if array.ndim == 0:
         raise GraphError("fg.each needs one row per factor, found a scalar")
-    return Declared(array, True)
+    return Declared(array, True, quantity("fg.each", units, frame))
 
 
-def shared(value: ArrayLike) -> Declared:
+def shared(value: ArrayLike, *, units: str | None = None, frame: str | None = None) -> Declared:
     """Declare that all factors of a term share a constant argument, however long it is.
+
+    ``units`` and ``frame`` are those of :meth:`unifg.Graph.data`.
 
     Raises:
         GraphError: it is not made of real numbers or booleans.
     """
-    return Declared(doubles("an argument of fg.shared", value, flags=True), False)
+    array = doubles("an argument of fg.shared", value, flags=True)
+    return Declared(array, False, quantity("fg.shared", units, frame))
 
 
 Variable: TypeAlias = Family | Selection
@@ -193,6 +209,16 @@ def as_selection(variable: Variable) -> Selection:
     if not isinstance(variable, Family | Selection):
         raise GraphError(f"expected a family of variables, or some of its members, found {variable!r}")
     return variable if isinstance(variable, Selection) else variable[:]
+
+
+def quantity_of(argument: Any) -> Quantity:
+    """Units and frame that an argument of a term declares."""
+    if isinstance(argument, Selection):
+        whole = argument.family._quantity
+        return whole if argument.component is None else whole.component(argument.manifold, argument.tangent)
+    if isinstance(argument, Family):
+        return argument._quantity
+    return argument.quantity if isinstance(argument, Data | Declared) else NOTHING
 
 
 def is_variable(argument: Any) -> bool:

@@ -46,7 +46,7 @@ def axes(size: float, colour: str) -> list[Part]:
 
 def ball(size: float, colour: str) -> list[Part]:
     """A ball of that radius, for what has no attitude."""
-    return [Part("ball", copies(sphere(), np.zeros((1, 3)), size * np.eye(3)[None]), colour)]
+    return [Part("ball", copies(sphere(12, 24), np.zeros((1, 3)), size * np.eye(3)[None]), colour)]
 
 
 def disc(size: float, colour: str) -> list[Part]:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -296,6 +297,32 @@ class Scene(Content, Canvas):
             ViewError: meshcat is not installed, or no port is free.
         """
         return Live(self, port)
+
+    def rerun(self, path: str | Path | None = None) -> Any:
+        """Log the scene in Rerun: to a file ``.rrd``, or without a path to a viewer that is started.
+
+        Returns:
+            The ``rerun.RecordingStream``, to log more into.
+
+        Raises:
+            ViewError: nothing is drawn, or rerun-sdk is not installed.
+        """
+        from unifg.view.to_rerun import log_to_rerun
+
+        return log_to_rerun(self, path)
+
+    def viser(self, port: int = 8080) -> Any:
+        """Serve the scene by viser on this machine, with a slider for the frames.
+
+        Returns:
+            The ``viser.ViserServer``, to be stopped, or added to.
+
+        Raises:
+            ViewError: nothing is drawn, or viser is not installed.
+        """
+        from unifg.view.to_viser import serve_by_viser
+
+        return serve_by_viser(self, port)
 
     # ------------------------------------------------------------------- inside
 

@@ -261,7 +261,7 @@ def sphere(bands: int = 6, corners: int = 10) -> Mesh:
     return vertices, faces
 
 
-def column(corners: int = 24, bottom: float = 1.0) -> Mesh:
+def column(corners: int = 48, bottom: float = 1.0) -> Mesh:
     """An upright cylinder of radius 1 from z = 0 to z = 1, or a cone below its top, which is apart from its side."""
     angles = np.linspace(0.0, 2.0 * np.pi, corners + 1)
     rim = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(corners + 1)])
