@@ -26,8 +26,9 @@ from unifg.typing import Array, BoolArray
 __all__ = ["certify"]
 
 ROUNDING = 1e-13  # of the sum of all weights: what sums of squares are worth
-RANKS = 5  # dimensions added to those of the world, at most
-STEPS = 40  # halvings on the way out of a saddle
+RANKS = 2, 3  # dimensions added to those of the world, and then to these
+CLIMBED = 1e-12  # of the cost, what a descent over more dimensions leaves
+STEPS, BESIDE = 40, 0.01  # halvings on the way out of a saddle, and steps along further ways beside the first
 
 
 def certify(
@@ -159,16 +160,16 @@ def _measured_in(pose_graph: PoseGraph, unit: float) -> PoseGraph:
 
 @dataclass(frozen=True, eq=False)
 class _Verdict:
-    """cost of a point, what no point costs less than, how far they may be apart; least eigenvalue, and its direction.
+    """cost of a point, what no point costs less than, how far they may be apart; least eigenvalue, ways down.
 
-    The direction is (n, d + 1).
+    The ways are (n, d + 1, k), the steepest first; they are orthonormal.
     """
 
     cost: float
     dual: float
     tolerance: float
     least: float
-    direction: Array
+    ways: Array
 
     @property
     def proven(self) -> bool:
@@ -202,7 +203,7 @@ class _Judge:
         system = self.quadratic.factorization
         lifted = np.tile(np.arange(dim + 1) > 0, problem.count).astype(np.float64)
         value = min(float(np.trace(multipliers, axis1=1, axis2=2).sum()), cost)  # of the dual; more is rounding
-        nowhere = np.zeros((problem.count, dim + 1))
+        nowhere = np.zeros((problem.count, dim + 1, sum(RANKS)))
         shift = 0.5 * tolerance / frames
         greatest = 1e3 * self.weight
         if not self.weight > 0.0:  # every map costs nothing
@@ -226,28 +227,30 @@ class _Judge:
 
         operator = LinearOperator((len(places), len(places)), matvec=lambda x: solved(x)[places], dtype=np.float64)
         start = np.random.default_rng(0).standard_normal(len(places))
-        values, vectors = eigsh(operator, k=1, which="LA", v0=start, tol=1e-6)
-        least = 1.0 / float(values[0]) - shift
-        direction = solved(vectors[:, 0]).reshape(problem.count, dim + 1) / float(values[0])
+        values, vectors = eigsh(operator, k=min(sum(RANKS), len(places) - 1), which="LA", v0=start, tol=1e-6)
+        least = 1.0 / float(values[-1]) - shift
+        found = [solved(vectors[:, k]).reshape(problem.count, dim + 1) / values[k] for k in range(len(values))]
+        ways = np.stack(found[::-1], axis=2)
         # The eigenvalue is found to its own tolerance; what is proven is the shift that could be factorised.
         for share in (1.001, 1.01, 1.1):
             nearer = max(-least * share, 0.5 * tolerance / frames)
             if nearer < shift and system.factor(entries, nearer * lifted) and system.definite:
                 dual = value - nearer * frames
                 break
-        return _Verdict(cost, dual, tolerance, least, direction)
+        return _Verdict(cost, dual, tolerance, least, ways)
 
 
 def _climb(judge: _Judge, point: Array, verdict: _Verdict) -> tuple[Array, int, float]:
-    """Follow the way down through more dimensions until there is none, and come back to rotations.
+    """Follow the ways down through more dimensions until there is none, and come back to rotations.
 
     Returns:
         The point of rank d, the rank reached, and what no map costs less than, as proven there.
     """
     problem, lifted = judge.problem, point
-    while not verdict.proven and lifted.shape[2] < problem.dim + RANKS:
-        lifted = problem.minimize(_leave(problem, lifted, verdict.direction))
-        verdict = judge(lifted)
+    for added in RANKS:
+        if not verdict.proven:
+            lifted = problem.descend(_leave(problem, lifted, verdict.ways[:, :, :added]), CLIMBED)
+            verdict = judge(lifted)
     returned = problem.minimize(_rounded(problem, lifted, point))
     return (
         (returned if problem.cost(returned) < problem.cost(point) else point),
@@ -256,13 +259,14 @@ def _climb(judge: _Judge, point: Array, verdict: _Verdict) -> tuple[Array, int, 
     )
 
 
-def _leave(problem: Relaxation, point: Array, direction: Array) -> Array:
-    """A point of lower cost with one dimension more, along the direction of negative curvature."""
-    lifted = np.concatenate([point, np.zeros((*point.shape[:2], 1))], axis=2)
-    cost, step = problem.cost(point), 1.0 / max(float(np.abs(direction[:, 1:]).max()), 1e-300)
+def _leave(problem: Relaxation, point: Array, ways: Array) -> Array:
+    """A point of lower cost with more dimensions: far along the steepest way, a little along the others."""
+    lifted = np.concatenate([point, np.zeros((*point.shape[:2], ways.shape[2]))], axis=2)
+    cost, step = problem.cost(point), 1.0 / max(float(np.abs(ways[:, 1:, 0]).max()), 1e-300)
+    shares = np.where(np.arange(ways.shape[2]) == 0, 1.0, BESIDE)
     for _ in range(STEPS):
         trial = lifted.copy()
-        trial[:, :, -1] += step * direction
+        trial[:, :, point.shape[2] :] = step * shares * ways
         trial[:, 1:] = polar(trial[:, 1:])
         if problem.cost(trial) < cost:
             return trial
@@ -281,9 +285,4 @@ def _rounded(problem: Relaxation, lifted: Array, like: Array) -> Array:
     left, _, right = np.linalg.svd(flat[:, 1:])
     left[np.linalg.det(left @ right) < 0.0, :, -1] *= -1.0
     flat[:, 1:] = left @ right
-    # Every part back to where its anchor is; columns of frames are rows here, turned from the right.
-    turn = np.swapaxes(flat[problem.anchors, 1:], 1, 2) @ like[problem.anchors, 1:]
-    flat[:, 0] -= flat[problem.anchors, 0][problem.parts]
-    back: Array = flat @ turn[problem.parts]
-    back[:, 0] += like[problem.anchors, 0][problem.parts]
-    return back
+    return problem.anchored(flat, like)

@@ -93,9 +93,7 @@ class BlockQuadratic:
 
     def solve(self, right: Array) -> Array:
         """(free, d, k) solution for right-hand sides (free, d, k), once the factorisation has been made."""
-        columns = right.reshape(len(self.free) * self.dim, -1)
-        found = [self.factorization.solve(np.ascontiguousarray(column)) for column in columns.T]
-        return np.stack(found, axis=1).reshape(right.shape)
+        return self.factorization.solve(right.reshape(len(self.free) * self.dim, -1)).reshape(right.shape)
 
 
 def block_gradient(

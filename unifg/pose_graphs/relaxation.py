@@ -13,10 +13,12 @@ L. Carlone, A. Bandeira, J. Leonard, "SE-Sync", IJRR 38(2-3), 2019, problem 1; i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.pose_graphs.descent import Descent
 from unifg.pose_graphs.information import bounded_below, indefinite
 from unifg.pose_graphs.linear import BlockQuadratic, block_gradient, polar, with_rotations
 from unifg.pose_graphs.pose_graph import PoseGraph
@@ -27,6 +29,7 @@ __all__ = ["Relaxation", "admit"]
 ISOTROPIC = 1e-6  # of the largest eigenvalue: information matrices are written with six digits
 ROUNDS = 100
 STILL = 1e-12  # of the cost, what a step must promise
+FAR = 1e-3  # of the cost, half the squared slope: from there Newton's method is quicker
 FRAME = 1e-9  # a bend of the quadratic below this share of its diagonal is damped
 
 
@@ -159,24 +162,40 @@ class Relaxation:
         product = slope @ np.swapaxes(point[:, 1:], 1, 2)
         return 0.5 * (product + np.swapaxes(product, 1, 2))
 
+    def anchored(self, point: Array, like: Array) -> Array:
+        """The same map of rank d, every part moved as a whole to where its anchor is in another."""
+        # Columns of frames are rows here, turned from the right.
+        turn = np.swapaxes(point[self.anchors, 1:], 1, 2) @ like[self.anchors, 1:]
+        moved = point.copy()
+        moved[:, 0] -= point[self.anchors, 0][self.parts]
+        back: Array = moved @ turn[self.parts]
+        back[:, 0] += like[self.anchors, 0][self.parts]
+        return back
+
+    @cached_property
+    def descend(self) -> Descent:
+        """From far away, over frames of any dimension."""
+        return Descent(self)
+
     def minimize(self, point: Array) -> Array:
-        """A local minimum near a point, by Newton's method on positions and frames; anchors stay.
+        """A local minimum of rank d near a point, by Newton's method on positions and frames; anchors stay.
 
         The second derivative along the manifold is the quadratic less the multipliers; where it is not positive, it is
-        damped.
+        damped. Far from a minimum a descent goes before.
         """
-        rank, dim = point.shape[2], self.dim
+        dim = self.dim
         spins = [(i, k) for i in range(dim) for k in range(i)]
-        size = rank + len(spins) + dim * (rank - dim)
+        size = dim + len(spins)
         system = BlockQuadratic(self.first, self.second, self.count, size, self.anchors)
-        cost, damping = self.cost(point), 0.0
         scale = float(np.max(np.abs(self.by_second), initial=0.0) ** 2)
         if not len(system.free) or not len(self.first):
             return point
+        point = self.anchored(self.descend(point, FAR), point)
+        cost, damping = self.cost(point), 0.0
         for _ in range(ROUNDS):
             basis = _tangents(point, spins)
-            flat = basis.reshape(self.count, dim + 1, rank * size)
-            shape = (len(self.first), (dim + 1) * rank, size)
+            flat = basis.reshape(self.count, dim + 1, dim * size)
+            shape = (len(self.first), (dim + 1) * dim, size)
             J_first = (self.by_first @ flat[self.first]).reshape(shape)
             J_second = (self.by_second @ flat[self.second]).reshape(shape)
             error = self.errors(point).reshape(len(self.first), -1, 1)
@@ -238,23 +257,13 @@ def _close(found: Array, wanted: Array | float, size: Array | None = None) -> Bo
 
 
 def _tangents(point: Array, spins: list[tuple[int, int]]) -> Array:
-    """(n, d + 1, r, q) directions of positions and frames: r shifts, turns of the frame, ways out of it."""
-    count, above, rank = point.shape
-    dim = above - 1
-    frames = point[:, 1:]
-    basis = np.zeros((count, above, rank, rank + len(spins) + dim * (rank - dim)))
-    for k in range(rank):
+    """(n, d + 1, d, q) directions of positions and frames: d shifts, turns of the frame."""
+    count, above, dim = point.shape
+    basis = np.zeros((count, above, dim, dim + len(spins)))
+    for k in range(dim):
         basis[:, 0, k, k] = 1.0
-    at = rank
-    for i, k in spins:
-        basis[:, 1 + i, :, at], basis[:, 1 + k, :, at] = frames[:, k], -frames[:, i]
-        at += 1
-    if rank > dim:
-        outside = np.linalg.svd(frames)[2][:, dim:]  # (n, r - d, r), orthogonal to the frame
-        for i in range(dim):
-            for k in range(rank - dim):
-                basis[:, 1 + i, :, at] = outside[:, k]
-                at += 1
+    for at, (i, k) in enumerate(spins, dim):
+        basis[:, 1 + i, :, at], basis[:, 1 + k, :, at] = point[:, 1 + k], -point[:, 1 + i]
     return basis
 
 
