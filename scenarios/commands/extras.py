@@ -30,6 +30,7 @@ PACKAGES = {
     "PIL": Package("pillow", "scenarios", "maps and scenarios"),
     "yaml": Package("pyyaml", "scenarios", "ROS maps"),
     "tqdm": Package("tqdm", "scenarios", "progress bars"),
+    "mujoco": Package("mujoco", "mujoco", "worlds of MuJoCo"),
     "casadi": Package("casadi", "casadi", "functions of CasADi"),
     "distributed": Package("distributed", "campaign", "campaigns on clusters"),
 }
