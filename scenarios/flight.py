@@ -29,6 +29,7 @@ from unifg.scenarios.quadrotor.estimator import EstimatorSettings
 from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS, make_pilot
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
 from unifg.scenarios.quadrotor.flight_watch import FlightWatch
+from unifg.scenarios.simulation.air import QuadrotorWorld
 from unifg.scenarios.simulation.conditions import draw_conditions
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.scenarios.simulation.faults import FLIGHT_FAULTS, Fault, FlightFaults, one_of
@@ -154,7 +155,9 @@ class Flight:
         x, y, z = calm.gust
         gusty = replace(calm, gust=(k * x, k * y, k * z))
         of_world = load_class("world", settings.world, WORLDS, OF_WORLD, "storm:Storm")
-        self.world = of_world(drawn.layout, settings.seed, drawn.true, settings.movers, disturbance=gusty)
+        self.world: QuadrotorWorld = of_world(
+            drawn.layout, settings.seed, drawn.true, settings.movers, disturbance=gusty
+        )
         error = settings.estimator.state_sigma * drawn.deviation
         believed = quadrotor.STATE.retract(self.world.state[None], error[None])[0]
         self.pilot = make_pilot(
@@ -167,7 +170,8 @@ class Flight:
         self._speed = self.pilot.controller.guide.settings
         if not rehearsal:
             avoidance, association = settings.controller.avoidance, settings.estimator.association
-            kind = SCENARIO, settings.coupling, settings.solver, avoidance, association, settings.movers > 0, name_of(settings.world)
+            world, movers = name_of(settings.world), settings.movers > 0
+            kind = SCENARIO, settings.coupling, settings.solver, avoidance, association, movers, world
             rehearse(kind, lambda: Flight(replace(settings, faults=()), rehearsal=True))
 
     def run(self, progress: Progress) -> FlightLog:

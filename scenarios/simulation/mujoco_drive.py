@@ -16,7 +16,7 @@ import pymunk
 from unifg.errors import ScenarioError
 from unifg.models import unicycle
 from unifg.scenarios.simulation.faults import AXLE
-from unifg.scenarios.simulation.mujoco_engine import STEP, Engine, box
+from unifg.scenarios.simulation.mujoco_engine import Engine, box
 from unifg.scenarios.simulation.plane import WALLS, World
 from unifg.scenarios.simulation.rectangles import wall_rectangles
 from unifg.typing import Array, ArrayLike
@@ -78,8 +78,8 @@ class MujocoDrive(World):
             )
         cells, turned = wall_rectangles(self.occupancy.occupied).astype(np.float64), self.occupancy.origin[2]
         halves = 0.5 * self.occupancy.resolution * np.diff(cells)[:, [2, 0]]
-        centres = self.occupancy.grid_to_world(0.5 * np.stack([cells[:, 2] + cells[:, 3], cells[:, 0] + cells[:, 1]], 1))
-        walls = [(WALLS, box(*row, turned)) for row in np.hstack([centres, halves]).tolist()]
+        centres = self.occupancy.grid_to_world(cells[:, [2, 0]] + 0.5 * np.diff(cells)[:, [2, 0]])
+        walls = [(WALLS, box(x, y, a, b, turned)) for x, y, a, b in np.hstack([centres, halves]).tolist()]
         height, middle, mass = HULL[1] - HULL[0], 0.5 * (HULL[0] + HULL[1]), MASS * (1.0 + train.load)
         radius, meets = self.radius, 'contype="0" conaffinity="2"'
         inertia = mass * np.array([3.0 * radius**2 + height**2, 3.0 * radius**2 + height**2, 6.0 * radius**2]) / 12.0
@@ -94,8 +94,8 @@ class MujocoDrive(World):
         wheels = motors = ""
         for name, side in (("left", 0.5 * AXLE), ("right", -0.5 * AXLE)):
             wheels += (
-                f'<body pos="0 {side} {WHEEL}"><joint name="{name}" axis="0 1 0" armature="{ROTOR}"/><geom type="ellipsoid" '
-                f'size="{WHEEL} {0.5 * WHEEL_WIDTH} {WHEEL}" mass="{WHEEL_MASS}" condim="4" '
+                f'<body pos="0 {side} {WHEEL}"><joint name="{name}" axis="0 1 0" armature="{ROTOR}"/>'
+                f'<geom type="ellipsoid" size="{WHEEL} {0.5 * WHEEL_WIDTH} {WHEEL}" mass="{WHEEL_MASS}" condim="4" '
                 f'friction="{FRICTION} {SCRUB}" contype="0" conaffinity="1"/></body>'
             )
             motors += f'<velocity joint="{name}" kv="{SERVO}" forcerange="-{TORQUE} {TORQUE}"/>'
@@ -136,7 +136,7 @@ class MujocoDrive(World):
         self._trim = np.clip(self._trim + pause / SETTLING * (wanted - data.qvel[6:8]), -TRIM, TRIM)
         data.ctrl[:] = wanted + self._trim
         self.physics.carry(self.discs())
-        self.physics.step(round(pause / STEP))
+        self.physics.step(self.physics.steps(pause))
         self.physics.report(self, (WALLS - 1,))
         w, x, y, z = data.qpos[3:7].tolist()
         heading = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

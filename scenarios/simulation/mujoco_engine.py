@@ -6,18 +6,22 @@ Everything the vehicle does, and everything that it touches, is the engine's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 
 import mujoco
 import numpy as np
 
 from unifg.scenarios.simulation.space import Space
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, ArrayLike, IntArray
 
 __all__ = ["STEP", "Engine", "box", "cylinder"]
 
 STEP = 1e-3
-"""Step of the engine [s]."""
+"""Longest step of the engine [s]."""
+
+SMOOTH = 0.2
+"""Friction of geoms that state none: hulls along things."""
 
 TALL = 20.0  # height of things [m]
 
@@ -45,7 +49,13 @@ class Engine:
     """
 
     def __init__(
-        self, things: Sequence[tuple[int, str]], discs: Array, first: int, vehicle: str, rest: str, floor: tuple[int, float]
+        self,
+        things: Sequence[tuple[int, str]],
+        discs: Array,
+        first: int,
+        vehicle: str,
+        rest: str,
+        floor: tuple[int, float],
     ) -> None:
         """Build the model.
 
@@ -57,14 +67,14 @@ class Engine:
             rest: actuators, sensors and assets.
             floor: its owner and height [m].
         """
-        standing = "".join(f'<geom {geom} contype="2" conaffinity="0"/>' for _, geom in things)
+        standing = "".join(f'<geom {geom} contype="2"/>' for _, geom in things)
         moving = "".join(
-            f'<body mocap="true" pos="{x!r} {y!r} 0"><geom {cylinder(0.0, 0.0, radius)} contype="2" conaffinity="0"/></body>'
+            f'<body mocap="true" pos="{x!r} {y!r} 0"><geom {cylinder(0.0, 0.0, radius)} contype="2"/></body>'
             for x, y, radius, _ in discs.tolist()
         )
-        ground = f'type="plane" size="0 0 1" pos="0 0 {floor[1]}" friction="0.01" condim="1" contype="1" conaffinity="0"'
+        ground = f'type="plane" size="0 0 1" pos="0 0 {floor[1]}" condim="1" conaffinity="0"'
         self.model = mujoco.MjModel.from_xml_string(
-            f'<mujoco><compiler angle="radian"/>'
+            f'<mujoco><compiler angle="radian"/><default><geom friction="{SMOOTH} 0" conaffinity="0"/></default>'
             f'<option timestep="{STEP}" integrator="Euler" cone="elliptic" impratio="10"/>'
             f"<worldbody><geom {ground}/>{standing}{moving}{vehicle}</worldbody>{rest}</mujoco>"
         )
@@ -73,9 +83,9 @@ class Engine:
         self.touching: set[int] = set()
         self._owners = [floor[0], *(owner for owner, _ in things), *range(first, first + len(discs))]
 
-    def place(self, position: Sequence[float], attitude: Sequence[float], velocity: Sequence[float] = (0, 0, 0)) -> None:
+    def place(self, position: ArrayLike, attitude: ArrayLike, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> None:
         """Put the vehicle at a position (3,) [m] in an attitude (4,), w first, with a velocity (3,) [m/s]."""
-        self.data.qpos[:7], self.data.qvel[:] = [*position, *attitude], 0.0
+        self.data.qpos[:3], self.data.qpos[3:7], self.data.qvel[:] = position, attitude, 0.0
         self.data.qvel[:3] = velocity
         mujoco.mj_forward(self.model, self.data)
 
@@ -83,6 +93,12 @@ class Engine:
         """Carry the discs (K, 4) to where they are now [m]."""
         if len(discs):
             self.data.mocap_pos[:, :2] = discs[:, :2]
+
+    def steps(self, pause: float) -> int:
+        """Set the length of a step, `STEP` at most; how many of them make a pause [s]."""
+        count = math.ceil(pause / STEP - 1e-9)
+        self.model.opt.timestep = pause / count
+        return count
 
     def step(self, count: int = 1) -> None:
         """Take steps with the actuators as they are told."""

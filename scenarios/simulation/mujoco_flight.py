@@ -19,7 +19,7 @@ import pymunk
 from unifg.models import quadrotor
 from unifg.scenarios.simulation.air import FLOOR, SOFT, VEHICLE_RADIUS, QuadrotorWorld, usable
 from unifg.scenarios.simulation.body_rate import Loops
-from unifg.scenarios.simulation.mujoco_engine import STEP, Engine, box, cylinder
+from unifg.scenarios.simulation.mujoco_engine import Engine, box, cylinder
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["MujocoQuadrotor"]
@@ -101,7 +101,7 @@ class MujocoQuadrotor(QuadrotorWorld):
             self.advance(pause)  # movers do not wait: their path is the same in every flight
             physics.carry(self.discs())
             speed = float(np.linalg.norm(physics.data.qvel[:3]))
-            for _ in range(round(pause / STEP)):
+            for _ in range(physics.steps(pause)):
                 self._push(told, noise)
                 physics.step()
                 felt.append(physics.data.sensordata.copy())
@@ -124,7 +124,7 @@ class MujocoQuadrotor(QuadrotorWorld):
         moment[2] = min(max(moment[2], -most), most)
         data.ctrl[:] = MIXER @ [told[3], *moment]  # the engine keeps them between nothing and the most
         rotation = data.xmat[self.physics.vehicle].reshape(3, 3)
-        blow = noise[3:] + [*p.wind, p.updraft]
+        blow = noise[3:] + np.array([*p.wind, p.updraft])
         data.xfrc_applied[self.physics.vehicle, :3] = p.mass * blow - rotation @ (p.drag * (data.qvel[:3] @ rotation))
 
     def first_met(self, origin: tuple[float, float], tip: tuple[float, float]) -> pymunk.Shape | None:
