@@ -168,14 +168,14 @@ def test_the_engine_sees_what_the_own_plant_sees() -> None:
 
 
 def test_wheels_roll_as_kinematics_say() -> None:
-    """Straight on a radius less what the load presses tyres in, in a turn to what they slip: below 2 % of the rate."""
+    """Straight on a radius up to the middle of what tyres are pressed in, in a turn to a slip below 2 %."""
     straight = driver(start=(1.0, 1.0, 0.0))
     for _ in range(10):
         straight.step(0.5, 0.0)
     begin = straight.pose[0]
     for _ in range(20):
         straight.step(0.5, 0.0)
-    radius = WHEEL + float(straight.physics.data.qpos[2])
+    radius = WHEEL + 0.5 * float(straight.physics.data.qpos[2])
     assert 0.99 * WHEEL < radius < WHEEL
     assert straight.pose[0] - begin == pytest.approx(0.5 * 2.0 * radius / WHEEL, rel=1e-3)
     np.testing.assert_allclose(straight.pose[1:], [1.0, 0.0], atol=1e-3)
