@@ -114,7 +114,7 @@ class Engine:
         self.touching = now
 
     def rays(self, origin: Sequence[float], ways: Array, reach: float) -> tuple[Array, IntArray]:
-        """What rays meet besides the vehicle.
+        """First things besides the vehicle that rays meet.
 
         Args:
             origin: (3,) [m].

@@ -100,13 +100,13 @@ class MujocoQuadrotor(QuadrotorWorld):
             noise = self._disturbances.draw(pause)
             self.advance(pause)  # movers do not wait: their path is the same in every flight
             physics.carry(self.discs())
-            speed = float(np.linalg.norm(physics.data.qvel[:3]))
             for _ in range(physics.steps(pause)):
                 self._push(told, noise)
+                soft = float(np.linalg.norm(physics.data.qvel[:3])) <= SOFT
                 physics.step()
+                physics.report(self, (FLOOR,) if soft else ())
+                self.grounded |= FLOOR in physics.touching
                 felt.append(physics.data.sensordata.copy())
-            physics.report(self, () if speed > SOFT else (FLOOR,))
-            self.grounded |= FLOOR in physics.touching
         self._rates, self._force = np.split(np.mean(felt, axis=0), 2)
         self._state = np.concatenate([physics.data.qpos, physics.data.qvel[:3]])
 
