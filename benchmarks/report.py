@@ -26,8 +26,8 @@ CHECKOUT = Path(__file__).resolve().parent.parent
 OUT = CHECKOUT / "out" / "benchmarks"
 CAMPAIGNS = CHECKOUT / "benchmarks" / "campaigns"
 PACKAGES = (
-    "numpy", "scipy", "numba", "osqp", "piqp", "casadi", "gtsam", "pymunk", "comma-deps-acados", "drake", "crocoddyl",
-    "almond-jaxls", "jax",
+    "numpy", "scipy", "numba", "osqp", "piqp", "casadi", "gtsam", "pymunk", "mujoco", "comma-deps-acados", "drake",
+    "crocoddyl", "almond-jaxls", "jax",
 )  # fmt: skip
 
 

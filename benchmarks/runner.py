@@ -104,7 +104,7 @@ PAGES: dict[str, dict[str, float]] = {
     "collection": {"collection": 0.1, "cops": 0.05},
     "pose-graphs": {"elimination": 0.1, "incremental": 0.1, "wrong_closures": 4.0, "verdicts": 0.3},
     "navigation": {"navigation": 0.1, "localisation": 0.15, "movers": 1.0},
-    "reliability": {"faults": 0.3, "fault_search": 0.15},
+    "reliability": {"faults": 0.3, "fault_search": 0.15, "mujoco": 0.25},
     "first-use": {"first_use": 0.2},
     "peers": {"peers": 0.1},
 }  # fmt: skip

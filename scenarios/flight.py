@@ -20,6 +20,7 @@ from unifg.errors import ScenarioError, UnifgError
 from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
+from unifg.scenarios.ground.protocols import load_class, name_of
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.options import count, not_negative, option, positive, share
@@ -40,6 +41,11 @@ SCENARIO = "quadrotor-mpc"
 REACHED_DISTANCE = 0.3  # [m], by belief and truth
 REACHED_SPEED = 0.5  # [m/s], by belief and truth
 SLOWEST_SHARE = 0.05  # of the speed of the reference; at rest nothing is planned
+WORLDS = {
+    "air": "unifg.scenarios.simulation.air:QuadrotorWorld",
+    "mujoco": "unifg.scenarios.simulation.mujoco_flight:MujocoQuadrotor",
+}
+OF_WORLD = ("step(control, dt)", "sense()", "discs()", "clearance()")
 COLLISIONS = 3  # with so many a flight is given up
 
 logger = logging.getLogger("unifg")
@@ -58,6 +64,8 @@ class FlightSettings:
         mass_error: by which the mass is believed wrong at the start, relative, in [0, 1).
         speed: cruise [m/s]; None for that of the controller's guide.
         gusts: factor on the standard deviation of the gusts, which the robot is not told.
+        world: simulation: "air", "mujoco", or a class of your own, MODULE:CLASS, with the arguments of
+            `unifg.scenarios.simulation.air.QuadrotorWorld`.
         time_limit: after which a flight is given up [s].
         estimator: of the past; its association is the flight's.
         controller: of the future; its avoidance and horizon are the flight's.
@@ -71,6 +79,7 @@ class FlightSettings:
     mass_error: float = option(0.05, text=share, metavar="E")
     speed: float | None = option(None, text=positive, metavar="M/S")
     gusts: float = option(1.0, text=not_negative, metavar="FACTOR")
+    world: str | type = option("air", text=str, metavar="NAME|MODULE:CLASS")
     time_limit: float = 60.0
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     controller: ControllerSettings = field(default_factory=ControllerSettings)
@@ -99,6 +108,7 @@ class FlightSettings:
             "movers": self.movers,
             "mass_error": self.mass_error,
             "gusts": self.gusts,
+            "world": name_of(self.world),
             "time_limit": self.time_limit,
             "window": self.estimator.window.length,
             "horizon": self.controller.horizon,
@@ -144,7 +154,10 @@ class Flight:
         calm, k = DisturbanceModel(), settings.gusts
         x, y, z = calm.gust
         gusty = replace(calm, gust=(k * x, k * y, k * z))
-        self.world = QuadrotorWorld(drawn.layout, settings.seed, drawn.true, settings.movers, disturbance=gusty)
+        of_world = load_class("world", settings.world, WORLDS, OF_WORLD, "storm:Storm")
+        self.world: QuadrotorWorld = of_world(
+            drawn.layout, settings.seed, drawn.true, settings.movers, disturbance=gusty
+        )
         error = settings.estimator.state_sigma * drawn.deviation
         believed = quadrotor.STATE.retract(self.world.state[None], error[None])[0]
         self.pilot = make_pilot(
@@ -157,7 +170,8 @@ class Flight:
         self._speed = self.pilot.controller.guide.settings
         if not rehearsal:
             avoidance, association = settings.controller.avoidance, settings.estimator.association
-            kind = SCENARIO, settings.coupling, settings.solver, avoidance, association, settings.movers > 0
+            world, movers = name_of(settings.world), settings.movers > 0
+            kind = SCENARIO, settings.coupling, settings.solver, avoidance, association, movers, world
             rehearse(kind, lambda: Flight(replace(settings, faults=()), rehearsal=True))
 
     def run(self, progress: Progress) -> FlightLog:

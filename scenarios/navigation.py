@@ -39,7 +39,7 @@ from unifg.scenarios.simulation.drivetrain import PLANTS, Drivetrain, plant
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, DriveFaults, Fault, one_of
 from unifg.scenarios.simulation.imperfection import Imperfection, imperfect
 from unifg.scenarios.simulation.placement import PlacementRules, place_obstacles
-from unifg.scenarios.simulation.plane import LidarModel, OdometryModel, World
+from unifg.scenarios.simulation.plane import LidarModel, OdometryModel
 from unifg.scenarios.simulation.traffic import Traffic, draw_traffic
 from unifg.typing import Array
 
@@ -58,7 +58,10 @@ HELPLESS = 20.0  # [s] that a robot that may not move waits before it gives up
 REACHED = "reached"
 MPC = "mpc"
 LOCALISERS = ("graph", "amcl")
-PLANE = "plane"
+WORLDS = {
+    "plane": "unifg.scenarios.simulation.plane:World",
+    "mujoco": "unifg.scenarios.simulation.mujoco_drive:MujocoDrive",
+}
 OF_WORLD = ("step(*control, dt)", "power(on)", "scan()", "odometry()", "discs()", "clearance()")
 LARGEST = Limits(pixels=200_000_000)  # of a map that a user names: 700 m by 700 m at 0.05 m
 
@@ -91,7 +94,7 @@ class NavigationSettings:
             MODULE:CLASS, as `unifg.scenarios.ground.local_planner` describes it.
         localiser: of the estimate: "graph", that of this library, "amcl", a Monte Carlo localiser to compare with, or
             a class of your own, MODULE:CLASS, constructed with a `LocaliserContext`.
-        world: simulation: "plane", or a class of your own, MODULE:CLASS, with the arguments of
+        world: simulation: "plane", "mujoco", or a class of your own, MODULE:CLASS, with the arguments of
             `unifg.scenarios.simulation.plane.World`.
         faults: what goes wrong; may be repeated.
         log: recorded drive that the localiser follows on the map, in the place of a simulated one.
@@ -116,7 +119,7 @@ class NavigationSettings:
     imperfection: Imperfection = field(default_factory=Imperfection)
     planner: str | type = option(MPC, text=str, metavar="MODULE:CLASS")
     localiser: str | type = option(LOCALISERS[0], text=str, metavar="NAME|MODULE:CLASS")
-    world: str | type = option(PLANE, text=str, metavar="MODULE:CLASS")
+    world: str | type = option("plane", text=str, metavar="NAME|MODULE:CLASS")
     faults: tuple[Fault, ...] = option(
         (), text=one_of(DRIVE_FAULTS), metavar="KIND[=SIZE]@SECONDS[:DURATION]", flag="fault", many=True
     )
@@ -192,9 +195,7 @@ class Episode:
             rules=rules,
         )
         walls = _field(true) if settings.imperfection != Imperfection() else self.distance_map
-        of_world = (
-            World if settings.world == PLANE else load_class("world", settings.world, (PLANE,), OF_WORLD, "fog:Fog")
-        )
+        of_world = load_class("world", settings.world, WORLDS, OF_WORLD, "fog:Fog")
         self.world = of_world(
             true, self.start, discs, sensors, base=control.kind, body=control.hull, lidar=settings.lidar,
             odometry=settings.odometry, drivetrain=settings.drivetrain, yields=False,

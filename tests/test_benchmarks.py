@@ -30,6 +30,7 @@ from benchmarks import (
     marginals,
     moved_goals,
     movers,
+    mujoco,
     own_functions,
     pose_graphs,
     runner,
@@ -227,6 +228,23 @@ def test_results_replace_what_stands_between_the_markers(tmp_path: Path) -> None
     page.write_text(f"# Notes\n{marker}\n")
     with pytest.raises(ValueError, match="has no"):
         put_results(page, "one", "new")
+
+
+def test_plants_are_compared_seed_by_seed() -> None:
+    """The tracking error is measured ahead; what was not reached is listed beside the medians."""
+    line = np.column_stack([np.arange(12.0), np.zeros(12)])
+    plans = line[:, None] + np.column_stack([1.1 * np.arange(4.0), np.zeros(4)])
+    assert mujoco.tracking(line, plans, 3) == pytest.approx(0.3)
+    numbers = dict.fromkeys(mujoco.MEASURES, 1.0) | {"emergency": 0, "causes": {"no plan": 2}}
+    rows = [
+        {"robot": robot, "world": world, "seed": seed, **numbers, "contacts": seed, "outcome": "reached",
+         "tracking_mm": 10.0 + 2.0 * (world == "mujoco")}
+        for robot, worlds in mujoco.WORLDS.items() for world in worlds for seed in range(2)
+    ]  # fmt: skip
+    text = mujoco.render(rows)
+    assert text.count("| tracking, rms [mm] | +2 (+2 .. +2) |") == 3
+    assert "- drive, mujoco, seed 1: reached, 1 contacts" in text and "seed 0" not in text
+    assert "- flight, air: *no plan* in 2 of 2" in text
 
 
 def test_a_sample_compares_counts_with_the_page(capsys: pytest.CaptureFixture[str]) -> None:

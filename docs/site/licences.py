@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 CHECKOUT = Path(__file__).resolve().parent.parent.parent
 PAGE = CHECKOUT / "docs" / "reference" / "licences.md"
 # Extras; those for tests, style and this site stay with us.
-USED = ("view", "scenarios", "casadi", "campaign", "mcap", "metis", "rerun", "viser", "bench")
+USED = ("view", "scenarios", "casadi", "campaign", "mcap", "metis", "mujoco", "rerun", "viser", "bench")
 HEAD = """# Licences
 
 unifg itself is under the [MIT licence](../../LICENSE). It contains no code of others; scenes carry meshcat's viewer

@@ -31,6 +31,7 @@ PACKAGES = {
     "mcap": Package("mcap", "mcap", "recordings in MCAP"),
     "yaml": Package("pyyaml", "scenarios", "ROS maps"),
     "tqdm": Package("tqdm", "scenarios", "progress bars"),
+    "mujoco": Package("mujoco", "mujoco", "worlds of MuJoCo"),
     "casadi": Package("casadi", "casadi", "functions of CasADi"),
     "distributed": Package("distributed", "campaign", "campaigns on clusters"),
 }

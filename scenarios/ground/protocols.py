@@ -6,7 +6,7 @@ Each is a class that `unifg run navigation` takes as MODULE:CLASS, and `Navigati
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -119,19 +119,26 @@ def name_of(given: str | type) -> str:
     return given if isinstance(given, str) else f"{given.__module__}:{given.__qualname__}"
 
 
-def load_class(what: str, given: str | type, known: Sequence[str], methods: Sequence[str], example: str) -> type:
-    """A user's class.
+def load_class(
+    what: str, given: str | type, known: Sequence[str] | Mapping[str, str], methods: Sequence[str], example: str
+) -> type:
+    """A user's class, or one that ships.
 
     Args:
         what: it is, for messages.
         given: ``MODULE:CLASS``, or the class; modules of the working directory are found, too.
-        known: names that stand for what ships.
+        known: names that stand for what ships; of a mapping, for the class ``MODULE:CLASS``.
         methods: that it must have, with their arguments.
         example: of such a name.
 
     Raises:
         ScenarioError: there is no such module or class, or it lacks a method.
+        ImportError: what a shipped class needs is not installed.
     """
+    if isinstance(known, Mapping) and given in known:
+        module_name, _, class_name = known[str(given)].partition(":")
+        shipped: type = getattr(import_module(module_name), class_name)
+        return shipped
     module_name, colon, class_name = name_of(given).partition(":")
     if not (module_name and colon and class_name):
         choices = " or ".join(map(repr, known))

@@ -28,7 +28,7 @@ from unifg.scenarios.simulation.bearing_range import Sensor, SensorModel
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.scenarios.simulation.placement import random_movers
-from unifg.scenarios.simulation.space import Obstacle, Space
+from unifg.scenarios.simulation.space import OTHERS, Obstacle, Space
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["VEHICLE_RADIUS", "QuadrotorWorld"]
@@ -44,7 +44,8 @@ _WORLD_TAG = 53  # keeps the noise apart from the layouts of the same seed
 SOFT = 0.8
 """Speed at which a vehicle may touch the floor [m/s]: a landing is no collision."""
 
-_FLOOR = -1  # owner of contacts with the floor; those of things are their ids, those of walls follow
+FLOOR = -1
+"""Owner of contacts with the floor; those of things are their ids, those of walls follow."""
 
 
 class QuadrotorWorld(Space):
@@ -99,10 +100,10 @@ class QuadrotorWorld(Space):
         self._rates, self._force = np.zeros(3), SO3.act(SO3.inverse(self._state[3:7]), UP)
         super().__init__(self._state[:2], Body.disc(VEHICLE_RADIUS))
         if self._state[2] <= 0.0:
-            self.begin(_FLOOR, counts=False)  # a start on the ground is no collision
+            self.begin(FLOOR, counts=False)  # a start on the ground is no collision
         shapes = self._add_things()
         self.add_vehicle()
-        self._sensor = Sensor(self.sensor_model, self.engine, shapes, len(shapes) - len(self.movers), sensor_rng)
+        self._sensor = Sensor(self.sensor_model, self.first_met, shapes, len(shapes) - len(self.movers), sensor_rng)
         if self.clearance() < 0.0:
             x, y, z = self._state[:3]
             raise ScenarioError(
@@ -136,13 +137,7 @@ class QuadrotorWorld(Space):
         Raises:
             ScenarioError: if the control or the duration is not usable.
         """
-        u = np.array(control, dtype=np.float64)
-        if u.shape != (4,) or not np.isfinite(u).all():
-            raise ScenarioError(
-                f"a control is four finite numbers, body rates and thrust; got {control!r}. Fly a stored plan or hover "
-                "rather than a plan that failed"
-            )
-        rates, path = list[Array](), [self._state]
+        u, rates, path = usable(control), list[Array](), [self._state]
         for pause in self.substeps(dt):
             noise = self._disturbances.draw(pause)
             rates.append(u[:3] + noise[:3])
@@ -166,11 +161,11 @@ class QuadrotorWorld(Space):
     def _land(self, state: Array) -> Array:
         """Keep a state (10,) above the floor."""
         if state[2] <= 0.0:
-            if not self.touches(_FLOOR):
-                self.begin(_FLOOR, counts=float(np.linalg.norm(state[7:10])) > SOFT)
+            if not self.touches(FLOOR):
+                self.begin(FLOOR, counts=float(np.linalg.norm(state[7:10])) > SOFT)
             state[2], state[9] = 0.0, max(state[9], 0.0)
-        elif self.touches(_FLOOR):
-            self.separate(_FLOOR)
+        elif self.touches(FLOOR):
+            self.separate(FLOOR)
         return state
 
     # ----------------------------------------------------------------- sensors
@@ -178,6 +173,11 @@ class QuadrotorWorld(Space):
     def sense(self) -> Reading:
         """Measure once at the present state; every call draws new noise."""
         return self._sensor.read(self.time, self._state, self.things(), self._rates, self._force)
+
+    def first_met(self, origin: tuple[float, float], tip: tuple[float, float]) -> pymunk.Shape | None:
+        """First shape that a ray meets between two places [m]; None for none."""
+        hit = self.engine.segment_query_first(origin, tip, 0.0, OTHERS)
+        return None if hit is None else hit.shape
 
     # ------------------------------------------------------------ ground truth
 
@@ -198,6 +198,21 @@ class QuadrotorWorld(Space):
         discs = np.concatenate([self.layout.cylinders, self.discs()[:, :3]])
         beside = float(obstacle_distance(self._state[None, :2], discs, self.layout.walls)[0]) - VEHICLE_RADIUS
         return min(beside, float(self._state[2]))
+
+
+def usable(control: ArrayLike) -> Array:
+    """(4,) body rates [rad/s] and thrust [N].
+
+    Raises:
+        ScenarioError: these are not four finite numbers.
+    """
+    u = np.array(control, dtype=np.float64)
+    if u.shape != (4,) or not np.isfinite(u).all():
+        raise ScenarioError(
+            f"a control is four finite numbers, body rates and thrust; got {control!r}. Fly a stored plan or hover "
+            "rather than a plan that failed"
+        )
+    return u
 
 
 def felt_force(states: Array, rates: Array, pause: float) -> Array:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 import pymunk
@@ -12,10 +13,12 @@ import pymunk
 from unifg.lie import SO3
 from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.perception.readings import Reading
-from unifg.scenarios.simulation.space import OTHERS
 from unifg.typing import Array
 
 __all__ = ["Sensor", "SensorModel"]
+
+First: TypeAlias = Callable[[tuple[float, float], tuple[float, float]], pymunk.Shape | None]
+"""First shape that a ray meets between two places [m], None for none."""
 
 _FLANK = 0.9  # of the angle between a cylinder's axis and its silhouette
 _CORNER_GAP = 0.01  # a ray to a corner ends this much before it, for it would hit the corner's own wall [m]
@@ -63,22 +66,22 @@ class Sensor:
     def __init__(
         self,
         model: SensorModel,
-        space: pymunk.Space,
+        first: First,
         shapes: Sequence[pymunk.Shape | None],
         standing: int,
         rng: np.random.Generator,
     ) -> None:
-        """Look around in a space.
+        """Look around.
 
         Args:
             model: noise and reach.
-            space: where the rays go.
+            first: of the shapes that a ray meets.
             shapes: shape of each thing by id; None for a corner.
             standing: number of things that do not move; the rest do.
             rng: its children are spawned, itself it is not advanced.
         """
         self.model = model
-        self._space, self._shapes = space, tuple(shapes)
+        self._first, self._shapes = first, tuple(shapes)
         self._standing, self._moving = standing, len(shapes) - standing
         self._kinds = np.array(
             [Landmarks.CORNER if shape is None else Landmarks.CYLINDER for shape in shapes], dtype=np.intp
@@ -148,7 +151,6 @@ class Sensor:
         for angle in angles:
             c, s = math.cos(angle), math.sin(angle)
             tip = origin[0] + share * (c * dx - s * dy), origin[1] + share * (s * dx + c * dy)
-            hit = self._space.segment_query_first(origin, tip, 0.0, OTHERS)
-            if (None if hit is None else hit.shape) is shape:
+            if self._first(origin, tip) is shape:
                 return True
         return False

@@ -42,7 +42,8 @@ _REST_SPEED = 0.02  # [m/s]; below it the robot counts as being at rest
 EDGE = 0.3
 """Neighbouring beams that differ by more have an edge between them [m]."""
 
-_WALLS = -1  # owner of all walls together; obstacles are owned by their index
+WALLS = -1
+"""Owner of all walls together; obstacles are owned by their index."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,7 @@ class World(Space):
         )
         world_corners = self.occupancy.grid_to_world(corners.reshape(-1, 2)).reshape(-1, 4, 2)
         for polygon in world_corners.tolist():
-            self.add(pymunk.Poly(self.engine.static_body, [(x, y) for x, y in polygon]), _WALLS)
+            self.add(pymunk.Poly(self.engine.static_body, [(x, y) for x, y in polygon]), WALLS)
 
     # ------------------------------------------------------------------ motion
 
@@ -217,7 +218,7 @@ class World(Space):
                 self._start_tick(pause)
             self.advance(pause, resting=self.vehicle.velocity.length < _REST_SPEED)
             self._trail.append((self.time, (*self.vehicle.position, self.vehicle.angle)))
-        self._measure(before, heading_before, dt, self._gripped / self._spun if self._spun > 0.0 else 1.0)
+        self._measure(before, heading_before, dt)
 
     def _drive(self, body: pymunk.Body, gravity: tuple[float, float], damping: float, dt: float) -> None:
         """Velocity for the coming substep, along its midpoint heading: the chord of the arc."""
@@ -245,19 +246,24 @@ class World(Space):
         self._drive(self.vehicle, (0.0, 0.0), 1.0, pause)
         self.vehicle.velocity = self.without_contacts(self.vehicle.velocity, relative=False)
 
-    def _measure(self, before: pymunk.Vec2d, heading_before: float, dt: float, grip: float) -> None:
-        """Read the wheels: the SE(2) logarithm of the motion made, as far as wheels roll, and what was slipped."""
+    def _measure(self, before: pymunk.Vec2d, heading_before: float, dt: float) -> None:
+        """Read the wheels after a step of ``dt`` [s] from a place and a heading."""
+        noise = self._odometry_model.noise_sigma * self._odometry_rng.standard_normal(self.base.size)
+        self._measured = self._rolled(before, heading_before, dt) * (self._scale + noise)
+
+    def _rolled(self, before: pymunk.Vec2d, heading_before: float, dt: float) -> Array:
+        """Controls (m,) of the wheels: the SE(2) logarithm of the motion made, as far as they roll, and the slip."""
         turn = self.vehicle.angle - heading_before
         body_motion = (self.vehicle.position - before).rotated(-heading_before)
         half = 0.5 * turn
         stretch = half / math.tan(half) if abs(half) > 1e-9 else 1.0
         forward = stretch * body_motion.x + half * body_motion.y
         left = [stretch * body_motion.y - half * body_motion.x] if self.base.slides else []
-        noise = self._odometry_model.noise_sigma * self._odometry_rng.standard_normal(self.base.size)
+        grip = self._gripped / self._spun if self._spun > 0.0 else 1.0
         made = np.array([forward, *left, turn]) / (dt * grip)
         if self.base.steering is not None:
             made[-1] = self._steered / dt
-        self._measured = made * (self._scale + noise)
+        return made
 
     def power(self, on: bool) -> None:
         """Give the motors power, or cut it: brakes bring the wheels to rest."""
@@ -278,12 +284,7 @@ class World(Space):
         places = self._track(lidar.turn * (np.arange(lidar.beams) - (lidar.beams - 1)) / lidar.beams)
         bearing = places[:, 2] + self._angles
         tips = places[:, :2] + reach * np.stack([np.cos(bearing), np.sin(bearing)], axis=1)
-        query = self.engine.segment_query_first
-        hits = [
-            query((x, y), (tip[0], tip[1]), 0.0, OTHERS)
-            for (x, y), tip in zip(places[:, :2].tolist(), tips.tolist(), strict=True)
-        ]
-        ranges = np.array([math.inf if hit is None else hit.alpha for hit in hits]) * reach
+        ranges = self._met(places[:, :2], tips)
         noise = lidar.sigma * self._lidar_rng.standard_normal(lidar.beams)
         lost = self._lidar_rng.random(lidar.beams) < lidar.dropout
         if lidar.clutter or lidar.mixed:
@@ -292,6 +293,15 @@ class World(Space):
         ranges[seen] = np.clip(ranges[seen] + noise[seen], 0.0, reach)
         ranges[lost] = np.nan
         return Scan(self._angles.copy(), ranges, self.time, lidar.turn)
+
+    def _met(self, origins: Array, tips: Array) -> Array:
+        """(B,) ranges at which beams from origins (B, 2) to tips (B, 2) meet something [m]; inf where they do not."""
+        query = self.engine.segment_query_first
+        hits = [
+            query((x, y), (tip[0], tip[1]), 0.0, OTHERS)
+            for (x, y), tip in zip(origins.tolist(), tips.tolist(), strict=True)
+        ]
+        return np.array([math.inf if hit is None else hit.alpha for hit in hits]) * self.lidar.range_max
 
     def _track(self, times: Array) -> Array:
         """(n, 3) where the robot was at times (n,) from now on, none of them positive [m, m, rad]."""
