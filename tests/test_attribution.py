@@ -1,0 +1,216 @@
+"""Causes of contacts: staged drives whose cause is known, and made-up logs at the edge of each decision."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pymunk
+import pytest
+
+from episodes import episode
+from maps import walled
+from unifg.files.ros_map import OccupancyMap, save_map
+from unifg.scenarios.commands.drives import summary
+from unifg.scenarios.ground.drive_signals import RAMPS
+from unifg.scenarios.ground.local_planner import PlannerContext, Situation
+from unifg.scenarios.ground.protocols import LocaliserContext
+from unifg.scenarios.ground.route import Route
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.logs.drive_metrics import episode_metrics
+from unifg.scenarios.monitoring.assumptions import BREAKS, FAULT, judged
+from unifg.scenarios.monitoring.supervisor import Ramp, Supervisor
+from unifg.scenarios.navigation import Episode, NavigationSettings
+from unifg.scenarios.perception.readings import Scan
+from unifg.scenarios.scenes.drive_scene import drive_scene
+from unifg.scenarios.simulation.drivetrain import Drivetrain
+from unifg.scenarios.simulation.plane import World
+from unifg.scenarios.simulation.space import Mover, Obstacle, Space
+from unifg.typing import Array
+
+HALL = walled(9.0, 3.0, wall=2)
+START, GOAL = (1.0, 1.5, 0.0), (7.5, 1.5, 1.57)  # passed by a robot that drives on
+
+
+class Dashes:
+    """Stands, and at a time dashes at the vehicle with a speed."""
+
+    def __init__(self, begin: float, speed: float) -> None:
+        self.begin, self.speed = begin, speed
+
+    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+        if space.time < self.begin:
+            return 0.0, 0.0
+        way = (space.vehicle.position - mover.body.position).normalized() * self.speed
+        return float(way.x), float(way.y)
+
+
+def with_mover(place: tuple[float, float], begin: float, speed: float) -> type:
+    """World with a disc that dashes."""
+
+    class Dashing(World):
+        def __init__(self, *args: Any, people: Any = (), **more: Any) -> None:
+            super().__init__(*args, people=[*people, Mover(np.array(place), 0.2, Dashes(begin, speed))], **more)
+
+    return Dashing
+
+
+class Glass(World):
+    """A wall across the hall that neither beams nor the map show."""
+
+    def __init__(self, occupancy: OccupancyMap, *args: Any, **more: Any) -> None:
+        occupied = occupancy.occupied.copy()
+        occupied[2:-2, 80:82] = True
+        super().__init__(replace(occupancy, occupied=occupied, free=~occupied), *args, **more)
+        for shape in self.engine.shapes:
+            if isinstance(shape, pymunk.Poly) and 3.9 < shape.bb.center().x < 4.2:
+                shape.filter = pymunk.ShapeFilter(categories=1)  # as queries pass the vehicle
+
+
+class Runaway(World):
+    """Brakes and motors that do not obey after two seconds."""
+
+    def step(self, *control: float, dt: float = 0.1) -> None:
+        super().step(*((1.0, 0.0) if self.time > 2.0 else control), dt=dt)
+
+    def power(self, on: bool) -> None:
+        """The relay is stuck, too."""
+
+
+class Pillar(World):
+    """A disc in the way that rests."""
+
+    def __init__(self, occupancy: OccupancyMap, start: Array, discs: Any, *args: Any, **more: Any) -> None:
+        super().__init__(occupancy, start, [Obstacle(np.array([4.0, 1.5]), 0.2)], *args, **more)
+
+
+class Onward:
+    """Planner that drives on whatever is there."""
+
+    speed = 0.8
+
+    def __init__(self, context: PlannerContext) -> None:
+        pass
+
+    def control(self, now: Situation) -> list[float]:
+        return [self.speed, 0.0]
+
+
+class Follows(Onward):
+    """Planner that follows its route past whatever is there."""
+
+    def control(self, now: Situation) -> list[float]:
+        ahead = now.reference[6, :2] - now.pose[:2]
+        turn = float(np.arctan2(ahead[1], ahead[0]) - now.pose[2])
+        return [self.speed * max(np.cos(turn), 0.0), 2.0 * turn]
+
+
+class Waits(Onward):
+    """Planner that stays."""
+
+    speed = 0.0
+
+
+class Wheels:
+    """Localiser that believes the wheels to a centimetre."""
+
+    refused, iterations = "", 0
+
+    def __init__(self, context: LocaliserContext) -> None:
+        self.base = context.base
+        self.reset(context.pose, context.sigma)
+
+    def reset(self, pose: Array, sigma: Array) -> None:
+        self.pose, self.covariance = np.array(pose), 1e-4 * np.eye(3)
+
+    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        if odometry is not None:
+            self.pose = self.base.step(self.pose[None], odometry[None], dt)[0]
+
+
+class Trusting:
+    """Emergency stop that stops nothing."""
+
+    def control(self, asked: Array, last: Array, scan: Scan) -> Array:
+        return asked
+
+
+def staged(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    occupancy: OccupancyMap = HALL,
+    trusting: bool = False,
+    ticks: int = 90,
+    **settings: Any,
+) -> EpisodeLog:
+    """Log of a drive that ends some ticks after its first contact, without reflexes if it trusts its plan."""
+    save_map(folder / "hall.yaml", occupancy)
+    usual: dict[str, Any] = {"start": START, "believed": START, "goals": (GOAL,)}
+    made = Episode(NavigationSettings(map=folder / "hall.yaml", **{**usual, **settings}), rehearsal=True)
+    if trusting:
+        made.pilot.emergency_stop = Trusting()  # type: ignore[assignment]
+        monkeypatch.setattr(Route, "repair", lambda self, pose, tracks: False)
+        made.pilot.supervisor = Supervisor({name: Ramp(name, np.inf, np.inf) for name in RAMPS})
+    left = ticks
+
+    def until(done: float, text: str) -> None:
+        nonlocal left
+        left = min(left - 1, 8 if made.world.collisions else left)
+        if left == 0 and done < 1.0:
+            raise KeyboardInterrupt
+
+    return made.run(until)
+
+
+def corner() -> OccupancyMap:
+    """A corridor along y = 1 that turns left at its end."""
+    return walled(8.0, 6.0, wall=2, blocks=[(slice(40, 120), slice(0, 110))])
+
+
+def niche() -> OccupancyMap:
+    """The hall with a block beside the way, behind which something fits."""
+    return walled(9.0, 3.0, wall=2, blocks=[(slice(38, 44), slice(60, 100))])
+
+
+STAGED: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "a mover beyond its bound": ("obstacle 0", f"{BREAKS} (mover)", {"world": with_mover((3.5, 1.8), 1.5, 4.0)}),
+    "a wall that no map shows": ("wall", f"{BREAKS} (map)", {"world": Glass}),
+    "brakes that disobey": ("wall", f"{BREAKS} (brakes)", {"world": Runaway}),
+    "wheels that slip": (
+        "wall", f"{BREAKS} (pose)",
+        {
+            "occupancy": corner(), "localiser": Wheels, "planner": Follows, "trusting": True, "start": (1.0, 1.0, 0.0),
+            "believed": (1.0, 1.0, 0.0), "goals": ((6.7, 5.0, 1.57),), "drivetrain": Drivetrain(slip=0.35), "ticks": 130,
+        },
+    ),
+    "a mover from unseen space": (
+        "obstacle 0", f"{BREAKS} (unseen)",
+        {"occupancy": niche(), "trusting": True, "world": with_mover((5.2, 2.45), 3.4, 3.0)},
+    ),
+    "a robot run into at rest": (
+        "obstacle 0", f"{BREAKS} (rest)", {"planner": Waits, "world": with_mover((2.6, 1.5), 1.0, 0.6)}
+    ),
+    "a planner that drives into a known wall": (
+        "wall", f"{FAULT}: its way out of", {"planner": Onward, "trusting": True, "ticks": 120}
+    ),
+    "a planner that drives into a known disc": (
+        "obstacle 0", f"{FAULT}: no assumption was broken", {"planner": Onward, "trusting": True, "world": Pillar}
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STAGED)
+def test_a_staged_contact_has_its_cause(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    thing, begin, settings = STAGED[name]
+    log = staged(tmp_path, monkeypatch, **settings)
+    contact = log.judgement.contacts[0]
+    assert contact.thing == thing and contact.cause.startswith(begin), contact
+    metrics = episode_metrics(log)
+    assert metrics["contacts"][:1] == [{"tick": contact.tick, "time": contact.time, "thing": thing, "cause": contact.cause}]
+    assert contact.cause in summary(log) and contact.cause in drive_scene(log).facts.values()
+    log.save(tmp_path / "drive.npz")
+    assert EpisodeLog.load(tmp_path / "drive.npz").judgement == log.judgement
