@@ -273,9 +273,12 @@ class Episode:
             occupancy=self.occupancy,
             walls=getattr(self.world, "occupancy", self._true),  # a world may have others
             assumed=Assumed(
-                s.controller.sigmas, s.controller.wall_clearance, s.controller.disc_clearance,
-                self.controller.accelerations[0], self.controller.mover_surprise,
-            ),  # fmt: skip
+                s.controller.sigmas,
+                s.controller.wall_clearance,
+                s.controller.disc_clearance,
+                self.controller.accelerations[0],
+                self.controller.mover_surprise,
+            ),
             path=self.path,
             goals=self.goals,
             start=self.start,

@@ -80,7 +80,10 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         scan_angles=np.linspace(-np.pi, np.pi, BEAMS, endpoint=False),
         obstacles=places,
         detected=[_seen(places[k], k) for k in range(ticks)],
-        expected=[np.column_stack([row[:, :2], np.tile([0.3, 0.21], (len(row), 1))]) for row in map(_seen, places, range(ticks))],
+        expected=[
+            np.column_stack([row[:, :2], np.tile([0.3, 0.21], (len(row), 1))])
+            for row in map(_seen, places, range(ticks))
+        ],
         solve_ms=solve,
         localise_ms=solve * 0.25,
         compiled=np.zeros(ticks, dtype=np.intp),

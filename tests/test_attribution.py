@@ -185,7 +185,8 @@ STAGED: dict[str, tuple[str, str, dict[str, Any]]] = {
         "wall", f"{BREAKS} (pose)",
         {
             "occupancy": corner(), "localiser": Wheels, "planner": Follows, "trusting": True, "start": (1.0, 1.0, 0.0),
-            "believed": (1.0, 1.0, 0.0), "goals": ((6.7, 5.0, 1.57),), "drivetrain": Drivetrain(slip=0.35), "ticks": 130,
+            "believed": (1.0, 1.0, 0.0), "goals": ((6.7, 5.0, 1.57),), "drivetrain": Drivetrain(slip=0.35),
+            "ticks": 130,
         },
     ),
     "a mover from unseen space": (
@@ -211,7 +212,8 @@ def test_a_staged_contact_has_its_cause(name: str, tmp_path: Path, monkeypatch: 
     contact = log.judgement.contacts[0]
     assert contact.thing == thing and contact.cause.startswith(begin), contact
     metrics = episode_metrics(log)
-    assert metrics["contacts"][:1] == [{"tick": contact.tick, "time": contact.time, "thing": thing, "cause": contact.cause}]
+    first = {"tick": contact.tick, "time": contact.time, "thing": thing, "cause": contact.cause}
+    assert metrics["contacts"][0] == first
     assert contact.cause in summary(log) and contact.cause in drive_scene(log).facts.values()
     log.save(tmp_path / "drive.npz")
     assert EpisodeLog.load(tmp_path / "drive.npz").judgement == log.judgement
@@ -284,7 +286,9 @@ def test_only_what_could_still_matter_is_a_cause(tick: int, broken: bool) -> Non
     assert found.startswith(f"{BREAKS} (overlooked) at {0.1 * tick:.1f} s") is broken
 
 
-@pytest.mark.parametrize(("seen", "kind"), [(2.0, "overlooked"), (np.inf, "overlooked"), (0.2, "unseen"), (np.nan, "unseen")])
+@pytest.mark.parametrize(
+    ("seen", "kind"), [(2.0, "overlooked"), (np.inf, "overlooked"), (0.2, "unseen"), (np.nan, "unseen")]
+)
 def test_what_beams_do_not_reach_is_unseen(seen: float, kind: str) -> None:
     log = made()
     nothing = [np.zeros((0, 3))] * log.ticks, [np.zeros((0, 4))] * log.ticks

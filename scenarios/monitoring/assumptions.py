@@ -266,7 +266,8 @@ class _Judge:
             return [
                 *found,
                 *self._where(
-                    misled, ticks, "pose", lambda k: f"{100 * nearer[k]:.0f} cm nearer to walls than estimated, "
+                    misled, ticks, "pose",
+                    lambda k: f"{100 * nearer[k]:.0f} cm nearer to walls than estimated, "
                     f"{100 * self.off[k]:.0f} cm beyond {self.assumed.sigmas:g} deviations",
                 ),
                 *self._where(unmapped, ticks, "map", lambda k: "a wall that no map and no beam shows"),
@@ -280,8 +281,8 @@ class _Judge:
             *found,
             *self._where(
                 self.nearer[:, thing] > 0.0, ticks, "mover",
-                lambda k: f"{100 * self.nearer[k, thing]:.0f} cm nearer after {self.assumed.ahead:.1f} s than its bound "
-                f"of {self._bound(k, thing):.2f} m/s, by {moved[k : k + self.steps].max():.2f} m/s",
+                lambda k: f"{100 * self.nearer[k, thing]:.0f} cm nearer after {self.assumed.ahead:.1f} s than its "
+                f"bound of {self._bound(k, thing):.2f} m/s, by {moved[k : k + self.steps].max():.2f} m/s",
             ),
             *self._where(self.overlooked[:, thing], ticks, "overlooked", lambda k: "in view and not seen"),
             *self._where(self.hidden[:, thing], ticks, "unseen", lambda k: "in space taken for free that no beam saw"),

@@ -127,7 +127,7 @@ class KeeperSettings:
 
 TRACKING = KeeperSettings(
     position=180.0, attitude=5e-3, velocity=2.7, rate=2.9e-5, thrust=8.3e-5, rate_change=1.3e-6, thrust_change=3.7e-5,
-    tolerance=1e-6, settled=True,
+    tolerance=1e-6, settled=True, portion=None, iterations=10,
 )  # fmt: skip
 """Weights for flights with nothing in the way, found by a search on a flight that appears in no table.
 
@@ -376,7 +376,7 @@ class CbfMpc:
     ) -> horizon.Decision:
         """Fly a plan that keeps the constraints; else the last one for a while; else brake."""
         decision = self._policy(solution, states, controls, now, kept)
-        if decision.source != "solved" and self.loop.unfinished:
+        if decision.source != "solved" and self.settings.portion is not None and self.loop.warm.unfinished:
             return decision
         # A solve that was begun goes on with the next one's numbers; after a few solves it begins anew.
         self._refused = 0 if decision.source == "solved" else self._refused + 1

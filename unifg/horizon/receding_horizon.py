@@ -154,11 +154,10 @@ class RecedingHorizon:
                 that have been sent until then lead by the robot's model, and the first control of a plan acts there;
                 ``applied`` is what acts in the meantime, at first zero.
             patience: ticks of ending behind before a solve begins anew.
-            portion: iterations of a tick; a solve that needs more goes on in the next ticks, with the numbers that it
-                began with, and what the judge has instead of a plan is applied meanwhile. Its plan is then followed
-                from where it should be by now. With a deadline as many of them are made as fit by the time that they
-                took before; where none fits, the tick is late and what is left of the last plan is applied. None: every
-                solve ends in its tick.
+            portion: iterations of a tick; a solve that needs more goes on in the next ticks, with its numbers, and what
+                the judge has instead of a plan is applied meanwhile. Its plan is then followed from where it should be.
+                With a deadline as many are made as fit by the time that they took before; where none fits, the tick is
+                late and what is left of the last plan is applied. None: every solve ends in its tick.
             clock: seconds of the wall.
 
         Raises:
@@ -389,11 +388,6 @@ class RecedingHorizon:
         self._solved_by = self.second if rescued else run if solution is first else None
         return self._decided(solution, now, present, begin, rescued)
 
-    @property
-    def unfinished(self) -> bool:
-        """True if the last solve has made its portion of iterations and may go on."""
-        return self._portion is not None and self.warm.unfinished
-
     def _fits(self, begin: float) -> bool:
         """Choose as many iterations of a portion as the deadline leaves time for; False for none."""
         if self._portion is None:
@@ -407,6 +401,8 @@ class RecedingHorizon:
 
     def _timed(self, solve: Callable[[], Solution]) -> Solution:
         """Solve, and learn how long an iteration takes."""
+        if self._portion is None or not np.isfinite(self._deadline):
+            return solve()
         before, begun = self._clock(), self.solution.iterations if self.goes_on and self.solution else 0
         solution = solve()
         took = (self._clock() - before) / max(solution.iterations - begun, 1)
@@ -509,7 +505,7 @@ class RecedingHorizon:
         states, controls = self._planned(solution)
         self.kept.age += float(self.times[1])
         choice = self.judge(solution, states, controls, now, self.kept)
-        self.goes_on = choice.source != "solved" and self.unfinished
+        self.goes_on = choice.source != "solved" and self._portion is not None and self.warm.unfinished
         if late and choice.source == "solved":
             instead = self._instead(now)
             self._accept(solution, states, controls, choice)
@@ -518,7 +514,8 @@ class RecedingHorizon:
             self._accept(solution, states, controls, choice)
             if self.waited:
                 left = self.kept.within(self.kept.left())
-                choice = replace(choice, controls=np.concatenate([left, left[-1:].repeat(len(controls) - len(left), 0)]))
+                rest = left[-1:].repeat(len(controls) - len(left), 0)
+                choice = replace(choice, controls=np.concatenate([left, rest]))
         elif not self.goes_on:
             self.failed = True
             if choice.resumed:
