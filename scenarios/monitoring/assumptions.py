@@ -23,7 +23,7 @@ from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap
 from unifg.models.footprint import Body
 from unifg.models.planar import base_of
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["FAULT", "Assumed", "Broken", "Contact", "DriveRecord", "Judgement", "judged"]
 
@@ -72,7 +72,7 @@ class DriveRecord(Protocol):
     estimate: Array
     covariance: Array
     control: Array
-    contacts: Array
+    contacts: IntArray
     scan: Array
     obstacles: Array
     detected: list[Array]
@@ -204,7 +204,7 @@ class _Judge:
             self.overlooked[tick, thing], self.hidden[tick, thing] = seen, not seen
             return
         track, later = int(np.argmin(apart)), min(tick + self.steps, len(log.time) - 1)
-        place, _, reach = expected[track, :2], *expected[track, 2:].tolist()
+        place, reach = expected[track, :2], float(expected[track, 3])
         assumed = np.hypot(*(place - log.estimate[later, :2])) - tracks[track, 2] - reach
         true = np.hypot(*(log.obstacles[later, thing, :2] - log.true_pose[later, :2])) - radius
         self.nearer[tick, thing] = assumed - true if later == tick + self.steps else -np.inf

@@ -204,8 +204,8 @@ class RecedingHorizon:
         self._probabilities = probabilities
         self._said = [handle for name, handle in self._handles.items() if name not in tied]
         backends = solver, cold or solver, second or solver
-        limit = deadline if portion is None else np.inf
-        timed = [replace(own, time_limit=min(own.time_limit, limit)) for own in backends]
+        most = deadline if portion is None else np.inf
+        timed = [replace(own, time_limit=min(own.time_limit, most)) for own in backends]
         self._limits = [own.time_limit for own in timed]
         self.warm, self.cold = (own.prepare(graph) for own in timed[:2])
         self.second = None if second is None else timed[2].prepare(graph)
@@ -392,9 +392,8 @@ class RecedingHorizon:
         """Choose as many iterations of a portion as the deadline leaves time for; False for none."""
         if self._portion is None:
             return True
-        count = self._portion
-        if np.isfinite(self._deadline) and self._step_time > 0.0:
-            left = (1.0 - RESERVE) * self._deadline - (self._clock() - begin)
+        left, count = (1.0 - RESERVE) * self._deadline - (self._clock() - begin), self._portion
+        if np.isfinite(left) and self._step_time > 0.0:
             count = min(count, int(left / self._step_time))
         self.warm.portioned(max(count, 1))
         return count > 0
@@ -413,7 +412,8 @@ class RecedingHorizon:
         """Apply what is left of the last plan, or brake; nothing is solved."""
         self.kept.age += float(self.times[1])
         choice = replace(self._instead(now), source="late")
-        self._step_time *= FORGOTTEN  # one slow tick is not the last one
+        self.sources["late"] += 1
+        self._step_time *= FORGOTTEN
         return self._applied(choice, Status.TIME_LIMIT, 0, begin, False)
 
     def _instead(self, now: Context[Any]) -> Decision:
@@ -434,7 +434,6 @@ class RecedingHorizon:
 
     def _applied(self, choice: Decision, status: Status, iterations: int, begin: float, rescued: bool) -> Plan:
         """Plan of a tick, whose first control is applied."""
-        self.sources[choice.source] += 1
         decided = np.concatenate([self.sent, choice.controls[:1]])
         self.applied, self.sent = decided[0], decided[1:]
         elapsed = 1e3 * (self._clock() - begin)
@@ -522,6 +521,7 @@ class RecedingHorizon:
                 self.guess = self.shifted(solution)
             else:
                 self.guess = None if choice.after is None else self.guess_of(*choice.after, now)
+        self.sources[choice.source] += 1
         return choice
 
     def _acting(self, now: Context[Any]) -> Context[Any]:
@@ -578,7 +578,7 @@ class RecedingHorizon:
             guess = solution.shifted(*along, by=0)
             return self._resampled(guess, solution[self.x], solution[self.u], later)
         if np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0):
-            return solution.shifted(*along, by=ticks)
+            return solution.shifted(*along, by=ticks) if self.waited else solution.shifted(*along)
         joint = len(self.x.family) > self.steps + 1
         whole = 1 if joint else round(self.steps * ticks * self.times[1] / self.times[-1])
         moved = solution.shifted(*along, by=whole)
