@@ -157,7 +157,7 @@ class _Judge:
         """Compare beliefs with the truth."""
         self.log, self.assumed = log, log.assumed
         same = log.walls is log.occupancy or np.array_equal(log.walls.occupied, log.occupancy.occupied)
-        self._judges_walls = log.collisions > 0 or not same
+        self._judges_walls = log.collisions > 0 or bool(log.contacts.any()) or not same
         if self._judges_walls:
             self.known = _field(log.occupancy)
             self.true = self.known if same else _field(log.walls)

@@ -417,7 +417,7 @@ class RecedingHorizon:
         return self._applied(choice, Status.TIME_LIMIT, 0, begin, False)
 
     def _instead(self, now: Context[Any]) -> Decision:
-        """What is left of the last plan, or braking as the judge does."""
+        """Rest of the last plan, or braking as the judge does."""
         return LastPlanThenBrake(self.robot, brake=getattr(self.judge, "brake", None)).instead(now, self.kept)
 
     def _decided(
