@@ -20,7 +20,7 @@ DT = 0.01
 LINE = Line((-4.0, 0.0, 1.0), (4.0, 0.0, 1.0), 2.0, 1.5)
 
 
-def chain() -> tuple[fg.Graph, fg.Variables, fg.Data]:
+def chain() -> tuple[fg.Graph, fg.Family, fg.Data]:
     """Points on a line that keep off a disc: an answer that takes some iterations."""
     graph = fg.Graph()
     x = graph.variables("x", fg.Rn(2), 8)
@@ -32,7 +32,7 @@ def chain() -> tuple[fg.Graph, fg.Variables, fg.Data]:
     return graph, x, goal
 
 
-def guess(x: fg.Variables, bent: float) -> dict[Any, Array]:
+def guess(x: fg.Family, bent: float) -> dict[Any, Array]:
     return {x: np.column_stack([np.linspace(-3.0, 3.0, 8), np.full(8, bent)])}
 
 

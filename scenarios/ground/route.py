@@ -207,8 +207,8 @@ class Route:
                 elif self._beside_a_mover(pose, tracks):
                     yield from self._retreat(pose)
                 else:
-                    staying = tracks.at(~tracks.mover)
-                    yield from self._detour(pose, float(arc[-1]), staying, ALLOWANCE, everywhere=True)
+                    still = tracks.at(~tracks.mover)
+                    yield from self._detour(pose, float(arc[-1]), still, ALLOWANCE, everywhere=True)
             return True
         standing = tracks.at((np.hypot(*tracks.velocity.T) < STANDING) & ~tracks.sweeps)
         if not len(standing):
