@@ -318,12 +318,22 @@ def test_a_robot_at_rest_is_run_into(speed: float, rest: bool) -> None:
     assert cause(near).startswith(f"{BREAKS} (rest)") is rest
 
 
+@pytest.mark.parametrize(("tick", "kind"), [(16, "overlooked"), (20, "brakes")])
+def test_what_was_broken_first_is_the_cause(tick: int, kind: str) -> None:
+    log = made()
+    pose, detected, expected = log.true_pose.copy(), list(log.detected), list(log.expected)
+    pose[19:, 0] += 0.02  # in the tick of 1.8 s
+    detected[tick], expected[tick] = np.zeros((0, 3)), np.zeros((0, 4))
+    found = cause(made(true_pose=pose, estimate=pose, detected=detected, expected=expected))
+    assert found.startswith(f"{BREAKS} ({kind})")
+
+
 def test_a_second_contact_soon_after_has_the_cause_of_the_first() -> None:
     contacts = made().contacts.copy()
     contacts[24:] = 2
     contacts[33:] = 3
     detected, expected = list(made().detected), list(made().expected)
-    detected[20], expected[20] = np.zeros((0, 3)), np.zeros((0, 4))
+    detected[16], expected[16] = np.zeros((0, 3)), np.zeros((0, 4))  # too early for the second alone
     found = judged(made(contacts=contacts, collisions=4, detected=detected, expected=expected)).contacts
     assert [each.tick for each in found] == [21, 24, 33, 39]  # that of the last tick has no row
     assert found[0].cause == found[1].cause and found[0].cause.startswith(f"{BREAKS} (overlooked)")
