@@ -59,6 +59,7 @@ PENALTY = 1e5  # of violation: multipliers of squared slacks that are used grow 
 SLOWING = 3.0  # deceleration of a vehicle that is faster than it may be [m/s^2]
 SPEEDING = 1e4  # weight of the squared slack of the speed [s^2/m^2]
 FEASIBLE = 1e-3  # violation of constraints up to which an answer is a plan
+WHOLE = 10  # iterations of a solve that cannot be made in portions
 TRIES = 3  # ticks in a row without a plan until the search begins anew
 KEEP = 0.2  # how long the last plan is flown on [s]
 INSIDE = 1e-3  # deeper than this within the distance to be kept is too near [m]
@@ -322,15 +323,18 @@ class CbfMpc:
         terms += [self._barriers] if s.slots else []
         early = {"step_tolerance": np.inf} if solver == "ipm" and not s.settled else {}
         numbers = {"tolerance": s.tolerance, **({"penalty": PENALTY} if solver == "ipm" else {}), **early}
+        # Solves in portions take one compiled loop.
+        self._parted = s.portion is not None and solver == "ipm" and s.gamma == 0.0
+        most = s.iterations if self._parted or s.portion is None else min(s.iterations, WHOLE)
         robot = Robot(quadrotor_loops.STATE, quadrotor.CONTROL)
         self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
         self._policy, self._refused = LastPlanThenBrake(robot, FEASIBLE, KEEP, self.brake), 0
         self.loop = RecedingHorizon(
             robot, s.horizon, terms, times=self.nodes,
-            solver=backend(solver, max_iterations=s.iterations, **numbers),
+            solver=backend(solver, max_iterations=most, **numbers),
             cold=backend(solver, **numbers), limits=(airframe.least, airframe.most), judge=self,
             starts=InitialGuesses(cold=self._along, after_failure=self._braking),
-            portion=s.portion, deadline=1e-3 * s.decide_ms, clock=time.thread_time,
+            portion=s.portion if self._parted else None, deadline=1e-3 * s.decide_ms, clock=time.thread_time,
         )  # fmt: skip
         self.loop.applied = quadrotor.hover(airframe.parameters)
         self._looked_at = [-1] * s.slots
@@ -376,7 +380,7 @@ class CbfMpc:
     ) -> horizon.Decision:
         """Fly a plan that keeps the constraints; else the last one for a while; else brake."""
         decision = self._policy(solution, states, controls, now, kept)
-        if decision.source != "solved" and self.settings.portion is not None and self.loop.warm.unfinished:
+        if decision.source != "solved" and self._parted and self.loop.warm.unfinished:
             return decision
         # A solve that was begun goes on with the next one's numbers; after a few solves it begins anew.
         self._refused = 0 if decision.source == "solved" else self._refused + 1
