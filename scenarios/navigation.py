@@ -23,6 +23,7 @@ from unifg.horizon import Plan
 from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
+from unifg.scenarios.ground.drive_parts import bounds
 from unifg.scenarios.ground.drive_pilot import STOPPED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
@@ -30,6 +31,7 @@ from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load
 from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.monitoring.assumptions import Assumed
 from unifg.scenarios.options import count, existing, option, pair, pose, positive
 from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan
@@ -194,6 +196,7 @@ class Episode:
             goals=self.goals,
             rules=rules,
         )
+        self._true = true
         walls = _field(true) if settings.imperfection != Imperfection() else self.distance_map
         of_world = load_class("world", settings.world, WORLDS, OF_WORLD, "fog:Fog")
         self.world = of_world(
@@ -269,6 +272,14 @@ class Episode:
         self._recorder = Recorder(
             EpisodeLog,
             occupancy=self.occupancy,
+            walls=getattr(self.world, "occupancy", self._true),  # a world may have others
+            assumed=Assumed(
+                s.controller.sigmas,
+                s.controller.wall_clearance,
+                s.controller.disc_clearance,
+                self.controller.accelerations[0],
+                self.controller.mover_surprise,
+            ),
             path=self.path,
             goals=self.goals,
             start=self.start,
@@ -431,9 +442,11 @@ class Episode:
             route=self.legs[self._goal].path,
             contacts=world.collisions,
             horizon=plan.states,
+            way_out=pilot.controller.way_out,
             scan=scan.ranges,
             obstacles=world.discs()[:, :3],
             detected=np.column_stack([pilot.tracks.centre, pilot.tracks.radius]),
+            expected=bounds(self.controller, pilot.tracks),
             solve_ms=took["localise_ms"] + took["plan_ms"],
             **took,
             compiled=compiled,

@@ -7,6 +7,7 @@ import numpy as np
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import wrap_angle
 from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.scenarios.monitoring.assumptions import Assumed
 from unifg.typing import Array
 
 RESOLUTION = 0.1
@@ -54,6 +55,8 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
     emergency[-1] = True
     return EpisodeLog(
         occupancy=room(yaw=map_yaw),
+        walls=room(yaw=map_yaw),
+        assumed=Assumed(2.0, 0.03, 0.06, 2.5, 0.5),
         path=truth.copy(),
         goals=truth[-1:].copy(),
         start=truth[0].copy(),
@@ -71,11 +74,16 @@ def episode(ticks: int = 40, obstacles: int = 2, *, map_yaw: float = 0.0, seed: 
         contacts=np.zeros(ticks, dtype=np.intp),
         control=np.column_stack([np.full(ticks, 0.5), np.full(ticks, 0.2)]),
         horizon=horizon,
+        way_out=np.repeat(truth[:, None], HORIZON + 1, axis=1),
         scan=scan,
         obstacle_moves=np.arange(obstacles) % 3 == 0,
         scan_angles=np.linspace(-np.pi, np.pi, BEAMS, endpoint=False),
         obstacles=places,
         detected=[_seen(places[k], k) for k in range(ticks)],
+        expected=[
+            np.column_stack([row[:, :2], np.tile([0.3, 0.21], (len(row), 1))])
+            for row in map(_seen, places, range(ticks))
+        ],
         solve_ms=solve,
         localise_ms=solve * 0.25,
         compiled=np.zeros(ticks, dtype=np.intp),

@@ -164,13 +164,13 @@ def test_a_drive_is_stored_so_that_others_can_read_it(tmp_path: Path) -> None:
     log.save(path)
     with np.load(path, allow_pickle=False) as file:  # as any program does
         about = json.loads(str(file["about"]))
-        assert about["units"]["control"] == "m/s, rad/s" and about["kind"] == "unifg drive log 2"
+        assert about["units"]["control"] == "m/s, rad/s" and about["kind"] == "unifg drive log 3"
         assert file["control"].shape == (12, 2) and file["health"][-1] == "degraded"
         assert file["route_lengths"].sum() == len(file["route"])
     again = EpisodeLog.load(path)
     for name, value in vars(log).items():
         other = getattr(again, name)
-        if name == "occupancy":
+        if name in ("occupancy", "walls"):
             assert np.array_equal(value.occupied, other.occupied) and value.origin == other.origin
         elif isinstance(value, np.ndarray):
             assert value.dtype == other.dtype and np.array_equal(value, other, equal_nan=value.dtype.kind == "f"), name
@@ -186,11 +186,11 @@ def test_files_that_are_no_drive_are_refused(tmp_path: Path) -> None:
     whole = path.read_bytes()
     for content in (b"", b"not a file", whole[: len(whole) // 2]):
         path.write_bytes(content)
-        with pytest.raises(FileFormatError, match="is no unifg drive log 2"):
+        with pytest.raises(FileFormatError, match="is no unifg drive log 3"):
             EpisodeLog.load(path)
     with np.errstate(all="ignore"):
         np.savez(path, about=np.array('{"kind": "something else", "units": {}}'))
-    with pytest.raises(FileFormatError, match="is no unifg drive log 2"):
+    with pytest.raises(FileFormatError, match="is no unifg drive log 3"):
         EpisodeLog.load(path)
     with pytest.raises(FileFormatError):
         EpisodeLog.load(tmp_path / "nothing.npz")

@@ -194,7 +194,7 @@ def test_who_is_too_fast_has_a_plan_that_slows_down(velocity: tuple[float, float
 
 def test_without_a_plan_the_last_is_flown_on_and_then_the_vehicle_brakes() -> None:
     start = np.array([-3.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0])
-    plans, nothing = keeper(), pillar(50.0, 50.0)
+    plans, nothing = keeper(portion=None), pillar(50.0, 50.0)
     first = decide(plans, start, 1.0, nothing)
     controls = plans.loop.kept.controls
     warm = plans.loop.warm

@@ -72,6 +72,7 @@ def summary(log: EpisodeLog) -> str:
         ("health", health(m)),
         ("samples not let in", ", ".join(f"{count} {what}" for what, count in m["dropped_samples"].items())),
         ("collisions", f"{m['collisions']}"),
+        *((f"{each['thing']}, {each['time']:.1f} s", each["cause"]) for each in m["contacts"]),
         ("driven", f"{m['path_length_m']:.2f} m in {m['duration_s']:.1f} s, {m['steps']} ticks"),
         ("planned path", f"{m['planned_length_m']:.2f} m"),
         ("smallest clearance", f"{m['min_clearance_m']:.3f} m"),

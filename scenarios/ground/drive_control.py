@@ -49,6 +49,7 @@ class Controller:
     Attributes:
         settings: weights and limits.
         loop: the prepared graph.
+        way_out: (N + 1, 3) poses of what the last tick would have driven without a plan [m, m, rad].
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Controller:
         self.settings = s = settings
         self.field = SmoothField(distance_map)
         self._coming = np.zeros((0, s.kind.size))  # what would be driven next if nothing were decided any more
+        self.way_out = np.zeros((s.horizon + 1, 3))
         self._evasion: int | None = None  # number of the evasion that was the last tick's way out
         terms: list[Term] = [
             *following(s),
@@ -100,6 +102,7 @@ class Controller:
         """Context of the terms; arguments as of :meth:`plan`."""
         spread = np.zeros((3, 3)) if covariance is None else covariance
         s, evasion = self.settings, self._evasion_from(pose, tracks)
+        self.way_out = evasion.states
         expected = None if s.futures == "worst" else futures(s, nearest(tracks, pose, s.discs))
         return Drive(self._cruise(reference), reference, tracks, spread, evasion, expected)
 
@@ -170,7 +173,8 @@ class Controller:
         controls = stopped(last, self._coming, s.most, s.horizon, s.kind)
         self.loop.abandon()
         self.loop.applied, self._coming = controls[0].copy(), controls[1:]
-        return controls, s.kind.followed(pose, last, controls, s.dt)
+        self.way_out = s.kind.followed(pose, last, controls, s.dt)
+        return controls, self.way_out
 
     def driven(self, control: Array) -> None:
         """Be told that another control (m,) than the first of the plan is applied."""

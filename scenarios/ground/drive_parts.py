@@ -234,6 +234,19 @@ def predicted(s: ControllerSettings, pose: Array, tracks: Tracks) -> Array:
     return centres
 
 
+def bounds(s: ControllerSettings, tracks: Tracks) -> Array:
+    """(m, 4) assumptions on discs for the time ``mover_surprise``: place then, bound of the speed, reach off the place.
+
+    A disc that never moved stays, one that is known to go to and fro goes on so; others may go anywhere within the
+    bound [m, m, m/s, m].
+    """
+    known, place = tracks.sweeps, tracks.centre.copy()
+    place[known] = tracks.at(known).swept(np.array([s.mover_surprise]))[0]
+    walk = np.where(tracks.mover, np.maximum(np.hypot(*tracks.velocity.T), s.mover_speed), 0.0)
+    reach = s.disc_clearance + walk * np.where(known, s.mover_unseen, s.mover_surprise)
+    return np.column_stack([place, walk, reach])
+
+
 def disc_limits(
     s: ControllerSettings, pose: Array, centres: Array, tracks: Tracks, evasive: Array, spread: Array
 ) -> Array:

@@ -132,12 +132,14 @@ class PlannerAdapter:
         settings: limits and clearances of now.
         applied: (2,) control of the last tick [m/s, rad/s].
         estimate: (3,) pose of the last tick [m, m, rad].
+        way_out: (N + 1, 3) poses of braking in the place of the last plan [m, m, rad].
     """
 
     def __init__(self, planner: LocalPlanner, context: PlannerContext) -> None:
         """Begin at rest."""
         self.planner, self.settings, self._walls = planner, context.settings, context.distance_map
         self.applied, self.estimate = np.zeros(context.settings.kind.size), np.zeros(3)
+        self.way_out = np.zeros((context.settings.horizon + 1, 3))
 
     def stations(self) -> Array:
         """(N + 1,) arc lengths of the reference [m]: as far as the horizon reaches at full speed."""
@@ -169,7 +171,8 @@ class PlannerAdapter:
                 f"the planner returned {answer!r}: give finite controls ({size},) or (K, {size}), or None"
             )
         wanted = np.concatenate([wanted, np.tile(wanted[-1], (max(s.horizon - len(wanted), 0), 1))])[: s.horizon]
-        controls = now.reachable(wanted)
+        controls, braking = now.reachable(wanted), now.reachable(np.zeros_like(wanted))
+        self.way_out = s.kind.rollout(self.estimate, braking, s.dt)
         least, most = s.box
         excess = float(np.maximum(wanted - most, least - wanted).max(initial=0.0))
         self.applied = controls[0]
@@ -185,7 +188,8 @@ class PlannerAdapter:
         s = self.settings
         controls = reachable(np.zeros((s.horizon, s.kind.size)), self.applied, s)
         self.applied, self.estimate = controls[0], np.asarray(pose, dtype=np.float64)
-        return controls, s.kind.rollout(self.estimate, controls, s.dt)
+        self.way_out = s.kind.rollout(self.estimate, controls, s.dt)
+        return controls, self.way_out
 
     def driven(self, control: Array) -> None:
         """Record that another control (2,) than the first of the plan is applied."""

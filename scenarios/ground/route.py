@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from unifg.models.planar import Base
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.follow import PathFollower
-from unifg.scenarios.planning.grid import SPACING, plan
+from unifg.scenarios.planning.grid import SPACING, Planning, finished, planning
 from unifg.scenarios.planning.lattice import plan_poses
 from unifg.scenarios.planning.polyline import headed, path_length, resample
 from unifg.scenarios.planning.space_time import quickest
@@ -51,6 +52,7 @@ LONGEST = 12.0  # [s] of such a way
 LATE = np.array([-0.2, 0.0, 0.2])  # [s] by which a mover may be late
 SMOOTH = 3  # cells on both sides over which a way of cells is averaged
 KERNEL = np.full(2 * SMOOTH + 1, 1.0 / (2 * SMOOTH + 1))
+EXPANSIONS = 100_000  # of searches in a tick; a longer one goes on in the next
 FRESH_STARTS = 3  # ways round about, on each of which the goal may be farther off again
 
 
@@ -83,6 +85,7 @@ class Route:
         path: (P, 3) present path [m, m, rad].
         repairs: number of detours planned so far.
         blocked: why there is no use going on; None as long as there may be.
+        searched: ticks for which the search of now has gone on; the robot keeps to its path meanwhile.
     """
 
     def __init__(
@@ -119,32 +122,34 @@ class Route:
         self._body = body or Body.disc(robot_radius)
         self._oriented = base.turning_radius > 0.0 or not self._body.round
         self._wall_gap, self._disc_gap = wall_gap, disc_gap
-        self.repairs = 0
+        self.repairs = self.searched = 0
+        self._search: Generator[int, None, bool] | None = None
         self.blocked: Blocked | None = None
         self._rest = self._since_anywhere = 0
         self._closed = self._stalled = self._held = 0
         self._nearest, self._starts = np.inf, FRESH_STARTS
         self._trail: list[Array] = []
         self._crumbs: list[Array] = []
-        self._follow(self._plan(start, goal))
+        self._follow(finished(self._plan(start, goal)))
 
-    def _plan(self, start: Array, goal: Array) -> Array:
+    def _plan(self, start: Array, goal: Array) -> Planning:
         """A way (P, 3) on the map alone."""
         return self._way(self._occupancy, self._distance_map, start, goal)
 
     def _way(
         self, occupancy: OccupancyMap, distance_map: DistanceMap, start: Array, goal: Array, discs: Array | None = None
-    ) -> Array:
-        """A way (P, 3) on a map, around discs (K, 3)."""
+    ) -> Planning:
+        """A way (P, 3) on a map, around discs (K, 3); that of a base whose heading matters is found in one part."""
         if self._oriented:
+            yield EXPANSIONS
             return plan_poses(
                 occupancy, distance_map, start, goal, base=self._base, body=self._body, gap=self._wall_gap,
                 extra_discs=discs,
             )  # fmt: skip
-        return plan(
+        return (yield from planning(
             occupancy, distance_map, start, goal, robot_radius=self._radius,
             clearance_least=self._radius + self._wall_gap, extra_discs=discs,
-        )  # fmt: skip
+        ))  # fmt: skip
 
     def _follow(self, path: Array) -> None:
         self.path = path
@@ -162,6 +167,8 @@ class Route:
         A robot that is stuck and finds no wide way nearby goes back the way it came if a mover is beside it, for each
         may be waiting for the other. Otherwise it looks for another way on the whole map, movers left out.
 
+        A search is made in parts: those of a tick are counted, and the robot keeps to its path until all are made.
+
         Returns:
             Whether the controller should start over from the path: it changed, or the robot is stuck on it.
         """
@@ -170,19 +177,38 @@ class Route:
         self._rest, self._since_anywhere = max(self._rest - 1, 0), self._since_anywhere + 1
         self._trail = [*self._trail[-STUCK_TICKS + 1 :], pose[:2].copy()]
         self._look_for_progress(pose, tracks)
-        if self._rest:
-            return False
+        if self._search is None:
+            if self._rest:
+                return False
+            self._search = self._repaired(pose, tracks)
+        return self._go_on()
+
+    def _go_on(self) -> bool:
+        """Search for as long as a tick allows; the result of :meth:`repair`, False before the search has ended."""
+        left, self.searched = EXPANSIONS, self.searched + 1
+        assert self._search is not None
+        try:
+            while left > 0:
+                left -= next(self._search)
+        except StopIteration as end:
+            self._search, self.searched = None, 0
+            return bool(end.value)
+        return False
+
+    def _repaired(self, pose: Array, tracks: Tracks) -> Generator[int, None, bool]:
+        """Work of :meth:`repair`."""
         arc = SPACING * np.arange(len(self.path))
         if self._stuck(float(arc[-1])):
             self._trail = []
             if len(tracks):  # wide around everything, whatever it does just now: the near side has been tried
                 rejoin = min(self._reached + 2.0 * REJOIN, float(arc[-1]))
-                if self._detour(pose, rejoin, tracks, WIDE):
+                if (yield from self._detour(pose, rejoin, tracks, WIDE)):
                     pass
                 elif self._beside_a_mover(pose, tracks):
-                    self._retreat(pose)
+                    yield from self._retreat(pose)
                 else:
-                    self._detour(pose, float(arc[-1]), tracks.at(~tracks.mover), ALLOWANCE, everywhere=True)
+                    still = tracks.at(~tracks.mover)
+                    yield from self._detour(pose, float(arc[-1]), still, ALLOWANCE, everywhere=True)
             return True
         standing = tracks.at((np.hypot(*tracks.velocity.T) < STANDING) & ~tracks.sweeps)
         if not len(standing):
@@ -198,13 +224,14 @@ class Route:
         last = float(arc[ahead][np.flatnonzero(blocked)[-1]])
         staying = ~standing.mover
         closed = (room[:, staying] < self._radius + self._disc_gap).any(axis=1)
-        if self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, ALLOWANCE):
+        if (yield from self._detour(pose, min(last + REJOIN, float(arc[-1])), standing, ALLOWANCE)):
             if closed.any():  # what has moved and only rests says nothing of whether there is a way
                 self._closed += VAIN  # unless the goal comes nearer on it
             return True
         if not closed.any():  # what has moved may go on: where it alone is in the way, the robot waits
             return False
-        return self._round_about(pose, standing.at(staying), self.path[ahead][np.flatnonzero(closed)[0], :2])
+        place = self.path[ahead][np.flatnonzero(closed)[0], :2]
+        return (yield from self._round_about(pose, standing.at(staying), place))
 
     def around(self, pose: Array, tracks: Tracks, speed: float, pause: float) -> bool:
         """Look for a quicker way, called while movers that go to and fro hold the robot; True if found.
@@ -222,7 +249,7 @@ class Route:
         ahead = self.path[begin : begin + round(LOOK_AHEAD / SPACING), :2]
         gap = np.hypot(*np.moveaxis(sweeping.beside(ahead) - ahead[:, None], -1, 0)) - sweeping.radius - self._radius
         met = gap < self._disc_gap + UNSEEN * sweeping.sweep[:, 5]
-        if self._oriented or not met.any():
+        if self._oriented or not met.any() or self._search is not None:
             return False
         self._held, self._trail = self._held + 1, []
         if self._held % BETWEEN != 1:
@@ -235,9 +262,14 @@ class Route:
         self._held = 0
         closed = replace(sweeping, centre=ends.mean(axis=1), radius=sweeping.radius + 0.5 * lengths)
         staying = tracks.at(~tracks.mover).followed_by(closed)
-        if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
+        self._search = self._beyond(pose, staying, sweeping.centre[first])
+        return self._go_on()
+
+    def _beyond(self, pose: Array, staying: Tracks, place: Array) -> Generator[int, None, bool]:
+        """Search a way on the whole map beside all that movers sweep; the goal is given up without one."""
+        if (yield from self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True)):
             return True
-        self.blocked = Blocked(sweeping.centre[first], self._radius + self._wall_gap, mover=True)
+        self.blocked = Blocked(place, self._radius + self._wall_gap, mover=True)
         return False
 
     def _between(self, pose: Array, tracks: Tracks, index: int, speed: float, pause: float) -> bool:
@@ -262,12 +294,12 @@ class Route:
         self.repairs += 1
         return True
 
-    def _round_about(self, pose: Array, staying: Tracks, place: Array) -> bool:
+    def _round_about(self, pose: Array, staying: Tracks, place: Array) -> Generator[int, None, bool]:
         """Search another way on the whole map; True if found. After enough failures the goal is given up."""
         self._closed += PATIENCE + 1
         if self._since_anywhere >= ANYWHERE:
             self._since_anywhere = 0
-            if self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True):
+            if (yield from self._detour(pose, float(SPACING * len(self.path)), staying, ALLOWANCE, everywhere=True)):
                 return True
         if self._closed > CLOSED:
             self.blocked = Blocked(place.copy(), self._radius + self._wall_gap)
@@ -302,19 +334,21 @@ class Route:
         gap = np.hypot(*(tracks.centre - pose[:2]).T) - tracks.radius - self._radius
         return bool((tracks.mover & (gap < BESIDE)).any())
 
-    def _retreat(self, pose: Array) -> None:
+    def _retreat(self, pose: Array) -> Generator[int, None, None]:
         """Go back the way the robot came, and then to the goal again."""
         back = np.stack([pose[:2], *self._crumbs[::-1]])
         if path_length(back) < CRUMB or self._oriented:
             return
         way = headed(resample(back, SPACING), float(pose[2]))
         try:
-            onward = self._plan(back[-1], self.path[-1])
+            onward = yield from self._plan(back[-1], self.path[-1])
         except ScenarioError:
             return
         self._follow(np.concatenate([way[:-1], onward]))
 
-    def _detour(self, pose: Array, rejoin: float, tracks: Tracks, allowance: float, everywhere: bool = False) -> bool:
+    def _detour(
+        self, pose: Array, rejoin: float, tracks: Tracks, allowance: float, everywhere: bool = False
+    ) -> Generator[int, None, bool]:
         """Plan around discs, on the map around the path up to ``rejoin`` [m] or on all of it; True if found."""
         last = len(self.path) - 1
         here, index = min(int(self._reached / SPACING), last), min(round(rejoin / SPACING), last)
@@ -327,7 +361,7 @@ class Route:
         discs = np.column_stack([tracks.centre, np.clip(reach, 0.0, tracks.radius + allowance)])
         occupancy, distance_map = (self._occupancy, self._distance_map) if everywhere else self._window(corners)
         try:
-            detour = self._way(occupancy, distance_map, pose, target, discs)
+            detour = yield from self._way(occupancy, distance_map, pose, target, discs)
         except ScenarioError:
             return False  # the controller stops before the disc; the next scan may see a way
         self._follow(np.concatenate([detour[:-1], self.path[index:]]))

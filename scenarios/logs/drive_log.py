@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.models.footprint import Body, body_of
 from unifg.scenarios.logs.columns import column, ragged, words
 from unifg.scenarios.logs.stored import StoredLog
+from unifg.scenarios.monitoring.assumptions import Assumed, Judgement, judged
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["EpisodeLog"]
@@ -25,6 +27,8 @@ class EpisodeLog(StoredLog):
 
     Attributes:
         occupancy: map the robot was given, without the unforeseen obstacles.
+        walls: map of the true walls.
+        assumed: constant assumptions of the robot.
         path: (P, 3) planned path over all goals, world frame [m, m, rad].
         goals: (G, 3) goal poses [m, m, rad].
         start: (3,) true start pose [m, m, rad].
@@ -49,9 +53,11 @@ class EpisodeLog(StoredLog):
         body: of the robot, as its option has it; "" for a disc.
     """
 
-    KIND: ClassVar[str] = "unifg drive log 2"
+    KIND: ClassVar[str] = "unifg drive log 3"
 
     occupancy: OccupancyMap
+    walls: OccupancyMap
+    assumed: Assumed
     path: Array
     goals: Array
     start: Array
@@ -89,12 +95,16 @@ class EpisodeLog(StoredLog):
     """The path to the present goal, as repaired so far."""
     horizon: Array = column("m, m, rad", None, 3)
     """Predicted poses."""
+    way_out: Array = column("m, m, rad", None, 3)
+    """Predicted poses of the evasive trajectory, or of braking, that the tick could have driven without a plan."""
     scan: Array = column("m", None)
     """Lidar ranges; NaN is a dropout, +inf no return."""
     obstacles: Array = column("m", None, 3)
     """True unforeseen obstacles and people: x, y, radius."""
     detected: list[Array] = ragged("m", 3)
     """Tracked obstacles: x, y, radius."""
+    expected: list[Array] = ragged("m, m, m/s, m", 4)
+    """Assumed of each: place after ``assumed.ahead``, bound of its speed, and how far it may be off the place."""
     solve_ms: Array = column("ms")
     """Localise and plan together."""
     localise_ms: Array = column("ms")
@@ -145,6 +155,11 @@ class EpisodeLog(StoredLog):
     def hull(self) -> Body:
         """Body of the robot."""
         return body_of(self.body) if self.body else Body.disc(self.robot_radius)
+
+    @cached_property
+    def judgement(self) -> Judgement:
+        """Assumptions that were broken, and the causes of contacts."""
+        return judged(self)
 
     @property
     def succeeded(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,9 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         and ``causes`` count ticks by what the supervisor made of them, ``dropped_samples`` what was not let in,
         ``power_off_s`` is the time at which the robot first asked for its motors' power to be cut, None for never, and
         ``last_stops`` counts ticks in which beams alone slowed the robot. ``tick_ms`` is all of a tick: estimate,
-        perception, repair of the route and plan; ``late_ticks`` took longer than their period.
+        perception, repair of the route and plan; ``late_ticks`` took longer than their period. ``contacts`` has the
+        cause of each, ``broken_assumptions`` counts ticks by the assumption that did not hold, and ``beyond_sigma`` is
+        the share of ticks whose true position lies outside of the ellipse that clearances are widened by.
 
     Raises:
         ScenarioError: the episode has no tick.
@@ -60,6 +63,9 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "obstacles": int(log.obstacles.shape[1]),
         "obstacles_wanted": int(log.obstacles_wanted),
         "collisions": int(log.collisions),
+        "contacts": [asdict(contact) for contact in log.judgement.contacts],
+        "broken_assumptions": log.judgement.ticks,
+        "beyond_sigma": log.judgement.beyond_sigma,
         "steps": log.ticks,
         "duration_s": float(duration),
         "path_length_m": length,

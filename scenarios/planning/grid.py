@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import TypeVar
+from collections.abc import Callable, Generator
+from functools import wraps
+from typing import ParamSpec, TypeAlias, TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +28,8 @@ from unifg.scenarios.planning.polyline import headed, resample
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
 Scalar = TypeVar("Scalar", bound=np.generic)
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _log = logging.getLogger("unifg")
 
@@ -36,6 +41,11 @@ _WIDE = 0.6  # clearance beyond the robot's radius from which more is worth noth
 _PENALTY = 4.0  # a path touching the inflation costs 1 + this per metre
 _LOOKAHEAD = 100  # longest shortcut tried, in strides along the path
 _SMOOTHING_SWEEPS = 400  # diffusion length sqrt(0.5 sweeps) SPACING = 0.7 m
+_AT_ONCE = 10_000  # expansions
+_SWEEPS = 50  # of these made at once
+_CELLS, _SMOOTHED = 16, 2  # cells looked at, and points smoothed, for as much work as an expansion
+_POINTS = 10  # expansions for as much work as a point and stride of a path that is shortened
+_highest: WeakKeyDictionary[DistanceMap, Array] = WeakKeyDictionary()
 _ATTACH = 0.5  # how far start or goal may lie from the inflated free space [m]
 
 
@@ -70,6 +80,13 @@ class Clearance:
 
         It is looked at in the middle of the cell and of its sides: the middle line of a door may run between two cells.
         """
+        highest = _highest.get(self.field)
+        if highest is None:
+            highest = _highest[self.field] = self._highest()
+        self.passable = self.occupancy.free & (highest >= least)
+
+    def _highest(self) -> Array:
+        """Greatest smoothed distance (H, W) in the middle of each cell and of its sides [m]."""
         values = self.field.values
         highest = smoothed(values)
         for axis in (0, 1):
@@ -81,7 +98,7 @@ class Clearance:
             )  # between the cell before and this one
             after = np.roll(side, -1, axis=axis)
             highest = np.maximum(highest, np.maximum(side, after))
-        self.passable = self.occupancy.free & (highest >= least)
+        return highest
 
     def _lower_around(self, x: float, y: float, radius: float) -> None:
         reach = (radius + 2.0) / self.occupancy.resolution  # beyond two metres no inflation asks
@@ -143,7 +160,31 @@ def plain(array: NDArray[Scalar]) -> NDArray[Scalar]:
     return np.require(array, requirements=["C", "W"])
 
 
-def plan(
+Planning: TypeAlias = Generator[int, None, Array]
+"""A search in parts, each of which yields its work in expansions of A*; it returns a path."""
+
+
+def finished(work: Generator[int, None, T]) -> T:
+    """Result of work in parts, after all of them."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+
+
+def at_once(work: Callable[P, Generator[int, None, T]]) -> Callable[P, T]:
+    """Function that does work in parts without a pause, with its arguments, result and errors."""
+
+    @wraps(work)
+    def whole(*args: P.args, **options: P.kwargs) -> T:
+        return finished(work(*args, **options))
+
+    return whole
+
+
+def planning(
     occupancy: OccupancyMap,
     distance_map: DistanceMap,
     start: ArrayLike,
@@ -152,7 +193,7 @@ def plan(
     robot_radius: float,
     clearance_least: float | None = None,
     extra_discs: ArrayLike | None = None,
-) -> Array:
+) -> Planning:
     """Find a short path that prefers the middle of free space and still passes the gaps that must be passed.
 
     Args:
@@ -164,6 +205,9 @@ def plan(
         clearance_least: lowest distance from the robot's centre to walls that is tried [m], by default the radius.
             The radius plus 0.15 m is tried first; where no such way exists it is lowered step by step.
         extra_discs: (K, 3) x, y, radius [m] of obstacles that are not on the map.
+
+    Yields:
+        Work of each part, in expansions.
 
     Returns:
         (P, 3) poses [m, m, rad] from start to goal, evenly spaced by about 0.05 m of arc length. Headings run
@@ -189,6 +233,7 @@ def plan(
     steps = math.ceil((preferred - least) / _LEVEL_STEP - 1e-9)
     for level in np.linspace(preferred, least, max(2, steps + 1)):
         route = _connected(clearance, start_pose[:2], goal_pose[:2], float(level), robot_radius)
+        yield clearance.grid.size // _CELLS
         if route is not None:
             break
     else:
@@ -201,15 +246,25 @@ def plan(
     if level < preferred - 1e-9:
         _log.info("planner: inflation lowered from %.2f m to %.2f m to find a way", preferred, level)
 
-    chain = _cheapest(clearance, *route, robot_radius)
+    chain = yield from _cheapest(clearance, *route, robot_radius)
     points = np.vstack([start_pose[:2], clearance.centres(chain), goal_pose[:2]])
     # Short lines first, then long ones between points further apart: together they undo the eight directions
     # of the grid.
     for stride in (1, 5):
-        points = _shorten(clearance, resample(points, SPACING), float(level), robot_radius, stride)
-    points = plain(resample(_smooth(clearance, resample(points, SPACING), preferred), SPACING))
+        fine = resample(points, SPACING)
+        points = _shorten(clearance, fine, float(level), robot_radius, stride)
+        yield _POINTS * stride * len(fine)
+    points = plain(resample(points, SPACING))
+    for _ in range(_SMOOTHING_SWEEPS // _SWEEPS):
+        _diffuse(clearance.field.table, clearance.known, clearance.discs, points, preferred, _SWEEPS)
+        yield _SWEEPS * len(points) // _SMOOTHED
+    points = plain(resample(points, SPACING))
     _leave_corners(clearance.field.table, clearance.discs, points, float(level))
     return headed(points, float(goal_pose[2]))
+
+
+plan = at_once(planning)
+"""The same at once: it returns the path."""
 
 
 def smoothed(values: Array) -> Array:
@@ -297,15 +352,16 @@ def _cheapest(
     first: tuple[int, int],
     last: tuple[int, int],
     robot_radius: float,
-) -> IntArray:
-    """Cheapest chain of neighbouring open cells, (n, 2) as row, column."""
+) -> Generator[int, None, IntArray]:
+    """Cheapest chain of neighbouring open cells, (n, 2) as row, column; yields expansions."""
     rows, columns = np.flatnonzero(cells.any(axis=1)), np.flatnonzero(cells.any(axis=0))
     corner = np.array([rows[0], columns[0]])
     part = (slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
     cells = cells[part]
     cost = plain(cost_per_metre(clearance.grid[part], robot_radius))
     source, target = (np.array(cell) - corner for cell in (first, last))
-    before, _ = search(plain(cells), cost, source, target)
+    yield cells.size // _CELLS
+    before, _ = yield from searching(plain(cells), cost, source, target)
     chain = [int(source[0] * cells.shape[1] + source[1])]
     end = int(target[0] * cells.shape[1] + target[1])
     while chain[-1] != end:
@@ -314,31 +370,44 @@ def _cheapest(
     return found
 
 
-@compiled
-def search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) -> tuple[IntArray, Array]:
+def searching(
+    cells: BoolArray, cost: Array, source: IntArray, target: IntArray
+) -> Generator[int, None, tuple[IntArray, Array]]:
     """Predecessor and cost of every cell on the cheapest chain from ``target``, flat, as far as ``source`` needs.
 
     Hart, Nilsson and Raphael's A* with the cheapest that eight directions allow; cells cost one per side at least. The
     search runs from the target, so that the chain of predecessors runs from start to goal. With a source that is no
-    cell it goes on to all that can be reached.
+    cell it goes on to all that can be reached. Yields expansions, `_AT_ONCE` at the most.
     """
-    height, width = cells.shape
-    before = np.full(height * width, -1, dtype=np.int64)
-    spent = np.full(height * width, np.inf)
-    done = np.zeros(height * width, dtype=np.bool_)
-    keys, places = np.empty(4 * height * width + 16), np.empty(4 * height * width + 16, dtype=np.int64)
-    goal = source[0] * width + source[1]
-    begin = target[0] * width + target[1]
+    count = cells.size
+    before, spent, done = np.full(count, -1, dtype=np.int64), np.full(count, np.inf), np.zeros(count, dtype=np.bool_)
+    keys, places = np.empty(4 * count + 16), np.empty(4 * count + 16, dtype=np.int64)
+    begin = int(target[0] * cells.shape[1] + target[1])
     spent[begin] = 0.0
     keys[0], places[0], size = 0.0, begin, 1
     while size > 0:
+        size = expand(cells, cost, source, before, spent, done, keys, places, size, _AT_ONCE)
+        yield _AT_ONCE
+    return before, spent
+
+
+@compiled
+def expand(
+    cells: BoolArray, cost: Array, source: IntArray, before: IntArray, spent: Array, done: BoolArray, keys: Array,
+    places: IntArray, size: int, most: int,
+) -> int:  # fmt: skip
+    """Go on with a search by so many expansions; size of the heap afterwards, 0 at the end."""
+    height, width = cells.shape
+    goal = source[0] * width + source[1]
+    while size > 0 and most > 0:
         current = pop(keys, places, size)
         size -= 1
         if done[current]:
             continue
         done[current] = True
+        most -= 1
         if current == goal:
-            break
+            return 0
         row, column = current // width, current % width
         for k in range(9):
             i, j = row + k // 3 - 1, column + k % 3 - 1
@@ -355,7 +424,7 @@ def search(cells: BoolArray, cost: Array, source: IntArray, target: IntArray) ->
             away, aside = abs(i - source[0]), abs(j - source[1])
             key = total + max(away, aside) + (math.sqrt(2.0) - 1.0) * min(away, aside)
             size = push(keys, places, size, key, neighbour)
-    return before, spent
+    return size
 
 
 @compiled
@@ -445,16 +514,9 @@ def _good_line(
     return bool(length * total / (pieces + 1) <= most)
 
 
-def _smooth(clearance: Clearance, points: Array, preferred: float) -> Array:
-    """Diffuse the corners away; no point moves nearer to a wall unless it keeps the preferred clearance."""
-    points = plain(points)
-    _diffuse(clearance.field.table, clearance.known, clearance.discs, points, preferred, _SMOOTHING_SWEEPS)
-    return points
-
-
 @compiled
 def _diffuse(table: Array, free: BoolArray, discs: Array, points: Array, preferred: float, sweeps: int) -> None:
-    """Sweeps over points (n, 2), in place; near walls only the part of a step that does not approach them is kept."""
+    """Diffuse the corners of points (n, 2) away, in place; near walls a step keeps the part that does not approach."""
     count = len(points)
     known = np.empty((count, 3))
     for i in range(count):

@@ -20,7 +20,7 @@ from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap, SmoothField, smooth
 from unifg.models.footprint import Body
 from unifg.models.planar import Base
-from unifg.scenarios.planning.grid import SPACING, Clearance, cost_per_metre, is_free, plain, search
+from unifg.scenarios.planning.grid import SPACING, Clearance, cost_per_metre, finished, is_free, plain, searching
 from unifg.scenarios.planning.heap import pop, push
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
@@ -118,7 +118,7 @@ def plan_poses(
     inner = max(-float(body.gap(np.zeros(2))), 0.0) + gap
     cells = clearance.known & (clearance.grid >= min(inner, inner + float(room[0]) - gap) - occupancy.resolution)
     begin = np.floor(occupancy.world_to_grid(ends[0, :2])).astype(np.int64)[::-1]
-    _, guide = search(plain(cells), prices, np.array([-1, -1]), plain(begin))
+    _, guide = finished(searching(plain(cells), prices, np.array([-1, -1]), plain(begin)))
     guide *= GUIDED * occupancy.resolution
     for comfort in COMFORT:
         chain = _hybrid(

@@ -59,6 +59,7 @@ PENALTY = 1e5  # of violation: multipliers of squared slacks that are used grow 
 SLOWING = 3.0  # deceleration of a vehicle that is faster than it may be [m/s^2]
 SPEEDING = 1e4  # weight of the squared slack of the speed [s^2/m^2]
 FEASIBLE = 1e-3  # violation of constraints up to which an answer is a plan
+WHOLE = 10  # iterations of a solve that cannot be made in portions
 TRIES = 3  # ticks in a row without a plan until the search begins anew
 KEEP = 0.2  # how long the last plan is flown on [s]
 INSIDE = 1e-3  # deeper than this within the distance to be kept is too near [m]
@@ -91,8 +92,12 @@ class KeeperSettings:
         tolerance: of the KKT test.
         settled: whether every plan is solved to its tolerance; or one step of the interior point is made per tick, and
             more of them only while the plan violates the constraints.
+        portion: iterations of a tick; a solve that needs more goes on in the next ticks, which fly the last plan. None
+            where every solve ends in its tick.
         iterations: most of a solve with a warm start.
-        budget: wall-clock time of a solve [s]; a finite one makes a flight depend on the machine.
+        decide_ms: processor time of a decision [ms]; of ``portion`` as many iterations are made as fit. A tick in which
+            none fits, or whose plan comes later, has the status "late": it flies the last plan, or brakes where that is
+            too old. A finite one makes a flight depend on the machine.
     """
 
     horizon: int = 20
@@ -116,13 +121,14 @@ class KeeperSettings:
     hinge: float = 1e4
     tolerance: float = 1e-4
     settled: bool = False
-    iterations: int = 10
-    budget: float = np.inf
+    portion: int | None = 4
+    iterations: int = 20
+    decide_ms: float = np.inf
 
 
 TRACKING = KeeperSettings(
     position=180.0, attitude=5e-3, velocity=2.7, rate=2.9e-5, thrust=8.3e-5, rate_change=1.3e-6, thrust_change=3.7e-5,
-    tolerance=1e-6, settled=True,
+    tolerance=1e-6, settled=True, portion=None, iterations=10,
 )  # fmt: skip
 """Weights for flights with nothing in the way, found by a search on a flight that appears in no table.
 
@@ -201,7 +207,7 @@ class Decision:
         control: (4,) to be told.
         plan: (k, 3) where the vehicle is expected to go [m].
         status: of the solve, in words; "too near" where the plan comes nearer to an obstacle than it is to, "last plan"
-            and "braking" where the solve found none.
+            and "braking" where the solve found none, "late" where the time for a decision was over before.
         iterations: of it.
         slack: greatest slack in the plan [m].
         mass: as it is believed [kg].
@@ -317,14 +323,18 @@ class CbfMpc:
         terms += [self._barriers] if s.slots else []
         early = {"step_tolerance": np.inf} if solver == "ipm" and not s.settled else {}
         numbers = {"tolerance": s.tolerance, **({"penalty": PENALTY} if solver == "ipm" else {}), **early}
+        # Solves in portions take one compiled loop.
+        self._parted = s.portion is not None and solver == "ipm" and s.gamma == 0.0
+        most = s.iterations if self._parted or s.portion is None else min(s.iterations, WHOLE)
         robot = Robot(quadrotor_loops.STATE, quadrotor.CONTROL)
         self._brakes = FlatnessController(Gains(), airframe.least, airframe.most)
-        self._policy, self._refused = LastPlanThenBrake(robot, FEASIBLE, KEEP, self._brake), 0
+        self._policy, self._refused = LastPlanThenBrake(robot, FEASIBLE, KEEP, self.brake), 0
         self.loop = RecedingHorizon(
             robot, s.horizon, terms, times=self.nodes,
-            solver=backend(solver, time_limit=s.budget, max_iterations=s.iterations, **numbers),
-            cold=backend(solver, **numbers), limits=(airframe.least, airframe.most), judge=self.judge,
+            solver=backend(solver, max_iterations=most, **numbers),
+            cold=backend(solver, **numbers), limits=(airframe.least, airframe.most), judge=self,
             starts=InitialGuesses(cold=self._along, after_failure=self._braking),
+            portion=s.portion if self._parted else None, deadline=1e-3 * s.decide_ms, clock=time.thread_time,
         )  # fmt: skip
         self.loop.applied = quadrotor.hover(airframe.parameters)
         self._looked_at = [-1] * s.slots
@@ -340,11 +350,8 @@ class CbfMpc:
             gust: (N, 3) acceleration by the air that is expected in each step [m/s^2].
         """
         begin = time.thread_time()
-        states, controls = flat_flight(flown, self.believed)
-        near = obstacles
-        if self.settings.slots:
-            near = obstacles.these(self._nearest(start, obstacles, later), self.settings.slots)
-        plan = self.loop.plan(start, Guarded(states, controls[:-1], near, later, gust))
+        given = None if self.loop.goes_on else self._given(start, flown, obstacles, later, gust)
+        plan = self.loop.plan(start, given)
         solution = self.loop.solution
         assert solution is not None
         status, slack, p = "last plan" if plan.source == "kept" else plan.source, 0.0, self.believed
@@ -354,22 +361,33 @@ class CbfMpc:
         if not plan.emergency:
             status, mass, drag = plan.status.name.lower(), float(solution["mass"][0, 0]), solution["drag"][0]
             slack = max((use.amount for kept in self._barriers.kept for use in kept.used(solution)), default=0.0)
-            if len(obstacles.keep) and obstacles.clearance(places, later + self.nodes).min() < -INSIDE:
+            nodes = self.nodes - self.loop.waited * self.nodes[1]  # from now on
+            if len(obstacles.keep) and obstacles.clearance(places, later + nodes).min() < -INSIDE:
                 status = "too near"
         spent = 1e3 * (time.thread_time() - begin)
         return Decision(plan.control, places, status, plan.iterations, slack, mass, drag, spent)
 
-    def judge(
+    def _given(self, start: Array, flown: Flown, obstacles: Obstacles, later: float, gust: Array) -> Guarded:
+        """Input of the terms where a solve begins; arguments as of :meth:`decide`."""
+        states, controls = flat_flight(flown, self.believed)
+        near = obstacles
+        if self.settings.slots:
+            near = obstacles.these(self._nearest(start, obstacles, later), self.settings.slots)
+        return Guarded(states, controls[:-1], near, later, gust)
+
+    def __call__(
         self, solution: fg.Solution, states: Array, controls: Array, now: Context[Guarded], kept: LastPlan
     ) -> horizon.Decision:
         """Fly a plan that keeps the constraints; else the last one for a while; else brake."""
         decision = self._policy(solution, states, controls, now, kept)
-        # A solve that was begun goes on in the next tick; after a few ticks it begins anew.
+        if decision.source != "solved" and self._parted and self.loop.warm.unfinished:
+            return decision
+        # A solve that was begun goes on with the next one's numbers; after a few solves it begins anew.
         self._refused = 0 if decision.source == "solved" else self._refused + 1
         begun = np.isfinite(states).all() and np.isfinite(controls).all() and self.loop.guess is not None
         return replace(decision, resumed=bool(begun) and self._refused % TRIES > 0)
 
-    def _brake(self, now: Context[Guarded]) -> Array:
+    def brake(self, now: Context[Guarded]) -> Array:
         """(4,) control that takes the velocity away."""
         level = np.clip(-np.array(Gains().velocity)[[0, 0, 1]] * now.present[7:10], -BRAKING, BRAKING)
         return self._brakes.steer(now.present[:10], level, np.zeros(3), self.believed)

@@ -120,6 +120,7 @@ def drive_scene(log: EpisodeLog) -> Scene:
         "closest approach": f"{max(0.0, m['min_clearance_m']):.2f} m",
         "localisation error": f"{100 * m['localisation_error_m']['mean']:.1f} cm on average",
         "health": health(m),
+        **{f"contact with {each['thing']} at {each['time']:.1f} s": each["cause"] for each in m["contacts"]},
         "odometry error": f"{m['odometry_error_m']['max']:.2f} m at worst",
     }
     return scene

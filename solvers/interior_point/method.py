@@ -49,6 +49,7 @@ ENDINGS = {
     state.TRY: Status.TIME_LIMIT,  # there was no time for the step
 }
 NO_ANSWER = -1
+FINER = 0.03  # by which `barrier.test` refines units where the KKT test fails
 ROOM = 2**18  # bytes for arrays that compiled functions allocate, besides those that grow with the graph
 STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
 RESTARTS = 3  # from points that violate less than where the method came to a halt
@@ -139,10 +140,10 @@ class InteriorPoint(Solver):
 
     def at_once(self, workspace: Workspace, values: Values, multipliers: Array) -> Conclusion | bool:
         """One compiled call, where nobody looks and the last solve has left its settings."""
-        if not workspace.repeats(self, values.flat, multipliers):
+        if not workspace.unfinished and not workspace.repeats(self, values.flat, multipliers):
             return False
         try:
-            workspace.run("solve_once")
+            workspace.run_portion(self.max_iterations)
         except KeyboardInterrupt:  # in compiled code Python learns of it when that is over
             workspace.interrupted = True
             return True
@@ -150,11 +151,13 @@ class InteriorPoint(Solver):
         iterations, cost, ending = now["iteration"], now["cost"], ENDINGS[now["answer"]]
         measured = read_numbers(work.kkt, cost)
         held = measured.passes(self.tolerances)
+        workspace.unfinished = ending is Status.ITERATION_LIMIT and iterations < self.max_iterations
         if now["suspicion"] > SUSPICIOUS or not cost >= UNBOUNDED_COST or not measured.finite:
             return True
         if not held and ((now["kept"] and now["violation"] > now["feasible"]) or iterations >= self.max_iterations):
             return True
-        if ending is not Status.STOP_RULE and not (held and ending is Status.CONVERGED):
+        sound = ending is Status.STOP_RULE or (held and ending is Status.CONVERGED)
+        if not sound and not workspace.unfinished:
             return True
         lin, status = workspace.found(), Status.CONVERGED if held else ending
         history = _history(work.log[: iterations + 1].copy(), lin, workspace.compiled)
@@ -287,9 +290,12 @@ class Workspace:
     Attributes:
         compiled: seconds of the solve in compiled code, but for the test of the answer of a solve in parts.
         interrupted: whether the user has interrupted the last solve in one call.
+        portion: iterations of one call; None for all.
+        unfinished: whether the next call goes on with the last solve.
     """
 
-    compiled, interrupted = 0.0, False
+    compiled, interrupted, unfinished = 0.0, False, False
+    portion: int | None = None
     # Options, the bytes of the scalars, and what these are where a solve with such options begins.
     _settings: tuple[dict[str, Any], NDArray[np.uint8], NDArray[np.uint8]] | None = None
 
@@ -369,6 +375,21 @@ class Workspace:
         began = perf_counter()
         self.call(function)
         self.compiled += perf_counter() - began
+
+    def run_portion(self, most: int) -> None:
+        """Solve, or go on with a solve that is unfinished, for a portion of at most so many iterations."""
+        now = self.now
+        begun = now["iteration"] if self.unfinished else 0
+        now["limit"] = most if self.portion is None else min(begun + self.portion, most)
+        if not self.unfinished:
+            self.run("solve_once")
+            return
+        now["stage"], now["going_on"] = state.MOVED, 1
+        worst = max(now["stationarity"], now["complementarity"], now["gap"])
+        if worst <= now["tolerance"] and not now["violated"]:  # tested again, which would refine units twice
+            now["finer"] /= FINER
+        self.run("loop")
+        self.call("conclude")
 
     def asks(self) -> bool:
         """Run the loop up to an ending, a question, or something to show; answer a question; whether it goes on."""

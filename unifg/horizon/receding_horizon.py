@@ -32,6 +32,7 @@ from unifg.typing import Array, ArrayLike
 
 TIMES = 100_000  # ticks whose times are kept
 CLOSE = 1e-4  # a plan may bend constraints more, but noise of the past is as small as that
+FORGOTTEN = 0.95  # of the time of an iteration, until a slower one
 RESERVE = 0.1  # share of the deadline that more starts leave free
 
 
@@ -88,6 +89,8 @@ class RecedingHorizon:
         solution: of the last tick; None before.
         statuses: how often solves ended in what way.
         sources: how often what was applied; "late" counts plans that came after the deadline.
+        goes_on: True if the next tick goes on with a solve that has begun, and looks at no ``given``.
+        waited: ticks between the begin of the last plan's solve and its end.
         rescues: how often the second backend had a plan when the first had none.
         subproblems: how many quadratic programs of plans each solver has solved, where the backend has such.
         more_starts: how many were tried beside the first of a tick.
@@ -116,6 +119,7 @@ class RecedingHorizon:
         deadline: float = np.inf,
         delay: int = 0,
         patience: int = 10,
+        portion: int | None = None,
         clock: Callable[[], float] = clocks.perf_counter,
     ) -> None:
         """State the graph and prepare the backends; ticks compile nothing.
@@ -150,13 +154,19 @@ class RecedingHorizon:
                 that have been sent until then lead by the robot's model, and the first control of a plan acts there;
                 ``applied`` is what acts in the meantime, at first zero.
             patience: ticks of ending behind before a solve begins anew.
+            portion: iterations of a tick; a solve that needs more goes on in the next ticks, with its numbers, and what
+                the judge has instead of a plan is applied meanwhile. Its plan is then followed from where it should be.
+                With a deadline as many are made as fit by the time that they took before; where none fits, the tick is
+                late and what is left of the last plan is applied. None: every solve ends in its tick.
             clock: seconds of the wall.
 
         Raises:
             GraphError: for an unknown coupling, a joint one without a window, sizes and limits that do not fit, a term
                 that cannot be stated, times that do not grow or begin with another step than a tick, or a delay of a
-                joint coupling or of a robot without a model.
+                joint coupling or of a robot without a model; portions of what begins anew with every tick.
         """
+        if portion is not None and (portion < 1 or coupling == "joint" or delay):
+            raise GraphError(f"portion={portion}: one iteration or more, of a plan that acts at once and is not joint")
         if coupling not in COUPLINGS:
             raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
         if not isinstance(steps, Tree) and steps < 1:
@@ -194,7 +204,8 @@ class RecedingHorizon:
         self._probabilities = probabilities
         self._said = [handle for name, handle in self._handles.items() if name not in tied]
         backends = solver, cold or solver, second or solver
-        timed = [replace(own, time_limit=min(own.time_limit, deadline)) for own in backends]
+        most = deadline if portion is None else np.inf
+        timed = [replace(own, time_limit=min(own.time_limit, most)) for own in backends]
         self._limits = [own.time_limit for own in timed]
         self.warm, self.cold = (own.prepare(graph) for own in timed[:2])
         self.second = None if second is None else timed[2].prepare(graph)
@@ -216,6 +227,8 @@ class RecedingHorizon:
         self._verification_time = 0.0
         self.sent: Array = np.zeros((delay, robot.control.storage))
         self.lagging, self.failed = 0, False
+        self._portion, self.goes_on, self._step_time = portion, False, 0.0
+        self.waited = 0
         self._believe_nothing()
 
     def _tied(self, graph: Graph, pull: float | Sequence[float] | Array) -> PresentCoupling:
@@ -355,28 +368,78 @@ class RecedingHorizon:
     def _plan(self, present: Context[Any], begin: float) -> Plan:
         """Solve, judge, and remember."""
         now = self._acting(present)
+        if self.goes_on:
+            self.waited += 1
+            if not self._fits(begin):
+                return self._late(now, begin)
+            return self._decided(self._timed(self.warm.proceed), now, present, begin)
+        self.waited = 0
         data = self.data(now)
         run, guess = self.begin(now)
-        if np.isfinite(self._deadline):
+        if run is self.warm and not self._fits(begin):
+            return self._late(now, begin)
+        if np.isfinite(self._deadline) and self._portion is None:
             limit = self._limits[0 if run is self.warm else 1]
             run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
-        first, rescued = run.solve(self.tie.begin(guess, now), data=data), False
+        first, rescued = self._timed(lambda: run.solve(self.tie.begin(guess, now), data=data)), False
         solution = self._search(first, now, data, begin)
         if self.second is not None and self._refuses(solution, now):
             solution, rescued = self._ask(self.second, solution, now, data, begin)
-        self.solution = solution
         self._solved_by = self.second if rescued else run if solution is first else None
+        return self._decided(solution, now, present, begin, rescued)
+
+    def _fits(self, begin: float) -> bool:
+        """Choose as many iterations of a portion as the deadline leaves time for; False for none."""
+        if self._portion is None:
+            return True
+        left, count = (1.0 - RESERVE) * self._deadline - (self._clock() - begin), self._portion
+        if np.isfinite(left) and self._step_time > 0.0:
+            count = min(count, int(left / self._step_time))
+        self.warm.portioned(max(count, 1))
+        return count > 0
+
+    def _timed(self, solve: Callable[[], Solution]) -> Solution:
+        """Solve, and learn how long an iteration takes."""
+        if self._portion is None or not np.isfinite(self._deadline):
+            return solve()
+        before, begun = self._clock(), self.solution.iterations if self.goes_on and self.solution else 0
+        solution = solve()
+        took = (self._clock() - before) / max(solution.iterations - begun, 1)
+        self._step_time = max(took, FORGOTTEN * self._step_time) if self._step_time else took
+        return solution
+
+    def _late(self, now: Context[Any], begin: float) -> Plan:
+        """Apply what is left of the last plan, or brake; nothing is solved."""
+        self.kept.age += float(self.times[1])
+        choice = replace(self._instead(now), source="late")
+        self.sources["late"] += 1
+        self._step_time *= FORGOTTEN
+        return self._applied(choice, Status.TIME_LIMIT, 0, begin, False)
+
+    def _instead(self, now: Context[Any]) -> Decision:
+        """Rest of the last plan, or braking as the judge does."""
+        return LastPlanThenBrake(self.robot, brake=getattr(self.judge, "brake", None)).instead(now, self.kept)
+
+    def _decided(
+        self, solution: Solution, now: Context[Any], present: Context[Any], begin: float, rescued: bool = False
+    ) -> Plan:
+        """Judge, and remember."""
+        self.solution = solution
         self.statuses[solution.status] += 1
         if self._counting:
             self.subproblems.update(subproblems(solution.history))
         choice = self.decide(solution, now, late=self._clock() - begin > self._deadline)
         self._believe(solution, choice, present)
+        return self._applied(choice, solution.status, solution.iterations, begin, rescued)
+
+    def _applied(self, choice: Decision, status: Status, iterations: int, begin: float, rescued: bool) -> Plan:
+        """Plan of a tick, whose first control is applied."""
         decided = np.concatenate([self.sent, choice.controls[:1]])
         self.applied, self.sent = decided[0], decided[1:]
         elapsed = 1e3 * (self._clock() - begin)
         self.milliseconds.append(elapsed)
         return Plan(
-            choice.controls, choice.states, solution.status, solution.iterations, choice.source, self.kept.excess,
+            choice.controls, choice.states, status, iterations, choice.source, self.kept.excess,
             elapsed, rescued,
         )  # fmt: skip
 
@@ -441,13 +504,18 @@ class RecedingHorizon:
         states, controls = self._planned(solution)
         self.kept.age += float(self.times[1])
         choice = self.judge(solution, states, controls, now, self.kept)
+        self.goes_on = choice.source != "solved" and self._portion is not None and self.warm.unfinished
         if late and choice.source == "solved":
-            instead = LastPlanThenBrake(self.robot, brake=getattr(self.judge, "brake", None)).instead(now, self.kept)
+            instead = self._instead(now)
             self._accept(solution, states, controls, choice)
             choice = replace(instead, source="late")
         elif choice.source == "solved":
             self._accept(solution, states, controls, choice)
-        else:
+            if self.waited:
+                left = self.kept.within(self.kept.left())
+                rest = left[-1:].repeat(len(controls) - len(left), 0)
+                choice = replace(choice, controls=np.concatenate([left, rest]))
+        elif not self.goes_on:
             self.failed = True
             if choice.resumed:
                 self.guess = self.shifted(solution)
@@ -494,25 +562,27 @@ class RecedingHorizon:
     def _accept(self, solution: Solution, states: Array, controls: Array, choice: Decision) -> None:
         """Keep a plan, and begin the next solve from it."""
         self.kept.store(controls, states)
+        self.kept.age = self.waited * float(self.times[1])
         self.failed = False
         self.guess = None if self.stays_behind(choice.behind) else self.shifted(solution)
 
     def shifted(self, solution: Solution) -> Guess:
-        """A solution moved on by a tick, for the next solve.
+        """A solution moved on to the next tick, for the solve there.
 
         Between nodes states are interpolated on their manifold; beyond the last one it repeats. Multipliers move by
         whole steps: by those that a tick is nearest to, on average over the horizon.
         """
-        along = *self.tie.along, self.u
+        along, ticks = (*self.tie.along, self.u), self.waited + 1
+        later = self.times + ticks * self.times[1]
         if self._branches is not None:
             guess = solution.shifted(*along, by=0)
-            return self._resampled(guess, solution[self.x], solution[self.u], self.times + self.times[1])
+            return self._resampled(guess, solution[self.x], solution[self.u], later)
         if np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0):
-            return solution.shifted(*along)
+            return solution.shifted(*along, by=ticks) if self.waited else solution.shifted(*along)
         joint = len(self.x.family) > self.steps + 1
-        whole = 1 if joint else round(self.steps * self.times[1] / self.times[-1])
+        whole = 1 if joint else round(self.steps * ticks * self.times[1] / self.times[-1])
         moved = solution.shifted(*along, by=whole)
-        return self._resampled(moved, solution[self.x], solution[self.u], self.times + self.times[1])
+        return self._resampled(moved, solution[self.x], solution[self.u], later)
 
     def _resampled(self, guess: Guess, states: Array, controls: Array, at: Array) -> Guess:
         """A guess with the states and controls of a plan on the nodes of now at other times (N + 1,)."""
@@ -561,7 +631,7 @@ class RecedingHorizon:
     def forget(self) -> None:
         """Drop the warm start, as when a new reference makes it misleading."""
         self.guess = None
-        self.failed = False
+        self.failed = self.goes_on = False
 
     def abandon(self) -> None:
         """Drop the warm start and the plan that is kept."""

@@ -730,6 +730,26 @@ class Prepared:
         finally:
             self._leave()
 
+    def proceed(self) -> Solution:
+        """Go on with the last solve, which is :attr:`unfinished`, with its data, for another portion of iterations."""
+        self._enter()
+        try:
+            work, program = self._workspace.work, self.program
+            reached = program.values_from(work.values.copy()), work.multipliers.copy(), program.no_penalties
+            return self._answered(*reached, None, time.perf_counter())
+        finally:
+            self._leave()
+
+    @property
+    def unfinished(self) -> bool:
+        """True if the last solve has ended with its portion of iterations, and not with all that it may make."""
+        return getattr(self._workspace, "unfinished", False)
+
+    def portioned(self, count: int | None) -> None:
+        """Let solves return after so many iterations, to :meth:`proceed` later; for backends that can."""
+        if hasattr(self._workspace, "portion"):
+            self._workspace.portion = count
+
     def solve_many(
         self, guesses: AnyGuess | Sequence[AnyGuess], *, data: Mapping[Data, Numbers] | None = None, threads: int = 1
     ) -> Batch:
@@ -849,6 +869,8 @@ class Prepared:
         program = self.program
         program.bind(data or {})
         self._say_if_stale()
+        if self.unfinished:
+            self._workspace.unfinished = False
         values, multipliers, penalties = self.read(guess, duals)
         began = time.perf_counter()
         solution = self._verified(self._answered(values, multipliers, penalties, callback, began), began, callback)

@@ -1,0 +1,132 @@
+"""Solves in portions over ticks, and decisions that have no time: what is applied meanwhile, and what follows."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.models import quadrotor
+from unifg.scenarios.planning.flat_path import Line
+from unifg.scenarios.quadrotor.cbf_mpc import CbfMpc, Decision, KeeperSettings, Obstacles
+from unifg.scenarios.quadrotor.flatness import flat_flight
+from unifg.scenarios.simulation.body_rate import Airframe
+from unifg.solvers import InteriorPoint
+from unifg.typing import Array
+
+DT = 0.01
+LINE = Line((-4.0, 0.0, 1.0), (4.0, 0.0, 1.0), 2.0, 1.5)
+
+
+def chain() -> tuple[fg.Graph, fg.Family, fg.Data]:
+    """Points on a line that keep off a disc: an answer that takes some iterations."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 8)
+    goal = graph.data("goal", np.array([3.0, 0.1]))
+    graph.minimize(fg.prior, x[-1], goal, sigma=0.1)
+    graph.minimize(lambda a, b: b - a, x[:-1], x[1:], sigma=1.0, name="steps")
+    graph.fix(x[0], [-3.0, 0.0])
+    graph.constrain(lambda p: np.hypot(p[:, :1], p[:, 1:]), x[1:], lower=1.0, name="off")
+    return graph, x, goal
+
+
+def guess(x: fg.Family, bent: float) -> dict[Any, Array]:
+    return {x: np.column_stack([np.linspace(-3.0, 3.0, 8), np.full(8, bent)])}
+
+
+@pytest.mark.parametrize("portion", [1, 3])
+def test_portions_make_the_steps_of_one_solve(portion: int) -> None:
+    whole, parts = InteriorPoint(), InteriorPoint()
+    (graph, x, goal), (other, y, aim) = chain(), chain()
+    one, many = whole.prepare(graph), parts.prepare(other)
+    one.solve(guess(x, 0.3)), many.solve(guess(y, 0.3))  # the first is always whole
+    moved = np.array([2.5, -0.4])
+    expected = one.solve(guess(x, -0.2), data={goal: moved})
+    many.portioned(portion)
+    found, calls = many.solve(guess(y, -0.2), data={aim: moved}), 1
+    assert many.unfinished and found.status is fg.Status.ITERATION_LIMIT and found.iterations == portion
+    while many.unfinished:
+        found, calls = many.proceed(), calls + 1
+        assert found.iterations <= calls * portion
+    assert found.converged and found.iterations == expected.iterations > 3 and calls == -(-found.iterations // portion)
+    np.testing.assert_array_equal(found[y], expected[x])
+    np.testing.assert_array_equal(found.dual("off"), expected.dual("off"))
+    many.solve(guess(y, -0.2), data={aim: moved})
+    assert many.unfinished
+    again = many.solve(guess(y, 0.3))  # with its own numbers: what was begun is dropped
+    assert again.iterations == portion and not np.array_equal(again[y], found[y])
+
+
+def keeper(**settings: Any) -> CbfMpc:
+    plans = CbfMpc(KeeperSettings(**{"alpha": 1.0, "slots": 1, **settings}), Airframe(), DT)
+    for k in range(3):  # the first is cold, the second begins with a warm start
+        decide(plans, k, pillar(9.0))
+    return plans
+
+
+def pillar(y: float) -> Obstacles:
+    flags = np.ones(1, dtype=bool)
+    return Obstacles(np.array([[0.0, y, 1.0]]), np.zeros((1, 3)), np.array([0.8]), flags, ~flags)
+
+
+def decide(plans: CbfMpc, tick: int, seen: Obstacles) -> Decision:
+    """Decision of a vehicle that is on its way along the line."""
+    flown = LINE.at(1.0 + DT * tick + plans.nodes)
+    state = flat_flight(flown, plans.believed)[0][0]
+    hover = quadrotor.hover(plans.believed)
+    start = np.concatenate([state, np.zeros(6), hover[3:]])
+    return plans.decide(start, flown, seen, 0.0, np.zeros((plans.settings.horizon, 3)))
+
+
+def test_the_last_plan_is_flown_until_all_portions_are_made() -> None:
+    plans, whole = keeper(portion=2, iterations=60), keeper(portion=None, iterations=12)
+    last = plans.loop.kept.controls.copy()
+    expected = decide(whole, 3, pillar(0.1))
+    decision, ticks = decide(plans, 3, pillar(0.1)), 0
+    while plans.loop.goes_on:
+        ticks += 1
+        assert decision.status == "last plan" and decision.iterations == 2 * ticks
+        np.testing.assert_array_equal(decision.control, plans.loop.kept.within(last)[(4 + ticks) // 5])
+        decision = decide(plans, 3 + ticks, pillar(9.0))  # a pillar that the solve does not see: it keeps its numbers
+    # Its first portion that keeps the constraints is a plan.
+    assert ticks == plans.loop.waited == 5
+    assert decision.status == expected.status and decision.iterations == expected.iterations
+    np.testing.assert_array_equal(plans.loop.kept.controls, whole.loop.kept.controls)
+    assert plans.loop.kept.age == pytest.approx(ticks * DT)
+    np.testing.assert_array_equal(decision.control, whole.loop.kept.controls[(4 + ticks) // 5])
+    before, after = whole.loop.solution, plans.loop.guess
+    assert before is not None and after is not None
+    speed = before[plans.loop.x.family.name][0, 7]
+    moved = after.values[plans.loop.x.family][0, 0] - before[plans.loop.x.family.name][0, 0]
+    assert moved == pytest.approx(speed * DT * (ticks + 1), rel=0.05)
+
+
+def test_a_decision_without_time_flies_the_last_plan_by_name_and_then_brakes() -> None:
+    plans = keeper(decide_ms=1e4, portion=2, iterations=60)
+    now, slow = 0.0, 0.0
+
+    def clock() -> float:
+        nonlocal now
+        now += slow
+        return now
+
+    plans.loop._clock = clock
+    decide(plans, 3, pillar(9.0))
+    last = plans.loop.kept.controls.copy()
+    slow, plans.loop._step_time = 4.0, 8.0  # [s], so that none of its iterations fits into ten
+    told = [decide(plans, 4 + k, pillar(9.0)) for k in range(10)]
+    assert [each.status for each in told] == ["late"] * 10 and {each.iterations for each in told} == {0}
+    np.testing.assert_array_equal(told[0].control, last[1])
+    for each in told[8:]:  # the plan is too old
+        assert each.control[1] < -0.1 and each.control[3] > 1.0  # the nose goes up, and the vehicle does not fall
+    slow = 0.0
+    while plans.loop._step_time > 4.0:
+        decide(plans, 14, pillar(9.0))
+    assert decide(plans, 14, pillar(9.0)).status in ("converged", "stop_rule")
+
+
+def test_portions_that_cannot_be_are_refused() -> None:
+    with pytest.raises(fg.GraphError, match="portion=0"):
+        keeper(portion=0)
