@@ -141,6 +141,25 @@ def test_a_folded_loop_is_refused_and_unfolded(name: str, count: int, turns: int
     assert np.array_equal(found.poses[0], folded.poses[0])  # the anchor stays
 
 
+@pytest.mark.parametrize("weight", [1e-6, 1.0])
+@pytest.mark.parametrize("made", [manhattan(120, 1, 0.1), sphere(6, 8, 1, 0.1)], ids=["plane", "space"])
+def test_a_descent_from_anywhere_ends_where_the_dual_proves_it(made: Simulated, weight: float) -> None:
+    """Wrong closures, and frames drawn at random: over enough dimensions the minimum is the lowest there is."""
+    edges = made.pose_graph.edges
+    problem = Relaxation.of(replace(made.pose_graph, edges=replace(edges, information=weight * edges.information)))
+    above, rank = problem.dim + 1, problem.dim + 5
+    start = np.random.default_rng(0).standard_normal((problem.count, above, rank))
+    start[:, 1:] = np.swapaxes(np.linalg.qr(np.swapaxes(start[:, 1:], 1, 2))[0], 1, 2)
+    judge = _Judge(problem, 1e-6)
+    found = problem.descend(start, 1e-12)
+    frames = found[:, 1:] @ np.swapaxes(found[:, 1:], 1, 2)
+    assert np.abs(frames - np.eye(problem.dim)).max() < 1e-12
+    assert judge(found).proven and problem.cost(found) < 0.1 * problem.cost(start)
+    rough = problem.cost(problem.descend(start, 1e-3))
+    assert problem.cost(found) * (1.0 + 1e-6) < rough < 1.01 * problem.cost(found)  # ends where it was asked to
+    assert np.array_equal(problem.descend(found, 1e-9), found)
+
+
 @pytest.mark.parametrize("weight", [1e-6, 1e6])
 @pytest.mark.parametrize("at", [0.0, 1e6])
 def test_units_and_offsets_decide_nothing(weight: float, at: float) -> None:
