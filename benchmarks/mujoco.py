@@ -39,15 +39,21 @@ def episode(robot: str, world: str, seed: int) -> Row:
     """Fly or drive once."""
     if robot in SPEEDS:
         flown = flight.run_flight(flight.FlightSettings(seed=seed, speed=SPEEDS[robot], world=world))
-        m, true, believed, plans = flight_metrics(flown), flown.truth[:, :3], flown.believed[:, :3], flown.plans
-        dt, tick, outcome = flown.dt, flown.estimate_ms + flown.plan_ms, flown.outcome
+        dt, plans, outcome = flown.dt, flown.plans, flown.outcome
+        m = flight_metrics(flown)
+        true = flown.truth[:, :3]
+        believed = flown.believed[:, :3]
+        tick = flown.estimate_ms + flown.plan_ms
     else:
         start, goal = drawn(seed, LENGTHS)
         log = navigation.run_navigation(
             navigation.NavigationSettings(start=start, goals=(goal,), obstacles=3, seed=seed, world=world)
         )
-        m, true, believed, plans = episode_metrics(log), log.true_pose[:, :2], log.estimate[:, :2], log.horizon
-        dt, tick, outcome = log.dt, log.tick_ms, log.outcomes[0]
+        dt, plans, outcome = log.dt, log.horizon, log.outcomes[0]
+        m = episode_metrics(log)
+        true = log.true_pose[:, :2]
+        believed = log.estimate[:, :2]
+        tick = log.tick_ms
     return {
         "outcome": outcome, "contacts": m["collisions"], "duration_s": m["duration_s"], "causes": m["causes"],
         "emergency": m["emergency_ticks"], "clearance_m": m["min_clearance_m"],
@@ -83,7 +89,9 @@ def cells(seeds: Sequence[int]) -> list[Cell]:
 
 def render(rows: list[Row]) -> str:
     """The table, paired differences, and what was not reached."""
-    lines, apart, failed = [], [], []
+    lines = []
+    apart = []
+    failed = []
     for robot, worlds in WORLDS.items():
         own = where(rows, robot=robot, world=worlds[0])
         for world in worlds:
@@ -96,11 +104,12 @@ def render(rows: list[Row]) -> str:
                 *(_spread([row[name] for row in mine]) for name in MEASURES),
             ))  # fmt: skip
             names = Counter(cause for row in mine for cause in row["causes"])
-            failed += [
-                f"- {robot}, {world}, seed {row['seed']}: {row['outcome']}, {row['contacts']} contacts"
-                for row in mine
-                if row["outcome"] != "reached" or row["contacts"]
-            ] + [f"- {robot}, {world}: *{cause}* in {count} of {len(mine)}" for cause, count in names.most_common()]
+            run = f"- {robot}, {world}"
+            for row in mine:
+                if row["outcome"] != "reached" or row["contacts"]:
+                    failed.append(f"{run}, seed {row['seed']}: {row['outcome']}, {row['contacts']} contacts")
+            for cause, count in names.most_common():
+                failed.append(f"{run}: *{cause}* in {count} of {len(mine)}")
         other = where(rows, robot=robot, world=worlds[1])
         for name, words in MEASURES.items():
             there, here = paired(other, own, itemgetter(name))

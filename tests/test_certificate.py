@@ -15,6 +15,7 @@ from unifg.errors import BackendError, GraphError
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import Edges, PoseGraph, Simulated, best_guess, certify, chordal, judge, manhattan, sphere
 from unifg.pose_graphs.certificate import _Judge, _measured_in
+from unifg.pose_graphs.descent import Descent
 from unifg.pose_graphs.information import bounded_below
 from unifg.pose_graphs.relaxation import Relaxation
 from unifg.solvers import DogLeg, GaussNewton, LevenbergMarquardt, names
@@ -150,14 +151,14 @@ def test_a_descent_from_anywhere_ends_where_the_dual_proves_it(made: Simulated, 
     above, rank = problem.dim + 1, problem.dim + 5
     start = np.random.default_rng(0).standard_normal((problem.count, above, rank))
     start[:, 1:] = np.swapaxes(np.linalg.qr(np.swapaxes(start[:, 1:], 1, 2))[0], 1, 2)
-    judge = _Judge(problem, 1e-6)
-    found = problem.descend(start, 1e-12)
+    judge, descend = _Judge(problem, 1e-6), Descent(problem)
+    found = descend(start, 1e-12)
     frames = found[:, 1:] @ np.swapaxes(found[:, 1:], 1, 2)
     assert np.abs(frames - np.eye(problem.dim)).max() < 1e-12
     assert judge(found).proven and problem.cost(found) < 0.1 * problem.cost(start)
-    rough = problem.cost(problem.descend(start, 1e-3))
+    rough = problem.cost(descend(start, 1e-3))
     assert problem.cost(found) * (1.0 + 1e-6) < rough < 1.01 * problem.cost(found)  # ends where it was asked to
-    assert np.array_equal(problem.descend(found, 1e-9), found)
+    assert np.array_equal(descend(found, 1e-9), found)
 
 
 @pytest.mark.parametrize("weight", [1e-6, 1e6])
@@ -296,7 +297,7 @@ def test_the_dual_holds_at_any_point(name: str) -> None:
     """Away from a stationary point, the sum of the multipliers' traces is less than the cost there, and counts."""
     right = solved(ring(20, 1, GROUPS[name]))
     problem = Relaxation.of(right)
-    point = problem.minimize(problem.lift(right))
+    point = Descent(problem).minimize(problem.lift(right))
     least, judge, rng = problem.cost(point), _Judge(problem, 1e-6), np.random.default_rng(0)
     for size in (0.1, 1.0):
         for _ in range(5):

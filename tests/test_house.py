@@ -285,10 +285,10 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 32_439, "scenarios": 13_064, "benchmarks": 4_575, "tests": 37_690,
+    "unifg solvers models": 32_436, "scenarios": 13_064, "benchmarks": 4_588, "tests": 37_704,
     "docs examples": 1_978, "unifg/factors": 4_305, "unifg/problem": 3_407, "models": 2_236,
     "unifg/elimination": 2_141, "solvers": 5_083, "unifg/solution": 3_102, "unifg/smoothing": 1_834,
-    "unifg/lie": 1_403, "unifg/view": 1_522, "unifg/files": 1_216, "unifg/pose_graphs": 1_434,
+    "unifg/lie": 1_403, "unifg/view": 1_522, "unifg/files": 1_216, "unifg/pose_graphs": 1_431,
     "unifg/horizon": 1_399, "unifg/modeling": 1_150, "unifg/codegen": 1_320, "unifg/plots": 415,
     "scenarios/scenes": 1_384, "scenarios/simulation": 1_407, "scenarios/campaigns": 921,
     "scenarios/quadrotor": 1_770, "scenarios/ground": 1_771, "scenarios/commands": 693,

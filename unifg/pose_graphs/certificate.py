@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.pose_graphs.descent import Descent
 from unifg.pose_graphs.linear import BlockQuadratic, polar
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.pose_graphs.relaxation import Relaxation
@@ -114,7 +115,7 @@ def require_one_for_each(pose_graph: PoseGraph, used: BoolArray | None) -> BoolA
 def _bound(judge: _Judge, start: Array, staircase: bool) -> tuple[Array, _Verdict, int, float]:
     """Stationary point near a start, what is known there, the rank reached, and what no poses cost less than."""
     problem = judge.problem
-    point = problem.minimize(start)
+    point = judge.descent.minimize(start)
     verdict = judge(point)
     rank, dual = problem.dim, verdict.dual
     if staircase and not verdict.proven:
@@ -180,7 +181,7 @@ class _Judge:
     """The dual matrix of one relaxation: its pattern is analysed once."""
 
     def __init__(self, problem: Relaxation, tolerance: float) -> None:
-        self.problem, self.relative = problem, tolerance
+        self.problem, self.relative, self.descent = problem, tolerance, Descent(problem)
         self.quadratic = BlockQuadratic(
             problem.first, problem.second, problem.count, problem.dim + 1, np.zeros(0, dtype=np.intp)
         )
@@ -249,9 +250,9 @@ def _climb(judge: _Judge, point: Array, verdict: _Verdict) -> tuple[Array, int, 
     problem, lifted = judge.problem, point
     for added in RANKS:
         if not verdict.proven:
-            lifted = problem.descend(_leave(problem, lifted, verdict.ways[:, :, :added]), CLIMBED)
+            lifted = judge.descent(_leave(problem, lifted, verdict.ways[:, :, :added]), CLIMBED)
             verdict = judge(lifted)
-    returned = problem.minimize(_rounded(problem, lifted, point))
+    returned = judge.descent.minimize(_rounded(problem, lifted, point))
     return (
         (returned if problem.cost(returned) < problem.cost(point) else point),
         lifted.shape[2],

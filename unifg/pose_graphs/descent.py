@@ -8,22 +8,22 @@ is factorised once and is the same for all dimensions (D. Rosen, L. Carlone, A. 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.pose_graphs.linear import BlockQuadratic, polar
+from unifg.pose_graphs.linear import BlockQuadratic, block_gradient, polar
+from unifg.pose_graphs.relaxation import Relaxation
 from unifg.typing import Array, IntArray
-
-if TYPE_CHECKING:
-    from unifg.pose_graphs.relaxation import Relaxation
 
 __all__ = ["Descent"]
 
 STEPS, INNER = 200, 200  # of a descent, and products for each
 REGULAR = 1e-6  # of the largest weight, added to the quadratic, which sees no common turn
 SHARE = 0.01  # of the squared slope that a step may leave
+ROUNDS = 100
+STILL = 1e-12  # of the cost, what a step must promise
+FAR = 1e-3  # of the cost, half the squared slope: from there Newton's method is quicker
+FRAME = 1e-9  # a bend of the quadratic below this share of its diagonal is damped
 KEPT, POOR, GOOD = 0.05, 0.25, 0.75  # measured by predicted decrease: taken, shorter radius, longer radius
 
 
@@ -77,6 +77,58 @@ class Descent:
                 break
         return point
 
+    def minimize(self, point: Array) -> Array:
+        """A local minimum of rank d near a point, by Newton's method on positions and frames; anchors stay.
+
+        The second derivative along the manifold is the quadratic less the multipliers; where it is not positive, it is
+        damped. Far from a minimum a descent goes before.
+        """
+        problem, dim = self.problem, self.problem.dim
+        spins = [(i, k) for i in range(dim) for k in range(i)]
+        size = dim + len(spins)
+        system = BlockQuadratic(problem.first, problem.second, problem.count, size, problem.anchors)
+        scale = float(np.max(np.abs(problem.by_second), initial=0.0) ** 2)
+        if not len(system.free) or not len(problem.first):
+            return point
+        point = problem.anchored(self(point, FAR), point)
+        cost, damping = problem.cost(point), 0.0
+        for _ in range(ROUNDS):
+            basis = _tangents(point, spins)
+            flat = basis.reshape(problem.count, dim + 1, dim * size)
+            shape = (len(problem.first), (dim + 1) * dim, size)
+            J_first = (problem.by_first @ flat[problem.first]).reshape(shape)
+            J_second = (problem.by_second @ flat[problem.second]).reshape(shape)
+            error = problem.errors(point).reshape(len(problem.first), -1, 1)
+            gradient = block_gradient(problem.first, problem.second, J_first, J_second, error, problem.count)[
+                system.free
+            ]
+            frames = basis[:, 1:]
+            bend = np.einsum("narq,nab,nbrs->nqs", frames, problem.multipliers(point), frames)
+            entries = system.entries(J_first, J_second, -bend)
+            step = None
+            while step is None:
+                added = np.full(len(system.free) * size, damping)
+                if system.factorization.factor(entries, added) and system.factorization.definite:
+                    step = -system.solve(gradient)
+                elif not damping < 1e3 * scale:  # so, too, where no edge has a weight
+                    return point
+                else:
+                    damping = max(10.0 * damping, FRAME * scale)
+            promised = -float(np.sum(gradient * step))
+            whole = np.zeros((problem.count, size))
+            whole[system.free] = step[:, :, 0]
+            trial = _retract(point, basis, whole)
+            lower = problem.cost(trial)
+            if promised <= STILL * cost:
+                # Here rounding decides which cost is lower. The multipliers are as exact as the slope, though, which a
+                # last step by Newton's method squares, so that it is taken unless it is no such step any more.
+                return trial if lower <= cost * (1.0 + 1e3 * STILL) else point
+            if lower <= cost:
+                point, cost, damping = trial, lower, (0.1 * damping if damping > FRAME * scale else 0.0)
+            else:
+                damping = max(10.0 * damping, FRAME * scale)
+        return point
+
     def _step(
         self, point: Array, multipliers: Array, slope: Array, toward: Array, radius: float
     ) -> tuple[Array, float, bool]:
@@ -118,6 +170,24 @@ class Descent:
         out = np.array(solved, order="C").reshape(slope.shape)
         _project(point, out)
         return out
+
+
+def _tangents(point: Array, spins: list[tuple[int, int]]) -> Array:
+    """(n, d + 1, d, q) directions of positions and frames: d shifts, turns of the frame."""
+    count, above, dim = point.shape
+    basis = np.zeros((count, above, dim, dim + len(spins)))
+    for k in range(dim):
+        basis[:, 0, k, k] = 1.0
+    for at, (i, k) in enumerate(spins, dim):
+        basis[:, 1 + i, :, at], basis[:, 1 + k, :, at] = point[:, 1 + k], -point[:, 1 + i]
+    return basis
+
+
+def _retract(point: Array, basis: Array, step: Array) -> Array:
+    """The nearest frames to a point moved by steps (n, q)."""
+    moved: Array = point + np.einsum("narq,nq->nar", basis, step)
+    moved[:, 1:] = polar(moved[:, 1:])
+    return moved
 
 
 @compiled

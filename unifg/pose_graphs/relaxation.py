@@ -13,24 +13,18 @@ L. Carlone, A. Bandeira, J. Leonard, "SE-Sync", IJRR 38(2-3), 2019, problem 1; i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.pose_graphs.descent import Descent
 from unifg.pose_graphs.information import bounded_below, indefinite
-from unifg.pose_graphs.linear import BlockQuadratic, block_gradient, polar, with_rotations
+from unifg.pose_graphs.linear import block_gradient, with_rotations
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["Relaxation", "admit"]
 
 ISOTROPIC = 1e-6  # of the largest eigenvalue: information matrices are written with six digits
-ROUNDS = 100
-STILL = 1e-12  # of the cost, what a step must promise
-FAR = 1e-3  # of the cost, half the squared slope: from there Newton's method is quicker
-FRAME = 1e-9  # a bend of the quadratic below this share of its diagonal is damped
 
 
 def admit(pose_graph: PoseGraph) -> None:
@@ -172,61 +166,6 @@ class Relaxation:
         back[:, 0] += like[self.anchors, 0][self.parts]
         return back
 
-    @cached_property
-    def descend(self) -> Descent:
-        """From far away, over frames of any dimension."""
-        return Descent(self)
-
-    def minimize(self, point: Array) -> Array:
-        """A local minimum of rank d near a point, by Newton's method on positions and frames; anchors stay.
-
-        The second derivative along the manifold is the quadratic less the multipliers; where it is not positive, it is
-        damped. Far from a minimum a descent goes before.
-        """
-        dim = self.dim
-        spins = [(i, k) for i in range(dim) for k in range(i)]
-        size = dim + len(spins)
-        system = BlockQuadratic(self.first, self.second, self.count, size, self.anchors)
-        scale = float(np.max(np.abs(self.by_second), initial=0.0) ** 2)
-        if not len(system.free) or not len(self.first):
-            return point
-        point = self.anchored(self.descend(point, FAR), point)
-        cost, damping = self.cost(point), 0.0
-        for _ in range(ROUNDS):
-            basis = _tangents(point, spins)
-            flat = basis.reshape(self.count, dim + 1, dim * size)
-            shape = (len(self.first), (dim + 1) * dim, size)
-            J_first = (self.by_first @ flat[self.first]).reshape(shape)
-            J_second = (self.by_second @ flat[self.second]).reshape(shape)
-            error = self.errors(point).reshape(len(self.first), -1, 1)
-            gradient = block_gradient(self.first, self.second, J_first, J_second, error, self.count)[system.free]
-            frames = basis[:, 1:]
-            bend = np.einsum("narq,nab,nbrs->nqs", frames, self.multipliers(point), frames)
-            entries = system.entries(J_first, J_second, -bend)
-            step = None
-            while step is None:
-                added = np.full(len(system.free) * size, damping)
-                if system.factorization.factor(entries, added) and system.factorization.definite:
-                    step = -system.solve(gradient)
-                elif not damping < 1e3 * scale:  # so, too, where no edge has a weight
-                    return point
-                else:
-                    damping = max(10.0 * damping, FRAME * scale)
-            promised = -float(np.sum(gradient * step))
-            whole = np.zeros((self.count, size))
-            whole[system.free] = step[:, :, 0]
-            trial = _retract(point, basis, whole)
-            lower = self.cost(trial)
-            if promised <= STILL * cost:
-                # Here rounding decides which cost is lower. The multipliers are as exact as the slope, though, which a
-                # last step by Newton's method squares, so that it is taken unless it is no such step any more.
-                return trial if lower <= cost * (1.0 + 1e3 * STILL) else point
-            if lower <= cost:
-                point, cost, damping = trial, lower, (0.1 * damping if damping > FRAME * scale else 0.0)
-            else:
-                damping = max(10.0 * damping, FRAME * scale)
-        return point
-
 
 def _lost(information: Array, dim: int, tau: Array) -> list[str]:
     """Sentences: directions of translation information, and couplings, that the form does not hold."""
@@ -254,21 +193,3 @@ def _greatest(blocks: Array) -> Array:
 def _close(found: Array, wanted: Array | float, size: Array | None = None) -> BoolArray:
     """(m,) whether blocks are as wanted, measured by their own size or by another (m,)."""
     return _greatest(found - wanted) <= ISOTROPIC * (_greatest(found) if size is None else size)
-
-
-def _tangents(point: Array, spins: list[tuple[int, int]]) -> Array:
-    """(n, d + 1, d, q) directions of positions and frames: d shifts, turns of the frame."""
-    count, above, dim = point.shape
-    basis = np.zeros((count, above, dim, dim + len(spins)))
-    for k in range(dim):
-        basis[:, 0, k, k] = 1.0
-    for at, (i, k) in enumerate(spins, dim):
-        basis[:, 1 + i, :, at], basis[:, 1 + k, :, at] = point[:, 1 + k], -point[:, 1 + i]
-    return basis
-
-
-def _retract(point: Array, basis: Array, step: Array) -> Array:
-    """The nearest frames to a point moved by steps (n, q)."""
-    moved: Array = point + np.einsum("narq,nq->nar", basis, step)
-    moved[:, 1:] = polar(moved[:, 1:])
-    return moved
