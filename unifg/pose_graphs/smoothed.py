@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from unifg.errors import GraphError
@@ -11,16 +13,19 @@ from unifg.pose_graphs.pose_graph import SEEN, Edges, PoseGraph, Priors, Sightin
 from unifg.smoothing.contents import Held, contents
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.incremental import Incremental
+from unifg.solvers import GaussNewton
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["from_smoother"]
+
+FEW = 10  # Gauss-Newton iterations
 
 
 def from_smoother(smoother: Incremental) -> tuple[PoseGraph, BoolArray]:
     """Pose graph of what a smoother holds, and which of its edges count.
 
-    ``graph.verdict(used=used)`` judges the map. Poses and landmarks are `estimate(..., best=True)`, their identifiers
-    are members, edges are in the order in which they were stated. Edges that revocable decisions leave out do not
+    ``graph.verdict(used=used)`` judges the map. Poses and landmarks are those of least squares, to which one or two
+    Gauss-Newton steps lead from the estimates. Identifiers are members, edges are in the order in which they were stated. Edges that revocable decisions leave out do not
     count; sightings and priors that they leave out are not in the graph. A prior that is the only one says nothing but
     where the map lies: the graph has a known pose in its place.
 
@@ -83,7 +88,11 @@ def from_smoother(smoother: Incremental) -> tuple[PoseGraph, BoolArray]:
         np.arange(x.count), smoother.estimate(x, best=True), edges, np.arange(len(landmarks)), landmarks, sightings,
         fixed, priors=priors,
     )  # fmt: skip
-    return graph, used
+    counting = replace(graph, edges=edges[used])
+    stated, poses, guess = counting.graph()
+    solution = GaussNewton(max_iterations=FEW).solve(stated, guess)
+    solved = graph.with_poses(solution[poses], None if places is None else solution[stated.families["landmarks"]])
+    return solved if 2.0 * solution.cost < counting.chi2() else graph, used
 
 
 def _family(smoother: Incremental, what: str, manifolds: tuple[object, ...]) -> GrowingFamily | None:
