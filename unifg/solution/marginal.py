@@ -320,7 +320,7 @@ def _schur(gone: Array, rest: Array, r: Array) -> tuple[Array, Array, Array] | N
 
 
 def _schur_of_tree(removal: Removal, jacobian: Array, r: Array) -> tuple[Array, Array, Array] | None:
-    """Eliminate as :func:`_schur` does, by an elimination tree: G' H^-1 G takes the paths of the rows of G to the root."""
+    """Eliminate as :func:`_schur` does, by the elimination tree of what leaves."""
     import scipy.sparse as sp
 
     costs, k = removal.costs, removal.gone
