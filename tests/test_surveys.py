@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from problems.closures import drive as hills
 from problems.closures import slipped
 from unifg.files.g2o import write_g2o
-from unifg.lie import SE2
+from unifg.lie import SE2, SE3
 from unifg.pose_graphs import PoseGraph, Sightings, manhattan
 from unifg.pose_graphs.surveys import surveys
 from unifg.scenarios import command
@@ -122,3 +123,23 @@ def test_solving_a_file_names_the_survey(tmp_path: Path) -> None:
     (first, *_) = json.loads((out / "metrics.json").read_text())["verdict"]["clusters"]
     assert first["kind"] == "survey" and first["edges"] == [] and first["sightings"][0] == "point"
     assert first["stretches"][0] == [60, 79] and (out / "graph.png").stat().st_size > 10_000
+
+
+def test_a_survey_in_space() -> None:
+    """Points over hills, and a stretch that sees them all elsewhere."""
+    rng, made = np.random.default_rng(2), hills(250, 2, spatial=True)
+    truth, odometry = made.truth, made.pose_graph.edges.odometry
+    marks = truth[rng.integers(0, 250, 60), :3] + rng.uniform(-4.0, 4.0, (60, 3))
+    pose, mark = np.nonzero(np.linalg.norm(truth[:, None, :3] - marks, axis=2) < 12.0)
+    wrong = (pose >= 90) & (pose < 120)
+    across = SE3.exp(np.array([0.8, -0.5, 0.3, 0.02, -0.03, 0.1]))
+    there = SE3.compose(SE3.compose(truth[105], across), SE3.inverse(truth[105]))
+    z = SE3.act(SE3.inverse(truth[pose]), np.where(wrong[:, None], SE3.act(there, marks[mark]), marks[mark]))
+    sightings = Sightings(pose, mark, z + rng.normal(0.0, 0.1, z.shape), np.tile(100.0 * np.eye(3), (len(z), 1, 1)))
+    graph = replace(
+        made.pose_graph, poses=truth, edges=made.pose_graph.edges[odometry], landmark_ids=np.arange(60),
+        landmarks=marks, sightings={"point": sightings},
+    )  # fmt: skip
+    (one,) = solved(graph).verdict(effort="cheap").of("survey")
+    assert one.stretches[0].tolist() == [90, 119] and one.sightings is not None
+    assert wrong[one.sightings[1]].all()

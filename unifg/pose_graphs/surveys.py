@@ -36,6 +36,8 @@ def surveys(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log")
         residual: as for `PoseGraph.graph`.
     """
     found: list[Cluster] = []
+    if not pose_graph.sightings:
+        return found, pose_graph
     dim, every = pose_graph.group.dim, np.ones(len(pose_graph.edges), dtype=np.bool_)
     count = len(pose_graph.poses) ** 2 // 2  # of stretches, from which the worst are chosen
     places = {kind: np.arange(len(seen)) for kind, seen in pose_graph.sightings.items()}
