@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.errors import GraphError
 from unifg.lie import Manifold
+from unifg.pose_graphs import manhattan
+from unifg.solution import marginal
 from unifg.solvers import SQP, GaussNewton
 from unifg.typing import Array, BoolArray
 
@@ -207,3 +210,31 @@ def test_a_marginal_prior_with_an_offset_is_the_same_model(rng: np.random.Genera
 def test_a_joint_prior_needs_a_manifold() -> None:
     with pytest.raises(fg.GraphError, match="at least one variable"):
         fg.joint_prior()
+
+
+@pytest.mark.parametrize("offset", [False, True])
+def test_many_are_eliminated_by_the_tree_as_by_dense_matrices(monkeypatch: pytest.MonkeyPatch, offset: bool) -> None:
+    """Poses of a city around eight that stay, of which one is fixed; a part that nothing determines is refused."""
+    made = manhattan(200, seed=2).pose_graph
+    graph, edges = fg.Graph(), made.edges
+    x = graph.variables("x", fg.SE2, 200)
+    graph.minimize(fg.between, x[edges.first], x[edges.second], edges.measured, information=edges.information)
+    graph.fix(x[70], made.poses[70])
+    solution = GaussNewton(max_iterations=1).solve(graph, {x: made.poses})
+    kept = [0, 1, 30, 70, 71, 120, 150, 199]
+    inner = x[np.setdiff1d(np.arange(200), kept)]
+    found = []
+    for many in (10**9, 0):
+        monkeypatch.setattr(marginal, "MANY", many)
+        found.append(solution.marginal_prior(["between"], inner, [x[k] for k in kept], offset=offset))
+    (reference, information), (other, same) = found
+    assert np.abs(other - reference).max() < 1e-9
+    assert np.abs(same - information).max() < 1e-10 * np.abs(information).max()
+    assert not same[9:12].any() and np.linalg.eigvalsh(same)[3] > 1.0  # that of the fixed one, and no other
+    loose = fg.Graph()
+    y = loose.variables("y", fg.SE2, 200)
+    loose.minimize(fg.between, y[:-2], y[1:-1], [1.0, 0.0, 0.0], sigma=0.1)
+    loose.minimize(fg.prior, y[-1], np.zeros(3), sigma=0.1)
+    unsolved = GaussNewton(max_iterations=0).solve(loose, {y: np.zeros((200, 3))})
+    with pytest.raises(GraphError, match=r"y\[0\] cannot be eliminated: the terms between do not determine it"):
+        unsolved.marginal_prior(["between"], y[:-1], y[-1])

@@ -12,7 +12,7 @@ from problems.closures import adrift, aliased, drive, slipped
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import PoseGraph, best_guess, manhattan, sphere
-from unifg.pose_graphs.clusters import _clusters, _Map, optimum
+from unifg.pose_graphs.clusters import Map, _clusters, optimum
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import IntArray
 
@@ -31,7 +31,7 @@ def found(fault: IntArray, kind: str, pose_graph: PoseGraph) -> bool:
 def test_statistics_of_a_cluster_are_those_of_dense_matrices() -> None:
     """Fall, leverage and movement, against the linear problem in which the later stretch may be displaced."""
     made = solved(manhattan(120, 3).pose_graph)
-    now = _Map(made, np.ones(len(made.edges), dtype=bool), "log")
+    now = Map(made, np.ones(len(made.edges), dtype=bool), "log")
     edges, group = made.edges, made.group
     group_of = max(_clusters(edges, ~edges.odometry), key=len)
     assert len(group_of) > 2

@@ -178,6 +178,7 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
             {
                 "kind": one.kind,
                 "edges": one.edges.tolist(),
+                "sightings": None if one.sightings is None else [one.sightings[0], one.sightings[1].tolist()],
                 "stretches": one.stretches.tolist(),
                 "leverage": one.leverage,
                 "squared": one.squared,

@@ -66,9 +66,14 @@ def plot_graph(graph: PoseGraph, outliers: BoolArray, name: str, ax: Axes, verdi
     draw_points(scene, graph)
     ax = scene.draw(ax)
     for number, cluster in enumerate(verdict.clusters[:NAMED] if verdict else (), start=1):
-        chosen = np.zeros(len(graph.edges), dtype=bool)
-        chosen[cluster.edges[len(cluster.edges) // 2]] = True
-        place: Any = segments(graph, chosen)[0].mean(axis=0)
+        if cluster.sightings is not None:
+            kind, which = cluster.sightings
+            pose = graph.sightings[kind].pose[which[len(which) // 2]]
+            place: Any = graph.poses[pose, : graph.group.point_dim]
+        else:
+            chosen = np.zeros(len(graph.edges), dtype=bool)
+            chosen[cluster.edges[len(cluster.edges) // 2]] = True
+            place = segments(graph, chosen)[0].mean(axis=0)
         label: Any = ax.text  # on axes in space it takes three numbers
         label(*place, f"{number}", fontweight="bold", color=INK, bbox={"facecolor": "white", "pad": 1.5, "lw": 0.5})
     return ax

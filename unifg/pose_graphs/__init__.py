@@ -9,6 +9,7 @@ from unifg.pose_graphs.initialise import Start, best_guess, chordal, lago, odome
 from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Priors, Sightings
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
+from unifg.pose_graphs.smoothed import from_smoother
 from unifg.pose_graphs.verdict import Certificate, Cluster, Judgement, Verdict
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "chart_between",
     "chordal",
     "distance",
+    "from_smoother",
     "indefinite",
     "judge",
     "lago",

@@ -29,12 +29,13 @@ from unifg.pose_graphs.pose_graph import Edges, PoseGraph, ResidualName
 from unifg.pose_graphs.verdict import Kind
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
+from unifg.problem.term import CompiledTerm
 from unifg.solution.conditioning import HARDLY
 from unifg.solvers.gating import NEAR, UNCHECKED, Innovations, VarianceFactor, neighbours
 from unifg.solvers.least_squares import MAP, GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["Search", "Suspect", "optimum", "search"]
+__all__ = ["Map", "Search", "Suspect", "optimum", "search"]
 
 CHANCE = 1e-3  # that anything is contradicted in a graph without wrong measurements
 SPARE = 4.0  # variance that right measurements may have beside that of the others
@@ -104,7 +105,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     edges, dim = pose_graph.edges, pose_graph.group.dim
     active, leverage = np.ones(len(edges), dtype=np.bool_), np.zeros(len(edges))
     closures = ~edges.odometry & (edges.first != edges.second)
-    now = _Map(pose_graph, active, residual)
+    now = Map(pose_graph, active, residual)
     solved, weak, maps = now.graph, now.weak(), {active.tobytes(): (now.graph, now.chi2)}
     ended, clusters = True, list[Suspect]()
     taken: list[list[Suspect]] = []
@@ -116,7 +117,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         worst = max([0.0, *(one.fall for one in clusters), *(alone[one.edges].max() for one in clusters)])
         steps = np.where(edges.odometry, alone, 0.0)
         slip, left = float(steps.max(initial=0.0)), freedom - dim * len(taken)
-        limit = _limit(now.chi2 - max(worst, slip), left - dim, dim, len(edges))
+        limit = limit_of(now.chi2 - max(worst, slip), left - dim, dim, len(edges))
         ended = not max(worst, slip) > limit
         if ended or len(taken) == ROUNDS:
             break
@@ -134,7 +135,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
             found = sorted([*clusters, *single], key=lambda one: -one.fall)
             taken.append([replace(one, before=before) for one in found if one.fall >= AS_MUCH * worst])
         active[taken[-1][0].edges] = False
-        rest = _Map(now.graph, active, residual)
+        rest = Map(now.graph, active, residual)
         if not rest.innovations.determined:  # nothing is left to compare with
             ended, active[taken.pop()[0].edges] = False, True
             break
@@ -144,7 +145,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     slipped: list[Suspect] = []
     if taken:
         # What agrees with the map of the rest, whose noise may be larger than stated, was not at fault.
-        over = max(1.0, now.chi2 / _quantile(left, 1.0 - CHANCE)) if left > 0 else 1.0
+        over = over_stated(now.chi2, left)
         out = ~active
         for group in [*np.flatnonzero(out & edges.odometry)[:, None], *_clusters(edges, closures & out)]:
             innovation = float(now.statistics([group])[1][0])
@@ -157,7 +158,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
                 contradicted.append(replace(first, edges=group, alike=group, fall=innovation))
                 contradicted += [one for one in others if not out[one.edges].any() and one.fall > limit]
         if (active & out).any():
-            now = _Map(now.graph, active, residual)
+            now = Map(now.graph, active, residual)
             maps[active.tobytes()] = now.graph, now.chi2
     named = np.concatenate([np.zeros(0, dtype=np.intp), *(one.edges for one in contradicted)])
     if taken and now.innovations.determined:
@@ -177,7 +178,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
 
 def optimum(pose_graph: PoseGraph, active: BoolArray, residual: ResidualName = "log") -> tuple[PoseGraph, float]:
     """Minimum of plain squares of some edges (m,) near the poses of a graph, to within 1e-5 of chi2, and chi2 there."""
-    solved = _Map(pose_graph, active, residual)
+    solved = Map(pose_graph, active, residual)
     return solved.graph, solved.chi2
 
 
@@ -188,10 +189,15 @@ def _quantile(freedom: float, share: float) -> float:
     return float(chdtri(freedom, share))
 
 
-def _limit(squared: float, freedom: int, size: int, count: int) -> float:
+def limit_of(squared: float, freedom: int, size: int, count: int) -> float:
     """Fall of the sum of squares that right measurements of ``size`` numbers stay below, one of ``count``."""
     noise = SPARE * VarianceFactor(squared, freedom).unit
     return min(1.0, max(CALM, noise)) * _quantile(size, CHANCE / max(count, 1))
+
+
+def over_stated(squared: float, freedom: int) -> float:
+    """Least factor by which noise is larger than stated, one where it may be as stated."""
+    return max(1.0, squared / _quantile(freedom, 1.0 - CHANCE)) if freedom > 0 else 1.0
 
 
 def _clusters(edges: Edges, chosen: BoolArray) -> list[IntArray]:
@@ -201,7 +207,7 @@ def _clusters(edges: Edges, chosen: BoolArray) -> list[IntArray]:
     return [which[group] for group in neighbours(ends, NEAR)]
 
 
-class _Map:
+class Map:
     """The optimum of some edges, and what it says of any.
 
     Attributes:
@@ -289,6 +295,33 @@ class _Map:
         hinge = np.repeat(late[starts + sizes // 2], sizes)
         across = group.adjoint(group.between(self.graph.poses[late], self.graph.poses[hinge]))
         shift = np.where(turned[:, None, None], rows[1][:, :, :dim], rows[1][:, :, dim:]) @ across
+        return self._tested(rows, shift, starts)
+
+    def surveys(self, kind: str, groups: list[IntArray]) -> tuple[Array, Array, Array, Array]:
+        """The same of groups of sightings that count, which see all landmarks displaced by one rigid motion."""
+        seen, group, dim = self.graph.sightings[kind], self.graph.group, self.graph.group.dim
+        chosen, sizes = np.concatenate(groups), np.array([len(one) for one in groups])
+        starts = np.cumsum(sizes) - sizes
+        rows = self.innovations.rows(self.term(kind), self._counting[1], chosen)
+        hinge = np.repeat(seen.pose[chosen][starts + sizes // 2], sizes)
+        poses = self.graph.poses
+        across = group.adjoint(group.between(poses[seen.pose[chosen]], poses[hinge]))
+        return self._tested(rows, rows[1][:, :, :dim] @ across, starts)
+
+    def single(self, kind: str, chosen: IntArray) -> Array:
+        """(k,) fall of the sum of squares without each of some sightings alone."""
+        term = self.term(kind)
+        mask = np.isin(np.arange(term.count), chosen)
+        return self.innovations.without(term, self._counting[1], mask, np.ones(len(chosen)))[0]
+
+    def term(self, name: str) -> CompiledTerm:
+        """A cost by its name."""
+        return next(term for term in self._program.cost_terms if term.name == name)
+
+    def _tested(
+        self, rows: tuple[Array, Array, IntArray], shift: Array, starts: IntArray
+    ) -> tuple[Array, Array, Array, Array]:
+        """Statistics of groups of measurements whose residuals an error in common moves by ``shift``."""
         own, held, pull = self.innovations.common(rows, shift, starts)
         lengths, axes = np.linalg.eigh(own)
         seen = lengths > UNCHECKED * lengths[:, -1:]

@@ -15,6 +15,7 @@ from unifg.pose_graphs.clusters import Search, optimum, search
 from unifg.pose_graphs.initialise import odometric, starts
 from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import JUDGES, PoseGraph, ResidualName
+from unifg.pose_graphs.surveys import surveys
 from unifg.pose_graphs.verdict import NAMED, Certificate, Cluster, Effort, Verdict
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -45,13 +46,16 @@ def _verdict(
         except GraphError as reason:
             uncertified = str(reason)
     with _timed(seconds, "clusters"):
-        found = search(judged, judgement.freedom, residual)
+        wrong, rest = surveys(judged, judgement.freedom, residual)
+        found = search(rest, judge(rest, residual).freedom if wrong else judgement.freedom, residual)
     with _timed(seconds, "solved again"):
-        clusters = _clusters(found, judged, residual)
+        clusters = [*wrong, *_clusters(found, rest, residual)]
     tried, basins, better = 0, 1, None
     if full:
         with _timed(seconds, "basins"):
-            tried, basins, better = _basins(judged, found.solved, certificate, residual)
+            whole = np.ones(len(judged.edges), dtype=np.bool_)
+            solved = optimum(judged, whole, residual)[0] if wrong else found.solved
+            tried, basins, better = _basins(judged, solved, certificate, residual)
     places, leverage = np.flatnonzero(counts), np.zeros(len(counts))
     leverage[places] = found.leverage
     return Verdict(

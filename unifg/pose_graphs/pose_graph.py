@@ -29,7 +29,7 @@ ResidualName: TypeAlias = Literal["log", "g2o"]
 RobustOn: TypeAlias = Literal["closures", "all"]
 
 _RELATIVE: dict[str, ManifoldResidual] = {"log": between, "g2o": chart_between}
-_SEEN: dict[str, ManifoldResidual | Residual] = {
+SEEN: dict[str, ManifoldResidual | Residual] = {
     "point": sighting,
     "bearing": bearing,
     "range": distance,
@@ -302,9 +302,9 @@ class PoseGraph:
             raise GraphError("the pose graph has no measurement: there is nothing to solve")
         terms = [_Term(name, relative, (), (part.first, part.second), (), part) for name, part in edges.items()]
         for kind, seen in self.sightings.items():
-            if kind not in _SEEN:
-                raise GraphError(f"sightings of kind {kind!r}: expected one of {', '.join(map(repr, _SEEN))}")
-            terms.append(_Term(kind, _SEEN[kind], (), (seen.pose,), (seen.landmark,), seen))
+            if kind not in SEEN:
+                raise GraphError(f"sightings of kind {kind!r}: expected one of {', '.join(map(repr, SEEN))}")
+            terms.append(_Term(kind, SEEN[kind], (), (seen.pose,), (seen.landmark,), seen))
         for kind, held in self.priors.items():
             name, rows = f"{kind} prior", (held.pose,)
             if kind == "pose":

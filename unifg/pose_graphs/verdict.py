@@ -12,7 +12,7 @@ from unifg.typing import Array, IntArray
 __all__ = ["Certificate", "Cluster", "Effort", "Judgement", "Kind", "Verdict"]
 
 Effort: TypeAlias = Literal["cheap", "full"]
-Kind: TypeAlias = Literal["contradicted", "slipped", "unsupported"]
+Kind: TypeAlias = Literal["survey", "contradicted", "slipped", "unsupported"]
 NAMED = 5  # clusters and edges
 
 
@@ -133,13 +133,15 @@ class Certificate:
 
 @dataclass(frozen=True, eq=False)
 class Cluster:
-    """Loop closures between the same two stretches, or steps of odometry, with an error in common.
+    """Loop closures between the same two stretches, steps of odometry, or sightings, with an error in common.
 
     Attributes:
         kind: "contradicted" by the rest; "unsupported", where nothing but themselves speaks for them; "slipped" for
-            steps of odometry of which one is contradicted.
-        edges: (k,) positions in the graph.
-        stretches: (2, 2) identifiers of the first and last pose of both stretches.
+            steps of odometry of which one is contradicted; "survey" for sightings of several landmarks from one
+            stretch, which the rest contradicts.
+        edges: (k,) positions in the graph; of a survey, there are none.
+        stretches: (2, 2) identifiers of the first and last pose of both stretches; of a survey, those of the first and
+            last pose and of the landmarks with the lowest and highest number.
         squared: fall of chi2 where their error is free, of contradicted ones their squared innovation.
         leverage: share of what the map knows of how the stretches lie that comes from them, 0 to 1.
         deviations: standard deviations by which the map moves where their error is free, in its own measure; infinite
@@ -147,6 +149,7 @@ class Cluster:
         moved: greatest distance [m] and turn [rad] by which poses move in the map that was solved again without them,
             and without what is contradicted more than they are; None where that was not done.
         chi2: of the others, with them and without; None likewise.
+        sightings: of a survey, their kind and (k,) positions; else None.
     """
 
     kind: Kind
@@ -157,6 +160,7 @@ class Cluster:
     deviations: float
     moved: tuple[float, float] | None = None
     chi2: tuple[float, float] | None = None
+    sightings: tuple[str, IntArray] | None = None
 
     def sentence(self) -> str:
         """The cluster, and what depends on it."""
@@ -164,6 +168,8 @@ class Cluster:
         one, other = (f"{low} to {high}" if low != high else f"{low}" for low, high in ((a, b), (c, d)))
         if self.kind == "slipped":
             text = f"a step of odometry between {a} and {d}"
+        elif self.sightings is not None:
+            text = f"the survey of landmarks {other} from {one} ({counted(len(self.sightings[1]), 'sighting')})"
         else:
             text = f"{counted(len(self.edges), 'closure')} of {one} with {other}"
         if self.moved is None or self.chi2 is None:
@@ -187,7 +193,8 @@ class Verdict:
         basins: different minima that these and the given map are.
         better: (n, storage) poses of a map with a lower chi2 that was found, otherwise None.
         better_chi2: chi2 of the given map and of that one; None without it.
-        clusters: contradicted ones, slipped steps, then unsupported ones. The first five were solved again without.
+        clusters: surveys, contradicted ones, slipped steps, then unsupported ones. Surveys and the first five of the
+            others were solved again without.
         leverage: (m,) of the cluster of each closure; zero for odometry and edges that do not count.
         weak: names of unknowns of which less than five digits are known.
         ended: False where more may be contradicted than is listed.
@@ -234,6 +241,7 @@ class Verdict:
         if self.better_chi2 is not None:
             said.append(f"a map of chi2 {self.better_chi2[1]:.6g} was found")
         words: dict[Kind, str] = {
+            "survey": "all others contradict {}",
             "contradicted": "the rest contradicts {}",
             "slipped": "loops contradict {}",
             "unsupported": "nothing else supports {}",

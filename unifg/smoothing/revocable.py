@@ -53,13 +53,14 @@ class Revocables:
     """All revocable factors of a smoother.
 
     Attributes:
+        rows: of each among the factors.
         accepted: whether each counts.
     """
 
     def __init__(self) -> None:
         """Know none."""
         self._labels: list[tuple[str, tuple[tuple[str, int], ...]]] = []
-        self._rows = np.zeros(0, dtype=np.int64)
+        self.rows = np.zeros(0, dtype=np.int64)
         self._limits, self.accepted = np.zeros(0), np.zeros(0, dtype=bool)
         self._group = np.zeros(0, dtype=np.int64)  # of each; those that belong together have one
         self._ends = np.zeros((0, 2), dtype=np.int64)  # first and last variable of the latest factor of each group
@@ -68,7 +69,7 @@ class Revocables:
 
     def __len__(self) -> int:
         """Number of factors."""
-        return len(self._rows)
+        return len(self.rows)
 
     def add(self, smoother: Smoother, item: Staged) -> None:
         """Take in staged factors that have just been added, which do not count yet."""
@@ -77,7 +78,7 @@ class Revocables:
         for _ in range(count):
             rows.append(row)
             row = int(state.factors["next"][row])
-        self._rows = np.append(self._rows, rows[::-1])
+        self.rows = np.append(self.rows, rows[::-1])
         self._limits = np.append(self._limits, np.full(count, item.limit))
         self.accepted = np.append(self.accepted, np.zeros(count, dtype=bool))
         for k in range(count):
@@ -102,7 +103,7 @@ class Revocables:
     def _variables(self, smoother: Smoother, k: int) -> list[int]:
         """Rows of the variables of a factor."""
         state = smoother._state
-        factor = state.factors[self._rows[k]]
+        factor = state.factors[self.rows[k]]
         at, count = int(factor["variables"]), int(state.types[factor["type"]]["slots"])
         rows: list[int] = state.lists[at : at + count].tolist()
         return rows
@@ -214,10 +215,10 @@ class Revocables:
         state, variables = smoother._state, list[int]()
         blocks = []
         for k in which:
-            factor = state.factors[self._rows[k]]
+            factor = state.factors[self.rows[k]]
             kind = state.types[factor["type"]]
             rows = np.empty((int(kind["rows"]), 1 + int(kind["width"])))
-            factor_rows(smoother._memory, int(self._rows[k]), rows)
+            factor_rows(smoother._memory, int(self.rows[k]), rows)
             blocks.append(rows / np.sqrt(weight))
             variables += self._variables(smoother, k)
         root = covariance_root(smoother._memory, np.array(variables))
@@ -233,7 +234,7 @@ class Revocables:
     def _squared(self, smoother: Smoother) -> Array:
         """(n,) |W r|^2 at the estimates."""
         squared = np.empty(len(self))
-        squared_errors(smoother._memory, self._rows, squared)
+        squared_errors(smoother._memory, self.rows, squared)
         found: Array = np.where(self.accepted, squared, squared / LEAST)
         return found
 
@@ -248,7 +249,7 @@ class Revocables:
             return
         state = smoother._state
         for k in changed.tolist():
-            row = int(self._rows[k])
+            row = int(self.rows[k])
             factor = state.factors[row]
             kind = state.types[factor["type"]]
             begin, end = (int(factor["data"] + kind[name]) for name in ("parameters", "numbers"))

@@ -1,4 +1,4 @@
-"""Marginalisation of a few variables by a dense Schur complement, for sliding windows.
+"""Marginalisation by a Schur complement: dense for a few variables, as of sliding windows, sparse for submaps.
 
 Only the named terms are used, at the linearisation point of the solution: a window keeps what the past measured
 and forgets what the future wished for. Hard equalities among them leave together with what they tie: along the
@@ -14,6 +14,8 @@ from typing import TypeAlias
 
 import numpy as np
 
+from unifg.elimination.factorization import Factorization
+from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
 from unifg.modeling.variables import Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
@@ -24,6 +26,7 @@ Variables: TypeAlias = Variable | Sequence[Variable]
 
 ROUNDING = 1e-13  # of a sum of squares
 RANK = 1e-10  # smaller pivots of scaled constraints are rounding
+MANY = 300  # removed unknowns from which on they are eliminated by the tree
 NOTHING_KNOWN = 1e-12  # smaller eigenvalues of a scaled information matrix are rounding
 
 
@@ -132,17 +135,30 @@ def marginal_prior(
     """
     leaving, staying = _selections(remove), _selections(keep)
     removal = _removal(program, tuple(terms), leaving, staying)
-    J, r = removal.costs.gather(lin.jacobian), lin.residual[removal.costs.rows]
+    r = lin.residual[removal.costs.rows]
     A, c = _equalities(program, lin, removal.constraints, program.equality if equality is None else equality)
     k = removal.gone
-    gone, rest = J[:, :k], J[:, k:]
-    if len(c):
-        particular, basis = _follow(A, c, k, leaving)
-        rest, r = rest - gone @ particular[:, 1:], r - gone @ particular[:, 0]
-        gone = gone @ basis
-    rest[:, ~removal.free] = 0.0
-    matrix, gradient = _schur(gone, rest, r, leaving, terms)
-    matrix, shift = _lowest(matrix, gradient, ROUNDING * np.einsum("ij,ij->j", rest, rest))
+    if k >= MANY and not len(c):
+        found = _schur_of_tree(removal, lin.jacobian, r)
+    else:
+        J = removal.costs.gather(lin.jacobian)
+        gone, rest = J[:, :k], J[:, k:]
+        if len(c):
+            particular, basis = _follow(A, c, k, leaving)
+            rest, r = rest - gone @ particular[:, 1:], r - gone @ particular[:, 0]
+            gone = gone @ basis
+        rest[:, ~removal.free] = 0.0
+        found = _schur(gone, rest, r)
+    if found is None:
+        first = leaving[0]
+        raise GraphError(
+            f"{first.family.name}[{first.indices[0]}] cannot be eliminated: the terms {', '.join(terms)} do not "
+            "determine it",
+            family=first.family.name,
+            index=int(first.indices[0]),
+        )
+    matrix, gradient, squared = found
+    matrix, shift = _lowest(matrix, gradient, ROUNDING * squared)
     if offset:
         points = [lin.values[s.family][s.indices][:, s.storage].ravel() for s in staying]
         return np.concatenate([*points, shift])[None], matrix
@@ -284,26 +300,47 @@ def _follow(A: Array, c: Array, k: int, leaving: Sequence[Selection]) -> tuple[A
     return rotation[:, :e] @ given, rotation[:, e:]
 
 
-def _schur(
-    gone: Array, rest: Array, r: Array, leaving: Sequence[Selection], terms: Sequence[str]
-) -> tuple[Array, Array]:
-    """Eliminate the first unknowns of |gone d_g + rest d_k + r|^2 / 2: information and gradient of the others."""
+def _schur(gone: Array, rest: Array, r: Array) -> tuple[Array, Array, Array] | None:
+    """Eliminate the first unknowns of |gone d_g + rest d_k + r|^2 / 2; None where they are not determined.
+
+    Returns:
+        Information and gradient of the others, and the squared norms of the columns of ``rest``.
+    """
     matrix, gradient = rest.T @ rest, rest.T @ r
+    squared = matrix.diagonal().copy()
     if gone.shape[1]:
         try:
             factor = np.linalg.cholesky(gone.T @ gone)
-        except np.linalg.LinAlgError as error:
-            first = leaving[0]
-            raise GraphError(
-                f"{first.family.name}[{first.indices[0]}] cannot be eliminated: the terms {', '.join(terms)} do not "
-                "determine it",
-                family=first.family.name,
-                index=int(first.indices[0]),
-            ) from error
+        except np.linalg.LinAlgError:
+            return None
         solved = np.linalg.solve(factor, gone.T @ np.column_stack([r, rest]))
         matrix -= solved[:, 1:].T @ solved[:, 1:]
         gradient -= solved[:, 1:].T @ solved[:, 0]
-    return 0.5 * (matrix + matrix.T), gradient
+    return 0.5 * (matrix + matrix.T), gradient, squared
+
+
+def _schur_of_tree(removal: Removal, jacobian: Array, r: Array) -> tuple[Array, Array, Array] | None:
+    """Eliminate as :func:`_schur` does, by the elimination tree of what leaves."""
+    import scipy.sparse as sp
+
+    costs, k = removal.costs, removal.gone
+    places = np.divmod(costs.places, costs.width)
+    J = sp.csc_array((jacobian[costs.entries], places), shape=(len(costs.rows), costs.width))
+    gone, rest = J[:, :k], J[:, k:] * removal.free
+    upper = sp.triu(gone.T @ gone, format="coo")
+    pattern = Symmetric(k, [(upper.row, upper.col)])
+    data = np.zeros(pattern.nnz)
+    data[pattern.positions(upper.row, upper.col)] = upper.data
+    factorization = Factorization(pattern)
+    if not (factorization.factor(data) and factorization.definite):
+        return None
+    between, matrix = sp.csr_array(gone.T @ rest), (rest.T @ rest).toarray()
+    squared, gradient = matrix.diagonal().copy(), rest.T @ r
+    rows = np.flatnonzero(np.diff(between.indptr))
+    if len(rows):
+        matrix -= factorization.products(np.array([0, len(rows)]), rows, between[rows].toarray())[0]
+        gradient -= between.T @ factorization.solve(gone.T @ r)
+    return matrix, gradient, squared
 
 
 def _lowest(matrix: Array, gradient: Array, rounding: Array) -> tuple[Array, Array]:
