@@ -19,7 +19,7 @@ import pytest
 
 from unifg.codegen import cache_folder, jit
 from unifg.codegen.artifact import Artifact
-from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON
+from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON, UseDispatcher
 from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.jit import compiled
 from unifg.codegen.objects import read_sealed, write_sealed
@@ -381,3 +381,8 @@ def test_a_newer_numba_works_from_sources(tmp_path: Path) -> None:
     assert said() == ("True False False", 1, 0)
     assert said() == ("False False True", 0, 0)
     assert said("renamed") == ("True False False", 0, 1)
+
+
+def test_numbas_dispatcher_is_given_settings() -> None:
+    made = UseDispatcher(read_from_cache)  # Numba 0.61 looks into both, and takes no None
+    assert (made.locals, made.targetoptions) == ({}, {})
