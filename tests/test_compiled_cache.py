@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
-from typing import Any
+from types import FunctionType
+from typing import Any, cast
 
 import numba
 import numpy as np
@@ -384,5 +385,5 @@ def test_a_newer_numba_works_from_sources(tmp_path: Path) -> None:
 
 
 def test_numbas_dispatcher_is_given_settings() -> None:
-    made = UseDispatcher(read_from_cache)  # Numba 0.61 looks into both, and takes no None
+    made = UseDispatcher(cast(FunctionType, read_from_cache))  # Numba 0.61 looks into both, and takes no None
     assert (made.locals, made.targetoptions) == ({}, {})
