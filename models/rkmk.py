@@ -111,9 +111,18 @@ def step_defect(group: LieGroup, field: Field, rows: Rows, x: Array, *rest: Any)
         field: F(x, inputs), (n, dim).
         rows: of the method's :class:`~unifg.models.tableau.Tableau`.
         x: (n, storage).
-        rest: inputs (n, k) each, x_next (n, storage), h one or (n,).
+        rest: inputs (n, k) or (k,) each, x_next (n, storage), h one or (n,).
+
+    Raises:
+        ModelError: x_next is no state, as when arguments are in another order.
     """
     *inputs, after, step = rest
+    if getattr(after, "shape", ())[1:] != (group.storage,):
+        found = getattr(after, "shape", after)
+        raise ModelError(
+            f"an integrator takes x, the inputs of its field, x_next and h, in this order: the last but one is no "
+            f"(n, {group.storage}) of {group.name}, found {found}"
+        )
     x, after, *inputs = alike(x, after, *inputs)
     xi = group.local(x, after)
     defect = xi
@@ -131,7 +140,8 @@ def travel(group: LieGroup, field: Field, rows: Rows, x: Array, *rest: Any) -> A
 
 
 def alike(*parts: Array) -> list[Array]:
-    """The same arrays, those of a single row repeated."""
+    """The same arrays, those of a single row repeated; one axis is a row."""
+    parts = tuple(part if len(np.shape(part)) > 1 else np.reshape(part, (1, -1)) for part in parts)
     count = max(len(part) for part in parts)
     return [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
 

@@ -29,6 +29,7 @@ from unifg.files.kitti import read_kitti
 from unifg.files.mrclam import read_mrclam
 from unifg.files.plaza import read_plaza
 from unifg.files.pose_graph import read_pose_graph
+from unifg.files.range_log import read_range_log
 from unifg.files.ros_map import load_map
 from unifg.files.toro import read_toro
 from unifg.files.tum import read_tum
@@ -114,6 +115,17 @@ free_thresh: 0.196
 PGM = b"P5\n4 3\n255\n" + bytes([0, 254, 205, 0] * 3)
 
 
+def drive_file(**others: Any) -> bytes:
+    """The columns of a `drive.npz` of two ticks that a log is made of."""
+    columns = {
+        "time": [0.0, 0.1], "scan_angles": [-1.0, 1.0], "scan": [[2.0, math.inf], [math.nan, 2.0]],
+        "dead_reckoning": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], "true_pose": [[1.0, 0.0, 0.0], [1.1, 0.0, 0.0]],
+    }  # fmt: skip
+    written = io.BytesIO()
+    np.savez_compressed(written, **(columns | others))
+    return written.getvalue()
+
+
 @dataclass(frozen=True)
 class Reader:
     """Reader of one kind of files.
@@ -153,6 +165,9 @@ READERS = {
     "room": Reader(lambda path: read_mrclam(path.parent, limits=SMALL), MRCLAM, tuple(MRCLAM)),
     "ranges": Reader(lambda path: read_plaza(path, path.parent / "TD.txt", limits=SMALL), PLAZA, tuple(PLAZA)),
     "cameras": _one(read_bal, "problem.txt", CAMERAS),
+    "drive": Reader(
+        lambda path: read_range_log(path, limits=SMALL).odometry, {"drive.npz": drive_file()}, ("drive.npz",)
+    ),
     "profile": _one(read_profile, "speeds.csv", PROFILE),
 }
 WORDS = (

@@ -11,7 +11,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
-from typing import Any
+from types import FunctionType
+from typing import Any, cast
 
 import numba
 import numpy as np
@@ -19,7 +20,7 @@ import pytest
 
 from unifg.codegen import cache_folder, jit
 from unifg.codegen.artifact import Artifact
-from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON
+from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON, UseDispatcher
 from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.jit import compiled
 from unifg.codegen.objects import read_sealed, write_sealed
@@ -381,3 +382,8 @@ def test_a_newer_numba_works_from_sources(tmp_path: Path) -> None:
     assert said() == ("True False False", 1, 0)
     assert said() == ("False False True", 0, 0)
     assert said("renamed") == ("True False False", 0, 1)
+
+
+def test_numbas_dispatcher_is_given_settings() -> None:
+    made = UseDispatcher(cast(FunctionType, read_from_cache))  # Numba 0.61 looks into both, and takes no None
+    assert (made.locals, made.targetoptions) == ({}, {})

@@ -152,6 +152,13 @@ def test_an_answer_of_another_shape_is_refused(own: Path) -> None:
         adapter.plan(np.zeros(3), ahead(), Tracks.none())
 
 
+def test_an_answer_that_stays_wrong_is_told_once(own: Path, caplog: pytest.LogCaptureFixture) -> None:
+    words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=0.8,0,0", "--obstacles", "0"]
+    assert main([*words, "--planner", "my_planners:Wrong", "--out", "out"]) == 1
+    said = [record.getMessage() for record in caplog.records]  # while the robot is woken, and when it drives
+    assert len(said) <= 2 and all(one.startswith("the tick at 0.00 s failed, the robot brakes: ") for one in said)
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hostile import drive_file
 from recorded import cast, corridors, recorded, wheels, write_csv
 from unifg.errors import FileFormatError, ScenarioError
 from unifg.files.range_log import RangeLog, aligned, read_range_log
@@ -222,6 +223,17 @@ def test_what_reads_a_recording_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     assert main(["map", str(tmp_path / name), "--out", str(tmp_path)]) == 2
     assert "pip install 'unifg[logs]'" in capsys.readouterr().err
+
+
+def test_a_drive_of_the_simulation_is_read(log: RangeLog, tmp_path: Path) -> None:
+    (tmp_path / "drive.npz").write_bytes(drive_file())
+    read = read_range_log(tmp_path / "drive.npz")
+    assert read.corrected is not None and np.isinf(read.ranges[0, 1]) and np.isnan(read.ranges[1, 0])
+    np.testing.assert_array_equal(read.odometry[:, 0], [0.0, 0.1])
+    for wrong in (drive_file(scan=np.ones((3, 2))), drive_file()[:-40], b"PK", b""):
+        (tmp_path / "drive.npz").write_bytes(wrong)
+        with pytest.raises(FileFormatError, match=r"is no drive\.npz of `unifg run`"):
+            read_range_log(tmp_path / "drive.npz")
 
 
 def test_a_broken_recording_is_refused(tmp_path: Path) -> None:

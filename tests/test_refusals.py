@@ -166,6 +166,16 @@ def test_check_finds_dependent_constraints_and_bad_residuals() -> None:
     assert [(f.kind, f.term, f.index) for f in found] == [("not finite", "inverse", 1)]
 
 
+def test_a_constant_that_is_not_finite_is_named_and_not_the_guess() -> None:
+    graph, x = line(2)
+    graph.minimize(lambda p, z: p - z, x, np.array([[1.0, 1.0], [np.nan, 1.0]]), name="seen")
+    guess = {x: np.zeros((2, 2))}
+    words = "argument 1, a constant, is .nan  1.. there: leave such factors out"
+    assert words.replace(".nan", "[nan").replace("1..", "1.]") in graph.check(guess).findings[0].message
+    with pytest.raises(fg.GraphError, match=f"residual of factor 1 is not finite .*{words}"):
+        fg.solve(graph, guess)
+
+
 def test_names_do_not_take_the_place_of_families() -> None:
     graph, x = line()
     graph.minimize(fg.prior, x, [0.0, 0.0])

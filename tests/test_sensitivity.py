@@ -468,7 +468,8 @@ def test_kinks_flags_losses_and_names_are_refused() -> None:
     refused(solution, "'flag' are booleans", "x", "flag")
     refused(solution, "'x' is solved for", "x", "x")
     refused(solution, r"called 'y' \(there are: p, q, flag, x\)", "x", "y")
-    refused(solution, r"called 'y' \(there are: cost\)", "y", "q")
+    refused(solution, r"called 'y' \(there are: x, cost\)", "y", "q")
+    refused(solution, "(float64|ndarray) is no data", "x", np.zeros(2))
     refused(solution, "does not belong", "x", fg.Graph().data("p", 1.0))
     with pytest.raises(fg.GraphError, match=r"weights of <1 of x> have shape \(3,\), expected \(1, 2\)"):
         solution.gradient({"x": [1.0, 2.0, 3.0]}, "q")

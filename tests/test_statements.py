@@ -232,6 +232,20 @@ def test_smoothers_refuse_the_same_and_go_on() -> None:
     np.testing.assert_allclose(smoother.estimate(x[0]), [[1.0, 2.0]])
 
 
+def test_a_number_for_each_factor_that_is_no_column_is_remarked(caplog: pytest.LogCaptureFixture) -> None:
+    graph, x, _ = stage()
+    far = lambda p, z: np.linalg.norm(p, axis=1, keepdims=True) - z  # noqa: E731
+    graph.minimize(far, x, np.ones((4, 1)), name="column")
+    graph.minimize(far, x, fg.shared(np.ones(4)), name="meant")
+    assert not caplog.records
+    graph.minimize(far, x, np.ones(4), name="row")
+    assert "term 'row': each of its 4 factors has 4 rows" in caplog.text and "z[:, None]" in caplog.text
+    with pytest.raises(IndexError) as caught:
+        graph.minimize(lambda p, z: p[:, :1] - z[:, 1:], x, np.ones(3), name="t")
+    assert caught.value.__notes__[1].endswith("constant (3,); one axis is passed on as it is: write c[None] for a row, "
+                                              "c[:, None] for a column")  # fmt: skip
+
+
 def test_what_a_function_itself_raises_names_the_term_and_what_it_was_called_with() -> None:
     graph, x, _ = stage()
     before = stated(graph)

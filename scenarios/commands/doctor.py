@@ -101,7 +101,7 @@ def _caches() -> Iterator[Finding]:
         yield from _cache(folder)
     if precompiled.archive().usable:
         changed = precompiled.outdated()
-        behind = f"; {len(changed)} functions have changed since and are compiled instead" if changed else ""
+        behind = f"; functions that have changed since and are compiled instead: {len(changed)}" if changed else ""
         yield Finding("caches", f"kernels that come half compiled fit this LLVM and Numba{behind}", not changed or None)
     else:
         yield Finding(

@@ -98,7 +98,7 @@ class Pilot(Generic[PlannerT]):
         self._signals = DriveSignals(s.dt, s.most, s.kind)
         self.calibration, self.recalibrated = Calibration(distance_map, s.dt, s.kind), False
         self._pause, self.search_said = 0, ""
-        self._awake = False
+        self._awake, self._failed = False, ""
         self._first: Scan | None = None
 
     @staticmethod
@@ -143,10 +143,12 @@ class Pilot(Generic[PlannerT]):
         self.clock.start()
         self.relocated = False
         try:
-            plan = self._decide(scan, odometry, route, now, first)
+            plan, self._failed = self._decide(scan, odometry, route, now, first), ""
         except (UnifgError, ArithmeticError, ValueError) as error:  # a robot that drives has to come to rest
-            logger.warning("the tick at %.2f s failed, the robot brakes: %s", now, error)
-            self.supervisor.fail(str(error))
+            if str(error) != self._failed:  # what goes on failing is counted by the supervisor
+                logger.warning("the tick at %.2f s failed, the robot brakes: %s", now, error)
+            self._failed = str(error)
+            self.supervisor.fail(self._failed)
             plan = self._rest(self.pose)
             for stage in ("localise", "perceive", "route", "plan"):
                 self.clock.seconds.setdefault(stage, 0.0)

@@ -1,4 +1,4 @@
-"""Logs of a planar laser and of odometry, from whatever file holds them: CARMEN, CSV, MCAP and rosbag2.
+"""Logs of a planar laser and of odometry, from whatever file holds them: CARMEN, CSV, MCAP, rosbag2, drives of unifg.
 
 A CSV file is one table with a header. ``time`` [s], ``x``, ``y`` [m] and ``theta`` [rad] are the odometry;
 ``corrected_x``, ``corrected_y`` and ``corrected_theta``, where a reference is known, the poses it says; every other
@@ -11,6 +11,9 @@ from __future__ import annotations
 import csv
 import io
 import logging
+import math
+import zipfile
+import zlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,6 +38,9 @@ AT_MOST = 0.99  # of the longest range
 OFTEN, PEAK = 0.005, 3.0  # share of the ranges there, and over those a little shorter, if it means that nothing was hit
 LONGEST = 10**6  # characters of a line, which has no blanks
 ROSBAGS = (".mcap", ".bag", ".db3")
+UNREADABLE = (
+    OSError, ValueError, LookupError, TypeError, RuntimeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +83,7 @@ class RangeLog:
 
 
 def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
-    """Read a log: ``.csv``; MCAP, rosbag2 (a folder) and rosbag; anything else as CARMEN, gzipped or not.
+    """Read a log: ``.csv``; MCAP, rosbag2 (a folder), rosbag; ``.npz`` of a drive; else CARMEN, gzipped or not.
 
     Of several lasers, that with most scans is taken. Of a CARMEN log whose scans bear corrected poses, the odometry is
     that of the robot, or of the ODOM lines where the robot's poses are corrected, too. Times in milliseconds or smaller
@@ -95,6 +101,8 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
     if path.suffix == ".csv":
         return _table(path, limits)
     name = legible(path.name)
+    if path.suffix == ".npz":
+        return _drive(path, limits)
     if path.is_dir() or path.suffix in ROSBAGS:
         return _in_order(name, *read_rosbag(path), None)
     log = read_carmen(path, limits=limits)
@@ -105,6 +113,22 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
         logger.warning("%s: %d kinds of scans, of which %d of one kind are taken", name, len(log.scans), len(scans))
     odometry, corrected = _poses(log, scans)
     return _in_order(name, scans.time, scans.angles, scans.ranges, scans.maximum, odometry, corrected)
+
+
+def _drive(path: Path, limits: Limits) -> RangeLog:
+    """The log of a simulated drive: dead reckoning is its odometry, true poses are the corrected ones."""
+    try:
+        with path.open("rb") as own, zipfile.ZipFile(own) as parts, np.load(own, allow_pickle=False) as file:
+            if sum(part.file_size for part in parts.infolist()) > limits.unpacked:
+                raise ValueError(f"it holds more than {limits.unpacked} bytes")
+            columns = ("time", "scan_angles", "scan", "dead_reckoning", "true_pose")
+            time, angles, ranges, wheels, truth = (np.asarray(file[name], dtype=np.float64) for name in columns)
+        count, beams = len(time), len(angles)
+        if (ranges.shape, wheels.shape, truth.shape) != ((count, beams), (count, 3), (count, 3)):
+            raise ValueError("its columns do not fit each other")
+    except UNREADABLE as e:
+        raise FileFormatError(f"{legible(path)} is no drive.npz of `unifg run`: {e}") from e
+    return _in_order(legible(path.name), time, angles, ranges, math.inf, wheels, truth)
 
 
 def aligned(poses: Array, onto: Array) -> Array:

@@ -63,7 +63,9 @@ def read_rosbag(path: Path) -> Recorded:
     except Exception as error:  # each of these packages lets out whatever its parts raise
         raise FileFormatError(f"{name}: cannot be read ({type(error).__name__}: {error})") from error
     if lacking := [kind for kind in (SCAN, ODOMETRY) if kind not in topics]:
-        raise FileFormatError(f"{name}: no message of the kind {' and '.join(lacking)}")
+        own = next(path.parent.glob("drive.npz"), None) if path.is_file() else None
+        hint = f"; of a run of unifg {legible(own)} is read" if own else ""
+        raise FileFormatError(f"{name}: no message of ROS of the kind {' and '.join(lacking)}{hint}")
     scans, wheels = (max(topics[kind].values(), key=len) for kind in (SCAN, ODOMETRY))
     forms = Counter((len(scan.ranges), scan.angle_min, scan.angle_increment) for scan in scans)
     (count, first, step), _ = forms.most_common(1)[0]

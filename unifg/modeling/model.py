@@ -396,7 +396,7 @@ class Model:
         wrapped = complete(function, arguments, name)
         unique = self._unique(name, default or wrapped.name, replaced)
         normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
-        size = rows_of(unique, wrapped, normal, count, scalar=scalar)
+        size = rows_of(unique, wrapped, normal, count, scalar=scalar, declared=rows)
         compare(unique, wrapped.name, arguments, wrapped.takes, elements_of(wrapped))
         return {
             "name": unique, "residual": wrapped, "arguments": normal, "active": active, "count": count, "size": size,

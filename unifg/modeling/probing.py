@@ -5,6 +5,8 @@ A function is called once, at identity elements. A kernel says what it expects, 
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,8 +20,17 @@ from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data, Selection
 from unifg.typing import Array
 
+logger = logging.getLogger("unifg")
 
-def rows_of(name: str, residual: Residual, arguments: Sequence[Any], count: int, scalar: bool = False) -> int:
+
+def rows_of(
+    name: str,
+    residual: Residual,
+    arguments: Sequence[Any],
+    count: int,
+    scalar: bool = False,
+    declared: Sequence[bool | None] = (),
+) -> int:
     """The number of rows m of one factor.
 
     Args:
@@ -28,6 +39,7 @@ def rows_of(name: str, residual: Residual, arguments: Sequence[Any], count: int,
         arguments: of the term, families as selections.
         count: factors n.
         scalar: whether the function is to return (n,) values instead of (n, m).
+        declared: of each argument, whether it is declared to have a row for each factor.
 
     Raises:
         GraphError: naming the term, when the residual does not take these arguments or returns something else. Errors
@@ -47,6 +59,15 @@ def rows_of(name: str, residual: Residual, arguments: Sequence[Any], count: int,
     batched.bind(given, places, [])
     points = [np.tile(a.manifold.identity(), (count, 1)) for a in arguments if isinstance(a, Selection)]
     size = size_of(tried(batched, points, lambda: told(arguments, count)), name, arguments, count, scalar)
+    if size == count > 1 and not scalar:
+        known = zip(given, declared or [None] * len(given), strict=True)
+        shapes = [np.shape(one) for one, rows in known if not isinstance(one, Selection) and rows is not False]
+        if (count,) in shapes and not any(len(shape) > 1 and shape[0] == count for shape in shapes):
+            logger.warning(
+                "term '%s': each of its %d factors has %d rows, because a constant or data of shape (%d,) was taken "
+                "as a row: a number for each factor is a column, z[:, None]; fg.shared(z) if a row is meant",
+                name, count, size, count,
+            )  # fmt: skip
     if residual.jacobian is not None and not scalar:
         _try_jacobian(name, residual.jacobian, batched.fill(points), arguments, (count, size))
     return size
@@ -112,7 +133,10 @@ def tried(batched: Batched, points: Sequence[Array], arguments: Callable[[], str
     except GraphError:
         raise
     except Exception as error:
-        error.add_note(f"it was called with {arguments()}")
+        shapes = arguments()
+        flat = isinstance(error, IndexError) and re.search(r"\(\d+,\)", shapes)
+        hint = "; one axis is passed on as it is: write c[None] for a row, c[:, None] for a column" if flat else ""
+        error.add_note(f"it was called with {shapes}{hint}")
         raise
 
 

@@ -153,6 +153,15 @@ class CompiledTerm:
         if isinstance(self.term, Cost) and isinstance(self.term.information, np.ndarray):
             _notice_no_information(self.name, self.whitener)
 
+    def remedy(self, index: int) -> str:
+        """What to do about a residual that is not finite at a factor: the point may be to blame, or a constant."""
+        for place, argument in enumerate(self.term.arguments):
+            if isinstance(argument, np.ndarray) and argument.dtype.kind == "f":
+                row = argument[index] if argument.ndim and len(argument) == self.count else argument
+                if not np.isfinite(row).all():
+                    return f"argument {place}, a constant, is {row} there: leave such factors out with active="
+        return "move the guess away from the singularity, or guard the residual"
+
     def _require_stated_size(self) -> None:
         """Call a function again: what it reads beyond its arguments may have changed since it was stated.
 

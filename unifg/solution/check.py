@@ -104,8 +104,7 @@ def _not_finite(term: CompiledTerm, values: Values) -> Finding | None:
     family, member = _first_variable(term, index)
     return Finding(
         "not finite",
-        f"term '{term.name}': factor {index} is {value[index]} at {family}[{member}]; "
-        "move the guess or guard the residual",
+        f"term '{term.name}': factor {index} is {value[index]} at {family}[{member}]; {term.remedy(index)}",
         term.name,
         family,
         index,

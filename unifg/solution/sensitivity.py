@@ -224,7 +224,7 @@ class Sensitivities:
 
     def matrix(self, of: Sequence[Selection | str], wrt: Sequence[Wrt]) -> Array:
         """(k, K) derivatives; arguments and errors as of :meth:`unifg.Solution.sensitivity`."""
-        if not (of and wrt):
+        if not (len(of) and len(wrt)):
             raise GraphError("sensitivity() of what? Name families, members or constraints, and data")
         places, columns, unknown = self._rows(of)
         change = self._change(wrt)
@@ -320,7 +320,7 @@ class Sensitivities:
             return Part(places, columns, bool((places >= 0).all()))
         rows = [rows for name, rows, _ in program.places if name == of]
         if not rows and of != COST:
-            known = ", ".join([*(name for name, _, _ in program.places), COST])
+            known = ", ".join([*(one.name for one in program.families), *(p[0] for p in program.places), COST])
             raise GraphError(f"sensitivity: no family or constraint is called '{of}' (there are: {known})", term=of)
         places = program.size + np.arange(rows[0].start, rows[0].stop) if rows else np.array([HEIGHT])
         return Part(places, np.full(len(places), -1), False)
@@ -426,6 +426,8 @@ def _called(asked: Named | Wrt) -> Hashable:
     """Data and names by themselves, variables by their members: each ``x[0]`` is another object."""
     if isinstance(asked, Data | str):
         return asked
+    if not isinstance(asked, Variable):
+        raise GraphError(f"sensitivity: {type(asked).__name__} is no data or variable: state it by graph.data first")
     chosen = as_selection(asked)
     return chosen.family, chosen.component, chosen.indices.tobytes()
 

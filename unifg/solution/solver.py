@@ -1089,7 +1089,7 @@ class Prepared:
                 raise GraphError(
                     f"term '{term.name}': the residual of factor {index} is not finite at the guess "
                     f"(its first variable is {selection.family.name}[{selection.indices[index % len(selection)]}]); "
-                    "move the guess away from the singularity",
+                    + term.remedy(index),
                     term=term.name,
                     family=selection.family.name,
                     index=index,
