@@ -268,16 +268,6 @@ def test_a_short_reference_is_refused() -> None:
 # ---------------------------------------------------------------- kernels as objects
 
 
-def test_addresses_are_not_pickled() -> None:
-    """They mean nothing to another process."""
-    kernel = kernel_of(ENDPOINT)
-    assert kernel.address
-    copy = pickle.loads(pickle.dumps(kernel))
-    assert "address" not in vars(copy)
-    beams = np.ones((COUNT, 2))
-    np.testing.assert_array_equal(copy(poses(), beams), kernel(poses(), beams))
-
-
 def test_graphs_are_understood_by_another_process() -> None:
     graph = fg.Graph()
     x = graph.variables("x", fg.SE2, COUNT)
