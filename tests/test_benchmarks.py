@@ -174,7 +174,7 @@ class Threads(ThreadPoolExecutor):
 
 
 def test_a_study_measures_the_cells_that_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By two workers, but for those that are measured alone, and by none."""
+    """Two workers measure what is missing, but for cells that are measured alone."""
     monkeypatch.setattr(runner, "OUT", tmp_path)
     monkeypatch.setattr(runner, "Workers", Threads)
     monkeypatch.setattr(runner, "machine", lambda codes: "here")

@@ -202,6 +202,7 @@ def test_numbers_and_words() -> None:
     assert "NOT ARRIVED" in summary(flown(avoidance="hard", guess="hover"))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "quadrotor-obstacles", "--out", str(tmp_path)]
     assert command.main([*words, "--solver", "ipm", "--avoidance", "hard", "--seed", "1003"]) == 0

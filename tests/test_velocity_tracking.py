@@ -253,6 +253,7 @@ def test_command_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert (found["solver"], found["length"], found["drag"], found["force_bounds_n"]) == ("kkt", 60, "quadratic", None)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_command_takes_bounds_that_begin_with_a_minus(tmp_path: Path) -> None:
     assert run(tmp_path, "--length", "60", "--solver", "ipm", "--linear", "--force-bounds", "-1200,900") == 0
     found = json.loads((tmp_path / "metrics.json").read_text())
@@ -280,6 +281,7 @@ def test_bad_arguments_exit_2(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_solve_that_falls_short_exits_1(tmp_path: Path) -> None:
     assert run(tmp_path, "--length", "60", "--solver", "penalty", "--tolerance", "1e-9") == 1
     assert not json.loads((tmp_path / "metrics.json").read_text())["converged"]
@@ -288,6 +290,7 @@ def test_a_solve_that_falls_short_exits_1(tmp_path: Path) -> None:
     assert not broken.succeeded and "BROKEN" in table(broken)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_interrupt_writes_what_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stopped = run_tracking(TrackingSettings(60), progress=lambda row: row.number == 1)
     assert stopped.solution.status is fg.Status.INTERRUPTED
