@@ -68,22 +68,6 @@ def test_level_hover_carries_the_weight() -> None:
     np.testing.assert_allclose(up, np.array([-3.0, 0.0, GRAVITY]) / np.hypot(3.0, GRAVITY), atol=1e-15)  # into the wind
 
 
-def test_free_fall() -> None:
-    """Without thrust and drag every integrator gives the parabola, however the vehicle tumbles."""
-    start = states(1)[0]
-    tumbling = np.array([3.0, -2.0, 1.0, 0.0])
-    t = 1.5
-    expected = start[:3] + start[7:] * t - 0.5 * GRAVITY * t * t * np.array([0.0, 0.0, 1.0])
-    for reached in (
-        quadrotor.rollout(start, np.tile(tumbling, (30, 1)), t / 30, CALM)[-1],
-        quadrotor.fly(start, tumbling, t, CALM, substeps=3),
-    ):
-        np.testing.assert_allclose(reached[:3], expected, atol=1e-12)
-        np.testing.assert_allclose(reached[7:], start[7:] - [0.0, 0.0, GRAVITY * t], atol=1e-12)
-        turned = fg.SO3.retract(start[3:7], t * tumbling[:3])
-        np.testing.assert_allclose(fg.SO3.local(turned, reached[3:7]), 0.0, atol=1e-13)
-
-
 def test_thrust_lifts_along_the_third_axis_of_the_body() -> None:
     x = states()
     x[:, 7:] = 0.0
@@ -116,26 +100,6 @@ def test_wind_and_noise_are_accelerations_in_the_world() -> None:
 # ---------------------------------------------------------------- integrators
 
 
-def errors(method: str) -> list[float]:
-    """After 0.8 s in ever shorter steps, against an integration fine enough to have no error left."""
-    start, u = STATE.random(np.random.default_rng(2), ()), np.array([1.0, -2.0, 1.5, 14.0])
-    exact = quadrotor.fly(start, u, 0.8, REAL, substeps=4000)
-    found = []
-    for steps in (8, 16, 32, 64):
-        if method == "fly":
-            reached = quadrotor.fly(start, u, 0.8, REAL, substeps=steps)
-        else:
-            reached = quadrotor.rollout(start, np.tile(u, (steps, 1)), 0.8 / steps, REAL)[-1]
-        found.append(float(np.abs(STATE.local(exact, reached)).max()))
-    return found
-
-
-@pytest.mark.parametrize(("method", "order"), [("step", 2), ("fly", 4)])
-def test_order(method: str, order: int) -> None:
-    found = np.array(errors(method))
-    np.testing.assert_allclose(np.log2(found[:-1] / found[1:]), order, atol=0.15)
-
-
 def test_fly_is_rk4_of_the_field() -> None:
     """One substep against the general integrator of the same order on the same field."""
     x, u, noise = states(), controls(), RNG.normal(size=(COUNT, 6))
@@ -156,13 +120,6 @@ def test_rollout_is_step_after_step() -> None:
     path = quadrotor.rollout(LEVEL, u, dt, REAL)
     for k in range(7):
         np.testing.assert_array_equal(path[k + 1], quadrotor.step(path[k : k + 1], u[k : k + 1], dt[k], REAL)[0])
-
-
-def test_the_attitude_stays_a_rotation() -> None:
-    path = quadrotor.rollout(LEVEL, np.tile([5.0, -3.0, 2.0, 9.0], (20000, 1)), 0.01, REAL)
-    assert np.abs(np.linalg.norm(path[:, 3:7], axis=1) - 1.0).max() < 1e-14
-    flown = quadrotor.fly(LEVEL, np.array([5.0, -3.0, 2.0, 9.0]), 200.0, REAL, substeps=20000)
-    assert abs(np.linalg.norm(flown[3:7]) - 1.0) < 1e-14
 
 
 def noisy_step() -> tuple[Array, ...]:
