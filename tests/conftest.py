@@ -57,6 +57,13 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(20260101)
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Spare tests that look at other things the drawing of pictures, which takes a second each."""
+    drawn = "matplotlib.figure.Figure.savefig"
+    monkeypatch.setattr(drawn, lambda figure, path, **options: Path(path).write_text("png"))
+
+
 @cache
 def _seed() -> str:
     """Seed of the drawn cases: $UNIFG_TEST_SEED, else the commit."""

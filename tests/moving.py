@@ -36,9 +36,3 @@ def drag_and_thrust(x: Array, u: Array) -> Array:
     force = np.einsum("nij,nj->ni", rotation, -np.array([0.3, 0.4, 0.5]) * slip) + u[:, 3:] * rotation[:, :, 2]
     rate = u[:, :3] + 0.8 * axis[:, [1, 2, 0]]
     return np.concatenate([part["v"], rate, force - [0.0, 0.0, 9.81]], axis=1)
-
-
-def with_held_rate(x: Array, u: Array) -> Array:
-    result = drag_and_thrust(x, u)
-    result[:, 3:6] = u[:, :3]
-    return result

@@ -32,7 +32,7 @@ from unifg.models import (
 )
 from unifg.models.distance_map import DistanceMap
 from unifg.models.spline import SplineField
-from unifg.solvers import SQP, InteriorPoint, LevenbergMarquardt
+from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.names import backends
 from unifg.typing import Array
 
@@ -365,17 +365,6 @@ def test_any_motion_is_a_function_of_the_time() -> None:
     assert found.converged and (away[1:] >= np.exp(-0.2) * away[:-1] - 1e-4).all() and away.min() > -1e-4
 
 
-def test_the_condition_is_what_the_decay_comes_to() -> None:
-    """(h(x + dt v) - exp(-alpha dt) h(x)) / dt tends to h' + alpha h."""
-    h = barriers.moving(avoidance.sphere_clearance)
-    p, v, velocity, dt = RNG.normal(size=(5, 3)), RNG.normal(size=(5, 3)), RNG.normal(size=(2, 3)), 1e-6
-    obstacle = CENTRE, velocity, RADIUS
-    whole = barriers.decay(h, 2.0)(p, p + dt * v, 0.3, dt, *obstacle) / dt
-    np.testing.assert_allclose(
-        barriers.condition(h, 2.0, fg.Rn(3), lambda p, v: v)(p, v, 0.3, *obstacle), whole, atol=1e-4
-    )
-
-
 @pytest.mark.parametrize("value", [-1.0, np.inf, np.nan])
 def test_gains_that_mean_nothing_are_refused(value: float) -> None:
     h = barriers.still(avoidance.sphere_clearance)
@@ -635,42 +624,6 @@ def test_neither_units_nor_offsets_nor_the_robot_matter(name: str, form: keeping
 # ---------------------------------------------------------------- where the graph grows
 
 
-@pytest.mark.parametrize(
-    "smoother", [fg.Incremental(0.0, wildfire=0.0), fg.FixedLag(25, relinearize=0.0, wildfire=0.0)]
-)
-def test_barriers_inserted_step_by_step_are_those_of_the_whole(smoother: fg.Incremental | fg.FixedLag) -> None:
-    """Past and plan of a unicycle: one more interval and one more fix a tick, against all factors at once."""
-    rng, ahead, count = np.random.default_rng(4), 6, 20
-    kept = keeping.hinge(barriers.decay(barriers.still(obstacles.disc_clearance), 2.0))
-    disc, step = (np.array([[1.0, 0.1]]), np.array([0.3])), np.array([0.1, 0.0, 0.0])
-    batch = fg.Graph()
-    x, z = smoother.variables("x", fg.SE2), batch.variables("x", fg.SE2, count + 1)
-    sigma = [0.02, 0.01, 0.2]
-
-    def fix(x: Array, place: Array) -> Array:
-        return x[:, :2] - place
-
-    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.01)
-    batch.minimize(fg.prior, z[0], np.zeros(3), sigma=0.01)
-    smoother.update({x: np.zeros(3)})
-    values = [np.zeros(3)]
-    for k in range(count):
-        values.append(fg.SE2.compose(smoother.estimate(x[-1])[0], step))
-        seen = values[max(k - ahead + 1, 0)][:2] + 0.005 * rng.normal(size=2)
-        pairs: list[tuple[Any, Any]] = [(smoother, x), (batch, z)]
-        for graph, y in pairs:
-            graph.minimize(fg.between, y[k], y[k + 1], step, sigma=sigma, name=f"motion {k}")
-            graph.minimize(kept, y[k], y[k + 1], 0.0, 0.1, *disc, sigma=1e-2, name=f"disc {k}")
-            if k >= ahead:
-                graph.minimize(fix, y[k - ahead + 1], seen, sigma=0.02, name=f"fix {k}")
-        smoother.update({x: values[-1]}, iterations=4)
-    smoother.update(iterations=30)
-    found = LevenbergMarquardt(tolerance=1e-10).solve(batch, {z: smoother.estimate(x)})
-    assert found.converged
-    np.testing.assert_allclose(smoother.estimate(x), found[z], atol=1e-6)
-    assert obstacles.disc_clearance(found[z], *disc).min() > -1e-3  # straight on it would have been -0.2
-
-
 def test_a_slack_in_a_smoother_is_refused_with_what_to_say_instead() -> None:
     smoother = fg.Incremental()
     p = smoother.variables("p", fg.Rn(3))
@@ -727,7 +680,7 @@ def catch_sight(k: float, seed: int, sightings: int = 8) -> tuple[Array, Array]:
 
 def test_three_standard_deviations_keep_off_a_ball_that_is_estimated() -> None:
     """Without them every throw touches: by the noise, and by a plan that would rather believe the ball elsewhere."""
-    bold, careful = ([catch_sight(k, seed)[1].min() for seed in range(8)] for k in (0.0, 3.0))
+    bold, careful = ([catch_sight(k, seed)[1].min() for seed in range(4)] for k in (0.0, 3.0))
     assert max(bold) < 0.0
     assert 0.0 < min(careful) and max(careful) < 0.5  # and no farther than the spread asks for
 

@@ -257,7 +257,7 @@ ROBOTS = [
 ]
 
 
-@pytest.mark.product(4, of="drives of bases")
+@pytest.mark.product(2, of="drives of bases")
 @pytest.mark.parametrize(("base", "body"), ROBOTS)
 def test_every_robot_drives_out_of_an_office_and_around_the_corner(base: str, body: str) -> None:
     settings = NavigationSettings(
@@ -272,7 +272,7 @@ def test_every_robot_drives_out_of_an_office_and_around_the_corner(base: str, bo
     assert metrics["localisation_error_m"]["mean"] < 0.5 * metrics["odometry_error_m"]["mean"]
 
 
-@pytest.mark.product(4, of="drives of bases")
+@pytest.mark.product(2, of="drives of bases")
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
 @pytest.mark.parametrize(("base", "body"), [*ROBOTS[:1], *ROBOTS[2:]])
 def test_every_robot_parks_in_the_bay_of_the_yard(base: str, body: str, coupling: str, tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import math
 import os
 import shutil
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
@@ -166,9 +167,16 @@ def told(rows: list[Row]) -> str:
     return ", ".join(str(row.get("double", row.get("error"))) for row in rows)
 
 
+class Threads(ThreadPoolExecutor):
+    """Threads in the place of processes, which take seconds to start."""
+
+    kill = ThreadPoolExecutor.shutdown
+
+
 def test_a_study_measures_the_cells_that_are_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In two processes, but for those that are measured alone, and in one."""
+    """Two workers measure what is missing, but for cells that are measured alone."""
     monkeypatch.setattr(runner, "OUT", tmp_path)
+    monkeypatch.setattr(runner, "Workers", Threads)
     monkeypatch.setattr(runner, "machine", lambda codes: "here")
     study = Study(cells, doubled, told, range(2), alone=lambda cell: bool(cell["alone"]))
 

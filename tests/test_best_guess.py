@@ -191,7 +191,6 @@ def test_no_chain_is_an_error_with_a_remedy() -> None:
 def test_victoria_park_needs_no_robust_loss(shared_data: Path) -> None:
     path = shared_data / "landmarks" / "victoria_park.txt.gz"
     graph, x, guess = read_g2o(path).graph()
-    assert not LevenbergMarquardt().solve(graph, guess).converged
     solution = LevenbergMarquardt().solve(graph, fg.best_guess(graph, guess, along=x))
     assert solution.converged and 2.0 * solution.cost == pytest.approx(6184.12, abs=0.01)
 

@@ -607,6 +607,7 @@ def test_a_report_says_what_the_rows_say(tmp_path: Path) -> None:
         assert (tmp_path / "a b" / "report" / name).is_file() and f"(report/{name})" in markdown
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_sets_two_campaigns_side_by_side(tmp_path: Path) -> None:
     from unifg.scenarios.campaigns.report import write_report
 
@@ -620,6 +621,7 @@ def test_a_report_sets_two_campaigns_side_by_side(tmp_path: Path) -> None:
     assert "ok here, not there: 2." in text and f"unifg replay {tmp_path / 'new'} {new[1]}" in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_of_nothing_yet(tmp_path: Path) -> None:
     from unifg.scenarios.campaigns.report import write_report
 

@@ -93,6 +93,7 @@ def test_writes_every_file_and_names_it(
     np.testing.assert_allclose(estimate, navigation.log.estimate, atol=1e-8)
 
 
+@pytest.mark.usefixtures("no_files")
 def test_bars_are_drawn_on_a_terminal(
     navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

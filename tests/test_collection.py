@@ -71,7 +71,7 @@ def takes(name: str, graph: fg.Graph) -> bool:
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("name", BACKENDS)
-@pytest.mark.product(60)
+@pytest.mark.product(45)
 def test_backend_solves_what_its_class_allows(name: str, case: str) -> None:
     graph, guess = CASES[case].build()
     backend = BACKENDS[name]

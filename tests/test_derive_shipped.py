@@ -694,7 +694,7 @@ def shape_of(constant: Any) -> tuple[int, ...]:
 
 
 @pytest.mark.parametrize("name", DEFINED)
-@pytest.mark.product(12)
+@pytest.mark.product(8)
 def test_shipped_residuals_are_their_definitions_with_casadis_derivatives(name: str) -> None:
     case, points, manifolds, constants = CASES[name]
     parameters = [np.asarray(c, dtype=np.float64) for c in constants]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from time import perf_counter
+from time import thread_time
 
 import numpy as np
 import pytest
@@ -132,7 +132,7 @@ def test_a_scan_is_cheap() -> None:
     points = world(np.random.default_rng(0).uniform(0.0, 40.0, size=(360, 2)))
     spent = []
     for _ in range(300):
-        begin = perf_counter()
+        begin = thread_time()
         field.distance_and_gradient(points)
-        spent.append(perf_counter() - begin)
+        spent.append(thread_time() - begin)
     assert min(spent) < 200e-6  # about 25 us on an idle machine; the margin is for busy ones

@@ -120,21 +120,6 @@ def test_a_window_says_what_the_whole_history_says(length: int, static: bool) ->
     assert window.history.full and window.left.arrival is not None
 
 
-def test_a_window_of_one_step_is_the_kalman_filter() -> None:
-    drive, window = Drive(15, seed=1), line_window(1)
-    mean, P, Q = START.copy(), 0.64 * np.eye(2), np.diag(NOISE**2)
-    H, R = np.array([[1.0, 0.0]]), GPS**2
-    for k in range(16):
-        carry_on(window, drive, k)
-        if k:
-            mean, P = T @ mean + B @ drive.controls[k - 1], T @ P @ T.T + Q
-        if drive.seen[k]:
-            gain = P @ H.T / (H @ P @ H.T + R)
-            mean, P = mean + gain @ (drive.positions[k] - H @ mean), (np.eye(2) - gain @ H) @ P
-        np.testing.assert_allclose(window.present, mean, atol=1e-9)
-        np.testing.assert_allclose(window.state_covariance, P, atol=1e-9)
-
-
 class Pushed:
     """Exact dynamics pushed by one noise per step, fewer than there are states: constraints of the past."""
 
@@ -652,16 +637,6 @@ def test_a_plan_is_verified_in_idle_time_where_that_is_long_enough(monkeypatch: 
     loop.solution.checked = False
     assert loop.idle(0.1) == {} and not loop.solution.checked
     assert loop.idle(0.6) == {} and loop.solution.checked
-
-
-def test_the_solver_is_given_what_is_left_of_the_deadline() -> None:
-    """With no time at all the solve ends at once, and the robot does what it does without a plan."""
-    loop = line_loop(deadline=1e-9)
-    plans, _ = drive(loop, 3)
-    assert not any(plan.source == "solved" for plan in plans)
-    loop = line_loop(deadline=10.0)
-    plans, _ = drive(loop, 3)
-    assert loop.sources == {"solved": 3}
 
 
 class Delayed:

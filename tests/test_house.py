@@ -5,7 +5,6 @@ import importlib
 import inspect
 import re
 import subprocess
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -106,28 +105,31 @@ def name_of(path: Path) -> str:
     return path.relative_to(CHECKOUT).as_posix()
 
 
-def imports(source: str, package: str = "") -> Iterator[tuple[int, str]]:
-    """Yield (line, absolute module name) of everything imported, wherever in the file.
+@cache
+def imports(source: str, package: str = "") -> tuple[tuple[int, str], ...]:
+    """All (line, absolute module name) of everything imported, wherever in the file.
 
     Args:
         source: Text of a module.
         package: Package the module lives in; what relative imports are relative to.
     """
+    found = list[tuple[int, str]]()
     for node in nodes_of(source):
         if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name) for alias in node.names)
+            found += ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
                 parents = package.split(".")
                 base = ".".join([*parents[: len(parents) - node.level + 1], *([base] if base else [])])
-            yield node.lineno, base
+            found.append((node.lineno, base))
             # `from unifg import solvers` imports unifg.solvers
-            yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
+            found += ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
         elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
             name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
             if name in ("import_module", "__import__"):
-                yield node.lineno, str(node.args[0].value)
+                found.append((node.lineno, str(node.args[0].value)))
+    return tuple(found)
 
 
 def is_in(module: str, package: str) -> bool:

@@ -6,19 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 import unifg as fg
-from dense import Batch, drive, one_by_one, seen_once, state
+from dense import Batch, drive, one_by_one, state
 from unifg.elimination.symbolic import cliques as find_cliques
 from unifg.elimination.symbolic import separators as find_separators
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.smoothing import Incremental
-from unifg.typing import Array
 
 
 @pytest.mark.parametrize("group", [fg.SE2, fg.SE3, fg.SO3], ids=lambda g: g.name)
@@ -113,84 +110,6 @@ def test_the_best_estimate_is_that_of_complete_back_substitution() -> None:
     assert np.abs(rough - full).max() > 1e-6  # or the test has shown nothing
 
 
-def test_landmarks_of_another_dimension_and_a_residual_of_the_users_own() -> None:
-    """Against SciPy's least squares over plain vectors, with landmarks that appear when they are first seen."""
-    rng = np.random.default_rng(3)
-    landmarks, poses = rng.uniform(-3, 3, (6, 2)), 12
-    look = fg.residual(seen_once, rows=2)
-    smoother = Incremental(relinearize=1e-6, wildfire=0.0)
-    x, points = smoother.variables("x", fg.SE2), smoother.variables("l", fg.Rn(2))
-    known: list[int] = []
-    drives, looks = [], []
-    truth = fg.SE2.identity()
-    for k in range(poses):
-        guess = truth
-        if k:
-            step = fg.SE2.exp(np.array([0.5, 0.0, 0.4]))
-            truth = fg.SE2.compose(truth, step)
-            measured = fg.SE2.compose(step, fg.SE2.exp(0.05 * rng.standard_normal(3)))
-            smoother.minimize(fg.between, x[k - 1], x[k], measured, sigma=0.05)
-            drives.append(measured)
-            guess = fg.SE2.compose(smoother.estimate(x[-1])[0], measured)
-        else:
-            smoother.minimize(fg.prior, x[0], truth, sigma=0.01)
-        which = rng.choice(6, size=2, replace=False)
-        body = fg.SE2.act(fg.SE2.inverse(truth), landmarks[which]) + 0.02 * rng.standard_normal((2, 2))
-        new = [j for j in which.tolist() if j not in known]
-        known += new
-        members = [known.index(j) for j in which.tolist()]
-        smoother.minimize(look, x[k], points[members], body, sigma=0.02)  # one pose, two landmarks
-        looks += [(k, member, seen) for member, seen in zip(members, body, strict=True)]
-        smoother.update({x: guess, points: landmarks[new] + 0.3} if new else {x: guess}, iterations=2)
-    smoother.update(iterations=10)
-
-    def residual(unknowns: Array) -> Array:
-        at, seen_points = unknowns[: 3 * poses].reshape(-1, 3), unknowns[3 * poses :].reshape(-1, 2)
-        parts = [fg.SE2.local(fg.SE2.identity(), at[0]) / 0.01]
-        for k, measured in enumerate(drives):
-            parts.append(fg.SE2.local(measured, fg.SE2.between(at[k], at[k + 1])) / 0.05)
-        for k, member, seen in looks:
-            parts.append((fg.SE2.act(fg.SE2.inverse(at[k]), seen_points[member]) - seen) / 0.02)
-        return np.concatenate(parts)
-
-    start = np.concatenate([smoother.estimate(x).ravel(), smoother.estimate(points).ravel()])
-    best = least_squares(residual, start + 0.02 * rng.standard_normal(len(start)), xtol=1e-14, ftol=1e-14, gtol=1e-12)
-    np.testing.assert_allclose(start, best.x, atol=1e-5)
-    assert smoother.cost == pytest.approx(best.cost, rel=1e-7)
-
-
-def test_products_move_part_by_part() -> None:
-    state = fg.Product(pose=fg.SE2, velocity=fg.Rn(2))
-    smoother = Incremental(relinearize=0.0, wildfire=0.0)
-    s = smoother.variables("s", state)
-
-    @numba.njit  # type: ignore[untyped-decorator]
-    def at(value: Array, goal: Array, r: Array) -> None:
-        for k in range(5):
-            r[k] = value[k] - goal[k]
-
-    goal = np.array([1.0, 2.0, 0.5, -1.0, 3.0])
-    smoother.minimize(fg.residual(at, rows=5), s[0], goal, sigma=0.1)
-    smoother.update({s: np.zeros(5)}, iterations=8)
-    np.testing.assert_allclose(smoother.estimate(s)[0], goal, atol=1e-7)
-    np.testing.assert_allclose(smoother.estimate(s.velocity)[0], goal[3:], atol=1e-7)
-    assert smoother.covariance(s.velocity) == pytest.approx(0.01 * np.eye(2))
-
-
-def test_a_robust_loss_disarms_a_wrong_loop_closure() -> None:
-    errors = []
-    for robust in (None, fg.Cauchy(1.0)):
-        smoother = Incremental(relinearize=0.0, wildfire=0.0)
-        x = smoother.variables("x", fg.SE2)
-        smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.01)
-        for k in range(1, 10):
-            smoother.minimize(fg.between, x[k - 1], x[k], [1.0, 0.0, 0.0], sigma=0.1)
-        smoother.minimize(fg.between, x[0], x[9], [0.0, 4.0, 0.0], sigma=0.1, robust=robust)
-        smoother.update({x: np.arange(10)[:, None] * [1.0, 0.0, 0.0]}, iterations=20)
-        errors.append(np.abs(smoother.estimate(x[9])[0] - [9.0, 0.0, 0.0]).max())
-    assert errors[0] > 1.0 and errors[1] < 0.1
-
-
 def test_what_is_missing_is_named_and_may_be_added_later() -> None:
     smoother = Incremental()
     x = smoother.variables("x", fg.SE2)
@@ -240,21 +159,6 @@ def test_refusals_name_term_and_family(wrong: Callable[..., object], message: st
     with pytest.raises(GraphError, match=message):
         wrong(smoother, x, y, v)
     assert len(x) == 0 and len(smoother) == 0
-
-
-def test_singular_information_and_whole_batches() -> None:
-    """A bearing alone, and all factors of a chain in one statement."""
-    smoother = Incremental(relinearize=0.0, wildfire=0.0)
-    x = smoother.variables("x", fg.SE2)
-    n = 30
-    poses = fg.SE2.random(np.random.default_rng(0), (n,))
-    smoother.minimize(fg.prior, x[0], poses[0], information=np.eye(3))
-    smoother.minimize(
-        fg.between, x[np.arange(n - 1)], x[np.arange(1, n)], fg.SE2.between(poses[:-1], poses[1:]), sigma=0.1
-    )
-    smoother.minimize(fg.prior, x[n - 1], poses[-1], information=np.diag([0.0, 0.0, 4.0]))
-    smoother.update({x: fg.SE2.retract(poses, 0.1 * np.random.default_rng(1).standard_normal((n, 3)))}, iterations=10)
-    assert np.abs(fg.SE2.local(poses, smoother.estimate(x))).max() < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(30))

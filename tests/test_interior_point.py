@@ -15,7 +15,6 @@ import pytest
 import unifg as fg
 from own_manifolds import S2, SphereManifold
 from problems.control import Quadrotor, Unicycle
-from problems.known import short_drive
 from unifg.codegen.clock import clock
 from unifg.factors.robust import Loss
 from unifg.models import avoidance, quadrotor
@@ -148,42 +147,6 @@ def test_limits_given_as_data_may_become_equalities() -> None:
     assert held.converged, held.report()
     np.testing.assert_allclose(held[x], 1.0, atol=1e-6)
     np.testing.assert_allclose(run.solve(start)[x], 1.0, atol=1e-6)
-
-
-def test_data_return_to_their_defaults() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 3)
-    goal = graph.data("goal", [1.0, 2.0])
-    weight = graph.data("weight", 1.0)
-    start = graph.data("start", [0.0, 0.0])
-    graph.fix(x[0], start)
-    graph.minimize(fg.prior, x[2], goal, sigma=weight, name="goal")
-    graph.minimize(fg.difference, x[:-1], x[1:], sigma=1.0, name="smooth")
-    run, program = SQP().prepare(graph), graph.compile()
-    guess = {x: np.zeros((3, 2))}
-    first = run.solve(guess)[x]
-    given = np.array([3.0, -1.0])
-    moved = run.solve(guess, data={goal: given})[x]
-    assert np.abs(moved - first).max() > 0.1
-    given[:] = 7.0  # a caller may reuse an array
-    np.testing.assert_allclose(run.solve(guess, data={goal: [3.0, -1.0]})[x], moved, atol=1e-9)
-    assert np.abs(run.solve(guess, data={goal: given})[x] - moved).max() > 0.1
-    assert np.abs(run.solve(guess, data={weight: 0.1})[x] - first).max() > 0.1
-    np.testing.assert_allclose(run.solve(guess, data={start: [1.0, 1.0]})[x][0], 1.0)
-    np.testing.assert_allclose(run.solve(guess)[x], first, atol=1e-9)
-    assert graph.compile() is program
-
-
-def test_refused_data_leave_nothing_behind() -> None:
-    graph, guess = short_drive()
-    x = graph.families["x"]
-    width = graph.data("width", 1.0)
-    graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], sigma=width, name="anchor")
-    run = InteriorPoint().prepare(graph)
-    expected = run.solve(guess, check=True).cost
-    with pytest.raises(fg.GraphError):
-        run.solve(guess, data={width: -1.0})
-    assert run.solve(guess, check=True).cost == pytest.approx(expected, rel=1e-9)
 
 
 @pytest.mark.parametrize("at", [0, 3, None])

@@ -38,22 +38,6 @@ def chain(count: int, rng: np.random.Generator) -> tuple[fg.Graph, fg.Family, Ar
     return graph, x, steps
 
 
-def test_marginal_prior_of_a_linear_chain_is_exact(rng: np.random.Generator) -> None:
-    """Eliminating the first state and adding its prior to the second leaves the others where they were."""
-    graph, x, steps = chain(5, rng)
-    whole = GaussNewton().solve(graph, {x: np.zeros((5, 2))}, check=True)
-    mean, information = whole.marginal_prior(["prior", "step", "gps"], x[0], x[1])
-    rest = fg.Graph()
-    y = rest.variables("y", fg.Rn(2), 4)
-    gps = graph.terms[2].arguments[1]
-    rest.minimize(fg.prior, y[0], mean, information=information)
-    rest.minimize(lambda a, b, z: b - a - z, y[:-1], y[1:], steps[1:], sigma=[0.1, 0.2])
-    rest.minimize(fg.prior, y, gps[1:], sigma=0.7)
-    short = GaussNewton().solve(rest, {y: np.zeros((4, 2))}, check=True)
-    np.testing.assert_allclose(short[y], whole[x][1:], atol=1e-9)
-    np.testing.assert_allclose(short.covariance(y), whole.covariance(x)[2:, 2:], rtol=1e-8, atol=1e-12)
-
-
 def test_marginal_prior_refuses_what_it_cannot_do(rng: np.random.Generator) -> None:
     graph, x, _ = chain(4, rng)
     solution = GaussNewton().solve(graph, {x: np.zeros((4, 2))})
@@ -93,18 +77,6 @@ def test_the_past_ignores_a_weightless_future() -> None:
     joint, alone = episode.pilot.pose, smoother.pose
     assert np.hypot(*(joint - alone)[:2]) < 1e-3
     assert np.hypot(*(joint - episode.world.pose)[:2]) < 0.15  # one step of motion after the last tick
-
-
-def test_a_heavy_future_pulls_the_estimate() -> None:
-    """The bias the documentation warns of: where nothing bounds it, it grows with the control weight."""
-    errors = []
-    for weight in (1e-3, 100.0):
-        settings = NavigationSettings(
-            start=HERE, goals=(THERE,), coupling="joint", seed=3,
-            controller=replace(ControllerSettings(), control_weight=weight, pull=(0.5, 0.5, 0.5)),
-        )  # fmt: skip
-        errors.append(episode_metrics(run_navigation(settings))["localisation_error_m"]["mean"])
-    assert errors[1] > 1.2 * errors[0]
 
 
 def test_the_pull_is_bounded() -> None:
@@ -171,14 +143,3 @@ def test_joint_episode_reaches_its_goal(solver: str) -> None:
     assert metrics["collisions"] == 0
     assert metrics["localisation_error_m"]["mean"] < 0.05
     assert metrics["max_bound_violation"] < 1e-3
-
-
-def test_same_seed_same_joint_drive() -> None:
-    settings = NavigationSettings(start=HERE, goals=(THERE,), coupling="joint", obstacles=1, seed=5)
-    one, two = (Episode(settings).run(maps.stop_after(25)).true_pose for _ in range(2))
-    np.testing.assert_array_equal(one, two)
-
-
-def test_unknown_coupling_is_refused() -> None:
-    with pytest.raises(fg.ScenarioError, match="choose sequential or joint"):
-        Episode(NavigationSettings(start=HERE, goals=(THERE,), coupling="both"))

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -266,32 +263,6 @@ def test_a_short_reference_is_refused() -> None:
 
 
 # ---------------------------------------------------------------- kernels as objects
-
-
-def test_addresses_are_not_pickled() -> None:
-    """They mean nothing to another process."""
-    kernel = kernel_of(ENDPOINT)
-    assert kernel.address
-    copy = pickle.loads(pickle.dumps(kernel))
-    assert "address" not in vars(copy)
-    beams = np.ones((COUNT, 2))
-    np.testing.assert_array_equal(copy(poses(), beams), kernel(poses(), beams))
-
-
-def test_graphs_are_understood_by_another_process() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, COUNT)
-    graph.minimize(fg.between, x[:-1], x[1:], np.array([0.3, 0.1, 0.2]))
-    cost = graph.compile().linearize({x: poses()}).cost
-    program = (
-        "import pickle, sys; graph, values = pickle.load(sys.stdin.buffer);"
-        "print(repr(graph.compile().linearize({graph.families['x']: values}).cost))"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    sent = pickle.dumps((graph, poses()))
-    run = subprocess.run([sys.executable, "-c", program], input=sent, capture_output=True, env=environment, timeout=120)
-    assert run.returncode == 0, run.stderr.decode()
-    assert float(run.stdout) == pytest.approx(cost, rel=1e-12)
 
 
 def test_tables_are_shared_and_what_compiled_code_expects() -> None:

@@ -9,7 +9,6 @@ import unifg as fg
 from unifg.errors import GraphError
 from unifg.models import landmarks
 from unifg.models.quadrotor import STATE
-from unifg.solvers import LevenbergMarquardt
 from unifg.typing import Array
 
 MARKS = np.array([[4.0, 1.0], [-2.0, 3.0], [1.0, -5.0], [6.0, 6.0]])
@@ -59,36 +58,6 @@ def test_the_cost_of_a_tilt(angle: float) -> None:
     """1 - cos of the angle to the vertical: upside down is the worst and no second optimum."""
     residual = landmarks.tilt(fg.SO3.exp(angle * np.array([0.6, -0.8, 0.0])), np.array([0.0, 0.0, 1.0]))[0]
     assert 0.5 * residual @ residual == pytest.approx(1.0 - np.cos(angle), abs=1e-14)
-
-
-def test_a_state_is_found_by_what_it_senses() -> None:
-    rng = np.random.default_rng(4)
-    truth = state((0.5, -0.3, 2.0), 0.2, -0.1, 0.8)
-    graph = fg.Graph()
-    x = graph.variables("x", STATE, 1)
-    seen = landmarks.observe(truth, MARKS)
-    here = x[np.zeros(len(MARKS), dtype=int)]
-    graph.minimize(landmarks.bearing_range, here, MARKS, seen, sigma=[0.01, 0.05])
-    graph.minimize(landmarks.height, x.p, 2.0, sigma=0.03)
-    graph.minimize(landmarks.tilt, x.R, landmarks.tilt(truth[3:7], np.zeros(3))[0], sigma=0.01)
-    graph.minimize(fg.prior, x.v, [0.0, 0.0, 0.0], sigma=1.0)
-    start = STATE.retract(
-        truth[None], np.concatenate([rng.normal(size=3), 0.3 * rng.normal(size=3), np.zeros(3)])[None]
-    )
-    solution = LevenbergMarquardt().solve(graph, {x: start})
-    assert solution.converged, solution.report()
-    np.testing.assert_allclose(STATE.local(truth, solution[x][0]), 0.0, atol=1e-7)
-
-
-def test_a_landmark_is_found_where_it_was_seen() -> None:
-    """Landmarks are variables too: three states see one place."""
-    states = np.stack([state((0.0, 0.0, 1.0)), state((1.0, 2.0, 1.5), 0.2, 0.1, 1.0), state((3.0, 0.0, 1.0), yaw=2.0)])
-    graph = fg.Graph()
-    place = graph.variables("landmark", fg.Rn(2), 1)
-    seen = np.concatenate([landmarks.observe(x, MARKS[:1]) for x in states])
-    graph.minimize(landmarks.bearing_range, states, place[np.zeros(3, dtype=int)], seen, sigma=[0.01, 0.05])
-    solution = LevenbergMarquardt().solve(graph, {place: np.array([[3.0, 0.5]])})
-    np.testing.assert_allclose(solution[place], MARKS[:1], atol=1e-7)
 
 
 def test_wrong_shapes_are_refused() -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from fractions import Fraction
 from math import comb, factorial
@@ -112,21 +110,6 @@ def test_a_group_of_your_own(rng: Generator) -> None:
     x, y = rng.standard_normal((3, 1, 2)), rng.standard_normal((5, 2))
     np.testing.assert_array_equal(double(x), -x)
     np.testing.assert_array_equal(plus(x, y), x + y)
-
-
-def test_import_compiles_nothing() -> None:
-    code = """
-from numba.core import event
-listener = event.RecordingListener()
-with event.install_listener("numba:compile", listener):
-    import unifg
-assert not listener.buffer, listener.buffer
-with event.install_listener("numba:compile", listener):
-    import numba
-    numba.njit(lambda x: x + 1)(1.0)
-assert listener.buffer  # the witness sees what there is to see
-"""
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 # -- functions of an angle --

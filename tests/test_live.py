@@ -293,6 +293,7 @@ def test_a_run_is_watched_tick_by_tick(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(scenes) == 1  # nobody wants to see it
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_says_where_a_run_can_be_watched(
     tmp_path: Any, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -263,15 +263,15 @@ def test_other_bases_and_stated_slip_are_refused() -> None:
 
 
 def test_a_flight_repeats_and_is_not_that_of_the_own_plant() -> None:
-    def flown(world: str) -> Array:
-        settings = FlightSettings(seed=1003, world=world, time_limit=2.0)
+    def flown(world: str, seconds: float = 2.0) -> Array:
+        settings = FlightSettings(seed=1003, world=world, time_limit=seconds)
         log = Flight(settings, rehearsal=True).run(lambda done, text: None)
         assert log.settings["world"] == world and not log.collisions and log.health == ["ok"] * log.ticks
         assert np.linalg.norm(log.believed[:, :3] - log.truth[:, :3], axis=1).max() < 0.15
         return log.truth
 
-    first, again, own = flown("mujoco"), flown("mujoco"), flown("air")
-    np.testing.assert_array_equal(first, again)
+    first, again, own = flown("mujoco"), flown("mujoco", 0.5), flown("air")
+    np.testing.assert_array_equal(first[: len(again)], again)
     assert first[-1, 0] > 2.5 and 1e-3 < np.linalg.norm(first[-1, :3] - own[-1, :3]) < 0.3
 
 

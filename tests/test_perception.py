@@ -330,9 +330,9 @@ def test_discs_in_the_building(shared_data: Path) -> None:
         """A tracker whose answers are timed and held against the truth."""
 
         def update(self, scan: Scan, pose: ArrayLike, dt: float) -> Tracks:
-            begin = time.perf_counter()
+            begin = time.thread_time()
             tracks = super().update(scan, pose, dt)
-            spent.append(time.perf_counter() - begin)
+            spent.append(time.thread_time() - begin)
             near = np.linalg.norm(tracks.centre - world.pose[:2], axis=1) < 3.0
             fresh = tracks.at(near & (tracks.unseen == 0.0))
             errors.extend(np.linalg.norm(fresh.centre[:, None] - centres[None], axis=2).min(axis=1).tolist())

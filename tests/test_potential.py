@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.models import unicycle
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.obstacles import disc_clearance, wall_distance
 from unifg.models.potential import FAR, NEAR, SCALE, Sense, potential
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt
 from unifg.typing import Array
 
-SENSES: tuple[Sense, ...] = ("circulate", "aside")
 CENTRE, RADIUS = np.array([[0.0, 0.0]]), np.array([0.3])
 
 
@@ -218,26 +216,3 @@ def test_vortex_leads_around_an_obstacle(
     heights = [row.values[family][0, 1] for row in free.history if row.values is not None]
     left = sense == "aside" or vortex < 0.0  # clockwise past a disc ahead is to the left
     assert (max(heights) > 1.0) if left else (min(heights) < -1.0)
-
-
-def test_one_sense_bends_a_trajectory_both_ways() -> None:
-    """Circulation pushes the poses before a disc to one side and those behind it to the other, aside all to one."""
-    count, dt = 12, 0.2
-    reference = np.stack([np.linspace(0.0, 2.0, count + 1), np.zeros(count + 1), np.zeros(count + 1)], axis=1)
-    heights = {}
-    for sense in SENSES:
-        graph = fg.Graph()
-        x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
-        graph.fix(x[0], [0.0, 0.0, 0.0])
-        graph.minimize(unicycle.tracking, x[1:], reference[1:], sigma=0.3)
-        graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
-        graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], dt, lower=0.0, upper=0.0)
-        push = potential(disc_clearance, vortex=1.0, sense=sense)
-        graph.minimize(push, x[1:], np.array([[1.0, 0.0]]), np.array([0.1]), sigma=0.3)
-        guess = {x: reference, u: np.tile([2.0 / (count * dt), 0.0], (count, 1))}
-        solution = AugmentedLagrangian(search_iterations=3, max_iterations=3, keep_values=True).solve(graph, guess)
-        row = solution.history[3]
-        assert row.values is not None and row.details["search"] == 1
-        heights[sense] = row.values[x][1:, 1]
-    assert (heights["circulate"][:4] < 0.0).all() and (heights["circulate"][7:] > 0.0).all()
-    assert (heights["aside"] > 0.0).all()

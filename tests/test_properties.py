@@ -13,7 +13,7 @@ from numpy.random import Generator
 
 import unifg as fg
 from judge import judge
-from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint
+from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.solvers.names import backends
 from unifg.typing import Array, IntArray
 
@@ -260,28 +260,3 @@ def test_started_at_the_answer_nothing_happens(name: str, seed: int) -> None:
     assert again.cost == first.cost
     for family, array in first.values.items():
         np.testing.assert_array_equal(again[family], array)
-
-
-@given(seed=SEEDS)
-@FEW
-def test_convex_backends_agree(seed: int) -> None:
-    problem = Convex(seed)
-    costs = [problem.solve(solver, *problem.order).cost for solver in EXACT.values()]
-    np.testing.assert_allclose(costs, costs[0], rtol=1e-7, atol=1e-8)
-
-
-@given(seed=SEEDS)
-@FEW
-def test_prepared_runs_remember_nothing(seed: int) -> None:
-    """A second solve of the same guess repeats the first, whatever was solved between."""
-    graph, guess = wild(seed)
-    other = {
-        family: family.manifold.retract(array, np.full(family.manifold.dim, 0.1)) for family, array in guess.items()
-    }
-    for solver in (SQP(), InteriorPoint(), AugmentedLagrangian()):
-        run = solver.prepare(graph)
-        first = run.solve(guess)
-        run.solve(other)
-        again = run.solve(guess)
-        assert (again.status, again.iterations) == (first.status, first.iterations)
-        assert again.cost == pytest.approx(first.cost, rel=1e-6, abs=1e-9)

@@ -63,15 +63,23 @@ LATE = (
 
 
 def test_the_import_loads_what_a_graph_is_made_of_alone() -> None:
+    """And compiles nothing."""
     script = f"""
 import sys
 import numpy, numba
+from numba.core import event
+listener = event.RecordingListener()
 there = {{*sys.modules}}
-import unifg as fg
+with event.install_listener("numba:compile", listener):
+    import unifg as fg
+assert not listener.buffer, listener.buffer
 fg.Graph, fg.solve, fg.SE2
 late = [name for name in {LATE} if name in {{*sys.modules}} - there]
 assert not late, late
 assert fg.FixedLag.__module__ == "unifg.smoothing.fixed_lag" and "unifg.smoothing" in sys.modules
+with event.install_listener("numba:compile", listener):
+    numba.njit(lambda x: x + 1)(1.0)
+assert listener.buffer  # the witness sees what there is to see
 """
     ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120)
     assert ended.returncode == 0, ended.stderr

@@ -14,10 +14,9 @@ import unifg as fg
 from unifg.errors import GraphError
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.models import quadrotor, rkmk
-from unifg.models.quadrotor import CONTROL, DRAG, GRAVITY, MASS, STATE, UPDRAFT, WIND, Parameters
+from unifg.models.quadrotor import GRAVITY, STATE, Parameters
 from unifg.models.rkmk import Method, step_defect
 from unifg.models.tableau import METHODS
-from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array
 
 RNG = np.random.default_rng(11)
@@ -69,37 +68,12 @@ def test_level_hover_carries_the_weight() -> None:
     np.testing.assert_allclose(up, np.array([-3.0, 0.0, GRAVITY]) / np.hypot(3.0, GRAVITY), atol=1e-15)  # into the wind
 
 
-def test_free_fall() -> None:
-    """Without thrust and drag every integrator gives the parabola, however the vehicle tumbles."""
-    start = states(1)[0]
-    tumbling = np.array([3.0, -2.0, 1.0, 0.0])
-    t = 1.5
-    expected = start[:3] + start[7:] * t - 0.5 * GRAVITY * t * t * np.array([0.0, 0.0, 1.0])
-    for reached in (
-        quadrotor.rollout(start, np.tile(tumbling, (30, 1)), t / 30, CALM)[-1],
-        quadrotor.fly(start, tumbling, t, CALM, substeps=3),
-    ):
-        np.testing.assert_allclose(reached[:3], expected, atol=1e-12)
-        np.testing.assert_allclose(reached[7:], start[7:] - [0.0, 0.0, GRAVITY * t], atol=1e-12)
-        turned = fg.SO3.retract(start[3:7], t * tumbling[:3])
-        np.testing.assert_allclose(fg.SO3.local(turned, reached[3:7]), 0.0, atol=1e-13)
-
-
 def test_thrust_lifts_along_the_third_axis_of_the_body() -> None:
     x = states()
     x[:, 7:] = 0.0
     found = velocity(x, np.tile([0.0, 0.0, 0.0, 5.0], (COUNT, 1)), Parameters(2.0))[:, 6:]
     expected = 2.5 * fg.SO3.to_matrix(x[:, 3:7])[:, :, 2] - [0.0, 0.0, GRAVITY]
     np.testing.assert_allclose(found, expected, atol=1e-14)
-
-
-def test_terminal_velocity() -> None:
-    """A level vehicle that falls without thrust ends where drag carries its weight: m g / D_z downwards."""
-    slow = Parameters(1.2, (0.1, 0.1, 0.8))
-    fallen = quadrotor.fly(LEVEL, np.zeros(4), 60.0, slow, substeps=2000)
-    np.testing.assert_allclose(fallen[7:], [0.0, 0.0, -1.2 * GRAVITY / 0.8], atol=1e-9)
-    steps = quadrotor.rollout(LEVEL, np.zeros((1200, 4)), 0.05, slow)
-    np.testing.assert_allclose(steps[-1, 7:], fallen[7:], atol=1e-9)
 
 
 def test_drag_dissipates_in_every_attitude() -> None:
@@ -113,13 +87,6 @@ def test_drag_dissipates_in_every_attitude() -> None:
     assert (power < 0.0).all()
 
 
-def test_a_mass_error_shows_up_in_the_thrust() -> None:
-    """A vehicle 5 % heavier than its controller believes sinks at g (1 - 1/1.05)."""
-    flown = quadrotor.fly(LEVEL, quadrotor.hover(CALM), 2.0, Parameters(1.05))
-    assert flown[9] == pytest.approx(-2.0 * GRAVITY * (1.0 - 1.0 / 1.05))
-    assert flown[2] == pytest.approx(2.0 - 2.0 * GRAVITY * (1.0 - 1.0 / 1.05))
-
-
 def test_wind_and_noise_are_accelerations_in_the_world() -> None:
     x, u = states(), controls()
     gone = velocity(x, u, REAL) - velocity(x, u, Parameters(REAL.mass, REAL.drag))
@@ -130,40 +97,7 @@ def test_wind_and_noise_are_accelerations_in_the_world() -> None:
     np.testing.assert_allclose(pushed, other, atol=1e-14)
 
 
-def test_the_world_has_no_preferred_place_or_heading() -> None:
-    x, u, still = states(), controls(), Parameters(1.3, (0.3, 0.2, 0.5))
-    yaw, shift = fg.SO3.from_rpy(0.0, 0.0, 1.1), np.array([3.0, -2.0, 5.0])
-
-    def elsewhere(x: Array) -> Array:
-        return np.concatenate(
-            [fg.SO3.act(yaw, x[:, :3]) + shift, fg.SO3.compose(yaw, x[:, 3:7]), fg.SO3.act(yaw, x[:, 7:])], axis=1
-        )
-
-    there, here = quadrotor.step(elsewhere(x), u, 0.1, still), elsewhere(quadrotor.step(x, u, 0.1, still))
-    np.testing.assert_allclose(STATE.local(here, there), 0.0, atol=1e-12)
-
-
 # ---------------------------------------------------------------- integrators
-
-
-def errors(method: str) -> list[float]:
-    """After 0.8 s in ever shorter steps, against an integration fine enough to have no error left."""
-    start, u = STATE.random(np.random.default_rng(2), ()), np.array([1.0, -2.0, 1.5, 14.0])
-    exact = quadrotor.fly(start, u, 0.8, REAL, substeps=4000)
-    found = []
-    for steps in (8, 16, 32, 64):
-        if method == "fly":
-            reached = quadrotor.fly(start, u, 0.8, REAL, substeps=steps)
-        else:
-            reached = quadrotor.rollout(start, np.tile(u, (steps, 1)), 0.8 / steps, REAL)[-1]
-        found.append(float(np.abs(STATE.local(exact, reached)).max()))
-    return found
-
-
-@pytest.mark.parametrize(("method", "order"), [("step", 2), ("fly", 4)])
-def test_order(method: str, order: int) -> None:
-    found = np.array(errors(method))
-    np.testing.assert_allclose(np.log2(found[:-1] / found[1:]), order, atol=0.15)
 
 
 def test_fly_is_rk4_of_the_field() -> None:
@@ -181,27 +115,11 @@ def test_step_is_the_zero_of_the_defect(parameters: Parameters) -> None:
     np.testing.assert_allclose(quadrotor.dynamics(x, u, reached, parameters.packed, 0.3), 0.0, atol=1e-13)
 
 
-def test_a_step_without_drag_is_the_reference_problems_map() -> None:
-    x, u, dt = states(), controls(), 0.05
-    after = fg.SO3.retract(x[:, 3:7], dt * u[:, :3])
-    up = fg.SO3.to_matrix(x[:, 3:7])[:, :, 2] + fg.SO3.to_matrix(after)[:, :, 2]
-    v = x[:, 7:] + dt * (0.5 * u[:, 3:] * up - [0.0, 0.0, GRAVITY])
-    expected = np.concatenate([x[:, :3] + 0.5 * dt * (x[:, 7:] + v), after, v], axis=1)
-    np.testing.assert_allclose(STATE.local(expected, quadrotor.step(x, u, dt, CALM)), 0.0, atol=1e-13)
-
-
 def test_rollout_is_step_after_step() -> None:
     u, dt = controls(7), np.linspace(0.01, 0.1, 7)
     path = quadrotor.rollout(LEVEL, u, dt, REAL)
     for k in range(7):
         np.testing.assert_array_equal(path[k + 1], quadrotor.step(path[k : k + 1], u[k : k + 1], dt[k], REAL)[0])
-
-
-def test_the_attitude_stays_a_rotation() -> None:
-    path = quadrotor.rollout(LEVEL, np.tile([5.0, -3.0, 2.0, 9.0], (20000, 1)), 0.01, REAL)
-    assert np.abs(np.linalg.norm(path[:, 3:7], axis=1) - 1.0).max() < 1e-14
-    flown = quadrotor.fly(LEVEL, np.array([5.0, -3.0, 2.0, 9.0]), 200.0, REAL, substeps=20000)
-    assert abs(np.linalg.norm(flown[3:7]) - 1.0) < 1e-14
 
 
 def noisy_step() -> tuple[Array, ...]:
@@ -248,68 +166,6 @@ def test_dynamics_is_disturbed_dynamics_without_noise() -> None:
 # ---------------------------------------------------------------- what a flight tells
 
 
-def slope(column: int, x: Array, u: Array) -> Array:
-    """Derivatives of the defects of a flight by one argument, one row per defect."""
-    assert quadrotor.disturbed_dynamics.jacobian is not None
-    given = x[:-1], u, np.zeros((len(u), 6)), *spread(REAL, len(u)), x[1:]
-    return np.asarray(quadrotor.disturbed_dynamics.jacobian(*given, 0.05)[column]).reshape(len(u) * 9, -1)
-
-
-def test_mass_and_updraft_are_one_parameter_at_hover_only() -> None:
-    """Columns that are parallel cannot be told apart: mass and updraft at hover, but not where the thrust changes."""
-    start = LEVEL.copy()
-    start[3:7] = quadrotor.hover_attitude(REAL)
-    hover, lively = np.tile(quadrotor.hover(REAL), (40, 1)), np.tile(quadrotor.hover(REAL), (40, 1))
-    lively[:, 3] += 3.0 * np.sin(np.arange(40.0))
-    angles = []
-    for u in (hover, lively):
-        x = quadrotor.rollout(start, u, 0.05, REAL)
-        columns = np.concatenate([slope(3, x, u), slope(5, x, u), slope(6, x, u)], axis=1)  # mass, wind, updraft
-        angles.append(np.linalg.svd(columns / np.linalg.norm(columns, axis=0), compute_uv=False)[-1])
-    assert angles[0] < 1e-12 and angles[1] > 1e-2
-
-
-def test_a_lively_flight_tells_all_parameters() -> None:
-    """Mass, drag, wind and updraft as unknowns shared by all steps, the states and controls known."""
-    t = 0.05 * np.arange(60)
-    u = np.column_stack([2.0 * np.sin(5.0 * t), 2.0 * np.cos(4.0 * t), np.sin(t), 14.0 + 4.0 * np.sin(7.0 * t)])
-    x = quadrotor.rollout(LEVEL, u, 0.05, REAL)
-    graph = fg.Graph()
-    families: list[tuple[fg.Family, Any]] = [
-        (graph.variables("mass", MASS, 1), [REAL.mass]),
-        (graph.variables("drag", DRAG, 1), REAL.drag),
-        (graph.variables("wind", WIND, 1), REAL.wind),
-        (graph.variables("updraft", UPDRAFT, 1), [REAL.updraft]),
-    ]
-    rho = [family for family, _ in families]
-    everywhere = [family[np.zeros(60, dtype=int)] for family in rho]
-    graph.minimize(quadrotor.disturbed_dynamics, x[:-1], u, np.zeros((60, 6)), *everywhere, x[1:], 0.05, sigma=0.01)
-    guess = {family: np.full((1, family.manifold.dim), 1.0 if family.name == "mass" else 0.0) for family in rho}
-    solution = GaussNewton(tolerance=1e-9).solve(graph, guess)
-    assert solution.converged, solution.report()
-    for family, truth in families:
-        np.testing.assert_allclose(solution[family][0], truth, atol=1e-8)
-
-
-def test_a_known_mass_is_data() -> None:
-    """The parameters of the plan change between solves without a new graph."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", STATE, 11), graph.variables("u", CONTROL, 10)
-    rho = graph.data("parameters", CALM.packed)
-    graph.fix(x[0], LEVEL)
-    graph.minimize(fg.prior, x.p, LEVEL[:3], sigma=0.1)
-    graph.minimize(fg.prior, x.v, [0.0, 0.0, 0.0], sigma=0.1)
-    graph.minimize(fg.prior, u, [0.0, 0.0, 0.0, 0.0], sigma=1e4)
-    graph.constrain(quadrotor.dynamics, x[:-1], u, x[1:], rho, 0.1, lower=0.0, upper=0.0)
-    guess = {x: np.tile(LEVEL, (11, 1)), u: np.tile(quadrotor.hover(CALM), (10, 1))}
-    run = InteriorPoint().prepare(graph)
-    for mass in (1.0, 1.6):
-        heavy = Parameters(mass)
-        solution = run.solve(guess, data={rho: heavy.packed})
-        assert solution.converged
-        np.testing.assert_allclose(solution[u], np.tile(quadrotor.hover(heavy), (10, 1)), atol=1e-3)
-
-
 # ---------------------------------------------------------------- refusals
 
 
@@ -350,11 +206,3 @@ def test_wrong_shapes_are_refused() -> None:
     for words, call in wrong.items():
         with pytest.raises((fg.ModelError, GraphError), match=words):
             call()
-
-
-def test_a_state_that_is_not_finite_is_refused_by_name() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", STATE, 2)
-    graph.minimize(quadrotor.dynamics, x[:1], controls(1), x[1:], CALM.packed, 0.1)
-    with pytest.raises(GraphError, match="x"):
-        GaussNewton().solve(graph, {x: np.full((2, 10), np.nan)})

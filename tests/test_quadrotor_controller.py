@@ -266,28 +266,6 @@ def test_limits_leave_time_to_dodge_what_stands_close() -> None:
 # ---------------------------------------------------------------- flights
 
 
-def fly(controller: Controller, start: Array, known: Landmarks, ticks: int, parameters: quadrotor.Parameters) -> Array:
-    """True states (n + 1, 10), with landmarks that come into view at 3 m."""
-    states = [start]
-    for _ in range(ticks):
-        seen = gaps(states[-1][None], known)[0] < 3.0
-        view = Landmarks(
-            known.ids[seen], known.positions[seen], known.covariances[seen], known.radii[seen], known.kinds[seen]
-        )
-        plan = controller.plan(belief(states[-1], view, parameters))
-        states.append(quadrotor.fly(states[-1], plan.controls[0], controller.settings.dt, parameters))
-    return np.array(states)
-
-
-def test_a_flight_past_cylinders_seen_late_arrives() -> None:
-    known = landmarks((4.0, 0.2, 0.5), (6.5, -0.7, 0.5), (7.0, 1.0, 0.4), (9.0, 0.3, 0.6))
-    controller = Controller(TARGET, WALLS, bounds=BOUNDS)
-    states = fly(controller, state(1.0), known, 150, HEAVY)
-    assert gaps(states, known).min() > HULL + 0.04
-    assert np.linalg.norm(states[-1, :3] - TARGET) < 0.1 and np.linalg.norm(states[-1, 7:]) < 0.1
-    assert set(controller.loop.sources) == {"solved"}
-
-
 @pytest.mark.parametrize("aware", [True, False])
 def test_a_mover_that_crosses_is_avoided_by_those_who_know(aware: bool) -> None:
     controller, dt = Controller(TARGET, WALLS, bounds=BOUNDS), 0.05

@@ -182,18 +182,6 @@ def test_a_plan_moves_as_the_shared_parameters_say_and_keeps_clear_of_the_shared
     assert np.all(np.abs(plan.controls[:, :3]) <= s.rate_limits)
 
 
-def test_backends_believe_the_same(past: Past) -> None:
-    found = {}
-    for solver in CONSTRAINED:
-        controller = past.controller(FREE, solver)
-        controller.plan(past.belief)
-        found[solver] = past.pulled(latest(controller))
-    for name, value in found["ipm"].items():
-        assert np.abs(value).max() > 0.02
-        for solver in ("sqp", "alm"):
-            assert np.abs(value - found[solver][name]).max() < 0.01
-
-
 def test_a_known_mass_stays_what_it_is() -> None:
     flight = FlightSettings(seed=SEED)
     window = replace(flight.estimator.window, estimated=("wind",))

@@ -64,12 +64,8 @@ def test_a_short_step_goes_where_the_field_points() -> None:
     np.testing.assert_allclose(wrong / h, 0.0, atol=2e-3)
 
 
-def test_steps_in_a_row_are_one_step() -> None:
-    one, two = quadrotor_loops.held(25.0, 0.02, [0.03, 0.06])
-    once, twice = one[:4].reshape(2, 2), two[:4].reshape(2, 2)
-    np.testing.assert_allclose(once @ once, twice, atol=1e-14)
-    np.testing.assert_allclose(0.5 * (one[5:7] + one[5:7] @ once), two[5:7], atol=1e-14)
-    assert one[4] ** 2 == pytest.approx(two[4]) and 0.5 * one[7] * (1.0 + one[4]) == pytest.approx(two[7])
+def test_nothing_is_missed_by_loops_without_lag_nor_in_no_time() -> None:
+    """Any other duration is held against exponentials of matrices in `test_safe_worlds`."""
     np.testing.assert_array_equal(quadrotor_loops.held(np.inf, 0.02, [0.01, 0.05]), 0.0)  # nothing is missed
     np.testing.assert_allclose(quadrotor_loops.held(25.0, 0.02, 0.0)[0], [1, 0, 0, 1, 1, 1, 0, 1], atol=1e-15)
 

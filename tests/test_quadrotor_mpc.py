@@ -107,12 +107,6 @@ def test_walls_on_the_map_correct_the_heading_and_cylinders_do_not(association: 
     assert headings[1] > 0.01
 
 
-def test_moving_discs_are_flown_around() -> None:
-    log = run_flight(short(2.0, movers=2))
-    assert log.collisions == 0
-    assert log.movers.shape == (40, 2, 3)
-
-
 def test_the_separate_coupling_learns_no_parameters_and_the_others_do() -> None:
     logs = {coupling: run_flight(short(1.0, coupling=coupling)) for coupling in COUPLINGS}
     nominal = draw_conditions(SEED).nominal.packed

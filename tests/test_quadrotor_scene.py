@@ -280,14 +280,6 @@ def test_tube_keeps_its_radius_in_every_direction(axis: int) -> None:
     assert len(faces) == 2 * 4 * 4 and faces.max() == 19
 
 
-def test_box_looks_outwards() -> None:
-    vertices, faces = shapes.box([1.0, 2.0, 3.0], [0.2, 0.4, 0.6])
-    np.testing.assert_allclose(np.ptp(vertices, axis=0), [0.2, 0.4, 0.6])
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.sum(normals * (corners.mean(axis=1) - [1.0, 2.0, 3.0]), axis=1) > 0.0).all()
-
-
 def test_ellipse_axes_and_thinning() -> None:
     turn = np.array([[math.cos(0.4), -math.sin(0.4)], [math.sin(0.4), math.cos(0.4)]])
     long, short, direction = shapes.ellipse_axes(turn @ np.diag([0.09, 0.01]) @ turn.T, 2.0)

@@ -10,7 +10,6 @@ import pytest
 
 import unifg as fg
 from problems.known import line, short_drive
-from unifg.models import unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton
 from unifg.typing import Array
 
@@ -115,24 +114,6 @@ def test_check_finds_nothing_in_a_sound_graph() -> None:
     graph, guess = short_drive()
     report = graph.check(guess)
     assert report, str(report)
-
-
-def test_check_finds_a_wrong_jacobian() -> None:
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 3), graph.variables("u", fg.Rn(2), 2)
-
-    def jacobian(*arguments: Array) -> list[Array]:
-        assert unicycle.dynamics.jacobian is not None
-        blocks = list(unicycle.dynamics.jacobian(*arguments))
-        blocks[1] = -blocks[1]
-        return blocks
-
-    wrong = fg.residual(unicycle.dynamics.function, jacobian, "dynamics")
-    graph.fix(x[0], [0.0, 0.0, 0.0])
-    graph.minimize(fg.prior, u, [0.5, 0.1])
-    graph.constrain(wrong, x[:-1], u, x[1:], 0.1, lower=0.0, upper=0.0)
-    report = graph.check({x: np.zeros((3, 3)), u: np.full((2, 2), 0.3)})
-    assert [(f.kind, f.term, f.family) for f in report.findings] == [("wrong Jacobian", "dynamics", "u")]
 
 
 def test_check_finds_what_nothing_determines() -> None:

@@ -12,14 +12,11 @@ import unifg as fg
 from unifg.factors.differences import jacobian
 from unifg.models import rkmk, unicycle
 from unifg.models.rkmk import Method
-from unifg.solvers import SQP, LevenbergMarquardt
+from unifg.solvers import SQP
 from unifg.typing import Array
 
 RNG = np.random.default_rng(11)
 FORMS: tuple[Method, ...] = ("full trapezoid", "simplified trapezoid")
-GROUPS: list[fg.LieGroup] = [fg.SE2, fg.SO2, fg.Rn(2), fg.Product(pose=fg.SE2, v=fg.Rn(2))]
-
-
 def current(x: Array, u: Array) -> Array:
     """A velocity that depends on the whole pose: a vehicle in a current, (n, 3)."""
     return np.stack(
@@ -39,54 +36,7 @@ def implicit_step(form: Method, x: Array, u: Array, h: float) -> Array:
     return after
 
 
-def flow(x: Array, u: Array, time: float, steps: int = 2000) -> Array:
-    """The same motion by small classical Runge-Kutta steps of world coordinates; uses neither Log nor dexp."""
-
-    def slope(y: Array) -> Array:
-        v, c, s = current(y, u), np.cos(y[:, 2]), np.sin(y[:, 2])
-        return np.stack([c * v[:, 0] - s * v[:, 1], s * v[:, 0] + c * v[:, 1], v[:, 2]], axis=1)
-
-    h = time / steps
-    for _ in range(steps):
-        a = slope(x)
-        b = slope(x + 0.5 * h * a)
-        c = slope(x + 0.5 * h * b)
-        d = slope(x + h * c)
-        x = x + h / 6.0 * (a + 2.0 * b + 2.0 * c + d)
-    return x
-
-
 START, CONTROL = np.array([[0.3, -0.2, 0.5]]), np.array([[1.0, 0.8]])
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_held_control_gives_the_exponential(form: Method) -> None:
-    """With F constant over the step X Exp(hF) is exact in both forms."""
-    x = fg.SE2.random(RNG, (200,))
-    u = RNG.normal(size=(200, 2))
-    for h in (0.02, 0.1, 0.7):
-        exact = fg.SE2.retract(x, h * rkmk.unicycle_field(x, u))
-        defect = rkmk.integrator(fg.SE2, rkmk.unicycle_field, form)(x, u, exact, h)
-        assert np.abs(defect).max() < 1e-14
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_the_constraint_leads_to_the_exponential(form: Method) -> None:
-    """Solved for the next pose from a guess elsewhere, the answer is X Exp(hF)."""
-    x = np.array([[0.2, -0.3, 3.0]])
-    u, h = np.array([[0.9, 0.8]]), 0.5
-    graph = fg.Graph()
-    nodes = graph.variables("x", fg.SE2, 2)
-    control = graph.variables("u", fg.Rn(2), 1)
-    graph.fix(nodes[0], x[0])
-    graph.fix(control, u[0])
-    graph.minimize(
-        rkmk.integrator(fg.SE2, rkmk.unicycle_field, form),
-        nodes[:-1], control, nodes[1:], h,
-    )  # fmt: skip
-    solution = LevenbergMarquardt(tolerance=1e-15).solve(graph, {nodes: np.tile(x, (2, 1)), control: u})
-    exact = fg.SE2.retract(x, h * rkmk.unicycle_field(x, u))
-    assert np.abs(fg.SE2.local(exact, solution[nodes[1]])).max() < 1e-14
 
 
 def test_an_input_of_one_axis_is_shared_and_another_order_is_refused() -> None:
@@ -113,51 +63,6 @@ def test_midpoint_model_is_close_but_not_the_same() -> None:
     assert np.linalg.norm(defect) == pytest.approx(h * (1.0 - np.sin(0.05) / 0.05), rel=1e-2)
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_second_order_when_the_field_depends_on_the_state(form: Method) -> None:
-    time, errors = 1.0, []
-    exact = flow(START, CONTROL, time)
-    for steps in (8, 16, 32, 64):
-        x = START
-        for _ in range(steps):
-            x = implicit_step(form, x, CONTROL, time / steps)
-        errors.append(float(np.linalg.norm(fg.SE2.local(exact, x))))
-    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
-    assert np.abs(orders - 2.0).max() < 0.02, orders
-
-
-def test_what_the_simplified_form_drops() -> None:
-    """Its step differs from the full one by h^3/8 [F, F']: a term of the order of the trapezoid's own error."""
-    rate = (flow(START, CONTROL, 1e-5, 1) - flow(START, CONTROL, -1e-5, 1)) / 2e-5
-    body = fg.SE2.local(START, START + 1e-6 * rate) / 1e-6
-    ahead, behind = (current(fg.SE2.retract(START, s * body), CONTROL) for s in (1e-5, -1e-5))
-    bracket = fg.SE2.ad(current(START, CONTROL)[0]) @ ((ahead - behind)[0] / 2e-5)
-    for h in (0.01, 0.005):
-        full, simplified = (implicit_step(form, START, CONTROL, h) for form in FORMS)
-        dropped = fg.SE2.local(simplified, full)[0]
-        np.testing.assert_allclose(dropped, h**3 / 8.0 * bracket, atol=0.05 * h**3 * np.abs(bracket).max())
-
-
-@pytest.mark.parametrize("group", GROUPS, ids=lambda g: g.name)
-def test_sign_of_dexp(group: fg.LieGroup) -> None:
-    """Exp(xi)^-1 Exp(xi + d) = Exp(dexp(xi) d) and dexp_inv undoes it: an order test cannot see this sign."""
-    tangent = RNG.normal(size=(50, group.dim))
-    small = 1e-7 * RNG.normal(size=(50, group.dim))
-    change = group.local(group.exp(tangent), group.exp(tangent + small))
-    inverse = group.right_jacobian_inverse(tangent)
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", inverse, change), small, atol=3e-14)
-    if not isinstance(group, fg.Rn) and group != fg.SO2:
-        other = group.left_jacobian_inverse(tangent)  # the sign of the formula Ta cites
-        assert np.abs(np.einsum("nij,nj->ni", other, change) - small).max() > 1e-8
-
-
-def test_series_of_dexp_inverse() -> None:
-    tangent = 0.01 * RNG.normal(size=(20, 3))
-    ad = fg.SE2.ad(tangent)
-    series = np.eye(3) + ad / 2.0 + ad @ ad / 12.0
-    np.testing.assert_allclose(fg.SE2.right_jacobian_inverse(tangent), series, atol=1e-9)
-
-
 def test_sign_inside_the_residual() -> None:
     """The full form minus the simplified one is -h/2 (dexp_inv - I) F, with +ad/2 in front."""
     x = fg.SE2.random(RNG, (20,))
@@ -167,27 +72,6 @@ def test_sign_inside_the_residual() -> None:
     leading = -0.25 * h * np.einsum("nij,nj->ni", fg.SE2.ad(tangent), current(after, u))
     np.testing.assert_allclose(full - simplified, leading, atol=1e-4 * h)
     assert np.abs(leading).max() > 1e-3 * h
-
-
-def test_exponential_coordinates_obey_their_equation() -> None:
-    """Eq. 17 along the true motion: d/dt Log(x_0^-1 x(t)) = dexp_inv(xi) F."""
-    ahead, here, behind = (flow(START, CONTROL, t) for t in (0.8 + 1e-5, 0.8, 0.8 - 1e-5))
-    rate = (fg.SE2.local(START, ahead) - fg.SE2.local(START, behind)) / 2e-5
-    inverse = fg.SE2.right_jacobian_inverse(fg.SE2.local(START, here))
-    np.testing.assert_allclose(rate[0], inverse[0] @ current(here, CONTROL)[0], atol=1e-8)
-    assert np.abs(rate[0] - inverse[0].T @ current(here, CONTROL)[0]).max() > 1e-2
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_vector_spaces_have_the_ordinary_trapezoid(form: Method) -> None:
-    space, h = fg.Rn(2), 0.2
-
-    def pendulum(x: Array, u: Array) -> Array:
-        return np.stack([x[:, 1], u[:, 0] - np.sin(x[:, 0])], axis=1)
-
-    x, after, u = (RNG.normal(size=(5, n)) for n in (2, 2, 1))
-    expected = after - x - 0.5 * h * (pendulum(x, u) + pendulum(after, u))
-    np.testing.assert_allclose(rkmk.integrator(space, pendulum, form)(x, u, after, h), expected, atol=1e-15)
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -72,13 +72,6 @@ def test_route_finds_a_detour_around_a_disc() -> None:
     assert not any(route.repair(start, tracks) for _ in range(20)), "the detour is clear: no reason for another"
 
 
-def test_route_waits_where_no_way_remains() -> None:
-    route, start = through_the_hall()
-    before = route.path
-    assert not route.repair(start, disc(3.5, 1.0, 0.8))
-    assert route.path is before
-
-
 def test_route_refuses_a_gap_too_narrow_for_the_controller() -> None:
     """Hull and disc fit side by side, but not with the clearances that the controller asks for."""
     route, start = through_the_hall()
@@ -183,8 +176,8 @@ def test_a_guess_without_a_warm_start_can_be_driven(heading: float) -> None:
 
 @pytest.mark.parametrize(
     "tracks",
-    [disc(8.0, 1.0, 0.25), disc(3.5, 1.0, 0.25, (0.0, 0.3)), disc(3.5, 1.75, 0.2)],
-    ids=["too far", "moving", "beside the path"],
+    [disc(8.0, 1.0, 0.25), disc(3.5, 1.0, 0.25, (0.0, 0.3)), disc(3.5, 1.75, 0.2), disc(3.5, 1.0, 0.8)],
+    ids=["too far", "moving", "beside the path", "no way remains"],
 )
 def test_route_is_left_alone(tracks: Tracks) -> None:
     route, start = through_the_hall()

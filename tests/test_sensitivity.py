@@ -13,15 +13,12 @@ import pytest
 
 import unifg as fg
 from problems.control import Problem, Unicycle, problems, sixteen
-from test_quadrotor_joint import Past
 from unifg.models import unicycle
 from unifg.pose_graphs import manhattan, sphere
 from unifg.problem.fixed_columns import FixedColumns
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.parameters import datum
 from unifg.problem.systems import KktStructure
-from unifg.scenarios.flight import FlightSettings
-from unifg.scenarios.quadrotor.flight_joint import JointSettings
 from unifg.solution import sensitivity
 from unifg.solution.gains import unfixed
 from unifg.solvers import SQP, GraduatedNonConvexity, InteriorPoint, LevenbergMarquardt
@@ -113,24 +110,6 @@ def test_control_cases(problem: Problem) -> None:
             assert "weakly active" in str(error)
     judge.agrees(of, stated._start, 9)
     judge.agrees(of, stated.graph._data["end" if isinstance(problem, Unicycle) else "end p"], 2)
-
-
-@pytest.mark.parametrize("problem", CASES, ids=lambda p: p.title)
-@pytest.mark.parametrize("name", ["sqp", "alm"])
-@pytest.mark.product(6)
-def test_control_cases_by_the_answers_of_other_backends(name: str, problem: Problem) -> None:
-    """Derivatives at their answers are those at the interior point's, which was judged above."""
-    stated = problem.formulation()
-    start = problem.manifold.retract(problem.start[None], np.full((1, problem.manifold.dim), 0.01))[0]
-    data = {stated._start: start}
-    solution = backend(name, tolerance=1e-9).prepare(stated.graph).solve(stated.guess, data=data, check=True)
-    reference = InteriorPoint(tolerance=TIGHT).prepare(stated.graph).solve(solution, data=data, check=True)
-    try:
-        found, expected = (one.sensitivity([stated.x, stated.u, "cost"], "start") for one in (solution, reference))
-    except fg.GraphError as error:
-        assert "weakly active" in str(error)
-        return
-    assert (np.linalg.norm(found - expected, axis=0) <= 1e-5 * np.linalg.norm(expected, axis=0)).all()
 
 
 def walk(state: Callable[..., Any]) -> tuple[fg.Graph, fg.Family]:
@@ -338,31 +317,6 @@ def test_a_joint_graph_of_a_unicycle(data: str) -> None:
     judge = Judge(InteriorPoint(tolerance=TIGHT), graph, guess)
     assert np.abs(judge.solution.dual("disc")).max() > 0.01 and np.abs(judge.solution.dual("limits")).max() > 0.01
     judge.agrees([x, u, graph.families["slip"], "limits", "disc", "future", "cost"], graph._data[data], 3)
-
-
-def test_a_joint_graph_of_a_quadrotor() -> None:
-    """Window, parameters and map of a flight, and the plan that shares them."""
-    past = Past(40, FlightSettings(seed=1000))
-    controller = past.controller(JointSettings(np.inf))
-    controller.plan(past.belief)
-    planned = controller.loop.solution
-    assert planned is not None
-    program = planned._program
-    data = {handle: value.copy() for handle, value in program.binding.present.items()}
-    judge = Judge(InteriorPoint(tolerance=TIGHT), program.graph, planned, data)
-    families = [family for family in program.families if ":" not in family.name]
-    moving = {
-        "survey",
-        "durations",
-        "pushed",
-        "sightings",
-        "tilt",
-        "mass at the start",
-        "wanted controls",
-        "way: wanted",
-    }
-    for name in sorted(moving):
-        judge.agrees([*families, "cost"], program.graph._data[name], 1)
 
 
 def refused(solution: fg.Solution, words: str, of: Any = "x", wrt: Any = "p") -> None:

@@ -11,7 +11,6 @@ from unifg.errors import ModelError
 from unifg.lie import SE3, SE23, SO3
 from unifg.models.quadrotor import STATE
 from unifg.models.space_landmarks import bearing_3d, bearing_range_3d, observe_3d
-from unifg.models.stamped import StampedMeasurements
 from unifg.solvers import InteriorPoint, LevenbergMarquardt
 from unifg.typing import Array
 
@@ -131,46 +130,3 @@ def test_a_direction_without_length_is_refused(
         else:
             found = solver().solve(graph, start, check=True)
             assert np.abs(SE3.local(SE3.identity(), found[x][0])).max() < 1e-6
-
-
-def test_poses_and_landmarks_are_found_together(rng: Generator) -> None:
-    """A sensor mounted askew looks all around, straight up and down too; three landmarks are known."""
-    count, marks = 8, np.concatenate([4.0 * rng.standard_normal((10, 3)), [[0.0, 0.0, 9.0], [0.0, 0.0, -9.0]]])
-    truth = SE3.exp(np.linspace(0.0, 1.0, count)[:, None] * np.array([3.0, 1.0, 0.5, 0.3, -0.8, 2.5]))
-    graph = fg.Graph()
-    x, l = graph.variables("x", SE3, count), graph.variables("l", fg.Rn(3), len(marks))  # noqa: E741
-    pose, mark = (part.ravel() for part in np.mgrid[:count, : len(marks)])
-    z = np.concatenate([observe_3d(at, marks, SE3, MOUNT) for at in truth])
-    z[:, :3] += 0.002 * rng.standard_normal((len(z), 3))
-    z[:, 3] += 0.02 * rng.standard_normal(len(z))
-    seen = bearing_range_3d(SE3, MOUNT)
-    graph.minimize(seen, x[pose], l[mark], z, sigma=[0.002, 0.002, 0.02], name="seen")
-    graph.fix(l[[0, 1, 2]], marks[:3])
-    graph.minimize(seen, x, np.tile(marks[3], (count, 1)), z[3 :: len(marks)], sigma=0.01, name="known")
-    guess = {
-        x: SE3.retract(truth, 0.2 * rng.standard_normal((count, 6))),
-        l: np.concatenate([marks[:3], marks[3:] + 0.5 * rng.standard_normal((9, 3))]),
-    }
-    solution = LevenbergMarquardt().solve(graph, guess, check=True)
-    assert np.abs(SE3.local(truth, solution[x])).max() < 0.03
-    assert np.abs(solution[l] - marks).max() < 0.05
-
-
-def test_landmarks_are_seen_between_nodes(rng: Generator) -> None:
-    """With stamps, by a pose on the geodesic; the landmark is a family of one member."""
-    graph, times = fg.Graph(), np.array([0.0, 0.5, 1.0])
-    x, mark = graph.variables("x", SE3, 3), graph.variables("mark", fg.Rn(3), 1)
-    twist = np.array([1.0, 0.2, 0.0, 0.3, 0.0, 1.0])
-    truth = SE3.exp(times[:, None] * twist)
-    seen = StampedMeasurements(
-        bearing_range_3d(SE3, MOUNT), 4, capacity=3, sigma=[0.01, 0.01, 0.02], constants=("mark",), name="seen"
-    )
-    seen.state(graph, x)
-    graph.minimize(fg.prior, x, truth, sigma=0.001)
-    place = np.array([2.0, 1.0, 3.0])
-    for stamp in (0.1, 0.6, 0.77, 0.9):
-        seen.add(stamp, observe_3d(SE3.exp(stamp * twist), place, SE3, MOUNT)[0])
-    data = seen.at(graph, times)
-    solution = LevenbergMarquardt().solve(graph, {x: truth, mark: [[1.0, 0.0, 2.0]]}, data=data, check=True)
-    np.testing.assert_allclose(solution[mark][0], place, atol=1e-8)
-    assert graph.check({x: truth, mark: place[None]}).routes["seen"] == "traced, its derivatives exact"

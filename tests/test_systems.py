@@ -103,16 +103,6 @@ def test_covariances_of_many_ticks_make_one_analysis(analyses: list[int]) -> Non
     assert all(np.array_equal(one, other) for one, other in zip(blocks, again, strict=True))
 
 
-def test_solutions_with_constraints_keep_their_covariances() -> None:
-    graph, x, start = chain("all")
-    prepared = SQP().prepare(graph)
-    guess = {x: np.zeros((len(x), 3))}
-    found = [prepared.solve(guess, data={start: [tick, 0.0, 0.3 * tick]}) for tick in range(3)]
-    blocks = [solution.marginals(x) for solution in found]
-    again = [solution.marginals(x) for solution in reversed(found)][::-1]
-    assert all(np.array_equal(one, other) for one, other in zip(blocks, again, strict=True))
-
-
 def test_structures_of_changing_rows_do_not_pile_up(analyses: list[int]) -> None:
     program = chain("all", 3 * KEPT)[0].compile()
     rows = np.zeros(program.constraints.count, dtype=bool)

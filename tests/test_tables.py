@@ -161,9 +161,9 @@ def test_code_grows_with_the_digits_of_the_length_alone() -> None:
     assert len(long._residual()) < 3 * len(short._residual())
     times = []
     for expression in (short, long):
-        begin = time.perf_counter()
+        begin = time.thread_time()
         expression._residual()
-        times.append(time.perf_counter() - begin)
+        times.append(time.thread_time() - begin)
     assert times[1] < 5.0 * times[0] + 0.02
 
 

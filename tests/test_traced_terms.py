@@ -6,7 +6,6 @@ import logging
 import math
 import pickle
 import re
-import threading
 import types
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,7 +23,7 @@ from unifg.factors.autodiff.symbols import TraceError
 from unifg.problem import term
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.term import CHANGES
-from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint
+from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array
 
 Function = Callable[..., Any]
@@ -596,21 +595,6 @@ def test_straight_rows_have_no_second_derivatives() -> None:
     assert not derived(lambda x: x**2, (fg.Rn(2),), captured_by(lambda x: x**2)).linear
 
 
-def test_threads_trace_at_once() -> None:
-    found: dict[int, Array] = {}
-
-    def work(k: int) -> None:
-        found[k] = solved(lambda x: np.sin(x) + k * x - 1.0)[1]
-
-    threads = [threading.Thread(target=work, args=(k,)) for k in range(1, 5)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for k in range(1, 5):
-        np.testing.assert_allclose(np.sin(found[k]) + k * found[k], 1.0, atol=1e-9)
-
-
 def test_a_function_that_would_take_seconds_to_compile_is_left_alone() -> None:
     def long(x: Array) -> Array:
         for _ in range(3000):
@@ -622,33 +606,6 @@ def test_a_function_that_would_take_seconds_to_compile_is_left_alone() -> None:
 
 
 # ---------------------------------------------------------------- the same answers as by differences
-
-
-def pendulum(x: Array, u: Array, after: Array, dt: float) -> Array:
-    """Implicit midpoint rule."""
-    mid = 0.5 * (x + after)
-    return np.stack(
-        [after[:, 0] - x[:, 0] - dt * mid[:, 1], after[:, 1] - x[:, 1] - dt * (u[:, 0] - np.sin(mid[:, 0]))], axis=1
-    )
-
-
-@pytest.mark.parametrize(
-    "solver", [InteriorPoint(), SQP(hessian="exact"), SQP(), AugmentedLagrangian()], ids=lambda s: s.name
-)
-def test_backends_find_what_they_find_by_differences(solver: fg.Solver) -> None:
-    found = []
-    for derivatives in ("trace", "differences"):
-        make = functools.partial(fg.residual, derivatives=derivatives)
-        graph = fg.Graph()
-        x, u = graph.variables("x", fg.Rn(2), 11), graph.variables("u", fg.Rn(1), 10)
-        graph.constrain(make(pendulum), x[:-1], u, x[1:], 0.2, lower=0.0, upper=0.0)
-        graph.minimize(make(lambda u: u), u)
-        graph.constrain(make(lambda x: x - np.array([0.0, 1.0])), x[0], lower=0.0, upper=0.0)
-        graph.constrain(make(lambda x: x - np.array([1.0, 0.0])), x[-1], lower=0.0, upper=0.0)
-        graph.constrain(make(lambda x: np.hypot(x[:, :1], x[:, 1:])), x[1:-1], upper=1.1)
-        solution = solver.solve(graph, {x: np.full((11, 2), 0.3), u: np.zeros((10, 1))}, check=True)
-        found.append(np.concatenate([solution[x].ravel(), solution[u].ravel()]))
-    np.testing.assert_allclose(found[0], found[1], atol=2e-5)
 
 
 @pytest.mark.parametrize("offset", [0.0, 1e6])

@@ -256,9 +256,9 @@ def test_verification_costs_little(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def timed(*arguments: Any) -> Any:
         nonlocal spent
-        began = time.perf_counter()
+        began = time.thread_time()
         found = honest(*arguments)
-        spent += time.perf_counter() - began
+        spent += time.thread_time() - began
         return found
 
     monkeypatch.setattr(prepared, "_verified", timed)

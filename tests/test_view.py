@@ -428,7 +428,13 @@ def test_a_distance_map_has_walls_where_the_distance_is_not_positive() -> None:
 
 
 def test_shapes_look_outwards() -> None:
-    for mesh, middle in ((sphere(), np.zeros(3)), (column(), np.array([0.0, 0.0, 0.5]))):
+    brick = box([1.0, 2.0, 3.0], [0.2, 0.4, 0.6])
+    np.testing.assert_allclose(np.ptp(brick[0], axis=0), [0.2, 0.4, 0.6])
+    for mesh, middle in (
+        (sphere(), np.zeros(3)),
+        (column(), np.array([0.0, 0.0, 0.5])),
+        (brick, np.array([1.0, 2.0, 3.0])),
+    ):
         corners = mesh[0][mesh[1]]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         large = np.linalg.norm(normals, axis=1) > 1e-12
