@@ -111,10 +111,10 @@ def step_defect(group: LieGroup, field: Field, rows: Rows, x: Array, *rest: Any)
         field: F(x, inputs), (n, dim).
         rows: of the method's :class:`~unifg.models.tableau.Tableau`.
         x: (n, storage).
-        rest: inputs (n, k) or (k,) each, x_next (n, storage), h one or (n,).
+        rest: inputs (n, k) or (1, k) each, x_next (n, storage), h one or (n,).
 
     Raises:
-        ModelError: x_next is no state, as when arguments are in another order.
+        ModelError: x_next is no state, as when arguments are in another order, or an input has no rows.
     """
     *inputs, after, step = rest
     if getattr(after, "shape", ())[1:] != (group.storage,):
@@ -140,8 +140,16 @@ def travel(group: LieGroup, field: Field, rows: Rows, x: Array, *rest: Any) -> A
 
 
 def alike(*parts: Array) -> list[Array]:
-    """The same arrays, those of a single row repeated; one axis is a row."""
-    parts = tuple(part if len(np.shape(part)) > 1 else np.reshape(part, (1, -1)) for part in parts)
+    """The same arrays, those of a single row repeated.
+
+    Raises:
+        ModelError: one of them has no two axes.
+    """
+    if flat := [np.shape(part) for part in parts if len(np.shape(part)) < 2]:
+        raise ModelError(
+            f"inputs of a field have rows, found shape {flat[0]}: c[None] is one row for all steps, c[:, None] a "
+            "number for each step"
+        )
     count = max(len(part) for part in parts)
     return [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
 

@@ -42,7 +42,7 @@ class LocaliseSettings:
     """A log to be localised.
 
     Attributes:
-        log: log with scans and odometry: CARMEN, CSV, MCAP or rosbag2.
+        log: log with scans and odometry: CARMEN, CSV, MCAP, rosbag2 or drive.npz.
         map: ROS map, its YAML file.
         start: pose of the laser at the first scan [m, m, rad]; without one that of the log where it fits the map, or
             the map is searched.

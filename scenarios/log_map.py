@@ -64,7 +64,7 @@ class MapSettings:
     """A log to be made a map of.
 
     Attributes:
-        log: log with scans and odometry: CARMEN, CSV, MCAP or rosbag2.
+        log: log with scans and odometry: CARMEN, CSV, MCAP, rosbag2 or drive.npz.
         resolution: side of a cell [m].
         reach: of the beams that make the map [m].
         mount: pose of the laser on the robot, where the odometry is that of the robot [m, m, rad].

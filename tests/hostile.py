@@ -117,7 +117,7 @@ PGM = b"P5\n4 3\n255\n" + bytes([0, 254, 205, 0] * 3)
 
 def drive_file(**others: Any) -> bytes:
     """The columns of a `drive.npz` of two ticks that a log is made of."""
-    columns = {
+    columns: dict[str, Any] = {
         "time": [0.0, 0.1], "scan_angles": [-1.0, 1.0], "scan": [[2.0, math.inf], [math.nan, 2.0]],
         "dead_reckoning": [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], "true_pose": [[1.0, 0.0, 0.0], [1.1, 0.0, 0.0]],
     }  # fmt: skip

@@ -119,7 +119,7 @@ FROM_FILES = {
     ),
     "map": Scenario(
         "maps",
-        "Make a map of a log of a lidar and wheels (CARMEN, CSV, MCAP, rosbag2).",
+        "Make a map of a log of a lidar and wheels (CARMEN, CSV, MCAP, rosbag2, drive.npz).",
         "",
         live=False,
         extras=("view",),

@@ -154,7 +154,7 @@ class CompiledTerm:
             _notice_no_information(self.name, self.whitener)
 
     def remedy(self, index: int) -> str:
-        """What to do about a residual that is not finite at a factor: the point may be to blame, or a constant."""
+        """Advice on a residual that is not finite at a factor: the point may be to blame, or a constant."""
         for place, argument in enumerate(self.term.arguments):
             if isinstance(argument, np.ndarray) and argument.dtype.kind == "f":
                 row = argument[index] if argument.ndim and len(argument) == self.count else argument
