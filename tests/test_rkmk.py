@@ -39,41 +39,7 @@ def implicit_step(form: Method, x: Array, u: Array, h: float) -> Array:
 START, CONTROL = np.array([[0.3, -0.2, 0.5]]), np.array([[1.0, 0.8]])
 
 
-<<<<<<< HEAD
-def test_an_input_of_one_axis_is_shared_and_another_order_is_refused() -> None:
-=======
-@pytest.mark.parametrize("form", FORMS)
-def test_held_control_gives_the_exponential(form: Method) -> None:
-    """With F constant over the step X Exp(hF) is exact in both forms."""
-    x = fg.SE2.random(RNG, (200,))
-    u = RNG.normal(size=(200, 2))
-    for h in (0.02, 0.1, 0.7):
-        exact = fg.SE2.retract(x, h * rkmk.unicycle_field(x, u))
-        defect = rkmk.integrator(fg.SE2, rkmk.unicycle_field, form)(x, u, exact, h)
-        assert np.abs(defect).max() < 1e-14
-
-
-@pytest.mark.parametrize("form", FORMS)
-def test_the_constraint_leads_to_the_exponential(form: Method) -> None:
-    """Solved for the next pose from a guess elsewhere, the answer is X Exp(hF)."""
-    x = np.array([[0.2, -0.3, 3.0]])
-    u, h = np.array([[0.9, 0.8]]), 0.5
-    graph = fg.Graph()
-    nodes = graph.variables("x", fg.SE2, 2)
-    control = graph.variables("u", fg.Rn(2), 1)
-    graph.fix(nodes[0], x[0])
-    graph.fix(control, u[0])
-    graph.minimize(
-        rkmk.integrator(fg.SE2, rkmk.unicycle_field, form),
-        nodes[:-1], control, nodes[1:], h,
-    )  # fmt: skip
-    solution = LevenbergMarquardt(tolerance=1e-15).solve(graph, {nodes: np.tile(x, (2, 1)), control: u})
-    exact = fg.SE2.retract(x, h * rkmk.unicycle_field(x, u))
-    assert np.abs(fg.SE2.local(exact, solution[nodes[1]])).max() < 1e-14
-
-
 def test_arguments_in_another_order_or_without_rows_are_refused() -> None:
->>>>>>> stranger
     def drifting(x: Array, u: Array, water: Array) -> Array:
         return current(x, u) + np.stack([water[:, 0], water[:, 1], 0.0 * x[:, 0]], axis=1)
 
