@@ -53,7 +53,7 @@ def takes(solver: fg.Solver, problem: Problem) -> bool:
 
 @pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
 @pytest.mark.parametrize("solver", BACKENDS, ids=IDS)
-@pytest.mark.product(75)
+@pytest.mark.product(55)
 def test_backend_solves_or_refuses(solver: fg.Solver, problem: Problem) -> None:
     graph, guess = problem.build()
     if not takes(solver, problem):
