@@ -11,7 +11,7 @@ import unifg as fg
 from unifg.errors import GraphError
 from unifg.factors.residuals import Residual, residual
 from unifg.models import avoidance, obstacles
-from unifg.solvers import SQP, GaussNewton, InteriorPoint
+from unifg.solvers import SQP, InteriorPoint
 from unifg.typing import Array
 
 CENTRES, RADII = np.array([[2.0, 0.0], [-1.0, -2.0]]), np.array([0.5, 0.25])
@@ -163,10 +163,6 @@ def test_both_forms_have_the_same_optimum(solver: fg.Solver, start: tuple[float,
     for solution in (scalar, squares):
         (found,) = solution.values.values()
         assert np.hypot(found[0, 0], found[0, 1]) - 0.5 == pytest.approx(d, rel=1e-5)
-
-
-def test_least_squares_backends_take_the_twin() -> None:
-    assert pushed("squares", (1.5, 0.4, 1.0), GaussNewton()).converged
 
 
 def test_potentials_are_traced_in_graphs() -> None:

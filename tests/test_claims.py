@@ -22,7 +22,7 @@ def stated(kind: str, seed: int = 0, equalities_only: bool = False) -> tuple[Twi
 
 
 @pytest.mark.parametrize("kind", ["parking", "attitude slew", "thrust cone", "two-link arm", "minimum snap"])
-@pytest.mark.product(3)
+@pytest.mark.product(2)
 def test_both_statements_are_one_problem(kind: str) -> None:
     """Cost, rows and gradient along the right perturbation agree; the study asserts it of every problem."""
     twin, judge = stated(kind, seed=1)
@@ -40,7 +40,7 @@ def test_two_different_problems_are_told_apart() -> None:
 
 @pytest.mark.parametrize("kind", ["hover with drag", "attitude slew"])
 @pytest.mark.parametrize("name", CONSTRAINED)
-@pytest.mark.product(6)
+@pytest.mark.product(4)
 def test_converged_is_true(name: str, kind: str) -> None:
     twin, judge = stated(kind)
     result = answer(CONSTRAINED[name], twin, judge)

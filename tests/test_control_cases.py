@@ -21,7 +21,7 @@ CONFIRMED = {("ahead", True, 20): (586.14768,), ("ahead", True, 50): (580.25905,
 
 @pytest.mark.parametrize("problem", list(dict.fromkeys([*problems(), *sixteen()])), ids=lambda p: p.title)
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.product(20)
+@pytest.mark.product(14)
 def test_control_case(solver: str, problem: Problem) -> None:
     stated = problem.formulation()
     solution = SOLVERS[solver].solve(stated.graph, stated.guess)

@@ -361,7 +361,7 @@ def test_models_are_kernels_unless_their_functions_are_batched() -> None:
 
 
 @pytest.mark.parametrize("name", KERNELS)
-@pytest.mark.product(30)
+@pytest.mark.product(20)
 def test_in_a_graph(name: str) -> None:
     """Some of the variables are constants, shared or one for each factor; so are parameters; factors are inactive."""
     case, points, manifolds, constants = CASES[name]

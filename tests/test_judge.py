@@ -274,7 +274,7 @@ def flat(row: Callable[[Array], Array], cost: float, rows: float, unknown: float
     ],
     ids=["exp", "cube", "slope", "small slope"],
 )
-@pytest.mark.product(40)
+@pytest.mark.product(25)
 def test_degenerate_multipliers_have_no_units(
     row: Callable[[Array], Array],
     start: float,

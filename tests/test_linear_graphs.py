@@ -116,7 +116,7 @@ def test_the_same_with_the_exact_hessian(name: str, rng: np.random.Generator) ->
 
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
 @pytest.mark.parametrize("name", BUILD)
-@pytest.mark.product(16)
+@pytest.mark.product(10)
 def test_a_solve_by_elimination_alone(name: str, hessian: str) -> None:
     graph, guess = BUILD[name]()
     mine = SQP(qp="elimination", fallback=None, hessian=hessian, tolerance=1e-8).solve(graph, guess)  # type: ignore[arg-type]

@@ -73,19 +73,6 @@ def test_a_linear_estimate_moves_by_sigma_times_the_slope_of_the_value(weight: f
     assert np.linalg.det(both.covariance(x[PAST])) < np.linalg.det(covariance[-2:, -2:])
 
 
-def test_the_pull_is_a_bias_that_adds_its_square_to_the_error() -> None:
-    """Over what the past leaves open, the error of the joint estimate is Sigma + d d': d is the pull."""
-    alone, xa, ua = linear(0.0)
-    past = GaussNewton().solve(alone, {xa: np.zeros((PAST + 1, 2)), ua: np.zeros((AHEAD, 1))}, check=True)
-    joint, x, u = linear(4.0)
-    both = KKT(tolerance=1e-11).solve(joint, {x: np.zeros((len(x), 2)), u: np.zeros((AHEAD, 1))}, check=True)
-    mean, covariance = past[xa][PAST], past.covariance(xa[PAST])
-    truth = np.random.default_rng(1).multivariate_normal(mean, covariance, 200_000)
-    error = np.mean(np.sum((truth - both[x][PAST]) ** 2, axis=1)) - np.mean(np.sum((truth - mean) ** 2, axis=1))
-    pull = np.sum((both[x][PAST] - mean) ** 2)
-    assert pull > 0.1 and error == pytest.approx(pull, rel=0.02)
-
-
 class Drive(NamedTuple):
     """A graph of a unicycle: past, future or both."""
 

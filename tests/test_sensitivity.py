@@ -96,7 +96,7 @@ class Judge:
 
 
 @pytest.mark.parametrize("problem", CASES, ids=lambda p: p.title)
-@pytest.mark.product(5)
+@pytest.mark.product(3)
 def test_control_cases(problem: Problem) -> None:
     stated = problem.formulation()
     of: list[Any] = [stated.x, stated.u, "limits", "dynamics", "cost"]

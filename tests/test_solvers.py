@@ -79,6 +79,20 @@ def test_backend_solves_or_refuses(solver: fg.Solver, problem: Problem) -> None:
         np.testing.assert_array_equal(guess[family], array)
 
 
+@pytest.mark.parametrize(
+    "solver",
+    [AugmentedLagrangian(), SQP(), InteriorPoint(), Penalty()],
+    ids=["alm", "sqp", "ipm", "penalty"],
+)
+def test_started_at_the_answer_takes_no_step(solver: fg.Solver) -> None:
+    graph, guess = short_drive()
+    first = solver.solve(graph, guess, check=True)
+    again = solver.solve(graph, first)
+    assert again.converged
+    assert again.iterations == 0
+    assert again.cost == first.cost
+
+
 @pytest.mark.parametrize("solver", BACKENDS, ids=IDS)
 def test_single_solves_share_a_workspace_and_nothing_else(solver: fg.Solver) -> None:
     """A later solve of a graph takes over memory and structure; its answer is that of a graph stated anew."""
@@ -94,6 +108,18 @@ def test_single_solves_share_a_workspace_and_nothing_else(solver: fg.Solver) -> 
         np.testing.assert_array_equal(again[family], first[family])
     replace(solver, tolerance=2.0 * solver.tolerance).solve(graph, guess)
     assert len(kept) == 2
+
+
+def test_bazzana_schedule_is_the_literal_loop() -> None:
+    """One primal and one dual step per iteration at constant penalty, in PHR form."""
+    graph, guess = inactive_inequality()
+    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess)
+    assert solution.converged
+    assert solution[graph.families["x"]][0, 0] == pytest.approx(0.2, abs=1e-7)
+    graph, guess = ecg2o((-0.2, -0.2))
+    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess)
+    assert solution.converged
+    assert {row.details["penalty"] for row in solution.history[1:]} == {10.0}
 
 
 def test_bazzana_stop_rule_does_not_claim_convergence() -> None:
@@ -161,6 +187,29 @@ def test_warm_start_needs_fewer_iterations() -> None:
         warm = run.solve(fg.Guess(values, shifted.multipliers))
         assert warm.converged
         assert warm.iterations < cold.iterations
+
+
+def test_unbounded_objective_is_reported() -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 1)
+    graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)
+    graph.bound(x, lower=0.0)
+    solution = SQP(max_iterations=500).solve(graph, {x: np.array([[1.0]])})
+    assert solution.status is fg.Status.UNBOUNDED, solution.report()
+
+
+def test_time_limit_and_callback_end_a_solve() -> None:
+    graph, guess = short_drive()
+    assert AugmentedLagrangian(time_limit=0.0).solve(graph, guess).status is fg.Status.TIME_LIMIT
+    rows: list[fg.Iteration] = []
+
+    def stop(row: fg.Iteration) -> bool:
+        rows.append(row)
+        return row.number == 2
+
+    solution = SQP().solve(graph, guess, callback=stop)
+    assert solution.status is fg.Status.INTERRUPTED
+    assert [row.number for row in rows] == [0, 1, 2]
 
 
 def test_full_steps_and_no_fallback_are_options() -> None:

@@ -379,7 +379,7 @@ def faulty(fault: str, coupling: str = "sequential", ticks: int = 50) -> Episode
 
 
 @pytest.mark.parametrize("kind", ["lidar-max", "lidar-frozen", "lidar-delayed", "beams-missing"])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_a_blind_robot_brakes_at_once_and_says_why(kind: str) -> None:
     log = faulty(f"{kind}@1", ticks=26)
     last_good = 9  # the tick at 0.9 s
