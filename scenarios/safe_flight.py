@@ -24,7 +24,16 @@ from unifg.scenarios.logs.safe_log import SafeLog
 from unifg.scenarios.options import count, not_negative, option, positive
 from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.quadrotor.cascade import CascadeSettings, Track
-from unifg.scenarios.quadrotor.cbf_mpc import TRACKING, CbfMpc, Decision, KeeperSettings, Obstacles, Reading, Terminal
+from unifg.scenarios.quadrotor.cbf_mpc import (
+    TRACKING,
+    WHOLE,
+    CbfMpc,
+    Decision,
+    KeeperSettings,
+    Obstacles,
+    Reading,
+    Terminal,
+)
 from unifg.scenarios.quadrotor.flatness import TUNED, FlatnessController, Gains, flat_flight
 from unifg.scenarios.quadrotor.one_step import FilterSettings, filtered
 from unifg.scenarios.quadrotor.pace import Pace
@@ -201,6 +210,8 @@ class SafeFlight:
             numbers = replace(
                 weights, alpha=alpha, gamma=gamma, reading=s.reading, speed=limit, slots=slots, terminal=s.terminal
             )
+            if controller == "cascade":  # a plan now and then has no next ticks to go on in
+                numbers = replace(numbers, portion=None, iterations=min(numbers.iterations, WHOLE))
             frame = s.books if estimating else replace(s.books, loops=replace(s.books.loops, gain=np.inf))
             keeper, lead = CbfMpc(numbers, frame, s.dt, self.weighing, s.solver), link + s.dt if estimating else 0.0
 

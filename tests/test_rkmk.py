@@ -17,6 +17,8 @@ from unifg.typing import Array
 
 RNG = np.random.default_rng(11)
 FORMS: tuple[Method, ...] = ("full trapezoid", "simplified trapezoid")
+
+
 def current(x: Array, u: Array) -> Array:
     """A velocity that depends on the whole pose: a vehicle in a current, (n, 3)."""
     return np.stack(

@@ -49,7 +49,7 @@ from unifg.scenarios.simulation.body_rate import Airframe
 from unifg.solvers.names import backend
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
 
-__all__ = ["TRACKING", "CbfMpc", "Decision", "KeeperSettings", "Obstacles", "Terminal"]
+__all__ = ["TRACKING", "WHOLE", "CbfMpc", "Decision", "KeeperSettings", "Obstacles", "Terminal"]
 
 Reading: TypeAlias = Literal["decay", "published"]
 Terminal: TypeAlias = Literal["none", "rest"]

@@ -120,12 +120,12 @@ def _drive(path: Path, limits: Limits) -> RangeLog:
     try:
         with path.open("rb") as own, zipfile.ZipFile(own) as parts, np.load(own, allow_pickle=False) as file:
             if sum(part.file_size for part in parts.infolist()) > limits.unpacked:
-                raise ValueError(f"it holds more than {limits.unpacked} bytes")
+                raise FileFormatError(f"{legible(path)} holds more than {limits.unpacked} bytes")
             columns = ("time", "scan_angles", "scan", "dead_reckoning", "true_pose")
             time, angles, ranges, wheels, truth = (np.asarray(file[name], dtype=np.float64) for name in columns)
         count, beams = len(time), len(angles)
         if (ranges.shape, wheels.shape, truth.shape) != ((count, beams), (count, 3), (count, 3)):
-            raise ValueError("its columns do not fit each other")
+            raise FileFormatError(f"{legible(path)} is no drive.npz of `unifg run`: its columns do not fit each other")
     except UNREADABLE as e:
         raise FileFormatError(f"{legible(path)} is no drive.npz of `unifg run`: {e}") from e
     return _in_order(legible(path.name), time, angles, ranges, math.inf, wheels, truth)
