@@ -92,6 +92,7 @@ import numpy as np
 from unifg.codegen.compile_counter import counting
 from unifg.scenarios import navigation
 from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.planning.grid import finished
 from unifg.scenarios.simulation.faults import Fault
 
 def discs(place, velocity, mover):
@@ -106,8 +107,9 @@ def progress(done, text):
     pilot, route = run.pilot, run.legs[0]
     if ticks == 3:  # something stands on the path: round it, nearby and on the whole map
         ahead = route.path[60]
-        turns.append(route.repair(pilot.pose, discs(ahead, (0.0, 0.0), False)))
-        turns.append(route._detour(pilot.pose, 1e9, discs(ahead, (0.0, 0.0), False), 0.04, everywhere=True))
+        stands = discs(ahead, (0.0, 0.0), False)
+        turns.append(any(route.repair(pilot.pose, stands) for _ in range(5)))
+        turns.append(finished(route._detour(pilot.pose, 1e9, stands, 0.04, everywhere=True)))
     if ticks == 5:  # something comes from the front
         heading = np.array([np.cos(pilot.pose[2]), np.sin(pilot.pose[2])])
         near = pilot.pose[:2] + 0.7 * heading
@@ -117,7 +119,7 @@ def progress(done, text):
         ahead = np.array([0.5, 0.0])  # at this moment the robot may be on its way back
         turns.append(bool(pilot.emergency_stop.control(ahead, ahead, near)[0] < ahead[0]))
     if ticks == 9:  # the way it came, to let a mover pass
-        route._retreat(pilot.pose)
+        finished(route._retreat(pilot.pose))
     if pilot.relocated:
         relocated.append(ticks)
     if ticks == 300 or relocated and ticks > relocated[0] + 5:
