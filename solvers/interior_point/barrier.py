@@ -71,6 +71,7 @@ WORTH = 0.25  # of the cost at the start: largest first mu
 NOTHING = 1e-20  # of the size of the cost: one that is only rounding
 BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
 FIRST_SLACK = 1e-2  # smallest slack of a cold start
+FINER = 0.03  # times the least mu, where the KKT test asks for more
 LEAST_FINER = 1e-10  # of the least mu, where the KKT test asks for more
 WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active has been found
 
@@ -315,7 +316,7 @@ def test(address: int) -> None:
         if max(kkt[0], kkt[2]) <= tolerance:
             now.answer, now.concluded = CONVERGED, 1
             return
-        now.finer = max(0.03 * now.finer, LEAST_FINER)  # the units at the answer are others
+        now.finer = max(FINER * now.finer, LEAST_FINER)  # the units at the answer are others
         run(links[0].measure, (address,))  # it was written over
     # With a larger mu, what is active has not been found, and short steps are those towards another problem's answer.
     if now.step < now.step_tolerance * now.taken and now.mu <= WARM_MU * min(1.0, now.size):

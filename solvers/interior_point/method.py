@@ -34,6 +34,7 @@ from unifg.solution.solver import UNBOUNDED_COST, Conclusion, Solver, SolveState
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
 from unifg.solvers.interior_point import each, state
+from unifg.solvers.interior_point.barrier import FINER
 from unifg.solvers.interior_point.loop import addresses, call
 from unifg.solvers.interior_point.state import Fields, Problem, empty_work
 from unifg.typing import Array, IntArray
@@ -49,7 +50,6 @@ ENDINGS = {
     state.TRY: Status.TIME_LIMIT,  # there was no time for the step
 }
 NO_ANSWER = -1
-FINER = 0.03  # by which `barrier.test` refines units where the KKT test fails
 ROOM = 2**18  # bytes for arrays that compiled functions allocate, besides those that grow with the graph
 STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
 RESTARTS = 3  # from points that violate less than where the method came to a halt

@@ -17,7 +17,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.pose_graphs.descent import Descent
-from unifg.pose_graphs.linear import BlockQuadratic, polar
+from unifg.pose_graphs.linear import polar
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName
 from unifg.pose_graphs.relaxation import Relaxation
 from unifg.pose_graphs.verdict import Certificate
@@ -163,7 +163,7 @@ def _measured_in(pose_graph: PoseGraph, unit: float) -> PoseGraph:
 class _Verdict:
     """cost of a point, what no point costs less than, how far they may be apart; least eigenvalue, ways down.
 
-    The ways are (n, d + 1, k), the steepest first; they are orthonormal.
+    The ways are (n, d + 1, k), the steepest first; their frames are orthonormal.
     """
 
     cost: float
@@ -182,11 +182,8 @@ class _Judge:
 
     def __init__(self, problem: Relaxation, tolerance: float) -> None:
         self.problem, self.relative, self.descent = problem, tolerance, Descent(problem)
-        self.quadratic = BlockQuadratic(
-            problem.first, problem.second, problem.count, problem.dim + 1, np.zeros(0, dtype=np.intp)
-        )
+        self._factorization = self.descent.factorization.twin()
         self.weight = float(np.sum(problem.by_first**2) + np.sum(problem.by_second**2))
-        self.anchor = float(np.max(problem.by_second**2, initial=0.0)) or 1.0
 
     def allowed(self, cost: float) -> float:
         """Gap that a cost may have."""
@@ -197,12 +194,7 @@ class _Judge:
         cost, multipliers = problem.cost(point), problem.multipliers(point)
         tolerance = self.allowed(cost)
         frames = dim * problem.count
-        own = np.zeros((problem.count, dim + 1, dim + 1))
-        own[:, 1:, 1:] = -multipliers
-        own[problem.anchors, 0, 0] = self.anchor  # shifting all of a part changes nothing: one place may be held
-        entries = self.quadratic.entries(problem.by_first, problem.by_second, own)
-        system = self.quadratic.factorization
-        lifted = np.tile(np.arange(dim + 1) > 0, problem.count).astype(np.float64)
+        entries, system, lifted = self.descent.entries(multipliers), self._factorization, self.descent.frames
         value = min(float(np.trace(multipliers, axis1=1, axis2=2).sum()), cost)  # of the dual; more is rounding
         nowhere = np.zeros((problem.count, dim + 1, sum(RANKS)))
         shift = 0.5 * tolerance / frames

@@ -12,8 +12,8 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.pose_graphs.linear import BlockQuadratic, block_gradient, polar
-from unifg.pose_graphs.relaxation import Relaxation
-from unifg.typing import Array, IntArray
+from unifg.pose_graphs.relaxation import Relaxation, sheared
+from unifg.typing import Array
 
 __all__ = ["Descent"]
 
@@ -28,21 +28,35 @@ KEPT, POOR, GOOD = 0.05, 0.25, 0.75  # measured by predicted decrease: taken, sh
 
 
 class Descent:
-    """Descents of one relaxation: its quadratic is factorised once."""
+    """Descents of one relaxation: its quadratic is factorised once.
+
+    Attributes:
+        problem: the relaxation.
+        factorization: of the quadratic over positions and frames, regularised.
+        frames: (n (d + 1),) one for the numbers of frames, zero for those of positions.
+        able: False where it cannot be factorised.
+    """
 
     def __init__(self, problem: Relaxation) -> None:
         """Factorise the quadratic, regularised."""
         self.problem, above = problem, problem.dim + 1
         self._system = BlockQuadratic(problem.first, problem.second, problem.count, above, np.zeros(0, dtype=np.intp))
-        own = np.zeros((problem.count, above, above))
-        own[problem.anchors, 0, 0] = float(np.max(problem.by_second**2, initial=0.0))
-        entries = self._system.entries(problem.by_first, problem.by_second, own)
-        shift = REGULAR * float(np.max(np.abs(problem.by_second), initial=0.0)) ** 2
-        frames = np.tile(np.arange(above) > 0, problem.count).astype(np.float64)
-        factorization, self.able = self._system.factorization, shift > 0.0
-        while self.able and not (factorization.factor(entries, shift * frames) and factorization.definite):
+        self._scale = float(np.max(problem.by_second**2, initial=0.0))
+        self.frames = np.tile(np.arange(above) > 0, problem.count).astype(np.float64)
+        self.factorization, shift = self._system.factorization, REGULAR * self._scale
+        entries, self.able = self.entries(np.zeros((problem.count, problem.dim, problem.dim))), shift > 0.0
+        while self.able and not (
+            self.factorization.factor(entries, shift * self.frames) and self.factorization.definite
+        ):
             shift *= 10.0
             self.able = np.isfinite(shift)
+
+    def entries(self, multipliers: Array) -> Array:
+        """(nnz,) entries of the quadratic less multipliers (n, d, d) of the frames."""
+        problem = self.problem
+        own = np.pad(-multipliers, ((0, 0), (1, 0), (1, 0)))
+        own[problem.anchors, 0, 0] = self._scale or 1.0  # shifting all of a part changes nothing: one place may be held
+        return self._system.entries(problem.by_first, problem.by_second, own)
 
     def __call__(self, point: Array, share: float) -> Array:
         """Descend until half the squared slope, as the quadratic measures it, is at most a share of the cost.
@@ -58,8 +72,9 @@ class Descent:
             return point
         cost, radius = self.problem.cost(point), 0.0
         for _ in range(STEPS):
-            multipliers = self.problem.multipliers(point)
-            slope = self._along(point, point, multipliers)
+            slope = self.problem.product(point)
+            multipliers = sheared(slope, point)
+            slope[:, 1:] -= multipliers @ point[:, 1:]
             toward = self._preconditioned(point, slope)
             squared = float(np.sum(slope * toward))
             if not squared > share * cost:
@@ -87,11 +102,10 @@ class Descent:
         spins = [(i, k) for i in range(dim) for k in range(i)]
         size = dim + len(spins)
         system = BlockQuadratic(problem.first, problem.second, problem.count, size, problem.anchors)
-        scale = float(np.max(np.abs(problem.by_second), initial=0.0) ** 2)
         if not len(system.free) or not len(problem.first):
             return point
         point = problem.anchored(self(point, FAR), point)
-        cost, damping = problem.cost(point), 0.0
+        cost, damping, scale = problem.cost(point), 0.0, self._scale
         for _ in range(ROUNDS):
             basis = _tangents(point, spins)
             flat = basis.reshape(problem.count, dim + 1, dim * size)
@@ -99,9 +113,8 @@ class Descent:
             J_first = (problem.by_first @ flat[problem.first]).reshape(shape)
             J_second = (problem.by_second @ flat[problem.second]).reshape(shape)
             error = problem.errors(point).reshape(len(problem.first), -1, 1)
-            gradient = block_gradient(problem.first, problem.second, J_first, J_second, error, problem.count)[
-                system.free
-            ]
+            slopes = block_gradient(problem.first, problem.second, J_first, J_second, error, problem.count)
+            gradient = slopes[system.free]
             frames = basis[:, 1:]
             bend = np.einsum("narq,nab,nbrs->nqs", frames, problem.multipliers(point), frames)
             entries = system.entries(J_first, J_second, -bend)
@@ -157,16 +170,15 @@ class Descent:
         return step, -float(np.sum((2.0 * slope + curved) * step)), at_edge
 
     def _along(self, point: Array, moved: Array, multipliers: Array) -> Array:
-        """Half the second derivative along the manifold, times a direction; of the point itself, half the slope."""
-        problem, out = self.problem, np.zeros_like(point)
-        _multiply(problem.first, problem.second, problem.by_first, problem.by_second, moved, out)
+        """Half the second derivative along the manifold, times a direction."""
+        out = self.problem.product(moved)
         out[:, 1:] -= multipliers @ moved[:, 1:]
         _project(point, out)
         return out
 
     def _preconditioned(self, point: Array, slope: Array) -> Array:
         """Solution of the quadratic for all dimensions, along the manifold."""
-        solved = self._system.factorization.solve(slope.reshape(-1, slope.shape[2]))
+        solved = self.factorization.solve(slope.reshape(-1, slope.shape[2]))
         out = np.array(solved, order="C").reshape(slope.shape)
         _project(point, out)
         return out
@@ -188,26 +200,6 @@ def _retract(point: Array, basis: Array, step: Array) -> Array:
     moved: Array = point + np.einsum("narq,nq->nar", basis, step)
     moved[:, 1:] = polar(moved[:, 1:])
     return moved
-
-
-@compiled
-def _multiply(first: IntArray, second: IntArray, by_first: Array, by_second: Array, moved: Array, out: Array) -> None:
-    """Add the quadratic's product with a direction to ``out``."""
-    above, rank = moved.shape[1], moved.shape[2]
-    error = np.empty(rank)
-    for k in range(len(first)):
-        i, j = first[k], second[k]
-        for row in range(above):
-            error[:] = 0.0
-            for a in range(above):
-                left, right = by_first[k, row, a], by_second[k, row, a]
-                for c in range(rank):
-                    error[c] += left * moved[i, a, c] + right * moved[j, a, c]
-            for a in range(above):
-                left, right = by_first[k, row, a], by_second[k, row, a]
-                for c in range(rank):
-                    out[i, a, c] += left * error[c]
-                    out[j, a, c] += right * error[c]
 
 
 @compiled

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +44,7 @@ JUDGES: list[Callable[[PoseGraph, Effort, ResidualName, BoolArray | None, float]
 
 
 class _Measurements:
-    """Base of measurements."""
+    """Base of measurements: arrays with a row for each."""
 
     measured: Array
     information: Array
@@ -52,6 +52,10 @@ class _Measurements:
     def __len__(self) -> int:
         """Number of measurements."""
         return len(self.measured)
+
+    def __getitem__(self, chosen: IntArray | BoolArray | slice) -> Self:
+        """Some of the measurements, by mask, positions or slice."""
+        return type(self)(**{name: rows[chosen] for name, rows in vars(self).items()})
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,10 +72,6 @@ class Edges(_Measurements):
     second: IntArray
     measured: Array
     information: Array
-
-    def __getitem__(self, chosen: IntArray | BoolArray | slice) -> Edges:
-        """Some of the edges, by mask, positions or slice."""
-        return Edges(self.first[chosen], self.second[chosen], self.measured[chosen], self.information[chosen])
 
     @property
     def odometry(self) -> BoolArray:

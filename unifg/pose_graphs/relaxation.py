@@ -16,13 +16,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.errors import GraphError
 from unifg.pose_graphs.information import bounded_below, indefinite
-from unifg.pose_graphs.linear import block_gradient, with_rotations
+from unifg.pose_graphs.linear import with_rotations
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["Relaxation", "admit"]
+__all__ = ["Relaxation", "admit", "sheared"]
 
 ISOTROPIC = 1e-6  # of the largest eigenvalue: information matrices are written with six digits
 
@@ -151,10 +152,13 @@ class Relaxation:
 
     def multipliers(self, point: Array) -> Array:
         """(n, d, d) Lambda_i = sym(G_i Y_i), multipliers of Y_i' Y_i = I, where G is half the gradient (eq. 106)."""
-        errors = self.errors(point)
-        slope = block_gradient(self.first, self.second, self.by_first, self.by_second, errors, self.count)[:, 1:]
-        product = slope @ np.swapaxes(point[:, 1:], 1, 2)
-        return 0.5 * (product + np.swapaxes(product, 1, 2))
+        return sheared(self.product(point), point)
+
+    def product(self, point: Array) -> Array:
+        """(n, d + 1, r) the quadratic times a point or a direction: half the slope of the cost."""
+        out = np.zeros_like(point)
+        _multiply(self.first, self.second, self.by_first, self.by_second, np.ascontiguousarray(point), out)
+        return out
 
     def anchored(self, point: Array, like: Array) -> Array:
         """The same map of rank d, every part moved as a whole to where its anchor is in another."""
@@ -193,3 +197,30 @@ def _greatest(blocks: Array) -> Array:
 def _close(found: Array, wanted: Array | float, size: Array | None = None) -> BoolArray:
     """(m,) whether blocks are as wanted, measured by their own size or by another (m,)."""
     return _greatest(found - wanted) <= ISOTROPIC * (_greatest(found) if size is None else size)
+
+
+def sheared(moved: Array, point: Array) -> Array:
+    """(n, d, d) sym(V Y'): what directions V (n, d + 1, r) do to the orthonormality of a point's frames Y."""
+    product = moved[:, 1:] @ np.swapaxes(point[:, 1:], 1, 2)
+    found: Array = 0.5 * (product + np.swapaxes(product, 1, 2))
+    return found
+
+
+@compiled
+def _multiply(first: IntArray, second: IntArray, by_first: Array, by_second: Array, moved: Array, out: Array) -> None:
+    """Add the quadratic's product with a direction to ``out``."""
+    above, rank = moved.shape[1], moved.shape[2]
+    error = np.empty(rank)
+    for k in range(len(first)):
+        i, j = first[k], second[k]
+        for row in range(above):
+            error[:] = 0.0
+            for a in range(above):
+                left, right = by_first[k, row, a], by_second[k, row, a]
+                for c in range(rank):
+                    error[c] += left * moved[i, a, c] + right * moved[j, a, c]
+            for a in range(above):
+                left, right = by_first[k, row, a], by_second[k, row, a]
+                for c in range(rank):
+                    out[i, a, c] += left * error[c]
+                    out[j, a, c] += right * error[c]

@@ -74,7 +74,7 @@ def from_smoother(smoother: Incremental) -> tuple[PoseGraph, BoolArray]:
     priors, fixed = dict[str, Priors](), tuple[int, ...]()
     if "pose" in found:
         where, measured, information, kept = _joined(found.pop("pose"), 1, group.storage, dim)
-        held_poses = Priors(where[kept, 0], measured[kept], information[kept])
+        held_poses = Priors(where[:, 0], measured, information)[kept]
         if len(held_poses) == 1 and np.linalg.matrix_rank(held_poses.information[0], hermitian=True) == dim:
             fixed = (int(held_poses.pose[0]),)
         elif len(held_poses):
@@ -83,7 +83,7 @@ def from_smoother(smoother: Incremental) -> tuple[PoseGraph, BoolArray]:
     for kind, several in found.items():
         ends, measured, information, kept = _joined(several, 2, 0, 0)
         if kept.any():
-            sightings[kind] = Sightings(ends[kept, 0], ends[kept, 1], measured[kept], information[kept])
+            sightings[kind] = Sightings(ends[:, 0], ends[:, 1], measured, information)[kept]
     landmarks = np.zeros((0, points.dim)) if places is None else smoother.estimate(places, best=True)
     graph = PoseGraph(
         np.arange(x.count), smoother.estimate(x, best=True), edges, np.arange(len(landmarks)), landmarks, sightings,

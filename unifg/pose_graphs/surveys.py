@@ -62,7 +62,7 @@ def surveys(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log")
             break
         seen = now.graph.sightings[kind]
         kept = np.setdiff1d(np.arange(len(seen)), group)
-        left = Map(replace(now.graph, sightings={**now.graph.sightings, kind: _of(seen, kept)}), every, residual)
+        left = Map(replace(now.graph, sightings={**now.graph.sightings, kind: seen[kept]}), every, residual)
         if not left.innovations.determined:
             break
         here, there = now.graph, left.graph
@@ -82,11 +82,6 @@ def surveys(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log")
         )  # fmt: skip
         places[kind], freedom, now = places[kind][kept], freedom - rows, left
     return found, now.graph
-
-
-def _of(seen: Sightings, kept: IntArray) -> Sightings:
-    """Some of the sightings."""
-    return Sightings(seen.pose[kept], seen.landmark[kept], seen.measured[kept], seen.information[kept])
 
 
 def _stretches(pose_graph: PoseGraph, seen: Sightings, alone: Array) -> list[IntArray]:

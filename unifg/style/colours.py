@@ -6,7 +6,7 @@ import re
 
 from unifg.errors import ViewError
 
-__all__ = ["COLOURS", "GREY", "INK", "css", "rgb"]
+__all__ = ["COLOURS", "GREY", "INK", "channels", "css", "rgb"]
 
 COLOURS = {
     "floor": 0xF6F4EF,
@@ -50,6 +50,11 @@ def rgb(colour: str) -> int:
     if not _HEX.fullmatch(colour):
         raise ViewError(f"there is no colour {colour!r}: take '#rrggbb' or one of {', '.join(COLOURS)}")
     return int(colour[1:], 16)
+
+
+def channels(colour: str) -> tuple[int, ...]:
+    """Red, green and blue of the colour, from 0 to 255."""
+    return tuple(rgb(colour).to_bytes(3, "big"))
 
 
 def css(colour: str) -> str:

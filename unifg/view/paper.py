@@ -18,11 +18,10 @@ from unifg.typing import Array, Axes
 from unifg.view.content import Content, Shot
 from unifg.view.recording import ground_of, keys_of
 from unifg.view.shapes import Mesh, copies
-from unifg.view.things import Surface, draw_way
+from unifg.view.things import MOST, Surface, draw_way
 
 __all__ = ["draw_frame", "draw_shot"]
 
-_MOST = 20_000  # members of a thing
 _FACES = 50_000  # triangles in space, from which on they are not made smaller
 _SIDE = 30.0  # longest side of a triangle in space, over half the width of a line
 _DOT = 0.55  # size of a dot in points, over its pixels
@@ -113,7 +112,7 @@ def draw_frame(content: Content, ax: Axes, frame: int = -1) -> Axes:
     shot, ground = shots[-1], ground_of(content, shots)
     paper = Paper(ax, ground.stroke)
     for name, thing in content.things.items():
-        thing.put(paper, name, _MOST, content.layers[name])
+        thing.put(paper, name, MOST, content.layers[name])
     draw_shot(paper, content, shots)
     paper.finish()
     for key in keys_of(content, [shot]):
@@ -139,7 +138,7 @@ def draw_frame(content: Content, ax: Axes, frame: int = -1) -> Axes:
 def draw_shot(surface: Surface, content: Content, shots: list[Shot]) -> None:
     """Draw the last of some frames, with ways as they have grown until then and without what stays."""
     for name, thing in shots[-1].things.items():
-        thing.put(surface, name, _MOST, content.layers[name])
+        thing.put(surface, name, MOST, content.layers[name])
     for name, placed in shots[-1].placed.items():
         turn = SO3.to_matrix(placed.attitude) * placed.scale
         for part in content.bodies[name].parts:
@@ -147,7 +146,7 @@ def draw_shot(surface: Surface, content: Content, shots: list[Shot]) -> None:
             surface.mesh(f"{name}/{part.name}", mesh, part.colour, lit=part.lit, opacity=part.opacity)
     for name, flat in content.flat_trails.items():
         places, layer = [past.trails[name] for past in shots if name in past.trails], content.layers[name]
-        draw_way(surface, name, _MOST, layer, points=np.array(places).reshape(-1, 3), flat=flat, width=layer.width)
+        draw_way(surface, name, MOST, layer, points=np.array(places).reshape(-1, 3), flat=flat, width=layer.width)
 
 
 def _art3d() -> Any:

@@ -21,6 +21,7 @@ from unifg.view.page import Key
 from unifg.view.shapes import Mesh
 
 __all__ = [
+    "MOST",
     "Layer",
     "Thing",
     "draw_arrows",
@@ -35,6 +36,8 @@ __all__ = [
     "draw_walls",
     "draw_way",
 ]
+
+MOST = 20_000  # members of a thing that are drawn, for surfaces that do not ask for fewer
 
 _CORNERS = 28  # of an ellipse
 

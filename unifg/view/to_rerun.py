@@ -12,16 +12,14 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.style.colours import rgb
+from unifg.style.colours import channels
 from unifg.typing import Array
 from unifg.view.content import Content, Shot
 from unifg.view.recording import ground_of, number_of
 from unifg.view.shapes import Mesh
-from unifg.view.things import Thing, draw_way
+from unifg.view.things import MOST, Thing, draw_way
 
 __all__ = ["log_to_rerun"]
-
-_MOST = 20_000  # members of a thing
 
 
 class RerunStage:
@@ -43,17 +41,17 @@ class RerunStage:
 
     def mesh(self, path: str, mesh: Mesh, colour: str, *, lit: bool = False, opacity: float = 1.0) -> None:
         """Log a mesh in one colour."""
-        shade = [*rgb(colour).to_bytes(3, "big"), round(255 * opacity)]
+        shade = [*channels(colour), round(255 * opacity)]
         self.log(path, self._rr.Mesh3D(vertex_positions=mesh[0], triangle_indices=mesh[1], albedo_factor=shade))
 
     def points(self, path: str, points: Array, colour: str, pixels: float) -> None:
         """Log dots (n, 3) [m]."""
-        shade, radius = list(rgb(colour).to_bytes(3, "big")), self._rr.Radius.ui_points(0.5 * pixels)
+        shade, radius = channels(colour), self._rr.Radius.ui_points(0.5 * pixels)
         self.log(path, self._rr.Points3D(points, colors=[shade], radii=[radius]))
 
     def lines(self, path: str, lines: Array, colour: str) -> None:
         """Log straight lines (n, 2, 3) [m]."""
-        shade, radius = list(rgb(colour).to_bytes(3, "big")), self._rr.Radius.ui_points(0.5)
+        shade, radius = channels(colour), self._rr.Radius.ui_points(0.5)
         self.log(path, self._rr.LineStrips3D(lines, colors=[shade], radii=[radius]))
 
 
@@ -77,7 +75,7 @@ def log_to_rerun(content: Content, path: str | Path | None) -> Any:
     stage.static = True
     stage.log("", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for name, thing in content.things.items():
-        thing.put(stage, content.layers[name].path, _MOST, content.layers[name])
+        thing.put(stage, content.layers[name].path, MOST, content.layers[name])
     for name, body in content.bodies.items():
         for part in body.parts:
             place = f"{content.layers[name].path}/{part.name}"
@@ -105,7 +103,7 @@ def _log_shot(
         del known[name]
     for name, thing in shot.things.items():
         if not thing.same(known.get(name)):
-            thing.put(stage, content.layers[name].path, _MOST, content.layers[name])
+            thing.put(stage, content.layers[name].path, MOST, content.layers[name])
         known[name] = thing
     for name in content.bodies:
         placed, at = shot.placed.get(name), content.layers[name].path

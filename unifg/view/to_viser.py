@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.style.colours import rgb
+from unifg.style.colours import channels
 from unifg.typing import Array
 from unifg.view.content import Content, Shot
 from unifg.view.paper import draw_shot
 from unifg.view.recording import ground_of
 from unifg.view.shapes import Mesh
+from unifg.view.things import MOST
 
 __all__ = ["serve_by_viser"]
 
-_MOST = 20_000  # members of a thing
 _DOT = 0.6  # size of dots, over half the width of a line and pixel
 
 
@@ -37,23 +37,19 @@ class ViserStage:
         """Send a mesh in one colour."""
         look: dict[str, Any] = {"flat_shading": True, "side": "double", "cast_shadow": False}
         self._keep(
-            "add_mesh_simple", path, *mesh, color=_shade(colour), opacity=opacity if opacity < 1.0 else None, **look
+            "add_mesh_simple", path, *mesh, color=channels(colour), opacity=opacity if opacity < 1.0 else None, **look
         )
 
     def points(self, path: str, points: Array, colour: str, pixels: float) -> None:
         """Send dots (n, 3) [m]."""
-        self._keep("add_point_cloud", path, points, _shade(colour), point_size=_DOT * pixels * self.stroke)
+        self._keep("add_point_cloud", path, points, channels(colour), point_size=_DOT * pixels * self.stroke)
 
     def lines(self, path: str, lines: Array, colour: str) -> None:
         """Send straight lines (n, 2, 3) [m]."""
-        self._keep("add_line_segments", path, lines, _shade(colour))
+        self._keep("add_line_segments", path, lines, channels(colour))
 
     def _keep(self, add: str, path: str, *given: Any, **options: Any) -> None:
         self.sent.append(getattr(self._scene, add)(f"/{path}", *given, **options))
-
-
-def _shade(colour: str) -> tuple[int, ...]:
-    return tuple(rgb(colour).to_bytes(3, "big"))
 
 
 def serve_by_viser(content: Content, port: int) -> Any:
@@ -73,7 +69,7 @@ def serve_by_viser(content: Content, port: int) -> Any:
     server.scene.configure_environment_map(None)  # which makes colours pale
     server.scene.add_light_ambient("/ambient", intensity=1.6)
     for name, thing in content.things.items():
-        thing.put(still, content.layers[name].path, _MOST, content.layers[name])
+        thing.put(still, content.layers[name].path, MOST, content.layers[name])
     centre = 0.5 * (ground.low + ground.high)
     server.initial_camera.look_at = centre
     server.initial_camera.position = centre + ground.size * np.array([0.05, -0.55, 0.6])
