@@ -103,8 +103,8 @@ class Model:
             name: unique.
             manifold: of every member.
             count: number of them.
-            units: of the tangent coordinates, as in ``"m, m, rad"``; compared with those of data, constants and
-                functions in every term that declares both.
+            units: of the tangent coordinates, as in ``"m, m, rad"``, or one for a vector; compared with those of data,
+                constants and functions in every term that declares both.
             frame: a name such as ``"map"``, or ``"map_T_base"`` for poses of the base in the map; compared likewise.
 
         Raises:

@@ -1,13 +1,14 @@
 """Units and frames as they are declared: of families, data, constants, and arguments of functions.
 
 Units are a text with one unit for each number, separated by commas: of variables for each tangent coordinate, of data
-for each stored number, where ``wxyz`` or ``xyzw`` stands for the four numbers of a quaternion. A frame is a name, or
+for each stored number, where ``wxyz`` or ``xyzw`` stands for the four numbers of a quaternion. One unit alone holds for
+all numbers of a vector. A frame is a name, or
 ``map_T_base`` for what takes coordinates of the second frame to the first.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from unifg.errors import GraphError
@@ -72,6 +73,8 @@ def quantity(what: str, units: str | None, frame: str | None, manifold: Manifold
         if given is not None and not (isinstance(given, str) and all(part.strip() for part in given.split(","))):
             raise GraphError(f"{what}: {name}= is a text such as {_EXAMPLES[name]}, found {given!r}")
     found = Quantity(tuple(unit.strip() for unit in units.split(",")) if units else (), (frame or "").strip())
+    if isinstance(manifold, Rn) and len(found.units) == 1:
+        found = replace(found, units=found.units * manifold.dim)
     if manifold is not None and found.units:
         fits(what, found, manifold)
     return found
@@ -84,10 +87,10 @@ def fits(what: str, found: Quantity, manifold: Manifold) -> None:
         GraphError: they are not as many as tangent coordinates, or angles that are stored in radians have another unit.
     """
     units = found.coordinates
-    if len(units) != manifold.dim:
+    if len(units) != manifold.dim and not (len(units) == 1 and isinstance(manifold, Rn)):
         raise GraphError(
             f"{what} declares {len(units)} units ({', '.join(found.units)}), but {manifold.name} has {manifold.dim} "
-            "tangent coordinates: give one unit for each, separated by commas"
+            f"tangent coordinates: give {'one unit for all, or ' * isinstance(manifold, Rn)}one for each, with commas"
         )
     at = 0
     for leaf, _, _ in leaves(manifold):
