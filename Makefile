@@ -41,15 +41,16 @@ ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 .PHONY: first-use peers docs kernels performance notebooks help demo test test-all fuzz test-lowest processes lint style types mypy pyright bench results sample release-build release-kernels release-check mutants fences clean offsets examples
 .DELETE_ON_ERROR:
 
+# Tests start some fifty processes; without what Python has compiled, each would compile all sources anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 help:
 	@sed -n '2,/^$$/s/^# \{0,1\}//p' Makefile
 
 demo: $(VENV)/installed
 	$(BIN)/unifg run navigation --coupling joint --obstacles 3 --seed 0 --out out/demo
 
-# Tests start some fifty processes, which would compile the sources anew wherever Python may not write what it compiled.
 test: $(VENV)/ready
-	@$(BIN)/python -W ignore -m compileall -qq unifg solvers models scenarios benchmarks tools
 	$(ONE_THREAD) $(BIN)/unifg warmup
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
 

@@ -205,6 +205,7 @@ STAGED: dict[str, tuple[str, str, dict[str, Any]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.product(3)
 @pytest.mark.parametrize("name", STAGED)
 def test_a_staged_contact_has_its_cause(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     thing, begin, settings = STAGED[name]

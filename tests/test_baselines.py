@@ -108,6 +108,7 @@ def test_a_base_without_limits_of_acceleration_is_driven_too(name: str) -> None:
     assert np.isfinite(controls).all() and controls[-1, 0] > 0.4
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize("name", OTHERS)
 def test_the_robot_stops_before_a_wall(name: str) -> None:
     start = np.array([6.0, 2.0, 0.0])
@@ -118,6 +119,7 @@ def test_the_robot_stops_before_a_wall(name: str) -> None:
     assert np.ptp(poses[-8:, 0]) < (0.3 if name == "mppi" else 0.1)  # noise never rests
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize(("name", "aside"), [("teb", 0.25), ("mppi", 0.25), ("dwa", 0.48), ("pursuit", 0.48)])
 def test_a_disc_beside_the_path_is_passed(name: str, aside: float) -> None:
     """Nearer than the clearance allows, where the planner can leave its path; the others need a route that is free."""

@@ -40,7 +40,7 @@ def assert_same(batch: Batch, singles: list[fg.Solution], family: fg.Family) -> 
 
 @pytest.mark.parametrize("case", [Unicycle("straight", True, 20), Quadrotor("goto", False, 20)], ids=str)
 @pytest.mark.parametrize("options", [{}, {"step_tolerance": np.inf}, {"max_iterations": 9}], ids=str)
-@pytest.mark.product(3)
+@pytest.mark.product(1)
 def test_instances_are_solved_as_one_by_one(case: Unicycle | Quadrotor, options: dict[str, Any]) -> None:
     stated, each = instances(case, COUNT if case.robot == "unicycle" else 20)
     prepared = InteriorPoint(tolerance=1e-4, **options).prepare(stated.graph)
@@ -64,6 +64,7 @@ def test_one_instance_as_a_solution() -> None:
     assert found.multipliers.keys() == {"dynamics", "limits"}
 
 
+@pytest.mark.product(3, of="studies")
 def test_what_compiled_code_leaves_is_solved_as_usual() -> None:
     """Other backends, a time limit, and data that single solves refuse."""
     stated, each = instances(Quadrotor("goto", False, 20), 6)

@@ -304,7 +304,7 @@ def faulty(fault: str, seed: int = 0, coupling: str = "sequential", plant: str =
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
-@pytest.mark.product(3)
+@pytest.mark.product(1)
 def test_a_jump_of_calibration_is_named_within_half_a_second(fault: str, cause: str, coupling: str) -> None:
     log = faulty(fault, coupling=coupling)
     named = [time for time, word in zip(log.time, log.cause, strict=True) if word == cause]
@@ -316,7 +316,7 @@ def test_a_jump_of_calibration_is_named_within_half_a_second(fault: str, cause: 
 
 @pytest.mark.parametrize("plant", ["light", "harsh"])
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_drives_without_a_fault_name_none(seed: int, plant: str) -> None:
     log = faulty("", seed, plant=plant)
     assert {cause for cause in log.cause if cause} <= {"the motors follow late"}
@@ -324,7 +324,7 @@ def test_drives_without_a_fault_name_none(seed: int, plant: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.product(1)
+@pytest.mark.product(6, of="drives and flights")
 def test_a_robot_whose_motors_are_stuck_has_its_power_cut(seed: int) -> None:
     settings = replace(CORRIDOR, seed=seed, faults=(Fault("actuator-stuck", 2.0),))
     log = Episode(settings).run(maps.stop_after(50))
@@ -367,7 +367,7 @@ def test_a_thrust_that_is_missing_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.product(1)
+@pytest.mark.product(6, of="drives and flights")
 def test_a_vehicle_that_is_loaded_in_flight_flies_on(seed: int) -> None:
     log = run_flight(FlightSettings(seed=seed, time_limit=5.0, faults=(Fault("payload", 3.0),)))
     named = [time for time, cause in zip(log.time, log.causes, strict=True) if cause]

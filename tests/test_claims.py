@@ -22,7 +22,7 @@ def stated(kind: str, seed: int = 0, equalities_only: bool = False) -> tuple[Twi
 
 
 @pytest.mark.parametrize("kind", ["parking", "attitude slew", "thrust cone", "two-link arm", "minimum snap"])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_both_statements_are_one_problem(kind: str) -> None:
     """Cost, rows and gradient along the right perturbation agree; the study asserts it of every problem."""
     twin, judge = stated(kind, seed=1)
@@ -40,13 +40,14 @@ def test_two_different_problems_are_told_apart() -> None:
 
 @pytest.mark.parametrize("kind", ["hover with drag", "attitude slew"])
 @pytest.mark.parametrize("name", CONSTRAINED)
-@pytest.mark.product(4)
+@pytest.mark.product(2)
 def test_converged_is_true(name: str, kind: str) -> None:
     twin, judge = stated(kind)
     result = answer(CONSTRAINED[name], twin, judge)
     assert (result.status, result.claim) == ("CONVERGED", "true"), result
 
 
+@pytest.mark.product(2)
 @pytest.mark.parametrize("equalities_only", [False, True])
 @pytest.mark.parametrize(
     ("kind", "seed", "limit"), [("pendulum", 1, 130), ("cart-pole", 1, 150), ("two-link arm", 0, 100)]
@@ -61,6 +62,7 @@ def test_the_augmented_lagrangian_moves_along_curved_dynamics(
     assert result.iterations <= limit
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize("kind", ["orbit", "attitude slew"])
 def test_converged_is_true_without_inequalities(kind: str) -> None:
     twin, judge = stated(kind, equalities_only=True)
@@ -86,6 +88,7 @@ def out_of_reach() -> Twin:
     return twin
 
 
+@pytest.mark.product(2)
 @pytest.mark.parametrize("name", ["alm", "sqp", "sqp graph", "ipm"])
 def test_infeasible_is_true(name: str) -> None:
     twin = out_of_reach()
@@ -133,6 +136,7 @@ def test_the_judge_contradicts_what_is_false() -> None:
         assert infeasible(seen, judge, 1e-6)[0] == "false"
 
 
+@pytest.mark.product(2)
 @pytest.mark.parametrize("seed", [0, 4])
 @pytest.mark.parametrize(("kind", "equalities_only"), [("free final time", False), ("thrust cone", True)])
 def test_the_augmented_lagrangian_finds_its_way(kind: str, equalities_only: bool, seed: int) -> None:

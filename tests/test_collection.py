@@ -71,7 +71,7 @@ def takes(name: str, graph: fg.Graph) -> bool:
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("name", BACKENDS)
-@pytest.mark.product(45)
+@pytest.mark.product(24)
 def test_backend_solves_what_its_class_allows(name: str, case: str) -> None:
     graph, guess = CASES[case].build()
     backend = BACKENDS[name]
@@ -96,6 +96,7 @@ def test_backend_solves_what_its_class_allows(name: str, case: str) -> None:
             assert np.abs(distance).max() < 1e-5
 
 
+@pytest.mark.product(3, of="studies")
 def test_the_aims_are_met() -> None:
     """Shares of what a backend takes; the test above holds the lists to the truth."""
     assert sum(len(GROUPS[name]) for name in ("Hock and Schittkowski",)) >= 60
@@ -106,6 +107,7 @@ def test_the_aims_are_met() -> None:
         assert 1.0 - len(UNSOLVED[name]) / len(taken) >= aim
 
 
+@pytest.mark.product(3, of="studies")
 def test_ipopt_confirms_the_formulas() -> None:
     """The same expressions, differentiated and solved by others, lead to the published optima."""
     pytest.importorskip("casadi")
@@ -169,6 +171,7 @@ def test_formulas_agree_with_the_files(shared_data: Path, name: str, rng: np.ran
 CONSTRAINED = [name for name, (_, inequalities, _) in CLASSES.items() if inequalities]
 
 
+@pytest.mark.product(12)
 @pytest.mark.parametrize("case", [case.name for case in GROUPS["infeasible"]])
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_least_violation_is_claimed_where_it_is(name: str, case: str, rng: np.random.Generator) -> None:

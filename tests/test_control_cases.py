@@ -21,7 +21,7 @@ CONFIRMED = {("ahead", True, 20): (586.14768,), ("ahead", True, 50): (580.25905,
 
 @pytest.mark.parametrize("problem", list(dict.fromkeys([*problems(), *sixteen()])), ids=lambda p: p.title)
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.product(14)
+@pytest.mark.product(8)
 def test_control_case(solver: str, problem: Problem) -> None:
     stated = problem.formulation()
     solution = SOLVERS[solver].solve(stated.graph, stated.guess)
@@ -32,6 +32,7 @@ def test_control_case(solver: str, problem: Problem) -> None:
         assert judge(stated.graph, solution).worst() < 1e-3
 
 
+@pytest.mark.product(3, of="studies")
 @pytest.mark.parametrize(("instance", "best"), [("ahead", 580.25905), ("goto", 3387.08409)])
 def test_a_better_optimum_than_that_of_ipopt_is_listed(instance: str, best: float) -> None:
     """IPOPT ends at the first of the list; it stays where it is started at the others (tests/problems/control.py)."""

@@ -126,7 +126,7 @@ def same(one: fg.Solution, other: fg.Solution) -> None:
 
 
 @pytest.mark.parametrize(("build", "name", "solver"), CASES, ids=[f"{name}, {b.__name__}" for b, name, _ in CASES])
-@pytest.mark.product(3)
+@pytest.mark.product(1)
 def test_a_prepared_solve_remembers_nothing(build: object, name: str, solver: fg.Solver) -> None:
     """After another solve, after one that failed, and in a run of its own."""
     assert callable(build)

@@ -128,7 +128,7 @@ def converged_end(name: str, feasible: bool) -> Array:
 
 @pytest.mark.parametrize("name", [name for name in BACKENDS if "kkt" not in name])
 @pytest.mark.parametrize("iterations", [1, 3])
-@pytest.mark.product(6)
+@pytest.mark.product(3)
 def test_few_iterations_pass_a_disc(name: str, iterations: int) -> None:
     loop = RecedingHorizon(disc=True)
     poses = loop.drive(BACKENDS[name](iterations), feasible=True)

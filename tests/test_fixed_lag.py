@@ -23,6 +23,7 @@ def within(statements: list[Model], k: int, lag: int) -> list[Model]:
     return [statement for statement in statements if min(statement[1]) > k - lag]
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize("seed", range(4))
 def test_linear_problems_lose_nothing(seed: int) -> None:
     """On Rn the window's estimates and covariance are those of a batch solve of the whole history."""

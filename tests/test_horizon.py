@@ -105,6 +105,7 @@ def carry_on(window: Window, drive: Drive, k: int) -> None:
     window.estimate(None)
 
 
+@pytest.mark.product(2)
 @pytest.mark.parametrize("length", [1, 3, 7])
 @pytest.mark.parametrize("static", [False, True])
 def test_a_window_says_what_the_whole_history_says(length: int, static: bool) -> None:
@@ -452,6 +453,7 @@ def drive(loop: RecedingHorizon, ticks: int, seed: int = 0) -> tuple[list[Plan],
 BACKENDS = backends("ipm", "sqp", "alm")
 
 
+@pytest.mark.product(6, of="drives and flights")
 def test_backends_and_couplings_find_the_same_way() -> None:
     ends = {}
     for name, solver in BACKENDS.items():
@@ -830,6 +832,7 @@ class Towards:
         return {}
 
 
+@pytest.mark.product(6, of="drives and flights")
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
 def test_a_robot_on_se2_finds_a_lamp_while_it_drives(coupling: Any) -> None:
     h, lamp = 0.2, np.array([2.0, -0.8])

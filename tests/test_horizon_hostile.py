@@ -120,6 +120,7 @@ def test_what_is_recorded_after_the_estimate_leaves_with_its_node(place: int, la
 # ---------------------------------------------------------------- weights
 
 
+@pytest.mark.product(2)
 @pytest.mark.parametrize(
     "loss",
     [
@@ -281,6 +282,7 @@ def test_a_measurement_that_is_taken_back_was_none() -> None:
     np.testing.assert_allclose(found[1], found[0], atol=1e-9)
 
 
+@pytest.mark.product(6)
 @pytest.mark.parametrize(
     "wrong",
     [

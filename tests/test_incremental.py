@@ -20,7 +20,7 @@ from unifg.smoothing import Incremental
 
 @pytest.mark.parametrize("group", [fg.SE2, fg.SE3, fg.SO3], ids=lambda g: g.name)
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.product(5)
+@pytest.mark.product(2)
 def test_every_update_is_a_batch_step(group: Any, seed: int) -> None:
     """Thresholds zero: after each update the estimates are those of a Gauss-Newton step over everything."""
     rng = np.random.default_rng(seed)
@@ -52,7 +52,7 @@ def test_every_update_is_a_batch_step(group: Any, seed: int) -> None:
 
 @pytest.mark.parametrize("group", [fg.SE2, fg.SE3], ids=lambda g: g.name)
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.product(4)
+@pytest.mark.product(1)
 def test_some_points_move_and_others_stay(group: Any, seed: int) -> None:
     """With a threshold the estimates solve the linear problem of the factors at the points the smoother reports."""
     rng = np.random.default_rng(seed)
@@ -199,6 +199,7 @@ def test_cliques_hold_what_they_must(seed: int) -> None:
             assert set(members) <= cliques[parent[k]] | set(separators[parent[k]])
 
 
+@pytest.mark.product(3, of="large maps")
 @pytest.mark.data
 def test_manhattan_3500_pose_by_pose(shared_data: Path) -> None:
     """The optimum of the batch problem, 1/2 chi2 = 68.9574391, is reached on the way, not afterwards."""

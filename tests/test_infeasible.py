@@ -119,7 +119,7 @@ def test_what_was_feasible_once_is_not_called_infeasible(name: str) -> None:
 
 
 @pytest.mark.parametrize("unit", [1e-8, 1e-4, 1.0, 1e4, 1e8])
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_the_unit_of_an_unknown_does_not_decide_what_is_infeasible(unit: float) -> None:
     """Neither the verdict on a point where steps still help, nor the way to the least violation."""
     graph, guess = drive(position=unit)

@@ -30,7 +30,7 @@ EVERY_METHOD = pytest.mark.parametrize("method", NAMES)
 
 @EVERY_METHOD
 @EVERY_GROUP
-@pytest.mark.product(4)
+@pytest.mark.product(1)
 def test_order_of_convergence(group: fg.LieGroup, method: Method) -> None:
     """Against the exact motion, at steps that halve."""
     field, order = Carried(group), METHODS[cast(str, method)].order

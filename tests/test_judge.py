@@ -133,6 +133,7 @@ def far_above_slope(p: Array, J: Array) -> None:
     J[0, 0] = 1e3 * np.sinh(p[0] - 1.0)
 
 
+@pytest.mark.product(2)
 @pytest.mark.parametrize("stated", ["njit", "NumPy", "attached", "traced", "NumPy, traced"])
 def test_rounding_of_residuals(stated: str) -> None:
     """A residual of 1e3 at the solution, beside a constraint; with a Jacobian that is exact it is as good as any."""

@@ -81,7 +81,7 @@ def numbers(function: Function, manifold: Manifold, count: int) -> tuple[Array, 
 @pytest.mark.parametrize("count", [loops.FEWEST, 9, 32])
 @pytest.mark.parametrize("manifold", [SE2, Rn(3)], ids=lambda m: m.name)
 @pytest.mark.parametrize("function", [distances, softest, alternating, mixed, signed, chained])
-@pytest.mark.product(8)
+@pytest.mark.product(3)
 def test_loops_compute_what_straight_lines_do(
     function: Function, manifold: Manifold, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

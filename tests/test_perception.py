@@ -154,6 +154,7 @@ def met(
     return world, DiscTracker(field(occupancy)), np.random.default_rng(5)
 
 
+@pytest.mark.product(1, of="tracks")
 def test_mover_that_turns_round_is_followed() -> None:
     """Over turns the track stays one, and near the mover."""
     world, tracker, rng = met((4.0, 5.5), (6.0, 5.5))
@@ -186,6 +187,7 @@ def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
     assert np.mean(wrong) < 0.35
 
 
+@pytest.mark.product(1, of="tracks")
 def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
     """A mover that has stood for two seconds, for the robot's sake, is not left behind by its track."""
     world, tracker, rng = met((6.5, 4.0), (4.0, 4.0))
@@ -205,7 +207,7 @@ def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
 
 
 @pytest.mark.parametrize("waits", [5.0, 12.0])
-@pytest.mark.product(1)
+@pytest.mark.product(1, of="tracks")
 def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
     """Ten seconds in one place; and when it goes on then, that is seen as of any other."""
     world, tracker, rng = met((6.5, 4.0), (4.0, 4.0))
@@ -221,7 +223,7 @@ def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
 
 
 @pytest.mark.parametrize("speed", [0.2, 0.5])
-@pytest.mark.product(1)
+@pytest.mark.product(1, of="tracks")
 def test_one_who_goes_to_and_fro_stays_a_mover(speed: float) -> None:
     world, tracker, rng = met((4.0, 5.5), (4.8, 5.5), speed, yields=False)
     watch(world, tracker, 60, np.zeros(3), rng)
@@ -294,7 +296,7 @@ def test_poor_scans_are_survived() -> None:
 
 
 @pytest.mark.data
-@pytest.mark.product(1, of="tracks in a building")
+@pytest.mark.product(1, of="tracks")
 def test_empty_building_gives_no_tracks(shared_data: Path) -> None:
     """Fifty metres through the real building, the estimate off by 0.03 m and 0.008 rad: no false tracks."""
     occupancy = load_map(shared_data / "maps" / "dis-B1-2011-09-27.yaml")
@@ -308,7 +310,7 @@ def test_empty_building_gives_no_tracks(shared_data: Path) -> None:
 
 
 @pytest.mark.data
-@pytest.mark.product(1, of="tracks in a building")
+@pytest.mark.product(1, of="tracks")
 def test_discs_in_the_building(shared_data: Path) -> None:
     """Discs beside a drive through the real building are found, placed to 0.05 m within 3 m, and quickly."""
     occupancy = load_map(shared_data / "maps" / "dis-B1-2011-09-27.yaml")

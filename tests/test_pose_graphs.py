@@ -286,6 +286,7 @@ def test_the_other_residual_has_another_optimum(shared_data: Path) -> None:
     assert after.chi2() == pytest.approx(1581.38, abs=0.05)
 
 
+@pytest.mark.product(2)
 @pytest.mark.data
 @pytest.mark.parametrize(
     ("name", "method"),

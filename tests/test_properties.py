@@ -175,7 +175,7 @@ def snapshot(graph: fg.Graph, guess: Guess) -> Any:
 @pytest.mark.parametrize("name", CONSTRAINED)
 @given(seed=SEEDS)
 @MORE
-@pytest.mark.product(3)
+@pytest.mark.product(1)
 def test_every_claim_is_true(name: str, seed: int) -> None:
     graph, guess = wild(seed)
     terms, families, before = snapshot(graph, guess)
@@ -211,6 +211,7 @@ def test_the_interior_point_decides_random_graphs(seed: int) -> None:
 EXACT = {**backends("alm", "ipm", tolerance=1e-9), "sqp": SQP(tolerance=1e-9, qp="graph")}
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize("name", EXACT)
 @given(seed=SEEDS)
 @FEW
@@ -227,6 +228,7 @@ def test_order_does_not_matter(name: str, seed: int) -> None:
     np.testing.assert_allclose(problem.rows(second)[0], duals, atol=1e-7)
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize("name", EXACT)
 @given(seed=SEEDS, scale=st.sampled_from([0.02, 0.3, 7.0, 50.0]))
 @FEW
@@ -239,6 +241,7 @@ def test_scaling_a_constraint_scales_its_multipliers(name: str, seed: int, scale
         np.testing.assert_allclose(scale * other.dual(term), dual, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.product(3)
 @pytest.mark.parametrize("name", [*CONSTRAINED, *UNCONSTRAINED, "kkt"])
 @given(seed=SEEDS)
 @FEW

@@ -17,6 +17,7 @@ NAMES = ["quadprog", "clarabel"]  # a dense active-set method, and a sparse inte
 CONSTRAINED = [problem for problem in PROBLEMS if problem.constrained]
 
 
+@pytest.mark.product(20)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("problem", CONSTRAINED, ids=lambda problem: problem.name)
 def test_solves_by_name(name: str, problem: Problem) -> None:

@@ -137,7 +137,7 @@ def test_marginalised_columns_leave_what_they_knew(rng: np.random.Generator) -> 
     assert np.abs(kept[[1, 4]]).max() == 0.0
 
 
-@pytest.mark.product(3, of="estimated flights")
+@pytest.mark.product(1, of="estimated flights")
 def test_the_window_equals_the_batch() -> None:
     """After 5 s, to a small part of the uncertainty: twenty states and a prior against all hundred at once."""
     seed, log = 3, flight(3)  # a prior in the world's coordinates is off by 0.6 standard deviations here
@@ -181,6 +181,7 @@ def test_the_covariance_is_that_of_the_terms() -> None:
     np.testing.assert_allclose(block / scale, dense[np.ix_(own, own)] / scale, atol=1e-8)
 
 
+@pytest.mark.product(6, of="drives and flights")
 def test_the_window_is_a_problem_for_newton_too() -> None:
     """Hard dynamics with noise on some rows, metres beside kilograms and radians: full steps, no line search."""
     estimator = begin(1)
@@ -195,7 +196,7 @@ def test_the_window_is_a_problem_for_newton_too() -> None:
         estimator.estimate()
 
 
-@pytest.mark.product(3, of="estimated flights")
+@pytest.mark.product(1, of="estimated flights")
 def test_the_mass_is_known_soon() -> None:
     """Wrong by 5 % at the start; after 5 s better than 1 %, and within two standard deviations."""
     errors, covered, consistent, ticks = [], [], 0.0, 0
@@ -216,7 +217,7 @@ def test_the_mass_is_known_soon() -> None:
     assert 4.0 < consistent / ticks < 14.0  # nine degrees of freedom, one realisation of a heading each
 
 
-@pytest.mark.product(3, of="estimated flights")
+@pytest.mark.product(1, of="estimated flights")
 def test_without_dynamics_nothing_is_learnt() -> None:
     log = flight(2)
     estimator = begin(2, DeadReckoning)
@@ -255,7 +256,7 @@ def test_one_structure_serves_a_whole_flight() -> None:
 # ---------------------------------------------------------------- landmarks
 
 
-@pytest.mark.product(3, of="estimated flights")
+@pytest.mark.product(1, of="estimated flights")
 def test_gating_without_names_makes_no_mistake() -> None:
     """Every landmark found by gating is one thing of the world; nearly every sighting is used."""
     settings = EstimatorSettings(association="unknown")
@@ -306,7 +307,7 @@ def test_landmarks_come_with_the_covariance_of_their_sighting() -> None:
     assert np.linalg.norm(belief.state[:2] - state[:2]) < 0.2
 
 
-@pytest.mark.product(3, of="estimated flights")
+@pytest.mark.product(1, of="estimated flights")
 def test_landmarks_give_way_when_slots_run_out() -> None:
     """Seven slots for fourteen things: what left a slot stays on the map, near where it is."""
     settings = EstimatorSettings(window=WindowSettings(landmarks=7))

@@ -318,7 +318,7 @@ def test_the_report_says_which_measure_it_is() -> None:
         ("sphere2500", 1351.4019259, 8),
     ],
 )
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 def test_published_optima_in_other_units(shared_data: Path, name: str, chi2: float, most: int) -> None:
     pose_graph = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz")
     for times in (1.0, 1e-6, 1e6):
@@ -376,6 +376,7 @@ def local_offset(program: CompiledProblem, lin: Linearization) -> float:
     return worst
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize("solver", [GaussNewton, LevenbergMarquardt, DogLeg, SQP])
 def test_a_solve_ends_when_every_variable_has_converged(solver: type[fg.Solver]) -> None:
     """Not sooner and not later than dense algebra says, whatever factorisation the test is made with."""

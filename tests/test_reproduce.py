@@ -129,7 +129,7 @@ def test_statements_hold_do_not_or_are_undecided() -> None:
     assert [counted("a", "often", hits, 100, 0.5).difference for hits in (80, 20)] == ["agrees", "differs"]
 
 
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 @pytest.mark.parametrize(("paper", "item"), SHORT, ids=[f"{paper} {item.option}" for paper, item in SHORT])
 def test_an_item_runs(paper: str, item: catalogue.Item, tmp_path: Path) -> None:
     try:

@@ -80,6 +80,7 @@ def told(smoother: Incremental, edges: Edges, wrong: BoolArray) -> tuple[int, in
     return int(accepted[~wrong[order]].sum()), int((~wrong[order]).sum()), int(accepted[wrong[order]].sum())
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize(("groups", "size"), [(12, 1), (5, 4)])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_wrong_closures_are_left_out_and_right_ones_are_not(groups: int, size: int, seed: int) -> None:
@@ -93,6 +94,7 @@ def test_wrong_closures_are_left_out_and_right_ones_are_not(groups: int, size: i
     assert found.cost == pytest.approx(best.cost, abs=0.5)
 
 
+@pytest.mark.product(3, of="large maps")
 @pytest.mark.data
 @pytest.mark.parametrize("size", [1, 4])
 def test_wrong_closures_of_a_city(shared_data: Path, size: int) -> None:

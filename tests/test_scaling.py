@@ -41,7 +41,7 @@ def named(units: dict[str, float]) -> str:
 
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
 @pytest.mark.parametrize("units", UNITS, ids=named)
-@pytest.mark.product(12)
+@pytest.mark.product(6)
 def test_units_do_not_decide_whether_sqp_converges(units: dict[str, Any], hessian: Any) -> None:
     """The same optimum in about as many steps; the judge keeps to the units of the graph, in which slopes are large."""
     graph, guess = drive(**units)
@@ -118,6 +118,7 @@ def between_lines(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
     return graph, {x: np.array([[0.3, 0.2]])}
 
 
+@pytest.mark.product(8)
 @pytest.mark.parametrize("gap", [1e-1, 1e-3, 1e-5, 4e-6])
 @pytest.mark.parametrize("build", [beside_disc, between_lines])
 @pytest.mark.parametrize("options", [{}, {"qp": "graph"}, {"hessian": "exact"}], ids=["osqp", "graph", "exact"])

@@ -203,6 +203,7 @@ PARAMETERS: dict[str, Callable[[fg.Graph, fg.Family], Any]] = {
 }  # fmt: skip
 
 
+@pytest.mark.product(10)
 @pytest.mark.parametrize("kind", PARAMETERS)
 def test_every_kind_of_parameter(kind: str) -> None:
     graph, x = walk(PARAMETERS[kind])
@@ -241,6 +242,7 @@ def test_every_backend_has_the_same(name: str) -> None:
         Judge(InteriorPoint(tolerance=TIGHT), graph, guess).agrees([x, "g", "wall", "cost"], graph._data["p"], 4)
 
 
+@pytest.mark.product(2)
 @pytest.mark.parametrize("loss", [None, fg.Huber(1.0), fg.DCS(5.0)], ids=str)
 @pytest.mark.parametrize("space", [False, True])
 def test_measurements_of_a_pose_graph(space: bool, loss: Any) -> None:

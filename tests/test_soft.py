@@ -64,7 +64,7 @@ PRICES = [(0.3, 0.0), (5.0, 0.0), (0.0, 2.0), (0.2, 1.0)]
 @pytest.mark.parametrize("limits", [(1.0, np.inf), (-np.inf, 0.4), (0.9, 1.1), (0.8, 0.8)], ids=str)
 @pytest.mark.parametrize("price", PRICES, ids=str)
 @pytest.mark.parametrize("solver", SOLVERS, ids=named)
-@pytest.mark.product(25)
+@pytest.mark.product(10)
 def test_the_answer_is_that_of_slack_variables_by_hand(
     solver: fg.Solver, price: tuple[float, float], limits: tuple[float, float]
 ) -> None:

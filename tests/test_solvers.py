@@ -251,6 +251,7 @@ def test_alm_leaves_a_subproblem_whose_steps_are_too_short_to_be_of_use() -> Non
     assert solution.violation < 1e-4
 
 
+@pytest.mark.product(4)
 @pytest.mark.parametrize("solver", BACKENDS, ids=IDS)
 def test_a_far_start_overflows_in_silence(solver: fg.Solver) -> None:
     """Squares of 1e160 overflow; that is for the status to say, not for a warning or an error of a QP solver."""

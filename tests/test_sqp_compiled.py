@@ -89,6 +89,7 @@ def test_contradicting_rows_are_proved_and_no_others(limit: float, contradicts: 
     assert contradicts or answer.error <= 1e-8
 
 
+@pytest.mark.product(6)
 @pytest.mark.parametrize("options", [{}, {"full_steps": True, "max_iterations": 5}], ids=["searched", "full steps"])
 @pytest.mark.parametrize("qp", ["graph", "osqp"])
 @pytest.mark.parametrize("case", ["drive", "HS26", "HS29", "HS40"])

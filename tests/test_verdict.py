@@ -74,6 +74,7 @@ def test_statistics_of_a_cluster_are_those_of_dense_matrices() -> None:
     assert lin.cost == pytest.approx(0.5 * now.chi2)
 
 
+@pytest.mark.product(2)
 @pytest.mark.parametrize("count", [1, 3])
 @pytest.mark.parametrize("spatial", [False, True])
 def test_clusters_that_the_rest_contradicts_are_named(count: int, spatial: bool) -> None:

@@ -70,6 +70,7 @@ def leave(path: Path) -> None:
     path.write_text(str(os.getpid()), encoding="utf-8")
 
 
+@pytest.mark.product(5, of="processes of their own")
 def test_where_nothing_came_precompiled_processes_compile_at_once(
     done: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,6 +124,7 @@ sys.exit(command.main(["warmup"]))
 """
 
 
+@pytest.mark.product(5, of="processes of their own")
 def test_the_library_is_compiled_without_extras() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -159,7 +161,7 @@ main(["solve", "map.g2o", "--effort", "full", "--out", "."])
 """
 
 
-@pytest.mark.product(2)
+@pytest.mark.product(1)
 @pytest.mark.parametrize("script", ["unifg solve", *sorted(path.stem for path in EXAMPLES)])
 def test_a_first_use_compiles_nothing_that_could_have_come(script: str, tmp_path: Path) -> None:
     """Functions of unifg that scripts call are in the archive; if one is not, unifg/precompile.py lacks a job."""
