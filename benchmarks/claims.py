@@ -13,18 +13,17 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-import unifg as fg
 from benchmarks.comparison import Row
 from benchmarks.report import listing
 from benchmarks.runner import Cell, Study
 from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
 from problems.twins import KINDS
-from variants import CONSTRAINED, EQUALITIES_ONLY
+from variants import CONSTRAINED
 
 TOLERANCE = 1e-6
 OTHERS = 5  # problems of every kind but parking
 SAME = 1e-4  # relative difference below which two costs are one optimum
-EQUALITY_BACKENDS: dict[str, fg.Solver] = {"kkt": EQUALITIES_ONLY["kkt"], **CONSTRAINED}
+BACKENDS = {name: solver for name, solver in CONSTRAINED.items() if name not in ("kkt full", "kkt lm")}
 
 
 @dataclass
@@ -49,8 +48,7 @@ def measure(kind: str, seed: int, equalities_only: bool) -> Case:
     apart = disagreement(twin, judge)
     if apart > AGREED:
         raise RuntimeError(f"{twin.name}: the graph and the casadi statement differ by {apart:.1e}")
-    backends = EQUALITY_BACKENDS if equalities_only else CONSTRAINED
-    answers = {name: answer(backend, twin, judge) for name, backend in backends.items()}
+    answers = {name: answer(backend, twin, judge) for name, backend in BACKENDS.items()}
     ipopt, fatrop = judge.ipopt(twin.guess, TOLERANCE), judge.fatrop(twin.guess, TOLERANCE)
     return Case(kind, seed, equalities_only, answers, ipopt, fatrop)
 
@@ -91,7 +89,7 @@ def summary(cases: list[Case], names: Iterable[str]) -> str:
 
 def render(cases: list[Case]) -> str:
     """All tables."""
-    names = [name for name in EQUALITY_BACKENDS if any(name in case.answers for case in cases)]
+    names = [name for name in BACKENDS if any(name in case.answers for case in cases)]
     parts = []
     for title, chosen in (
         ("Parkings", [c for c in cases if c.kind == "parking"]),

@@ -2,7 +2,7 @@
 
 A unicycle is to be 3 m ahead in 4 s; two discs leave it a bend between them. Cost and constraints are stated once, each
 backend is named and timed on the same cold guess, in its second solve. Stationarity, violation and complementarity are
-measured by one function for all, after the backend has stopped. Backends that know no inequalities say so.
+measured by one function for all, after the backend has stopped. A backend that knows no constraints says so.
 
     python examples/swap_backends.py [FOLDER]
 """

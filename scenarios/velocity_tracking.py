@@ -45,10 +45,10 @@ class TrackingSettings:
 
     Attributes:
         length: steps N.
-        solver: one of `unifg.solvers.names.EQUALITIES`.
+        solver: one of `unifg.solvers.names.CONSTRAINED`.
         profile: CSV file of the speeds, column v_ref_mps [m/s]; without one, the drive cycle that ships with unifg.
         linear: air drag linear in the speed instead of quadratic.
-        force_bounds: least and greatest force [N], if any; not for kkt.
+        force_bounds: least and greatest force [N], if any.
         start: speed at the beginning [m/s].
         track: Q, weight of the deviation from the profile [s^2/m^2].
         end: P, the same at the last step.

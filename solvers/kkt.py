@@ -1,4 +1,4 @@
-"""KKT Gauss-Newton: equality constraints as factors with multiplier variables (ecg2o, section 4.2).
+"""KKT Gauss-Newton: constraints as factors with multiplier variables (ecg2o, section 4.2).
 
 An equality h(x) = 0 becomes a factor of x and of its multipliers with error (h, lambda) and weight [[0, I], [I, 0]];
 its contribution to the linear system is the block A and nothing else:
@@ -12,9 +12,13 @@ shift is gone (:mod:`unifg.elimination.saddle`). H is that of Gauss-Newton, or o
 first converge slowly (:mod:`unifg.solvers.globalize.slow_convergence`): second-order terms may be as large as H. A step
 of the second that does not lower the merit is left for one of the first.
 
+Inequalities are the paper's outlook: those of the active set are equalities of the system, which is solved again until
+the linearised problem is (:mod:`unifg.solvers.active_set`).
+
 The paper takes every step in full. By default a step has to lower the l1 merit f + price |h| (Nocedal and Wright,
 chapter 18): the cost alone would reject steps that restore feasibility. A full step that is rejected is corrected once
-for the curvature of the constraints before it is shortened; shortened steps damp the next ones.
+for the curvature of the constraints before it is shortened; shortened steps damp the next ones. The price need not
+exceed the largest multiplier of the linearised problem by much.
 
 The outlook of the paper is Levenberg-Marquardt on this system: mu times the diagonal of H is added to H, and the
 linearised constraints are to be met by a part 1 / (1 + mu). With a large mu the step is short in every direction and
@@ -33,9 +37,9 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
 from unifg.problem.systems import aim, fill
-from unifg.solution.capabilities import require
 from unifg.solution.solver import Solver, SolveState
 from unifg.solution.status import Status
+from unifg.solvers.active_set import ActiveSet
 from unifg.solvers.augmented_objective import DIAGONAL_FLOOR
 from unifg.solvers.globalize.damping import LARGEST, Damping, gain
 from unifg.solvers.globalize.feasibility_restoration import leave, settle
@@ -43,7 +47,7 @@ from unifg.solvers.globalize.line_search import search
 from unifg.solvers.globalize.merit import OnePrice
 from unifg.solvers.globalize.norms import largest, norm
 from unifg.solvers.globalize.slow_convergence import converges_slowly
-from unifg.typing import Array
+from unifg.typing import Array, BoolArray
 
 RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved
 ROUNDING = 1e-13
@@ -53,11 +57,14 @@ DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and shorten
 FIRST_SLACKNESS = 1e-4
 FIRST_LEVENBERG = 1e-6
 RETRY_GROWTH = 100.0
+SHORT = 0.1  # share of a step with the Hessian of the Lagrangian below which one of Gauss-Newton is tried as well
+PRICE = 2.0  # times the largest multiplier: the penalty of violation at most
+ENTERING = 1e-3  # share of the tolerance by which a row is violated that enters the active set
 
 
 @dataclass(kw_only=True)
 class KKT(Solver):
-    """Equality constraints by Newton's method on the KKT conditions, with a Gauss-Newton Hessian.
+    """Newton's method on the KKT conditions, with a Gauss-Newton Hessian and an active set of the inequalities.
 
     Attributes:
         full_steps: take every step in full, as the paper does; no merit function and no damping.
@@ -68,7 +75,6 @@ class KKT(Solver):
     """
 
     rehearses = True
-    constraints = "equalities"
     scalar_costs = False
 
     full_steps: bool = False
@@ -91,13 +97,13 @@ class KKT(Solver):
 
     def search_step(self, run: SolveState, workspace: Newton, lin: Linearization) -> Array | None:
         """The unknowns' part of the full step."""
-        workspace.begin(self.name)
+        workspace.begin(run)
         found = workspace.step(lin, run.multipliers, SMALLEST_DAMPING, 0.0)
         return None if found is None else found[0]
 
     def iterate(self, run: SolveState, workspace: Newton) -> Status | None:
         """Iterate to convergence."""
-        workspace.begin(self.name)
+        workspace.begin(run)
         if self.globalization == "levenberg-marquardt":
             return self._damped(run, workspace)
         merit = OnePrice(run.program)
@@ -107,13 +113,13 @@ class KKT(Solver):
             taken, slow = None, slow or (converges_slowly(run.history) and not self.full_steps)
             if slow and (found := workspace.step(run.lin, run.multipliers, 0.0, slackness, curved=True)) is not None:
                 taken = self._search(run, workspace, merit, *found, hopeful=True)
-            if taken is None:
+            if doubtful := taken is None or taken[3] < SHORT:
                 found = workspace.step(run.lin, run.multipliers, damping, slackness)
             if found is None and self.full_steps:
                 return settle(run, Status.SINGULAR)
             # Damping tells of steps that were shortened: without it the full one will probably be taken.
-            if taken is None and found is not None:
-                taken = self._search(run, workspace, merit, *found, hopeful=damping == 0.0)
+            if doubtful and found is not None:
+                taken = self._search(run, workspace, merit, *found, hopeful=damping == 0.0) or taken
             if (taken is None or slackness) and run.infeasible_stationary():
                 if (ending := leave(run)) is not None:
                     return ending
@@ -197,7 +203,7 @@ class KKT(Solver):
         if self.full_steps:
             return program.linearize(program.retract(lin.values, step)), step, change, 1.0, False
         linear = program.constraints.times(lin.constraint_jacobian, step)
-        slope = merit.slope(lin, step, linear)
+        slope = merit.slope(lin, step, linear, PRICE * largest(run.multipliers + change))
         here = merit.value(lin)
         slack = ROUNDING * max(1.0, abs(here)) + merit.rounding(lin)
         if not slope <= slack:
@@ -222,16 +228,12 @@ class Newton:
         self.program = program
         self._structure(program)
 
-    def begin(self, solver: str) -> None:
-        """Look at the limits of this solve: they may be data.
-
-        Raises:
-            BackendError: when a limit no longer is an equality.
-        """
+    def begin(self, run: SolveState) -> None:
+        """Look at the limits of this solve, which may be data, and begin with its multipliers."""
         program = self.program
-        if not np.array_equal(program.equality, self.system.held):
-            require(program, solver, "equalities")
+        if not np.array_equal(_limited(program), self.system.held):
             self._structure(program)
+        self.active = ActiveSet(program, run.multipliers, ENTERING * run.tolerances.violation)
         self._begun = False  # equal solves take equal steps
 
     def step(
@@ -255,7 +257,8 @@ class Newton:
             curved: whether H is the Hessian of the Lagrangian.
 
         Returns:
-            (n,) tangent step and (M,) change of the multipliers; None when the system is singular.
+            (n,) tangent step and (M,) change of the multipliers; None when the system is singular, or no active set
+            was found.
         """
         n = self.program.size
         hessian = lagrangian_hessian(self.program, lin, multipliers) if curved else lin.hessian
@@ -267,18 +270,36 @@ class Newton:
             pull = (largest(lin.constraint_jacobian) or 1.0) ** 2 / curvature
             self._data[diagonal[:n]] += damping * np.maximum(curvatures, DIAGONAL_FLOOR * curvature)
             self._data[diagonal[n:]] -= slackness * pull
-        if not self.system.saddle.factor(self._data, self._begun):
+        if not self.active.choice:
+            return self._solved(lin, multipliers, less)
+        for _ in self.active.attempts():
+            found = self._solved(lin, multipliers, less, convex=curved)
+            if found is None:
+                self.active.fail()
+                continue
+            reached = lin.constraints + self.program.constraints.times(lin.constraint_jacobian, found[0])
+            if self.active.settled(reached, multipliers + found[1]):
+                return found
+        return None
+
+    def _solved(
+        self, lin: Linearization, multipliers: Array, less: float, convex: bool = False
+    ) -> tuple[Array, Array] | None:
+        """The step for the present active set; None where the system is singular, or not ``convex`` as it has to be."""
+        n, rows, data = self.program.size, self.system.arrays.rows, self._data
+        out = ~self.active.held[rows]
+        if out.any():
+            data = self.system.without(data, np.concatenate([np.zeros(n, dtype=bool), out]))
+        if not self.system.saddle.factor(data, self._begun):
             return None
         self._begun = True
-        kept = np.zeros(len(multipliers))
-        if less:
-            rows = self.system.arrays.rows
-            kept[rows] = less * (self.program.lower - lin.constraints)[rows]
-        return self.resolve(lin, multipliers, kept)
+        if convex and self.system.factorization.inertia != (n, len(rows), 0):
+            return None
+        return self.resolve(lin, multipliers, less * self.active.missing(lin.constraints))
 
     def resolve(self, lin: Linearization, multipliers: Array, bend: Array) -> tuple[Array, Array] | None:
         """Solve with the last factorisation, the constraints moved by ``bend`` (M,)."""
-        program, n, rows = self.program, self.program.size, self.system.arrays.rows
+        program, n, rows, held = self.program, self.program.size, self.system.arrays.rows, self.active.held
         right = np.empty(n + len(rows))
         aim(
             program.arrays,
@@ -287,20 +308,28 @@ class Newton:
             lin.gradient,
             lin.constraints,
             lin.constraint_jacobian,
-            multipliers,
+            np.where(held, multipliers, 0.0),
             bend,
             right,
         )
+        if self.active.choice:
+            right[n:] = np.where(held, self.active.missing(lin.constraints) - bend, 0.0)[rows]
         found, error = self.system.saddle.solve(right)
         if not error <= RESIDUAL:
             return None
-        change = np.zeros(len(multipliers))
-        change[rows] = found[n:]
+        change = np.where(held, 0.0, -multipliers)
+        change[rows] += found[n:]
         return found[:n], change
 
     def _structure(self, program: CompiledProblem) -> None:
-        self.system = program.systems.kkt(program.equality)
+        self.system = program.systems.kkt(_limited(program))
         self._data, self._begun = np.zeros(self.system.pattern.nnz), False
+
+
+def _limited(program: CompiledProblem) -> BoolArray:
+    """(M,) rows that have a limit."""
+    limited: BoolArray = np.isfinite(program.lower) | np.isfinite(program.upper)
+    return limited
 
 
 def _next_damping(damping: float, length: float) -> float:

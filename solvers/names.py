@@ -53,8 +53,6 @@ TABLE = {
 _PLAIN = tuple(name for name, entry in TABLE.items() if issubclass(entry.made_by, Solver))
 LEAST_SQUARES = tuple(name for name in _PLAIN if TABLE[name].made_by.constraints == "none")
 """Made for sums of squares without constraints."""
-EQUALITIES = tuple(name for name in _PLAIN if TABLE[name].made_by.constraints != "none")
-"""Take equalities."""
 CONSTRAINED = tuple(name for name in _PLAIN if TABLE[name].made_by.constraints == "all")
 """Take equalities and inequalities."""
 SECOND_ORDER = tuple(name for name in CONSTRAINED if "hessian" in TABLE[name].options)

@@ -14,7 +14,7 @@ from unifg.solvers import (
     GaussNewton,
     InteriorPoint,
 )
-from unifg.solvers.names import EQUALITIES, LEAST_SQUARES, backends
+from unifg.solvers.names import CONSTRAINED, LEAST_SQUARES, backends
 from unifg.typing import Array
 
 # ---------------------------------------------------------------- priors of what leaves
@@ -345,7 +345,7 @@ def test_no_iteration_is_a_limit_like_any_other() -> None:
     assert solution.status is fg.Status.ITERATION_LIMIT and solution[x] == 1.0
 
 
-STEPPING = backends(*LEAST_SQUARES, *EQUALITIES, keep_values=True)
+STEPPING = backends(*LEAST_SQUARES, *CONSTRAINED, keep_values=True)
 
 
 @pytest.mark.parametrize("name", STEPPING)

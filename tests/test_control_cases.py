@@ -12,7 +12,7 @@ from unifg.models import quadrotor
 from unifg.solvers import InteriorPoint
 from unifg.solvers.names import backends
 
-SOLVERS = backends("ipm", "sqp", "alm", tolerance=1e-4)
+SOLVERS = backends("ipm", "sqp", "alm", "kkt", tolerance=1e-4)
 
 
 # Minima that are not listed, at which IPOPT stays when it is started there.

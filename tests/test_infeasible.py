@@ -15,9 +15,9 @@ from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.solvers.globalize.feasibility_restoration import least_violation
 from unifg.typing import Array
 from units import drive
-from variants import CONSTRAINED, EQUALITIES_ONLY
+from variants import CONSTRAINED
 
-BACKENDS = {**EQUALITIES_ONLY, **CONSTRAINED}
+BACKENDS = CONSTRAINED
 LEAST = 0.00253189415  # squared, of a drive whose end is out of reach
 Problem = tuple[fg.Graph, dict[fg.Family, Array]]
 

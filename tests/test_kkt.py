@@ -1,9 +1,9 @@
-"""The KKT backend: its step against dense algebra, its globalisation, its refusals, the paper's second case study."""
+"""The KKT backend: its step against dense algebra, its globalisation, its active set, the paper's second case study."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from problems.known import STARTS, ecg2o, pose_chain, three_variable_qp
 from unifg.models import unicycle
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import KKT, SQP, InteriorPoint
+from unifg.solvers.active_set import ALL_AT_ONCE, ONE_BY_ONE, ActiveSet
 from unifg.typing import Array
 
 STEPS_OF_REFERENCE = [5, 7, 8, 8, 6, 10]
@@ -181,8 +182,9 @@ def test_limits_that_are_data_are_looked_at_in_every_solve() -> None:
     run = KKT().prepare(graph)
     guess = {x: np.zeros((1, 2))}
     np.testing.assert_allclose(run.solve(guess)[x], 0.5)
-    with pytest.raises(fg.BackendError, match="inequality 'box'"):
-        run.solve(guess, data={high: np.array([0.5, 0.7])})
+    wider = run.solve(guess, data={high: np.array([0.5, 0.7])})
+    np.testing.assert_allclose(wider[x], [[0.5, 0.7]])
+    np.testing.assert_allclose(wider.multipliers["box"], [[0.5, 1.3]])
     free = run.solve(guess, data={low: np.array([0.5, -np.inf]), high: np.array([0.5, np.inf])})
     np.testing.assert_allclose(free[x], [[0.5, 2.0]])
 
@@ -337,3 +339,77 @@ def test_chains_with_a_hard_end_are_solved(globalization: Literal["line-search",
         solution = KKT(globalization=globalization).solve(graph, guess, check=True)
         assert solution.iterations <= 60
         assert solution.cost == pytest.approx(InteriorPoint().solve(graph, guess, check=True).cost, rel=1e-6)
+
+
+def corner(upper: float) -> tuple[fg.Graph, fg.Family]:
+    """A point that is drawn to (1, 2), below a line and a parabola that meet at (1, 1)."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(2), 1)
+    graph.minimize(fg.prior, x, [1.0, 2.0])
+    graph.constrain(lambda x: x[:, :1] + x[:, 1:], x, upper=upper, name="line")
+    graph.constrain(lambda x: x[:, 1:] - x[:, :1] ** 2, x, upper=0.0, name="parabola")
+    graph.bound(x, lower=-5.0, upper=5.0, name="box")
+    return graph, x
+
+
+@pytest.mark.parametrize("rule", ["line-search", "levenberg-marquardt"])
+def test_inequalities_are_active_or_have_no_multiplier(rule: Any) -> None:
+    for upper, expected in ((2.0, [1.0, 1.0]), (9.0, None)):
+        graph, x = corner(upper)
+        solution = KKT(globalization=rule).solve(graph, {x: np.zeros((1, 2))}, check=True)
+        assert judge(graph, solution).worst() < 2e-6
+        if expected is not None:
+            np.testing.assert_allclose(solution[x][0], expected, atol=1e-6)
+        assert (solution.multipliers["line"][0, 0] > 0.1) == (upper == 2.0)
+        assert solution.multipliers["parabola"][0, 0] > 0.1 and not solution.multipliers["box"].any()
+
+
+def test_multipliers_of_the_guess_begin_the_active_set() -> None:
+    graph, x = corner(2.0)
+    first = KKT().solve(graph, {x: np.array([[3.0, -4.0]])}, check=True)
+    again = KKT().solve(graph, first, check=True)
+    assert again.iterations == 0
+    wrong = {"line": np.array([[-1.0]]), "box": np.array([[2.0, -2.0]])}  # at a limit that is none, and far from one
+    other = KKT().solve(graph, {x: np.array([[3.0, -4.0]])}, duals=wrong, check=True)
+    np.testing.assert_allclose(other[x], first[x], atol=1e-6)
+
+
+def active_set(limits: Array, multipliers: Array) -> ActiveSet:
+    """Rows x below their limits, the first of which is an equality."""
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(len(limits)), 1)
+    graph.minimize(fg.prior, x, np.zeros(len(limits)))
+    lower = np.where(np.arange(len(limits)) == 0, limits, -np.inf)
+    graph.constrain(lambda x: x, x, lower=lower, upper=limits, name="rows")
+    return ActiveSet(graph.compile(), multipliers, 1e-9)
+
+
+def test_rows_enter_and_leave_at_once_then_one_by_one() -> None:
+    chosen = active_set(np.ones(4), np.array([-3.0, 1.0, 0.0, -1.0]))
+    assert chosen.choice and chosen.side.tolist() == [1, 1, 0, 0]
+    np.testing.assert_array_equal(chosen.missing(np.array([0.5, 2.0, 2.0, 2.0])), [0.5, -1.0, 0.0, 0.0])
+    beyond, pulling = np.array([1.0, 1.5, 1.5, 1.5]), np.array([-3.0, -2.0, 0.0, 0.0])
+    sides = []
+    for _ in chosen.attempts():  # it never settles, so the set of the beginning is left
+        sides.append(chosen.side.tolist())
+        assert not chosen.settled(beyond, pulling)
+    assert sides[:3] == [[1, 1, 0, 0], [1, 0, 1, 1], [1, 1, 1, 1]]
+    assert sides[ALL_AT_ONCE : ALL_AT_ONCE + 3] == [[1, 1, 0, 0], [1, 0, 0, 0], [1, 1, 0, 0]]
+    assert len(sides) == ALL_AT_ONCE + ONE_BY_ONE and chosen.side.tolist() == [1, 1, 0, 0]
+
+
+def test_a_singular_system_ends_a_series_of_attempts() -> None:
+    chosen = active_set(np.ones(2), np.array([0.0, 1.0]))
+    count = 0
+    for _ in chosen.attempts():
+        count += 1
+        chosen.fail()
+    assert count == 2 and chosen.side.tolist() == [1, 1]
+    assert not active_set(np.ones(1), np.zeros(1)).choice
+
+
+def test_rounding_moves_no_row() -> None:
+    chosen = active_set(np.ones(3), np.array([0.0, 1.0, 0.0]))
+    assert chosen.settled(np.array([1.0, 1.0, 1.0 + 1e-10]), np.array([1e4, -1e-9, 0.0]))
+    assert not chosen.settled(np.array([1.0, 1.0, 1.0 + 1e-8]), np.array([1e4, -1e-9, 0.0]))
+    assert not chosen.settled(np.array([1.0, 1.0, 1.0 + 1e-8]), np.array([1e4, -1e-7, 1.0]))

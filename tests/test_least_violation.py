@@ -11,11 +11,11 @@ import unifg as fg
 from unifg.models import unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
-from variants import CONSTRAINED, EQUALITIES_ONLY
+from variants import CONSTRAINED
 
 Expected = tuple[fg.Graph, dict[fg.Family, Array], dict[str, float]]
 
-EQUALITIES = {**EQUALITIES_ONLY, "sqp elimination": SQP(qp="elimination")}
+EQUALITIES = {"sqp elimination": SQP(qp="elimination")}
 BACKENDS = {
     **CONSTRAINED,
     "alm gauss-newton": AugmentedLagrangian(hessian="gauss-newton"),

@@ -44,10 +44,8 @@ def takes(solver: fg.Solver, problem: Problem) -> bool:
     """Test whether a backend claims the class of a problem."""
     if isinstance(solver, SQP | InteriorPoint | AugmentedLagrangian):
         return True
-    if isinstance(solver, Penalty):
+    if isinstance(solver, Penalty | KKT):
         return not problem.scalar
-    if isinstance(solver, KKT):
-        return not problem.scalar and bool(problem.build()[0].compile().equality.all())
     return not (problem.constrained or problem.scalar)
 
 

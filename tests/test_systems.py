@@ -25,8 +25,10 @@ from unifg.typing import Array
 
 TICKS = 6
 UNCONSTRAINED = [GaussNewton(), LevenbergMarquardt(), DogLeg()]
-EQUALITIES = [KKT(), KKT(globalization="levenberg-marquardt")]
-ALL = [AugmentedLagrangian(), Penalty(), SQP(), SQP(qp="graph"), SQP(hessian="exact"), InteriorPoint()]
+ALL = [
+    AugmentedLagrangian(), Penalty(), SQP(), SQP(qp="graph"), SQP(hessian="exact"), InteriorPoint(), KKT(),
+    KKT(globalization="levenberg-marquardt"),
+]  # fmt: skip
 
 
 @pytest.fixture
@@ -67,7 +69,6 @@ def chain(kind: str, poses: int = 12) -> tuple[fg.Graph, fg.Family, fg.Data]:
     ("solver", "kind"),
     [
         *((solver, "free") for solver in UNCONSTRAINED),
-        *((solver, "equalities") for solver in EQUALITIES),
         *((solver, "all") for solver in ALL),
     ],
 )

@@ -10,10 +10,7 @@ CONSTRAINED: dict[str, fg.Solver] = {
     **backends("alm", "sqp"),
     "sqp exact": SQP(hessian="exact"),
     "sqp graph": SQP(qp="graph"),
-    **backends("ipm", "penalty"),
-}
-EQUALITIES_ONLY: dict[str, fg.Solver] = {
-    **backends("kkt"),
+    **backends("ipm", "penalty", "kkt"),
     "kkt full": KKT(full_steps=True),
     "kkt lm": KKT(globalization="levenberg-marquardt"),
 }

@@ -95,7 +95,7 @@ SCENARIOS = {
     "velocity-tracking": Scenario(
         "speed_tracking",
         "Forces that make a car follow a speed profile: one optimal control problem over the whole drive.",
-        "EQUALITIES",
+        "CONSTRAINED",
     ),
     "quadrotor-mpc": Scenario(
         "flights",

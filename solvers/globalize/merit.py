@@ -60,13 +60,14 @@ class OnePrice(Merit):
         largest = float(np.abs(self.program.columns.values(lin.values).flat).max(initial=0.0))
         return self.penalty * 0.5 * float(np.spacing(largest)) * len(lin.constraints)
 
-    def slope(self, lin: Linearization, step: Array, linear: Array) -> float:
+    def slope(self, lin: Linearization, step: Array, linear: Array, most: float = np.inf) -> float:
         """Bound of the merit's derivative along a step, after the penalty was raised to make it one of descent.
 
         Args:
             lin: where.
             step: (n,).
             linear: (M,) A times the step.
+            most: penalty that suffices where the step solves the linearised problem.
         """
         descent = inner(lin.gradient[self.program.columns.free], step)
         gain = float(self.outside(lin.constraints).sum()) - float(self.outside(lin.constraints + linear).sum())
@@ -74,7 +75,7 @@ class OnePrice(Merit):
             curved = self._curved(lin, step)
             needed = (descent + 0.5 * curved) / ((1.0 - MARGIN) * gain)
             if needed > self.penalty:
-                self.penalty = 1.5 * needed
+                self.penalty = max(self.penalty, min(1.5 * needed, most))
         return descent - self.penalty * gain
 
     def predicted(self, lin: Linearization, step: Array, linear: Array) -> float:
