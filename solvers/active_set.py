@@ -3,8 +3,8 @@
 A row is held at a limit while its multiplier pushes towards the inside, and enters where a step would leave the limit:
 Newton's method on min(slack, multiplier) = 0 (M. Hintermueller, K. Ito, K. Kunisch, "The primal-dual active set
 strategy as a semismooth Newton method", SIAM J. Optim. 13(3), 2002). All rows change at once, which takes a few systems
-where it settles; where it does not, or meets a singular system, one row changes at a time, the first of those that are wrong,
-which ends for strictly convex problems (K. G. Murty, "Note on a Bard-type scheme", Opsearch 11, 1974).
+where it settles; where it does not, or meets a singular system, one row changes at a time, the first of those that are
+wrong, which ends for strictly convex problems (K. G. Murty, "Note on a Bard-type scheme", Opsearch 11, 1974).
 """
 
 from __future__ import annotations
@@ -45,7 +45,8 @@ class ActiveSet:
     @property
     def held(self) -> BoolArray:
         """(M,) rows that are held."""
-        return self.side != 0
+        held: BoolArray = self.side != 0
+        return held
 
     def missing(self, constraints: Array) -> Array:
         """(M,) distance of held rows from their limits, zero for the others."""

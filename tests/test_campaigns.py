@@ -173,8 +173,8 @@ def test_defaults_are_those_of_the_command_line() -> None:
     (episode,) = made.episodes()
     settings = campaigns_settings(made, episode.settings)
     assert (settings.obstacles, settings.seed, settings.goals) == (3, 1, ((20.0, 8.0, 0.0),))
-    with pytest.raises(ScenarioError, match="'kkt' is none of"):
-        stated({"scenario": "navigation", "seeds": [1], "settings": {"solver": "kkt"}})
+    with pytest.raises(ScenarioError, match="'lm' is none of"):
+        stated({"scenario": "navigation", "seeds": [1], "settings": {"solver": "lm"}})
     assert stated({"scenario": "velocity-tracking"}).seeds == (None,)
 
 
