@@ -292,7 +292,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.product(5, of="processes of their own")
+@pytest.mark.product(4, of="processes of their own")
 def test_numbers_need_nothing_but_the_library(tmp_path: Path) -> None:
     path = put(tmp_path, "g.g2o", PLANAR)
     command = [sys.executable, "-c", WITHOUT, "solve", str(path), "--out", str(tmp_path / "out")]

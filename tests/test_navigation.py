@@ -41,7 +41,7 @@ CORNER = NavigationSettings(start=(10.8, 17.0, -1.57), goals=((16.5, 14.0, 0.0),
     [replace(CORRIDOR, obstacles=2, seed=1), replace(CORNER, obstacles=1, seed=2)],
     ids=["corridor", "corner"],
 )
-@pytest.mark.product(6, of="drives and flights")
+@pytest.mark.product(4, of="drives and flights")
 def test_short_drive_reaches_its_goal(settings: NavigationSettings, solver: str) -> None:
     log = run_navigation(replace(settings, solver=solver))
     metrics = episode_metrics(log)

@@ -163,7 +163,7 @@ def said(source: str, *words: str) -> object:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-@pytest.mark.product(5, of="processes of their own")
+@pytest.mark.product(4, of="processes of their own")
 def test_no_backend_compiles_after_prepare_however_its_solves_end() -> None:
     found = said(SOLVES)
     assert isinstance(found, dict) and len(found) >= 4

@@ -129,7 +129,7 @@ def defects(plan: Plan, parameters: quadrotor.Parameters, dt: float) -> Array:
 # ---------------------------------------------------------------- what the graph says
 
 
-@pytest.mark.product(6, of="drives and flights")
+@pytest.mark.product(4, of="drives and flights")
 def test_without_wishes_the_past_decides(past: Past) -> None:
     """A future that costs nothing leaves states, parameters and landmarks where the past alone puts them."""
     # With weights of 1e-9 rounding keeps one solve in forty above 1e-7.

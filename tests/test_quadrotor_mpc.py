@@ -67,7 +67,7 @@ def test_every_backend_flies(solver: str) -> None:
     assert log.truth[-1, 0] > log.truth[0, 0] + 0.3
 
 
-@pytest.mark.product(6, of="drives and flights")
+@pytest.mark.product(4, of="drives and flights")
 def test_a_flight_reaches_the_target_and_learns_the_mass() -> None:
     log = run_flight(FlightSettings(seed=SEED))
     assert log.succeeded

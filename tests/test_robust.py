@@ -159,7 +159,7 @@ def test_graduation_wants_a_loss_it_can_graduate() -> None:
 
 @pytest.mark.parametrize("loss", [fg.TruncatedLeastSquares(3.4), fg.GemanMcClure(3.4)], ids=repr)
 @pytest.mark.parametrize("seed", [0, 1, 2])
-@pytest.mark.product(3, of="large maps")
+@pytest.mark.product(2, of="large maps")
 def test_a_third_of_all_loop_closures_wrong(loss: Loss, seed: int) -> None:
     sim = manhattan(300, seed, outliers=0.3)
     graph = sim.pose_graph
@@ -432,7 +432,7 @@ def test_the_study_of_wrong_closures_counts_what_each_method_keeps() -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "wrong"), [("M3500", 217), ("intel", 87)])
-@pytest.mark.product(3, of="large maps")
+@pytest.mark.product(2, of="large maps")
 def test_wrong_closures_of_a_long_drive(shared_data: Path, name: str, wrong: int) -> None:
     """One wrong closure of M3500 that paid by the cost as stated left the answer 6 m off."""
     clean = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz")
@@ -443,7 +443,7 @@ def test_wrong_closures_of_a_long_drive(shared_data: Path, name: str, wrong: int
 
 @pytest.mark.data
 @pytest.mark.parametrize(("seed", "claim"), [(2, "anywhere")])
-@pytest.mark.product(3, of="large maps")
+@pytest.mark.product(2, of="large maps")
 def test_a_third_of_the_closures_of_a_real_drive_wrong(shared_data: Path, seed: int, claim: Claim) -> None:
     """From the bent solution of the stage before it ended 25 m off, CONVERGED."""
     clean = read_g2o(shared_data / "pose_graphs" / "intel.g2o.gz")

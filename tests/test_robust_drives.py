@@ -48,7 +48,7 @@ def apart(one: PoseGraph, other: PoseGraph) -> float:
     ("seed", "kind"),
     [(0, Kind()), (5, Kind(noise=0.05, tail=0.1)), (0, HEAVY), (6, HEAVY), (0, UNEVEN), (6, UNEVEN), (7, UNEVEN)],
 )
-@pytest.mark.product(3, of="large maps")
+@pytest.mark.product(2, of="large maps")
 def test_a_clean_drive_keeps_every_closure(seed: int, kind: Kind) -> None:
     """Up to 69 of 100 right closures were given up, for a map 56 m off, CONVERGED."""
     graph, _ = drive(seed, kind)
@@ -60,7 +60,7 @@ def test_a_clean_drive_keeps_every_closure(seed: int, kind: Kind) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["tinyGrid3D.g2o", "smallGrid3D.g2o", "intel.g2o.gz", "M3500.g2o.gz"])
-@pytest.mark.product(3, of="large maps")
+@pytest.mark.product(2, of="large maps")
 def test_a_published_graph_keeps_every_closure(shared_data: Path, name: str) -> None:
     graph = read_g2o(shared_data / "pose_graphs" / name)
     solution, found, kept = robust(graph, fg.TruncatedLeastSquares(THRESHOLD if graph.group is fg.SE2 else 4.1))
@@ -81,7 +81,7 @@ def test_what_is_improbable_as_stated_is_not_kept() -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3])
-@pytest.mark.product(3, of="large maps")
+@pytest.mark.product(2, of="large maps")
 def test_uneven_closures_are_kept_beside_wrong_ones(share: float) -> None:
     """Two right ones with more noise than the others were given up together with the wrong ones."""
     clean, _ = drive(10, HEAVY)
@@ -118,7 +118,7 @@ def test_a_group_that_contradicts_the_others_is_left_out(seed: int, count: int) 
 
 
 @pytest.mark.parametrize("seed", [0, 6, 9])
-@pytest.mark.product(3, of="large maps")
+@pytest.mark.product(2, of="large maps")
 def test_wrong_odometry_is_found_and_no_start_leads_lower(seed: int) -> None:
     """Each start alone, and its Huber optimum: local descent of the stated objective ends no lower.
 
@@ -154,7 +154,7 @@ def test_a_graph_names_further_starts_where_nothing_is_trusted() -> None:
     assert len(stated.starts) == 3
 
 
-@pytest.mark.product(3, of="large maps")
+@pytest.mark.product(2, of="large maps")
 def test_the_command_doubts_odometry_when_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clean, _ = drive(0, CALM)
     graph, _ = slipped(clean, 100)

@@ -329,7 +329,7 @@ def searched(search: Relocaliser, sample: Scan) -> tuple[Found, int]:
     raise AssertionError
 
 
-@pytest.mark.product(6, of="drives and flights")
+@pytest.mark.product(4, of="drives and flights")
 @pytest.mark.parametrize("place", [(3.0, 25.2, 2.0), (21.0, 9.6, -2.0)], ids=str)
 def test_a_robot_put_down_anywhere_is_found(place: tuple[float, float, float]) -> None:
     occupancy, field = maps.building()
@@ -411,7 +411,7 @@ def test_a_robot_without_odometry_goes_on_slowly(coupling: str) -> None:
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
-@pytest.mark.product(6, of="drives and flights")
+@pytest.mark.product(4, of="drives and flights")
 def test_a_kidnapped_robot_stops_and_finds_itself(coupling: str) -> None:
     log = faulty("kidnapped@1", coupling, 60)
     assert np.hypot(*(log.true_pose[10] - log.true_pose[9])[:2]) > 3.0
@@ -420,7 +420,7 @@ def test_a_kidnapped_robot_stops_and_finds_itself(coupling: str) -> None:
     assert any(cause == "the scan does not fit the map" for cause in log.cause)
 
 
-@pytest.mark.product(6, of="drives and flights")
+@pytest.mark.product(4, of="drives and flights")
 def test_a_robot_with_the_wrong_map_rests_and_says_so() -> None:
     log = faulty("wrong-map@1")
     assert log.health[-1] == "lost" and log.cause[-1] == "the scan does not fit the map"
@@ -435,7 +435,7 @@ def test_a_robot_with_the_wrong_map_rests_and_says_so() -> None:
         ("solver-timeout@1", "no plan"),
     ],
 )
-@pytest.mark.product(6, of="drives and flights")
+@pytest.mark.product(4, of="drives and flights")
 def test_other_faults_are_named_too(fault: str, cause: str) -> None:
     log = faulty(fault)
     assert cause in log.cause and log.collisions == 0

@@ -131,7 +131,7 @@ def test_a_map_of_half_a_kilometre_is_read(monkeypatch: pytest.MonkeyPatch, tmp_
         Episode(NavigationSettings(map=tmp_path / "town.yaml", start=(1.0, 1.0, 0.0), goals=((2.0, 1.0, 0.0),)))
 
 
-@pytest.mark.product(6, of="drives and flights")
+@pytest.mark.product(4, of="drives and flights")
 def test_obstacles_may_be_other_than_the_robot_expects() -> None:
     def radii(between: tuple[float, float]) -> Array:
         settings = NavigationSettings(obstacles=6, seed=2, obstacle_radius=between)

@@ -70,7 +70,7 @@ def leave(path: Path) -> None:
     path.write_text(str(os.getpid()), encoding="utf-8")
 
 
-@pytest.mark.product(5, of="processes of their own")
+@pytest.mark.product(4, of="processes of their own")
 def test_where_nothing_came_precompiled_processes_compile_at_once(
     done: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -124,7 +124,7 @@ sys.exit(command.main(["warmup"]))
 """
 
 
-@pytest.mark.product(5, of="processes of their own")
+@pytest.mark.product(4, of="processes of their own")
 def test_the_library_is_compiled_without_extras() -> None:
     done = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
