@@ -95,13 +95,10 @@ def costs() -> str:
     cases = [(n, drag, None, j) for drag, known in COSTS.items() for n, j in zip(LENGTHS, known, strict=True)]
     rows = []
     for length, drag, bounds, reference in [*cases, *((n, drag, BOUNDS, j) for (n, drag), j in BOUNDED.items())]:
-        found = {  # KKT takes no bounds
-            name: 2.0 * solver.solve(*drive(length, drag, bounds)).cost
-            for name, solver in solvers.items() if bounds is None or name != "KKT"
-        }  # fmt: skip
+        found = {name: 2.0 * solver.solve(*drive(length, drag, bounds)).cost for name, solver in solvers.items()}
         shown = f"{found['KKT']:.6f}" if bounds is None else f"{found['IPM']:.4f}"
         limits = "none" if bounds is None else ", ".join(f"{bound:g}" for bound in bounds)
-        apart = (f"{found[n] / reference - 1.0:.0e}" if n in found else "-" for n in solvers)
+        apart = (f"{value / reference - 1.0:.0e}" for value in found.values())
         rows.append([str(length), drag, limits, shown, *apart])
     return table(["N", "drag", "bounds [N]", "J", *solvers], rows, 3)
 
