@@ -28,6 +28,7 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.elimination.saddle import NOTHING
 from unifg.errors import BackendError
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
@@ -232,7 +233,7 @@ class Newton:
         if not np.array_equal(program.equality, self.system.held):
             require(program, solver, "equalities")
             self._structure(program)
-        self._begun = False  # equal solves take equal steps
+        self._near = NOTHING  # equal solves take equal steps
 
     def step(
         self,
@@ -267,9 +268,9 @@ class Newton:
             pull = (largest(lin.constraint_jacobian) or 1.0) ** 2 / curvature
             self._data[diagonal[:n]] += damping * np.maximum(curvatures, DIAGONAL_FLOOR * curvature)
             self._data[diagonal[n:]] -= slackness * pull
-        if not self.system.saddle.factor(self._data, self._begun):
+        if not self.system.saddle.factor(self._data, self._near):
             return None
-        self._begun = True
+        self._near = self.system.saddle.scale
         kept = np.zeros(len(multipliers))
         if less:
             rows = self.system.arrays.rows
@@ -300,7 +301,7 @@ class Newton:
 
     def _structure(self, program: CompiledProblem) -> None:
         self.system = program.systems.kkt(program.equality)
-        self._data, self._begun = np.zeros(self.system.pattern.nnz), False
+        self._data, self._near = np.zeros(self.system.pattern.nnz), NOTHING
 
 
 def _next_damping(damping: float, length: float) -> float:
