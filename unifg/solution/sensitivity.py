@@ -68,7 +68,7 @@ class Part(NamedTuple):
 
 
 class Parameters(NamedTuple):
-    """What derivatives are taken by.
+    """Data and fixed variables that derivatives are taken by.
 
     Attributes:
         each: data and fixed variables.
