@@ -62,6 +62,7 @@ class SaddlePoint:
         factorization: of the shifted matrix.
         unknowns: number of rows of H.
         arrays: for compiled code.
+        scale: (n,) diagonal that equilibrates the last matrix.
     """
 
     def __init__(self, factorization: Factorization, unknowns: int) -> None:
@@ -73,12 +74,7 @@ class SaddlePoint:
         self._data: Array = np.zeros(factorization.pattern.nnz)
         numbers = np.zeros_like(self._data), np.ones(size), np.zeros(size)
         self.arrays = SaddleArrays(indptr, indices, np.zeros_like(indptr), np.zeros_like(indices), *numbers)
-        self._shift = SHIFT
-
-    @property
-    def scale(self) -> Array:
-        """(n,) diagonal that equilibrates the last matrix."""
-        return self.arrays.scale
+        self.scale, self._shift = self.arrays.scale, SHIFT
 
     def factor(self, data: Array, near: Array = NOTHING) -> bool:
         """Equilibrate, shift and factorise; False when an entry is not finite.
@@ -92,24 +88,21 @@ class SaddlePoint:
         Raises:
             UnifgError: the array has the wrong shape, or the structure asked for makes no sense.
         """
-        self._data = data = np.ascontiguousarray(data, dtype=np.float64)
+        data = np.ascontiguousarray(data, dtype=np.float64)
         if data.shape != self.arrays.indices.shape:
             raise UnifgError(f"data has shape {data.shape}; expected {self.arrays.indices.shape}")
         success = bool(prepared(self.factorization.plan, self.arrays, data, self.unknowns, near))
         return self.adopt(data, success) or self._factor(SAFE_SHIFT)
 
-    def adopt(self, data: Array, success: bool) -> bool:
-        """Take over what :func:`prepared` has made of entries in compiled code, and its answer."""
-        self._data, self._shift = data, SHIFT
+    def adopt(self, data: Array, success: bool, shift: float = SHIFT) -> bool:
+        """Take over what :func:`prepared` or :func:`shifted` has made of entries in compiled code, and its answer."""
+        self._data, self._shift = data, shift
         self.factorization.adopt(success)
         return success
 
     def _factor(self, shift: float) -> bool:
-        self._shift = shift
-        factorization = self.factorization
-        success = shifted(factorization.plan, self._data, self.scale, self.unknowns, shift, self.arrays.added)
-        factorization.adopt(bool(success))
-        return bool(success)
+        plan, added = self.factorization.plan, self.arrays.added
+        return self.adopt(self._data, bool(shifted(plan, self._data, self.scale, self.unknowns, shift, added)), shift)
 
     def solve(self, right: Array, enough: float = EXACT) -> tuple[Array, float]:
         """Solve the system that was factorised, without its shift.
