@@ -32,6 +32,7 @@ from typing import Literal
 
 import numpy as np
 
+from unifg.elimination.saddle import NOTHING
 from unifg.errors import BackendError
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
@@ -234,7 +235,7 @@ class Newton:
         if not np.array_equal(_limited(program), self.system.held):
             self._structure(program)
         self.active = ActiveSet(program, run.multipliers, ENTERING * run.tolerances.violation)
-        self._begun = False  # equal solves take equal steps
+        self._near = NOTHING  # equal solves take equal steps
 
     def step(
         self,
@@ -290,9 +291,9 @@ class Newton:
         out = ~self.active.held[rows]
         if out.any():
             data = self.system.without(data, np.concatenate([np.zeros(n, dtype=bool), out]))
-        if not self.system.saddle.factor(data, self._begun):
+        if not self.system.saddle.factor(data, self._near):
             return None
-        self._begun = True
+        self._near = self.system.saddle.scale
         if convex and self.system.factorization.inertia != (n, len(rows), 0):
             return None
         return self.resolve(lin, multipliers, less * self.active.missing(lin.constraints))
@@ -323,7 +324,7 @@ class Newton:
 
     def _structure(self, program: CompiledProblem) -> None:
         self.system = program.systems.kkt(_limited(program))
-        self._data, self._begun = np.zeros(self.system.pattern.nnz), False
+        self._data, self._near = np.zeros(self.system.pattern.nnz), NOTHING
 
 
 def _limited(program: CompiledProblem) -> BoolArray:

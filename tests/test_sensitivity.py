@@ -357,6 +357,19 @@ def test_weakly_active_rows_are_refused_by_name(limit: float) -> None:
     refused(point(state), r"'wall', factor 0, row 0, is weakly active.*both below 1.0e-03")
 
 
+def test_a_refused_question_leaves_no_factor_behind() -> None:
+    graph = fg.Graph()
+    x, p = graph.variables("x", fg.Rn(2), 1), graph.data("p", [3.0, 2.0])
+    graph.minimize(lambda x, p: np.sinh(x - p), x, p)
+    graph.constrain(lambda x: x, x, upper=[1.0, 5.0], name="wall")
+    run = InteriorPoint(tolerance=1e-8).prepare(graph)
+    held = run.solve({x: np.full((1, 2), 0.1)}, check=True)
+    expected = held.sensitivity("x", p)
+    np.testing.assert_allclose(expected, [[0.0, 0.0], [0.0, 1.0]], atol=1e-9)
+    refused(run.solve({x: np.full((1, 2), 0.1)}, data={p: [1.0, 2.0]}), "weakly active")
+    np.testing.assert_array_equal(held.sensitivity("x", p), expected)
+
+
 def test_a_limit_that_acts_and_one_that_does_not_are_told_apart() -> None:
     def state(graph: fg.Graph, x: fg.Family) -> None:
         graph.minimize(fg.prior, x, graph.data("p", [1.0, 2.0]))

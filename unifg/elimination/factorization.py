@@ -183,9 +183,9 @@ class Factorization:
         self._demand("refine")
         data = _numbers(data, self.pattern.nnz, "data")
         right = _numbers(right, self.pattern.size, "the right-hand side")
-        out = np.empty(len(right))
-        own, rows, symbolic = np.ones(len(right)), len(right), self.symbolic
-        substitution.refine(self.plan, symbolic.indptr, symbolic.indices, data, right, own, rows, out, tolerance, steps)
+        out, left = np.empty(len(right)), np.empty(len(right))
+        pattern, own, rows = (self.symbolic.indptr, self.symbolic.indices), np.ones(len(right)), len(right)
+        substitution.refine(self.plan, *pattern, data, right, own, rows, out, left, tolerance, 0.0, steps)
         return out
 
     @property

@@ -15,6 +15,7 @@ factorisation that breaks down, or whose refined solution is not accurate, is re
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,26 @@ ACCURATE = 1e-8  # residual above which a factorisation with the small shift cou
 EXACT = 1e-15  # residual that refinement strives for
 SWEEPS, NEAR = 4, 4.0
 CORRECTIONS = 12
+NOTHING: Array = np.zeros(0)
+
+
+class SaddleArrays(NamedTuple):
+    """Arrays for compiled code.
+
+    Attributes:
+        indptr, indices: upper triangle of the matrix by columns.
+        starts, rows, entries: the same without zeros, and its numbers.
+        scale: (n,) diagonal that equilibrates it.
+        added: (n,) what is added to its diagonal.
+    """
+
+    indptr: IntArray
+    indices: IntArray
+    starts: IntArray
+    rows: IntArray
+    entries: Array
+    scale: Array
+    added: Array
 
 
 class SaddlePoint:
@@ -40,6 +61,7 @@ class SaddlePoint:
     Attributes:
         factorization: of the shifted matrix.
         unknowns: number of rows of H.
+        arrays: for compiled code.
         scale: (n,) diagonal that equilibrates the last matrix.
     """
 
@@ -48,41 +70,39 @@ class SaddlePoint:
         size = factorization.pattern.size
         self.factorization = factorization
         self.unknowns = unknowns
-        self.scale: Array = np.ones(size)
-        self._indptr, self._indices = factorization.symbolic.indptr, factorization.symbolic.indices
+        indptr, indices = factorization.symbolic.indptr, factorization.symbolic.indices
         self._data: Array = np.zeros(factorization.pattern.nnz)
-        self._entries = np.zeros_like(self._indptr), np.zeros_like(self._indices), np.zeros_like(self._data)
-        self._added: Array = np.zeros(size)
-        self._shift = SHIFT
+        numbers = np.zeros_like(self._data), np.ones(size), np.zeros(size)
+        self.arrays = SaddleArrays(indptr, indices, np.zeros_like(indptr), np.zeros_like(indices), *numbers)
+        self.scale, self._shift = self.arrays.scale, SHIFT
 
-    def factor(self, data: Array, near: bool = False) -> bool:
+    def factor(self, data: Array, near: Array = NOTHING) -> bool:
         """Equilibrate, shift and factorise; False when an entry is not finite.
 
         Where a pivot vanishes all the same, because rounding took the shift, the larger shift is tried.
 
         Args:
             data: (nnz,) entries in the order of the pattern, kept until the next call.
-            near: whether the last matrix was like this one: then its diagonal D is where the new one starts.
+            near: (n,) diagonal D of a matrix like this one, where the new one starts; empty without one.
 
         Raises:
             UnifgError: the array has the wrong shape, or the structure asked for makes no sense.
         """
-        self._data = data = np.ascontiguousarray(data, dtype=np.float64)
-        if data.shape != self._indices.shape:
-            raise UnifgError(f"data has shape {data.shape}; expected {self._indices.shape}")
-        starts, rows, entries = self._entries
-        if not near:
-            self.scale[:] = 1.0
-        enough = NEAR if near else 1.0
-        prepare(self._indptr, self._indices, data, starts, rows, entries, self.scale, self._added, enough)
-        return self._factor(SHIFT) or self._factor(SAFE_SHIFT)
+        data = np.ascontiguousarray(data, dtype=np.float64)
+        if data.shape != self.arrays.indices.shape:
+            raise UnifgError(f"data has shape {data.shape}; expected {self.arrays.indices.shape}")
+        success = bool(prepared(self.factorization.plan, self.arrays, data, self.unknowns, near))
+        return self.adopt(data, success) or self._factor(SAFE_SHIFT)
+
+    def adopt(self, data: Array, success: bool, shift: float = SHIFT) -> bool:
+        """Take over what :func:`prepared` or :func:`shifted` has made of entries in compiled code, and its answer."""
+        self._data, self._shift = data, shift
+        self.factorization.adopt(success)
+        return success
 
     def _factor(self, shift: float) -> bool:
-        self._shift = shift
-        factorization = self.factorization
-        success = shifted(factorization.plan, self._data, self.scale, self.unknowns, shift, self._added)
-        factorization.adopt(bool(success))
-        return bool(success)
+        plan, added = self.factorization.plan, self.arrays.added
+        return self.adopt(self._data, bool(shifted(plan, self._data, self.scale, self.unknowns, shift, added)), shift)
 
     def solve(self, right: Array, enough: float = EXACT) -> tuple[Array, float]:
         """Solve the system that was factorised, without its shift.
@@ -106,28 +126,35 @@ class SaddlePoint:
         return (again, less) if less < error else (out, error)
 
     def _refine(self, right: Array, enough: float) -> tuple[Array, float]:
-        out = np.empty(len(right))
+        out, rest = np.empty(len(right)), np.empty(len(right))
         error = substitution.refine(
             self.factorization.plan,
-            *self._entries,
+            *self.arrays[2:5],
             right,
             self.scale,
             self.unknowns,
             out,
+            rest,
             enough,
+            0.0,
             CORRECTIONS,
         )
         return out, float(error)
 
-    def solve_rows(self, right: Array, enough: float) -> tuple[Array, Array]:
+    def solve_rows(self, right: Array, enough: float, small: float = 0.0) -> tuple[Array, Array]:
         """Solve for the rows of (k, n); no other shift is tried.
+
+        Args:
+            right: right-hand sides.
+            enough: residual at which refinement ends, as of :meth:`solve`.
+            small: residual relative to the right-hand side at which it ends, too.
 
         Returns:
             (k, n) solutions, and (k,) largest residual of each relative to the right-hand side, both equilibrated.
         """
-        out, left = np.empty_like(right), np.empty(len(right))
-        plan, first = self.factorization.plan, self.unknowns
-        substitution.refine_rows(plan, *self._entries, right, self.scale, first, out, left, enough, CORRECTIONS)
+        out, left, pattern = np.empty_like(right), np.empty(len(right)), self.arrays[2:5]
+        given = self.factorization.plan, *pattern, right, self.scale, self.unknowns
+        substitution.refine_rows(*given, out, left, enough, small, CORRECTIONS)
         return out, left
 
     def residual(self, solution: Array, right: Array) -> Array:
@@ -137,20 +164,14 @@ class SaddlePoint:
 
 
 @compiled
-def prepare(
-    indptr: IntArray,
-    indices: IntArray,
-    data: Array,
-    starts: IntArray,
-    rows: IntArray,
-    entries: Array,
-    scale: Array,
-    size: Array,
-    enough: float,
-) -> None:
-    """:func:`compress` and :func:`equilibrate`."""
-    compress(indptr, indices, data, starts, rows, entries)
-    equilibrate(starts, rows, entries, scale, size, enough)
+def prepared(plan: Plan, saddle: SaddleArrays, data: Array, unknowns: int, near: Array) -> bool:
+    """:func:`compress`, :func:`equilibrate` and :func:`shifted`, from the diagonal ``near`` unless that is empty."""
+    begun = len(near) > 0
+    for k in range(len(saddle.scale)):
+        saddle.scale[k] = near[k] if begun else 1.0
+    compress(saddle.indptr, saddle.indices, data, saddle.starts, saddle.rows, saddle.entries)
+    equilibrate(saddle.starts, saddle.rows, saddle.entries, saddle.scale, saddle.added, NEAR if begun else 1.0)
+    return shifted(plan, data, saddle.scale, unknowns, SHIFT, saddle.added)
 
 
 @compiled

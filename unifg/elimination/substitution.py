@@ -205,7 +205,9 @@ def refine(
     scale: Array,
     first: int,
     out: Array,
+    left: Array,
     tolerance: float,
+    small: float,
     steps: int,
 ) -> float:
     """Solve A x = right for A near the factorised matrix, by iterative refinement from x = 0.
@@ -223,7 +225,9 @@ def refine(
         scale: (n,) factors of the rows, where their residuals are compared.
         first: row from which on rows are measured by themselves, say those of multipliers; n for none.
         out: (n,) receives x, the best of the iterates.
+        left: (n,) receives right - A x.
         tolerance: of the residual, as :func:`residual` measures it.
+        small: scaled residual that will do as well.
         steps: corrections at most.
 
     Returns:
@@ -235,6 +239,7 @@ def refine(
     moves, effects = np.empty((MEMORY, scalars)), np.empty((MEMORY, scalars))
     best, idle = np.inf, 0
     out[:] = 0.0
+    copy_to(right, left)
     for k in range(steps + 1):
         solve(plan, rest, step)
         for i in range(scalars):
@@ -242,7 +247,8 @@ def refine(
         relative = residual(indptr, indices, data, trial, right, scale, first, after, bulk)
         if not relative < np.inf:
             break
-        if relative > tolerance:
+        enough = relative <= tolerance or largest_of(scale, after) <= small
+        if not enough:
             for i in range(scalars):
                 bulk[i] = scale[i] * (rest[i] - after[i])
             kept = min(k + 1, MEMORY)
@@ -258,7 +264,8 @@ def refine(
         if relative < best:
             best = relative
             copy_to(trial, out)
-        if best <= tolerance or idle == PATIENCE:
+            copy_to(after, left)
+        if enough or best <= tolerance or idle == PATIENCE:
             break
         copy_to(trial, x)
         copy_to(after, rest)
@@ -277,17 +284,28 @@ def refine_rows(
     out: Array,
     left: Array,
     tolerance: float,
+    small: float,
     steps: int,
 ) -> None:
-    """:func:`refine` for the rows of (k, n); ``left`` (k,) receives max scale |right - A x| / max scale |right|."""
-    rest, bulk = np.empty(right.shape[1]), np.empty(right.shape[1])
+    """:func:`refine` for the rows of (k, n); ``left`` (k,) receives max scale |right - A x| / max scale |right|.
+
+    Below ``small`` that will do, however small the part of some rows in it.
+    """
+    rest = np.empty(right.shape[1])
     for k in range(len(right)):
-        refine(plan, indptr, indices, data, right[k], scale, first, out[k], tolerance, steps)
-        finite = residual(indptr, indices, data, out[k], right[k], scale, first, rest, bulk) < np.inf
-        worst = size = 0.0
-        for i in range(len(rest)):
-            worst, size = max(worst, scale[i] * abs(rest[i])), max(size, scale[i] * abs(right[k, i]))
-        left[k] = (worst / size if size > 0.0 else worst) if finite else np.inf
+        size = largest_of(scale, right[k])
+        best = refine(plan, indptr, indices, data, right[k], scale, first, out[k], rest, tolerance, small * size, steps)
+        worst = largest_of(scale, rest)
+        left[k] = (worst / size if size > 0.0 else worst) if best < np.inf else np.inf
+
+
+@compiled
+def largest_of(scale: Array, numbers: Array) -> float:
+    """Largest magnitude of numbers times their scales."""
+    largest = 0.0
+    for i in range(len(numbers)):
+        largest = max(largest, scale[i] * abs(numbers[i]))
+    return largest
 
 
 @compiled

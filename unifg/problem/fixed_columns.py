@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.codegen.jit import compiled
 from unifg.modeling.terms import ScalarCost
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.problem.hessian import add_curvature, add_losses, require_second, row_weights
+from unifg.problem.hessian import curve, require_second, row_weights
 from unifg.problem.linearization import Linearization
 from unifg.problem.scalars import add_scalars
-from unifg.problem.table import COLUMN, COUNT, POSITION, WIDTH
+from unifg.problem.table import COLUMN, COUNT, POSITION, WIDTH, TermArrays
 from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, IntArray
 
@@ -66,6 +67,8 @@ class FixedColumns:
             coordinates.append(numbers[np.where(found[0], *ends_of)[pairs]])
         fields = np.array([program.table.row_of(term) for term in self._terms], dtype=int)
         self._fields = fields[fields < len(arrays.fields)], fields[fields >= len(arrays.fields)]
+        own = [program.table.fields[rows] for rows in self._fields]
+        self._arrays = arrays._replace(fields=own[0], scalars=own[1], positions=self._positions)
         rows.append(program.size + constraints.rows[self._slopes])
         coordinates.append(numbers[constraints.columns[self._slopes]])
         height = program.size + constraints.count
@@ -82,23 +85,19 @@ class FixedColumns:
             multipliers: (M,) there.
         """
         require_second(program)
-        table, values, found = program.table, lin.stored, np.zeros(self._pairs)
-        squares, scalars = (table.fields[rows] for rows in self._fields)
-        arrays = program.arrays._replace(fields=squares, scalars=scalars, positions=self._positions)
-        weights = lin.residual * self._touched, lin.weights, multipliers * self._own
-        add_curvature(arrays, values, *weights, found)
-        if table.robust:
-            add_losses(arrays, lin.residual, lin.jacobian, lin.squares, lin.weights, found)
-        if len(scalars):
-            ignored = np.empty(table.scalars), np.zeros(program.columns.width)
+        arrays, values, found = self._arrays, lin.stored, np.zeros(self._pairs)
+        for rows, fields in zip(self._fields, (arrays.fields, arrays.scalars), strict=True):
+            program.table.fields.take(rows, axis=0, out=fields, mode="clip")  # of machine code that may be another now
+        if len(arrays.scalars):
+            ignored = np.empty(program.table.scalars), np.zeros(program.columns.width)
             add_scalars(arrays, values, *ignored, found, np.zeros(self._pairs), program.scratch, False)
         for term in self._terms:
             if term.kernel is None and not term.is_bound:
                 self._differenced(program, term, lin, multipliers, found)
-        J = lin.jacobian
-        squared = J[self._squares[0]] * J[self._squares[1]]
-        every = np.concatenate([squared, found, lin.constraint_jacobian[self._slopes]])
-        return np.asarray(np.bincount(self._order, every, len(self.rows)), dtype=np.float64)
+        every, weights = np.zeros(len(self.rows)), (lin.residual, lin.weights, lin.squares, multipliers)
+        own, places = (self._touched, self._own), (*self._squares, self._slopes, self._order)
+        add_up(arrays, values, *weights, lin.jacobian, lin.constraint_jacobian, *own, *places, found, every)
+        return every
 
     def _differenced(
         self, program: CompiledProblem, term: CompiledTerm, lin: Linearization, multipliers: Array, found: Array
@@ -111,3 +110,53 @@ class FixedColumns:
         of_pairs = blocks[:, *np.tril_indices(blocks.shape[1])].ravel()
         places = self._positions[int(term.place[POSITION]) :][: len(of_pairs)]
         np.add.at(found, places[places >= 0], of_pairs[places >= 0])
+
+
+@compiled
+def add_up(
+    terms: TermArrays,
+    values: Array,
+    residual: Array,
+    robust: Array,
+    squares: Array,
+    multipliers: Array,
+    jacobian: Array,
+    constraint_jacobian: Array,
+    touched: Array,
+    own: Array,
+    first: IntArray,
+    second: IntArray,
+    slopes: IntArray,
+    order: IntArray,
+    pairs: Array,
+    out: Array,
+) -> None:
+    """Add the entries of squares, of second derivatives and of constraints, each to its place.
+
+    Args:
+        terms: those with a factor that counts.
+        values: stored ones.
+        residual: as linearised.
+        robust: weights of losses.
+        squares: of robust factors.
+        multipliers: of the constraint rows.
+        jacobian: of the costs.
+        constraint_jacobian: of the constraints.
+        touched: rows of costs that count.
+        own: rows of constraints that do.
+        first: entries of the Jacobian whose products count.
+        second: those they are multiplied with.
+        slopes: entries of the constraint Jacobian.
+        order: places of all of these, products, pairs and slopes.
+        pairs: second derivatives that are there already; the others are added.
+        out: entries to add to.
+    """
+    curve(terms, values, residual * touched, jacobian, squares, robust, multipliers * own, pairs)
+    at = len(first)
+    for k in range(at):
+        out[order[k]] += jacobian[first[k]] * jacobian[second[k]]
+    for k in range(len(pairs)):
+        out[order[at + k]] += pairs[k]
+    at += len(pairs)
+    for k in range(len(slopes)):
+        out[order[at + k]] += constraint_jacobian[slopes[k]]

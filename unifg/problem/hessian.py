@@ -72,11 +72,16 @@ def lagrangian_hessian(program: CompiledProblem, lin: Linearization, multipliers
         lin: where.
         multipliers: (M,).
     """
+    entries = uncompiled_hessian(program, lin, multipliers)
+    own = lin.stored, lin.residual, lin.jacobian, lin.squares, lin.weights
+    curve(program.arrays, *own, multipliers, entries)
+    return entries
+
+
+def uncompiled_hessian(program: CompiledProblem, lin: Linearization, multipliers: Array) -> Array:
+    """The same without what :func:`curve` adds."""
     require_second(program)
     entries = lin.hessian + lin.concavity if len(lin.concavity) else lin.hessian.copy()
-    add_curvature(program.arrays, lin.stored, lin.residual, lin.weights, multipliers, entries)
-    if program.table.robust:
-        add_losses(program.arrays, lin.residual, lin.jacobian, lin.squares, lin.weights, entries)
     for term in program.batched:
         _add(program, term, lin, multipliers, entries)
     return entries
@@ -126,6 +131,23 @@ def loss_curvature(term: CompiledTerm, lin: Linearization) -> Array:
 def _of_factors(term: CompiledTerm, robust: Array) -> Array:
     """(n,) of an array with one number for every robust factor."""
     return robust[term.place[WEIGHT] : term.place[WEIGHT] + term.count]
+
+
+@compiled
+def curve(
+    terms: TermArrays,
+    values: Array,
+    residual: Array,
+    jacobian: Array,
+    squares: Array,
+    robust: Array,
+    multipliers: Array,
+    hessian: Array,
+) -> None:
+    """:func:`add_curvature` and :func:`add_losses`."""
+    add_curvature(terms, values, residual, robust, multipliers, hessian)
+    if len(robust):
+        add_losses(terms, residual, jacobian, squares, robust, hessian)
 
 
 @compiled

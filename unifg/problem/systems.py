@@ -19,7 +19,7 @@ import numpy as np
 from unifg.codegen.jit import compiled
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.plan import Plan
-from unifg.elimination.saddle import SaddlePoint
+from unifg.elimination.saddle import NOTHING, SaddlePoint
 from unifg.elimination.symmetric import Symmetric
 from unifg.problem.evaluation import add_constraints, transposed_times
 from unifg.problem.linearization import Rows
@@ -178,11 +178,16 @@ class KktSystem:
         self.saddle = SaddlePoint(self.factorization, structure.unknowns)
         self.loaded: Array | None = None
 
-    def load(self, data: Array) -> bool:
-        """Factorise ``data`` (nnz,), unless it was the last to be; False when an entry is not finite."""
+    def load(self, data: Array, near: Array = NOTHING) -> bool:
+        """Factorise ``data`` (nnz,), unless it was the last to be; False when an entry is not finite.
+
+        Args:
+            data: entries in the order of the pattern.
+            near: as of :meth:`SaddlePoint.factor`.
+        """
         if self.loaded is not data:
             self.loaded = None
-            if not self.saddle.factor(data):
+            if not self.saddle.factor(data, near):
                 return False
             self.loaded = data
         return True

@@ -8,7 +8,6 @@ bounds their error. Every factor reads arguments of its own, so that one call mo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,7 @@ STEP = 6e-5  # the longer of two steps [m, rad, ...]
 LENGTHS = STEP * np.array([1.0, -1.0, 0.5, -0.5])
 EPSILON = 2.0 * float(np.finfo(np.float64).eps)
 NOISE = 20.0  # roundings in second differences
-LONGEST = 1 << 17  # numbers in the points of one call
+LONGEST = 1 << 18  # numbers in the points of one call
 ALIKE = 10.0 * EPSILON  # relative difference of a factor's rows in a call of more factors
 BEND = 1e-5  # of a squared norm, by which the slope of a robust loss is found
 
@@ -52,58 +51,59 @@ class WrittenTerm:
         self.term, self._data, n = term, data, term.count
         self._arguments = [resolve(a, data) if isinstance(a, Data) else a for a in term.arguments]
         self._places = [k for k, a in enumerate(term.arguments) if isinstance(a, Selection)]
+        own = []
         for k, chosen in zip(self._places, term.selections, strict=True):
-            point = values[chosen.family][chosen.indices][:, chosen.storage]
-            self._arguments[k] = np.array(np.broadcast_to(point, (n, point.shape[1])))
-        own = [columns.of(chosen) for chosen in term.selections]
+            times = n if len(chosen) == 1 else 1
+            self._arguments[k] = np.repeat(values[chosen.family][chosen.indices][:, chosen.storage], times, axis=0)
+            own.append(np.repeat(columns.of(chosen), times, axis=0))
         self._long = not term.residual.rows  # whether many moves stand in one call
-        self.columns: IntArray = np.concatenate([np.broadcast_to(c, (n, c.shape[1])) for c in own], axis=1)
+        self.columns: IntArray = np.concatenate(own, axis=1)
         mask = resolve(term.active, data) if isinstance(term.active, Data) else term.active
         self.active: BoolArray = np.ones(n, dtype=bool) if mask is None else mask.astype(bool)
-        self.rows = self._rows(self._arguments)
-        sizes = [np.abs(self._arguments[k]).max(axis=1, keepdims=True) for k in self._places]
+        points = [self._arguments[k] for k in self._places]
+        self.rows, sizes = self._rows(points), [np.abs(point).max(axis=1, keepdims=True) for point in points]
         self.rounding = EPSILON * np.maximum(1.0, np.max(sizes, axis=0))  # of zero, that of a number of order one
 
-    def _rows(self, arguments: list[Any], times: int = 1) -> Array:
-        """(n, m) rows for some arguments; (times n, m) for such arguments one after the other."""
+    def _rows(self, points: list[Array], times: int = 1) -> Array:
+        """(times n, m) rows with the variable arguments at some points (times n, storage)."""
         own, n = self.term.residual, self.term.count * times
+        declared = list(zip(self._arguments, self.term.rows, strict=True))
+        arguments = [
+            np.tile(a, (times, *[1] * (a.ndim - 1)))
+            if times > 1 and k not in self._places and rows is not False and np.ndim(a) and len(a) == self.term.count
+            else a
+            for k, (a, rows) in enumerate(declared)
+        ]
+        for k, point in zip(self._places, points, strict=True):
+            arguments[k] = point.copy()  # the function may write into it
         if own.rows:
-            each = [
-                k in self._places or (has_rows(a, declared) and len(a) == n)
-                for k, (a, declared) in enumerate(zip(arguments, self.term.rows, strict=True))
-            ]
+            each = [k in self._places or (has_rows(a, rows) and len(a) == n) for k, (a, rows) in enumerate(declared)]
             found = np.zeros((n, own.rows))
             for i in np.flatnonzero(self.active):
                 given = [np.array(a[i] if row else a) for a, row in zip(arguments, each, strict=True)]
                 found[i] = in_python(own.function, [a if a.ndim else float(a) for a in given], own.rows)
             return found
-        given = [a.copy() if k in self._places else a for k, a in enumerate(arguments)]  # it may write into them
-        return np.where(np.tile(self.active, times)[:, None], np.array(own.function(*given)).reshape(n, -1), 0.0)
+        found = np.array(own.function(*arguments)).reshape(n, -1)
+        return found if self.active.all() else np.where(np.tile(self.active, times)[:, None], found, 0.0)
 
-    def _moved(self, place: int, there: Array) -> Array:
-        """(K, n, m) rows with an argument at (K, n, storage) points, in one call where the function allows that.
+    def _moved(self, there: list[Array]) -> Array:
+        """(K, n, m) rows with each variable argument at (K + 2, n, storage) points, in one call where that is allowed.
 
-        It may know how many factors there are: then the call fails, or the last rows differ from those by themselves.
+        The function may know how many factors there are: then the call fails, or its last rows differ from those by
+        themselves. The two last points move all arguments, and an odd number of points stands before the last.
         """
-        arguments, times, n = self._arguments, len(there), self.term.count
-        before, after = arguments[:place], arguments[place + 1 :]
-        if self._long and times * sum(arguments[k].size for k in self._places) <= LONGEST:
-            many = [
-                np.tile(a, (times, *[1] * (a.ndim - 1)))
-                if isinstance(a, np.ndarray) and a.ndim and len(a) == n and declared is not False
-                else a
-                for a, declared in zip(arguments, self.term.rows, strict=True)
-            ]
-            many[place] = there.reshape(times * n, -1)
-            last = self._rows([*before, there[-1], *after])
+        times, n = there[0].shape[:2]
+        if self._long and sum(points.size for points in there) <= LONGEST:
+            last = self._rows([points[-1] for points in there])
             try:
-                found = self._rows(many, times).reshape(times, *last.shape)
-                if np.allclose(found[-1], last, ALIKE, ALIKE, equal_nan=True):
-                    return found
+                found = self._rows([points.reshape(times * n, -1) for points in there], times)
+                found = found.reshape(times, *last.shape)
+                if (np.abs(found[-1] - last) <= ALIKE * (1.0 + np.abs(last))).all():
+                    return found[:-2]
             except Exception:  # of the user's function
                 pass
             self._long = False
-        return np.stack([self._rows([*before, point, *after]) for point in there])
+        return np.stack([self._rows([points[k] for points in there]) for k in range(times - 2)])
 
     def slopes(self) -> tuple[Array, Array]:
         """(n, m, D) derivatives along right perturbations, and bounds of their errors.
@@ -111,14 +111,18 @@ class WrittenTerm:
         A kink at the point itself makes both quotients alike. It shows in second differences, which are there
         proportional to the step, and to its square where a function is smooth.
         """
-        found = []
+        (n, width), count, first, there = self.columns.shape, len(LENGTHS), 0, []
         for place, chosen in zip(self._places, self.term.selections, strict=True):
             point, dim = self._arguments[place], chosen.manifold.dim
-            steps = np.kron(LENGTHS[:, None], np.eye(dim))
-            many = np.tile(point, (len(steps), 1)), np.repeat(steps, len(point), axis=0)
-            there = np.asarray(chosen.manifold.retract(*many)).reshape(len(steps), *point.shape)
-            found.append(self._moved(place, there).reshape(len(LENGTHS), dim, *self.rows.shape))
-        ahead, behind, near, nearly = np.moveaxis(np.concatenate(found, axis=1), 1, 3)
+            points = np.empty((count * width + 2, *point.shape))
+            points[:] = point
+            own = points[:-2].reshape(count, width, *point.shape)[:, first : first + dim]
+            steps = np.repeat((LENGTHS[:, None, None] * np.eye(dim)).reshape(-1, dim), n, axis=0)
+            own[:] = np.asarray(chosen.manifold.retract(own.reshape(-1, point.shape[1]), steps)).reshape(own.shape)
+            points[-2:], first = own[-1, -1], first + dim
+            there.append(points)
+        found = self._moved(there).reshape(count, width, *self.rows.shape)
+        ahead, behind, near, nearly = np.ascontiguousarray(found.transpose(0, 2, 3, 1))
         here = self.rows[:, :, None]
         long, short = (ahead - behind) / (2.0 * STEP), (near - nearly) / STEP
         rounding = (self.rounding[:, :, None] + EPSILON * np.abs(here)) / STEP * np.maximum(1.0, np.abs(short))

@@ -139,19 +139,39 @@ def size_of(
 
 @compiled
 def weakest(
-    constraints: Array, lower: Array, upper: Array, multipliers: Array, counted: BoolArray, equality: BoolArray
+    constraints: Array,
+    lower: Array,
+    upper: Array,
+    multipliers: Array,
+    counted: BoolArray,
+    equality: BoolArray,
+    forces: Array,
+    out: BoolArray,
 ) -> tuple[int, float, float]:
     """Inequality that is closest to being active or not, by the larger of its two numbers.
+
+    Args:
+        constraints: (M,) rows.
+        lower: limits.
+        upper: limits.
+        multipliers: (M,).
+        counted: rows with an unknown.
+        equality: rows that are equalities.
+        forces: receives the multipliers of rows that are held.
+        out: ends with the rows that are not.
 
     Returns:
         Its row, -1 without one; its distance from the nearer limit; its multiplier, scaled as the KKT test does.
     """
-    total = 0.0
+    total, first = 0.0, len(out) - len(multipliers)
     for multiplier in multipliers:
         total += abs(multiplier)
     scale = max(1.0, total / 100.0 / max(len(multipliers), 1))
     row, least, slack = -1, np.inf, 0.0
+    hold(constraints, lower, upper, multipliers, out[first:])
     for k in range(len(multipliers)):
+        held = counted[k] and (equality[k] or out[first + k])
+        out[first + k], forces[k] = not held, multipliers[k] if held else 0.0
         if counted[k] and not equality[k]:
             own = min(abs(constraints[k] - lower[k]), abs(constraints[k] - upper[k]))
             if max(own, abs(multipliers[k]) / scale) < least:

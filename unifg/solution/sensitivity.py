@@ -22,17 +22,20 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from unifg.elimination.saddle import EXACT
+from unifg.codegen.jit import compiled
+from unifg.elimination.saddle import CORRECTIONS, EXACT, NOTHING, SaddleArrays, prepared
+from unifg.elimination.substitution import refine_rows
 from unifg.errors import GraphError
 from unifg.factors.robust import form_of
 from unifg.modeling.terms import Cost
 from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.fixed_columns import FixedColumns
-from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.hessian import curve, uncompiled_hessian
 from unifg.problem.linearization import Linearization
 from unifg.problem.parameters import Parameter, datum, fixed_variables, parts_of
-from unifg.problem.systems import KktSystem, fill, leave_out
+from unifg.problem.systems import KktArrays, KktSystem, fill, leave_out
+from unifg.problem.table import TermArrays
 from unifg.solution.covariance import SOLVED
 from unifg.solution.gains import REPLACED, SAME
 from unifg.solution.multipliers import weakest
@@ -64,6 +67,22 @@ class Part(NamedTuple):
     unknown: bool
 
 
+class Parameters(NamedTuple):
+    """Data and fixed variables that derivatives are taken by.
+
+    Attributes:
+        each: data and fixed variables.
+        starts: first coordinate of each, and the number of all.
+        numbers: (parameters, width) coordinate of each full tangent column, -1 for none.
+        fixed: columns of fixed variables, None where it moves none.
+    """
+
+    each: list[Parameter]
+    starts: list[int]
+    numbers: IntArray
+    fixed: list[FixedColumns | None]
+
+
 class Structure:
     """Structure that questions about all solutions of a graph share.
 
@@ -71,6 +90,7 @@ class Structure:
         kkt: of the matrix with all constraint rows.
         probe: (size,) random numbers.
         open: (M,) rows with an unknown.
+        scale: (size,) diagonal that equilibrates the first matrix; those of later ones begin there.
         parts, parameters: the ones asked for.
         fixed: columns of fixed variables, by the coordinates.
     """
@@ -92,8 +112,9 @@ class Structure:
         self.probe = np.random.default_rng(0).standard_normal(self.kkt.factorization.pattern.size)
         self.open = np.ones(program.constraints.count, dtype=bool)
         self.open[program.fixed_rows()] = False
+        self.scale: Array = NOTHING
         self.parts: dict[Hashable, Part] = {}
-        self.parameters: dict[Hashable, Parameter] = {}
+        self.parameters: dict[Hashable, Parameters] = {}
         self.fixed: dict[Hashable, FixedColumns] = {}
 
 
@@ -114,7 +135,7 @@ class Sensitivities:
         program: CompiledProblem,
         lin: Linearization,
         multipliers: Array,
-        active: BoolArray,
+        equality: BoolArray,
         tolerance: float,
         edition: int,
         limits: tuple[Array, Array],
@@ -125,7 +146,7 @@ class Sensitivities:
             program: the compiled graph, with the data of the solution bound.
             lin: linearisation at the solution.
             multipliers: (M,) there.
-            active: (M,) rows that hold as equalities.
+            equality: (M,) rows that are equalities.
             tolerance: of the solve.
             edition: number of its data.
             limits: of the constraints, (M,) each.
@@ -136,21 +157,55 @@ class Sensitivities:
         """
         self._program, self._lin, self._edition, self._limits = program, lin, edition, limits
         self._changes: dict[tuple[Hashable, ...], Change] = {}
-        with program.lock:
-            self._structure = structure = program.once(Structure)
+        self._multipliers, self._out = np.empty(len(multipliers)), np.zeros(program.size + len(multipliers), dtype=bool)
+        self._structure = program.once(Structure)
+        self._near = self._structure.scale
+        with program.lock, self._structure.kkt.borrowed() as system:
             self._require_data()
-            self._require_strict(multipliers, tolerance)
-            held = active & structure.open
-            self._multipliers = np.where(held, multipliers, 0.0)
-            hessian = lagrangian_hessian(program, lin, self._multipliers)
-        self._out = out = np.concatenate([np.zeros(program.size, dtype=bool), ~held])
-        with structure.kkt.borrowed() as system:
-            pattern, self._entries = system.pattern, np.empty(system.pattern.nnz)
-            fill(system.arrays, hessian, lin.constraint_jacobian, self._entries)
-            leave_out(pattern.indptr, pattern.indices, self._entries, out, program.size, self._entries)
-            if not system.load(self._entries):
-                raise GraphError("sensitivity: the Hessian is not finite at the solution")
-            self._dependent = self._probe(system)
+            self._dependent = self._settle(system, multipliers, equality, tolerance)
+
+    def _settle(self, system: KktSystem, multipliers: Array, equality: BoolArray, tolerance: float) -> str:
+        """Find which rows are held, factorise, and solve for random numbers, of which singular directions leave some.
+
+        Returns:
+            Description of a row that depends on others, empty where there is none.
+
+        Raises:
+            GraphError: as of the class.
+        """
+        program, lin, structure, saddle = self._program, self._lin, self._structure, system.saddle
+        self._entries, right = np.empty(system.pattern.nnz), np.empty((2, len(self._out)))
+        held = lin.constraints, *self._limits, multipliers, structure.open, equality, self._multipliers, self._out
+        if program.batched:
+            weakest(*held)
+        linearized = lin.stored, lin.residual, lin.jacobian, lin.squares, lin.weights, lin.constraint_jacobian
+        hessian, system.loaded = uncompiled_hessian(program, lin, self._multipliers), None
+        row, slack, force, left = settle(
+            program.arrays, system.arrays, saddle.arrays, held, linearized, hessian, self._near, structure.probe,
+            self._entries, right,
+        )  # fmt: skip
+        if row >= 0 and max(slack, force) < (least := WEAK * math.sqrt(tolerance)):
+            term, factor, place = self._place(row)
+            raise GraphError(
+                f"sensitivity: {place} is weakly active, its slack {slack:.1e} and its multiplier "
+                f"{force:.1e} both below {least:.1e}: on either side of the present data the derivative is "
+                "another. Solve with a smaller tolerance if one of them is not that small, else ask at other data",
+                term=term,
+                index=factor,
+            )
+        if not (saddle.adopt(self._entries, left >= 0.0) or system.load(self._entries, self._near)):
+            raise GraphError("sensitivity: the Hessian is not finite at the solution")
+        system.loaded, dependent = self._entries, ""
+        if not len(structure.scale):
+            structure.scale = saddle.scale.copy()
+        if not 0.0 <= left <= SOLVED:
+            dependent = self._singular(system, np.where(self._out, 0.0, structure.probe / saddle.scale))
+        if system.factorization.inertia != (program.size, len(self._out) - program.size, 0):
+            raise GraphError(
+                "sensitivity: the reduced Hessian is indefinite: the solution is no strict local minimum, and what "
+                "becomes of it when data change is not determined; start elsewhere"
+            )
+        return dependent
 
     def _require_data(self) -> None:
         """Raise unless the present data are those of the solution: their number, or what they make of its values."""
@@ -163,42 +218,6 @@ class Sensitivities:
         if not all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in pairs):
             raise GraphError(REPLACED)
         self._edition = program.binding.edition
-
-    def _require_strict(self, multipliers: Array, tolerance: float) -> None:
-        """Raise for the weakest row that may be active or not."""
-        program, least = self._program, WEAK * float(np.sqrt(tolerance))
-        own = self._structure.open, program.equality
-        row, slack, force = weakest(self._lin.constraints, *self._limits, multipliers, *own)
-        if row >= 0 and max(slack, force) < least:
-            term, factor, place = self._place(row)
-            raise GraphError(
-                f"sensitivity: {place} is weakly active, its slack {slack:.1e} and its multiplier "
-                f"{force:.1e} both below {least:.1e}: on either side of the present data the derivative is "
-                "another. Solve with a smaller tolerance if one of them is not that small, else ask at other data",
-                term=term,
-                index=factor,
-            )
-
-    def _probe(self, system: KktSystem) -> str:
-        """Solve for random numbers: what is left of them is what the matrix is singular in.
-
-        Returns:
-            Description of a row that depends on others, empty where there is none.
-
-        Raises:
-            GraphError: the reduced Hessian is singular or indefinite.
-        """
-        n = self._program.size
-        right, dependent = self._structure.probe / system.saddle.scale, ""
-        right[self._out] = 0.0
-        if not system.saddle.solve_rows(right[None], ENOUGH)[1][0] <= SOLVED:
-            dependent = self._singular(system, right)
-        if system.factorization.inertia != (n, len(right) - n, 0):
-            raise GraphError(
-                "sensitivity: the reduced Hessian is indefinite: the solution is no strict local minimum, and what "
-                "becomes of it when data change is not determined; start elsewhere"
-            )
-        return dependent
 
     def _singular(self, system: KktSystem, right: Array) -> str:
         """Find what the matrix is singular in, from a system that was not solved at once."""
@@ -249,7 +268,7 @@ class Sensitivities:
         for part in _chunks(len(places)):
             right = np.zeros((part.stop - part.start, len(self._out)))
             right[np.arange(len(right)), places[part]] = 1.0
-            result[part] = [change.pulled(adjoint) for adjoint in self._solved(right)]
+            result[part] = change.pulled(self._solved(right))
         return result
 
     def gradient(self, of: Mapping[Selection | str, Array], wrt: Wrt) -> Array:
@@ -271,7 +290,7 @@ class Sensitivities:
             for part in _chunks(change.count):
                 total[part] += self._solved(self._columns(change, part)) @ right
         elif asked:
-            total += change.pulled(self._solved(right[None])[0])
+            total += change.pulled(self._solved(right[None]))[0]
         return total.reshape(change.shape)
 
     def _weights(self, of: Selection | str, weights: Array) -> Array:
@@ -348,27 +367,36 @@ class Sensitivities:
         asked = tuple(map(_called, wrt))
         if asked in self._changes:
             return self._changes[asked]
-        program, known, fixed = self._program, self._structure.parameters, self._structure.fixed
-        given = [remembered(known, name, partial(self._parameter, one)) for name, one in zip(asked, wrt, strict=True)]
-        *starts, count = accumulate((math.prod(one.shape) for one in given), initial=0)
-        heights, parts = np.zeros(count), []
+        program, parts = self._program, []
+        given = remembered(self._structure.parameters, asked, partial(self._parameters, wrt))
+        heights = np.zeros(given.starts[-1])
         with program.lock:
             self._require_data()
-            for first, one in zip(starts, given, strict=True):
-                if one.fixed:
-                    found = remembered(fixed, one.numbers.tobytes(), partial(FixedColumns, program, one.numbers))
-                    values = found.entries(program, self._lin, self._multipliers)
-                    parts.append((found.rows, found.coordinates + first, values))
+            for first, one, fixed in zip(given.starts, given.each, given.fixed, strict=False):
+                if fixed is not None:
+                    values = fixed.entries(program, self._lin, self._multipliers)
+                    parts.append((fixed.rows, fixed.coordinates + first, values))
                 if one.handle is not None:
                     parts += self._of_data(one, first, heights)
-        moved = [np.where(one.numbers < 0, -1, one.numbers + first) for first, one in zip(starts, given, strict=True)]
-        if len(parts) == 1 and given[0].fixed:  # ordered already
+        if len(parts) == 1 and given.fixed[0] is not None:  # ordered already
             rows, numbers, values = parts[0]
             entries = rows, numbers, np.where(self._out[rows], 0.0, values)
         else:
             entries = _ordered(parts, self._out)
-        self._changes[asked] = change = Change(given[0].shape, *entries, heights, np.array(moved))
+        self._changes[asked] = change = Change(given.each[0].shape, *entries, heights, given.numbers)
         return change
+
+    def _parameters(self, wrt: Sequence[Wrt]) -> Parameters:
+        """Several parameters, one after the other."""
+        program, each = self._program, [self._parameter(one) for one in wrt]
+        starts = list(accumulate((math.prod(one.shape) for one in each), initial=0))
+        moved = [np.where(one.numbers < 0, -1, one.numbers + first) for first, one in zip(starts, each, strict=False)]
+        known = self._structure.fixed
+        fixed = [
+            remembered(known, one.numbers.tobytes(), partial(FixedColumns, program, one.numbers)) if one.fixed else None
+            for one in each
+        ]
+        return Parameters(each, starts, np.array(moved), fixed)
 
     def _of_data(self, one: Parameter, first: int, heights: Array) -> Iterator[tuple[IntArray, IntArray, Array]]:
         """Places, numbers and values of what data do to the terms that read them; adds to the heights."""
@@ -410,7 +438,7 @@ class Sensitivities:
             GraphError: one has none.
         """
         with self._structure.kkt.borrowed() as system:
-            system.load(self._entries)
+            system.load(self._entries, self._near)
             solutions, left = system.saddle.solve_rows(right, ENOUGH)
             for k in () if left.max(initial=0.0) <= SOLVED else np.flatnonzero(~(left <= SOLVED)):
                 solutions[k], rest = _tried(system, right[k])
@@ -466,7 +494,7 @@ def _chunks(count: int) -> Iterator[slice]:
     return (slice(first, min(first + AT_ONCE, count)) for first in range(0, count, AT_ONCE))
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Change:
     """Change of the KKT conditions by parameters, entry by entry, ordered by parameter.
 
@@ -489,8 +517,62 @@ class Change:
         """Coordinates of all parameters."""
         return len(self.heights)
 
-    def pulled(self, adjoint: Array) -> Array:
-        """(K,) derivatives, of the solution for the rows that are asked for."""
-        return np.asarray(
-            np.bincount(self.coordinates, -self.values * adjoint[self.rows], self.count), dtype=np.float64
-        )
+    def pulled(self, adjoints: Array) -> Array:
+        """(k, K) derivatives, of the solutions (k, size) for the rows that are asked for."""
+        found = np.zeros((len(adjoints), self.count))
+        pull(self.rows, self.coordinates, self.values, adjoints, found)
+        return found
+
+
+@compiled
+def settle(
+    terms: TermArrays,
+    kkt: KktArrays,
+    saddle: SaddleArrays,
+    held: tuple[Array, Array, Array, Array, BoolArray, BoolArray, Array, BoolArray],
+    linearized: tuple[Array, Array, Array, Array, Array, Array],
+    hessian: Array,
+    near: Array,
+    probe: Array,
+    entries: Array,
+    right: Array,
+) -> tuple[int, float, float, float]:
+    """Factorise the matrix of the rows that are held.
+
+    Args:
+        terms: of the program.
+        kkt: of the matrix.
+        saddle: of the same.
+        held: arguments of :func:`weakest`.
+        linearized: those of :func:`curve`, and the constraint Jacobian.
+        hessian: the part of it that is there already; receives all.
+        near: as of :func:`prepared`.
+        probe: (size,) random numbers.
+        entries: receive those of the matrix.
+        right: (2, size) memory.
+
+    Returns:
+        What :func:`weakest` does; what is left of the random numbers, negative where the factorisation fails.
+    """
+    row, slack, force = weakest(*held)
+    forces, out, left = held[6], held[7], np.empty(1)
+    curve(terms, *linearized[:5], forces, hessian)
+    fill(kkt, hessian, linearized[5], entries)
+    leave_out(saddle.indptr, saddle.indices, entries, out, kkt.size[0], entries)
+    if not prepared(kkt.plan, saddle, entries, kkt.size[0], near):
+        return row, slack, force, -1.0
+    for k in range(len(probe)):
+        right[0, k] = 0.0 if out[k] else probe[k] / saddle.scale[k]
+    refine_rows(
+        kkt.plan, saddle.starts, saddle.rows, saddle.entries, right[:1], saddle.scale, kkt.size[0], right[1:], left,
+        ENOUGH, SOLVED, CORRECTIONS,
+    )  # fmt: skip
+    return row, slack, force, left[0]
+
+
+@compiled
+def pull(rows: IntArray, coordinates: IntArray, values: Array, adjoints: Array, out: Array) -> None:
+    """Subtract the products of each adjoint with the entries of every coordinate."""
+    for k in range(len(adjoints)):
+        for e in range(len(values)):
+            out[k, coordinates[e]] -= values[e] * adjoints[k, rows[e]]

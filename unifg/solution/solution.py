@@ -403,8 +403,7 @@ class Solution:
     def _sensitivities(self) -> Sensitivities:
         if not self.converged:
             raise GraphError(f"sensitivity: needs a solution that is CONVERGED, this one is {self.status.name}")
-        active = self._equality | self._held()
-        given = self._multipliers, active, self.tolerance, self._edition, (self._lower, self._upper)
+        given = self._multipliers, self._equality, self.tolerance, self._edition, (self._lower, self._upper)
         return Sensitivities(self._program, self._lin, *given)
 
     def information(self, terms: Sequence[str], *variables: Variable) -> Array:

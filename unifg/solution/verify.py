@@ -22,9 +22,10 @@ from unifg.solution.as_written import WrittenTerm, moved_fix, off_manifold
 from unifg.typing import Array, IntArray
 
 ROUNDS = 30  # of pivoting
+NEAR = 1e-3  # slack of a row that has a multiplier to begin with
 FAR = 1e12  # a row so far from its limit has no multiplier
 DAMPING = 1e-13  # relative, of the rows that depend on each other
-NOTHING = 1e-10  # of the largest slope: a multiplier is not worth it
+NOTHING = 1e-10  # of the largest slope, where the slack is small: a multiplier is not worth it
 FLAT = 1e-11  # curvature, relative to the diagonal, of a direction of which differences say nothing
 FITS = 100.0  # times the rounding of the variables: residuals that are nothing else
 SYMMETRIC = "MMD_AT_PLUS_A"  # ordering
@@ -102,12 +103,12 @@ class Entries(NamedTuple):
 
     @classmethod
     def of(cls, parts: Sequence[tuple[Array, Array, IntArray, IntArray]]) -> Entries:
-        """Join arrays that broadcast; negative places are those of fixed variables, and left out."""
+        """Join arrays that broadcast, without zeros known to be that and negative places, those of fixed variables."""
         flat = [[np.zeros(0), np.zeros(0), np.zeros(0, np.intp), np.zeros(0, np.intp)]]
         flat += [[array.ravel() for array in np.broadcast_arrays(*part)] for part in parts]
         numbers, errors, rows, columns = (np.concatenate(arrays) for arrays in zip(*flat, strict=True))
-        known = (rows >= 0) & (columns >= 0)
-        return cls(numbers[known], errors[known], rows[known], columns[known])
+        counted = (rows >= 0) & (columns >= 0) & ((numbers != 0.0) | (errors != 0.0))
+        return cls(numbers[counted], errors[counted], rows[counted], columns[counted])
 
 
 class Conditions:
@@ -199,24 +200,26 @@ class Conditions:
 
         A, count, size = self._jacobian, len(self.g), self.program.size
         multipliers = np.zeros(count)
-        if not count:
+        if not (count and size):
             return multipliers
         equality = self.lower == self.upper
         above, below = self.upper - self.g, self.g - self.lower
         sign = np.where(equality, 0.0, np.where(above <= below, 1.0, -1.0))
         slack = np.where(equality, 0.0, np.minimum(np.abs(above), np.abs(below)))
         candidate = np.isfinite(slack)
-        free = candidate.copy()
+        free = slack <= NEAR
         held = np.minimum(slack, FAR) ** 2 + DAMPING * np.maximum(np.bincount(A.rows, A.numbers**2, count), 1e-12)
-        right, worth = np.append(-self.gradient, multipliers), NOTHING * float(np.abs(self.gradient).max(initial=0.0))
-        both, own = np.arange(size + count), size + np.arange(count)
-        places = np.concatenate([both, size + A.rows, A.columns]), np.concatenate([both, A.columns, size + A.rows])
-        matrix = sp.csc_matrix((np.concatenate([np.ones(size + count), A.numbers, A.numbers]), places))
-        diagonal = np.flatnonzero(matrix.indices == np.repeat(both, np.diff(matrix.indptr)))[size:]
-        for _ in range(ROUNDS):  # of [[I, A'], [A, -s^2]] [rest; multipliers] = [-gradient; 0]
-            matrix.data[diagonal] = -np.where(free, held, FAR**2)
-            found = spl.splu(matrix, SYMMETRIC, relax=1, panel_size=1).solve(right)
-            multipliers = np.where(free, found[own], 0.0)
+        largest, both = float(np.abs(self.gradient).max(initial=0.0)), np.arange(size + count)
+        worth = NOTHING * largest * np.maximum(slack / NEAR, 1.0)
+        for _ in range(ROUNDS):  # of [[I, A'], [A, -s^2]] [rest; multipliers] = [-gradient; 0], with the free rows of A
+            number, kept = size - 1 + np.cumsum(free), free[A.rows]
+            rows, columns, entries = number[A.rows[kept]], A.columns[kept], A.numbers[kept]
+            diagonal, right = np.append(np.ones(size), -held[free]), np.append(-self.gradient, 0.0 * held[free])
+            own = both[: len(right)]
+            places = np.concatenate([own, rows, columns]), np.concatenate([own, columns, rows])
+            matrix = sp.csc_matrix((np.concatenate([diagonal, entries, entries]), places))
+            found = spl.splu(matrix, relax=1, panel_size=1).solve(right)
+            multipliers = np.where(free, found[number], 0.0)
             gain = sign * np.bincount(A.rows, A.numbers * found[A.columns], count)
             wrong = np.where(free, sign * multipliers < 0.0, candidate & (gain > worth))
             if not wrong.any():
