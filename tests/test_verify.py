@@ -84,6 +84,23 @@ def estimate() -> tuple[fg.Graph, dict[Any, Any]]:
     return graph, {x: np.tile(fg.SE3.identity(), (6, 1)), trees: np.array([[1.0, 1.0], [0.5, -1.0]])}
 
 
+def test_large_forces_are_judged_relative_to_their_size() -> None:
+    """Regression test: a solution that passed by the relative numbers of the KKT test failed by absolute ones."""
+    graph = fg.Graph()
+    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 500)
+    graph.minimize(fg.prior, x, [1.0], sigma=0.01)
+    graph.minimize(fg.prior, y, [0.0])
+    graph.bound(x, upper=0.0, name="wall")
+    graph.bound(y, lower=-1.0, upper=1.0, name="room")
+    off = {"wall": np.array([[1e4 + 5e-5]])}
+    solution = InteriorPoint().solve(graph, {x: np.zeros((1, 1)), y: np.zeros((500, 1))}, duals=off, check=True)
+    assert 1e-7 < solution.stationarity <= 1e-6 and solution.iterations == 0
+    found = solution.verify()
+    assert found and found.claimed is not None and found.claimed.stationarity == pytest.approx(solution.stationarity)
+    off["wall"] += 1e-3
+    assert not InteriorPoint(max_iterations=0).solve(graph, solution, duals=off).verify()
+
+
 @pytest.mark.parametrize("solver", CONSTRAINED, ids=lambda s: f"{s.name}{getattr(s, 'hessian', '')}")
 def test_plans_of_all_backends_pass(solver: fg.Solver) -> None:
     graph, guess, goal = control()

@@ -30,6 +30,7 @@ FLAT = 1e-11  # curvature, relative to the diagonal, of a direction of which dif
 FITS = 100.0  # times the rounding of the variables: residuals that are nothing else
 SYMMETRIC = "MMD_AT_PLUS_A"  # ordering
 COST = 1e-8  # relative difference of costs
+SHARE = 0.01  # of the largest product that a gradient is a sum of: what its size is
 
 
 @dataclass(frozen=True)
@@ -37,9 +38,9 @@ class Numbers:
     """KKT numbers with some multipliers.
 
     Attributes:
-        stationarity: as that of a solution: scaled, and of least squares the relative offset.
+        stationarity: as that of a solution: scaled or relative, and of least squares the relative offset.
         bound: by how much differences may be wrong about it.
-        complementarity: scaled.
+        complementarity: scaled or relative.
         variable: family and member with the largest slope; None where nothing is unknown.
         row: of the largest complementarity, -1 without constraints.
     """
@@ -139,10 +140,12 @@ class Conditions:
         """Find gradient, Jacobian of the constraints and, of least squares, the Gauss-Newton matrix."""
         unknown, size = self.program.columns.unknown, self.program.size
         slope, doubtful, blocks, squares = np.zeros(size + 1), np.zeros(size + 1), [], 0.0  # the last, of what is fixed
+        self._forces = np.zeros(size + 1)
         for term, _, force, weights in self._costs:
             slopes, doubt = term.slopes()
             own = unknown[term.columns]
             np.add.at(slope, own, np.einsum("nmd,nm->nd", slopes, force))
+            np.maximum.at(self._forces, own, np.abs(slopes * force[:, :, None]).max(axis=1, initial=0.0))
             rounding = np.abs(weights).sum(axis=2) * term.rounding
             squares += float((rounding * term.rounding).sum())
             np.add.at(doubtful, own, np.einsum("nmd,nm->nd", doubt, np.abs(force)))
@@ -164,16 +167,32 @@ class Conditions:
         slope = self.gradient + np.bincount(A.columns, A.numbers * multipliers[A.rows], size)
         doubt = self._doubt + np.bincount(A.columns, A.errors * np.abs(multipliers[A.rows]), size)
         scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
-        stationarity, bound = (float(np.abs(part).max(initial=0.0)) / scale for part in (slope, doubt))
+        sizes = self._sizes(multipliers)
+        stationarity, bound = min(
+            tuple(float(np.abs(part / size).max(initial=0.0)) for part in (slope, doubt)) for size in (scale, sizes)
+        )
         if self.program.least_squares and len(slope):
             stationarity, bound = self._offset(slope, doubt)
         limit = np.where(multipliers > 0.0, self.upper, self.lower)
         slack = np.where(np.isfinite(limit), np.abs(self.g - np.where(np.isfinite(limit), limit, 0.0)), 1.0)
-        wrong = np.where(self.lower != self.upper, np.abs(multipliers) * slack, 0.0)
+        shares = np.zeros(len(multipliers))
+        np.maximum.at(shares, A.rows, np.abs(A.numbers) / sizes[A.columns])
+        shares = np.where(shares > 0.0, np.minimum(shares, 1.0 / scale), 1.0 / scale)
+        wrong = np.where(self.lower != self.upper, np.abs(multipliers) * slack * shares, 0.0)
         columns = self.program.columns
         at = columns.name(int(columns.free[np.abs(slope).argmax()])) if len(slope) else None
         row = int(wrong.argmax()) if len(wrong) else -1
-        return Numbers(stationarity, bound, float(wrong.max(initial=0.0)) / scale, at, row)
+        return Numbers(stationarity, bound, float(wrong.max(initial=0.0)), at, row)
+
+    def _sizes(self, multipliers: Array) -> Array:
+        """(size,) sizes of gradients, the same for all members along a coordinate of a family; infinite where none."""
+        A, columns = self._jacobian, self.program.columns
+        forces, kinds = self._forces[:-1].copy(), columns.coordinates[columns.free]
+        np.maximum.at(forces, A.columns, np.abs(A.numbers * multipliers[A.rows]))
+        sizes = np.zeros(kinds.max(initial=-1) + 1)
+        np.maximum.at(sizes, kinds, SHARE * forces)
+        found: Array = np.where(sizes > 0.0, sizes, np.inf)[kinds]
+        return found
 
     def _offset(self, slope: Array, doubt: Array) -> tuple[float, float]:
         """Relative offset of least squares, and by how much it may be wrong."""
