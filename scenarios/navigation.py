@@ -30,8 +30,7 @@ from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
 from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load_class, name_of
 from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.logs.columns import Recorder
-from unifg.scenarios.logs.drive_log import EpisodeLog
-from unifg.scenarios.monitoring.assumptions import Assumed
+from unifg.scenarios.logs.drive_log import Assumed, EpisodeLog
 from unifg.scenarios.options import count, existing, option, pair, pose, positive
 from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -12,13 +11,32 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.models.footprint import Body, body_of
 from unifg.scenarios.logs.columns import column, ragged, words
 from unifg.scenarios.logs.stored import StoredLog
-from unifg.scenarios.monitoring.assumptions import Assumed, Judgement, judged
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["EpisodeLog"]
+__all__ = ["Assumed", "EpisodeLog"]
 
 
-@dataclass(kw_only=True)
+@dataclass(frozen=True)
+class Assumed:
+    """Constant assumptions of a drive.
+
+    Attributes:
+        sigmas: standard deviations of the estimate that clearances are wider by.
+        wall_gap, disc_gap: clearances beyond these [m].
+        deceleration: of the brakes, by the data sheet [m/s^2].
+        ahead: time for which a mover may do anything within its bound before the robot is at rest [s].
+        unseen: "free": space that no beam has looked into, but for blind sectors, which are occupied.
+    """
+
+    sigmas: float
+    wall_gap: float
+    disc_gap: float
+    deceleration: float
+    ahead: float
+    unseen: str = "free"
+
+
+@dataclass(kw_only=True, eq=False)
 class EpisodeLog(StoredLog):
     """One episode of T ticks with a horizon of N steps, K true obstacles and G goals.
 
@@ -155,11 +173,6 @@ class EpisodeLog(StoredLog):
     def hull(self) -> Body:
         """Body of the robot."""
         return body_of(self.body) if self.body else Body.disc(self.robot_radius)
-
-    @cached_property
-    def judgement(self) -> Judgement:
-        """Assumptions that were broken, and the causes of contacts."""
-        return judged(self)
 
     @property
     def succeeded(self) -> bool:
