@@ -40,7 +40,6 @@ from unifg.scenarios.quadrotor.flight_parts import (
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings, backend
 from unifg.scenarios.quadrotor.guide import Guide, Reference
 from unifg.scenarios.quadrotor.slots import SlotObstacles, Slots
-from unifg.solvers import names
 from unifg.typing import Array
 
 LEFT_BEHIND = 1.0  # [m] between the ends of plan and reference
@@ -97,10 +96,9 @@ class Controller:
         lean = ReferenceCost("level", s.weighted(s.level_sigma), upright, "R", residual=landmarks.tilt, size=3)
         terms = [*self.past.motion(), Limits(s), lean, effort]
         if s.avoidance == "potential":
-            squares = not s.general_costs or not names.entry(solver).made_by.scalar_costs
-            terms += [Potential(s, self.walls, target, squares), *self.past.apart(squares)]
+            terms += [Potential(s, self.walls, target), *self.past.apart()]
         else:
-            terms += [*following(s), Clearance(s, self.walls), *self.past.apart(None)]
+            terms += [*following(s), Clearance(s, self.walls), *self.past.apart()]
         window = self.past.window
         self.loop = RecedingHorizon(
             self.past.robot, s.horizon, terms, solver=backend(solver, s), cold=backend(solver, s, cold=True),
