@@ -18,7 +18,7 @@ from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.ground.localiser import FEWEST_BEAMS, FITS, Localiser
 from unifg.scenarios.ground.protocols import Estimator
 from unifg.scenarios.ground.relocalise import Relocaliser, refine
-from unifg.scenarios.options import existing, option, pose
+from unifg.scenarios.options import Settings, existing, option, pose
 from unifg.scenarios.perception.explaining import FARTHEST, explained
 from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
@@ -38,7 +38,7 @@ BASE = base_of("omnidirectional")
 
 
 @dataclass(frozen=True)
-class LocaliseSettings:
+class LocaliseSettings(Settings):
     """A log to be localised.
 
     Attributes:
@@ -112,8 +112,6 @@ def _estimator(
     if settings.localiser == "amcl":
         rng, trusted = np.random.default_rng(settings.seed), MonteCarloSettings(noise=(0.01,) * 4)
         return MonteCarlo(occupancy, field, start, SIGMA, rng, trusted, BASE)
-    if settings.localiser != "graph":
-        raise ScenarioError(f"a log is followed by 'graph' or 'amcl', not by '{settings.localiser}'")
     return Localiser(field, start, SIGMA, beams, BASE, WHEELS, SURE)
 
 

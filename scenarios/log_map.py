@@ -28,7 +28,7 @@ from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.ground.hypotheses import Hypothesis
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.relocalise import nearest_fit
-from unifg.scenarios.options import existing, option, pose, positive
+from unifg.scenarios.options import Settings, existing, option, pose, positive
 from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
@@ -60,7 +60,7 @@ SHIFT, TURN = 0.2, 0.05  # [m, rad] by which a closure moves the last pose, afte
 
 
 @dataclass(frozen=True)
-class MapSettings:
+class MapSettings(Settings):
     """A log to be made a map of.
 
     Attributes:

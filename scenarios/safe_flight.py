@@ -21,7 +21,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, run_ticks, silent
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.safe_log import SafeLog
-from unifg.scenarios.options import count, not_negative, option, positive
+from unifg.scenarios.options import Settings, count, not_negative, option, positive
 from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.quadrotor.cascade import CascadeSettings, Track
 from unifg.scenarios.quadrotor.cbf_mpc import (
@@ -73,12 +73,8 @@ _SWEPT: dict[Kind, _Swept] = {
 """What a case is flown with when nothing else is asked for."""
 
 
-def _true_vehicle() -> quadrotor.Parameters:
-    return quadrotor.Parameters(1.1, (0.3, 0.3, 0.15))
-
-
 @dataclass(frozen=True)
-class SafeSettings:
+class SafeSettings(Settings):
     """Flights to run; of several alphas, speeds and controllers all combinations.
 
     Attributes:
@@ -134,7 +130,7 @@ class SafeSettings:
     patience: float = 2.0
     dt: float = 0.01
     books: Airframe = field(default_factory=Airframe)
-    truth: quadrotor.Parameters = field(default_factory=_true_vehicle)
+    truth: quadrotor.Parameters = field(default_factory=lambda: quadrotor.Parameters(1.1, (0.3, 0.3, 0.15)))
     true_loops: Loops = field(default_factory=lambda: Loops(22.0, 0.025, 0.012))
     gains: Gains = TUNED
     filter: FilterSettings = field(default_factory=FilterSettings)
@@ -342,20 +338,10 @@ class SafeFlight:
 
 
 def flights(settings: SafeSettings) -> list[SafeFlight]:
-    """Every flight that is asked for, in order.
-
-    Raises:
-        ScenarioError: for a case or a controller that is unknown.
-    """
-    s = settings
-    if s.case not in _SWEPT:
-        situation(s.case)
-    swept = _SWEPT[s.case]
+    """Every flight that is asked for, in order."""
+    s, swept = settings, _SWEPT[settings.case]
     all_alphas, all_gammas, speeds = s.alpha or swept.alpha, s.gamma or swept.gamma, s.speed or swept.speed
     controllers = s.controller or swept.controller
-    for name in controllers:
-        if name not in CONTROLLERS:
-            raise fg.ScenarioError(f"unknown controller {name!r}: choose one of {', '.join(CONTROLLERS)}")
     made = []
     for speed in speeds:
         about = situation(s.case, speed, s.seed)

@@ -96,8 +96,8 @@ def test_people_are_drawn_where_there_is_room() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"people": -1}, "people must be from 0 to 200"),
-        ({"people": 10**9}, "people must be from 0 to 200"),
+        ({"people": -1}, "people: '-1' is not a whole number"),
+        ({"people": 10**9}, "people: '1000000000' is more than 200"),
         ({"slowest": 2.0}, "slowest <= fastest"),
     ],
 )

@@ -13,7 +13,7 @@ from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_itera
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.logs.metrics import write_metrics
 from unifg.scenarios.logs.solved_log import SolvedLog, held
-from unifg.scenarios.options import option
+from unifg.scenarios.options import Settings, option
 from unifg.scenarios.scenes.manoeuvre_plot import picture
 from unifg.scenarios.scenes.manoeuvre_scene import manoeuvre_iterate, manoeuvre_scene, manoeuvre_stage
 from unifg.solution.status import Status
@@ -23,7 +23,7 @@ __all__ = ["SETTINGS", "run"]
 
 
 @dataclass(frozen=True)
-class CaseSettings:
+class CaseSettings(Settings):
     """Settings of manoeuvres.
 
     Attributes:

@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 import unifg as fg
-from unifg.errors import ScenarioError, UnifgError
+from unifg.errors import UnifgError
 from unifg.files.ros_map import OccupancyMap
 from unifg.horizon import Plan
 from unifg.models.distance_map import DistanceMap
@@ -91,7 +91,9 @@ class Pilot(Generic[PlannerT]):
         self.clock = Stopwatch()
         self.pose = estimator.pose
         self.validator, self.supervisor = Validator(beams), Supervisor(RAMPS)
-        self.emergency_stop = EmergencyStop(s.hull, self._braking(s), s.dt, s.kind)
+        self.emergency_stop = EmergencyStop(
+            s.hull, (float(s.most[0]) / s.dt, s.accelerations[1]), s.dt, s.kind
+        )
         self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
         self.driven = np.zeros(s.kind.size)
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
@@ -100,11 +102,6 @@ class Pilot(Generic[PlannerT]):
         self._pause, self.search_said = 0, ""
         self._awake, self._failed = False, ""
         self._first: Scan | None = None
-
-    @staticmethod
-    def _braking(settings: ControllerSettings) -> tuple[float, float]:
-        """Decelerations, moving and turning [m/s^2, rad/s^2]."""
-        return float(settings.most[0]) / settings.dt, settings.accelerations[1]
 
     @property
     def verdict(self) -> HealthReport:
@@ -327,15 +324,13 @@ def make_pilot(
         beams: number of beams in a scan.
 
     Raises:
-        ScenarioError: for an unknown coupling.
+        BackendError: for an unknown solver.
     """
     estimator: Estimator
     if coupling == "sequential":
         estimator = Localiser(distance_map, pose, sigma, beams, settings.kind)
         controller = Controller(distance_map, solver, settings)
-    elif coupling == "joint":
+    else:
         estimator = smoother = Smoother(distance_map, pose, sigma, beams, settings.dt, base=settings.kind)
         controller = Controller(distance_map, solver, settings, smoother.window)
-    else:
-        raise ScenarioError(f"unknown coupling '{coupling}': choose {' or '.join(COUPLINGS)}")
     return Pilot(estimator, controller, DiscTracker(distance_map), occupancy, distance_map, beams)

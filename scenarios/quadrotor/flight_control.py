@@ -81,12 +81,9 @@ class Controller:
             past: None for a graph of the future alone.
 
         Raises:
-            ScenarioError: for an unknown avoidance.
             BackendError: for an unknown solver.
         """
         self.settings = s = settings or ControllerSettings()
-        if s.avoidance not in ("clearance", "potential"):
-            raise fg.ScenarioError(f"unknown avoidance '{s.avoidance}': choose clearance or potential")
         self.past: GivenFlight = past or GivenFlight(s)
         self.walls = np.asarray(walls, dtype=np.float64)
         target = np.asarray(target, dtype=np.float64)

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 import unifg as fg
-from unifg.scenarios.options import option
+from unifg.scenarios.options import Settings, option
 from unifg.scenarios.quadrotor.guide import GuideSettings
 from unifg.solvers import names
 from unifg.typing import Array, ArrayLike
@@ -17,7 +17,7 @@ Avoidance: TypeAlias = Literal["clearance", "potential"]
 
 
 @dataclass(frozen=True)
-class ControllerSettings:
+class ControllerSettings(Settings):
     """Weights and limits of the controller.
 
     Attributes:

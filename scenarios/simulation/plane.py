@@ -24,7 +24,7 @@ from unifg.lie import SE2
 from unifg.models import unicycle
 from unifg.models.footprint import Body
 from unifg.models.planar import Base
-from unifg.scenarios.options import not_negative, option, positive, share
+from unifg.scenarios.options import Settings, not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.simulation.rectangles import wall_rectangles
@@ -47,7 +47,7 @@ WALLS = -1
 
 
 @dataclass(frozen=True)
-class LidarModel:
+class LidarModel(Settings):
     """Lidar at the robot's centre, beams evenly over its field of view.
 
     Attributes:
@@ -72,7 +72,8 @@ class LidarModel:
 
     def __post_init__(self) -> None:
         """Refuse a field of view that is none."""
-        if not 0.0 < self.field <= 2.0 * math.pi + 1e-9:
+        super().__post_init__()
+        if self.field > 2.0 * math.pi + 1e-9:
             raise ScenarioError(f"the lidar's field of view must be in (0, 2 pi] rad, got {self.field:g}")
 
     @property
@@ -83,7 +84,7 @@ class LidarModel:
 
 
 @dataclass(frozen=True)
-class OdometryModel:
+class OdometryModel(Settings):
     """Wheel odometry: measured = true * (1 + scale + noise), for v and omega each on its own.
 
     Attributes:

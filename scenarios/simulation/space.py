@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import pymunk
@@ -144,7 +144,12 @@ class Space:
             shape.collision_type = _VEHICLE_TYPE
             shape.filter = pymunk.ShapeFilter(categories=_VEHICLE_CATEGORY)
         self.engine.add(self.vehicle, *shapes)
-        self.engine.on_collision(_VEHICLE_TYPE, _THING_TYPE, begin=self._on_begin, separate=self._on_separate)
+        self.engine.on_collision(
+            _VEHICLE_TYPE,
+            _THING_TYPE,
+            begin=lambda met, space, data: self.begin(self._thing(met)),
+            separate=lambda met, space, data: self.separate(self._thing(met)),
+        )
 
     def discs(self) -> Array:
         """(K, 4) x, y, radius [m] of the discs now, in the order they were added, and 1 for movers, else 0."""
@@ -207,12 +212,6 @@ class Space:
         """Note a contact that ends."""
         self._touching[owner] = self._touching.get(owner, 1) - 1
         self._separated[owner] = self.time
-
-    def _on_begin(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        self.begin(self._thing(arbiter))
-
-    def _on_separate(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        self.separate(self._thing(arbiter))
 
     def _thing(self, arbiter: pymunk.Arbiter) -> int:
         first, second = arbiter.shapes
