@@ -40,7 +40,7 @@ from unifg.scenarios.quadrotor.pace import Pace
 from unifg.scenarios.quadrotor.sightings import Sightings, SightingSettings
 from unifg.scenarios.quadrotor.situations import Kind, Situation, situation
 from unifg.scenarios.quadrotor.spline_planner import SplinePath, SplineSettings, around
-from unifg.scenarios.quadrotor.state_filter import FilterStatistics, StateFilter
+from unifg.scenarios.quadrotor.state_filter import AIR, StateFilter
 from unifg.scenarios.quadrotor.weighing import Weighing, WeighingSettings
 from unifg.scenarios.simulation.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
@@ -140,7 +140,6 @@ class SafeSettings(Settings):
     keeper: KeeperSettings = field(default_factory=KeeperSettings)
     tracking: KeeperSettings = TRACKING
     weighing: WeighingSettings = field(default_factory=WeighingSettings)
-    believed: FilterStatistics = field(default_factory=FilterStatistics)
     seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
     disturbance: DisturbanceModel = field(default_factory=DisturbanceModel)
 
@@ -187,7 +186,7 @@ class SafeFlight:
         self.plant, self.model = BodyRatePlant(truth, start, s.dt), BodyRatePlant(s.books, start, s.dt)
         estimating = s.knowledge == "estimated"
         self.weighing = Weighing(s.weighing, s.books.parameters, s.dt) if estimating else None
-        self.filter = StateFilter(s.believed, s.dt) if estimating else None
+        self.filter = StateFilter(s.dt) if estimating else None
         path = self._spline() if controller == "spline" else about.path
         self.pace = Pace(path, s.patience * speed)
         noisy, beside = s.sight != "exact" and len(about.bodies) > 0, s.sight == "relative"
@@ -213,7 +212,7 @@ class SafeFlight:
 
             def plan(state: Array, seen: Obstacles) -> Decision:
                 start = np.concatenate(self.model.ahead(state, lead, self._air))
-                fade = np.exp(-(lead + keeper.nodes[:-1]) / s.believed.air.gust_time)
+                fade = np.exp(-(lead + keeper.nodes[:-1]) / AIR.gust_time)
                 gust = fade[:, None] * self._air[3:]
                 return keeper.decide(start, self.pace.at(lead + keeper.nodes), seen, lead, gust)
 

@@ -15,7 +15,7 @@ from unifg.plots.shown import every
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import estimated_parameters, has_estimate, state_errors
 from unifg.scenarios.logs.metrics import collision_words
-from unifg.scenarios.scenes.flight_scene import flight_frame, flight_stage, sensor_reach
+from unifg.scenarios.scenes.flight_scene import flight_frame, flight_stage, senses
 from unifg.scenarios.scenes.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import INK, css
 from unifg.style.figures import ground, headline, key_of, new_figure
@@ -126,7 +126,7 @@ def control(log: FlightLog) -> Figure:
 
 def plot_moment(log: FlightLog, tick: int, ax: Axes) -> Axes:
     """Obstacles, belief and plan at one tick, from above."""
-    scene = flight_stage(log, sensed=sensor_reach(log) is not None, estimated=has_estimate(log))
+    scene = flight_stage(log, sensed=senses(log), estimated=has_estimate(log))
     past, before = slice(tick + 1), max(1, tick + 2 - len(log.pasts[tick]))
     scene.way("trail", log.believed[:before, :3])
     scene.way("truth", log.truth[past, :3] if has_estimate(log) else log.truth[:0, :3])
