@@ -18,6 +18,7 @@ from unifg.scenarios.logs.metrics import collision_words, health, one_graph
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
 from unifg.scenarios.scenes.parts import CLEAR, draw_way, layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
+from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
@@ -68,7 +69,9 @@ NUMBERS_OF_A_PLAN = (
 
 NUMBERS = (
     *NUMBERS_OF_A_PLAN,
-    Number("estimate + plan", None, lambda log, k: log.estimate_ms[k] + log.plan_ms[k], plot={"unit": "ms", "log": True}),
+    Number(
+        "estimate + plan", None, lambda log, k: log.estimate_ms[k] + log.plan_ms[k], plot={"unit": "ms", "log": True}
+    ),
     Number(
         "position error", lambda log, k: f"{_error(log, k):.1f} cm", _error, plot={"unit": "cm", "colour": "estimate"}
     ),
