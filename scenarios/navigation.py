@@ -201,7 +201,7 @@ class Episode:
         of_world = load_class("world", settings.world, WORLDS, OF_WORLD, "fog:Fog")
         self.world = of_world(
             true, self.start, discs, sensors, base=control.kind, body=control.hull, lidar=settings.lidar,
-            odometry=settings.odometry, drivetrain=settings.drivetrain, yields=False,
+            odometry=settings.odometry, drivetrain=settings.drivetrain,
             people=draw_traffic(settings.traffic, walls, self.path, about),
         )  # fmt: skip
         sigma = np.array(settings.initial_sigma)

@@ -43,7 +43,7 @@ class Dashes:
     def __init__(self, begin: float, speed: float) -> None:
         self.begin, self.speed = begin, speed
 
-    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+    def velocity(self, mover: Mover, space: Space, dt: float) -> tuple[float, float]:
         if space.time < self.begin:
             return 0.0, 0.0
         way = (space.vehicle.position - mover.body.position).normalized() * self.speed

@@ -68,7 +68,6 @@ class Pilot(Generic[PlannerT]):
         relocated: whether the last tick has found the robot at another place.
         slowed: true if the emergency stop has changed the control of the last tick.
         driven: (m,) control of the last tick.
-        search_said: why the last search has not found the robot, "" where it has.
         calibration: slow states of the sensors.
         recalibrated: true if one of them has jumped in the last tick.
         planless: whether no solve is to give a plan: a planner that is out of time.
@@ -99,7 +98,7 @@ class Pilot(Generic[PlannerT]):
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
         self._signals = DriveSignals(s.dt, s.most, s.kind)
         self.calibration, self.recalibrated = Calibration(distance_map, s.dt, s.kind), False
-        self._pause, self.search_said = 0, ""
+        self._pause = 0
         self._awake, self._failed = False, ""
         self._first: Scan | None = None
 
@@ -287,7 +286,6 @@ class Pilot(Generic[PlannerT]):
         if result is None:
             return
         self._pause = SEARCH_AGAIN
-        self.search_said = result.cause
         if result.pose is None:
             return
         self.estimator.reset(result.pose, FOUND_SIGMA)

@@ -80,7 +80,7 @@ class Social:
         self._walls, self._arc = walls, arc_lengths(way)
         self._along, self._sense = 0.0, 1.0
 
-    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+    def velocity(self, mover: Mover, space: Space, dt: float) -> tuple[float, float]:
         """Velocity after ``dt`` [s] of the forces, at most a hasty walk."""
         velocity = np.array(mover.body.velocity)
         velocity = velocity + dt * self.force(np.array(mover.body.position), velocity)
