@@ -212,11 +212,6 @@ class Course:
     iterates: Array
 
     @property
-    def time(self) -> Array:
-        """(N + 1,) time of each node [s]."""
-        return self.settings.dt * np.arange(self.settings.horizon + 1, dtype=np.float64)
-
-    @property
     def target_distance(self) -> float:
         """Distance from the end to the target [m]."""
         return float(np.linalg.norm(self.states[-1, :3] - self.layout.target))

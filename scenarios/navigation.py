@@ -161,8 +161,10 @@ class Episode:
                     raise ScenarioError(
                         f"the {word} '{name_of(chosen)}' stands for itself: its coupling is 'sequential'"
                     )
-        self._localiser = None if settings.localiser in LOCALISERS else load_class(
-            "localiser", settings.localiser, LOCALISERS, OF_LOCALISER, "my:Filter"
+        self._localiser = (
+            None
+            if settings.localiser in LOCALISERS
+            else load_class("localiser", settings.localiser, LOCALISERS, OF_LOCALISER, "my:Filter")
         )
         least, most = settings.obstacle_radius
         if not 0.0 < least <= most < np.inf:

@@ -95,7 +95,7 @@ def compilations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 def latest(controller: Controller) -> Belief:
     """Belief of the last joint solve."""
     assert isinstance(controller.past, SharedFlight)
-    return controller.past.latest
+    return controller.belief
 
 
 def alone(past: Past) -> tuple[Array, dict[str, Array]]:

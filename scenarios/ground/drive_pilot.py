@@ -90,9 +90,7 @@ class Pilot(Generic[PlannerT]):
         self.clock = Stopwatch()
         self.pose = estimator.pose
         self.validator, self.supervisor = Validator(beams), Supervisor(RAMPS)
-        self.emergency_stop = EmergencyStop(
-            s.hull, (float(s.most[0]) / s.dt, s.accelerations[1]), s.dt, s.kind
-        )
+        self.emergency_stop = EmergencyStop(s.hull, (float(s.most[0]) / s.dt, s.accelerations[1]), s.dt, s.kind)
         self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
         self.driven = np.zeros(s.kind.size)
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)

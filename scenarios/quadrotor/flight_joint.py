@@ -128,7 +128,6 @@ class SharedFlight(GivenFlight):
         robot: who flies.
         window: of the past.
         pull: how far the future may lean on the past.
-        latest: what the last joint solve says; what the past alone says where that solve was of no use.
         names: of what the window's slots held at the last solve.
     """
 
@@ -142,7 +141,6 @@ class SharedFlight(GivenFlight):
         """
         super().__init__(settings, estimator.window.robot, estimator.window, joint.pull)
         self.estimator = estimator
-        self.latest = estimator.belief()
         self.names = estimator.atlas.names.copy()
 
     def motion(self) -> list[Term]:
@@ -182,7 +180,6 @@ class SharedFlight(GivenFlight):
         """Belief by the joint solve, with the covariances of the past; the given one where it says nothing."""
         atlas = self.estimator.atlas
         self.names = atlas.names.copy()
-        self.latest = given
         if not loop.believed:
             return given
         positions = given.landmarks.positions.copy()
@@ -190,13 +187,12 @@ class SharedFlight(GivenFlight):
             slot = atlas.slot_of(name)
             if slot >= 0:
                 positions[row] = loop.constants["landmarks"][slot]
-        self.latest = replace(
+        return replace(
             given,
             state=loop.estimate.copy(),
             parameters=flyable(packed(loop.constants)),
             landmarks=replace(given.landmarks, positions=positions),
         )
-        return self.latest
 
 
 def believable(solution: fg.Solution, choice: object) -> bool:
