@@ -243,8 +243,8 @@ def plain(kind: Any) -> Any:
 
 
 def _help(leaf: Leaf, default: Any) -> str:
-    """Text about a field in the docstring of its class, and its default."""
-    doc = inspect.getdoc(leaf.owner) or ""
+    """Text about a field in the docstring of its class or of one it inherits from, and its default."""
+    doc = "\n".join(inspect.getdoc(one) or "" for one in leaf.owner.__mro__)
     found = re.search(rf"^    {leaf.path[-1]}: (.*?)(?=^ {{0,4}}\S|\Z)", doc, re.MULTILINE | re.DOTALL)
     words = " ".join(found[1].split()).rstrip(".") if found else ""
     quiet = default in (MISSING, None, "") or isinstance(default, bool)
