@@ -66,7 +66,7 @@ def measure(case: Problem | None, rounds: int) -> tuple[str, ...]:
         whole[place] = found.seconds
     middle: Sequence[Array] = [np.median(spent, axis=0) for spent in (in_c, compiled, whole)]
     shown = (*(1e6 * float(np.median(part)) for part in middle), float(np.median(middle[0] / middle[1])))
-    return title, *(number(found, 3) for found in shown), number(size / 1e3, 3)
+    return title, *map(number, shown), number(size / 1e3)
 
 
 def tables(rounds: int) -> str:

@@ -29,7 +29,6 @@ from unifg.scenarios.simulation.conditions import draw_conditions
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, SIZES, Fault
 
-SEEDS = range(5)
 ROBOTS = {"drive": DRIVE_FAULTS, "flight": FLIGHT_FAULTS}
 BEGIN = {"drive": 2.0, "flight": 3.0}  # [s]
 DURATIONS = (2.0, 1000.0)  # [s]; the second one for good

@@ -35,7 +35,6 @@ from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import mapped
 from unifg.typing import Array
 
-SEEDS = range(200, 204)
 DT = 0.1
 OBSTACLES = 3
 LOG = "intel-corrected.log.gz"

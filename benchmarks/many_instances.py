@@ -44,7 +44,7 @@ def measure(case: Problem, rounds: int, count: int = COUNT) -> tuple[str, ...]:
     single = [fg.Status.CONVERGED is status for status in prepared.solve_many(stated.guess, data=data).statuses]
     middle = float(np.median(spent["many"]))
     relative = ratio(spent["many"], spent["loop"])[0], middle / float(np.median(compiled[-rounds:])), alone / shared
-    shown = (number(found, 3) for found in (1e6 * middle / count, *relative))
+    shown = (number(found) for found in (1e6 * middle / count, *relative))
     return case.title, f"{sum(single)} of {count}", *shown
 
 

@@ -25,7 +25,6 @@ from unifg.scenarios.navigation import NavigationSettings, run_navigation
 from unifg.typing import Array
 
 SOLVERS = ("ipm", "sqp", "alm")
-SEEDS = range(5)
 DEPARTMENT, ARENA = "dis-B1-2011-09-27.yaml", "turtlebot3_world.yaml"
 
 # Limits of the campaign: what a drive has to keep, and what all ticks of one backend have to keep together.

@@ -67,12 +67,11 @@ def milliseconds(seconds: Array) -> Spread:
     return spread(1e3 * seconds)
 
 
-def shown(value: Spread | None, digits: int = 3) -> str:
+def shown(value: Spread | None) -> str:
     """Median and bounds for a table."""
     if value is None:
         return "-"
-    median, low, high = (number(part, digits) for part in value)
-    return f"{median} ({low} to {high})"
+    return "{} ({} to {})".format(*map(number, value))
 
 
 def number(value: float, digits: int = 3) -> str:

@@ -39,7 +39,6 @@ MADE: dict[str, Callable[[], PoseGraph]] = {
 }
 GRAPHS = (*MADE, "intel", "sphere2500", "M3500")
 SHARES = (0.1, 0.3, 0.5, 0.7)
-SEEDS = range(10, 15)
 
 
 class Found(NamedTuple):

@@ -14,7 +14,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import avoidance, landmarks, quadrotor
-from unifg.scenarios.options import option
+from unifg.scenarios.options import Settings, option
 from unifg.scenarios.planning.polyline import arc_lengths, at_stations
 from unifg.scenarios.planning.visibility import Ways
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
@@ -51,7 +51,7 @@ _CLEARANCES = (0.6, 0.5, 0.4, 0.3)  # of the centre line of a guess along a way,
 
 
 @dataclass(frozen=True)
-class CourseSettings:
+class CourseSettings(Settings):
     """Numbers of the problem. Weights multiply half the square of an error.
 
     Attributes:
@@ -177,13 +177,11 @@ def course_guess(settings: CourseSettings, layout: Layout) -> tuple[Array, Array
     """States (N + 1, 10) and controls (N, 4) to begin with: hovering, at the start or along a path that is given.
 
     Raises:
-        ScenarioError: for a guess along a way where there is none, or an unknown guess.
+        ScenarioError: for a guess along a way where there is none.
     """
     s, kind = settings, settings.chosen_guess
     states = np.tile(_standing(layout), (s.horizon + 1, 1))
     controls = np.tile(quadrotor.hover(s.vehicle), (s.horizon, 1))
-    if kind not in GUESSES:
-        raise fg.ScenarioError(f"unknown guess '{kind}': choose one of {', '.join(GUESSES)}")
     if kind != "hover":
         path = _way(layout) if kind == "way" else np.stack([layout.start[:2], layout.target[:2]])
         arc, share = arc_lengths(path), np.linspace(0.0, 1.0, s.horizon + 1)
@@ -212,11 +210,6 @@ class Course:
     states: Array
     controls: Array
     iterates: Array
-
-    @property
-    def time(self) -> Array:
-        """(N + 1,) time of each node [s]."""
-        return self.settings.dt * np.arange(self.settings.horizon + 1, dtype=np.float64)
 
     @property
     def target_distance(self) -> float:

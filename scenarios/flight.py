@@ -23,7 +23,7 @@ from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.ground.protocols import load_class, name_of
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
-from unifg.scenarios.options import count, not_negative, option, positive, share
+from unifg.scenarios.options import Settings, count, not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.quadrotor.estimator import EstimatorSettings
 from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS, make_pilot
@@ -52,7 +52,7 @@ logger = logging.getLogger("unifg")
 
 
 @dataclass(frozen=True)
-class FlightSettings:
+class FlightSettings(Settings):
     """One flight.
 
     Attributes:
@@ -93,6 +93,7 @@ class FlightSettings:
         Raises:
             ScenarioError: if the time limit is not positive.
         """
+        super().__post_init__()
         if not self.time_limit > 0.0:
             raise ScenarioError(f"the time limit must be positive, got {self.time_limit} s")
 

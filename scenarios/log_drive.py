@@ -22,7 +22,7 @@ from unifg.scenarios.options import existing, option, pose
 from unifg.scenarios.perception.explaining import FARTHEST, explained
 from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
-from unifg.scenarios.range_logs import WHEELS, LogRun, step_of
+from unifg.scenarios.range_logs import WHEELS, LogRun, LogSettings, step_of
 from unifg.typing import Array
 
 __all__ = ["LocaliseSettings", "localise"]
@@ -38,28 +38,19 @@ BASE = base_of("omnidirectional")
 
 
 @dataclass(frozen=True)
-class LocaliseSettings:
+class LocaliseSettings(LogSettings):
     """A log to be localised.
 
     Attributes:
-        log: log with scans and odometry: CARMEN, CSV, MCAP, rosbag2 or drive.npz.
         map: ROS map, its YAML file.
         start: pose of the laser at the first scan [m, m, rad]; without one that of the log where it fits the map, or
             the map is searched.
         localiser: that of this library, or a Monte Carlo localiser to compare with.
-        mount: pose of the laser on the robot, where the odometry is that of the robot [m, m, rad].
-        simulated_odometry: the poses in the log are corrected ones: odometry is made of them, with 5 % of scale error
-            and 2 % of noise, and they are what errors are counted from.
-        seed: of everything random.
     """
 
-    log: Path = option(text=existing("a log of a laser", folders=True), metavar="LOG")
     map: Path = option(text=existing("the YAML file of a ROS map"), metavar="MAP.yaml")
     start: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
     localiser: str = option("graph", choices=("graph", "amcl"))
-    mount: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
-    simulated_odometry: bool = option(False)
-    seed: int = option(0, metavar="S")
 
 
 def localise(log: RangeLog, occupancy: OccupancyMap, settings: LocaliseSettings, progress: Progress = silent) -> LogRun:
@@ -112,8 +103,6 @@ def _estimator(
     if settings.localiser == "amcl":
         rng, trusted = np.random.default_rng(settings.seed), MonteCarloSettings(noise=(0.01,) * 4)
         return MonteCarlo(occupancy, field, start, SIGMA, rng, trusted, BASE)
-    if settings.localiser != "graph":
-        raise ScenarioError(f"a log is followed by 'graph' or 'amcl', not by '{settings.localiser}'")
     return Localiser(field, start, SIGMA, beams, BASE, WHEELS, SURE)
 
 

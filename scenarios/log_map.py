@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -28,12 +27,12 @@ from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.ground.hypotheses import Hypothesis
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.relocalise import nearest_fit
-from unifg.scenarios.options import existing, option, pose, positive
+from unifg.scenarios.options import option, positive
 from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
 from unifg.scenarios.pose_graph import OUTLIER_WEIGHT, threshold
-from unifg.scenarios.range_logs import WHEELS, LogRun, step_of
+from unifg.scenarios.range_logs import WHEELS, LogRun, LogSettings, step_of
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -60,25 +59,16 @@ SHIFT, TURN = 0.2, 0.05  # [m, rad] by which a closure moves the last pose, afte
 
 
 @dataclass(frozen=True)
-class MapSettings:
+class MapSettings(LogSettings):
     """A log to be made a map of.
 
     Attributes:
-        log: log with scans and odometry: CARMEN, CSV, MCAP, rosbag2 or drive.npz.
         resolution: side of a cell [m].
         reach: of the beams that make the map [m].
-        mount: pose of the laser on the robot, where the odometry is that of the robot [m, m, rad].
-        simulated_odometry: the poses in the log are corrected ones: odometry is made of them, with 5 % of scale error
-            and 2 % of noise, and they are what errors are counted from.
-        seed: of everything random.
     """
 
-    log: Path = option(text=existing("a log of a laser", folders=True), metavar="LOG")
     resolution: float = option(0.05, text=positive, metavar="M")
     reach: float = option(12.0, text=positive, metavar="M")
-    mount: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
-    simulated_odometry: bool = option(False)
-    seed: int = option(0, metavar="S")
 
 
 def map_log(log: RangeLog, settings: MapSettings, progress: Progress = silent) -> tuple[LogRun, PoseGraph]:

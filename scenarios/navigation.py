@@ -30,9 +30,8 @@ from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
 from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load_class, name_of
 from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.logs.columns import Recorder
-from unifg.scenarios.logs.drive_log import EpisodeLog
-from unifg.scenarios.monitoring.assumptions import Assumed
-from unifg.scenarios.options import count, existing, option, pair, pose, positive
+from unifg.scenarios.logs.drive_log import Assumed, EpisodeLog
+from unifg.scenarios.options import Settings, count, existing, option, pair, pose, positive
 from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.planning.polyline import path_length
@@ -64,12 +63,13 @@ WORLDS = {
     "plane": "unifg.scenarios.simulation.plane:World",
     "mujoco": "unifg.scenarios.simulation.mujoco_drive:MujocoDrive",
 }
+OF_LOCALISER = ("update(scan, odometry, dt)", "reset(pose, sigma)")
 OF_WORLD = ("step(*control, dt)", "power(on)", "scan()", "odometry()", "discs()", "clearance()")
 LARGEST = Limits(pixels=200_000_000)  # of a map that a user names: 700 m by 700 m at 0.05 m
 
 
 @dataclass(frozen=True)
-class NavigationSettings:
+class NavigationSettings(Settings):
     """One episode.
 
     Attributes:
@@ -149,8 +149,6 @@ class Episode:
 
     def __init__(self, settings: NavigationSettings, *, rehearsal: bool = False) -> None:
         """Load the map, plan the legs, place the obstacles, wake the robot, and rehearse unless this is a rehearsal."""
-        if settings.plant not in PLANTS:
-            raise ScenarioError(f"unknown plant '{settings.plant}': choose {', '.join(PLANTS)}")
         settings = replace(settings, drivetrain=plant(settings.plant, settings.drivetrain))
         self.settings = settings
         self.controller = control = replace(settings.controller, accelerations=settings.drivetrain.sheet)
@@ -163,7 +161,11 @@ class Episode:
                     raise ScenarioError(
                         f"the {word} '{name_of(chosen)}' stands for itself: its coupling is 'sequential'"
                     )
-        self._localiser = None if settings.localiser in LOCALISERS else self._own_localiser(settings.localiser)
+        self._localiser = (
+            None
+            if settings.localiser in LOCALISERS
+            else load_class("localiser", settings.localiser, LOCALISERS, OF_LOCALISER, "my:Filter")
+        )
         least, most = settings.obstacle_radius
         if not 0.0 < least <= most < np.inf:
             raise ScenarioError(f"obstacles have radii 0 < least <= greatest, got {least:g} and {most:g} m")
@@ -201,7 +203,7 @@ class Episode:
         of_world = load_class("world", settings.world, WORLDS, OF_WORLD, "fog:Fog")
         self.world = of_world(
             true, self.start, discs, sensors, base=control.kind, body=control.hull, lidar=settings.lidar,
-            odometry=settings.odometry, drivetrain=settings.drivetrain, yields=False,
+            odometry=settings.odometry, drivetrain=settings.drivetrain,
             people=draw_traffic(settings.traffic, walls, self.path, about),
         )  # fmt: skip
         sigma = np.array(settings.initial_sigma)
@@ -254,12 +256,6 @@ class Episode:
             pilot.estimator = estimator
         pilot.pose = pilot.estimator.pose
         return pilot
-
-    @staticmethod
-    def _own_localiser(name: str | type) -> type:
-        return load_class(
-            "localiser", name, LOCALISERS, ("update(scan, odometry, dt)", "reset(pose, sigma)"), "my:Filter"
-        )
 
     def run(self, progress: Progress) -> EpisodeLog:
         """Tick until the last goal is reached or given up."""
@@ -367,7 +363,7 @@ class Episode:
         helpless = pilot.verdict.rests or pilot.planless_for > dt
         self._helpless = self._helpless + dt if helpless else 0.0
         if self._arrived(goal):
-            if self._confirmed(goal):
+            if _near(self.world.pose, self.goals[goal], TRUE_DISTANCE, TRUE_HEADING):
                 return REACHED
             away = float(np.hypot(*(self.world.pose - self.goals[goal])[:2]))
             return f"believed to be reached, {away:.2f} m away"
@@ -486,10 +482,6 @@ class Episode:
             return False
         distance, heading = min(REACHED_DISTANCE, TRUE_DISTANCE - off), min(REACHED_HEADING, TRUE_HEADING - turned)
         return _near(self.pilot.pose, goal_pose, distance, heading)
-
-    def _confirmed(self, goal: int) -> bool:
-        """Return True if the robot truly is where it believes to have arrived."""
-        return _near(self.world.pose, self.goals[goal], TRUE_DISTANCE, TRUE_HEADING)
 
 
 def askew(occupancy: OccupancyMap, pose: Array) -> OccupancyMap:

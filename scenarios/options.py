@@ -15,17 +15,19 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args, get_origin, get_type_hints
 
-from unifg.errors import UnifgError
+from unifg.errors import ScenarioError, UnifgError
 from unifg.files.contents import legible
 
 __all__ = [
     "Help",
     "Leaf",
     "Option",
+    "Settings",
     "Text",
     "add_options",
     "checked",
@@ -34,6 +36,7 @@ __all__ = [
     "find_modules_in",
     "leaves",
     "not_negative",
+    "number",
     "option",
     "pair",
     "plain",
@@ -103,6 +106,17 @@ class Leaf(NamedTuple):
         """Declaration of :func:`option`, if it is one."""
         return self.declared.metadata.get("option")
 
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """Words to choose from; none where any will do."""
+        kind, declared = plain(self.kind), () if self.option is None else self.option.choices
+        return declared or (get_args(kind) if get_origin(kind) is Literal else ())
+
+    @property
+    def text(self) -> Text | None:
+        """Reader of a word of the command line."""
+        return (self.option and self.option.text) or (count if plain(self.kind) is int else None)
+
 
 def leaves(settings: type, before: tuple[str, ...] = ()) -> Iterator[Leaf]:
     """Fields of a class of settings and of the settings inside."""
@@ -113,6 +127,33 @@ def leaves(settings: type, before: tuple[str, ...] = ()) -> Iterator[Leaf]:
             yield from leaves(kind, path)
         elif declared.init:
             yield Leaf(path, settings, kinds[declared.name], declared)
+
+
+class Settings:
+    """Settings that refuse, wherever they are made, the words and numbers that the command line refuses."""
+
+    def __post_init__(self) -> None:
+        """Check the options.
+
+        Raises:
+            ScenarioError: naming the field.
+        """
+        for leaf in _options(cast(type, type(self))):
+            name, value = leaf.path[0], getattr(self, leaf.path[0])
+            for one in value if isinstance(value, tuple) and leaf.option.many else (value,):  # type: ignore[union-attr]
+                if leaf.choices and one is not None and one not in leaf.choices:
+                    raise ScenarioError(f"unknown {name} {one!r}: choose {', '.join(leaf.choices)}")
+                if leaf.text is not None and isinstance(one, int | float) and not isinstance(one, bool):
+                    try:
+                        leaf.text(str(one))
+                    except argparse.ArgumentTypeError as error:
+                        raise ScenarioError(f"{name}: {error}") from None
+
+
+@cache
+def _options(settings: type) -> list[Leaf]:
+    """Options of a class of settings itself."""
+    return [leaf for leaf in leaves(settings) if leaf.option is not None and len(leaf.path) == 1]
 
 
 def replaced(settings: S, path: Sequence[str], value: Any) -> S:
@@ -139,13 +180,12 @@ def add_options(parser: argparse.ArgumentParser, settings: type, **defaults: Any
             groups[inside] = parser.add_argument_group(inside)
         default = defaults.get(name, leaf.declared.default)
         words: dict[str, Any] = {"help": _help(leaf, default).replace("%", "%%"), "metavar": chosen.metavar}
-        kind = plain(leaf.kind)
-        if kind is bool:
+        if plain(leaf.kind) is bool:
             del words["metavar"]
             words["action"] = "store_true"
         else:
-            words["choices"] = chosen.choices or (get_args(kind) if get_origin(kind) is Literal else ()) or None
-            words["type"] = chosen.text or (count if kind is int else str)
+            words["choices"] = leaf.choices or None
+            words["type"] = leaf.text or str
             if chosen.many:
                 words["action"] = "append"
         if leaf.declared.default is MISSING:
@@ -203,8 +243,8 @@ def plain(kind: Any) -> Any:
 
 
 def _help(leaf: Leaf, default: Any) -> str:
-    """Text about a field in the docstring of its class, and its default."""
-    doc = inspect.getdoc(leaf.owner) or ""
+    """Text about a field in the docstring of its class or of one it inherits from, and its default."""
+    doc = "\n".join(inspect.getdoc(one) or "" for one in leaf.owner.__mro__)
     found = re.search(rf"^    {leaf.path[-1]}: (.*?)(?=^ {{0,4}}\S|\Z)", doc, re.MULTILINE | re.DOTALL)
     words = " ".join(found[1].split()).rstrip(".") if found else ""
     quiet = default in (MISSING, None, "") or isinstance(default, bool)

@@ -24,7 +24,7 @@ from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName, RobustOn
 from unifg.pose_graphs.verdict import Judgement, Verdict
 from unifg.scenarios.episode import Progress, silent
-from unifg.scenarios.options import existing, option
+from unifg.scenarios.options import Settings, existing, option
 from unifg.scenarios.stopwatch import Stopwatch
 from unifg.solution.history import Iteration
 from unifg.solution.solution import Solution
@@ -59,7 +59,7 @@ OUTLIER_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
-class SolveSettings:
+class SolveSettings(Settings):
     """Settings of a solve.
 
     Attributes:

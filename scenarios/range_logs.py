@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,12 +15,52 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2
 from unifg.models.odometry import OdometryNoise
 from unifg.scenarios.logs.drive_metrics import pose_errors
+from unifg.scenarios.options import Settings, existing, option, pose
 from unifg.typing import Array
 
-__all__ = ["WHEELS", "LogRun", "opened", "step_of"]
+__all__ = ["WHEELS", "LogRun", "LogSettings", "step_of"]
 
 WHEELS = OdometryNoise(0.1, 0.1, 0.04)  # of wheels that nobody has calibrated
 SCALE, NOISE = 0.05, 0.02  # of odometry that is made of corrected poses, as in `OdometryModel`
+
+
+@dataclass(frozen=True)
+class LogSettings(Settings):
+    """Settings of everything that reads a log.
+
+    Attributes:
+        log: log with scans and odometry: CARMEN, CSV, MCAP, rosbag2 or drive.npz.
+        mount: pose of the laser on the robot, where the odometry is that of the robot [m, m, rad].
+        simulated_odometry: the poses in the log are corrected ones: odometry is made of them, with 5 % of scale error
+            and 2 % of noise, and they are what errors are counted from.
+        seed: of everything random.
+    """
+
+    log: Path = option(text=existing("a log of a laser", folders=True), metavar="LOG")
+    _: KW_ONLY
+    mount: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
+    simulated_odometry: bool = option(False)
+    seed: int = option(0, metavar="S")
+
+    def opened(self) -> RangeLog:
+        """The log, with the odometry that is wanted.
+
+        Raises:
+            FileFormatError: the file cannot be read.
+        """
+        log = read_range_log(self.log)
+        if self.mount is not None:
+            log = log.mounted(np.array(self.mount))
+        if not self.simulated_odometry:
+            return log
+        corrected = log.odometry if log.corrected is None else log.corrected
+        steps, rng = SE2.between(corrected[:-1], corrected[1:]), np.random.default_rng(self.seed)
+        scale = 1.0 + SCALE * rng.standard_normal(2)
+        told = steps * (scale[[0, 0, 1]] + NOISE * rng.standard_normal(steps.shape))
+        odometry = [corrected[0]]
+        for step in told:
+            odometry.append(SE2.compose(odometry[-1], step))
+        return replace(log, odometry=np.array(odometry), corrected=corrected)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,33 +121,6 @@ class LogRun:
         off = SE2.local(aligned(self.poses, self.truth), self.truth)
         found: Array = np.einsum("ni,ni->n", off, np.linalg.solve(self.covariance, off[:, :, None])[:, :, 0])
         return found
-
-
-def opened(path: Path, mount: tuple[float, float, float] | None, simulated: bool, seed: int) -> RangeLog:
-    """A log as the user wants it.
-
-    Args:
-        path: of the file.
-        mount: pose of the laser on the robot that the odometry is of; None where it is the laser's.
-        simulated: whether odometry is made of the corrected poses, with errors of wheels.
-        seed: of these errors.
-
-    Raises:
-        FileFormatError: the file cannot be read.
-    """
-    log = read_range_log(path)
-    if mount is not None:
-        log = log.mounted(np.array(mount))
-    if not simulated:
-        return log
-    corrected = log.odometry if log.corrected is None else log.corrected
-    steps, rng = SE2.between(corrected[:-1], corrected[1:]), np.random.default_rng(seed)
-    scale = 1.0 + SCALE * rng.standard_normal(2)
-    told = steps * (scale[[0, 0, 1]] + NOISE * rng.standard_normal(steps.shape))
-    odometry = [corrected[0]]
-    for step in told:
-        odometry.append(SE2.compose(odometry[-1], step))
-    return replace(log, odometry=np.array(odometry), corrected=corrected)
 
 
 def step_of(log: RangeLog, begin: int, end: int) -> Array:

@@ -21,7 +21,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, run_ticks, silent
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.safe_log import SafeLog
-from unifg.scenarios.options import count, not_negative, option, positive
+from unifg.scenarios.options import Settings, count, not_negative, option, positive
 from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.quadrotor.cascade import CascadeSettings, Track
 from unifg.scenarios.quadrotor.cbf_mpc import (
@@ -40,7 +40,7 @@ from unifg.scenarios.quadrotor.pace import Pace
 from unifg.scenarios.quadrotor.sightings import Sightings, SightingSettings
 from unifg.scenarios.quadrotor.situations import Kind, Situation, situation
 from unifg.scenarios.quadrotor.spline_planner import SplinePath, SplineSettings, around
-from unifg.scenarios.quadrotor.state_filter import FilterStatistics, StateFilter
+from unifg.scenarios.quadrotor.state_filter import AIR, StateFilter
 from unifg.scenarios.quadrotor.weighing import Weighing, WeighingSettings
 from unifg.scenarios.simulation.body_rate import SUBSTEP, Airframe, BodyRatePlant, Loops
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
@@ -73,12 +73,8 @@ _SWEPT: dict[Kind, _Swept] = {
 """What a case is flown with when nothing else is asked for."""
 
 
-def _true_vehicle() -> quadrotor.Parameters:
-    return quadrotor.Parameters(1.1, (0.3, 0.3, 0.15))
-
-
 @dataclass(frozen=True)
-class SafeSettings:
+class SafeSettings(Settings):
     """Flights to run; of several alphas, speeds and controllers all combinations.
 
     Attributes:
@@ -134,7 +130,7 @@ class SafeSettings:
     patience: float = 2.0
     dt: float = 0.01
     books: Airframe = field(default_factory=Airframe)
-    truth: quadrotor.Parameters = field(default_factory=_true_vehicle)
+    truth: quadrotor.Parameters = field(default_factory=lambda: quadrotor.Parameters(1.1, (0.3, 0.3, 0.15)))
     true_loops: Loops = field(default_factory=lambda: Loops(22.0, 0.025, 0.012))
     gains: Gains = TUNED
     filter: FilterSettings = field(default_factory=FilterSettings)
@@ -144,7 +140,6 @@ class SafeSettings:
     keeper: KeeperSettings = field(default_factory=KeeperSettings)
     tracking: KeeperSettings = TRACKING
     weighing: WeighingSettings = field(default_factory=WeighingSettings)
-    believed: FilterStatistics = field(default_factory=FilterStatistics)
     seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
     disturbance: DisturbanceModel = field(default_factory=DisturbanceModel)
 
@@ -191,7 +186,7 @@ class SafeFlight:
         self.plant, self.model = BodyRatePlant(truth, start, s.dt), BodyRatePlant(s.books, start, s.dt)
         estimating = s.knowledge == "estimated"
         self.weighing = Weighing(s.weighing, s.books.parameters, s.dt) if estimating else None
-        self.filter = StateFilter(s.believed, s.dt) if estimating else None
+        self.filter = StateFilter(s.dt) if estimating else None
         path = self._spline() if controller == "spline" else about.path
         self.pace = Pace(path, s.patience * speed)
         noisy, beside = s.sight != "exact" and len(about.bodies) > 0, s.sight == "relative"
@@ -217,7 +212,7 @@ class SafeFlight:
 
             def plan(state: Array, seen: Obstacles) -> Decision:
                 start = np.concatenate(self.model.ahead(state, lead, self._air))
-                fade = np.exp(-(lead + keeper.nodes[:-1]) / s.believed.air.gust_time)
+                fade = np.exp(-(lead + keeper.nodes[:-1]) / AIR.gust_time)
                 gust = fade[:, None] * self._air[3:]
                 return keeper.decide(start, self.pace.at(lead + keeper.nodes), seen, lead, gust)
 
@@ -342,20 +337,10 @@ class SafeFlight:
 
 
 def flights(settings: SafeSettings) -> list[SafeFlight]:
-    """Every flight that is asked for, in order.
-
-    Raises:
-        ScenarioError: for a case or a controller that is unknown.
-    """
-    s = settings
-    if s.case not in _SWEPT:
-        situation(s.case)
-    swept = _SWEPT[s.case]
+    """Every flight that is asked for, in order."""
+    s, swept = settings, _SWEPT[settings.case]
     all_alphas, all_gammas, speeds = s.alpha or swept.alpha, s.gamma or swept.gamma, s.speed or swept.speed
     controllers = s.controller or swept.controller
-    for name in controllers:
-        if name not in CONTROLLERS:
-            raise fg.ScenarioError(f"unknown controller {name!r}: choose one of {', '.join(CONTROLLERS)}")
     made = []
     for speed in speeds:
         about = situation(s.case, speed, s.seed)

@@ -21,7 +21,7 @@ import unifg as fg
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios.logs import metrics as numbers
-from unifg.scenarios.options import count, existing, option, pair, positive
+from unifg.scenarios.options import Settings, count, existing, option, pair, positive
 from unifg.scenarios.planning.speed_profile import Profile, drive_cycle, read_profile
 from unifg.solution.solver import Callback
 from unifg.solvers import names
@@ -40,7 +40,7 @@ ROUNDING = 1e-6  # relative, by which a limit may seem exceeded
 
 
 @dataclass(frozen=True)
-class TrackingSettings:
+class TrackingSettings(Settings):
     """Numbers of the problem.
 
     Attributes:

@@ -6,8 +6,7 @@ import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import wrap_angle
-from unifg.scenarios.logs.drive_log import EpisodeLog
-from unifg.scenarios.monitoring.assumptions import Assumed
+from unifg.scenarios.logs.drive_log import Assumed, EpisodeLog
 from unifg.typing import Array
 
 RESOLUTION = 0.1

@@ -20,9 +20,9 @@ from unifg.scenarios.ground.drive_signals import RAMPS
 from unifg.scenarios.ground.local_planner import PlannerContext, Situation
 from unifg.scenarios.ground.protocols import LocaliserContext
 from unifg.scenarios.ground.route import Route
+from unifg.scenarios.logs.assumptions import BREAKS, FAULT, judged
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
-from unifg.scenarios.monitoring.assumptions import BREAKS, FAULT, judged
 from unifg.scenarios.monitoring.supervisor import Ramp, Supervisor
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.perception.readings import Scan
@@ -43,7 +43,7 @@ class Dashes:
     def __init__(self, begin: float, speed: float) -> None:
         self.begin, self.speed = begin, speed
 
-    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+    def velocity(self, mover: Mover, space: Space, dt: float) -> tuple[float, float]:
         if space.time < self.begin:
             return 0.0, 0.0
         way = (space.vehicle.position - mover.body.position).normalized() * self.speed
@@ -210,22 +210,22 @@ STAGED: dict[str, tuple[str, str, dict[str, Any]]] = {
 def test_a_staged_contact_has_its_cause(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     thing, begin, settings = STAGED[name]
     log = staged(tmp_path, monkeypatch, **settings)
-    contact = log.judgement.contacts[0]
+    contact = judged(log).contacts[0]
     assert contact.thing == thing and contact.cause.startswith(begin), contact
     metrics = episode_metrics(log)
     first = {"tick": contact.tick, "time": contact.time, "thing": thing, "cause": contact.cause}
     assert metrics["contacts"][0] == first
     assert contact.cause in summary(log) and contact.cause in drive_scene(log).facts.values()
     log.save(tmp_path / "drive.npz")
-    assert EpisodeLog.load(tmp_path / "drive.npz").judgement == log.judgement
+    assert judged(EpisodeLog.load(tmp_path / "drive.npz")) == judged(log)
 
 
 def test_a_clean_drive_breaks_nothing_and_says_how_often_deviations_were_exceeded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = staged(tmp_path, monkeypatch, goals=((5.5, 1.5, 0.0),), world=Pillar)
-    assert log.reached == [True] and log.judgement.contacts == ()
-    assert log.judgement.ticks == {"pose": 0, "brakes": 0, "map": 0, "mover": 0, "overlooked": 1}
+    assert log.reached == [True] and judged(log).contacts == ()
+    assert judged(log).ticks == {"pose": 0, "brakes": 0, "map": 0, "mover": 0, "overlooked": 1}
     error, covariance = (log.true_pose - log.estimate)[:, :2], log.covariance[:, :2, :2]
     turn = np.array([[[np.cos(a), -np.sin(a)], [np.sin(a), np.cos(a)]] for a in log.estimate[:, 2]])
     spread = turn @ covariance @ turn.transpose(0, 2, 1)

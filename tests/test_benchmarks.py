@@ -333,7 +333,7 @@ def test_derivatives_are_beside_problems_solved_again() -> None:
 def test_the_future_is_that_of_the_world() -> None:
     hall = walled(12.0, 12.0, 2)
     discs = [Obstacle(np.array([6.0, 6.0]), 0.2), Obstacle(np.array([3.0, 9.0]), 0.25, np.array([4.3, 8.2]), 0.7)]
-    world = World(hall, (2.0, 2.0, 0.0), discs, yields=False)
+    world = World(hall, (2.0, 2.0, 0.0), discs)
     for _ in range(70):
         world.step(0.0, 0.0)
         assert np.allclose(world.discs()[:, :3], movers.future(discs)(world.time), atol=0.01)

@@ -44,7 +44,7 @@ def test_beams_fill_the_field_of_view() -> None:
     assert scan.spacing == pytest.approx(math.pi / 180) and not scan.closed
     assert Scan(LidarModel().angles, np.ones(360)).closed
     for view in (0.0, 7.0, math.nan):
-        with pytest.raises(ScenarioError, match="field of view"):
+        with pytest.raises(ScenarioError, match=r"^field: |field of view"):
             LidarModel(field=view)
 
 

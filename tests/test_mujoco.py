@@ -214,7 +214,7 @@ def test_a_polygon_touches_with_its_front() -> None:
 
 def test_a_disc_that_moves_pushes_and_is_counted() -> None:
     mover = Obstacle(np.array([4.5, 3.0]), 0.2, np.array([1.0, 3.0]), 0.5)
-    world = MujocoDrive(walled(6.0, 6.0), (3.0, 3.0, 0.0), [mover], drivetrain=Drivetrain(), yields=False)
+    world = MujocoDrive(walled(6.0, 6.0), (3.0, 3.0, 0.0), [mover], drivetrain=Drivetrain())
     for _ in range(40):
         world.step(0.0, 0.0)
     assert world.collisions >= 1 and world.pose[0] < 2.9

@@ -153,6 +153,7 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
         "unifg/view/live.js",
         "unifg/view/page.html",
         "unifg/scenarios/commands/performance.jsonl",
+        "unifg/scenarios/logs/foxglove.json",
     }
     if (source / "unifg" / "codegen" / "kernels.zip").exists():  # what may be missing is compiled on the first use
         expected.add("unifg/codegen/kernels.zip")

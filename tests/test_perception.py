@@ -17,7 +17,7 @@ from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks, nearest
 from unifg.scenarios.planning.grid import plan
 from unifg.scenarios.simulation.plane import LidarModel, World
-from unifg.scenarios.simulation.space import Obstacle
+from unifg.scenarios.simulation.space import Mover, Obstacle, Space
 from unifg.typing import Array, ArrayLike
 
 DT = 0.1
@@ -145,12 +145,27 @@ def test_velocity_of_a_mover(heading: float) -> None:
     assert max(errors) < 0.1
 
 
+class Waiting:
+    """Goes along -x at 0.3 m/s, and stands before a robot at rest."""
+
+    def velocity(self, mover: Mover, space: Space, dt: float) -> tuple[float, float]:
+        gap = mover.body.position.get_distance(space.vehicle.position) - mover.radius - space.radius
+        return (0.0 if gap < 0.1 and space.vehicle.velocity.length < 0.02 else -0.3), 0.0
+
+
+def waiting() -> tuple[World, DiscTracker, np.random.Generator]:
+    """A robot in the middle of the hall, and a mover that comes and waits for it."""
+    mover = Mover(np.array([6.5, 4.0]), 0.2, Waiting())
+    world = World(hall(), (5.0, 4.0, 0.0), [], np.random.default_rng(4), people=[mover])
+    return world, DiscTracker(field(hall())), np.random.default_rng(5)
+
+
 def met(
-    begin: tuple[float, float], end: tuple[float, float], speed: float = 0.3, seed: int = 4, yields: bool = True
+    begin: tuple[float, float], end: tuple[float, float], speed: float = 0.3, seed: int = 4
 ) -> tuple[World, DiscTracker, np.random.Generator]:
     """A robot in the middle of the hall, and a mover that goes to and fro between two points."""
     occupancy, mover = hall(), Obstacle(np.array(begin), 0.2, np.array(end), speed)
-    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(seed), yields=yields)
+    world = World(occupancy, (5.0, 4.0, 0.0), [mover], np.random.default_rng(seed))
     return world, DiscTracker(field(occupancy)), np.random.default_rng(5)
 
 
@@ -177,7 +192,7 @@ def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
     length, wrong = 2.2, []
     for seed in range(3):
         begin = 3.8 + 0.2 * seed
-        world, tracker, rng = met((begin, 5.3), (begin + length, 5.3), speed, seed, yields=False)
+        world, tracker, rng = met((begin, 5.3), (begin + length, 5.3), speed, seed)
         turn = math.ceil(length / speed / DT - 1e-9)
         watch(world, tracker, turn - 10, np.zeros(3), rng)
         found = np.array([watch(world, tracker, 1, np.array([0.005, 0.005, 0.002]), rng).velocity[0, 0]
@@ -190,7 +205,7 @@ def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
 @pytest.mark.product(1, of="tracks")
 def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
     """A mover that has stood for two seconds, for the robot's sake, is not left behind by its track."""
-    world, tracker, rng = met((6.5, 4.0), (4.0, 4.0))
+    world, tracker, rng = waiting()
     still = np.zeros(3)
     waited = 0
     for _ in range(80):
@@ -210,7 +225,7 @@ def test_mover_that_waited_is_followed_when_it_goes_on() -> None:
 @pytest.mark.product(1, of="tracks")
 def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
     """Ten seconds in one place; and when it goes on then, that is seen as of any other."""
-    world, tracker, rng = met((6.5, 4.0), (4.0, 4.0))
+    world, tracker, rng = waiting()
     watch(world, tracker, 41, np.zeros(3), rng)  # it has come to the robot and waits from then on
     assert tracker.tracks().mover.tolist() == [True]
     tracks = watch(world, tracker, round(10.0 * waits), np.zeros(3), rng)
@@ -225,7 +240,7 @@ def test_a_mover_that_has_stood_for_long_stands(waits: float) -> None:
 @pytest.mark.parametrize("speed", [0.2, 0.5])
 @pytest.mark.product(1, of="tracks")
 def test_one_who_goes_to_and_fro_stays_a_mover(speed: float) -> None:
-    world, tracker, rng = met((4.0, 5.5), (4.8, 5.5), speed, yields=False)
+    world, tracker, rng = met((4.0, 5.5), (4.8, 5.5), speed)
     watch(world, tracker, 60, np.zeros(3), rng)
     assert all(watch(world, tracker, 10, np.zeros(3), rng).mover.all() for _ in range(20))
 

@@ -135,7 +135,6 @@ def test_unknown_cells_are_not_driven_through() -> None:
         ((1, 1, 0), (-0.3, 1, 0), r"goal \(-0\.30, 1\.00\) lies in an unknown cell"),
         ((0.1, 1, 0), (1, 1, 0), r"start \(0\.10, 1\.00\) is 0\.100 m from the nearest wall"),
         ((1, math.nan, 0), (1, 1, 0), "start .* is not finite"),
-        ((1, 1, 0), (1, 1), "must be poses"),
     ],
 )
 def test_places_where_no_robot_can_stand_are_refused(
@@ -144,12 +143,6 @@ def test_places_where_no_robot_can_stand_are_refused(
     occupancy = room()
     with pytest.raises(ScenarioError, match=words):
         plan(occupancy, maps.field(occupancy), start, goal, robot_radius=RADIUS)
-
-
-def test_a_distance_map_of_another_map_is_refused() -> None:
-    other = DistanceMap(np.zeros((3, 3)), 0.05, (0, 0, 0))
-    with pytest.raises(ScenarioError, match="differ in shape"):
-        plan(room(), other, (1, 1, 0), (5, 1, 0), robot_radius=RADIUS)
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.01, 0.3])
@@ -214,8 +207,6 @@ def test_the_reference_never_goes_back_and_a_follower_remembers_nothing() -> Non
     assert np.array_equal(once, again)
     assert arc == arc_again
     assert used.reference(path[0], 0.06 * np.arange(10.0), 3.0)[1] == 3.0
-    with pytest.raises(ScenarioError, match="at least two poses"):
-        PathFollower(path[:1])
 
 
 @pytest.fixture(scope="module")

@@ -176,15 +176,6 @@ def test_limits_of_the_controls_are_the_solver_s_business_not_the_clipping_s() -
     assert np.abs(flown[:, 2] - plan.states[:, 2]).max() < 0.02
 
 
-def test_general_costs_are_stated_as_squares_for_a_solver_that_knows_no_others() -> None:
-    """Ta's potential as a general cost needs one that takes it; the penalty method gets the same objective."""
-    general = replace(SETTINGS, avoidance="potential", general_costs=True, horizon=4)
-    for solver, squares in (("penalty", True), ("alm", False), ("ipm", False)):
-        controller = Controller(TARGET, WALLS, solver, general, BOUNDS)
-        scalar = [term.name for term in controller.loop.warm.program.scalar_terms]
-        assert (not scalar) == squares
-
-
 # ---------------------------------------------------------------- plans that may not be flown
 
 

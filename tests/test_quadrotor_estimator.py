@@ -339,7 +339,7 @@ def test_what_moves_is_left_out() -> None:
         (WindowSettings, {"length": 1}, "at least two past states"),
         (WindowSettings, {"landmarks": 0}, "at least one slot"),
         (WindowSettings, {"estimated": ("weight",)}, "'weight' is no parameter"),
-        (EstimatorSettings, {"association": "guessed"}, "choose known or unknown"),
+        (EstimatorSettings, {"association": "guessed"}, "choose known, unknown"),
     ],
 )
 def test_settings_are_checked(settings: Any, wrong: dict[str, Any], words: str) -> None:

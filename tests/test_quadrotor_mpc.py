@@ -250,9 +250,9 @@ def test_arrival_needs_belief_and_truth(monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: draw_conditions(-1),
-        lambda: draw_conditions(0, 1.0),
-        lambda: draw_conditions(0, -0.1),
+        lambda: FlightSettings(seed=-1),
+        lambda: FlightSettings(mass_error=1.0),
+        lambda: FlightSettings(mass_error=-0.1),
         lambda: Flight(short(0.2, coupling="loose")),
         lambda: Flight(short(0.2, solver="newton")),
         lambda: Flight(short(0.2, movers=-1)),

@@ -4,7 +4,6 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -352,13 +351,10 @@ def test_estimates_and_controls_show_what_there_is(log: FlightLog) -> None:
     titles = [ax.get_title(loc="left") for ax in figure.axes if ax.get_title(loc="left")]
     assert len(titles) == 6 + 9 and titles[0].startswith("Mass, ends +0.0 %")
     assert "Position error, z, 4.0 cm rms; 100 % within 2\u03c3" in titles
-    with pytest.raises(ViewError, match="has no estimate"):
-        estimates(flight(estimated=False))
     panels = [ax for part in control(log).subfigs for ax in part.axes]
     assert len(panels) == 8
     lines = {float(np.asarray(line.get_ydata())[0]) for line in panels[3].get_lines()}
     assert {2.0, 20.0} <= lines  # limits of the thrust
-    assert len([ax for part in control(flight(estimated=False)).subfigs for ax in part.axes]) == 7
 
 
 def written(folder: Path, log: FlightLog, metrics: dict[str, Any]) -> list[Path]:
@@ -374,13 +370,3 @@ def test_results_leave_files_that_can_be_read_again(log: FlightLog, tmp_path: Pa
     assert flight_metrics(FlightLog.load(tmp_path / "flight.npz")) == flight_metrics(log)
     table = summary(log)
     assert "reached after 1.15 s" in table and "ipm, sequential, 7" in table and "mass error" in table
-
-
-def test_results_of_a_flight_without_estimate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(results, "write_figure", lambda path, figure, dpi: path)
-    monkeypatch.setattr(results, "flight_scene", lambda log: SimpleNamespace(save=lambda path: path))
-    plain = flight(estimated=False)
-    names = [path.name for path in written(tmp_path, plain, {"own": 1})]
-    assert names == ["scene.html", "control.png", "overview.png", "flight.npz", "metrics.json"]
-    assert json.loads((tmp_path / "metrics.json").read_text()) == {"own": 1}
-    assert "position error" not in summary(plain) and "mass error" not in summary(plain)

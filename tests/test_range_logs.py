@@ -27,7 +27,7 @@ from unifg.scenarios.ground.hypotheses import Hypothesis, gathered, mixed
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
-from unifg.scenarios.range_logs import opened
+from unifg.scenarios.range_logs import LogSettings
 from unifg.typing import Array
 
 ANYWHERE = Path("log")
@@ -424,17 +424,18 @@ def test_a_recorded_drive_needs_a_map_and_a_localiser(made: Path, capsys: pytest
     words = ["run", "navigation", "--log", str(made / "log.csv"), "--out", str(made / "none")]
     assert main(words) == 2 and "give --map" in capsys.readouterr().err
     assert main([*words, "--map", str(made / "map.yaml"), "--localiser", "my:Filter"]) == 2
-    assert "'graph' or 'amcl'" in capsys.readouterr().err
+    assert "choose graph, amcl" in capsys.readouterr().err
 
 
 @pytest.mark.product(2, of="large maps")
 def test_odometry_is_made_of_corrected_poses(made: Path) -> None:
-    one, again, other = (opened(made / "log.csv", None, True, seed) for seed in (4, 4, 5))
+    simulated = LogSettings(made / "log.csv", simulated_odometry=True)
+    one, again, other = (replace(simulated, seed=seed).opened() for seed in (4, 4, 5))
     assert one.corrected is not None
     np.testing.assert_array_equal(one.odometry, again.odometry)
     assert 0.1 < apart(one.odometry, one.corrected)[-1] and not np.allclose(one.odometry, other.odometry)
-    plain = opened(made / "log.csv", None, False, 0).odometry
-    mounted = opened(made / "log.csv", (0.3, 0.0, 0.2), False, 0).odometry
+    plain = LogSettings(made / "log.csv").opened().odometry
+    mounted = LogSettings(made / "log.csv", mount=(0.3, 0.0, 0.2)).opened().odometry
     np.testing.assert_allclose(SE2.between(plain, mounted), np.tile([0.3, 0.0, 0.2], (len(plain), 1)), atol=1e-12)
 
 

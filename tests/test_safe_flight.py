@@ -30,7 +30,7 @@ from unifg.scenarios.quadrotor.cbf_mpc import (
 from unifg.scenarios.quadrotor.flatness import TUNED, FlatnessController, Gains, flat_flight
 from unifg.scenarios.quadrotor.pace import Pace
 from unifg.scenarios.quadrotor.situations import SITUATIONS, situation
-from unifg.scenarios.quadrotor.state_filter import FilterStatistics, StateFilter
+from unifg.scenarios.quadrotor.state_filter import StateFilter
 from unifg.scenarios.quadrotor.weighing import Weighing, WeighingSettings
 from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
 from unifg.scenarios.simulation.body_rate import Airframe, BodyRatePlant
@@ -278,7 +278,7 @@ def test_the_filter_knows_better_than_the_sensors_and_how_well() -> None:
     air, seen, rng = DisturbanceModel(), np.array([1e-3, 3e-3, 1e-2]), np.random.default_rng(5)
     start = flat_flight(LINE.at(np.zeros(1)), quadrotor.Parameters())[0][0]
     plant, model = (BodyRatePlant(Airframe(), start, 0.01) for _ in range(2))
-    shake, estimate = Disturbances(air, rng), StateFilter(FilterStatistics(), 0.01)
+    shake, estimate = Disturbances(air, rng), StateFilter(0.01)
     told = np.array([0.0, 0.0, 0.0, quadrotor.GRAVITY])
     misses, raw, sizes = [], [], []
     for k in range(600):
@@ -344,8 +344,8 @@ def test_situations_are_what_they_are_called_and_a_seed_moves_them() -> None:
             start = one.path.at(np.zeros(1)).position
             assert one.bodies.nearest(np.tile(start, (2, 1)), np.array([0.0, 1e-3])).min() > 0.3
     assert len(situation("cluttered").bodies) >= 20
-    with pytest.raises(ScenarioError, match="unknown case 'flat': choose one of static"):
-        situation("flat")  # type: ignore[arg-type]
+    with pytest.raises(ScenarioError, match="unknown case 'flat': choose static"):
+        SafeSettings(case="flat")  # type: ignore[arg-type]
 
 
 @pytest.mark.product(4, of="drives and flights")
@@ -373,7 +373,7 @@ def test_who_is_asked_for_flies() -> None:
     labels = [flight.label for flight in flights(SafeSettings(case="figure8", speed=(1.0, 2.0)))]
     assert labels == ["1 m/s, barrier", "1 m/s, flatness", "2 m/s, barrier", "2 m/s, flatness"]
     assert [flight.label for flight in flights(SafeSettings(alpha=(0.5,), controller=("flatness",)))] == ["flatness"]
-    with pytest.raises(ScenarioError, match="unknown controller 'pilot': choose one of barrier, flatness, filter"):
+    with pytest.raises(ScenarioError, match="unknown controller 'pilot': choose barrier, flatness, filter"):
         flights(SafeSettings(controller=("pilot",)))  # type: ignore[arg-type]
 
 

@@ -18,8 +18,9 @@ from unifg.scenarios.commands.drives import summary
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.scenes import drive_plot
 from unifg.scenarios.scenes.drive_plot import overview, plot_localisation
-from unifg.scenarios.scenes.drive_scene import drive_scene, scan_points
+from unifg.scenarios.scenes.drive_scene import drive_scene
 from unifg.scenarios.scenes.panels import plot_times
+from unifg.scenarios.scenes.parts import lidar_hits
 from unifg.style.figures import write_figure
 from unifg.view.recorder import Recorder, viewer_script
 from unifg.view.shapes import cover, extrude, flat, known_corners, ribbon
@@ -145,9 +146,9 @@ def test_covariance_route_and_contacts_are_shown(page: str, log: EpisodeLog) -> 
 
 
 def test_scan_points_skip_dropouts_and_misses(log: EpisodeLog) -> None:
-    beams = np.arange(len(log.scan_angles))
-    points = scan_points(log, 4, beams)
-    assert len(points) == len(beams) - 2
+    points = lidar_hits(log.true_pose[4], log.scan[4], log.scan_angles, 0.6)
+    assert len(points) == len(log.scan_angles) - 2 and (points[:, 2] == 0.6).all()
+    points = points[:, :2]
     ranges = np.linalg.norm(points - log.true_pose[4, :2], axis=1)
     np.testing.assert_allclose(ranges, log.scan[4, 2:])
     first = log.true_pose[4, 2] + log.scan_angles[2]
@@ -175,7 +176,7 @@ def test_odd_episodes_are_drawn_too(log: EpisodeLog) -> None:
     paths = {command.get("path") for command in commands_of(drive_scene(lost).html())}
     assert not any(path and path.startswith(("/meshcat/horizon", "/meshcat/scan")) for path in paths)
     with pytest.raises(ViewError, match="no tick"):
-        drive_scene(replace(log, time=log.time[:0]))
+        drive_scene(replace(log, plan_ms=log.plan_ms[:0]))
 
 
 def test_recorder_makes_numpy_and_identifiers_plain() -> None:

@@ -46,7 +46,7 @@ def test_a_person_alone_takes_up_its_pace_as_the_forces_say() -> None:
     walker = person(way, 0.2, 1.2, field(hall()))
     assert walker.policy is not None
     for k in range(400):
-        walker.body.velocity = walker.policy.velocity(walker, FAR, False, PAUSE)
+        walker.body.velocity = walker.policy.velocity(walker, FAR, PAUSE)
         place, speed = walker.body.position, walker.body.velocity
         assert speed.x == pytest.approx(1.2 * (1.0 - math.exp(-(k + 1) * PAUSE / 0.5)), abs=0.01)
         walker.body.position = place + PAUSE * speed
@@ -96,8 +96,8 @@ def test_people_are_drawn_where_there_is_room() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"people": -1}, "people must be from 0 to 200"),
-        ({"people": 10**9}, "people must be from 0 to 200"),
+        ({"people": -1}, "people: '-1' is not a whole number"),
+        ({"people": 10**9}, "people: '1000000000' is more than 200"),
         ({"slowest": 2.0}, "slowest <= fastest"),
     ],
 )

@@ -137,25 +137,6 @@ def test_mover_keeps_its_pace_on_its_segment() -> None:
     assert world.discs()[0, 3] == 1.0
 
 
-@pytest.mark.parametrize("turning", [0.0, 0.6])
-def test_mover_waits_for_a_robot_at_rest(turning: float) -> None:
-    """It stops 0.1 m before a resting robot, in its way or beside it, and goes on when the robot has left."""
-    world = quiet_world((3.0, 2.1, math.pi / 2), Obstacle(np.array([4.5, 2.0]), 0.2, np.array([1.5, 2.0]), 0.3))
-    gaps = []
-    for _ in range(80):
-        world.step(0.0, turning)
-        gaps.append(world.clearance())
-    assert min(gaps) >= 0.1 - 1e-6
-    assert gaps[-1] == pytest.approx(0.1, abs=0.005)
-    assert world.collisions == 0
-    waiting = world.discs()[0, 0]
-    while abs(math.remainder(world.pose[2] - math.pi / 2, 2 * math.pi)) > 0.05:
-        world.step(0.0, 0.5)
-    for _ in range(15):
-        world.step(1.0, 0.0)
-    assert world.discs()[0, 0] < waiting - 0.2
-
-
 @pytest.mark.parametrize("yaw", [0.0, 0.7, -2.0])
 def test_lidar_measures_the_room(yaw: float) -> None:
     """Noiseless ranges equal the distance to the room's faces, also on a rotated map."""

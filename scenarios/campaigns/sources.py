@@ -10,7 +10,7 @@ from pathlib import Path
 
 __all__ = ["fingerprint"]
 
-COUNTED = (".py", ".pgm", ".png", ".yaml", ".csv")
+COUNTED = (".py", ".pgm", ".png", ".yaml", ".csv", ".json")
 _SIDES = ("unifg.solvers", "unifg.models", "unifg.scenarios")
 
 

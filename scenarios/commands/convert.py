@@ -43,7 +43,7 @@ def convert(source: Path, target: Path) -> str:
     known = {**GRAPHS, **TRAJECTORIES}
     if ending not in known:
         raise FileFormatError(f"{legible(target)}: no format ends in '{ending}': choose {', '.join(known)}, also .gz")
-    graph = _read_graph(source)
+    graph = None if _ending(source) in (".kitti", ".tum", ".csv") else read_pose_graph(source)
     if ending in TRAJECTORIES:
         time, poses = (_numbers(graph.poses), graph.poses) if graph else _read_trajectory(source)
         TRAJECTORIES[ending](target, time, poses)
@@ -62,11 +62,6 @@ def _ending(path: Path) -> str:
 def _numbers(poses: Array) -> Array:
     """Numbers of poses, in the place of times."""
     return np.arange(len(poses), dtype=np.float64)
-
-
-def _read_graph(path: Path) -> PoseGraph | None:
-    """The graph of a file, unless its ending is that of a trajectory."""
-    return None if _ending(path) in (".kitti", ".tum", ".csv") else read_pose_graph(path)
 
 
 def _read_trajectory(path: Path) -> tuple[Array, Array]:

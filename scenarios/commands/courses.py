@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from unifg.scenarios import course as courses
-from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.course import Course
 from unifg.scenarios.logs.metrics import of_solution, table, write_metrics
@@ -25,10 +25,7 @@ SETTINGS = courses.CourseSettings
 
 def run(settings: courses.CourseSettings, progress: Progress, announce: Announce | None = None) -> Outcome:
     """Optimise the flight that was asked for."""
-    tell = by_iterations(
-        progress, 0.95, lambda row: f"iteration {row.number}, cost {row.cost:.5g}, violation {row.violation:.1e}"
-    )
-    with watching_iterates(announce, course_stage(settings), course_iterate, tell) as watch:
+    with watching_iterates(announce, course_stage(settings), course_iterate, progress) as watch:
         course = courses.run_course(settings, progress=watch)
     progress(1.0, "solved")
     interrupted = course.solution.status is Status.INTERRUPTED

@@ -9,7 +9,7 @@ from unifg.scenarios import flight
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.flight_log import FlightLog
-from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
+from unifg.scenarios.logs.flight_metrics import flight_metrics
 from unifg.scenarios.logs.metrics import health, table, write_metrics
 from unifg.scenarios.scenes.flight_plot import control, estimates, overview
 from unifg.scenarios.scenes.flight_scene import flight_frame, flight_scene, flight_stage
@@ -43,16 +43,14 @@ def results(log: FlightLog, metrics: Mapping[str, object]) -> dict[str, Writer]:
         log: a flight; one without an estimate has no picture of it.
         metrics: what to write as metrics.
     """
-    files: dict[str, Writer] = {
+    return {
         "metrics.json": lambda path: write_metrics(path, metrics),
         "flight.npz": log.save,
         "overview.png": lambda path: write_figure(path, overview(log), 130),
+        "estimates.png": lambda path: write_figure(path, estimates(log), 120),
+        "control.png": lambda path: write_figure(path, control(log), 120),
+        "scene.html": lambda path: flight_scene(log).save(path),
     }
-    if has_estimate(log):
-        files["estimates.png"] = lambda path: write_figure(path, estimates(log), 120)
-    files["control.png"] = lambda path: write_figure(path, control(log), 120)
-    files["scene.html"] = lambda path: flight_scene(log).save(path)
-    return files
 
 
 def summary(log: FlightLog) -> str:
@@ -60,12 +58,11 @@ def summary(log: FlightLog) -> str:
     m = flight_metrics(log)
     settings = m["settings"]
     stopped = " (interrupted)" if m["interrupted"] else ""
-    words = [str(settings[key]) for key in ("solver", "coupling", "seed") if settings.get(key) is not None]
     arrival = m["time_to_goal_s"]
     target = f"{m['target_distance_m']:.2f} m away at the end" if arrival is None else f"reached after {arrival:.2f} s"
     rows = (
-        ("scenario", f"{settings.get('scenario', 'quadrotor')}, {m['layout']}"),
-        ("solver, coupling, seed", ", ".join(words)),
+        ("scenario", f"{settings['scenario']}, {m['layout']}"),
+        ("solver, coupling, seed", f"{settings['solver']}, {settings['coupling']}, {settings['seed']}"),
         ("target", target + stopped),
         ("outcome", "" if m["outcome"] in ("reached", "interrupted") else m["outcome"]),
         ("health", health(m) if any(log.health) else ""),

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from unifg.scenarios import manoeuvres
-from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.logs.metrics import write_metrics
 from unifg.scenarios.logs.solved_log import SolvedLog, held
-from unifg.scenarios.options import option
+from unifg.scenarios.options import Settings, option
 from unifg.scenarios.scenes.manoeuvre_plot import picture
 from unifg.scenarios.scenes.manoeuvre_scene import manoeuvre_iterate, manoeuvre_scene, manoeuvre_stage
 from unifg.solution.status import Status
@@ -23,7 +23,7 @@ __all__ = ["SETTINGS", "run"]
 
 
 @dataclass(frozen=True)
-class CaseSettings:
+class CaseSettings(Settings):
     """Settings of manoeuvres.
 
     Attributes:
@@ -48,9 +48,8 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
         def part(done: float, text: str, name: str = name, number: int = number) -> None:
             progress((number + done) / len(names), f"{name}: {text}")
 
-        tell = by_iterations(part, 0.9, lambda row: f"iteration {row.number}, cost {row.cost:.5g}")
         case = manoeuvres.CASES[name]
-        with watching_iterates(announce, manoeuvre_stage(case), manoeuvre_iterate, tell) as watch:
+        with watching_iterates(announce, manoeuvre_stage(case), manoeuvre_iterate, part) as watch:
             solved.append(manoeuvres.run_manoeuvre(case, settings.solver, progress=watch))
         interrupted = solved[-1].solution.status is Status.INTERRUPTED
         if interrupted:

@@ -7,7 +7,6 @@ from unifg.files.ros_map import save_map
 from unifg.scenarios import log_map
 from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.commands.replays import outcome_of
-from unifg.scenarios.range_logs import opened
 
 __all__ = ["SETTINGS", "run"]
 
@@ -16,8 +15,7 @@ SETTINGS = log_map.MapSettings
 
 def run(settings: log_map.MapSettings, progress: Progress) -> Outcome:
     """Make a map of a log."""
-    log = opened(settings.log, settings.mount, settings.simulated_odometry, settings.seed)
-    made, graph = log_map.map_log(log, settings, progress)
+    made, graph = log_map.map_log(settings.opened(), settings, progress)
     return outcome_of(
         made,
         {

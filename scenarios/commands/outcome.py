@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from unifg.scenarios.episode import Progress
-from unifg.solution.history import Iteration
 
 logger = logging.getLogger("unifg")
 if TYPE_CHECKING:
     from unifg.scenarios.logs.mcap_log import Log
 
-__all__ = ["Outcome", "Progress", "Writer", "by_iterations"]
+__all__ = ["Outcome", "Progress", "Writer"]
 
 Writer: TypeAlias = Callable[[Path], object]
 """Writes a file of this path."""
@@ -62,18 +61,3 @@ class Outcome:
             write(folder / name)
         progress(1.0, "done")
         return [folder / name for name in reversed(self.files)]
-
-
-def by_iterations(progress: Progress, pace: float, say: Callable[[Iteration], str]) -> Callable[[Iteration], None]:
-    """A callback of a solver that tells of its progress.
-
-    Args:
-        progress: to be told.
-        pace: share of the remainder that each iteration leaves, as their number is unknown.
-        say: the word about an iteration.
-    """
-
-    def tell(row: Iteration) -> None:
-        progress(1.0 - pace**row.number, say(row))
-
-    return tell

@@ -13,7 +13,7 @@ from unifg.files.tum import write_tum
 from unifg.scenarios import log_drive
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.logs.metrics import errors, spread, table, write_metrics
-from unifg.scenarios.range_logs import LogRun, opened
+from unifg.scenarios.range_logs import LogRun
 from unifg.scenarios.scenes.log_scene import log_scene, picture
 from unifg.style.figures import write_figure
 
@@ -24,8 +24,7 @@ SETTINGS = log_drive.LocaliseSettings
 
 def run(settings: log_drive.LocaliseSettings, progress: Progress) -> Outcome:
     """Follow a log on a map."""
-    log = opened(settings.log, settings.mount, settings.simulated_odometry, settings.seed)
-    return outcome_of(log_drive.localise(log, load_map(settings.map), settings, progress))
+    return outcome_of(log_drive.localise(settings.opened(), load_map(settings.map), settings, progress))
 
 
 def outcome_of(made: LogRun, more: Mapping[str, Writer] | None = None) -> Outcome:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.scenarios import velocity_tracking
-from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, by_iterations
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.commands.watching import Announce, watching_iterates
 from unifg.scenarios.logs.metrics import write_metrics
 from unifg.scenarios.logs.solved_log import SolvedLog, held
@@ -21,8 +21,7 @@ SETTINGS = velocity_tracking.TrackingSettings
 
 def run(settings: velocity_tracking.TrackingSettings, progress: Progress, announce: Announce | None = None) -> Outcome:
     """Solve the whole drive."""
-    tell = by_iterations(progress, 0.7, lambda row: f"iteration {row.number}, cost {2.0 * row.cost:.8g}")
-    with watching_iterates(announce, velocity_stage(settings), lambda frame, row: None, tell) as watch:
+    with watching_iterates(announce, velocity_stage(settings), lambda frame, row: None, progress) as watch:
         drive = velocity_tracking.run_tracking(settings, progress=watch)
     progress(1.0, "solved")
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeAlias
 
+from unifg.scenarios.episode import Progress
 from unifg.scenarios.logs.columns import SoFar, watched
 from unifg.scenarios.scenes.numbers import Number, declare, show
 from unifg.solution.history import Iteration
@@ -13,6 +14,7 @@ from unifg.view import Frame, Live, Scene
 
 __all__ = ["Announce", "watching_iterates", "watching_ticks"]
 
+REMAINDER = 0.9  # that an iteration leaves
 Announce: TypeAlias = Callable[[str], None]
 """Receives the address of the scene; None without a viewer."""
 
@@ -69,7 +71,7 @@ def watching_ticks(
 
 @contextmanager
 def watching_iterates(
-    announce: Announce | None, scene: Scene, draw: Callable[[Frame, Iteration], None], tell: Callable[[Iteration], None]
+    announce: Announce | None, scene: Scene, draw: Callable[[Frame, Iteration], None], progress: Progress
 ) -> Iterator[Callable[[Iteration], None]]:
     """Callback of a solver that tells of every iterate and shows it, where there is a viewer.
 
@@ -77,8 +79,13 @@ def watching_iterates(
         announce: see `Announce`.
         scene: with what stays.
         draw: what an iterate shows, besides its numbers.
-        tell: called with every iterate.
+        progress: told of every iterate; as their number is unknown, each leaves the same share of the remainder.
     """
+
+    def tell(row: Iteration) -> None:
+        text = f"iteration {row.number}, cost {row.cost:.6g}, violation {row.violation:.1e}"
+        progress(1.0 - REMAINDER**row.number, text)
+
     if announce is None:
         yield tell
         return

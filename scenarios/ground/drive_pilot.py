@@ -9,7 +9,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 import unifg as fg
-from unifg.errors import ScenarioError, UnifgError
+from unifg.errors import UnifgError
 from unifg.files.ros_map import OccupancyMap
 from unifg.horizon import Plan
 from unifg.models.distance_map import DistanceMap
@@ -68,7 +68,6 @@ class Pilot(Generic[PlannerT]):
         relocated: whether the last tick has found the robot at another place.
         slowed: true if the emergency stop has changed the control of the last tick.
         driven: (m,) control of the last tick.
-        search_said: why the last search has not found the robot, "" where it has.
         calibration: slow states of the sensors.
         recalibrated: true if one of them has jumped in the last tick.
         planless: whether no solve is to give a plan: a planner that is out of time.
@@ -91,20 +90,15 @@ class Pilot(Generic[PlannerT]):
         self.clock = Stopwatch()
         self.pose = estimator.pose
         self.validator, self.supervisor = Validator(beams), Supervisor(RAMPS)
-        self.emergency_stop = EmergencyStop(s.hull, self._braking(s), s.dt, s.kind)
+        self.emergency_stop = EmergencyStop(s.hull, (float(s.most[0]) / s.dt, s.accelerations[1]), s.dt, s.kind)
         self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
         self.driven = np.zeros(s.kind.size)
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
         self._signals = DriveSignals(s.dt, s.most, s.kind)
         self.calibration, self.recalibrated = Calibration(distance_map, s.dt, s.kind), False
-        self._pause, self.search_said = 0, ""
+        self._pause = 0
         self._awake, self._failed = False, ""
         self._first: Scan | None = None
-
-    @staticmethod
-    def _braking(settings: ControllerSettings) -> tuple[float, float]:
-        """Decelerations, moving and turning [m/s^2, rad/s^2]."""
-        return float(settings.most[0]) / settings.dt, settings.accelerations[1]
 
     @property
     def verdict(self) -> HealthReport:
@@ -290,7 +284,6 @@ class Pilot(Generic[PlannerT]):
         if result is None:
             return
         self._pause = SEARCH_AGAIN
-        self.search_said = result.cause
         if result.pose is None:
             return
         self.estimator.reset(result.pose, FOUND_SIGMA)
@@ -327,15 +320,13 @@ def make_pilot(
         beams: number of beams in a scan.
 
     Raises:
-        ScenarioError: for an unknown coupling.
+        BackendError: for an unknown solver.
     """
     estimator: Estimator
     if coupling == "sequential":
         estimator = Localiser(distance_map, pose, sigma, beams, settings.kind)
         controller = Controller(distance_map, solver, settings)
-    elif coupling == "joint":
+    else:
         estimator = smoother = Smoother(distance_map, pose, sigma, beams, settings.dt, base=settings.kind)
         controller = Controller(distance_map, solver, settings, smoother.window)
-    else:
-        raise ScenarioError(f"unknown coupling '{coupling}': choose {' or '.join(COUPLINGS)}")
     return Pilot(estimator, controller, DiscTracker(distance_map), occupancy, distance_map, beams)

@@ -12,7 +12,7 @@ import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.models.footprint import Body, body_of
 from unifg.models.planar import Base, base_of
-from unifg.scenarios.options import checked, option, positive
+from unifg.scenarios.options import Settings, checked, option, positive
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -28,7 +28,7 @@ SEARCH = 5  # iterations with the tangent vector
 
 
 @dataclass(frozen=True)
-class ControllerSettings:
+class ControllerSettings(Settings):
     """Weights and limits of the controller.
 
     Attributes:
@@ -108,14 +108,12 @@ class ControllerSettings:
 
     def __post_init__(self) -> None:
         """Refuse an unknown base or way of avoiding things."""
+        super().__post_init__()
         base_of(self.base)
         if self.body:
             object.__setattr__(self, "robot_radius", self.hull.radius)
         if not self.hull.round and self.avoidance in ("potential", "vortex"):
             raise ScenarioError(f"avoidance '{self.avoidance}' is one of discs about their axis; leave --body out")
-        for name, value, known in (("avoidance", self.avoidance, AVOIDANCES), ("futures", self.futures, FUTURES)):
-            if value not in known:
-                raise ScenarioError(f"unknown {name} '{value}': choose {', '.join(known)}")
         if not (self.tails >= 2 and 1 <= self.shared < self.horizon):
             raise ScenarioError(
                 f"a tree has two tails or more, and shares 1 to {self.horizon - 1} of {self.horizon} steps: found "

@@ -23,7 +23,6 @@ RAMPS: Mapping[str, Ramp] = {
     "blind": Ramp("the lidar sees nothing in a sector", 0.15, 1.0, least=0.3),  # [rad]
     "spread": Ramp("where it is, is known to decimetres only", 0.12, 0.35, lost=0.5),  # [m]
     "plan": Ramp("no plan", 0.45, 1.0, least=0.3),  # [s] since the last; at rest there is nothing to plan from
-    "tick": Ramp("ticks take longer than they last", 1.0, 3.0, least=0.3),  # durations of a tick
     "wheels": Ramp("the robot does not do what it is told", 0.3, 0.5),  # share
     "lag": Ramp("the motors follow late", 0.05, 0.3, least=0.5),  # [s]; half as fast, braking is as short as without
     "slip": Ramp("the wheels slip", 0.25, 0.6, least=0.4),  # share of the way
@@ -62,7 +61,7 @@ class DriveSignals:
         self._sides = np.array([[1.0, 1.0], [-ARM, ARM]])
         if base.slides:
             self._sides = np.array([[1.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-ARM, ARM, 0.0]])
-        self._fix = self._plan = self._odometry = self._took = 0.0
+        self._fix = self._plan = self._odometry = 0.0
         self._share, self._spread, self._blind = 1.0, 0.0, 0.0
         self._asked: deque[Array] = deque([base.of(np.zeros(base.size))], maxlen=LATELY)
         self._missed: deque[float] = deque(maxlen=AGREE)
@@ -153,10 +152,6 @@ class DriveSignals:
         """Record if the tick has a plan of its own."""
         self._plan = 0.0 if sound else self._plan + self._dt
 
-    def took(self, seconds: float) -> None:
-        """Record the duration of the last tick [s], where that is to count."""
-        self._took = seconds
-
     def _misses(self, did: Array) -> float:
         """Share by which body velocities (k,) miss the recent commands of one wheel."""
         told, made = np.array(self._asked) @ self._sides, did @ self._sides
@@ -178,7 +173,6 @@ class DriveSignals:
             "blind": self._blind,
             "spread": self._spread,
             "plan": self._plan,
-            "tick": self._took / self._dt,
             "wheels": HELD if self._held or self._off else self._distrust(),
             "lag": self.motors.seconds,
             "slip": slip,

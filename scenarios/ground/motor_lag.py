@@ -14,7 +14,6 @@ from collections import deque
 
 import numpy as np
 
-from unifg.errors import ScenarioError
 from unifg.models import unicycle
 from unifg.models.planar import Base
 from unifg.scenarios.simulation.drivetrain import followed
@@ -43,16 +42,7 @@ class MotorLag:
             dt: duration of a tick [s].
             most: (m,) greatest changes of the controls in a tick by the data sheet.
             base: that moves.
-
-        Raises:
-            ScenarioError: a number that no base can have.
         """
-        if not (math.isfinite(dt) and dt > 0.0):
-            raise ScenarioError(f"a tick must last a finite, positive time, got {dt!r} s")
-        if np.shape(most) != (base.size,) or not (np.isfinite(most).all() and np.min(most) >= 0.0):
-            raise ScenarioError(
-                f"greatest changes of the controls must be {base.size} finite numbers >= 0, got {most!r}"
-            )
         self._dt, self._most, self._base = dt, most, base
         self._velocities = np.zeros((len(LAGS), base.size))
         self._evidence = np.zeros(len(LAGS))

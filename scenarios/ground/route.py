@@ -83,7 +83,6 @@ class Route:
 
     Attributes:
         path: (P, 3) present path [m, m, rad].
-        repairs: number of detours planned so far.
         blocked: why there is no use going on; None as long as there may be.
         searched: ticks for which the search of now has gone on; the robot keeps to its path meanwhile.
     """
@@ -122,7 +121,7 @@ class Route:
         self._body = body or Body.disc(robot_radius)
         self._oriented = base.turning_radius > 0.0 or not self._body.round
         self._wall_gap, self._disc_gap = wall_gap, disc_gap
-        self.repairs = self.searched = 0
+        self.searched = 0
         self._search: Generator[int, None, bool] | None = None
         self.blocked: Blocked | None = None
         self._rest = self._since_anywhere = 0
@@ -291,7 +290,6 @@ class Route:
         points = points[np.append(True, np.hypot(*np.diff(points, axis=0).T) > STANDING_GAP)]
         onward = headed(resample(points, SPACING), float(self.path[index, 2]))
         self._follow(np.concatenate([onward[:-1], self.path[index:]]))
-        self.repairs += 1
         return True
 
     def _round_about(self, pose: Array, staying: Tracks, place: Array) -> Generator[int, None, bool]:
@@ -365,7 +363,6 @@ class Route:
         except ScenarioError:
             return False  # the controller stops before the disc; the next scan may see a way
         self._follow(np.concatenate([detour[:-1], self.path[index:]]))
-        self.repairs += 1
         return True
 
     def _window(self, corners: Array) -> tuple[OccupancyMap, DistanceMap]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -11,15 +10,34 @@ import numpy as np
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.footprint import Body, body_of
 from unifg.scenarios.logs.columns import column, ragged, words
-from unifg.scenarios.logs.stored import StoredLog
-from unifg.scenarios.monitoring.assumptions import Assumed, Judgement, judged
+from unifg.scenarios.logs.vehicle_log import VehicleLog
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["EpisodeLog"]
+__all__ = ["Assumed", "EpisodeLog"]
 
 
-@dataclass(kw_only=True)
-class EpisodeLog(StoredLog):
+@dataclass(frozen=True)
+class Assumed:
+    """Constant assumptions of a drive.
+
+    Attributes:
+        sigmas: standard deviations of the estimate that clearances are wider by.
+        wall_gap, disc_gap: clearances beyond these [m].
+        deceleration: of the brakes, by the data sheet [m/s^2].
+        ahead: time for which a mover may do anything within its bound before the robot is at rest [s].
+        unseen: "free": space that no beam has looked into, but for blind sectors, which are occupied.
+    """
+
+    sigmas: float
+    wall_gap: float
+    disc_gap: float
+    deceleration: float
+    ahead: float
+    unseen: str = "free"
+
+
+@dataclass(kw_only=True, eq=False)
+class EpisodeLog(VehicleLog):
     """One episode of T ticks with a horizon of N steps, K true obstacles and G goals.
 
     Columns share the leading axis T. Row k holds what was true, estimated and decided at ``time[k]``;
@@ -32,21 +50,16 @@ class EpisodeLog(StoredLog):
         path: (P, 3) planned path over all goals, world frame [m, m, rad].
         goals: (G, 3) goal poses [m, m, rad].
         start: (3,) true start pose [m, m, rad].
-        dt: control period [s].
         robot_radius: radius of the robot's disc, or of the largest disc of its body [m].
         solver: name of the backend, or of the planner in its place.
         coupling: how estimation and control were joined, such as ``"sequential"``.
         seed: seed of the episode.
         scan_angles: (B,) beam angles in the body frame [rad].
-        collisions: distinct contact events of the episode.
         reached: one flag per goal.
         obstacle_moves: (K,) True for obstacles that move.
         control_limits: greatest absolute values of the controls.
         scenario: name of the scenario.
-        interrupted: the user stopped the episode before its end.
         outcomes: what has become of every goal, in words.
-        dropped: samples that were not let in, by what was wrong with them.
-        subproblems: quadratic programs of plans by the solver that solved them; empty for backends without any.
         faults: what was made to go wrong.
         obstacles_wanted: unforeseen obstacles that were asked for; fewer may have found a place.
         base: kind of base of the robot.
@@ -61,21 +74,16 @@ class EpisodeLog(StoredLog):
     path: Array
     goals: Array
     start: Array
-    dt: float
     robot_radius: float
     solver: str
     coupling: str
     seed: int
     scan_angles: Array
-    collisions: int
     reached: list[bool]
     obstacle_moves: BoolArray
     control_limits: tuple[float, ...] = (1.0, 1.0)
     scenario: str = "navigation"
-    interrupted: bool = False
     outcomes: list[str] = field(default_factory=list)
-    dropped: dict[str, int] = field(default_factory=dict)
-    subproblems: dict[str, int] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
     obstacles_wanted: int = 0
     base: str = "unicycle"
@@ -108,31 +116,22 @@ class EpisodeLog(StoredLog):
     solve_ms: Array = column("ms")
     """Localise and plan together."""
     localise_ms: Array = column("ms")
-    plan_ms: Array = column("ms")
     perceive_ms: Array = column("ms")
     """Update of the tracked obstacles."""
     route_ms: Array = column("ms")
     """Repair of the global route, most often nothing."""
-    compiled: IntArray = column("functions", dtype=np.intp)
-    """Functions compiled, or read from the disk, in the tick: none, once the robot has been woken."""
     localisation_iterations: IntArray = column("iterations", dtype=np.intp)
     plan_iterations: IntArray = column("iterations", dtype=np.intp)
     status: list[str] = words()
     """Of the plan, ``"converged"`` when all is well."""
     bound_violation: Array = column()
     """Worst violation of a control bound by the plan that is driven, as the solver returned it, before any clipping."""
-    clearance: Array = column("m")
-    """Distance from the robot's hull to the nearest thing."""
     contacts: IntArray = column("events", dtype=np.intp)
     """Contacts so far."""
     goal_index: IntArray = column(dtype=np.intp)
     """Goal being approached."""
-    emergency: BoolArray = column(dtype=np.bool_)
-    """True where the robot braked or got out of the way because there was no plan."""
     rescued: BoolArray = column(dtype=np.bool_)
     """True where the plan is that of the second backend, asked because the first had none."""
-    health: list[str] = words()
-    """What the supervisor makes of the robot: "ok", "degraded" or "lost"."""
     cause: list[str] = words()
     """Why it is not well."""
     allowed: Array = column("share")
@@ -143,8 +142,6 @@ class EpisodeLog(StoredLog):
     """True where beams alone have slowed the robot below what was planned."""
     power_off: BoolArray = column(dtype=np.bool_)
     """True where the robot asks for the power of its motors to be cut."""
-    fault: list[str] = words()
-    """What was made to go wrong just then."""
 
     @property
     def tick_ms(self) -> Array:
@@ -155,11 +152,6 @@ class EpisodeLog(StoredLog):
     def hull(self) -> Body:
         """Body of the robot."""
         return body_of(self.body) if self.body else Body.disc(self.robot_radius)
-
-    @cached_property
-    def judgement(self) -> Judgement:
-        """Assumptions that were broken, and the causes of contacts."""
-        return judged(self)
 
     @property
     def succeeded(self) -> bool:

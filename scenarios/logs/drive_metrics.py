@@ -10,6 +10,7 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.lie import SE2, wrap_angle
+from unifg.scenarios.logs.assumptions import judged
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.metrics import spread, statistics, timing
 from unifg.scenarios.planning.polyline import path_length
@@ -46,7 +47,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
     length = path_length(log.true_pose)
     position, heading = pose_errors(log.estimate, log.true_pose)
     odometry_position, odometry_heading = pose_errors(log.dead_reckoning, log.true_pose)
-    emergencies = int(np.count_nonzero(log.emergency))
+    emergencies, judgement = int(np.count_nonzero(log.emergency)), judged(log)
     return {
         "scenario": log.scenario,
         "map": log.occupancy.name,
@@ -63,9 +64,9 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "obstacles": int(log.obstacles.shape[1]),
         "obstacles_wanted": int(log.obstacles_wanted),
         "collisions": int(log.collisions),
-        "contacts": [asdict(contact) for contact in log.judgement.contacts],
-        "broken_assumptions": log.judgement.ticks,
-        "beyond_sigma": log.judgement.beyond_sigma,
+        "contacts": [asdict(contact) for contact in judgement.contacts],
+        "broken_assumptions": judgement.ticks,
+        "beyond_sigma": judgement.beyond_sigma,
         "steps": log.ticks,
         "duration_s": float(duration),
         "path_length_m": length,

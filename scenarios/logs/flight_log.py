@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from unifg.scenarios.logs.columns import column, ragged, words
-from unifg.scenarios.logs.stored import StoredLog
+from unifg.scenarios.logs.vehicle_log import VehicleLog
 from unifg.scenarios.simulation.layouts import Layout
-from unifg.typing import Array, ArrayLike, BoolArray, IntArray
+from unifg.typing import Array, ArrayLike, IntArray
 
 __all__ = ["LANDMARK", "FlightLog", "landmark_rows"]
 
@@ -25,8 +25,8 @@ def landmark_rows(ids: ArrayLike, means: ArrayLike, covariances: ArrayLike, radi
     return rows
 
 
-@dataclass(kw_only=True)
-class FlightLog(StoredLog):
+@dataclass(kw_only=True, eq=False)
+class FlightLog(VehicleLog):
     """One flight of T ticks with horizons of N steps among K moving obstacles.
 
     Row k holds what was true, believed and decided at ``time[k]``; ``controls[k]`` is held over ``[time[k], time[k] +
@@ -36,28 +36,18 @@ class FlightLog(StoredLog):
     Attributes:
         layout: start, target and what stands between.
         settings: everything that says how the flight was made (solver, coupling, seed, ...); JSON values.
-        dt: control period [s].
         parameters_true: (7,).
-        collisions: distinct contact events of the flight.
         reached: the target was reached.
-        interrupted: the user stopped the flight before its end.
         outcome: of the flight, in words.
-        dropped: samples that were not let in, by what was wrong with them.
-        subproblems: quadratic programs of plans by the solver that solved them; empty for backends without any.
     """
 
     KIND: ClassVar[str] = "unifg flight log 4"
 
     layout: Layout
     settings: dict[str, Any]
-    dt: float
     parameters_true: Array
-    collisions: int
     reached: bool
-    interrupted: bool = False
     outcome: str = ""
-    dropped: dict[str, int] = field(default_factory=dict)
-    subproblems: dict[str, int] = field(default_factory=dict)
 
     truth: Array = column("m, 1, m/s", 10)
     believed: Array = column("m, 1, m/s", 10)
@@ -79,21 +69,10 @@ class FlightLog(StoredLog):
     movers: Array = column("m", None, 3)
     """Moving obstacles: x, y, radius."""
     estimate_ms: Array = column("ms")
-    plan_ms: Array = column("ms")
-    compiled: IntArray = column("functions", dtype=np.intp)
-    """Functions compiled, or read from the disk, in the tick: none, once the pilot has been woken."""
     statuses: list[str] = words()
     """Of the plan."""
-    emergency: BoolArray = column(dtype=np.bool_)
-    """True where no new plan was to be had and a stored one was flown."""
-    clearance: Array = column("m")
-    """Distance from the hull to the nearest obstacle or the floor."""
-    health: list[str] = words()
-    """State by the supervisor: "ok", "degraded" or "lost"; "" without one."""
     causes: list[str] = words()
     """Cause of a state that is not "ok"."""
-    fault: list[str] = words()
-    """Injected fault of the tick."""
 
     @property
     def time(self) -> Array:

@@ -14,6 +14,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -37,6 +38,7 @@ Message: TypeAlias = tuple[str, dict[str, Any]]
 _WORLD, _ESTIMATE = "map", "estimate"
 _UNSIGNED_BYTE = 1  # foxglove.NumericType
 _TICK = "unifg.Tick"
+_PUBLISHED = Path(__file__).with_name("foxglove.json")  # schemas of Foxglove
 
 
 @dataclass(frozen=True)
@@ -119,10 +121,14 @@ def write_mcap(path: str | os.PathLike[str], log: Log) -> None:
         writer = Writer(file)
         writer.start(profile="", library="unifg")
         schemas, channels = dict[str, int](), dict[str, int]()
+        numbers = {name: {"description": columns(log)[name].unit} for name in _plain(log)}
+        known: dict[str, Any] = json.loads(_PUBLISHED.read_text(encoding="utf-8"))
+        known[_TICK] = {"type": "object", "properties": numbers}
         for number, (moment, (topic, content)) in enumerate(_messages(log)):
             name = _SCHEMA_OF.get(topic, "foxglove.PosesInFrame")
             if name not in schemas:
-                data = json.dumps(_schema(name, log)).encode()
+                schema = {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": name, **known[name]}
+                data = json.dumps(schema).encode()
                 schemas[name] = writer.register_schema(name=name, encoding="jsonschema", data=data)
             if topic not in channels:
                 channels[topic] = writer.register_channel(topic, "json", schemas[name])
@@ -268,61 +274,6 @@ def _timestamp(moment: float) -> dict[str, int]:
     return {"sec": seconds, "nsec": nanoseconds}
 
 
-def _object(**properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties}
-
-
-def _array(items: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "array", "items": items}
-
-
-def _schema(name: str, log: Log) -> dict[str, Any]:
-    """JSON schema of a message."""
-    if name == _TICK:
-        units = {key: column.unit for key, column in columns(log).items()}
-        schema = _object(**{key: {"description": units[key]} for key in _plain(log)})
-    else:
-        schema = _SCHEMAS[name]
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": name, **schema}
-
-
-_NUMBER, _INTEGER, _STRING, _BOOLEAN = ({"type": kind} for kind in ("number", "integer", "string", "boolean"))
-_TIME = _object(sec=_INTEGER, nsec=_INTEGER)
-_VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE = _object(position=_VECTOR, orientation=_QUATERNION)
-_COLOUR = _object(r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
-_CYLINDER = _object(pose=_POSE, size=_VECTOR, bottom_scale=_NUMBER, top_scale=_NUMBER, color=_COLOUR)
-_SPHERE = _object(pose=_POSE, size=_VECTOR, color=_COLOUR)
-_ENTITY = _object(
-    timestamp=_TIME, frame_id=_STRING, id=_STRING, lifetime=_TIME, frame_locked=_BOOLEAN,
-    metadata=_array(_object(key=_STRING, value=_STRING)),
-    **{kind: _array({"cylinders": _CYLINDER, "spheres": _SPHERE}.get(kind, _object())) for kind in _SHAPES},
-)  # fmt: skip
-_SCHEMAS = {
-    "foxglove.FrameTransforms": _object(
-        transforms=_array(
-            _object(
-                timestamp=_TIME, parent_frame_id=_STRING, child_frame_id=_STRING, translation=_VECTOR,
-                rotation=_QUATERNION,
-            )
-        )
-    ),
-    "foxglove.Grid": _object(
-        timestamp=_TIME, frame_id=_STRING, pose=_POSE, column_count=_INTEGER, cell_size=_object(x=_NUMBER, y=_NUMBER),
-        row_stride=_INTEGER, cell_stride=_INTEGER,
-        fields=_array(_object(name=_STRING, offset=_INTEGER, type=_INTEGER)),
-        data={"type": "string", "contentEncoding": "base64"},
-    ),
-    "foxglove.PosesInFrame": _object(timestamp=_TIME, frame_id=_STRING, poses=_array(_POSE)),
-    "foxglove.LaserScan": _object(
-        timestamp=_TIME, frame_id=_STRING, pose=_POSE, start_angle=_NUMBER, end_angle=_NUMBER,
-        ranges=_array(_NUMBER), intensities=_array(_NUMBER),
-    ),
-    "foxglove.SceneUpdate": _object(
-        deletions=_array(_object(timestamp=_TIME, type=_INTEGER, id=_STRING)), entities=_array(_ENTITY)
-    ),
-}  # fmt: skip
 _SCHEMA_OF = {
     "/tf": "foxglove.FrameTransforms", "/map": "foxglove.Grid", "/scan": "foxglove.LaserScan", "/tick": _TICK,
     "/obstacles": "foxglove.SceneUpdate", "/tracked": "foxglove.SceneUpdate",

@@ -1,7 +1,7 @@
 """Numbers of runs: statistics of declared columns, and the JSON file they end in.
 
 Everything measured by a clock lives under keys that end in ``_ms``; the rest depends on settings and seed alone, so two
-runs of the same seed compare equal after `without_timings`.
+runs of the same seed have the same numbers there.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ __all__ = [
     "strict",
     "table",
     "timing",
-    "without_timings",
     "write_metrics",
 ]
 
@@ -73,11 +72,6 @@ def collision_words(count: int) -> str:
 def one_graph(coupling: object) -> str:
     """Part of a title, where estimation and control are joined."""
     return ", one graph estimates and plans" if coupling == "joint" else ""
-
-
-def without_timings(metrics: Mapping[str, object]) -> dict[str, object]:
-    """The metrics that settings and seed determine: all but the keys that end in ``_ms``."""
-    return {key: value for key, value in metrics.items() if not key.endswith("_ms")}
 
 
 def of_solution(solution: Solution) -> dict[str, Any]:

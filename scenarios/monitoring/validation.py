@@ -8,53 +8,34 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.typing import Array, BoolArray
 
-__all__ = ["ValidationSettings", "Validator", "first_true"]
+__all__ = ["Validator", "first_true"]
 
 EARLY = 1e-6  # [s] by which a stamp may lie ahead of the clock
-
-
-@dataclass(frozen=True)
-class ValidationSettings:
-    """Limits of valid samples.
-
-    Attributes:
-        min_range: a beam that comes back from nearer has met nothing [m].
-        max_range: beams longer than this say nothing about the map [m].
-        min_beams: beams between these that a scan must have.
-        max_age: a scan older than this says where the robot was, not where it is [s].
-        moved: distance [m] and turn [rad] after which a scan that repeats the last one, bit by bit, is none.
-        max_speed: greatest |v| [m/s] and |omega| [rad/s] that wheels can report.
-        max_specific_force: greatest specific force [m/s^2] and body rate [rad/s] that a reading can hold.
-    """
-
-    min_range: float = 0.01
-    max_range: float = 10.0
-    min_beams: int = 20
-    max_age: float = 0.15
-    moved: tuple[float, float] = (0.005, 0.005)
-    max_speed: tuple[float, float] = (5.0, 10.0)
-    max_specific_force: tuple[float, float] = (500.0, 50.0)
+MIN_RANGE, MAX_RANGE = 0.01, 10.0  # [m]; a beam from nearer has met nothing, a longer one says nothing about the map
+MIN_BEAMS = 20  # between these that a scan must have
+MAX_AGE = 0.15  # [s]; an older scan says where the robot was, not where it is
+MOVED = (0.005, 0.005)  # [m, rad] after which a scan that repeats the last one, bit by bit, is none
+MAX_SPEED = (5.0, 10.0)  # [m/s, rad/s] that wheels can report
+MAX_SPECIFIC_FORCE = (500.0, 50.0)  # [m/s^2], and body rate [rad/s], that a reading can hold
 
 
 class Validator:
     """Looks at samples.
 
     Attributes:
-        settings: what they can be.
         dropped: how many were not let in, by what was wrong with them.
         refused: what was wrong with the last sample of each sensor; no entry where it was let in.
     """
 
     def __init__(self, beams: int = 0) -> None:
         """Expect scans of so many beams."""
-        self.settings = ValidationSettings()
         self.dropped: Counter[str] = Counter()
         self.refused: dict[str, str] = {}
         self._beams = beams
@@ -81,27 +62,27 @@ class Validator:
         ranges, angles = _numbers(scan.ranges, (self._beams,)), _numbers(scan.angles, (self._beams,))
         if ranges is None or angles is None or not np.isfinite(angles).all():
             return None, "not the size of a scan"
-        s, stamp = self.settings, now if scan.time is None else _number(scan.time)
-        measured = np.isfinite(ranges) & (ranges >= s.min_range) & (ranges <= s.max_range)
+        stamp = now if scan.time is None else _number(scan.time)
+        measured = np.isfinite(ranges) & (ranges >= MIN_RANGE) & (ranges <= MAX_RANGE)
         wrong = first_true(
             (math.isnan(stamp), "its time is not a number"),
             (stamp > now + EARLY, "from the future"),
-            (now - stamp > s.max_age + EARLY, "too old"),
+            (now - stamp > MAX_AGE + EARLY, "too old"),
             (scan.time is not None and stamp <= self._time, "not newer than the last"),
             (self._repeats(ranges), "the last one once more"),
-            (measured.sum() < s.min_beams, _emptiness(ranges, s.min_range)),
+            (measured.sum() < MIN_BEAMS, _emptiness(ranges, MIN_RANGE)),
         )
         if wrong:
             return None, wrong
         self._last, self._since[:] = ranges.copy(), 0.0
         self._time = stamp
         turn = _number(scan.turn)
-        turn = turn if 0.0 <= turn <= s.max_age else 0.0
-        return Scan(angles, np.where(ranges >= s.min_range, ranges, np.nan), stamp, turn), ""
+        turn = turn if 0.0 <= turn <= MAX_AGE else 0.0
+        return Scan(angles, np.where(ranges >= MIN_RANGE, ranges, np.nan), stamp, turn), ""
 
     def _repeats(self, ranges: Array) -> bool:
         """Return True if noise has not changed a single beam though the robot has moved."""
-        if self._last is None or not (self._since > self.settings.moved).any():
+        if self._last is None or not (self._since > MOVED).any():
             return False
         return np.array_equal(ranges, self._last, equal_nan=True)
 
@@ -115,7 +96,7 @@ class Validator:
             applied: (m,) asked for since the last tick.
             dt: duration [s].
         """
-        size, (speed, turning) = len(applied), self.settings.max_speed
+        size, (speed, turning) = len(applied), MAX_SPEED
         found = _numbers(measured, (size,))
         numbers = np.zeros(size) if found is None else found
         wrong = first_true(
@@ -143,7 +124,7 @@ class Validator:
         """
         sightings, wrong = _sightings(reading)
         self._note("detector", wrong)
-        force, rates = self.settings.max_specific_force
+        force, rates = MAX_SPECIFIC_FORCE
         inertial = reading is not None and _bounded(reading.rates, 3, rates) and _bounded(reading.force, 3, force)
         self._note("inertial unit", "" if inertial else "not three numbers that can be")
         if reading is None:

@@ -16,32 +16,15 @@ from unifg.scenarios.perception.readings import Reading
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.typing import Array, IntArray
 
-__all__ = ["LineTracker", "TrackerSettings"]
+__all__ = ["LineTracker"]
 
 
-@dataclass(frozen=True)
-class TrackerSettings:
-    """Settings of the tracks.
-
-    Attributes:
-        memory: age of the oldest detection that counts [s].
-        patience: for which a track that is not seen goes on [s].
-        least: detections before a velocity is believed; until then a disc stands.
-        gate: greatest distance of a detection from where its track is expected [m]; for unknown association.
-        speed_limit: greatest speed that is believed [m/s].
-        watch: age of the oldest detection that tells whether a disc moves [s]; for unknown association.
-        slowest: least speed of what moves [m/s]; a belief that is corrected makes all things seem to.
-        sure: standard deviations from rest beyond which it does.
-    """
-
-    memory: float = 0.6
-    patience: float = 1.5
-    least: int = 6
-    gate: float = 0.6
-    speed_limit: float = 1.5
-    watch: float = 1.0
-    slowest: float = 0.2
-    sure: float = 5.0
+MEMORY, WATCH = 0.6, 1.0  # [s]; age of the oldest detection that counts, and that tells whether a disc moves
+PATIENCE = 1.5  # [s] for which a track that is not seen goes on
+LEAST = 6  # detections before a velocity is believed; until then a disc stands
+GATE = 0.6  # [m] of a detection from where its track is expected, at most; for unknown association
+SPEED_LIMIT, SLOWEST = 1.5, 0.2  # [m/s] that is believed, and of what moves: corrections make all things seem to
+SURE = 5.0  # standard deviations from rest beyond which it does
 
 
 @dataclass
@@ -64,7 +47,6 @@ class LineTracker:
 
     def __init__(self, association: str = "known") -> None:
         """Begin without tracks; ``association`` "known" trusts the readings' names and flags, "unknown" finds out."""
-        self.settings = TrackerSettings()
         self._known = association == "known"
         self._tracks: list[_Track] = []
         self._count = 0
@@ -92,11 +74,11 @@ class LineTracker:
             reading: as it was :meth:`told`.
             state: (10,) believed at its time.
         """
-        s, now = self.settings, reading.time
+        now = reading.time
         if self._known:
             for track in self._follow(reading, state, np.flatnonzero(reading.moving)):
                 track.moves = True
-        self._tracks = [track for track in self._tracks if now - track.times[-1] <= s.patience]
+        self._tracks = [track for track in self._tracks if now - track.times[-1] <= PATIENCE]
         moving = [track for track in self._tracks if track.moves]
         if not moving:
             return Tracks.none()
@@ -128,7 +110,7 @@ class LineTracker:
         else:
             name, self._count = self._count, self._count + 1
             near = [(float(np.linalg.norm(track.at(now) - place)), track.name, track) for track in free]
-            fitting = [track for gap, _, track in sorted(near, key=lambda row: row[:2]) if gap <= self.settings.gate]
+            fitting = [track for gap, _, track in sorted(near, key=lambda row: row[:2]) if gap <= GATE]
         if fitting:
             free.remove(fitting[0])
             return fitting[0]
@@ -137,20 +119,19 @@ class LineTracker:
 
     def _fit(self, track: _Track, now: float) -> None:
         """Least squares of a constant velocity."""
-        s = self.settings
-        kept = s.memory if self._known else max(s.memory, s.watch)
+        kept = MEMORY if self._known else max(MEMORY, WATCH)
         first = next(k for k, time in enumerate(track.times) if now - time <= kept)
         del track.times[:first], track.places[:first], track.radii[: max(0, len(track.radii) - 50)]
-        if not self._known and not track.moves and len(track.times) >= s.least:
+        if not self._known and not track.moves and len(track.times) >= LEAST:
             _, _, velocity, sigma = _line(track.times, track.places)
-            track.moves = float(np.hypot(*velocity)) > max(s.slowest, s.sure * sigma)
-        late = next(k for k, time in enumerate(track.times) if now - time <= s.memory)
+            track.moves = float(np.hypot(*velocity)) > max(SLOWEST, SURE * sigma)
+        late = next(k for k, time in enumerate(track.times) if now - time <= MEMORY)
         times, places = track.times[late:], track.places[late:]
-        if len(times) < s.least:
+        if len(times) < LEAST:
             track.line = np.mean(places, axis=0), np.zeros(2), now
             return
         middle, mean, velocity, _ = _line(times, places)
-        velocity *= min(1.0, s.speed_limit / max(float(np.hypot(*velocity)), 1e-9))
+        velocity *= min(1.0, SPEED_LIMIT / max(float(np.hypot(*velocity)), 1e-9))
         track.line = mean + (now - middle) * velocity, velocity, now
 
 

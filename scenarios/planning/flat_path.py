@@ -8,7 +8,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from unifg.errors import ScenarioError
 from unifg.typing import Array
 
 __all__ = ["FigureEight", "FlatPath", "Flown", "Hover", "Line"]
@@ -55,23 +54,15 @@ class Line:
     """A straight line with a trapezoidal speed profile; at rest before it begins and after its end.
 
     Attributes:
-        start, end: (x, y, z) [m].
+        start, end: (x, y, z) [m], not the same.
         speed: on the plateau, if the line is long enough to reach it [m/s].
         acceleration: along the ramps [m/s^2]; the jerk at their corners is left out.
-
-    Raises:
-        ScenarioError: when start and end coincide, or a number is not positive.
     """
 
     start: tuple[float, float, float]
     end: tuple[float, float, float]
     speed: float
     acceleration: float
-
-    def __post_init__(self) -> None:
-        """Refuse what leads nowhere."""
-        if not (self.length > 0.0 and self.speed > 0.0 and self.acceleration > 0.0):
-            raise ScenarioError(f"a line needs a length, a speed and an acceleration above zero, got {self}")
 
     @property
     def length(self) -> float:

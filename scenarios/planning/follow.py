@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from unifg.errors import ScenarioError
 from unifg.lie import wrap_angle
 from unifg.scenarios.planning.polyline import arc_lengths, at_stations
 from unifg.typing import Array, ArrayLike
@@ -35,8 +34,6 @@ class PathFollower:
             spacing: between its poses, as metres at full speed, of a path planned with its headings; 0 for others.
         """
         self.path: Array = np.array(path, dtype=np.float64)
-        if self.path.ndim != 2 or self.path.shape[1] != 3 or len(self.path) < 2:
-            raise ScenarioError(f"path of shape {self.path.shape}: at least two poses (P, 3) are needed")
         count = len(self.path)
         self._arc = arc_lengths(self.path[:, :2])
         if spacing:

@@ -53,16 +53,7 @@ class Clearance:
     """Distance to the nearest wall or disc, on the cells and between them."""
 
     def __init__(self, occupancy: OccupancyMap, distance_map: DistanceMap, discs: ArrayLike | None) -> None:
-        """Lower a map's distances around discs (K, 3) x, y, radius [m].
-
-        Raises:
-            ScenarioError: map and distances differ in shape.
-        """
-        if distance_map.values.shape != occupancy.shape:
-            raise ScenarioError(
-                f"planner: distance map {distance_map.values.shape} and map {occupancy.name!r} "
-                f"{occupancy.shape} differ in shape; build one from the other"
-            )
+        """Lower a map's distances around discs (K, 3) x, y, radius [m]."""
         self.occupancy = occupancy
         self.field = distance_map
         # Compiled for one layout: a part of a map, or a read-only array, would be compiled for anew.
@@ -218,10 +209,6 @@ def planning(
         is no way.
     """
     start_pose, goal_pose = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-    if start_pose.shape not in ((2,), (3,)) or goal_pose.shape != (3,):
-        raise ScenarioError(
-            f"planner: start {start_pose.shape} and goal {goal_pose.shape} must be poses (x, y, heading)"
-        )
     clearance = Clearance(occupancy, distance_map, extra_discs)
     for name, pose in (("start", start_pose), ("goal", goal_pose)):
         _check_standing(clearance, name, pose, robot_radius)

@@ -73,9 +73,7 @@ class KeeperSettings:
 
     Attributes:
         horizon: steps N.
-        step: greatest length of a step [s].
-        growth: how much longer a step is than the one before it, the first being as long as a tick; infinite where all
-            but the first have the greatest length.
+        step: length of a step [s]; the first is no longer than a tick.
         slots: obstacles that are looked at: those that the last plan, or a vehicle that brakes, comes nearest to.
         alpha: rate at which a clearance may shrink [1/s].
         gamma: of the velocity in a second barrier, none if zero [s]; as published [s/m^2].
@@ -102,7 +100,6 @@ class KeeperSettings:
 
     horizon: int = 20
     step: float = 0.05
-    growth: float = np.inf
     slots: int = 5
     alpha: float = 1.2
     gamma: float = 0.0
@@ -306,8 +303,8 @@ class CbfMpc:
         self.settings, self.airframe = settings, airframe
         s = settings
         self._weighing = weighing
-        with np.errstate(over="ignore"):
-            steps = np.minimum(np.full(s.horizon, s.step), dt * s.growth ** np.arange(s.horizon))
+        steps = np.full(s.horizon, s.step)
+        steps[0] = min(s.step, dt)
         self.nodes = np.concatenate([[0.0], np.cumsum(steps)])
         share = (steps / s.step)[:, None]
         self._barriers = Barriers(s, airframe, self.nodes, steps)

@@ -11,10 +11,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-import unifg as fg
 from unifg.models import quadrotor
 from unifg.models.matching import DOUBTFUL, NEW, Gates, nearest
-from unifg.scenarios.options import option
+from unifg.scenarios.options import Settings, option
 from unifg.scenarios.perception.association import expected, places
 from unifg.scenarios.perception.atlas import Atlas
 from unifg.scenarios.perception.belief import Belief, Landmarks
@@ -43,7 +42,7 @@ TOLERANCE = 1e-3  # of the KKT test, and of the dynamics in their own units
 
 
 @dataclass(frozen=True)
-class EstimatorSettings:
+class EstimatorSettings(Settings):
     """Initial belief, and settings of the window.
 
     Attributes:
@@ -73,11 +72,6 @@ class EstimatorSettings:
     gates: Gates = field(default_factory=Gates)
     iterations: int = 2
     manoeuvre_sigma: float = 3.0
-
-    def __post_init__(self) -> None:
-        """Refuse what does not exist."""
-        if self.association not in ASSOCIATIONS:
-            raise fg.ScenarioError(f"unknown association '{self.association}': choose {' or '.join(ASSOCIATIONS)}")
 
     @property
     def state_sigma(self) -> Array:

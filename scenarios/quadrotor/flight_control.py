@@ -40,7 +40,6 @@ from unifg.scenarios.quadrotor.flight_parts import (
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings, backend
 from unifg.scenarios.quadrotor.guide import Guide, Reference
 from unifg.scenarios.quadrotor.slots import SlotObstacles, Slots
-from unifg.solvers import names
 from unifg.typing import Array
 
 LEFT_BEHIND = 1.0  # [m] between the ends of plan and reference
@@ -82,12 +81,9 @@ class Controller:
             past: None for a graph of the future alone.
 
         Raises:
-            ScenarioError: for an unknown avoidance.
             BackendError: for an unknown solver.
         """
         self.settings = s = settings or ControllerSettings()
-        if s.avoidance not in ("clearance", "potential"):
-            raise fg.ScenarioError(f"unknown avoidance '{s.avoidance}': choose clearance or potential")
         self.past: GivenFlight = past or GivenFlight(s)
         self.walls = np.asarray(walls, dtype=np.float64)
         target = np.asarray(target, dtype=np.float64)
@@ -97,10 +93,9 @@ class Controller:
         lean = ReferenceCost("level", s.weighted(s.level_sigma), upright, "R", residual=landmarks.tilt, size=3)
         terms = [*self.past.motion(), Limits(s), lean, effort]
         if s.avoidance == "potential":
-            squares = not s.general_costs or not names.entry(solver).made_by.scalar_costs
-            terms += [Potential(s, self.walls, target, squares), *self.past.apart(squares)]
+            terms += [Potential(s, self.walls, target), *self.past.apart()]
         else:
-            terms += [*following(s), Clearance(s, self.walls), *self.past.apart(None)]
+            terms += [*following(s), Clearance(s, self.walls), *self.past.apart()]
         window = self.past.window
         self.loop = RecedingHorizon(
             self.past.robot, s.horizon, terms, solver=backend(solver, s), cold=backend(solver, s, cold=True),

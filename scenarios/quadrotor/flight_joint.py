@@ -90,11 +90,9 @@ class KeepClear:
 
     Attributes:
         settings: weights and limits.
-        squares: whether 1/d is stated as a sum of squares; None for a hard clearance.
     """
 
     settings: ControllerSettings
-    squares: bool | None
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         """Pair them."""
@@ -103,22 +101,23 @@ class KeepClear:
         radii = graph.data("radii of landmarks", np.zeros(len(node)), each=True)
         near = graph.data("landmarks to keep clear of", np.zeros(len(node), dtype=bool), each=True)
         pairs, kept = (x.p[1:][node], marks[mark], radii), avoidance.landmark_clearance
-        if self.squares is None:
+        if s.avoidance == "clearance":
             least = graph.data("clearances of landmarks", np.zeros((len(node), 1)), each=True)
             graph.constrain(kept, *pairs, lower=least, active=near, name="landmarks")
         else:
-            repel(graph, s, self.squares, kept, *pairs, name="landmarks", active=near)
+            repel(graph, s, kept, *pairs, name="landmarks", active=near)
 
     def data(self, now: Context[FlightInput]) -> Mapping[str, ArrayLike]:
         """Flags of the landmarks that are obstacles now, their radii, and the clearances to keep."""
         s, given, count = self.settings, now.given, len(now.constants["landmarks"])
+        hard = s.avoidance == "clearance"
         hulls, limits = np.zeros((2, s.horizon, count))
         counting = np.zeros((s.horizon, count), dtype=bool)
         counting[:, given.marks] = True
-        hulls[:, given.marks] = given.obstacles.radii[given.held] + (0.0 if self.squares is None else s.vehicle_radius)
+        hulls[:, given.marks] = given.obstacles.radii[given.held] + (0.0 if hard else s.vehicle_radius)
         limits[:, given.marks] = given.obstacles.limits[:, given.held]
         values = {"radii of landmarks": hulls.ravel(), "landmarks to keep clear of": counting.ravel()}
-        return values | ({"clearances of landmarks": limits.reshape(-1, 1)} if self.squares is None else {})
+        return values | ({"clearances of landmarks": limits.reshape(-1, 1)} if hard else {})
 
 
 class SharedFlight(GivenFlight):
@@ -129,7 +128,6 @@ class SharedFlight(GivenFlight):
         robot: who flies.
         window: of the past.
         pull: how far the future may lean on the past.
-        latest: what the last joint solve says; what the past alone says where that solve was of no use.
         names: of what the window's slots held at the last solve.
     """
 
@@ -143,16 +141,15 @@ class SharedFlight(GivenFlight):
         """
         super().__init__(settings, estimator.window.robot, estimator.window, joint.pull)
         self.estimator = estimator
-        self.latest = estimator.belief()
         self.names = estimator.atlas.names.copy()
 
     def motion(self) -> list[Term]:
         """Terms of the motion."""
         return [SharedMotion(self.settings, "drag" in self.estimator.own.estimated)]
 
-    def apart(self, squares: bool | None) -> list[Term]:
+    def apart(self) -> list[Term]:
         """Keep clear of the landmarks' variables; the slots keep what has left the window's map, and movers."""
-        return [KeepClear(self.settings, squares)]
+        return [KeepClear(self.settings)]
 
     def split(self, obstacles: SlotObstacles) -> tuple[SlotObstacles, BoolArray, list[int]]:
         """Obstacles without those that are landmarks of the window; which (M,) these are, and the slots they hold."""
@@ -183,7 +180,6 @@ class SharedFlight(GivenFlight):
         """Belief by the joint solve, with the covariances of the past; the given one where it says nothing."""
         atlas = self.estimator.atlas
         self.names = atlas.names.copy()
-        self.latest = given
         if not loop.believed:
             return given
         positions = given.landmarks.positions.copy()
@@ -191,13 +187,12 @@ class SharedFlight(GivenFlight):
             slot = atlas.slot_of(name)
             if slot >= 0:
                 positions[row] = loop.constants["landmarks"][slot]
-        self.latest = replace(
+        return replace(
             given,
             state=loop.estimate.copy(),
             parameters=flyable(packed(loop.constants)),
             landmarks=replace(given.landmarks, positions=positions),
         )
-        return self.latest
 
 
 def believable(solution: fg.Solution, choice: object) -> bool:

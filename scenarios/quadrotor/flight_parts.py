@@ -89,8 +89,8 @@ class GivenFlight:
         """Terms of the motion."""
         return [GivenMotion(self.settings)]
 
-    def apart(self, squares: bool | None) -> list[Term]:
-        """Terms that keep clear of variables: hard, or for Ta's potential as sums of squares or not."""
+    def apart(self) -> list[Term]:
+        """Terms that keep clear of variables."""
         return []
 
     def split(self, obstacles: SlotObstacles) -> tuple[SlotObstacles, BoolArray, list[int]]:
@@ -201,13 +201,11 @@ class Potential:
         settings: weights and limits.
         walls: (W, 2, 2) [m].
         target: (3,) [m].
-        squares: whether 1/d is stated as a sum of squares.
     """
 
     settings: ControllerSettings
     walls: Array
     target: Array
-    squares: bool
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         """Add the costs, and bound the speed."""
@@ -219,10 +217,10 @@ class Potential:
         speed_back = graph.data("speed back", np.full((n, 3), -most), each=True)
         graph.bound(x.v[1:], lower=speed_back, upper=speed, name="speed")
         discs = x.p[1:], centres, radii
-        repel(graph, s, self.squares, avoidance.cylinder_clearance, *discs, name="cylinders")
+        repel(graph, s, avoidance.cylinder_clearance, *discs, name="cylinders")
         if len(self.walls):
             hulls = x.p[1:], self.walls, np.full(len(self.walls), s.vehicle_radius)
-            repel(graph, s, self.squares, avoidance.segment_clearance, *hulls, name="walls")
+            repel(graph, s, avoidance.segment_clearance, *hulls, name="walls")
 
     def data(self, now: Context[FlightInput]) -> Mapping[str, ArrayLike]:
         """Contents of the slots, and a speed that the vehicle can come down to."""
@@ -243,17 +241,12 @@ def slots(graph: fg.Graph, settings: ControllerSettings) -> tuple[fg.Data, fg.Da
 def repel(
     graph: fg.Graph,
     settings: ControllerSettings,
-    squares: bool,
     clearance: Residual,
     *arguments: fg.Selection | fg.Data | Array,
     name: str,
     active: fg.Data | None = None,
 ) -> None:
-    """Add 1/d of a clearance, as it is or as half the square of its root, where it is ``active``."""
-    weight, name = settings.potential_weight * settings.control_weight, f"1/d, {name}"
-    if squares:
-        root = avoidance.inverse_distance_root(clearance)
-        graph.minimize(root, *arguments, sigma=1.0 / np.sqrt(weight), active=active, name=name)
-    else:
-        inverse = avoidance.inverse_distance(clearance, weight=weight)
-        graph.minimize_scalar(inverse, *arguments, active=active, name=name)
+    """Add 1/d of a clearance, as half the square of its root, where it is ``active``."""
+    sigma = 1.0 / np.sqrt(settings.potential_weight * settings.control_weight)
+    root = avoidance.inverse_distance_root(clearance)
+    graph.minimize(root, *arguments, sigma=sigma, active=active, name=f"1/d, {name}")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from unifg.errors import ScenarioError
 from unifg.horizon import Plan
 from unifg.models import quadrotor
 from unifg.scenarios.perception.belief import Belief
@@ -41,7 +40,7 @@ class Pilot:
         self.tracker = LineTracker(association=estimator.settings.association)
         self.belief: Belief = estimator.belief()
         self.alone = self.belief
-        self.pushed: Callable[[Belief], Belief] = _as_it_is
+        self.pushed: Callable[[Belief], Belief] = lambda belief: belief
         self.clock = Stopwatch()
         self.clock.seconds = {"estimate": 0.0, "plan": 0.0}
 
@@ -75,10 +74,6 @@ class Pilot:
         return plan
 
 
-def _as_it_is(belief: Belief) -> Belief:
-    return belief
-
-
 def make_pilot(
     coupling: str,
     solver: str,
@@ -104,11 +99,8 @@ def make_pilot(
         joint: how far the future may lean on the past, in one graph.
 
     Raises:
-        ScenarioError: for an unknown coupling, association or avoidance.
         BackendError: for an unknown solver.
     """
-    if coupling not in COUPLINGS:
-        raise ScenarioError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
     model = (DeadReckoning if coupling == "separate" else Dynamics)(nominal)
     past = Estimator(state, nominal, estimator, layout.corners, model)
     if coupling == "joint":

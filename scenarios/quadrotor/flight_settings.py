@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 import unifg as fg
-from unifg.scenarios.options import option
+from unifg.scenarios.options import Settings, option
 from unifg.scenarios.quadrotor.guide import GuideSettings
 from unifg.solvers import names
 from unifg.typing import Array, ArrayLike
@@ -17,7 +17,7 @@ Avoidance: TypeAlias = Literal["clearance", "potential"]
 
 
 @dataclass(frozen=True)
-class ControllerSettings:
+class ControllerSettings(Settings):
     """Weights and limits of the controller.
 
     Attributes:
@@ -42,9 +42,7 @@ class ControllerSettings:
         movers: slots for moving discs.
         mover_margin: added to the margin around moving discs [m].
         mover_growth: by which that grows with the time to a node [m/s].
-        avoidance: "clearance", hard, or "potential", Ta's cost 1/d.
-        general_costs: whether 1/d is stated as it is, which "alm" does not take and "ipm" and "sqp" differentiate by
-            differences, instead of as half the square of its root, which is the same objective.
+        avoidance: "clearance", hard, or "potential", Ta's cost 1/d as half the square of its root.
         goal_sigma: of Ta's cost |p - l_g|^2 [m].
         potential_weight: factor on Ta's cost 1/d [m].
         guide: of the reference.
@@ -76,7 +74,6 @@ class ControllerSettings:
     mover_margin: float = 0.25
     mover_growth: float = 0.25
     avoidance: Avoidance = option("clearance")
-    general_costs: bool = False
     goal_sigma: float = 1.0
     potential_weight: float = 1.0
     guide: GuideSettings = field(default_factory=GuideSettings)

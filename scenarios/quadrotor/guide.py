@@ -65,7 +65,6 @@ class Guide:
 
     Attributes:
         target: (3,) [m].
-        plans: how often a way was planned.
     """
 
     def __init__(
@@ -78,7 +77,6 @@ class Guide:
         """Know the target (3,), the walls (W, 2, 2) and, if any, the bounds (2, 2) of where a way may lead [m]."""
         self.target, self.walls, self.bounds = np.asarray(target, dtype=np.float64), walls, bounds
         self.settings = settings or GuideSettings()
-        self.plans = 0
         self._discs = np.zeros((0, 3))
         self._way: Array | None = None
         self._ways: Ways | None = None
@@ -105,7 +103,6 @@ class Guide:
             another = self._widest(position)
         else:
             another = self._ways.way(position) if self._ways is not None else None
-        self.plans += 1
         kept = None if self._way is None else _onwards(self._way, position)
         if another is None or self._ways is None:
             self._way = None

@@ -10,7 +10,6 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from unifg.errors import ScenarioError
 from unifg.scenarios.planning.flat_path import FigureEight, FlatPath, Hover, Line
 from unifg.scenarios.simulation.bodies import Bodies, Body, Ellipse, Shuttle, Still, Thrown
 
@@ -49,12 +48,7 @@ def situation(kind: Kind, speed: float | None = None, seed: int | None = None) -
         kind: its name.
         speed: of the path at its fastest [m/s]; None for 2.
         seed: of sizes, places and phases; None for those of the description.
-
-    Raises:
-        ScenarioError: for an unknown name.
     """
-    if kind not in SITUATIONS:
-        raise ScenarioError(f"unknown case {kind!r}: choose one of {', '.join(SITUATIONS)}")
     rng = None if seed is None else np.random.default_rng([_TAG, seed])
     made = {"static": _static, "ellipse": _ellipse, "cluttered": _cluttered, "figure8": _figure8, "ball": _ball}
     return made[kind](2.0 if speed is None else speed, rng)

@@ -12,7 +12,6 @@ with the attitude R Exp(theta); position, attitude and velocity are seen themsel
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,22 +21,11 @@ from unifg.scenarios.simulation.body_rate import BodyRatePlant
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.typing import Array
 
-__all__ = ["FilterStatistics", "StateFilter"]
+__all__ = ["AIR", "StateFilter"]
 
+SEEN = (1e-3, 3e-3, 1e-2)  # [m, rad, m/s] standard deviations of position, attitude and velocity as believed
+AIR = DisturbanceModel()  # noise of rates and accelerations, and gusts, as believed
 P, R, V, G = (slice(k, k + 3) for k in range(0, 12, 3))
-
-
-@dataclass(frozen=True)
-class FilterStatistics:
-    """Statistics of sensors and air as believed.
-
-    Attributes:
-        seen: standard deviations of position, attitude and velocity as they are seen [m, rad, m/s].
-        air: noise of rates and accelerations, and gusts.
-    """
-
-    seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
-    air: DisturbanceModel = field(default_factory=DisturbanceModel)
 
 
 class StateFilter:
@@ -49,15 +37,14 @@ class StateFilter:
         covariance: (12, 12) of position, attitude, velocity and gust.
     """
 
-    def __init__(self, statistics: FilterStatistics, dt: float) -> None:
+    def __init__(self, dt: float) -> None:
         """Know nothing; ``dt`` is the length of a tick [s]."""
-        air = statistics.air
-        self._dt, self._keep = dt, math.exp(-dt / air.gust_time)
-        self._noise = np.square(np.repeat(np.maximum(statistics.seen, 1e-9), 3))
-        blow = np.square(air.gust)
+        self._dt, self._keep = dt, math.exp(-dt / AIR.gust_time)
+        self._noise = np.square(np.repeat(np.maximum(SEEN, 1e-9), 3))
+        blow = np.square(AIR.gust)
         fresh = (1.0 - self._keep**2) * blow
         self._fresh = np.concatenate(
-            [np.zeros(3), np.full(3, air.rate_density**2 * dt), np.full(3, air.acceleration_density**2 * dt), fresh]
+            [np.zeros(3), np.full(3, AIR.rate_density**2 * dt), np.full(3, AIR.acceleration_density**2 * dt), fresh]
         )
         self._fresh[P] = self._fresh[V] * dt * dt / 3.0
         self.state: Array | None = None

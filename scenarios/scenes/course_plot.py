@@ -19,7 +19,7 @@ from unifg.style.colours import GREY, INK, css
 from unifg.style.figures import face, ground, headline, key_of, new_figure
 from unifg.typing import Array, Axes, Figure
 
-__all__ = ["chosen_iterates", "picture", "plot_above", "plot_numbers", "plot_space"]
+__all__ = ["chosen_iterates", "picture", "plot_above", "plot_space"]
 
 _WAY = css("horizon")
 _GUESSES = {"hover": "stay at the start", "line": "straight to the target", "way": "a shortest way"}
@@ -46,9 +46,15 @@ def picture(course: Course) -> Figure:
             plot_space(c, number, spaces[row])
         spaces[0].set_title("The same in space; grey: below it on the ground", y=1.0)
         key.legend(*key_of(tops), loc="center", ncols=4)
+        history = c.solution.history
+        values = {"cost": history.column("cost"), "violation": np.maximum(history.column("violation"), _FLOOR)}
         cost, violation = below.subplots(1, 2)
-        plot_numbers(c, "cost", cost)
-        plot_numbers(c, "violation", violation)
+        draw_cost(cost, values["cost"], _TITLES["cost"])
+        draw_errors(violation, {"violation": values["violation"]})
+        for ax, (what, shown) in zip((cost, violation), values.items(), strict=True):
+            ax.plot(chosen, shown[chosen], "o", color=_WAY, ms=8, mec=INK, mew=0.8, label="iterates shown above")
+            ax.legend(loc="best")
+            face(ax, _TITLES[what], x="iterate")
         headline(figure, _title(c), 11.0)
     return figure
 
@@ -61,15 +67,17 @@ def chosen_iterates(count: int) -> list[int]:
 
 def plot_above(course: Course, number: int, ax: Axes) -> Axes:
     """One iterate from above, with the nodes at which its hull would touch something."""
-    nodes = course.iterates[number]
-    _shading(course, ax)
+    nodes, low, high = course.iterates[number], *_extent(course)
+    x, y, gap = shade_distance(ax, low, high, lambda p: course.layout.distance(p) - VEHICLE_RADIUS, _REACH, "#cfd6df")
+    ax.contour(x, y, gap, levels=[0.0], colors=[GREY], linewidths=0.9, linestyles=[(0, (2, 2))], zorder=1)
+    ax.plot([], [], color=GREY, lw=0.9, ls=(0, (2, 2)), label="centre inside this line: the hull touches")
     scene = iterate_scene(course, number)
     scene.points("nodes", nodes[:, :3], pixels=4.0, colour="horizon", legend="")
     hits = course.layout.distance(nodes[:, :2]) < VEHICLE_RADIUS - 1e-3  # by more than rounding
     if hits.any():
         scene.points("hits", nodes[hits, :3], colour="fixed", legend="node where the hull would touch")
     scene.draw(ax)
-    ground(ax, *_extent(course))
+    ground(ax, low, high)
     ax.set_title(_caption(course, number))
     ax.label_outer()
     return ax
@@ -91,33 +99,11 @@ def plot_space(course: Course, number: int, ax: Any) -> Any:
     return ax
 
 
-def plot_numbers(course: Course, what: str, ax: Axes) -> Axes:
-    """The "cost" or the largest "violation" of every iterate; those drawn above are marked."""
-    values = course.solution.history.column(what)
-    if what == "cost":
-        draw_cost(ax, values, _TITLES[what])
-    else:
-        values = np.maximum(values, _FLOOR)
-        draw_errors(ax, {what: values})
-    chosen = chosen_iterates(len(values))
-    ax.plot(chosen, values[chosen], "o", color=_WAY, ms=8, mec=INK, mew=0.8, label="iterates shown above")
-    ax.legend(loc="best")
-    return face(ax, _TITLES[what], x="iterate")
-
-
 def _extent(course: Course) -> Array:
     """(2, 2) lowest and highest corner of the ground shown [m]: the layout's, and the last iterate's."""
     low, high = course.layout.size
     way = course.states[:, :2]
     return np.stack([np.minimum(low, way.min(axis=0) - _BESIDE), np.maximum(high, way.max(axis=0) + _BESIDE)])
-
-
-def _shading(course: Course, ax: Axes) -> None:
-    """The ground, the darker the nearer the hull would be to something, and where it would touch."""
-    low, high = _extent(course)
-    x, y, gap = shade_distance(ax, low, high, lambda p: course.layout.distance(p) - VEHICLE_RADIUS, _REACH, "#cfd6df")
-    ax.contour(x, y, gap, levels=[0.0], colors=[GREY], linewidths=0.9, linestyles=[(0, (2, 2))], zorder=1)
-    ax.plot([], [], color=GREY, lw=0.9, ls=(0, (2, 2)), label="centre inside this line: the hull touches")
 
 
 def _caption(course: Course, number: int) -> str:

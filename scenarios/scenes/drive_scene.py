@@ -19,11 +19,11 @@ from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.metrics import collision_words, health, one_graph
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
-from unifg.scenarios.scenes.parts import CLEAR, draw_way, pillar, standing
-from unifg.typing import Array, IntArray
+from unifg.scenarios.scenes.parts import CLEAR, draw_way, lidar_hits, pillar, standing
+from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["drive_frame", "drive_scene", "drive_stage", "place_movers", "scan_points"]
+__all__ = ["drive_frame", "drive_scene", "drive_stage", "place_movers"]
 
 _MAX_POINTS = 90_000  # lidar points of the whole file; beyond, every second beam, every third, ...
 _FRAMES = 500  # that a file shows
@@ -182,8 +182,7 @@ def drive_frame(scene: Scene, frame: Frame, log: Any, tick: int, frames: int = 1
     frame.trail("trail", truth[:2])
     frame.way("route", log.route[tick][:, :2], colour="plan")
     beams = np.arange(0, len(log.scan_angles), math.ceil(frames * len(log.scan_angles) / _MAX_POINTS))
-    hits = scan_points(log, tick, beams)
-    frame.points("scan", np.column_stack([hits, np.full(len(hits), _WALL + 0.02)]), pixels=4.0)
+    frame.points("scan", lidar_hits(truth, log.scan[tick][beams], log.scan_angles[beams], _WALL + 0.02), pixels=4.0)
     draw_way(frame, "horizon", log.horizon[tick][:, :2])
     rings = [shapes.ring(x[:2], float(x[2]) + 0.03, 0.06, _WALL + 0.01, corners=10) for x in log.detected[tick]]
     if rings:
@@ -197,14 +196,6 @@ def place_movers(frame: Frame, log: Any, tick: int) -> None:
     """Place the obstacles that move."""
     for index in np.flatnonzero(log.obstacle_moves).tolist():
         frame.place(f"obstacle {index}", [*log.obstacles[tick][index][:2], 0.0])
-
-
-def scan_points(log: EpisodeLog, tick: int, beams: IntArray) -> Array:
-    """World points (n, 2) [m] where the chosen beams of a tick really ended; dropouts and misses are left out."""
-    ranges = log.scan[tick][beams]
-    returned = np.isfinite(ranges)
-    angles = log.scan_angles[beams][returned]
-    return SE2.act(log.true_pose[tick], ranges[returned, None] * np.column_stack([np.cos(angles), np.sin(angles)]))
 
 
 def _robots(scene: Scene, hull: Body, pin: float) -> None:

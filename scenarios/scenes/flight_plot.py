@@ -1,9 +1,7 @@
 """A flight as pictures: from above at several moments, what it believed against the truth, and how it was flown.
 
 The view from above is as in Fig. 5 of Ta, Kobilarov and Dellaert (ICUAS 2014), a frame of the scene: the estimated past
-is blue, the predicted future green, the reach of the sensor magenta; cylinders not seen by then are faint. Limits of
-controls are drawn where the settings of the flight name them, at their top or under ``controller``: ``rate_limits``,
-three greatest rates [rad/s], and ``thrust_limits``, least and greatest thrust [N].
+is blue, the predicted future green, the reach of the sensor magenta; cylinders not seen by then are faint.
 """
 
 from __future__ import annotations
@@ -13,28 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import ViewError
 from unifg.plots.shown import every
 from unifg.scenarios.logs.flight_log import FlightLog
-from unifg.scenarios.logs.flight_metrics import PARAMETERS, estimated_parameters, has_estimate, state_errors
+from unifg.scenarios.logs.flight_metrics import estimated_parameters, has_estimate, state_errors
 from unifg.scenarios.logs.metrics import collision_words
-from unifg.scenarios.scenes.flight_scene import flight_frame, flight_stage, sensor_reach
+from unifg.scenarios.scenes.flight_scene import flight_frame, flight_stage, senses
 from unifg.scenarios.scenes.panels import over_time, padded, plot_clearance, plot_times, shade_trouble
 from unifg.style.colours import INK, css
 from unifg.style.figures import ground, headline, key_of, new_figure
 from unifg.typing import Array, Axes, Figure
 
-__all__ = [
-    "control",
-    "estimates",
-    "overview",
-    "plot_control",
-    "plot_height",
-    "plot_moment",
-    "plot_parameter",
-    "plot_speed",
-    "plot_state_error",
-]
+__all__ = ["control", "estimates", "overview", "plot_moment", "plot_parameter", "plot_state_error"]
 
 _MOMENTS = 6  # evenly spread from the first tick to the last
 _MARGIN = 0.6  # around the layout [m]
@@ -49,7 +36,7 @@ _STATES = (
 )
 _SCALES = (100.0, 1000.0, 100.0)
 _SHOWN = (0, 1, 2, 6, 7, 8, 3, 4, 5)  # position, velocity, attitude
-_CONTROLS = ("Roll rate", "Pitch rate", "Yaw rate", "Thrust")
+_CONTROLS = {"Roll rate": "[rad/s]", "Pitch rate": "[rad/s]", "Yaw rate": "[rad/s]", "Thrust": "[N]"}
 
 
 def overview(log: FlightLog) -> Figure:
@@ -80,21 +67,19 @@ def estimates(log: FlightLog) -> Figure:
     """Every parameter that is estimated, then the errors of position, velocity and attitude.
 
     Raises:
-        ViewError: the flight has no tick or no estimate.
+        ViewError: the flight has no tick.
     """
-    if log.ticks and not has_estimate(log):
-        raise ViewError("this flight has no estimate: it has neither sigmas nor windows")
     parameters = np.flatnonzero(estimated_parameters(log)).tolist()
     rows = math.ceil(len(parameters) / _COLUMNS) + len(_STATES) // _COLUMNS
     with new_figure((15.0, 2.05 * rows + 0.9), log.ticks) as figure:
         panels = list(figure.subplots(rows, _COLUMNS, sharex=True, squeeze=False).flat)
         for ax, index in zip(panels, parameters, strict=False):
-            plot_parameter(log, PARAMETERS[index], ax=ax)
+            plot_parameter(log, index, ax)
         begin = len(panels) - len(_STATES)
         for ax in panels[len(parameters) : begin]:
             ax.set_axis_off()
         for ax, component in zip(panels[begin:], _SHOWN, strict=True):
-            plot_state_error(log, component, ax=ax)
+            plot_state_error(log, component, ax)
         for ax in panels[-_COLUMNS:]:
             ax.set_xlabel("time [s]")
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
@@ -103,27 +88,33 @@ def estimates(log: FlightLog) -> Figure:
 
 
 def control(log: FlightLog) -> Figure:
-    """Body rates and thrust on the left; speed and height, clearance and timing on the right.
+    """Body rates and thrust with their limits on the left; speed and height, clearance and timing on the right.
 
     Raises:
         ViewError: the flight has no tick.
     """
-    total = log.estimate_ms + log.plan_ms
-    clock = float(total.max(initial=0.0)) > 0.0
+    s, thick = log.settings["controller"], {"color": css("robot"), "lw": 1.4}
+    limits = [*((-rate, rate) for rate in s["rate_limits"]), s["thrust_limits"]]
     with new_figure((15.0, 9.2), log.ticks) as figure:
         left, right = figure.subfigures(1, 2, squeeze=False)[0]
-        panels = left.subplots(4, 1, sharex=True)
-        for index, ax in enumerate(panels):
-            plot_control(log, index, ax=ax)
-        others = right.subplots(4 if clock else 3, 1, sharex=True)
-        plot_speed(log, ax=others[0])
-        plot_height(log, ax=others[1])
+        panels, others = left.subplots(4, 1, sharex=True), right.subplots(4, 1, sharex=True)
+        for ax, values, ends, (name, unit) in zip(panels, log.controls.T, limits, _CONTROLS.items(), strict=True):
+            curve = values, {"color": css("robot"), "drawstyle": "steps-post"}
+            bounds = padded(values, ends, least=0.1)
+            over_time(log, ax, f"{name} and its limits", unit, [curve], levels=ends, bounds=bounds)
+        speed, height = np.linalg.norm(log.truth[:, 7:], axis=1), log.truth[:, 2]
+        title = f"Speed, at most {speed.max():.2f} m/s"
+        over_time(log, others[0], title, "[m/s]", [(speed, thick)], bounds=(0.0, 1.12 * max(float(speed.max()), 0.1)))
+        shade_trouble(others[0], log.dt, log.health, log.causes, title)
+        target = np.full(log.ticks, log.layout.target[2])
+        curves = (height, thick), (target, {"color": css("goal"), "lw": 1.4, "ls": "--"})
+        top = 1.15 * max(float(height.max()), float(target[0]), 0.1)
+        over_time(log, others[1], "Height, and that of the target", "[m]", curves, bounds=(0.0, top))
         plot_clearance(log, ax=others[2])
-        if clock:
-            parts = {"plan": (log.plan_ms, "horizon"), "estimate": (log.estimate_ms, "estimate")}
-            ax = plot_times(log, total, parts, ax=others[3])
-            ax.axhline(1e3 * log.dt, color=css("moving"), lw=1.1, label="control period")
-            ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
+        parts = {"plan": (log.plan_ms, "horizon"), "estimate": (log.estimate_ms, "estimate")}
+        ax = plot_times(log, log.estimate_ms + log.plan_ms, parts, ax=others[3])
+        ax.axhline(1e3 * log.dt, color=css("moving"), lw=1.1, label="control period")
+        ax.legend(loc="upper right", ncols=4, markerscale=3, borderpad=0.0)
         for part, axes in ((left, panels), (right, others)):
             axes[-1].set_xlabel("time [s]")
             part.align_ylabels(axes)
@@ -135,7 +126,7 @@ def control(log: FlightLog) -> Figure:
 
 def plot_moment(log: FlightLog, tick: int, ax: Axes) -> Axes:
     """Obstacles, belief and plan at one tick, from above."""
-    scene = flight_stage(log, sensed=sensor_reach(log) is not None, estimated=has_estimate(log))
+    scene = flight_stage(log, sensed=senses(log), estimated=has_estimate(log))
     past, before = slice(tick + 1), max(1, tick + 2 - len(log.pasts[tick]))
     scene.way("trail", log.believed[:before, :3])
     scene.way("truth", log.truth[past, :3] if has_estimate(log) else log.truth[:0, :3])
@@ -151,15 +142,14 @@ def plot_moment(log: FlightLog, tick: int, ax: Axes) -> Axes:
     return ax
 
 
-def plot_parameter(log: FlightLog, name: str, ax: Axes) -> Axes:
+def plot_parameter(log: FlightLog, index: int, ax: Axes) -> Axes:
     """One parameter over time, its band of two standard deviations, and the truth.
 
     Args:
         log: the flight.
-        name: one of `unifg.scenarios.logs.flight_metrics.PARAMETERS`.
+        index: of the parameter.
         ax: axes to draw into.
     """
-    index = PARAMETERS.index(name)
     values, sigmas = log.parameters[:, index], log.parameters_sigma[:, index]
     true = float(log.parameters_true[index])
     ends = f"ends {100.0 * (values[-1] / true - 1.0):+.1f} %" if index == 0 else f"ends {values[-1] - true:+.3f}"
@@ -209,52 +199,8 @@ def _band(
     return over_time(log, ax, f"{title}; {inside:.0f} % within 2\u03c3", unit, curves, bounds=bounds)
 
 
-def plot_control(log: FlightLog, index: int, ax: Axes) -> Axes:
-    """One control over time against its limits.
-
-    Args:
-        log: the flight.
-        index: 0-2 body rates, 3 thrust.
-        ax: axes to draw into.
-    """
-    values, limits = log.controls[:, index], _limits(log, index)
-    title, unit = _CONTROLS[index] + (" and its limits" if limits else ""), "[N]" if index == 3 else "[rad/s]"
-    curve = values, {"color": css("robot"), "drawstyle": "steps-post"}
-    return over_time(log, ax, title, unit, [curve], levels=limits, bounds=padded(values, limits, least=0.1))
-
-
-def plot_speed(log: FlightLog, ax: Axes) -> Axes:
-    """True speed over time [m/s]."""
-    speed = np.linalg.norm(log.truth[:, 7:], axis=1)
-    title, top = f"Speed, at most {speed.max():.2f} m/s", 1.12 * max(float(speed.max()), 0.1)
-    over_time(log, ax, title, "[m/s]", [(speed, {"color": css("robot"), "lw": 1.4})], bounds=(0.0, top))
-    shade_trouble(ax, log.dt, log.health, log.causes, title)
-    return ax
-
-
-def plot_height(log: FlightLog, ax: Axes) -> Axes:
-    """True height over time, with that of the target [m]."""
-    height, target = log.truth[:, 2], np.full(log.ticks, log.layout.target[2])
-    curves = (height, {"color": css("robot"), "lw": 1.4}), (target, {"color": css("goal"), "lw": 1.4, "ls": "--"})
-    top = 1.15 * max(float(height.max()), float(target[0]), 0.1)
-    return over_time(log, ax, "Height, and that of the target", "[m]", curves, bounds=(0.0, top))
-
-
-def _limits(log: FlightLog, index: int) -> list[float]:
-    settings = {**log.settings, **log.settings.get("controller", {})}
-    if index == 3:
-        return [float(limit) for limit in settings.get("thrust_limits", ())]
-    rates = settings.get("rate_limits", ())
-    return [-float(rates[index]), float(rates[index])] if len(rates) == 3 else []
-
-
 def _title(log: FlightLog, what: str) -> str:
     """Title of a figure: its content and the flight."""
-    settings = log.settings
-    words = [what, str(settings.get("scenario", "")), log.layout.name]
-    if settings.get("solver"):
-        coupling = f" ({settings['coupling']})" if settings.get("coupling") else ""
-        words.append(f"solver {settings['solver']}{coupling}")
-    if settings.get("seed") is not None:
-        words.append(f"seed {settings['seed']}")
-    return "  |  ".join(word for word in words if word)
+    s = log.settings
+    said = f"solver {s['solver']} ({s['coupling']})  |  seed {s['seed']}"
+    return f"{what}  |  {s['scenario']}, {log.layout.name}  |  {said}"

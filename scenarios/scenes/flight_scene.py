@@ -7,7 +7,6 @@ with all cylinders solid from the start.
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Any
 
@@ -23,11 +22,12 @@ from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["flight_frame", "flight_scene", "flight_stage", "sensor_reach"]
+__all__ = ["flight_frame", "flight_scene", "flight_stage", "senses"]
 
 SIGMAS = 2.0
 """Half axes of ellipses in standard deviations."""
 
+_REACH = SensorModel().range_max  # [m]
 _HEIGHT = 2.0  # of walls, cylinders and movers [m]; there they have no top
 
 
@@ -42,15 +42,9 @@ def _mass(log: Any, k: int) -> str:
     return f"{mass:.3f} \u00b1 {sigma:.3f} kg" if sigma > 0.0 else ""
 
 
-def _spent(log: Any, k: int) -> float:
-    """Time of a tick [ms]; NaN where no clock ran."""
-    return float(log.estimate_ms[k] + log.plan_ms[k]) or math.nan
-
-
 def _times(log: Any, k: int) -> str:
-    """Times of estimate and plan, where a clock ran."""
-    spent = f"{log.estimate_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + " (compiled)" * bool(log.compiled[k])
-    return "" if math.isnan(_spent(log, k)) else spent
+    """Times of estimate and plan."""
+    return f"{log.estimate_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + " (compiled)" * bool(log.compiled[k])
 
 
 NUMBERS_OF_A_PLAN = (
@@ -75,7 +69,9 @@ NUMBERS_OF_A_PLAN = (
 
 NUMBERS = (
     *NUMBERS_OF_A_PLAN,
-    Number("estimate + plan", None, _spent, plot={"unit": "ms", "log": True}),
+    Number(
+        "estimate + plan", None, lambda log, k: log.estimate_ms[k] + log.plan_ms[k], plot={"unit": "ms", "log": True}
+    ),
     Number(
         "position error", lambda log, k: f"{_error(log, k):.1f} cm", _error, plot={"unit": "cm", "colour": "estimate"}
     ),
@@ -102,7 +98,7 @@ def flight_scene(log: FlightLog) -> Scene:
     Raises:
         ViewError: the flight has no tick.
     """
-    sensed, estimated = sensor_reach(log) is not None, has_estimate(log)
+    sensed, estimated = senses(log), has_estimate(log)
     scene = filled(log, partial(flight_stage, log, sensed=sensed, estimated=estimated), flight_frame)
     if scene.around is not None:
         scene.around = np.concatenate([scene.around, log.truth[:, :3]])
@@ -123,11 +119,9 @@ def flight_scene(log: FlightLog) -> Scene:
     return scene
 
 
-def sensor_reach(log: FlightLog) -> float | None:
-    """Reach of the sensor [m], ``settings["sensor_range"]`` or the usual one; None in a flight without a sensor."""
-    if not any(len(ids) for ids in log.seen):
-        return None
-    return float(log.settings.get("sensor_range", SensorModel().range_max))
+def senses(log: FlightLog) -> bool:
+    """Return True for a flight with a sensor."""
+    return any(len(ids) for ids in log.seen)
 
 
 def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Scene:
@@ -153,7 +147,10 @@ def flight_stage(log: Any, *, sensed: bool = True, estimated: bool = True) -> Sc
     for row in (*LAYERS, ("trail", "line", "trail", past, 0.06), ("seen", "disc", "fixed", seen)):
         scene.layer(*row)
     scene.layer("rims", "ring", "start", seen)
-    _bodies(scene, float(log.settings.get("sensor_range", SensorModel().range_max)) if sensed else None)
+    vehicle(scene, VEHICLE_RADIUS, plumb=True)
+    if sensed:
+        ring = Part("ring", shapes.ring(np.zeros(2), _REACH - 0.07, 0.07, 0.014, corners=96), "scan", False)
+        scene.body("sensor", [ring], colour="scan", swatch="ring", legend="reach of the sensor")
     layout(scene, log.layout, _HEIGHT)
     _views(scene, log)
     declare(scene, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
@@ -191,16 +188,6 @@ def flight_frame(scene: Scene, frame: Frame, log: Any, tick: int) -> None:
     if len(points):
         frame.mesh("below", shapes.ribbon(points, 0.06, 0.018), opacity=0.35)
     show(frame, log, tick, NUMBERS if estimated else NUMBERS_OF_A_PLAN)
-
-
-def _bodies(scene: Scene, reach: float | None) -> None:
-    """The vehicle, its shadow with a plumb line, and the circle the sensor reaches."""
-    vehicle(scene, VEHICLE_RADIUS, plumb=True)
-    if reach is not None:
-        ring = shapes.ring(np.zeros(2), reach - 0.07, 0.07, 0.014, corners=96)
-        scene.body(
-            "sensor", [Part("ring", ring, "scan", False)], colour="scan", swatch="ring", legend="reach of the sensor"
-        )
 
 
 def _cylinders(frame: Frame, log: Any, tick: int, sensed: bool) -> None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.lie import SE2
 from unifg.plots.shown import every
 from unifg.scenarios.range_logs import LogRun
+from unifg.scenarios.scenes.parts import lidar_hits
 from unifg.style.colours import css
 from unifg.style.figures import face, headline, key_of, new_figure
-from unifg.typing import Array, Figure, IntArray
+from unifg.typing import Figure
 from unifg.view import Scene, shapes
 
 __all__ = ["log_scene", "picture"]
@@ -75,7 +75,8 @@ def log_scene(run: LogRun) -> Scene:
     for k in scene.numbers:
         frame = scene.frame()
         frame.place("robot", run.poses[k])
-        frame.points("scan", _ends(run, k, beams), pixels=4.0, colour="scan", legend="lidar hits")
+        hits = lidar_hits(run.poses[k], run.log.ranges[k][beams], run.log.angles[beams], _WALL + 0.02)
+        frame.points("scan", hits, pixels=4.0, colour="scan", legend="lidar hits")
         frame.value("explained", 100.0 * float(run.share[k]))
         frame.readout("explained", f"{100.0 * run.share[k]:.0f} % of the beams", alarm=bool(run.share[k] < 0.5))
         if len(run.hypotheses):
@@ -86,11 +87,3 @@ def log_scene(run: LogRun) -> Scene:
     if run.kind == "map":
         scene.outcome = "interrupted" if run.interrupted else "mapped"
     return scene
-
-
-def _ends(run: LogRun, k: int, beams: IntArray) -> Array:
-    """(n, 3) where chosen beams of a scan ended, above the walls [m]."""
-    ranges, angles = run.log.ranges[k][beams], run.log.angles[beams]
-    seen = np.isfinite(ranges)
-    ends = ranges[seen, None] * np.column_stack([np.cos(angles[seen]), np.sin(angles[seen])])
-    return np.column_stack([SE2.act(run.poses[k], ends), np.full(int(seen.sum()), _WALL + 0.02)])

@@ -6,12 +6,13 @@ import math
 
 import numpy as np
 
+from unifg.lie import SE2
 from unifg.models.footprint import Body
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array
 from unifg.view import Frame, Part, Scene, shapes
 
-__all__ = ["CLEAR", "draw_way", "floor", "layout", "pillar", "standing", "vehicle"]
+__all__ = ["CLEAR", "draw_way", "floor", "layout", "lidar_hits", "pillar", "standing", "vehicle"]
 
 CLEAR = 0.6
 """Opacity of obstacles: ways and vehicles behind them are seen."""
@@ -73,6 +74,13 @@ def draw_way(frame: Frame, name: str, way: Array) -> Array:
         return way[:0]
     frame.way(name, points)
     return points
+
+
+def lidar_hits(pose: Array, ranges: Array, angles: Array, height: float) -> Array:
+    """Points (n, 3) [m] at some height where beams seen from a pose end; dropouts and misses are left out."""
+    seen = np.isfinite(ranges)
+    ends = ranges[seen, None] * np.column_stack([np.cos(angles[seen]), np.sin(angles[seen])])
+    return np.column_stack([SE2.act(pose, ends), np.full(len(ends), height)])
 
 
 def pillar(radius: float, height: float, colour: str) -> Part:

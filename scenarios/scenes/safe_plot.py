@@ -15,7 +15,7 @@ from unifg.style.colours import GREY, css
 from unifg.style.figures import face, ground, headline, new_figure
 from unifg.typing import Array, Axes, Figure
 
-__all__ = ["picture", "plot_above", "plot_distance", "plot_error", "plot_speed", "plot_time"]
+__all__ = ["picture", "plot_above"]
 
 _LINES = ("robot", "estimate", "horizon", "scan", "trail", "moving", "fixed", "start")
 _STAMPS = 6  # places drawn of a body that moves
@@ -30,14 +30,32 @@ _TITLES = {
 
 
 def picture(logs: Sequence[SafeLog]) -> Figure:
-    """Four panels of one or more flights of the same case."""
+    """Ways from above, speeds, distances and times to decide of one or more flights of the same case."""
+    guarded = bool(logs) and len(logs[0].radii) > 0
     with new_figure((11.0, 8.0), min((log.ticks for log in logs), default=0)) as figure:
-        top, bottom = figure.subplots(2, 2, width_ratios=(1.15, 1.0))
-        plot_above(logs, top[0])
-        plot_speed(logs, top[1])
-        (plot_distance if len(logs[0].radii) else plot_error)(logs, bottom[0])
-        plot_time(logs, bottom[1])
-        figure.legend(*top[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+        (above, speed), (near, clock) = figure.subplots(2, 2, width_ratios=(1.15, 1.0))
+        plot_above(logs, above)
+        paths = [np.linalg.norm(log.wanted[:, 3:], axis=1) for log in logs]
+        for k, (log, path) in enumerate(zip(logs, paths, strict=True)):
+            if not any(len(path) == len(other) and np.allclose(path, other) for other in paths[:k]):
+                speed.plot(log.time, path, color=GREY, lw=1.2, ls="--")
+        for log, colour in zip(logs, map(css, _LINES * len(logs)), strict=False):
+            gaps = log.boundary if guarded else 1e3 * np.linalg.norm(log.error, axis=1)
+            speed.plot(log.time, np.linalg.norm(log.states[:, 7:], axis=1), color=colour, lw=1.4)
+            near.plot(log.time, gaps, color=colour, lw=1.4)
+            clock.plot(np.sort(log.decide_ms), 100.0 * np.arange(1, log.ticks + 1) / log.ticks, color=colour, lw=1.4)
+            if guarded:
+                near.plot(log.time[np.argmin(gaps)], gaps.min(), "o", color=colour, ms=4)
+        face(speed, "Speed; dashed: of the path", "[m/s]", "time [s]")
+        face(near, "Distance from the path", "[mm]", "time [s]")
+        if guarded:
+            near.axhline(0.0, color=css("moving"), lw=1.0)
+            near.set_ylim(top=min(near.get_ylim()[1], 4.0))
+            face(near, "Boundary distance: beyond the margin, along the whole way", "[m]", "time [s]")
+        clock.set_ylim(0.0, 102.0)
+        clock.set_xlim(left=0.0)
+        face(clock, "Ticks decided within a processor time", "[%]", "[ms]")
+        figure.legend(*above.get_legend_handles_labels(), loc="outside lower center", ncols=4)
         headline(figure, _TITLES[str(logs[0].settings["case"])])
     return figure
 
@@ -75,44 +93,3 @@ def _extent(logs: Sequence[SafeLog]) -> tuple[Array, Array]:
         reach = first.radii[inside, None]
         ends = np.concatenate([ends, near[inside] - reach, near[inside] + reach])
     return ends.min(axis=0) - _BESIDE, ends.max(axis=0) + _BESIDE
-
-
-def plot_speed(logs: Sequence[SafeLog], ax: Axes) -> Axes:
-    """Speed of the vehicle and of the path."""
-    paths = [np.linalg.norm(log.wanted[:, 3:], axis=1) for log in logs]
-    for k, (log, path) in enumerate(zip(logs, paths, strict=True)):
-        if not any(len(path) == len(other) and np.allclose(path, other) for other in paths[:k]):
-            ax.plot(log.time, path, color=GREY, lw=1.2, ls="--")
-    _curves(ax, logs, [np.linalg.norm(log.states[:, 7:], axis=1) for log in logs])
-    return face(ax, "Speed; dashed: of the path", "[m/s]", "time [s]")
-
-
-def plot_distance(logs: Sequence[SafeLog], ax: Axes) -> Axes:
-    """Boundary distance: between hull and the nearest surface, beyond the margin."""
-    _curves(ax, logs, [log.boundary for log in logs])
-    for log, colour in zip(logs, _LINES * len(logs), strict=False):
-        ax.plot(log.time[np.argmin(log.boundary)], log.boundary.min(), "o", color=css(colour), ms=4)
-    ax.axhline(0.0, color=css("moving"), lw=1.0)
-    ax.set_ylim(top=min(ax.get_ylim()[1], 4.0))
-    return face(ax, "Boundary distance: beyond the margin, along the whole way", "[m]", "time [s]")
-
-
-def plot_error(logs: Sequence[SafeLog], ax: Axes) -> Axes:
-    """Distance from where the path is."""
-    _curves(ax, logs, [1e3 * np.linalg.norm(log.error, axis=1) for log in logs])
-    return face(ax, "Distance from the path", "[mm]", "time [s]")
-
-
-def plot_time(logs: Sequence[SafeLog], ax: Axes) -> Axes:
-    """Share of the ticks that were decided within a time."""
-    shares = [100.0 * np.arange(1, log.ticks + 1) / log.ticks for log in logs]
-    _curves(ax, logs, shares, [np.sort(log.decide_ms) for log in logs])
-    ax.set_ylim(0.0, 102.0)
-    ax.set_xlim(left=0.0)
-    return face(ax, "Ticks decided within a processor time", "[%]", "[ms]")
-
-
-def _curves(ax: Axes, logs: Sequence[SafeLog], values: Sequence[Array], over: Sequence[Array] | None = None) -> None:
-    """One curve for each flight, over its time unless something else is given."""
-    for x, y, colour in zip(over or [log.time for log in logs], values, _LINES * len(logs), strict=False):
-        ax.plot(x, y, color=css(colour), lw=1.4)

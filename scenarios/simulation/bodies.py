@@ -14,7 +14,6 @@ from typing import Protocol
 
 import numpy as np
 
-from unifg.errors import ScenarioError
 from unifg.models.quadrotor import GRAVITY
 from unifg.typing import Array, BoolArray
 
@@ -60,8 +59,6 @@ class Ellipse:
 
     def __post_init__(self) -> None:
         """Measure the circumference."""
-        if not (min(self.axes) > 0.0 and math.isfinite(self.speed)):
-            raise ScenarioError(f"an ellipse needs half axes above zero and a finite speed, got {self}")
         angle = np.linspace(0.0, 2.0 * np.pi, 4097)
         a, b = self.axes
         pace = np.hypot(a * np.sin(angle), b * np.cos(angle))
@@ -100,8 +97,6 @@ class Shuttle:
         """Positions and velocities."""
         span = np.array(self.end) - np.array(self.start)
         length = float(np.linalg.norm(span))
-        if not length > 0.0:
-            raise ScenarioError(f"a shuttle needs two places, got {self}")
         share = (self.phase + self.speed * times / (2.0 * length)) % 1.0
         share_along = 1.0 - np.abs(2.0 * share - 1.0)
         sense = np.where(share < 0.5, 1.0, -1.0)
@@ -174,17 +169,11 @@ class Bodies:
     """
 
     def __init__(self, bodies: Sequence[Body]) -> None:
-        """Keep them in their order.
-
-        Raises:
-            ScenarioError: for a radius that is not positive.
-        """
+        """Keep them in their order."""
         self.bodies = tuple(bodies)
         self.radii = np.array([body.radius for body in self.bodies], dtype=np.float64)
         self.upright: BoolArray = np.array([body.upright for body in self.bodies], dtype=bool)
         self.falls: BoolArray = np.array([isinstance(body.motion, Thrown) for body in self.bodies], dtype=bool)
-        if not (self.radii > 0.0).all():
-            raise ScenarioError(f"obstacles need radii above zero, got {self.radii.tolist()}")
 
     def __len__(self) -> int:
         """Number of bodies."""

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.errors import ScenarioError
 from unifg.models import quadrotor
 from unifg.scenarios.simulation.layouts import Layout, corridor
 from unifg.typing import Array
@@ -57,14 +56,7 @@ def draw_conditions(seed: int, mass_error: float = 0.05) -> Conditions:
     Args:
         seed: not negative.
         mass_error: relative, in [0, 1).
-
-    Raises:
-        ScenarioError: if the seed is negative or the mass error not in [0, 1).
     """
-    if seed < 0:
-        raise ScenarioError(f"a seed must not be negative, got {seed}")
-    if not 0.0 <= mass_error < 1.0:
-        raise ScenarioError(f"the mass error is a share of the true mass in [0, 1), got {mass_error}")
     truth, belief = np.random.default_rng([_TAG, seed]).spawn(2)
     drag = truth.uniform(*DRAG, 3).tolist()
     angle, strength = truth.uniform(0.0, 2.0 * math.pi), truth.uniform(0.0, WIND)

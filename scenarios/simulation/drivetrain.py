@@ -11,28 +11,28 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from unifg.errors import ScenarioError
 from unifg.models import unicycle
 from unifg.models.planar import Base
-from unifg.scenarios.options import not_negative, option, positive, share
+from unifg.scenarios.options import Settings, not_negative, number, option, share
 from unifg.typing import Array
 
 __all__ = ["COMPUTED", "PLANTS", "Drivetrain", "Wheels", "followed", "plant"]
 
+above_zero = number("a number above zero", lambda value: value > 0.0)  # infinite of an ideal base
 COMPUTED = -1.0  # latency that is the measured time of each tick
 
 
 def latency_of(text: str) -> float:
     """Seconds, or "auto" for `COMPUTED`."""
-    return COMPUTED if text == "auto" else not_negative(text)
+    return COMPUTED if text in ("auto", str(COMPUTED)) else not_negative(text)
 
 
 @dataclass(frozen=True)
-class Drivetrain:
+class Drivetrain(Settings):
     """Of a base, as it is; the robot knows of it what its data sheet says, the accelerations unloaded.
 
     2.5 m/s^2 and 3.2 rad/s^2 are the accelerations that the example of Nav2's DWB controller gives a light base; the
@@ -49,29 +49,13 @@ class Drivetrain:
         skid: outward drift of a base that turns, per lateral acceleration [(m/s)/(m/s^2)].
     """
 
-    acceleration: float = option(2.5, text=positive, metavar="M/S2")
-    turning: float = option(3.2, text=positive, metavar="RAD/S2")
+    acceleration: float = option(2.5, text=above_zero, metavar="M/S2")
+    turning: float = option(3.2, text=above_zero, metavar="RAD/S2")
     load: float = option(0.0, text=not_negative, metavar="SHARE")
     lag: float = option(0.0, text=not_negative, metavar="S")
     latency: float = option(0.0, text=latency_of, metavar="S")
     slip: float = option(0.0, text=share, metavar="SHARE")
     skid: float = option(0.0, text=not_negative, metavar="S")
-
-    def __post_init__(self) -> None:
-        """Refuse what is no base.
-
-        Raises:
-            ScenarioError: naming the field.
-        """
-        for field in fields(self):
-            value = getattr(self, field.name)
-            least_excluded = field.name in ("acceleration", "turning")
-            most = 1.0 if field.name == "slip" else math.inf
-            inside = (0.0 < value <= most) if least_excluded else (0.0 <= value < most)
-            inside = inside or (field.name == "latency" and value == COMPUTED)
-            if not inside:
-                bounds = f"{'above zero' if least_excluded else 'zero or more'}{' and below 1' if most == 1.0 else ''}"
-                raise ScenarioError(f"{field.name} of a drivetrain must be {bounds}, got {value}")
 
     @staticmethod
     def ideal() -> Drivetrain:

@@ -13,7 +13,7 @@ import numpy as np
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.options import not_negative, option
+from unifg.scenarios.options import Settings, not_negative, option
 from unifg.scenarios.planning.grid import path_exists
 from unifg.typing import Array
 
@@ -29,7 +29,7 @@ DRAWS = 200  # of one piece
 
 
 @dataclass(frozen=True)
-class Imperfection:
+class Imperfection(Settings):
     """Errors of the robot's map.
 
     Attributes:

@@ -125,10 +125,8 @@ def corridor(seed: int, count: int = 10) -> Layout:
         count: number of cylinders.
 
     Raises:
-        ScenarioError: if ``count`` is negative, or so many cylinders leave no way in a thousand draws.
+        ScenarioError: so many cylinders leave no way in a thousand draws.
     """
-    if count < 0:
-        raise ScenarioError(f"a corridor needs a number of cylinders that is not negative, got {count}")
     rng = np.random.default_rng([_CORRIDOR_TAG, seed])
     start, target = np.array([_INSET, 0.0, _HEIGHT]), np.array([_LENGTH - _INSET, 0.0, _HEIGHT])
     walls = np.array([[[0.0, side], [_LENGTH, side]] for side in (_HALF_WIDTH, -_HALF_WIDTH)])

@@ -127,9 +127,9 @@ class MujocoDrive(World):
     def _start_tick(self, pause: float) -> None:
         """Do nothing: forces of the engine act at once."""
 
-    def advance(self, pause: float, resting: bool = False) -> None:
+    def advance(self, pause: float) -> None:
         """Move discs and robot for a substep [s]."""
-        super().advance(pause, resting)
+        super().advance(pause)
         v, omega = self._wheels.advance(pause).tolist()
         data = self.physics.data
         wanted = np.array([v - 0.5 * AXLE * omega, v + 0.5 * AXLE * omega]) / WHEEL

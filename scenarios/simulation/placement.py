@@ -219,10 +219,8 @@ def random_movers(layout: Layout, count: int, rng: np.random.Generator) -> tuple
         rng: source of all numbers.
 
     Raises:
-        ScenarioError: if ``count`` is negative or a thousand draws find no room for a mover.
+        ScenarioError: if a thousand draws find no room for a mover.
     """
-    if count < 0:
-        raise ScenarioError(f"the number of movers must not be negative, got {count}")
     return tuple(_random_mover(layout, index, rng) for index in range(count))
 
 

@@ -24,7 +24,7 @@ from unifg.lie import SE2
 from unifg.models import unicycle
 from unifg.models.footprint import Body
 from unifg.models.planar import Base
-from unifg.scenarios.options import not_negative, option, positive, share
+from unifg.scenarios.options import Settings, not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.simulation.rectangles import wall_rectangles
@@ -37,7 +37,6 @@ ROBOT_RADIUS = 0.17
 """Radius of the robot's disc [m]."""
 
 HULL_SPACING = 0.02  # [m] between places of a hull whose distance from walls and obstacles is measured
-_REST_SPEED = 0.02  # [m/s]; below it the robot counts as being at rest
 
 EDGE = 0.3
 """Neighbouring beams that differ by more have an edge between them [m]."""
@@ -47,7 +46,7 @@ WALLS = -1
 
 
 @dataclass(frozen=True)
-class LidarModel:
+class LidarModel(Settings):
     """Lidar at the robot's centre, beams evenly over its field of view.
 
     Attributes:
@@ -72,7 +71,8 @@ class LidarModel:
 
     def __post_init__(self) -> None:
         """Refuse a field of view that is none."""
-        if not 0.0 < self.field <= 2.0 * math.pi + 1e-9:
+        super().__post_init__()
+        if self.field > 2.0 * math.pi + 1e-9:
             raise ScenarioError(f"the lidar's field of view must be in (0, 2 pi] rad, got {self.field:g}")
 
     @property
@@ -83,7 +83,7 @@ class LidarModel:
 
 
 @dataclass(frozen=True)
-class OdometryModel:
+class OdometryModel(Settings):
     """Wheel odometry: measured = true * (1 + scale + noise), for v and omega each on its own.
 
     Attributes:
@@ -115,7 +115,6 @@ class World(Space):
         drivetrain: Drivetrain | None = None,
         base: Base = unicycle.BASE,
         body: Body | None = None,
-        yields: bool = True,
         people: Sequence[Mover] = (),
     ) -> None:
         """Build the walls, place the obstacles and the robot.
@@ -131,7 +130,6 @@ class World(Space):
             drivetrain: what the base makes of its commands; None for a base that follows them at once.
             base: of the robot.
             body: of the robot; None for a disc.
-            yields: obstacles that move stop before a robot at rest instead of going on through it.
             people: walk about by social forces.
 
         Raises:
@@ -157,7 +155,7 @@ class World(Space):
         self._velocities = base.of(np.zeros(size)).tolist()
         self._left, self._spun, self._gripped = 0, 0.0, 0.0
         self.computing = 0.0  # [s] of the tick that decided the next control
-        super().__init__(pose, body or Body.disc(robot_radius), yields)
+        super().__init__(pose, body or Body.disc(robot_radius))
         self._boundary = self.body.boundary(HULL_SPACING)
         self._add_walls()
         for index, obstacle in enumerate(self.obstacles):
@@ -216,7 +214,7 @@ class World(Space):
             if not count:
                 self._left = round(dt / pause)
                 self._start_tick(pause)
-            self.advance(pause, resting=self.vehicle.velocity.length < _REST_SPEED)
+            self.advance(pause)
             self._trail.append((self.time, (*self.vehicle.position, self.vehicle.angle)))
         self._measure(before, heading_before, dt)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import pymunk
@@ -18,10 +18,7 @@ from unifg.errors import ScenarioError
 from unifg.models.footprint import Body
 from unifg.typing import Array
 
-__all__ = ["OTHERS", "YIELD_GAP", "Mover", "Obstacle", "Policy", "Space", "ToAndFro", "reflected"]
-
-YIELD_GAP = 0.1
-"""Gap a mover keeps between its hull and that of a resting robot [m]."""
+__all__ = ["OTHERS", "Mover", "Obstacle", "Policy", "Space", "ToAndFro", "reflected"]
 
 _SUBSTEP = 0.005  # [s]; at 1 m/s a first contact overlaps by at most 5 mm
 _EVENT_GAP = 0.5  # [s]; a contact renewed sooner belongs to the same event
@@ -63,8 +60,8 @@ class Obstacle:
 class Policy(Protocol):
     """Motion of a mover."""
 
-    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
-        """Velocity for the next substep of ``dt`` [s]; ``resting``: the vehicle stands still [m/s]."""
+    def velocity(self, mover: Mover, space: Space, dt: float) -> tuple[float, float]:
+        """Velocity for the next substep of ``dt`` [s]."""
 
 
 class Mover:
@@ -97,8 +94,8 @@ class Space:
         collisions: contact events so far; contacts with one owner less than 0.5 s apart are one.
     """
 
-    def __init__(self, place: Array, body: Body, yields: bool = True) -> None:
-        """Stand at ``place`` (2,) or (3,), x, y and heading [m, m, rad], alone; ``yields``: movers wait at rest."""
+    def __init__(self, place: Array, body: Body) -> None:
+        """Stand at ``place`` (2,) or (3,), x, y and heading [m, m, rad], alone."""
         self.engine = pymunk.Space()
         self.engine.collision_slop = 1e-4  # the default lets shapes overlap by 0.1 m
         self.engine.collision_bias = 1e-6
@@ -106,7 +103,6 @@ class Space:
         self.vehicle.position = (float(place[0]), float(place[1]))
         self.vehicle.angle = float(place[2]) if len(place) > 2 else 0.0
         self.body, self.radius = body, body.radius
-        self._yields = yields
         self.time = 0.0
         self.collisions = 0
         self._owner: dict[pymunk.Shape, int] = {}
@@ -126,7 +122,7 @@ class Space:
 
     def add_disc(self, obstacle: Obstacle, owner: int) -> pymunk.Shape:
         """Add a disc that rests or goes to and fro."""
-        policy = ToAndFro(obstacle, self._yields) if obstacle.moving else None
+        policy = ToAndFro(obstacle) if obstacle.moving else None
         return self.add_mover(Mover(obstacle.centre, obstacle.radius, policy), owner)
 
     def add_mover(self, mover: Mover, owner: int) -> pymunk.Shape:
@@ -144,7 +140,12 @@ class Space:
             shape.collision_type = _VEHICLE_TYPE
             shape.filter = pymunk.ShapeFilter(categories=_VEHICLE_CATEGORY)
         self.engine.add(self.vehicle, *shapes)
-        self.engine.on_collision(_VEHICLE_TYPE, _THING_TYPE, begin=self._on_begin, separate=self._on_separate)
+        self.engine.on_collision(
+            _VEHICLE_TYPE,
+            _THING_TYPE,
+            begin=lambda met, space, data: self.begin(self._thing(met)),
+            separate=lambda met, space, data: self.separate(self._thing(met)),
+        )
 
     def discs(self) -> Array:
         """(K, 4) x, y, radius [m] of the discs now, in the order they were added, and 1 for movers, else 0."""
@@ -166,11 +167,11 @@ class Space:
             self.time = begin + (k + 1) * (dt / count)
             yield dt / count
 
-    def advance(self, pause: float, resting: bool = False) -> None:
-        """Move everything for a substep [s]; movers that yield wait for a vehicle that is ``resting``."""
+    def advance(self, pause: float) -> None:
+        """Move everything for a substep [s]."""
         for disc in self._discs:
             if disc.policy is not None:
-                disc.body.velocity = disc.policy.velocity(disc, self, resting, pause)
+                disc.body.velocity = disc.policy.velocity(disc, self, pause)
         self.engine.step(pause)
 
     def without_contacts(self, velocity: pymunk.Vec2d, relative: bool = True) -> pymunk.Vec2d:
@@ -208,38 +209,25 @@ class Space:
         self._touching[owner] = self._touching.get(owner, 1) - 1
         self._separated[owner] = self.time
 
-    def _on_begin(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        self.begin(self._thing(arbiter))
-
-    def _on_separate(self, arbiter: pymunk.Arbiter, space: pymunk.Space, data: Any) -> None:
-        self.separate(self._thing(arbiter))
-
     def _thing(self, arbiter: pymunk.Arbiter) -> int:
         first, second = arbiter.shapes
         return self._owner[first] if first in self._owner else self._owner[second]
 
 
 class ToAndFro:
-    """To and fro along the segment of an obstacle at constant speed; waits where it would crowd a robot at rest."""
+    """To and fro along the segment of an obstacle at constant speed."""
 
-    def __init__(self, obstacle: Obstacle, yields: bool) -> None:
-        """Begin at the obstacle's centre, about to leave for its end; ``yields``: wait for robots at rest."""
+    def __init__(self, obstacle: Obstacle) -> None:
+        """Begin at the obstacle's centre, about to leave for its end."""
         self.origin, end = (pymunk.Vec2d(*place) for place in obstacle.positions(np.array([0.0, 1.0])).tolist())
         span = end - self.origin
         self.length, self.direction, self.speed = span.length, span.normalized(), obstacle.speed
-        self.along, self.sense, self.yields = 0.0, 1.0, yields
+        self.along, self.sense = 0.0, 1.0
 
-    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+    def velocity(self, mover: Mover, space: Space, dt: float) -> tuple[float, float]:
         """Velocity to the next place on the segment, so that nothing drifts."""
-        along, sense = reflected(self.along, self.sense, self.speed * dt, self.length)
-        target, robot = self.origin + along * self.direction, space.vehicle.position
-        if resting and self.yields:
-            hulls = space.radius + mover.radius
-            gap = target.get_distance(robot) - hulls
-            if gap < YIELD_GAP and gap < mover.body.position.get_distance(robot) - hulls:
-                return 0.0, 0.0
-        self.along, self.sense = along, sense
-        return (target - mover.body.position) / dt
+        self.along, self.sense = reflected(self.along, self.sense, self.speed * dt, self.length)
+        return (self.origin + self.along * self.direction - mover.body.position) / dt
 
 
 def reflected(along: float, sense: float, step: float, length: float) -> tuple[float, float]:

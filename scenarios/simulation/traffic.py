@@ -15,7 +15,7 @@ import numpy as np
 
 from unifg.errors import ScenarioError
 from unifg.models.distance_map import DistanceMap
-from unifg.scenarios.options import count, option, positive
+from unifg.scenarios.options import Settings, count, option, positive
 from unifg.scenarios.planning.polyline import arc_lengths, at_stations
 from unifg.scenarios.simulation.space import Mover, Space, reflected
 from unifg.typing import Array
@@ -35,7 +35,7 @@ DRAWS = 200  # of each
 
 
 @dataclass(frozen=True)
-class Traffic:
+class Traffic(Settings):
     """People in the building; none by default.
 
     Attributes:
@@ -54,10 +54,9 @@ class Traffic:
         Raises:
             ScenarioError: naming the field.
         """
-        if not 0.0 < self.slowest <= self.fastest < math.inf:
-            raise ScenarioError(f"people walk at 0 < slowest <= fastest, got {self.slowest:g} and {self.fastest:g} m/s")
-        if not 0 <= self.people <= MOST:
-            raise ScenarioError(f"the number of people must be from 0 to {MOST}, got {self.people}")
+        super().__post_init__()
+        if self.slowest > self.fastest:
+            raise ScenarioError(f"people walk at slowest <= fastest, got {self.slowest:g} and {self.fastest:g} m/s")
 
 
 class Social:
@@ -81,7 +80,7 @@ class Social:
         self._walls, self._arc = walls, arc_lengths(way)
         self._along, self._sense = 0.0, 1.0
 
-    def velocity(self, mover: Mover, space: Space, resting: bool, dt: float) -> tuple[float, float]:
+    def velocity(self, mover: Mover, space: Space, dt: float) -> tuple[float, float]:
         """Velocity after ``dt`` [s] of the forces, at most a hasty walk."""
         velocity = np.array(mover.body.velocity)
         velocity = velocity + dt * self.force(np.array(mover.body.position), velocity)

@@ -12,20 +12,20 @@ had met a known wall before.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from functools import lru_cache
 
 import numpy as np
 
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap
-from unifg.models.footprint import Body
 from unifg.models.planar import base_of
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.scenarios.logs.drive_log import EpisodeLog
+from unifg.typing import Array, BoolArray
 
-__all__ = ["FAULT", "Assumed", "Broken", "Contact", "DriveRecord", "Judgement", "judged"]
+__all__ = ["FAULT", "Broken", "Contact", "Judgement", "judged"]
 
 FAULT = "fault of the robot"
 BREAKS = "assumption broken"
@@ -35,53 +35,6 @@ BRAKES = 0.1  # [m/s] by which a base may be faster than it is told
 CARRIED = 5.0  # [m/s]; a faster robot was carried
 REST, RESTED = 0.05, 0.5  # [m/s, s] of a robot that is run into
 TOUCH = 0.01  # [m] inside of a known wall, from which a way out meets it
-
-
-@dataclass(frozen=True)
-class Assumed:
-    """Constant assumptions of a drive.
-
-    Attributes:
-        sigmas: standard deviations of the estimate that clearances are wider by.
-        wall_gap, disc_gap: clearances beyond these [m].
-        deceleration: of the brakes, by the data sheet [m/s^2].
-        ahead: time for which a mover may do anything within its bound before the robot is at rest [s].
-        unseen: "free": space that no beam has looked into, but for blind sectors, which are occupied.
-    """
-
-    sigmas: float
-    wall_gap: float
-    disc_gap: float
-    deceleration: float
-    ahead: float
-    unseen: str = "free"
-
-
-class DriveRecord(Protocol):
-    """Columns of a drive's log that are judged, as `unifg.scenarios.logs.drive_log.EpisodeLog` declares them."""
-
-    assumed: Assumed
-    occupancy: OccupancyMap
-    walls: OccupancyMap
-    base: str
-    dt: float
-    collisions: int
-    scan_angles: Array
-    time: Array
-    true_pose: Array
-    estimate: Array
-    covariance: Array
-    control: Array
-    contacts: IntArray
-    scan: Array
-    obstacles: Array
-    detected: list[Array]
-    expected: list[Array]
-    way_out: Array
-
-    @property
-    def hull(self) -> Body:
-        """Body of the robot."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +84,9 @@ class Judgement:
     beyond_sigma: float
 
 
-def judged(log: DriveRecord) -> Judgement:
-    """Check every tick of a drive, and attribute its contacts."""
+@lru_cache(1)
+def judged(log: EpisodeLog) -> Judgement:
+    """Check every tick of a drive, and attribute its contacts; the last drive is not checked again."""
     judge = _Judge(log)
     flags = {
         "pose": judge.off > log.assumed.wall_gap, "brakes": judge.too_fast > BRAKES,
@@ -153,7 +107,7 @@ def judged(log: DriveRecord) -> Judgement:
 class _Judge:
     """Quantities of all ticks; K true obstacles, T ticks."""
 
-    def __init__(self, log: DriveRecord) -> None:
+    def __init__(self, log: EpisodeLog) -> None:
         """Compare beliefs with the truth."""
         self.log, self.assumed = log, log.assumed
         same = log.walls is log.occupancy or np.array_equal(log.walls.occupied, log.occupancy.occupied)
@@ -294,16 +248,9 @@ class _Judge:
         return float(self.log.expected[tick][int(np.argmin(away)), 2])
 
     @staticmethod
-    def _where(held: BoolArray, ticks: range, kind: str, words: Words) -> list[Broken]:
+    def _where(held: BoolArray, ticks: range, kind: str, words: Callable[[int], str]) -> list[Broken]:
         """The first of some ticks in which an assumption was broken."""
         return [Broken(k, kind, words(k)) for k in ticks if held[k]][:1]
-
-
-class Words(Protocol):
-    """Numbers of a tick, in words."""
-
-    def __call__(self, k: int) -> str:
-        """Of tick ``k``."""
 
 
 def _field(occupancy: OccupancyMap) -> DistanceMap:
