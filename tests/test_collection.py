@@ -18,17 +18,17 @@ from problems.lie import LieCase
 from unifg.modeling.terms import Constraint
 from unifg.typing import Array
 
-# Equalities, inequalities, costs that are no squares.
+# Constraints, costs that are no squares.
 CLASSES = {
-    "GaussNewton": (False, False, False),
-    "LevenbergMarquardt": (False, False, False),
-    "DogLeg": (False, False, False),
-    "KKT": (True, False, False),
-    "Penalty": (True, True, False),
-    "AugmentedLagrangian": (True, True, True),
-    "SQP": (True, True, True),
-    "SQP, exact": (True, True, True),
-    "InteriorPoint": (True, True, True),
+    "GaussNewton": (False, False),
+    "LevenbergMarquardt": (False, False),
+    "DogLeg": (False, False),
+    "KKT": (True, False),
+    "Penalty": (True, False),
+    "AugmentedLagrangian": (True, True),
+    "SQP": (True, True),
+    "SQP, exact": (True, True),
+    "InteriorPoint": (True, True),
 }
 # What is known not to be solved; a problem that begins to fail or to pass fails here.
 UNSOLVED: dict[str, set[str]] = {
@@ -60,13 +60,9 @@ AIMS = {"InteriorPoint": 0.95, "SQP": 0.95, "AugmentedLagrangian": 0.90}
 
 def takes(name: str, graph: fg.Graph) -> bool:
     """Test whether a backend claims the class of a graph."""
-    equalities, inequalities, scalars = CLASSES[name]
+    constraints, scalars = CLASSES[name]
     program = graph.compile()
-    if program.scalar_terms and not scalars:
-        return False
-    if program.equality.any() and not equalities:
-        return False
-    return inequalities or bool(program.equality.all())
+    return (scalars or not program.scalar_terms) and (constraints or not len(program.equality))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -168,7 +164,7 @@ def test_formulas_agree_with_the_files(shared_data: Path, name: str, rng: np.ran
 
 # ------------------------------------------------------------------- honest endings
 
-CONSTRAINED = [name for name, (_, inequalities, _) in CLASSES.items() if inequalities]
+CONSTRAINED = [name for name, (constraints, _) in CLASSES.items() if constraints]
 
 
 @pytest.mark.product(12)
@@ -198,10 +194,7 @@ def test_least_violation_is_claimed_where_it_is(name: str, case: str, rng: np.ra
 
 def staged(name: str) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """A problem of the backend's class that takes it several iterations."""
-    equalities, inequalities, _ = CLASSES[name]
-    if inequalities:
-        return short_drive()
-    return CASES["HS77" if equalities else "Bard"].build()
+    return short_drive() if CLASSES[name][0] else CASES["Bard"].build()
 
 
 @pytest.mark.parametrize("name", BACKENDS)
@@ -228,7 +221,7 @@ def test_limits_and_interruptions_are_told_apart(name: str) -> None:
         assert re.match(re.escape(f"{solution.solver}: {solution.status.value}"), solution.report())
 
 
-@pytest.mark.parametrize("name", [name for name, (_, _, scalars) in CLASSES.items() if scalars])
+@pytest.mark.parametrize("name", [name for name, (_, scalars) in CLASSES.items() if scalars])
 @pytest.mark.parametrize("bounded", [True, False], ids=["bounded", "free"])
 def test_an_objective_without_minimum_is_unbounded(name: str, bounded: bool) -> None:
     graph = fg.Graph()
