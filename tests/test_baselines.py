@@ -174,6 +174,7 @@ def test_an_uncertain_robot_keeps_farther_off() -> None:
     assert heard[0] - heard[1] == pytest.approx(SETTINGS.sigmas * 0.1)
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_goal_is_reached_with_its_heading(name: str) -> None:
     goal = np.array([3.2, 2.0, 0.5])

@@ -257,7 +257,7 @@ def test_a_retraction_too_short_for_second_derivatives_is_refused() -> None:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda manifold: manifold.name)
-@pytest.mark.product(1, of="derivatives along own manifolds")
+@pytest.mark.product(1, of="own manifolds")
 def test_manifolds_that_know_nothing_of_tracing(manifold: fg.Manifold) -> None:
     """Retraction and local coordinates agree with fourth-order differences along the manifold's own retraction."""
     rng = np.random.default_rng(6)

@@ -94,7 +94,7 @@ BACKENDS: dict[str, Callable[[int], fg.Solver]] = {
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("iterations", [1, 2, 3, 5])
 @pytest.mark.parametrize("feasible", [True, False], ids=["rolled out", "shifted"])
-@pytest.mark.product(5)
+@pytest.mark.product(2)
 def test_few_iterations_follow_a_moved_goal(name: str, iterations: int, feasible: bool) -> None:
     arrives_as_converged(name, lambda loop: loop.drive(BACKENDS[name](iterations), feasible), feasible)
 

@@ -189,7 +189,7 @@ def beacons(loss: Loss, constrained: bool, equal: bool) -> tuple[fg.Graph, dict[
 
 
 @pytest.mark.parametrize("name", [*LEAST_SQUARES, *CONSTRAINED])
-@pytest.mark.product(4)
+@pytest.mark.product(2)
 def test_every_backend_finds_the_optimum_of_every_loss(name: str) -> None:
     for loss in [*LOSSES, Welsch()]:
         graph, guess, measured = beacons(loss, name in CONSTRAINED, name not in LEAST_SQUARES)

@@ -157,6 +157,7 @@ def test_a_flight_is_read_back(tmp_path: Path) -> None:
         assert tick["statuses"] == log.statuses[k] and "landmarks" not in tick
 
 
+@pytest.mark.product(3, of="scenes and pictures")
 def test_a_flight_past_bodies_is_read_back(tmp_path: Path) -> None:
     def stop(done: float, text: str) -> None:
         if done > 0.05:

@@ -262,6 +262,7 @@ def test_other_bases_and_stated_slip_are_refused() -> None:
 # ------------------------------------------------------------------ closed loops
 
 
+@pytest.mark.product(4, of="drives and flights")
 def test_a_flight_repeats_and_is_not_that_of_the_own_plant() -> None:
     def flown(world: str, seconds: float = 2.0) -> Array:
         settings = FlightSettings(seed=1003, world=world, time_limit=seconds)

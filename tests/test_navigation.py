@@ -93,7 +93,7 @@ def test_turtlebot_world(shared_data: Path, solver: str) -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.product(1, of="seeds of drives")
+@pytest.mark.product(4, of="drives and flights")
 def test_same_seed_same_drive(solver: str) -> None:
     settings = replace(CORRIDOR, solver=solver, obstacles=2, seed=5)
     one, two = (Episode(settings).run(stop_after(40)) for _ in range(2))
@@ -168,7 +168,7 @@ def replace_solver(monkeypatch: pytest.MonkeyPatch, episode: Episode, double: ob
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("good", [12, 30], ids=["straight", "in the turn"])
-@pytest.mark.product(1)
+@pytest.mark.product(4, of="drives and flights")
 def test_failed_solves_brake_to_rest_along_the_stored_plan(
     monkeypatch: pytest.MonkeyPatch, solver: str, good: int
 ) -> None:
@@ -197,6 +197,7 @@ def test_failed_solves_brake_to_rest_along_the_stored_plan(
     assert episode_metrics(log)["solver_failures"] == log.ticks - good
 
 
+@pytest.mark.product(4, of="drives and flights")
 def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(replace(CORRIDOR, seed=3))
     run = episode.pilot.controller.loop.warm

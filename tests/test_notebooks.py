@@ -31,6 +31,7 @@ def test_all_are_there_and_bare() -> None:
         assert all(cell["outputs"] == [] and cell["execution_count"] is None for cell in code), f"clear {path.name}"
 
 
+@pytest.mark.product(3)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run(path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     plt = pytest.importorskip("matplotlib.pyplot")

@@ -44,7 +44,7 @@ def test_axioms_hold(manifold: fg.Manifold) -> None:
 
 
 @pytest.mark.parametrize("group", GROUPS[:3], ids=lambda g: g.name)
-@pytest.mark.product(1)
+@pytest.mark.product(1, of="own manifolds")
 def test_what_follows_is_exact(group: fg.LieGroup, rng: Generator) -> None:
     """Everything but four functions is derived; against exponentials of matrices, to rounding."""
     x, d = group.random(rng, (20,)), 0.9 * rng.standard_normal((20, group.dim))
@@ -135,7 +135,7 @@ MUTANTS: list[tuple[fg.Manifold, str, Callable[..., None], str]] = [
 
 
 @pytest.mark.parametrize(("good", "name", "wrong", "axiom"), MUTANTS, ids=[f"{m[1]} {m[2].__name__}" for m in MUTANTS])
-@pytest.mark.product(3)
+@pytest.mark.product(1)
 def test_mutants_are_named(good: fg.Manifold, name: str, wrong: Callable[..., None], axiom: str) -> None:
     mutant: Any = type("Mutant", (type(good),), {name: fg.elementwise(compiled(wrong)), "name": "mutant"})()
     report = fg.check_manifold(mutant)
@@ -185,6 +185,7 @@ def test_what_is_no_function_of_one_element_is_refused() -> None:
         XYZW.act(np.zeros(4), np.zeros(3))
 
 
+@pytest.mark.product(1, of="own manifolds")
 def test_a_subclass_inherits_and_replaces() -> None:
     functions, straight = functions_of(fg.SE2), functions_of(STRAIGHT)
     assert functions is not None and straight is not None
@@ -264,7 +265,7 @@ class Chain:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda m: m.name)
-@pytest.mark.product(1, of="derivatives along own manifolds")
+@pytest.mark.product(1, of="own manifolds")
 def test_all_backends_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
     chain = Chain(manifold)
     answer = chain.answer()
@@ -284,7 +285,7 @@ def test_all_backends_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
 
 
 @pytest.mark.parametrize("manifold", OWN, ids=lambda m: m.name)
-@pytest.mark.product(1)
+@pytest.mark.product(1, of="own manifolds")
 def test_smoothers_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
     chain = Chain(manifold)
     smoother, lag = fg.Incremental(relinearize=0.0, wildfire=0.0), fg.FixedLag(COUNT)

@@ -160,6 +160,7 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     assert {name for name in names if ".dist-info/" not in name} == expected
 
 
+@pytest.mark.product(4, of="processes of their own")
 def test_sdist_holds_the_examples(source: Path, wheel: Path) -> None:
     del wheel  # building it leaves the sdist beside it
     (sdist,) = (source / "dist").glob("*.tar.gz")
@@ -199,6 +200,7 @@ def test_imports_come_from_the_wheel(clean: Path) -> None:
         assert Path(file).resolve().is_relative_to(home), file
 
 
+@pytest.mark.product(4, of="processes of their own")
 def test_bare_side_folders_are_not_installed(clean: Path) -> None:
     out = run(
         clean / "python", "-I", "-c",
@@ -222,6 +224,7 @@ def test_the_shipped_map_can_be_loaded(clean: Path) -> None:
     assert out.strip() != ""
 
 
+@pytest.mark.product(4, of="processes of their own")
 def test_console_script(clean: Path) -> None:
     for extra in EXTRAS:
         pytest.importorskip(extra)

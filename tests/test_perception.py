@@ -186,7 +186,7 @@ def test_mover_that_turns_round_is_followed() -> None:
 
 
 @pytest.mark.parametrize("speed", [0.3, 0.6, 1.0, 1.5])
-@pytest.mark.product(1)
+@pytest.mark.product(1, of="tracks")
 def test_a_mover_that_turns_round_is_believed_soon(speed: float) -> None:
     """From where it turns it goes a forearm, at any speed, to where its track thought that it would not be."""
     length, wrong = 2.2, []

@@ -183,7 +183,7 @@ def test_no_tick_compiles_though_solves_fail(what: str, coupling: str) -> None:
     assert new == [[], [], []] and columns == [0] * 16
 
 
-@pytest.mark.product(1, of="episodes that are prepared")
+@pytest.mark.product(4, of="processes of their own")
 def test_no_tick_compiles_whatever_it_turns_to() -> None:
     """A route repaired nearby and on the whole map, a step aside, the last stop, a way back, a robot found again."""
     found = said(TURNS)

@@ -66,6 +66,7 @@ def test_rows_have_what_tables_need(short_rows: dict[str, Row]) -> None:
         assert len({line.count("|") for line in lines}) <= 1
 
 
+@pytest.mark.product(4, of="drives and flights")
 def test_a_failure_is_told(short_rows: dict[str, Row]) -> None:
     row = copy.deepcopy(short_rows["sequential"])
     row["metrics"] |= {"collisions": 1, "reached": True}

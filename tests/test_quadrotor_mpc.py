@@ -108,6 +108,7 @@ def test_walls_on_the_map_correct_the_heading_and_cylinders_do_not(association: 
     assert headings[1] > 0.01
 
 
+@pytest.mark.product(4, of="drives and flights")
 def test_the_separate_coupling_learns_no_parameters_and_the_others_do() -> None:
     logs = {coupling: run_flight(short(1.0, coupling=coupling)) for coupling in COUPLINGS}
     nominal = draw_conditions(SEED).nominal.packed
@@ -333,6 +334,7 @@ def test_who_moves_is_found_out_where_nobody_names_things(flag: bool) -> None:
     assert walking.update(reading, state).velocity[0] == pytest.approx([0.0, 0.4], abs=0.15)
 
 
+@pytest.mark.product(4, of="drives and flights")
 def test_what_turns_out_to_move_leaves_the_map() -> None:
     flight = Flight(replace(short(3.0, movers=2), seed=7, estimator=EstimatorSettings(association="unknown")))
     log = flight.run(silent)

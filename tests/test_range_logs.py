@@ -420,6 +420,7 @@ def test_a_map_is_written_and_localised_on(made: Path, log: RangeLog, capsys: py
     assert json.loads((out / "metrics.json").read_text())["end_error_m"] == numbers["end_error_m"]
 
 
+@pytest.mark.product(2, of="large maps")
 def test_a_recorded_drive_needs_a_map_and_a_localiser(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "navigation", "--log", str(made / "log.csv"), "--out", str(made / "none")]
     assert main(words) == 2 and "give --map" in capsys.readouterr().err
@@ -439,6 +440,7 @@ def test_odometry_is_made_of_corrected_poses(made: Path) -> None:
     np.testing.assert_allclose(SE2.between(plain, mounted), np.tile([0.3, 0.0, 0.2], (len(plain), 1)), atol=1e-12)
 
 
+@pytest.mark.product(2, of="large maps")
 def test_an_interrupt_leaves_the_map_so_far(log: RangeLog) -> None:
     def stop(done: float, text: str) -> None:
         if done > 0.3:

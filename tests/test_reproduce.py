@@ -23,7 +23,8 @@ from unifg.scenarios.papers.printed import numbers, pairs, printed
 ITEMS = [(paper, item) for paper, found in catalogue.PAPERS.items() for item in found]
 # Legs of 170 m take minutes: `test_a_quick_campaign_...` looks at what is run, `--figure 6` runs three of them.
 ERRORS = (bazzana.POSITION, bazzana.HEADING)
-SHORT = [(paper, item) for paper, item in ITEMS if item.option not in ("--table I", "--table II")]
+LONG = [("bazzana", "--table I"), ("bazzana", "--table II"), ("factormpc", "--figure 10")]  # more than a minute each
+SHORT = [(paper, item) for paper, item in ITEMS if (paper, item.option) not in LONG]
 
 
 class Least(Effort):
@@ -144,6 +145,22 @@ def test_an_item_runs(paper: str, item: catalogue.Item, tmp_path: Path) -> None:
         assert consistent(line), line
         assert re.fullmatch(r"-|[\d.]+( to [\d.]+| ± [\d.]+)?", line.paper) or any(line.paper in t for t in texts)
     assert any(line.paper != "-" for line in found.lines) or item.option == "--figure 5"
+
+
+def test_figure_eights_are_compared_in_pairs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    flown: list[Any] = []
+
+    def flights(effort: Effort, jobs: list[Any]) -> list[dict[str, float]]:
+        """Plans are 10 mm better than flatness at 1 and 2 m/s, and as much worse at 3 m/s."""
+        flown.extend(jobs)
+        better = {1.0: -0.01, 2.0: -0.01, 3.0: 0.01}
+        return [{"error": 0.05 + 0.001 * job.seed + better[job.speed] * (job.controller == "barrier")} for job in jobs]
+
+    monkeypatch.setattr(factormpc, "_flown", flights)
+    found = factormpc.figure_10(effort(tmp_path))
+    assert len(flown) == 12 and len({(job.controller, job.speed, job.seed) for job in flown}) == 12
+    assert [line.difference for line in found.lines[2::3]] == ["agrees", "agrees", "differs"]
+    assert [float(line.ours.split()[0]) for line in found.lines[2::3]] == pytest.approx([-10.0, -10.0, 10.0])
 
 
 def drives(runs: int) -> pd.DataFrame:

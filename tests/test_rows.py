@@ -45,6 +45,7 @@ def route(function: Function, *arguments: Any, count: int = 6, size: int = 3) ->
     return graph.compile().terms[0].route
 
 
+@pytest.mark.product(12)
 @pytest.mark.parametrize("given", ["constant", "data", "closure", "attribute", "changed"])
 @pytest.mark.parametrize("function", [clearance, own_clearance])
 @pytest.mark.parametrize("solver", [InteriorPoint(), SQP(), AugmentedLagrangian()], ids=lambda s: s.name)

@@ -100,7 +100,7 @@ def test_convergence_is_quadratic(name: str) -> None:
 
 @pytest.mark.parametrize("qp", ["osqp", "piqp", "graph"])
 @pytest.mark.parametrize("problem", PROBLEMS, ids=lambda p: p.name)
-@pytest.mark.product(40)
+@pytest.mark.product(15)
 def test_exact_solves_what_gauss_newton_solves(problem: Problem, qp: str) -> None:
     graph, guess = problem.build()
     solution = SQP(hessian="exact", qp=qp).solve(graph, guess)
@@ -159,6 +159,7 @@ ROUTES: dict[str, Callable[[CompiledProblem], Route]] = {
 }
 
 
+@pytest.mark.product(4)
 @pytest.mark.parametrize(
     ("name", "equality"),
     [*((name, True) for name in ROUTES), *((name, False) for name in ROUTES if name != "elimination")],

@@ -155,7 +155,7 @@ RUNS: dict[str, tuple[Callable[[], Stated], dict[str, Any], set[int]]] = {
 
 
 @pytest.mark.parametrize("name", RUNS)
-@pytest.mark.product(10)
+@pytest.mark.product(4)
 def test_a_solve_takes_the_steps_of_a_watched_one(
     name: str, answers: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:

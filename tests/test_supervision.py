@@ -391,6 +391,7 @@ def test_a_blind_robot_brakes_at_once_and_says_why(kind: str) -> None:
     assert m["health"]["lost"] == 5 and sum(m["dropped_samples"].values()) == 16
 
 
+@pytest.mark.product(4, of="drives and flights")
 def test_a_robot_that_sees_again_goes_on() -> None:
     log = faulty("lidar-nan@1:1.5")
     assert log.health[25] == "lost" and log.health[-1] == "ok" and log.control[-1, 0] > 0.9

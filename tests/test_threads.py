@@ -51,6 +51,7 @@ def at_once(work: Callable[[int], Any], threads: int = THREADS) -> list[Any]:
     return found
 
 
+@pytest.mark.product(4)
 @pytest.mark.parametrize("name", BACKENDS)
 def test_each_thread_gets_the_answer_to_its_own_data(name: str) -> None:
     walk = Walk(name)
