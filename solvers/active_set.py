@@ -38,7 +38,7 @@ class ActiveSet:
         """
         self._lower, self._upper, self._equality = program.lower, program.upper, program.equality
         self._tolerance, self._single = tolerance, False
-        self.choice = bool((np.isfinite(self._lower) | np.isfinite(self._upper))[~self._equality].any())
+        self.choice = bool(program.inequalities.any())
         side = np.sign(multipliers) * np.isfinite(np.where(multipliers > 0.0, program.upper, program.lower))
         self.side: IntArray = np.where(program.equality, 1, side).astype(np.intp)
 
@@ -82,7 +82,7 @@ class ActiveSet:
         side[(self.side == 0) & (constraints > self._upper + self._tolerance)] = 1
         side[(self.side == 0) & (constraints < self._lower - self._tolerance)] = -1
         wrong = np.flatnonzero(side != self.side)
-        if self._single and len(wrong) > 1:
+        if self._single:
             side[wrong[1:]] = self.side[wrong[1:]]
         self.side = side
         return not len(wrong)

@@ -83,8 +83,7 @@ def _kind(program: CompiledProblem) -> str:
         return f"the scalar cost '{program.scalar_terms[0].name}'"
     if not program.constraint_terms:
         return "least squares without constraints"
-    limited = np.isfinite(program.lower) | np.isfinite(program.upper)
-    rows = np.flatnonzero(limited & ~program.equality)
+    rows = np.flatnonzero(program.inequalities)
     if len(rows):
         return f"the inequality '{program.row_name(int(rows[0]))[0]}'"
     equal = np.flatnonzero(program.equality)

@@ -48,7 +48,7 @@ from unifg.solvers.globalize.line_search import search
 from unifg.solvers.globalize.merit import OnePrice
 from unifg.solvers.globalize.norms import largest, norm
 from unifg.solvers.globalize.slow_convergence import converges_slowly
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array
 
 RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved
 ROUNDING = 1e-13
@@ -232,7 +232,7 @@ class Newton:
     def begin(self, run: SolveState) -> None:
         """Look at the limits of this solve, which may be data, and begin with its multipliers."""
         program = self.program
-        if not np.array_equal(_limited(program), self.system.held):
+        if not np.array_equal(program.equality | program.inequalities, self.system.held):
             self._structure(program)
         self.active = ActiveSet(program, run.multipliers, ENTERING * run.tolerances.violation)
         self._near = NOTHING  # equal solves take equal steps
@@ -323,14 +323,8 @@ class Newton:
         return found[:n], change
 
     def _structure(self, program: CompiledProblem) -> None:
-        self.system = program.systems.kkt(_limited(program))
+        self.system = program.systems.kkt(program.equality | program.inequalities)
         self._data, self._near = np.zeros(self.system.pattern.nnz), NOTHING
-
-
-def _limited(program: CompiledProblem) -> BoolArray:
-    """(M,) rows that have a limit."""
-    limited: BoolArray = np.isfinite(program.lower) | np.isfinite(program.upper)
-    return limited
 
 
 def _next_damping(damping: float, length: float) -> float:

@@ -611,6 +611,12 @@ class CompiledProblem:
             return lin.gradient
         return lin.gradient + self.constraints.transposed_times(lin.constraint_jacobian, multipliers)
 
+    @property
+    def inequalities(self) -> BoolArray:
+        """(M,) rows that have a limit and are no equalities."""
+        found: BoolArray = (np.isfinite(self.lower) | np.isfinite(self.upper)) & ~self.equality
+        return found
+
     def violation(self, constraints: Array) -> Array:
         """(M,) signed distance outside the limits: positive above, negative below, zero inside."""
         found = np.empty(len(constraints))

@@ -52,8 +52,7 @@ def require(
         )
     if constraints != "equalities":
         return
-    limited = np.isfinite(program.lower) | np.isfinite(program.upper)
-    rows = np.flatnonzero(limited & ~program.equality)
+    rows = np.flatnonzero(program.inequalities)
     if len(rows):
         name, index = program.row_name(int(rows[0]))
         raise BackendError(
