@@ -16,8 +16,9 @@ from unifg.errors import BackendError, GraphError
 from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
+from unifg.horizon.margins import Margins
 from unifg.horizon.multistart import LEAST_TIME, Jumps, cheapest
-from unifg.horizon.robot import Robot, numbers
+from unifg.horizon.robot import Robot, control_limits, numbers
 from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.tree import BranchedSelection, ExpectedCost, Tree
 from unifg.horizon.window import Window
@@ -120,6 +121,7 @@ class RecedingHorizon:
         delay: int = 0,
         patience: int = 10,
         portion: int | None = None,
+        sigmas: float | Mapping[str, float] = 0.0,
         clock: Callable[[], float] = clocks.perf_counter,
     ) -> None:
         """State the graph and prepare the backends; ticks compile nothing.
@@ -147,8 +149,7 @@ class RecedingHorizon:
             starts: where solves begin that have no last answer to go on from, and what is tried beside the warm start
                 when the goal has moved. The cheapest feasible plan is kept; what the deadline leaves no time for is
                 tried in the next tick.
-            believable: whether what a joint solve says of the present is believed; by default when its plan is
-                applied and bends no constraint by more than ``CLOSE``.
+            believable: test of what a joint solve says of the present; None: its plan is used, violated by ``CLOSE``.
             deadline: for a tick [s]: the solver is given what is left of it; a plan that comes later is not applied.
             delay: ticks after which a plan acts, because solving takes time. The horizon begins where the controls
                 that have been sent until then lead by the robot's model, and the first control of a plan acts there;
@@ -158,6 +159,8 @@ class RecedingHorizon:
                 the judge has instead of a plan is applied meanwhile. Its plan is then followed from where it should be.
                 With a deadline as many are made as fit by the time that they took before; where none fits, the tick is
                 late and what is left of the last plan is applied. None: every solve ends in its tick.
+            sigmas: standard deviations of the estimate by which inequality constraints on states are tightened, of all
+                or by their names (:class:`unifg.horizon.margins.Margins`).
             clock: seconds of the wall.
 
         Raises:
@@ -186,7 +189,7 @@ class RecedingHorizon:
         self.tree, self.path = tree, tree.paths[-1]
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, len(tree), coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
-        between = _looked_at((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
+        between = control_limits((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
         graph = Graph()
         self.tie: PresentCoupling = self._tied(graph, pull)
         self.x, self.u = self.tie.ahead, graph.variables("u", robot.control, self.steps)
@@ -202,6 +205,7 @@ class RecedingHorizon:
         if probabilities is not None:
             self._expected = ExpectedCost(graph, graph.terms[before:], tree, self.x, self.u)
         self._probabilities = probabilities
+        self._margins = Margins(graph, graph.terms[before:], sigmas, robot, self.x, window) if sigmas else None
         self._said = [handle for name, handle in self._handles.items() if name not in tied]
         backends = solver, cold or solver, second or solver
         most = deadline if portion is None else np.inf
@@ -290,21 +294,28 @@ class RecedingHorizon:
         window.estimate(given)
         return self._plan(replace(window.now(given, last), times=self.times, tree=self._branches), begin)
 
-    def plan(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Plan:
+    def plan(
+        self,
+        present: ArrayLike,
+        given: Any = None,
+        constants: Mapping[str, Array] | None = None,
+        covariance: ArrayLike | None = None,
+    ) -> Plan:
         """Plan from a present state (storage,) that is estimated elsewhere.
 
         Args:
             present: state.
             given: what terms ask for in ``now.given``.
             constants: (count, storage) by name; by default those of the window, without one those at the start.
+            covariance: (D, D) of state and constants side by side, for ``sigmas``; by default that of the window.
 
         Raises:
-            GraphError: for constants that there are not, and data of a term that do not fit.
+            GraphError: for constants that there are not, data of a term and a covariance that do not fit.
             BackendError: while another thread plans.
         """
         with self._alone():
             begin = self._clock()
-            return self._plan(self.now(present, given, constants), begin)
+            return self._plan(self.now(present, given, constants), begin, covariance)
 
     def idle(self, seconds: float = np.inf) -> dict[str, str]:
         """Verify the last solution by the functions as written, while nothing is due: after the control was applied.
@@ -365,7 +376,7 @@ class RecedingHorizon:
             found |= self._expected.data(self.probabilities)
         return found
 
-    def _plan(self, present: Context[Any], begin: float) -> Plan:
+    def _plan(self, present: Context[Any], begin: float, covariance: ArrayLike | None = None) -> Plan:
         """Solve, judge, and remember."""
         now = self._acting(present)
         if self.goes_on:
@@ -376,6 +387,8 @@ class RecedingHorizon:
         self.waited = 0
         data = self.data(now)
         run, guess = self.begin(now)
+        if self._margins:
+            data = self._margins.data(run.program, self.tie.begin(guess, now), covariance, data)
         if run is self.warm and not self._fits(begin):
             return self._late(now, begin)
         if np.isfinite(self._deadline) and self._portion is None:
@@ -680,19 +693,6 @@ def _node_times(times: ArrayLike | None, tree: Tree, robot: Robot) -> Array:
     if robot.tick is not None and not np.isclose(robot.tick, nodes[1], rtol=1e-9, atol=0.0):
         raise GraphError(f"the first step must be as long as a tick of the robot ({robot.tick} s), got {nodes[1]} s")
     return nodes
-
-
-def _looked_at(limits: tuple[ArrayLike, ArrayLike], size: int) -> tuple[Array, Array]:
-    """Least and greatest controls (m,), between which there are some."""
-    try:
-        least, most = (np.broadcast_to(np.array(limit, dtype=np.float64), (size,)) for limit in limits)
-    except (TypeError, ValueError) as error:
-        raise GraphError(
-            f"the limits must be two, ({size},) each: least and greatest controls; got {limits}"
-        ) from error
-    if not (np.all(least <= most) and np.all(least < np.inf) and np.all(most > -np.inf)):
-        raise GraphError(f"the limits leave no control: the least ({size},) is {least}, the greatest {most}")
-    return least, most
 
 
 def _close(solution: Solution, choice: Decision) -> bool:

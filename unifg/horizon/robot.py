@@ -161,6 +161,19 @@ class Robot:
         return ahead, controls[step[:-1]]
 
 
+def control_limits(limits: tuple[ArrayLike, ArrayLike], size: int) -> tuple[Array, Array]:
+    """Least and greatest controls (m,), between which there are some."""
+    try:
+        least, most = (np.broadcast_to(np.array(limit, dtype=np.float64), (size,)) for limit in limits)
+    except (TypeError, ValueError) as error:
+        raise GraphError(
+            f"the limits must be two, ({size},) each: least and greatest controls; got {limits}"
+        ) from error
+    if not (np.all(least <= most) and np.all(least < np.inf) and np.all(most > -np.inf)):
+        raise GraphError(f"the limits leave no control: the least ({size},) is {least}, the greatest {most}")
+    return least, most
+
+
 def numbers(value: ArrayLike, shape: tuple[int, ...], what: str, *, finite: bool = True, family: str = "") -> Array:
     """An array of that shape.
 
