@@ -91,7 +91,9 @@ class Timing:
 PAGES: dict[str, dict[str, float]] = {
     "bazzana": {"experiments": 3.0, "against_ipopt": 0.1},
     "ta": {"obstacle_fields": 0.1, "obstacle_courses": 0.25, "quadrotor_flights": 1.5, "quadrotor_pull": 0.15},
-    "factormpc": {"safe_campaign": 0.6, "guarded_flights": 0.15, "horizon_and_velocity": 0.15},
+    "factormpc": {
+        "safe_campaign": 0.6, "guarded_flights": 0.15, "horizon_and_velocity": 0.15, "learned_residual": 0.05,
+    },
     "ecg2o": {"ecg2o": 0.1},
     "unification": {
         "coupling": 0.8, "covariance_plans": 0.1, "active_perception": 0.1, "shared_dynamics": 0.1,
