@@ -28,6 +28,7 @@ FIRST, SECOND = 4 * HIDDEN, 3 * HIDDEN + 3  # weights and offsets of each layer
 NOISE = np.repeat([0.002, 0.003, 0.01], 3)  # of position [m], attitude [rad], velocity [m/s]
 PROCESS = np.repeat([0.001, 0.001, 0.01], 3)  # of a step
 MASS, DRAG, LIFT = 1.2, 0.25, 0.12  # of the vehicle [kg, 1/m, 1/m]; its model begins with 1 kg and no drag
+ESTIMATED = ("mass", "drag", "weights")
 MODELS = {"mass and drag": 0.0, "mass, drag and a network": 0.5}
 """Standard deviation of the weights at the start; with zero they are known, and the network says nothing."""
 
@@ -47,16 +48,23 @@ def network(air: Array, weights: Array) -> Array:
     """(n, 3) acceleration in the body [m/s^2] by the velocity ``air`` (n, 3) there."""
     first = weights[:, :FIRST].reshape(-1, HIDDEN, 4)
     second = weights[:, FIRST:].reshape(-1, 3, HIDDEN + 1)
-    inner = np.tanh((first[:, :, :3] * air[:, None, :] / 3.0).sum(axis=2) + first[:, :, 3])
-    outer: Array = (second[:, :, :HIDDEN] * inner[:, None, :]).sum(axis=2) + second[:, :, HIDDEN]
-    return outer
+    inner = np.tanh(layer(first, air / 3.0))
+    return layer(second, inner)
+
+
+def layer(weights: Array, given: Array) -> Array:
+    """(n, k) outputs of a layer with weights (n, k, m + 1), the last ones offsets, for inputs (n, m)."""
+    products = weights[:, :, :-1] * given[:, None, :]
+    outputs: Array = products.sum(axis=2) + weights[:, :, -1]
+    return outputs
 
 
 def modelled(x: Array, u: Array, mass: Array, drag: Array, weights: Array) -> Array:
     """(n, 3) acceleration by the model [m/s^2]."""
     air = flow(x)
     body = u[:, 3:] * [0.0, 0.0, 1.0] / mass - drag * air / mass + network(air, weights)
-    return fg.SO3.act(x[:, 3:7], body) - [0.0, 0.0, quadrotor.GRAVITY]
+    pull: Array = fg.SO3.act(x[:, 3:7], body) - [0.0, 0.0, quadrotor.GRAVITY]
+    return pull
 
 
 def motion(x: Array, u: Array, mass: Array, drag: Array, weights: Array, after: Array, step: Any) -> Array:
@@ -71,20 +79,24 @@ def motion(x: Array, u: Array, mass: Array, drag: Array, weights: Array, after: 
 def true(x: Array, u: Array) -> Array:
     """(n, 3) acceleration of the vehicle [m/s^2]."""
     air = flow(x)
-    speed, lift = np.linalg.norm(air, axis=1, keepdims=True), LIFT * np.square(air[:, :2]).sum(axis=1, keepdims=True)
+    speed = np.linalg.norm(air, axis=1, keepdims=True)
+    lift = LIFT * np.square(air[:, :2]).sum(axis=1, keepdims=True)
     body = (u[:, 3:] / MASS + lift) * [0.0, 0.0, 1.0] - DRAG * speed * air
-    return fg.SO3.act(x[:, 3:7], body) - [0.0, 0.0, quadrotor.GRAVITY]
+    pull: Array = fg.SO3.act(x[:, 3:7], body) - [0.0, 0.0, quadrotor.GRAVITY]
+    return pull
 
 
 def flown(state: Array, control: Array, parts: int = 10) -> Array:
     """State of the vehicle after a tick."""
-    x, u, step = state[None].copy(), control[None], TICK / parts
+    x, u = state[None].copy(), control[None]
+    step = TICK / parts
     for _ in range(parts):
         pull = true(x, u)
         x[:, :3] += step * (x[:, 7:10] + 0.5 * step * pull)
         x[:, 7:10] += step * pull
         x[:, 3:7] = fg.SO3.retract(x[:, 3:7], step * u[:, :3])
-    return x[0]
+    after: Array = x[0]
+    return after
 
 
 class Eight:
@@ -105,38 +117,45 @@ def loop_of(start: Array, sigma: float, rng: np.random.Generator) -> RecedingHor
     """Loop whose past estimates mass, drag and weights, and whose plan takes them."""
     books = quadrotor.Parameters()
     weights = np.concatenate([rng.normal(0.0, 1.0, FIRST), np.zeros(SECOND)])
-    mass, drag = Constant("mass", fg.Rn(1), [[1.0]], 0.2), Constant("drag", fg.Rn(3), [[0.0, 0.0, 0.0]], 0.3)
-    constants = mass, drag, Constant("weights", fg.Rn(FIRST + SECOND), [weights], sigma)
-    names = tuple(constant.name for constant in constants)
-    robot = Robot(quadrotor.STATE, quadrotor.CONTROL, constants, predict=lambda x, u: quadrotor.fly(x, u, TICK, books))
-    past: list[Term] = [Measurement("seen", fg.prior, (10,), NOISE), Dynamics(motion, TICK, PROCESS, constants=names)]
+    mass = Constant("mass", fg.Rn(1), [[1.0]], 0.2)
+    drag = Constant("drag", fg.Rn(3), [[0.0, 0.0, 0.0]], 0.3)
+    learned = Constant("weights", fg.Rn(FIRST + SECOND), [weights], sigma)
+    robot = Robot(
+        quadrotor.STATE, quadrotor.CONTROL, (mass, drag, learned), predict=lambda x, u: quadrotor.fly(x, u, TICK, books)
+    )
+    seen = Measurement("seen", fg.prior, (10,), NOISE)
+    past: list[Term] = [seen, Dynamics(motion, TICK, PROCESS, constants=ESTIMATED)]
     window = Window(robot, 10, past, start=start, sigma=NOISE, solver=InteriorPoint(tolerance=1e-3))
     effort = ControlCost(sigma=[4.0, 4.0, 2.0, 6.0], wanted=quadrotor.hover(books))
-    future: list[Term] = [Dynamics(motion, TICK, constants=names), Eight(), effort]
+    future: list[Term] = [Dynamics(motion, TICK, constants=ESTIMATED), Eight(), effort]
     return RecedingHorizon(robot, STEPS, future, solver=InteriorPoint(tolerance=1e-4), window=window)
 
 
 def measure(seed: int, model: str) -> Row:
     """Fly once."""
-    rng, wanted = np.random.default_rng(seed), eight(LAPS * LAP + STEPS + 1)
+    rng = np.random.default_rng(seed)
+    wanted = eight(LAPS * LAP + STEPS + 1)
     x = quadrotor.STATE.pack(p=wanted[0], R=fg.SO3.identity(), v=(wanted[1] - wanted[0]) / TICK)
     loop = loop_of(x, MODELS[model], rng)
-    off, missing = np.zeros(LAPS * LAP), np.zeros(LAPS * LAP)
+    off = np.zeros(LAPS * LAP)
+    missing = np.zeros(LAPS * LAP)
     for tick in range(LAPS * LAP):
-        seen = quadrotor.STATE.retract(x, NOISE * rng.normal(size=9))
+        noise = NOISE * rng.normal(size=9)
+        seen = quadrotor.STATE.retract(x, noise)
         plan = loop.tick(wanted[tick + 1 : tick + STEPS + 1], {"seen": seen})
-        known, u = loop.constants, plan.control[None]
-        error = true(x[None], u) - modelled(x[None], u, known["mass"], known["drag"], known["weights"])
+        u = plan.control[None]
+        known = [loop.constants[name] for name in ESTIMATED]
+        error = true(x[None], u) - modelled(x[None], u, *known)
         x = flown(x, plan.control)
-        off[tick], missing[tick] = np.linalg.norm(x[:3] - wanted[tick + 1]), np.linalg.norm(error)
-    laps = 1e3 * np.sqrt(np.square(off).reshape(LAPS, LAP).mean(axis=1))
+        off[tick] = np.linalg.norm(x[:3] - wanted[tick + 1])
+        missing[tick] = np.linalg.norm(error)
+    by_lap = np.square(off).reshape(LAPS, LAP)
+    laps = 1e3 * np.sqrt(by_lap.mean(axis=1))
     found: Row = {f"lap {lap + 1}": float(value) for lap, value in enumerate(laps)}
     found["missing"] = float(np.sqrt(np.square(missing[-LAP:]).mean()))
     found["solved"] = loop.sources["solved"]
-    return found | {
-        "tick": float(np.median(loop.milliseconds)),
-        "late tick": float(np.percentile(loop.milliseconds, 99)),
-    }
+    found["tick"], found["late tick"] = np.percentile(loop.milliseconds, [50, 99]).tolist()
+    return found
 
 
 def tables(rows: list[Row]) -> str:

@@ -287,7 +287,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 32_929, "scenarios": 12_845, "benchmarks": 4_582, "tests": 37_352,
+    "unifg solvers models": 32_929, "scenarios": 12_845, "benchmarks": 4_692, "tests": 37_364,
     "docs examples": 1_978, "unifg/factors": 4_305, "unifg/problem": 3_431, "models": 2_241,
     "unifg/elimination": 2_156, "solvers": 5_137, "unifg/solution": 3_182, "unifg/smoothing": 1_872,
     "unifg/lie": 1_403, "unifg/view": 1_518, "unifg/files": 1_233, "unifg/pose_graphs": 1_585,
