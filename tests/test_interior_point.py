@@ -442,6 +442,10 @@ def test_the_time_of_a_solve_is_told_by_its_parts(monkeypatch: pytest.MonkeyPatc
     assert (
         SQP().solve(stated.graph, stated.guess).times == InteriorPoint().solve(stated.graph, stated.guess).times == {}
     )
+    with monkeypatch.context() as patched:  # the test of the answer is part of that one call, and told once
+        patched.setattr(method, "perf_counter", iter([0.0, 5.0]).__next__)
+        parts = prepared.solve(found.shifted(stated.x, stated.u)).times
+    assert sum(parts[name] for name in ("evaluation", "linear systems", "search", "judge")) == pytest.approx(5.0)
     prepared._workspace.now["clock"], prepared._workspace._settings = 0, None  # a system without that clock
     found = prepared.solve(stated.guess)
     assert found.times == {} and "Of the time" not in found.report()

@@ -288,7 +288,7 @@ class Workspace:
     """Memory kept between solves of one structure.
 
     Attributes:
-        compiled: seconds of the solve in compiled code, but for the test of the answer of a solve in parts.
+        compiled: seconds of the solve in compiled code, but for the test of the answer.
         interrupted: whether the user has interrupted the last solve in one call.
         portion: iterations of one call; None for all.
         unfinished: whether the next call goes on with the last solve.
@@ -383,6 +383,7 @@ class Workspace:
         now["limit"] = most if self.portion is None else min(begun + self.portion, most)
         if not self.unfinished:
             self.run("solve_once")
+            self.compiled -= now["judging"]
             return
         now["stage"], now["going_on"] = state.MOVED, 1
         worst = max(now["stationarity"], now["complementarity"], now["gap"])
