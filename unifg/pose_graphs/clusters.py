@@ -25,6 +25,7 @@ from functools import cached_property
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
+from unifg.modeling.variables import Data
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, ResidualName
 from unifg.pose_graphs.verdict import Kind
 from unifg.problem.compiled_problem import CompiledProblem
@@ -35,7 +36,7 @@ from unifg.solvers.gating import NEAR, UNCHECKED, Innovations, VarianceFactor, n
 from unifg.solvers.least_squares import MAP, GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["Map", "Search", "Suspect", "optimum", "search"]
+__all__ = ["Map", "Partial", "Search", "Suspect", "optimum", "search"]
 
 CHANCE = 1e-3  # that anything is contradicted in a graph without wrong measurements
 SPARE = 4.0  # variance that right measurements may have beside that of the others
@@ -180,6 +181,36 @@ def optimum(pose_graph: PoseGraph, active: BoolArray, residual: ResidualName = "
     """Minimum of plain squares of some edges (m,) near the poses of a graph, to within 1e-5 of chi2, and chi2 there."""
     solved = Map(pose_graph, active, residual)
     return solved.graph, solved.chi2
+
+
+class Partial:
+    """Optima of parts of the edges of a graph, near its poses; the structure of all is found once.
+
+    Attributes:
+        graph: all edges, at the poses that solves begin from.
+    """
+
+    def __init__(self, pose_graph: PoseGraph, residual: ResidualName) -> None:
+        """State it."""
+        self.graph = pose_graph
+        self._stated, self._x, self._guess = pose_graph.graph(residual=residual)
+        self._counting: list[tuple[Data, BoolArray]] = []
+        for name in ("odometry", "closures"):
+            chosen = pose_graph.edges.odometry == (name == "odometry")
+            if chosen.any():
+                used = self._stated.data(f"{name} that count", np.ones(int(chosen.sum()), dtype=np.bool_), each=True)
+                self._stated.replace(name, active=used)
+                self._counting.append((used, chosen))
+        self._solver = GaussNewton(tolerance=MAP, max_iterations=FEW).prepare(self._stated)
+
+    def optimum(self, active: BoolArray) -> tuple[PoseGraph, float]:
+        """Minimum of plain squares of some edges (m,), to within 1e-5 of chi2, and chi2 there."""
+        data = {used: active[chosen] for used, chosen in self._counting}
+        solution = self._solver.solve(self._guess, data=data)
+        if not solution.converged:
+            solution = LevenbergMarquardt(tolerance=MAP).prepare(self._stated).solve(solution, data=data)
+        landmarks = solution[self._stated.families["landmarks"]] if len(self.graph.landmarks) else None
+        return self.graph.with_poses(solution[self._x], landmarks), 2.0 * solution.cost
 
 
 def _quantile(freedom: float, share: float) -> float:

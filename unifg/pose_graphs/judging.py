@@ -11,7 +11,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.pose_graphs.certificate import certify, require_one_for_each
-from unifg.pose_graphs.clusters import Search, optimum, search
+from unifg.pose_graphs.clusters import Partial, Search, optimum, search
 from unifg.pose_graphs.initialise import odometric, starts
 from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import JUDGES, PoseGraph, ResidualName
@@ -78,13 +78,16 @@ def _verdict(
 def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[Cluster]:
     """Clusters with the names of their stretches, the first of them solved again without."""
     dim, count = judged.group.point_dim, len(judged.edges)
+    partial: Partial | None = None
 
     def solved(left_out: IntArray) -> tuple[BoolArray, PoseGraph, float]:
         """Edges that are left, their map, and its chi2."""
+        nonlocal partial
         mask = np.ones(count, dtype=np.bool_)
         mask[left_out] = False
         if mask.tobytes() not in found.maps:
-            found.maps[mask.tobytes()] = optimum(found.solved, mask, residual)
+            partial = partial or Partial(found.solved, residual)
+            found.maps[mask.tobytes()] = partial.optimum(mask)
         return mask, *found.maps[mask.tobytes()]
 
     clusters: list[Cluster] = []
