@@ -30,6 +30,7 @@ from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS, make_pilot
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings
 from unifg.scenarios.quadrotor.flight_watch import FlightWatch
 from unifg.scenarios.simulation.air import QuadrotorWorld
+from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.scenarios.simulation.conditions import draw_conditions
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.scenarios.simulation.faults import FLIGHT_FAULTS, Fault, FlightFaults, one_of
@@ -46,6 +47,7 @@ WORLDS = {
     "mujoco": "unifg.scenarios.simulation.mujoco_flight:MujocoQuadrotor",
 }
 OF_WORLD = ("step(control, dt)", "sense()", "discs()", "clearance()")
+CONFIRMATION = (4, 6)  # readings that show a cylinder before it is a landmark, and of how many, in clutter
 COLLISIONS = 3  # with so many a flight is given up
 
 logger = logging.getLogger("unifg")
@@ -64,6 +66,9 @@ class FlightSettings(Settings):
         mass_error: by which the mass is believed wrong at the start, relative, in [0, 1).
         speed: cruise [m/s]; None for that of the controller's guide.
         gusts: factor on the standard deviation of the gusts, which the robot is not told.
+        misses: share of its sightings that the sensor of landmarks loses.
+        clutter: cylinders that it sees in a reading and that are not there, on average.
+        radius_error: standard deviation of the radii that it measures [m].
         world: simulation: "air", "mujoco", or a class of your own, MODULE:CLASS, with the arguments of
             `unifg.scenarios.simulation.air.QuadrotorWorld`.
         time_limit: after which a flight is given up [s].
@@ -79,6 +84,9 @@ class FlightSettings(Settings):
     mass_error: float = option(0.05, text=share, metavar="E")
     speed: float | None = option(None, text=positive, metavar="M/S")
     gusts: float = option(1.0, text=not_negative, metavar="FACTOR")
+    misses: float = option(0.0, text=share, metavar="SHARE")
+    clutter: float = option(0.0, text=not_negative, metavar="COUNT")
+    radius_error: float = option(0.0, text=not_negative, metavar="M")
     world: str | type = option("air", text=str, metavar="NAME|MODULE:CLASS")
     time_limit: float = 60.0
     estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
@@ -109,6 +117,9 @@ class FlightSettings(Settings):
             "movers": self.movers,
             "mass_error": self.mass_error,
             "gusts": self.gusts,
+            "misses": self.misses,
+            "clutter": self.clutter,
+            "radius_error": self.radius_error,
             "world": name_of(self.world),
             "time_limit": self.time_limit,
             "window": self.estimator.window.length,
@@ -116,6 +127,16 @@ class FlightSettings(Settings):
             "controller": asdict(self.flown),
             "faults": [str(fault) for fault in self.faults],
         }
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Sensor of the vehicle."""
+        return SensorModel(sigma_radius=self.radius_error, misses=self.misses, clutter=self.clutter)
+
+    @property
+    def known(self) -> EstimatorSettings:
+        """Settings of the past, which knows whether its sensor sees what is not there."""
+        return replace(self.estimator, confirmation=CONFIRMATION) if self.clutter else self.estimator
 
     @property
     def flown(self) -> ControllerSettings:
@@ -157,12 +178,12 @@ class Flight:
         gusty = replace(calm, gust=(k * x, k * y, k * z))
         of_world = load_class("world", settings.world, WORLDS, OF_WORLD, "storm:Storm")
         self.world: QuadrotorWorld = of_world(
-            drawn.layout, settings.seed, drawn.true, settings.movers, disturbance=gusty
+            drawn.layout, settings.seed, drawn.true, settings.movers, disturbance=gusty, sensor=settings.sensor
         )
         error = settings.estimator.state_sigma * drawn.deviation
         believed = quadrotor.STATE.retract(self.world.state[None], error[None])[0]
         self.pilot = make_pilot(
-            settings.coupling, settings.solver, drawn.layout, believed, drawn.nominal, settings.estimator,
+            settings.coupling, settings.solver, drawn.layout, believed, drawn.nominal, settings.known,
             settings.flown,
         )  # fmt: skip
         self.faults = FlightFaults(settings.faults, settings.seed)

@@ -26,7 +26,7 @@ from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics, state_errors
 from unifg.scenarios.options import add_options, settings_of
 from unifg.scenarios.perception.line_tracker import LineTracker
-from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.perception.readings import NOTHING, Reading
 from unifg.scenarios.quadrotor import flight_watch
 from unifg.scenarios.quadrotor.estimator import EstimatorSettings
 from unifg.scenarios.quadrotor.flight_pilot import COUPLINGS
@@ -332,6 +332,39 @@ def test_who_moves_is_found_out_where_nobody_names_things(flag: bool) -> None:
         first += [k] if reading.moving[0] else []
     assert 0.05 * first[0] < 1.5 and len(first) == 60 - first[0], "once it has moved, it is a mover"
     assert walking.update(reading, state).velocity[0] == pytest.approx([0.0, 0.4], abs=0.15)
+
+
+def test_in_clutter_a_cylinder_counts_once_enough_readings_show_it() -> None:
+    """Four of six: a real one from its fourth sighting on, misses or not; false ones, spread out, never."""
+    rng, state = np.random.default_rng(3), np.array([0.0, 0.0, 1.5, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    tracker, told, shown = LineTracker("unknown", (4, 6)), [], 0
+    for k in range(300):
+        there = rng.uniform() > 0.2
+        false = np.array([[-6.0 + 12.0 * ((7 * k) % 97) / 97.0, -5.0 + 10.0 * ((13 * k) % 89) / 89.0]])
+        places = np.concatenate([np.array([[3.0, 0.5]])[: int(there)], false])
+        told.append(tracker.told(sighting(0.05 * k, places, [NOTHING] * len(places), state), state))
+        shown += there
+        if shown == 3:
+            assert not any(len(reading.ids) for reading in told)
+    near = [np.hypot(*(np.cos(r.bearings) * r.ranges - 3.0, np.sin(r.bearings) * r.ranges - 0.5)) for r in told]
+    assert sum(len(own) for own in near) > 0.9 * shown
+    assert max(float(own.max(initial=0.0)) for own in near) < 0.7
+    known = LineTracker().told(sighting(0.0, np.array([[1.0, 0.0], [2.0, 0.0]]), [5, NOTHING], state), state)
+    assert known.ids.tolist() == [5]
+
+
+@pytest.mark.product(1, of="drives and flights")
+@pytest.mark.parametrize("association", ["known", "unknown"])
+def test_clutter_misses_and_wrong_radii_cost_a_flight_little(association: str) -> None:
+    settings = replace(short(4.0), clutter=1.0, misses=0.2, radius_error=0.03)
+    settings = replace(settings, estimator=EstimatorSettings(association=association))
+    flight = Flight(settings)
+    log, plain = flight.run(silent), run_flight(replace(settings, clutter=0.0, misses=0.0, radius_error=0.0))
+    assert log.collisions == 0
+    assert np.linalg.norm(log.truth[-1, :3] - plain.truth[-1, :3]) < 1.0  # after the same time
+    mapped = log.landmarks[-1]["mean"][log.landmarks[-1]["radius"] > 0.0]
+    gaps = np.linalg.norm(mapped[:, None] - flight.world.layout.cylinders[None, :, :2], axis=2).min(axis=1)
+    assert len(mapped) and gaps.max() < 0.5  # nothing false is on the map
 
 
 @pytest.mark.product(4, of="drives and flights")

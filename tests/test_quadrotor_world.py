@@ -16,6 +16,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
 from unifg.scenarios.perception.belief import Landmarks
+from unifg.scenarios.perception.readings import NOTHING
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS, QuadrotorWorld
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
@@ -250,6 +251,23 @@ def test_things_beyond_the_range_are_not_seen() -> None:
         world.step(HOVER)
         assert world.time < 3.0
     assert world.state[0] == pytest.approx(1.0, abs=0.06)  # within one tick of 8 m to the axis
+
+
+def test_misses_and_clutter_are_as_frequent_as_promised_and_shift_no_other_noise() -> None:
+    layout, model = field([(3.0, 0.0, 0.3), (0.0, 5.0, 0.4)]), SensorModel(misses=0.3, clutter=1.5)
+    worlds = QuadrotorWorld(layout, 1, PARAMETERS, sensor=model), QuadrotorWorld(layout, 1, PARAMETERS)
+    readings = [(worlds[0].sense(), worlds[1].sense()) for _ in range(2000)]
+    false = [reading.only(reading.ids == NOTHING) for reading, _ in readings]
+    assert sum(len(reading.ids) for reading in false) == pytest.approx(3000, abs=200)
+    assert sum(len(reading.ids) for reading, _ in readings) - 3000 == pytest.approx(0.7 * 4000, abs=200)
+    spread = np.concatenate([reading.ranges for reading in false])
+    assert spread.max() <= model.range_max
+    assert (spread < 0.5 * model.range_max).mean() == pytest.approx(0.25, abs=0.04)  # evenly over the area
+    for reading, full in readings:
+        own = reading.only(reading.ids != NOTHING)
+        kept = full.only(np.isin(full.ids, own.ids))
+        np.testing.assert_array_equal(own.ranges, kept.ranges)
+        np.testing.assert_array_equal(reading.force, full.force)
 
 
 def test_noise_is_as_large_as_promised() -> None:

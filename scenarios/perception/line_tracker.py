@@ -12,7 +12,8 @@ import numpy as np
 
 from unifg.scenarios.perception.association import places
 from unifg.scenarios.perception.belief import Landmarks
-from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.perception.confirmation import Confirmation
+from unifg.scenarios.perception.readings import NOTHING, Reading
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.typing import Array, IntArray
 
@@ -45,27 +46,38 @@ class _Track:
 class LineTracker:
     """Tracks of what moves, in the frame of the belief."""
 
-    def __init__(self, association: str = "known") -> None:
-        """Begin without tracks; ``association`` "known" trusts the readings' names and flags, "unknown" finds out."""
+    def __init__(self, association: str = "known", confirmation: tuple[int, int] = (1, 1)) -> None:
+        """Begin without tracks.
+
+        Args:
+            association: "known" trusts the readings' names and flags, "unknown" finds out.
+            confirmation: M and N: where it is unknown, cylinders are told of once M of the last N readings show them.
+        """
+        self._confirmation = Confirmation(*confirmation)
         self._known = association == "known"
         self._tracks: list[_Track] = []
         self._count = 0
 
     def told(self, reading: Reading, state: Array) -> Reading:
-        """The reading as a vehicle may know it: for unknown association with names and flags that were found out.
+        """The reading as a vehicle may know it, without false sightings, as far as these are told apart.
+
+        For unknown association it has names and flags that were found out.
 
         Args:
             reading: as the sensor gives it.
             state: (10,) predicted for its time.
         """
         if self._known:
-            return reading
+            return reading if (reading.ids != NOTHING).all() else reading.only(reading.ids != NOTHING)
         rows = np.flatnonzero(reading.kinds == Landmarks.CYLINDER)
         tracks = self._follow(reading, state, rows)
         names, moving = np.full(len(reading.ids), -1, dtype=np.intp), np.zeros(len(reading.ids), dtype=bool)
         names[rows] = [track.name for track in tracks]
         moving[rows] = [track.moves for track in tracks]
-        return replace(reading, ids=names, moving=moving)
+        self._confirmation.note(names)
+        counts = reading.kinds != Landmarks.CYLINDER
+        counts[rows] = [self._confirmation.holds(track.name) for track in tracks]
+        return replace(reading, ids=names, moving=moving).only(counts)
 
     def update(self, reading: Reading, state: Array) -> Tracks:
         """Tracks of the discs that move, now.

@@ -11,9 +11,10 @@ import numpy as np
 from unifg.lie import SE2, wrap_angle
 from unifg.typing import Array, BoolArray, IntArray
 
-__all__ = ["Reading", "Scan"]
+__all__ = ["NOTHING", "Reading", "Scan"]
 
 
+NOTHING = -1  # name of a false sighting
 GAP = 0.1  # [rad] between measurements, within which nothing is expected to hide
 
 
@@ -103,7 +104,8 @@ class Reading:
 
     Attributes:
         time: [s].
-        ids: (K,) true names: cylinders first, then corners, then movers. For known association only.
+        ids: (K,) true names: cylinders first, then corners, then movers, `NOTHING` of false sightings. For known
+            association only.
         bearings: (K,) in the ground plane from the heading (of R e1) to the axis or corner, in [-pi, pi) [rad].
         ranges: (K,) in the ground plane to the axis or corner [m].
         radii: (K,) of the cylinders [m]; 0 for corners.

@@ -53,6 +53,7 @@ class EstimatorSettings(Settings):
         wind_sigma, updraft_sigma: [m/s^2].
         association: whether the sensor names what it sees, or who is who is found by gating.
         gates: for unknown association.
+        confirmation: M and N: of unknown association a cylinder counts once M of the last N readings show it.
         iterations: SQP iterations per tick.
         manoeuvre_sigma: acceleration that an estimator without dynamics expects over a tick [m/s^2].
 
@@ -70,6 +71,7 @@ class EstimatorSettings(Settings):
     updraft_sigma: float = 0.3
     association: str = option("known", choices=ASSOCIATIONS)
     gates: Gates = field(default_factory=Gates)
+    confirmation: tuple[int, int] = (1, 1)
     iterations: int = 2
     manoeuvre_sigma: float = 3.0
 

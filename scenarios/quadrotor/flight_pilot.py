@@ -37,7 +37,7 @@ class Pilot:
     def __init__(self, estimator: Estimator, controller: Controller) -> None:
         """Join what stands for itself."""
         self.estimator, self.controller = estimator, controller
-        self.tracker = LineTracker(association=estimator.settings.association)
+        self.tracker = LineTracker(estimator.settings.association, estimator.settings.confirmation)
         self.belief: Belief = estimator.belief()
         self.alone = self.belief
         self.pushed: Callable[[Belief], Belief] = lambda belief: belief

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -12,7 +12,7 @@ import pymunk
 
 from unifg.lie import SO3
 from unifg.scenarios.perception.belief import Landmarks
-from unifg.scenarios.perception.readings import Reading
+from unifg.scenarios.perception.readings import NOTHING, Reading
 from unifg.typing import Array
 
 __all__ = ["Sensor", "SensorModel"]
@@ -21,6 +21,7 @@ First: TypeAlias = Callable[[tuple[float, float], tuple[float, float]], pymunk.S
 """First shape that a ray meets between two places [m], None for none."""
 
 _FLANK = 0.9  # of the angle between a cylinder's axis and its silhouette
+_FALSE_RADII = (0.1, 0.4)  # [m] of false cylinders
 _CORNER_GAP = 0.01  # a ray to a corner ends this much before it, for it would hit the corner's own wall [m]
 
 
@@ -38,6 +39,8 @@ class SensorModel:
         sigma_gyro: of each body rate [rad/s].
         sigma_force: of each component of the specific force [m/s^2].
         sigma_force_bias: of what its sensor shows too much, throughout [m/s^2].
+        misses: share of the sightings that are missing.
+        clutter: false cylinders of a reading, on average, anywhere within reach.
     """
 
     range_max: float = 8.0
@@ -49,6 +52,8 @@ class SensorModel:
     sigma_gyro: float = 0.01
     sigma_force: float = 0.1
     sigma_force_bias: float = 0.05
+    misses: float = 0.0
+    clutter: float = 0.0
 
     @staticmethod
     def exact(range_max: float = 8.0) -> SensorModel:
@@ -87,6 +92,7 @@ class Sensor:
             [Landmarks.CORNER if shape is None else Landmarks.CYLINDER for shape in shapes], dtype=np.intp
         )
         *self._streams, self._felt = rng.spawn(6)
+        self._lost, self._false = self._felt.spawn(2)
         self._bias = model.sigma_force_bias * self._felt.standard_normal(3)
 
     def read(self, time: float, state: Array, things: Array, rates: Array, force: Array) -> Reading:
@@ -112,13 +118,11 @@ class Sensor:
         rotation = SO3.matrix(state[None, 3:7])[0]
         offset = things[:, :2] - state[:2]
         distance = np.hypot(offset[:, 0], offset[:, 1])
-        ids = np.array(
-            [i for i in np.flatnonzero(distance <= model.range_max) if self._visible(int(i), state, things)],
-            dtype=np.intp,
-        )
+        reached = (distance <= model.range_max) & (self._lost.uniform(size=len(things)) >= model.misses)
+        ids = np.array([i for i in np.flatnonzero(reached) if self._visible(int(i), state, things)], dtype=np.intp)
         heading = math.atan2(rotation[1, 0], rotation[0, 0])
         bearings = np.arctan2(offset[ids, 1], offset[ids, 0]) - heading + model.sigma_bearing * noise[ids, 0]
-        return Reading(
+        reading = Reading(
             time=time,
             ids=ids,
             bearings=(bearings + np.pi) % (2.0 * np.pi) - np.pi,
@@ -134,6 +138,25 @@ class Sensor:
             tilt=rotation[2] + model.sigma_tilt * tilt_noise,
             rates=rates + model.sigma_gyro * gyro_noise,
             force=force + self._bias + model.sigma_force * self._felt.standard_normal(3),
+        )
+        return self._cluttered(reading)
+
+    def _cluttered(self, reading: Reading) -> Reading:
+        """A reading with false sightings behind the others, which have no name."""
+        rng, model = self._false, self.model
+        count = int(rng.poisson(model.clutter))
+        bearings, shares = rng.uniform(-np.pi, np.pi, count), rng.uniform(size=count)
+        radii = rng.uniform(*_FALSE_RADII, count)
+        if not count:
+            return reading
+        return replace(
+            reading,
+            ids=np.append(reading.ids, np.full(count, NOTHING)),
+            bearings=np.append(reading.bearings, bearings),
+            ranges=np.append(reading.ranges, model.range_max * np.sqrt(shares)),
+            radii=np.append(reading.radii, radii),
+            kinds=np.append(reading.kinds, np.full(count, Landmarks.CYLINDER)),
+            moving=np.append(reading.moving, np.zeros(count, dtype=bool)),
         )
 
     def _visible(self, index: int, state: Array, things: Array) -> bool:

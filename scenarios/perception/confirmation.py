@@ -1,0 +1,28 @@
+"""Confirmation of new tracks by M of the last N readings, the usual rule against false detections.
+
+Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 3.4: with false
+detections that are spread out, few are in one place M times in N readings.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+from unifg.typing import IntArray
+
+
+class Confirmation:
+    """Names that were seen in enough of the last readings."""
+
+    def __init__(self, needed: int, readings: int) -> None:
+        """Begin with nothing seen."""
+        self._needed = needed
+        self._seen: deque[frozenset[int]] = deque(maxlen=readings)
+
+    def note(self, names: IntArray) -> None:
+        """Take in the names of a reading."""
+        self._seen.append(frozenset(names.tolist()))
+
+    def holds(self, name: int) -> bool:
+        """Test whether a name was seen often enough."""
+        return sum(name in names for names in self._seen) >= self._needed
