@@ -13,6 +13,7 @@ from benchmarks import (
     covariance_plans,
     excluded_pasts,
     impossible_states,
+    learned_residual,
     shared_dynamics,
 )
 
@@ -150,3 +151,26 @@ def test_changes_are_compared_corridor_by_corridor() -> None:
     truth[:, 0] = 0.05 * np.arange(ticks)  # 1 m/s; planned to be 1.1, from where it was not
     plans[:, :, 0] = 7.0 + 0.055 * np.arange(ahead + 1)
     assert shared_dynamics.tracking(cast(Any, SimpleNamespace(truth=truth, plans=plans))) == pytest.approx(0.05)
+
+
+@pytest.mark.product(1, of="drives and flights")
+@pytest.mark.parametrize("seed", [11, 12])
+def test_a_network_learns_within_a_lap(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(learned_residual, "LAPS", 1)
+    rows = [
+        {"seed": seed, "model": model, **learned_residual.measure(seed, model)} for model in learned_residual.MODELS
+    ]
+    plain, learned = rows
+    assert learned["lap 1"] < 0.8 * plain["lap 1"]
+    assert learned["missing"] < 0.8 * plain["missing"]
+    assert plain["solved"] == learned["solved"] == learned_residual.LAP
+    table = learned_residual.tables(rows)
+    assert f"{plain['lap 1']:.3g}" in table and "1 flights of 100 ticks" in table
+
+
+def test_a_network_without_weights_in_its_second_layer_says_nothing() -> None:
+    air, weights = (
+        np.ones((2, 3)),
+        np.concatenate([np.ones(learned_residual.FIRST), np.zeros(learned_residual.SECOND)])[None],
+    )
+    assert np.array_equal(learned_residual.network(air, weights), np.zeros((2, 3)))
