@@ -288,7 +288,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
     "unifg solvers models": 32_952, "scenarios": 12_881, "benchmarks": 4_692, "tests": 37_409,
-    "docs examples": 1_978, "unifg/factors": 4_305, "unifg/problem": 3_431, "models": 2_241,
+    "docs examples": 1_991, "unifg/factors": 4_305, "unifg/problem": 3_431, "models": 2_241,
     "unifg/elimination": 2_156, "solvers": 5_138, "unifg/solution": 3_182, "unifg/smoothing": 1_872,
     "unifg/lie": 1_403, "unifg/view": 1_518, "unifg/files": 1_233, "unifg/pose_graphs": 1_607,
     "unifg/horizon": 1_495, "unifg/modeling": 1_161, "unifg/codegen": 1_321, "unifg/plots": 415,

@@ -66,10 +66,26 @@ def _told(notebook: Path) -> str:
 
 @cache
 def public() -> dict[str, list[str]]:
-    """Public names by module."""
+    """Public names by module, each by the first one that lists it."""
     shelved = [f"{shelf}.{module}" for shelf in SHELVES for module in names_of(shelf)]
-    found = {module: names_of(module) for module in (*ROOMS, *shelved, *ALONE)}
-    return {module: names for module, names in found.items() if names}
+    found: dict[str, list[str]] = {}
+    known = set[tuple[str, str]]()
+    for module in (*ROOMS, *shelved, *ALONE):
+        own = {name: origin(module, name) for name in names_of(module)}
+        if new := [name for name, place in own.items() if place not in known]:
+            found[module] = new
+        known |= set(own.values())
+    return found
+
+
+def origin(module: str, name: str) -> tuple[str, str]:
+    """Module that defines what another one lists, and its name there."""
+    for node in ast.walk(tree_of(module)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("unifg"):
+            for alias in node.names:
+                if (alias.asname or alias.name) == name:
+                    return origin(str(node.module), alias.name)
+    return module, name
 
 
 def folder(module: str) -> Path:
