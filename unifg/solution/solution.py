@@ -547,9 +547,9 @@ class Solution:
             pieces: boxes between two factors.
 
         Raises:
-            GraphError: there is no such term, or it is of another kind.
+            GraphError: there is no such term, it is of another kind, or its data have been replaced since.
         """
-        return tube(self._program, self._lin.values, term, pieces)
+        return tube(self._program, self._lin.values, self._claims("tube")[-1], term, pieces)
 
     def report(self) -> str:
         """The status sentence with the numbers behind it, and the times of the parts."""
