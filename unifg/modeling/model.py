@@ -20,7 +20,7 @@ from unifg.factors.residuals import Residual, as_residual
 from unifg.factors.robust import Loss
 from unifg.lie import Manifold, Rn
 from unifg.lie.product import Product
-from unifg.modeling.duplicates import doubles
+from unifg.modeling.duplicates import doubles, kept
 from unifg.modeling.elements import elements_of, on_manifolds
 from unifg.modeling.factors import ManifoldResidual
 from unifg.modeling.probing import rows_of
@@ -393,6 +393,7 @@ class Model:
         scalar: bool = False,
     ) -> dict[str, Any]:
         """Parts that every kind of term has, by their names in :class:`Term`."""
+        arguments = tuple(map(kept, arguments))
         wrapped = complete(function, arguments, name)
         unique = self._unique(name, default or wrapped.name, replaced)
         normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
@@ -489,7 +490,9 @@ class Model:
         selection, value = _one_variable("a fix", stated[:1], name), stated[1]
         unique = self._unique(name, f"{selection.family.name} fixed", replaced is not None)
         held = (
-            value if isinstance(value, Data) else np.atleast_1d(doubles(f"fix '{unique}': value", value, term=unique))
+            value
+            if isinstance(value, Data)
+            else np.array(doubles(f"fix '{unique}': value", value, term=unique), ndmin=1)
         )
         self._own(selection, unique)
         self._own_data(unique, held)
