@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from difflib import get_close_matches
 from html import escape
 from operator import index
@@ -33,6 +34,7 @@ from unifg.modeling.units import compare
 from unifg.modeling.variables import (
     RESERVED,
     Data,
+    Declared,
     Family,
     Selection,
     Variable,
@@ -393,8 +395,13 @@ class Model:
         scalar: bool = False,
     ) -> dict[str, Any]:
         """Parts that every kind of term has, by their names in :class:`Term`."""
-        arguments = tuple(map(kept, arguments))
         wrapped = complete(function, arguments, name)
+        if (
+            wrapped.kernel is not None
+        ):  # a function in Python sees what becomes of its arrays, as of all that it reaches
+            arguments = tuple(
+                replace(a, value=kept(a.value)) if isinstance(a, Declared) else kept(a) for a in arguments
+            )
         unique = self._unique(name, default or wrapped.name, replaced)
         normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
         size = rows_of(unique, wrapped, normal, count, scalar=scalar, declared=rows)

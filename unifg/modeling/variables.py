@@ -10,7 +10,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.lie import Manifold, Product
-from unifg.modeling.duplicates import doubles, kept
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.quantities import NOTHING, Quantity, quantity
 from unifg.typing import Array, ArrayLike, IntArray
 
@@ -177,7 +177,7 @@ def each(value: ArrayLike, *, units: str | None = None, frame: str | None = None
     Raises:
         GraphError: it is a scalar, or not made of real numbers or booleans.
     """
-    array = kept(doubles("an argument of fg.each", value, flags=True))
+    array = doubles("an argument of fg.each", value, flags=True)
     if array.ndim == 0:
         raise GraphError("fg.each needs one row per factor, found a scalar")
     return Declared(array, True, quantity("fg.each", units, frame))
@@ -191,7 +191,7 @@ def shared(value: ArrayLike, *, units: str | None = None, frame: str | None = No
     Raises:
         GraphError: it is not made of real numbers or booleans.
     """
-    array = kept(doubles("an argument of fg.shared", value, flags=True))
+    array = doubles("an argument of fg.shared", value, flags=True)
     return Declared(array, False, quantity("fg.shared", units, frame))
 
 
