@@ -200,10 +200,10 @@ class PoseGraph:
         everywhere = robust if robust_on == "all" else None
         graph = Graph()
         x = graph.variables("poses", self.group, len(self.poses))
-        guess = {x: self.poses}
+        guess = {x: self.poses.copy()}
         if len(self.landmarks):
             places = graph.variables("landmarks", Rn(self.landmarks.shape[1]), len(self.landmarks))
-            guess[places] = self.landmarks
+            guess[places] = self.landmarks.copy()
         for term in terms:
             if len(self.landmarks) or not term.landmarks:
                 measured = graph.data(term.name, term.batch.measured, each=True)
