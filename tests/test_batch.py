@@ -64,6 +64,17 @@ def test_one_instance_as_a_solution() -> None:
     assert found.multipliers.keys() == {"dynamics", "limits"}
 
 
+def test_a_batch_keeps_its_data_when_the_caller_changes_them() -> None:
+    graph = fg.Graph()
+    x, goal = graph.variables("x", fg.Rn(2), 1), graph.data("goal", [0.0, 0.0])
+    graph.minimize(fg.difference, x, goal)
+    graph.constrain(lambda x: (x**2).sum(axis=1, keepdims=True), x, upper=1.0)
+    goals = np.array([[2.0, 0.0], [0.0, 2.0]])
+    batch = InteriorPoint().prepare(graph).solve_many({x: [[0.1, 0.0]]}, data={goal: goals})
+    goals[:] = 0.0
+    np.testing.assert_allclose(batch.solution(1)[x], [[0.0, 1.0]], atol=1e-6)
+
+
 @pytest.mark.product(3, of="studies")
 def test_what_compiled_code_leaves_is_solved_as_usual() -> None:
     """Other backends, a time limit, and data that single solves refuse."""

@@ -97,11 +97,12 @@ def test_settings_of_trees() -> None:
         assert horizon_of(ControllerSettings(**chain)) == 30  # type: ignore[arg-type]
     for wrong, said in (
         ({"futures": "best"}, "unknown futures 'best'"),
-        ({"tails": 1}, "two tails or more"),
-        ({"shared": 30}, "shares 1 to 29 of 30 steps"),
+        ({"futures": "tree", "tails": 1}, "two tails or more"),
+        ({"futures": "tree", "shared": 30}, "shares 1 to 29 of 30 steps"),
     ):
         with pytest.raises(ScenarioError, match=said):
             ControllerSettings(**wrong)
+    assert horizon_of(ControllerSettings(horizon=4)) == 4  # a chain shares no steps
 
 
 def reference() -> Array:

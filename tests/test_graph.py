@@ -101,3 +101,19 @@ def test_history_has_each_term_and_timing() -> None:
     assert all(a.seconds <= b.seconds for a, b in zip(solution.history, solution.history[1:], strict=False))
     assert solution.history[-1].terms["dynamics"] < 1e-6
     assert str(solution.iterations) in solution.report()
+
+
+def test_a_graph_keeps_what_it_was_stated_with_when_the_caller_reuses_his_arrays() -> None:
+    graph, place, sigma, limit, on = fg.Graph(), np.empty(2), np.ones(2), np.empty(2), np.ones(1, dtype=bool)
+    x = graph.variables("x", fg.Rn(2), 3)
+    for k in range(3):
+        place[:] = [k, k * k]
+        limit[:] = k + 0.5
+        graph.minimize(fg.prior, x[k], place, sigma=sigma, active=on)
+        graph.minimize(fg.difference, fg.shared(place), x[k], information=np.diag(sigma))
+        graph.bound(x[k], upper=limit, soft=fg.Soft(quadratic=sigma))
+    graph.fix(x[0], place)
+    for array in (place, sigma, limit, on):
+        array[:] = 0
+    expected = [[2.0, 4.0], [1.0, 1.0], [2.0, (2 * 4.0 + 2.5) / 3.0]]
+    np.testing.assert_allclose(fg.solve(graph, {x: np.zeros((3, 2))})[x], expected, atol=1e-6)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.horizon import Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
+from unifg.horizon import Constant, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array, ArrayLike
 
@@ -362,3 +362,11 @@ class Wrong(Speed):
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         return {"durations": [1.0]}
+
+
+def test_a_constant_keeps_what_it_was_stated_with() -> None:
+    start, sigma = np.array([[1.0, 2.0]]), np.array([0.5, 0.1])
+    mark = Constant("mark", fg.Rn(2), start, sigma)
+    start[:], sigma[:] = 9.0, 9.0
+    np.testing.assert_array_equal(mark.values, [[1.0, 2.0]])
+    np.testing.assert_allclose(mark.information[0], np.diag([4.0, 100.0]))

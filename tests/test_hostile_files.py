@@ -160,6 +160,12 @@ def test_what_may_be_meant_is_warned_about_by_name(tmp_path: Path, caplog: pytes
     assert any("alone.g2o: nothing has measured 1 of the landmarks: 10" in text for text in said)
 
 
+def test_a_map_is_solved_beside_what_nothing_has_measured(tmp_path: Path) -> None:
+    path = put(tmp_path, "alone.g2o", PLANAR + b"VERTEX_SE2 9 0 0 0\nVERTEX_XY 10 1 1\n")
+    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--no-scene"]) == 0
+    np.testing.assert_array_equal(read_g2o(tmp_path / "out" / "graph.g2o").landmarks[-1], [1.0, 1.0])
+
+
 def test_names_that_are_no_text_are_spelled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = os.fsdecode(os.fsencode(tmp_path) + b"/\xff.g2o")
     assert legible(path).endswith("\\xff.g2o")

@@ -245,3 +245,17 @@ def test_what_is_not_determined_is_still_named_so(kind: str) -> None:
         smoother.minimize(fg.between, y[adrift], y[0], [-adrift, 0.0, 0.0], sigma=0.1)
         with pytest.raises(fg.GraphError, match=r"^y\[\d\] is not determined by its factors"):
             smoother.update({y: np.zeros((adrift + 1, 3)) + np.arange(adrift + 1)[:, None] * [1.0, 0.0, 0.1]})
+
+
+@pytest.mark.parametrize("error", [lambda x: np.log(x - 5.0), lambda x: x * np.nan])
+@pytest.mark.parametrize("smoother", [fg.Incremental, lambda: fg.FixedLag(lag=3)])
+def test_a_residual_that_is_not_finite_is_no_estimate(smoother: Any, error: Any) -> None:
+    live = smoother()
+    y = live.variables("y", fg.Rn(1))
+    live.minimize(fg.prior, y[0], [0.0], sigma=1.0)
+    live.update({y: [0.0]})
+    live.minimize(error, y[0], sigma=1.0)
+    with pytest.raises(GraphError, match=r"y\[0\] cannot be found: a residual or its Jacobian is not finite"):
+        live.update()
+    with pytest.raises(GraphError, match="the last update failed"):
+        live.covariance(y[0])

@@ -13,6 +13,7 @@ import unifg as fg
 from maps import building, field, stop_after
 from unifg.errors import BackendError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.route import Route
 from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
@@ -20,7 +21,7 @@ from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigati
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.polyline import path_length, polyline_distance
-from unifg.scenarios.simulation.plane import World
+from unifg.scenarios.simulation.plane import LidarModel, World
 from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
@@ -295,6 +296,18 @@ def test_failure_on_the_first_tick_stands_still(monkeypatch: pytest.MonkeyPatch)
 def test_impossible_episodes_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises((ScenarioError, BackendError), match=message):
         run_navigation(replace(CORRIDOR, **change))
+
+
+@pytest.mark.parametrize("wrong", [{"dt": 0.0}, {"horizon": 0}, {"sigmas": -1.0}, {"wall_clearance": -0.1}], ids=str)
+def test_impossible_settings_of_the_controller_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ScenarioError, match=r"of some length|begin at zero"):
+        ControllerSettings(**wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"beams": 0}, {"beams": 1}, {"range_max": 0.0}], ids=str)
+def test_a_lidar_without_beams_is_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ScenarioError, match="two beams or more"):
+        LidarModel(**wrong)
 
 
 def test_a_map_of_ones_own_needs_start_and_goal(tmp_path: Path) -> None:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import osqp
 import pytest
 
 import unifg as fg
@@ -43,6 +45,13 @@ def test_counts_are_kept_apart() -> None:
     count = Count(["osqp", "piqp", "osqp", "elastic"], [10, 80], [80, 80])
     assert (count.by("osqp"), count.by("piqp"), count.share) == (2, 1, 0.5)
     assert Count().share == 0.0
+
+
+def test_control_c_that_osqp_has_taken_ends_the_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(osqp.OSQP, "solve", lambda *_, **__: SimpleNamespace(info=told))
+    told = SimpleNamespace(status_val=osqp.SolverStatus.OSQP_SIGINT, iter=1, rho_updates=0)
+    graph, guess = active_bounds()
+    assert SQP().solve(graph, guess).status is fg.Status.INTERRUPTED
 
 
 def at(name: str = "short drive") -> tuple[CompiledProblem, QP]:

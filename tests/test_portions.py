@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.horizon import ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
 from unifg.models import quadrotor
 from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.quadrotor.cbf_mpc import CbfMpc, Decision, KeeperSettings, Obstacles
@@ -125,6 +126,19 @@ def test_a_decision_without_time_flies_the_last_plan_by_name_and_then_brakes() -
     while plans.loop._step_time > 4.0:
         decide(plans, 14, pillar(9.0))
     assert decide(plans, 14, pillar(9.0)).status in ("converged", "stop_rule")
+
+
+def test_a_tick_without_time_for_a_solve_still_estimates() -> None:
+    robot = Robot(fg.Rn(1), fg.Rn(1), predict=lambda x, u: x + u)
+    step = Dynamics(lambda x, u, y, h: y - x - h * u, 1.0, sigma=0.1)
+    window = Window(robot, 3, [step, Measurement("place", fg.difference, (1,), 0.01)], start=[0.0], sigma=1.0)
+    loop = RecedingHorizon(
+        robot, 3, [step, ControlCost(sigma=1.0)], solver=InteriorPoint(), window=window, portion=1, deadline=1e3
+    )
+    loop.tick(measured={"place": [0.0]})
+    loop._step_time = np.inf
+    assert loop.tick(measured={"place": [5.0]}).source == "late"
+    np.testing.assert_allclose(loop.estimate, [5.0], atol=0.1)
 
 
 def test_portions_that_cannot_be_are_refused() -> None:

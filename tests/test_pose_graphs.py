@@ -412,3 +412,11 @@ def test_headings_of_first_guesses_are_weighed_by_what_is_left_of_them(
     np.testing.assert_allclose(turned, -gap * variance / variance.sum(), rtol=1e-3)
     diagonal = 1.0 / edges.information[:, 2, 2]
     assert np.abs(diagonal / diagonal.sum() - variance / variance.sum()).max() > 0.05
+
+
+def test_a_guess_that_is_changed_leaves_the_pose_graph_as_it_is() -> None:
+    made = manhattan(20, seed=1).pose_graph
+    _, x, guess = made.graph()
+    before = made.poses.copy()
+    guess[x][5] = 9.0
+    np.testing.assert_array_equal(made.poses, before)

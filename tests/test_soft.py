@@ -266,6 +266,18 @@ def test_bounds_give_way_too() -> None:
     np.testing.assert_allclose(found.dual("speed"), np.tile([0.3, -2.0], (3, 1)), atol=1e-5)
 
 
+@pytest.mark.parametrize("price", [1e-2, 1e-6, 0.0])
+def test_a_limit_that_is_kept_has_no_slack_however_little_it_would_cost(price: float) -> None:
+    graph = fg.Graph()
+    x, on = graph.variables("x", fg.Rn(1), 2), graph.data("on", [True, False], each=True)
+    weight = graph.data("weight", 1.0)
+    graph.minimize(fg.prior, x, [3.0])
+    graph.constrain(lambda x: x, x, upper=10.0, soft=weight, active=on, name="most")
+    found = InteriorPoint().solve(graph, {x: [[12.0], [12.0]]}, data={weight: price})
+    np.testing.assert_array_equal(found.slack("most"), np.zeros((2, 1)))
+    assert "gives way" not in found.report()
+
+
 # ---------------------------------------------------------------- the graph
 
 

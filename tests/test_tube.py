@@ -100,3 +100,18 @@ def test_other_terms_are_refused_by_name() -> None:
     for term, why in (("lean", "leave SO3"), ("level", "has no tape")):
         with pytest.raises(fg.GraphError, match=why):
             turned.tube(term)
+
+
+def test_data_of_a_later_solve_are_refused() -> None:
+    graph = fg.Graph()
+    p, centre, goal = graph.variables("p", fg.Rn(1), 3), graph.data("centre", [0.0]), graph.data("goal", [1.0])
+    graph.minimize(fg.prior, p, goal)
+    graph.minimize(lambda p, c: p - c, p, centre, name="off")
+    run = InteriorPoint().prepare(graph)
+    first = run.solve({p: np.zeros((3, 1))})
+    found = first.tube("off")
+    run.solve(first, data={goal: [3.0]})
+    np.testing.assert_array_equal(first.tube("off"), found)  # those of the term are the same
+    run.solve(first, data={centre: [5.0]})
+    with pytest.raises(fg.GraphError, match="have been replaced"):
+        first.tube("off")

@@ -98,6 +98,14 @@ def test_a_cluster_that_nothing_else_reaches_is_unsupported() -> None:
     assert found(fault, "unsupported", dirty)
 
 
+def test_the_only_closure_between_two_drives_is_said_to_hold_the_map_together() -> None:
+    made = drive(200, 1).pose_graph
+    kept = made.edges.odometry & (made.edges.first != 99)
+    kept[np.flatnonzero(~made.edges.odometry)[0]] = True
+    verdict = solved(replace(made, edges=made.edges[kept])).verdict(effort="cheap")
+    assert "(without, the map falls apart, and chi2" in verdict.of("unsupported")[0].sentence()
+
+
 def test_a_slip_is_not_laid_on_closures() -> None:
     made = manhattan(600, 4).pose_graph
     verdict = solved(slipped(made, 200, np.array([2.0, 0.0, 0.1]))).verdict(effort="cheap")

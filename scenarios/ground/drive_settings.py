@@ -107,14 +107,18 @@ class ControllerSettings(Settings):
     feasible: float = 5e-4
 
     def __post_init__(self) -> None:
-        """Refuse an unknown base or way of avoiding things."""
+        """Refuse unknown bases, steps of no length, negative distances, and ways of avoiding things that do not go."""
         super().__post_init__()
+        if not (self.horizon >= 1 and self.dt > 0.0):
+            raise ScenarioError(f"a horizon has steps of some length, found horizon {self.horizon}, dt {self.dt:g} s")
+        if min(self.wall_clearance, self.disc_clearance, self.margin, self.sigmas) < 0.0:
+            raise ScenarioError("wall_clearance, disc_clearance, margin and sigmas of the controller begin at zero")
         base_of(self.base)
         if self.body:
             object.__setattr__(self, "robot_radius", self.hull.radius)
         if not self.hull.round and self.avoidance in ("potential", "vortex"):
             raise ScenarioError(f"avoidance '{self.avoidance}' is one of discs about their axis; leave --body out")
-        if not (self.tails >= 2 and 1 <= self.shared < self.horizon):
+        if self.branches and not (self.tails >= 2 and 1 <= self.shared < self.horizon):
             raise ScenarioError(
                 f"a tree has two tails or more, and shares 1 to {self.horizon - 1} of {self.horizon} steps: found "
                 f"{self.tails} tails, {self.shared} shared"

@@ -70,8 +70,12 @@ class LidarModel(Settings):
     field: float = option(2.0 * math.pi, text=positive, metavar="RAD", flag="field-of-view")
 
     def __post_init__(self) -> None:
-        """Refuse a field of view that is none."""
+        """Refuse a field of view that is none, and fewer than two beams."""
         super().__post_init__()
+        if not (self.beams >= 2 and self.range_max > 0.0):
+            raise ScenarioError(
+                f"a lidar has two beams or more and some range, got {self.beams} of {self.range_max:g} m"
+            )
         if self.field > 2.0 * math.pi + 1e-9:
             raise ScenarioError(f"the lidar's field of view must be in (0, 2 pi] rad, got {self.field:g}")
 

@@ -130,6 +130,8 @@ class OsqpRoute:
             spent += int(result.info.iter)
             self._adapted = self._adapted or result.info.rho_updates > 0
             status = result.info.status_val
+            if status == osqp.SolverStatus.OSQP_SIGINT:  # its own handler has taken the signal from Python
+                raise KeyboardInterrupt
             if status not in (*SOLVED, UNFINISHED):
                 return replace(best, iterations=spent, infeasible=best.infeasible or status in INFEASIBLE)
             step, dual = packed.columns * result.x, packed.rows * result.y

@@ -382,7 +382,7 @@ class RecedingHorizon:
         if self.goes_on:
             self.waited += 1
             if not self._fits(begin):
-                return self._late(now, begin)
+                return self._late(now, present, begin)
             return self._decided(self._timed(self.warm.proceed), now, present, begin)
         self.waited = 0
         data = self.data(now)
@@ -390,7 +390,7 @@ class RecedingHorizon:
         if self._margins:
             data = self._margins.data(run.program, self.tie.begin(guess, now), covariance, data)
         if run is self.warm and not self._fits(begin):
-            return self._late(now, begin)
+            return self._late(now, present, begin)
         if np.isfinite(self._deadline) and self._portion is None:
             limit = self._limits[0 if run is self.warm else 1]
             run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
@@ -421,12 +421,13 @@ class RecedingHorizon:
         self._step_time = max(took, FORGOTTEN * self._step_time) if self._step_time else took
         return solution
 
-    def _late(self, now: Context[Any], begin: float) -> Plan:
+    def _late(self, now: Context[Any], present: Context[Any], begin: float) -> Plan:
         """Apply what is left of the last plan, or brake; nothing is solved."""
         self.kept.age += float(self.times[1])
         choice = replace(self._instead(now), source="late")
         self.sources["late"] += 1
         self._step_time *= FORGOTTEN
+        self._believe(None, choice, present)
         return self._applied(choice, Status.TIME_LIMIT, 0, begin, False)
 
     def _instead(self, now: Context[Any]) -> Decision:
@@ -626,8 +627,9 @@ class RecedingHorizon:
                 self.guess = self._resampled(self.guess, states, self.guess.values[self.u], found)
             self.times, self.kept.times = found, found[self.path]
 
-    def _believe(self, solution: Solution, choice: Decision, now: Context[Any]) -> None:
-        said = self.tie.believed(solution) if self._believable(solution, choice) else None
+    def _believe(self, solution: Solution | None, choice: Decision, now: Context[Any]) -> None:
+        """Take what a joint solve says of the present, or what is known without a solve."""
+        said = self.tie.believed(solution) if solution and self._believable(solution, choice) else None
         self.believed = said is not None
         self.estimate, self.constants = said or (now.present, dict(now.constants))
 

@@ -14,7 +14,7 @@ from unifg.modeling.variables import Family
 from unifg.typing import Array, ArrayLike
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Constant:
     """Unknowns that do not change with time: parameters, landmarks, biases. One family in every graph of the robot.
 
@@ -36,8 +36,8 @@ class Constant:
     sigma: ArrayLike
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be believed."""
-        start = np.atleast_2d(np.asarray(self.start, dtype=np.float64))
+        """Refuse what cannot be believed, and keep the rest, whatever the caller does with its arrays."""
+        start = np.atleast_2d(np.array(self.start, dtype=np.float64))
         if start.ndim != 2 or start.shape[1] != self.manifold.storage or not np.all(self.manifold.is_valid(start)):
             raise GraphError(
                 f"static '{self.name}': its start has shape {start.shape}, expected (count, {self.manifold.storage}), "
@@ -52,6 +52,8 @@ class Constant:
             ) from error
         if not np.all(sigma > 0.0) and np.any(sigma):
             raise GraphError(f"static '{self.name}': standard deviations must be positive", family=self.name)
+        object.__setattr__(self, "start", start)
+        object.__setattr__(self, "sigma", sigma.copy())
 
     @property
     def values(self) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -38,3 +39,8 @@ def doubles(what: str, given: Any, *, term: str | None = None, flags: bool = Fal
         return array
     found = _KINDS.get(array.dtype.kind, f"an array of {array.dtype} objects") if array.ndim else f"{given!r}"[:80]
     raise GraphError(f"{what} must be real numbers, found {found}: convert to float64 first", term=term)
+
+
+def kept(given: Any) -> Any:
+    """A copy of an array or a list, which the caller may go on to change; anything else as it is."""
+    return deepcopy(given) if isinstance(given, np.ndarray | list) else given

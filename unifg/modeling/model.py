@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
+from dataclasses import replace
 from difflib import get_close_matches
 from html import escape
 from operator import index
@@ -20,7 +21,7 @@ from unifg.factors.residuals import Residual, as_residual
 from unifg.factors.robust import Loss
 from unifg.lie import Manifold, Rn
 from unifg.lie.product import Product
-from unifg.modeling.duplicates import doubles
+from unifg.modeling.duplicates import doubles, kept
 from unifg.modeling.elements import elements_of, on_manifolds
 from unifg.modeling.factors import ManifoldResidual
 from unifg.modeling.probing import rows_of
@@ -33,6 +34,7 @@ from unifg.modeling.units import compare
 from unifg.modeling.variables import (
     RESERVED,
     Data,
+    Declared,
     Family,
     Selection,
     Variable,
@@ -394,6 +396,12 @@ class Model:
     ) -> dict[str, Any]:
         """Parts that every kind of term has, by their names in :class:`Term`."""
         wrapped = complete(function, arguments, name)
+        if (
+            wrapped.kernel is not None
+        ):  # a function in Python sees what becomes of its arrays, as of all that it reaches
+            arguments = tuple(
+                replace(a, value=kept(a.value)) if isinstance(a, Declared) else kept(a) for a in arguments
+            )
         unique = self._unique(name, default or wrapped.name, replaced)
         normal, rows, active, count = self._arguments(unique, wrapped, arguments, active)
         size = rows_of(unique, wrapped, normal, count, scalar=scalar, declared=rows)
@@ -489,7 +497,9 @@ class Model:
         selection, value = _one_variable("a fix", stated[:1], name), stated[1]
         unique = self._unique(name, f"{selection.family.name} fixed", replaced is not None)
         held = (
-            value if isinstance(value, Data) else np.atleast_1d(doubles(f"fix '{unique}': value", value, term=unique))
+            value
+            if isinstance(value, Data)
+            else np.array(doubles(f"fix '{unique}': value", value, term=unique), ndmin=1)
         )
         self._own(selection, unique)
         self._own_data(unique, held)

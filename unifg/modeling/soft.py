@@ -105,7 +105,7 @@ def slack_of(
         raise GraphError(f"term '{name}': soft= gives no price to a row; a price must be positive", term=name)
     sides = UPPER * _anywhere(upper, np.inf) | LOWER * _anywhere(lower, -np.inf)
     width = 2 * size if sides == UPPER | LOWER else size
-    kept = Soft(*(w if isinstance(w, Data) else np.asarray(w, dtype=np.float64) for w in (soft.linear, soft.quadratic)))
+    kept = Soft(*(w if isinstance(w, Data) else np.array(w, dtype=np.float64) for w in (soft.linear, soft.quadratic)))
     return Slack(SlackFamily(f"{name}{SLACK}", Rn(width), count), sides, kept)
 
 

@@ -200,10 +200,10 @@ class PoseGraph:
         everywhere = robust if robust_on == "all" else None
         graph = Graph()
         x = graph.variables("poses", self.group, len(self.poses))
-        guess = {x: self.poses}
+        guess = {x: self.poses.copy()}
         if len(self.landmarks):
             places = graph.variables("landmarks", Rn(self.landmarks.shape[1]), len(self.landmarks))
-            guess[places] = self.landmarks
+            guess[places] = self.landmarks.copy()
         for term in terms:
             if len(self.landmarks) or not term.landmarks:
                 measured = graph.data(term.name, term.batch.measured, each=True)
@@ -258,21 +258,25 @@ class PoseGraph:
     def anchors(self, priors: bool = False) -> tuple[IntArray, IntArray]:
         """Positions of the poses and landmarks held fixed: those known, or the first pose of a connected part.
 
+        A landmark that nothing has measured is held, too, as such a pose is.
+
         Args:
             priors: whether a part needs no fixed pose that priors determine: one of a whole pose, or those of so many
                 poses as a position has coordinates.
         """
         known = np.array(self.fixed_ids, dtype=np.int64)
-        poses, landmarks = np.flatnonzero(np.isin(self.ids, known)), np.flatnonzero(np.isin(self.landmark_ids, known))
-        part = self.parts()
-        held = np.concatenate([part[poses], part[len(self.poses) + landmarks]])
+        part, count = self.parts(), len(self.poses)
+        unseen = ~np.isin(part[count:], part[:count])
+        poses = np.flatnonzero(np.isin(self.ids, known))
+        landmarks = np.flatnonzero(np.isin(self.landmark_ids, known) | unseen)
+        held = np.concatenate([part[poses], part[count + landmarks]])
         if priors and self.priors:
             ranks = [np.linalg.matrix_rank(kind.information, hermitian=True) for kind in self.priors.values()]
             whole = np.concatenate(ranks) == self.group.dim
             where = np.concatenate([kind.pose for kind in self.priors.values()])
             counts = np.bincount(part[np.unique(where)])
             held = np.concatenate([held, part[where[whole]], np.flatnonzero(counts >= self.group.point_dim)])
-        present, firsts = np.unique(part[: len(self.poses)], return_index=True)
+        present, firsts = np.unique(part[:count], return_index=True)
         loose = firsts[~np.isin(present, held)]
         return np.sort(np.concatenate([poses, loose])), landmarks
 

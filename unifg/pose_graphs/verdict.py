@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isinf
 from typing import Literal, TypeAlias
 
 from unifg.modeling.summary import counted
@@ -174,8 +175,9 @@ class Cluster:
             text = f"{counted(len(self.edges), 'closure')} of {one} with {other}"
         if self.moved is None or self.chi2 is None:
             return text
+        moved = f"moves by {self.moved[0]:.2g} m and {self.moved[1]:.2g} rad"
         return (
-            f"{text} (without, the map moves by {self.moved[0]:.2g} m and {self.moved[1]:.2g} rad, "
+            f"{text} (without, the map {'falls apart' if isinf(self.deviations) else moved}, "
             f"and chi2 of the others falls from {self.chi2[0]:.6g} to {self.chi2[1]:.6g})"
         )
 

@@ -68,10 +68,9 @@ class Incremental(Smoother):
         if options.get("information") is None:
             options["sigma"] = 1.0 if options.get("sigma") is None else options["sigma"]
         super().minimize(function, *arguments, **options)
-        staged = self._staged[-1]
+        staged = self._staged.pop()
         row = self._types.fields[staged.kind]
         if staged.term is not None or not row[FIELD["whitening"]]:
-            self._staged.pop()
             raise GraphError(
                 f"term '{staged.name}': a revocable factor needs a function that can be traced or compiled",
                 term=staged.name,
@@ -79,6 +78,7 @@ class Incremental(Smoother):
         staged.limit = limit_of(revocable, staged.name)
         staged.data = staged.data.copy()
         staged.data[:, int(row[FIELD["parameters"]]) :] *= LEAST**0.5
+        self._staged.append(staged)
 
     @property
     @synchronized

@@ -37,6 +37,19 @@ from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers
 FIRST_MADE = PLACE[MADE[0]]
 VARIABLE_END, FACTOR_END, CLIQUE_END = PLACE["variable_end"], PLACE["factor_end"], PLACE["clique_end"]
 UPDATES, SCRATCH = PLACE["updates"], PLACE["scratch"]
+LOST = (
+    "is determined by its factors, but lost to rounding: the problem is too ill-conditioned where it is linear now, as "
+    "after first guesses that are radians off, or with weights many orders apart. Begin again with better guesses, or "
+    "solve the whole as a fg.Graph"
+)
+UNDETERMINED = (
+    "is not determined by its factors: it, or something it is tied to, needs a prior or another measurement. The "
+    "factors are kept; add what is missing and update again"
+)
+NOT_FINITE = (
+    "cannot be found: a residual or its Jacobian is not finite at the present values. The factors are kept; begin "
+    "again, with other values or without that factor"
+)
 
 
 class Effort(NamedTuple):
@@ -290,8 +303,10 @@ class Smoother:
             )
             self._move(None, numbers)
             family.grow(out)
+        fresh = [np.zeros(0, dtype=np.int64)]
         for item in self._staged:
             touched = _touched(item)
+            fresh.append(touched.ravel())
             number = self._batches.add(_batch(item, touched)) if item.term is not None else 0
             lists, numbers = add_factors(self._memory, item.kind, touched, item.data, number, item.items)
             self._move(lists, numbers)
@@ -300,6 +315,7 @@ class Smoother:
         self._staged.clear()
         for _ in range(iterations):
             self._solve()
+        self._require_finite(np.concatenate(fresh))
 
     def _effort(self) -> Effort:
         return Effort(*self._counts[FIRST_MADE : FIRST_MADE + len(MADE)].tolist())
@@ -332,23 +348,24 @@ class Smoother:
         failed, lists, numbers = renew(self._memory, chain, self.relinearize, self.wildfire, self._chronological)
         self._move(lists, numbers)
         if failed >= 0:
-            family = self._order[int(state.variables["family"][failed])]
-            member = int(state.variables["member"][failed])
-            why = (
-                "is determined by its factors, but lost to rounding: the problem is too ill-conditioned where it is "
-                "linear now, as after first guesses that are radians off, or with weights many orders apart. Begin "
-                "again with better guesses, or solve the whole as a fg.Graph"
-                if enough(state, failed)
-                else "is not determined by its factors: it, or something it is tied to, needs a "
-                "prior or another measurement. The factors are kept; add what is missing and update again"
-            )
-            raise GraphError(
-                f"{family.name}[{member}] {why}",
-                family=family.name,
-                index=member,
-            )
+            why = NOT_FINITE if not isfinite(self.cost) else LOST if enough(state, failed) else UNDETERMINED
+            self._fail(failed, why)
         for family in self._by_python:
             move_by_python(self._state, family, self._chronological)
+
+    def _require_finite(self, rows: IntArray) -> None:
+        """Fail where the steps of variables with new factors are not finite."""
+        variables = self._state.variables
+        finite = np.isfinite(self._state.numbers[variables["value"][rows] + variables["storage"][rows]])
+        if not finite.all():
+            give_up(self._memory, int(rows[finite.argmin()]))
+            self._fail(int(rows[finite.argmin()]), NOT_FINITE)
+
+    def _fail(self, variable: int, why: str) -> NoReturn:
+        """Refuse an update, by the name of a variable."""
+        record = self._state.variables[variable]
+        family, member = self._order[int(record["family"])], int(record["member"])
+        raise GraphError(f"{family.name}[{member}] {why}", family=family.name, index=member)
 
     def _checked(self, family: GrowingFamily, value: ArrayLike) -> tuple[GrowingFamily, Array]:
         """Values of new members as (n, storage)."""

@@ -149,7 +149,7 @@ def stacked_data(data: Mapping[Data, Numbers]) -> tuple[dict[Data, Array], int |
     found: dict[Data, Array] = {}
     count: int | None = None
     for handle, given in data.items():
-        array = np.asarray(given)
+        array = np.array(given)  # a copy: the batch reads it later, and the caller may change it
         if array.shape[1:] != handle.value.shape:
             raise GraphError(
                 f"data '{handle.name}' of many instances has shape {array.shape}, expected (K, "

@@ -39,7 +39,7 @@ from unifg.typing import Array, BoolArray, Figure, Numbers
 if TYPE_CHECKING:
     from unifg.plots.shown import Shown
 
-GIVEN_WAY = 1e-6  # of a slack variable, from which on it is reported
+GIVEN_WAY = 1e-6  # of a violation, from which on it is reported
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,11 @@ class Solution:
         if name not in soft:
             known = ", ".join(soft) or "none"
             raise GraphError(f"no soft constraint is called '{name}' (there are: {known})", term=name)
-        return soft[name].signed(self._lin.values[soft[name].family].copy())
+        arrays = self._lin.constraints, self._lower, self._upper
+        rows, lower, upper = (self._program.by_term(array)[name] for array in arrays)
+        value = rows + soft[name].signed(self._lin.values[soft[name].family])  # a slack may exceed what is needed
+        outside: Array = np.maximum(value - upper, 0.0) - np.maximum(lower - value, 0.0)
+        return outside
 
     def shifted(self, *families: Family, by: int = 1) -> Guess:
         """A guess moved ``by`` stages towards the end of the horizon, for the next control tick.
@@ -543,9 +547,9 @@ class Solution:
             pieces: boxes between two factors.
 
         Raises:
-            GraphError: there is no such term, or it is of another kind.
+            GraphError: there is no such term, it is of another kind, or its data have been replaced since.
         """
-        return tube(self._program, self._lin.values, term, pieces)
+        return tube(self._program, self._lin.values, self._claims("tube")[-1], term, pieces)
 
     def report(self) -> str:
         """The status sentence with the numbers behind it, and the times of the parts."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from unifg.errors import GraphError
@@ -9,16 +11,20 @@ from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.intervals import bounds
 from unifg.factors.kernel import side_by_side
 from unifg.factors.steps import ANGLE, OTHER, TURN, parts_of
+from unifg.modeling.variables import Data
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
+from unifg.solution.gains import REPLACED
 from unifg.typing import Array
 
 
-def tube(program: CompiledProblem, values: Values, name: str, pieces: int) -> Array:
+def tube(program: CompiledProblem, values: Values, data: Mapping[Data, Array], name: str, pieces: int) -> Array:
     """(n - 1, m, 2) bounds; arguments and errors as of :meth:`unifg.Solution.tube`."""
     term = program.term_named(name)
     if (kernel := term.kernel) is None or not isinstance(expression := getattr(kernel, "expression", None), Expression):
         raise GraphError(f"tube: term '{name}' has no tape: it takes a function that is traced", term=name)
+    if not all(np.array_equal(data[handle], program.binding.present[handle]) for handle in term.term.data):
+        raise GraphError(f"tube: term '{name}': {REPLACED}")
     variables, parameters, _ = kernel.split(term._for_kernel(term.points(values)), term.count)
     numbers = side_by_side(variables, term.count), side_by_side(parameters, term.count)
     turned, ends = np.zeros(numbers[0].shape[1], dtype=bool), []
