@@ -199,6 +199,12 @@ def test_errors_name_what_was_given():
         loop_of(Wall(), sigmas={"limits": 2.0})
     with pytest.raises(GraphError, match=r"-1\.0 standard deviations for 'wall'"):
         loop_of(Wall(), sigmas=-1.0)
+    with pytest.raises(GraphError, match=r"sigmas of 'wall' has shape \(2,\), expected \(\)"):
+        loop_of(Wall(), sigmas=np.array([1.0, 2.0]))
+    with pytest.raises(GraphError, match="sigmas of 'wall' must be finite"):
+        loop_of(Wall(), sigmas=np.inf)
+    with pytest.raises(GraphError, match="negative variances"):
+        loop_of(Wall(), sigmas=1.0).plan((0.0, 0.4, 0.0), covariance=-np.eye(3))
     with pytest.raises(GraphError, match=r"need the covariance of state and constants, \(3, 3\), or a window"):
         loop_of(Wall(), sigmas=1.0).plan((0.0, 0.4, 0.0))
 

@@ -22,6 +22,7 @@ from unifg.solution.solution import Guess
 from unifg.typing import Array, ArrayLike, IntArray
 
 WIDEST = 0.45  # of what lies between two limits, so that something is left between them
+ROUNDING = 1e-9  # of a covariance
 PRICE = 100.0  # of one standard deviation less than wanted, in units of cost: squared standard deviations
 
 
@@ -58,7 +59,7 @@ class Margins:
         self,
         graph: Graph,
         terms: Sequence[Term],
-        sigmas: float | Mapping[str, float],
+        sigmas: float | Mapping[str, float] | None,
         robot: Robot,
         x: Selection,
         window: Window | None,
@@ -68,7 +69,7 @@ class Margins:
         Args:
             graph: that they are stated in.
             terms: of the future.
-            sigmas: of all inequality constraints and bounds on states, or by their names.
+            sigmas: of all inequality constraints and bounds on states, or by their names; None for no margin.
             robot: who moves.
             x: (N + 1) nodes of the future.
             window: of the past, whose covariance is that of a tick; None where each is given.
@@ -78,19 +79,24 @@ class Margins:
         """
         self._robot, self._x, self._window = robot, x, window
         own = {term.name: term for term in terms if isinstance(term, Constraint) and self._limits_state(term)}
-        chosen = dict(sigmas) if isinstance(sigmas, Mapping) else dict.fromkeys(own, sigmas)
+        given = dict(sigmas) if isinstance(sigmas, Mapping) else dict.fromkeys(own, 0.0 if sigmas is None else sigmas)
+        chosen = {name: float(numbers(count, (), f"sigmas of '{name}'")) for name, count in given.items()}
         for name, count in chosen.items():
             if name not in own:
                 known = ", ".join(f"'{other}'" for other in own) or "none"
                 raise GraphError(
                     f"sigmas: '{name}' is no inequality constraint on states (there are: {known})", term=name
                 )
-            if not (np.isfinite(count) and count >= 0.0):
+            if count < 0.0:
                 raise GraphError(f"sigmas: {count} standard deviations for '{name}': a number from 0 on", term=name)
         self._tightened = [self._tighten(graph, own[name], count) for name, count in chosen.items() if count]
         used = {handle for term in graph.terms for handle in term.data} | {h for fix in graph.fixes for h in fix.data}
         stated = {limit for one in self._tightened for limit, _, _ in one.limits if isinstance(limit, Data)}
         self._replaced = stated - used
+
+    def __bool__(self) -> bool:
+        """Test whether any constraint has a margin."""
+        return bool(self._tightened)
 
     def _limits_state(self, term: Constraint) -> bool:
         """Test whether a constraint is an inequality about nodes of the future."""
@@ -135,6 +141,8 @@ class Margins:
         if covariance is None:
             raise GraphError(f"sigmas need the covariance of state and constants, ({size}, {size}), or a window")
         spread = numbers(covariance, (size, size), "sigmas: the covariance of state and constants")
+        if np.linalg.eigvalsh(spread)[0] < -ROUNDING * np.abs(spread).max():
+            raise GraphError("sigmas: the covariance of state and constants has negative variances")
         data = {handle: value for handle, value in given.items() if handle not in self._replaced}
         with program.lock:
             program.bind(data)

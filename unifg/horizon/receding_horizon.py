@@ -121,7 +121,7 @@ class RecedingHorizon:
         delay: int = 0,
         patience: int = 10,
         portion: int | None = None,
-        sigmas: float | Mapping[str, float] = 0.0,
+        sigmas: float | Mapping[str, float] | None = None,
         clock: Callable[[], float] = clocks.perf_counter,
     ) -> None:
         """State the graph and prepare the backends; ticks compile nothing.
@@ -159,8 +159,8 @@ class RecedingHorizon:
                 the judge has instead of a plan is applied meanwhile. Its plan is then followed from where it should be.
                 With a deadline as many are made as fit by the time that they took before; where none fits, the tick is
                 late and what is left of the last plan is applied. None: every solve ends in its tick.
-            sigmas: standard deviations of the estimate by which inequality constraints on states are tightened, of all
-                or by their names (:class:`unifg.horizon.margins.Margins`).
+            sigmas: standard deviations of the estimate by which inequality constraints on states are tightened, all or
+                those named (:class:`unifg.horizon.margins.Margins`); None for no margin.
             clock: seconds of the wall.
 
         Raises:
@@ -205,7 +205,7 @@ class RecedingHorizon:
         if probabilities is not None:
             self._expected = ExpectedCost(graph, graph.terms[before:], tree, self.x, self.u)
         self._probabilities = probabilities
-        self._margins = Margins(graph, graph.terms[before:], sigmas, robot, self.x, window) if sigmas else None
+        self._margins = Margins(graph, graph.terms[before:], sigmas, robot, self.x, window)
         self._said = [handle for name, handle in self._handles.items() if name not in tied]
         backends = solver, cold or solver, second or solver
         most = deadline if portion is None else np.inf
@@ -640,8 +640,6 @@ class RecedingHorizon:
             return False
         self.lagging = 0
         return True
-
-    # ---------------------------------------------------------------- beginning anew
 
     def forget(self) -> None:
         """Drop the warm start, as when a new reference makes it misleading."""
