@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from problems.known import short_drive
 from test_house import LIBRARY, name_of, text_of, tree_of
 from unifg.elimination.factorization import Factorization
@@ -104,8 +105,7 @@ def test_not_converged_is_an_error_of_unifg_and_names_the_worst_factor() -> None
 
 
 def test_not_converged_names_nothing_where_nothing_is_violated() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(lambda p: np.cosh(p - 3.0), x)
     graph.bound(x, lower=-1.0)
     with pytest.raises(fg.NotConverged) as caught:
@@ -163,21 +163,18 @@ def test_models_maps_and_methods_refuse_with_an_error_of_unifg(
 
 def test_an_error_inside_a_residual_names_its_term() -> None:
     """Whoever raises it: a model that is given the wrong numbers, or the user's own code."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 2)
+    graph, x = graph_with(fg.Rn(3), 2)
     with pytest.raises(fg.ModelError, match=r"^term 'flight': a quadrotor's states have shape") as caught:
         graph.minimize(lambda p: quadrotor.step(p, p, 0.1, quadrotor.Parameters()), x, name="flight")
     assert caught.value.term == "flight"
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 2)
+    graph, x = graph_with(fg.Rn(3), 2)
     with pytest.raises(ValueError) as other:
         graph.minimize(lambda p: p @ np.ones(2), x, name="mine")
     assert other.value.__notes__[0] == "raised by the function of term 'mine'"
 
 
 def test_an_error_of_a_function_says_where_and_keeps_what_was_reached() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 5)
+    graph, x = graph_with(fg.Rn(1), 5)
 
     def fragile(p: Array, z: Array) -> Array:
         if np.any(np.abs(p - 2.8) < 0.1):  # where the second step leads

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 import own_manifolds as own
 import unifg as fg
 from own_manifolds import GROUPS, OWN, S2, SE23, STRAIGHT, XYZW
+from problems.graphs import graph_with
 from unifg.codegen.jit import compiled
 from unifg.lie import se2
 from unifg.lie.functions import functions_of
@@ -209,8 +210,7 @@ def test_a_subclass_inherits_and_replaces() -> None:
 
 
 def test_between_needs_a_group() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", S2, 2)
+    graph, x = graph_with(S2, 2)
     with pytest.raises(fg.GraphError, match="between needs a Lie group, found S2; use difference"):
         graph.minimize(fg.between, x[0], x[1], S2.identity())
 
@@ -279,8 +279,7 @@ def test_all_backends_find_the_answer_of_charts(manifold: fg.Manifold) -> None:
         AugmentedLagrangian(),
         KKT(),
     ):
-        solution = solver.solve(chain.graph, {chain.x: chain.seen})
-        assert solution.converged, solution.report()
+        solution = solver.solve(chain.graph, {chain.x: chain.seen}, check=True)
         chain.assert_same(solution[chain.x], answer, 2e-6)
 
 
@@ -310,19 +309,16 @@ def test_compiled_residuals_are_differenced_along_own_steps() -> None:
     rng = np.random.default_rng(1)
     seen = S2.retract(np.array([0.6, 0.0, 0.8]), 0.2 * rng.standard_normal((12, 2)))
     residual = fg.residual(beam, rows=3)  # type: ignore[arg-type]
-    graph = fg.Graph()
-    u = graph.variables("u", S2, 1)
+    graph, u = graph_with(S2, 1, "u")
     graph.minimize(residual, u[np.zeros(12, dtype=int)], seen, sigma=0.1)
     scatter = seen.T @ seen  # the sum of squared sines is N - u' S u
     mean = np.linalg.eigh(scatter)[1][:, -1]
     for solver in (GaussNewton(), SQP(hessian="exact"), InteriorPoint(), AugmentedLagrangian()):
-        solution = solver.solve(graph, {u: np.array([[0.0, 0.0, 1.0]])})
-        assert solution.converged, solution.report()
+        solution = solver.solve(graph, {u: np.array([[0.0, 0.0, 1.0]])}, check=True)
         np.testing.assert_allclose(solution[u][0], mean * np.sign(mean[2]), atol=1e-6)
     graph.constrain(lambda u: u[:, :1], u, upper=0.3, name="cap")
     for solver in (SQP(), SQP(hessian="exact"), InteriorPoint(), AugmentedLagrangian()):
-        solution = solver.solve(graph, {u: np.array([[0.0, 0.0, 1.0]])})
-        assert solution.converged, solution.report()
+        solution = solver.solve(graph, {u: np.array([[0.0, 0.0, 1.0]])}, check=True)
         found = solution[u][0]
         assert found[0] == pytest.approx(0.3, abs=1e-6)
         angle = math.atan2(found[1], found[2])

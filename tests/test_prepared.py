@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.solvers import GaussNewton
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -147,8 +148,7 @@ class Particular(GaussNewton):
 
 
 def test_a_rehearsal_that_fails_fails_nothing() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [2.0], sigma=1.0)
     solution = Particular().prepare(graph).solve({x: [[0.0]]})
     assert solution.converged and solution[x][0, 0] == pytest.approx(2.0)

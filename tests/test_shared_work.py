@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.codegen import threads as crews
 from unifg.codegen.jit import compiled
 from unifg.codegen.threads import cores, share, threads
@@ -216,8 +217,7 @@ def test_entries_that_several_shares_write_to_stand_beside_the_matrix(lattice: P
 def test_shares_that_meet_in_parts_of_blocks() -> None:
     """Positions alone in another share than the steps: beside the matrix, rows of blocks do not follow each other."""
     count = 9000
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Product(position=fg.Rn(2), heading=fg.Rn(1)), count)
+    graph, x = graph_with(fg.Product(position=fg.Rn(2), heading=fg.Rn(1)), count)
     here, there = np.arange(count - 1), np.arange(1, count)
     moved = np.tile([0.1, 0.0, 0.01], (count - 1, 1))
     graph.minimize(fg.between, x[here], x[there], graph.data("moved", moved, each=True), sigma=0.1, name="steps")

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.solvers import SQP, GaussNewton
 
 SCRIPT = """
@@ -39,8 +40,7 @@ def test_verbose_prints_although_logging_is_not_configured(configure: str) -> No
 def test_verbose_logs_where_logging_is_configured(
     caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 2.0])
     with caplog.at_level(logging.INFO, "unifg"):
         GaussNewton(verbose=True).solve(graph, {x: np.zeros((1, 2))})
@@ -49,8 +49,7 @@ def test_verbose_logs_where_logging_is_configured(
 
 
 def test_costs_that_were_traced_take_no_time_in_python() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize_scalar(lambda p: np.cosh(p[:, 0] - 1.0) + p[:, 1] ** 2, x, name="bowl")
     solution = SQP(hessian="exact").solve(graph, {x: np.full((1, 2), 3.0)}, check=True)
     assert solution.converged and solution.in_python == 0.0

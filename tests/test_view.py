@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from unifg import view
 from unifg.errors import GraphError, ViewError
@@ -113,8 +114,7 @@ def test_ellipses_are_the_marginals_in_the_world(group: Any) -> None:
 
 
 def test_covariances_of_places_that_a_function_gives_are_carried_through_it() -> None:
-    graph = fg.Graph()
-    arm = graph.variables("arm", fg.SO2, 1)
+    graph, arm = graph_with(fg.SO2, 1, "arm")
     graph.minimize(fg.prior, arm, [0.5], sigma=0.1)
     solution = GaussNewton().solve(graph, {arm: [[0.4]]})
     scene = Scene.of(
@@ -138,8 +138,7 @@ def test_iterates_are_on_the_slider_with_their_numbers(solved: tuple[fg.Solution
     assert data["play"] is False
     assert dict(tracks["x/1"][".visible"])[0] is False
     with pytest.raises(ViewError, match="keep_values=True"):
-        graph = fg.Graph()
-        y = graph.variables("y", POINT, 1)
+        graph, y = graph_with(POINT, 1, "y")
         graph.minimize(fg.prior, y, [0.0, 0.0], sigma=1.0)
         Scene.of(GaussNewton().solve(graph, {y: [[1.0, 1.0]]}), y, over="iterates")
 
