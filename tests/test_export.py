@@ -17,10 +17,11 @@ import pytest
 
 import unifg as fg
 from asserting import below
-from fences import CHECKOUT, fences
+from fences import fences
 from problems.around_a_disc import around_a_disc
 from problems.control import Quadrotor, Stated, Unicycle
 from problems.graphs import graph_with
+from scripts import CHECKOUT
 from unifg.codegen import standalone
 from unifg.errors import BackendError
 from unifg.solution.solver import Prepared

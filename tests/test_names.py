@@ -6,6 +6,7 @@ import pytest
 
 import unifg as fg
 from problems.graphs import graph_with
+from scripts import CHECKOUT
 from unifg import solvers
 from unifg.scenarios import command as shell
 from unifg.scenarios.commands.catalogue import FROM_FILES, SCENARIOS
@@ -67,11 +68,10 @@ def test_commands_offer_names_with_titles(command: tuple[str, ...], capsys: pyte
 
 
 def test_a_short_name_stands_in_no_second_table() -> None:
-    checkout = Path(__file__).resolve().parent.parent
     found = [
         path.name
         for folder in ("solvers", "scenarios", "benchmarks", "tools", "tests")
-        for path in (checkout / folder).rglob("*.py")
+        for path in (CHECKOUT / folder).rglob("*.py")
         if path != Path(__file__).resolve() and '"ipm": InteriorPoint' in path.read_text(encoding="utf-8")
     ]
     assert sorted(found) == []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ import pytest
 
 import unifg as fg
 from problems.graphs import graph_with
+from scripts import run_script
 from unifg.codegen.cache_folder import VARIABLE
 from unifg.solvers import AugmentedLagrangian, GaussNewton
 from unifg.typing import Array
@@ -190,9 +190,8 @@ def solved(folder: Path, *changes: str) -> tuple[str, list[tuple[int, float]]]:
         for name, source in (("script.py", KEPT), ("outside.py", OUTSIDE)):
             changed = source.replace("made(2.0)", "unknown") if value >= 3.0 else source
             (folder / change / name).write_text(changed.replace(before, after), encoding="utf-8")
-    place = {**os.environ, VARIABLE: str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", SCRIPTS, str(folder / "run"), *(str(folder / change) for change in changes)]
-    ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=True)
+    place = {VARIABLE: str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = run_script(SCRIPTS, folder / "run", *(folder / change for change in changes), **place)
     lines = [line.split() for line in ended.stdout.splitlines()]
     return ended.stderr, [(int(count), float(answer)) for count, answer in lines]
 

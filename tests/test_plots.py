@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,13 +17,12 @@ import unifg as fg
 from own_manifolds import S2
 from problems.graphs import graph_with
 from problems.known import line, short_drive
+from scripts import run_script
 from unifg.plots import factor_graph, shown
 from unifg.plots.factor_graph import _apart
 from unifg.solution.history import History
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array
-
-CHECKOUT = Path(__file__).resolve().parent.parent
 
 SILENT = """
 import sys
@@ -49,10 +47,7 @@ figures[0].savefig(sys.argv[1])
 @pytest.mark.product(4, of="processes of their own")
 def test_matplotlib_is_imported_when_something_is_drawn_and_pyplot_never(tmp_path: Path) -> None:
     target = tmp_path / "graph.png"
-    done = subprocess.run(
-        [sys.executable, "-c", SILENT, str(target)], cwd=CHECKOUT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    run_script(SILENT, target)
     assert target.read_bytes()[:4] == b"\x89PNG"
 
 

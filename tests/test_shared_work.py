@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,6 +14,7 @@ import pytest
 
 import unifg as fg
 from problems.graphs import graph_with
+from scripts import run_script
 from unifg.codegen import threads as crews
 from unifg.codegen.jit import compiled
 from unifg.codegen.threads import cores, share, threads
@@ -147,7 +146,7 @@ def test_a_forked_child_has_threads_of_its_own() -> None:
         "    os._exit(0 if np.array_equal(run.solve(guess)[x], here) and hands == 2 else 1)\n"
         "raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
     )
-    assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0
+    run_script(script)
 
 
 def test_little_work_is_not_shared_out() -> None:

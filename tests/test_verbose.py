@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 import unifg as fg
 from problems.graphs import graph_with
+from scripts import run_script
 from unifg.solvers import SQP, GaussNewton
 
 SCRIPT = """
@@ -30,9 +29,7 @@ for verbose in (True, False):
 @pytest.mark.parametrize("configure", ["", "logging.basicConfig()"])
 @pytest.mark.product(1)
 def test_verbose_prints_although_logging_is_not_configured(configure: str) -> None:
-    script = SCRIPT.format(configure=configure)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    verbose, silent, rest = done.stderr.split("solved\n")
+    verbose, silent, rest = run_script(SCRIPT.format(configure=configure)).stderr.split("solved\n")
     assert sum(line.startswith("iter ") for line in verbose.splitlines()) == 1 and verbose.count("\n") >= 3
     assert "iter" not in silent and not rest
 

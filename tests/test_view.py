@@ -7,7 +7,6 @@ import math
 import re
 import shutil
 import subprocess
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import pytest
 import unifg as fg
 from problems.graphs import graph_with
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
+from scripts import CHECKOUT, run_script
 from unifg import view
 from unifg.errors import GraphError, ViewError
 from unifg.files.ros_map import OccupancyMap
@@ -217,13 +217,9 @@ def test_same_bytes_for_the_same_input(tmp_path: Path) -> None:
         "import hashlib; from test_view import everything;"
         "print(hashlib.sha256(everything().html().encode()).hexdigest())"
     )
-    here = Path(__file__).parent
-    environment = {"PYTHONPATH": f"{here}:{here.parent}", "PYTHONHASHSEED": "7"}
-    printed = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
-    ).stdout.strip()
-    assert printed == hashlib.sha256(everything().html().encode()).hexdigest()
-    assert everything().save(tmp_path / "a.html").read_text(encoding="utf-8") == everything().html()
+    printed = run_script(code, PYTHONPATH=f"{CHECKOUT / 'tests'}:{CHECKOUT}", PYTHONHASHSEED="7").stdout.strip()
+    page = everything().save(tmp_path / "a.html").read_text(encoding="utf-8")
+    assert printed == hashlib.sha256(page.encode()).hexdigest()
 
 
 def everything() -> Scene:
