@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -12,10 +13,12 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parent.parent
 
 
-def run_script(script: str, *words: object, cwd: Path = CHECKOUT, **variables: str) -> subprocess.CompletedProcess[str]:
+def run_script(
+    script: str, *words: object, cwd: Path = CHECKOUT, variables: Mapping[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
     """Run a script by Python, which has to succeed, with more variables of the environment; what it printed."""
     command = [sys.executable, "-c", script, *map(str, words)]
-    place = {**os.environ, **variables}
+    place = {**os.environ, **(variables or {})}
     done = subprocess.run(command, cwd=cwd, env=place, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     return done

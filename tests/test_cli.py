@@ -370,7 +370,7 @@ def test_without_extras_everything_works_or_names_the_extra(tmp_path: Path) -> N
     helps = [f"run {name} --help" for name in SCENARIOS]
     example = next(block for block in fences(Path(__file__).parent.parent / "README.md") if block.language == "python")
     words = [example.code, *works, *extras, *helps]
-    done = run_script(BARE, *words, cwd=tmp_path, PYTHONPATH=str(CHECKOUT))
+    done = run_script(BARE, *words, cwd=tmp_path, variables={"PYTHONPATH": str(CHECKOUT)})
     example_said, *lines = done.stdout.splitlines()
     assert "The KKT conditions of the problem hold" in example_said
     for asked, status, said in map(json.loads, lines):

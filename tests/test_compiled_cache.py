@@ -173,7 +173,7 @@ print(bool(tally.compiled))
 def test_what_processes_have_compiled_meets_in_a_third(tmp_path: Path, runs: list[str]) -> None:
     """Numba numbers the functions of each process from one: two callers took the first one's copy of their callee."""
     for run in (*runs, "here 2 3"):
-        ended = run_script(MEET, *run.split(), **{cache_folder.VARIABLE: str(tmp_path)})
+        ended = run_script(MEET, *run.split(), variables={cache_folder.VARIABLE: str(tmp_path)})
     assert ended.stdout.strip() == "False"
 
 
@@ -265,7 +265,7 @@ assert function(3.0) == 6.0
 @pytest.mark.product(4, of="processes of their own")
 def test_without_a_folder_to_write_to_everything_works_after_one_warning(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder", encoding="utf-8")
-    ended = run_script(NOWHERE, **{cache_folder.VARIABLE: str(tmp_path / "file" / "below")})
+    ended = run_script(NOWHERE, variables={cache_folder.VARIABLE: str(tmp_path / "file" / "below")})
     assert ended.stderr.count("\n") == 1 and cache_folder.VARIABLE in ended.stderr
 
 
@@ -371,7 +371,7 @@ def test_a_newer_numba_works_from_sources(tmp_path: Path) -> None:
     """Its layout is not the archive's, which is said once; what it has renamed the cache does without."""
 
     def said(*how: str) -> tuple[str, int, int]:
-        ended = run_script(NEWER, *how, **{cache_folder.VARIABLE: str(tmp_path)})
+        ended = run_script(NEWER, *how, variables={cache_folder.VARIABLE: str(tmp_path)})
         return ended.stdout.strip(), ended.stderr.count("not for Numba 99.0.0"), ended.stderr.count("than unifg knows")
 
     assert said() == ("True False False", 1, 0)

@@ -142,7 +142,7 @@ def bends(
     """
 
     def pull(*moved: Array) -> Array:
-        return np.einsum("nm,nmd->nd", weights, evaluated(expression, *packed(arguments, moved))[1])
+        return np.asarray(np.einsum("nm,nmd->nd", weights, evaluated(expression, *packed(arguments, moved))[1]))
 
     differenced = differences(pull, arguments, values)
     found = curved(expression, *packed(arguments, values), weights)

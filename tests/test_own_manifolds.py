@@ -208,12 +208,6 @@ def test_a_subclass_inherits_and_replaces() -> None:
     np.testing.assert_array_equal(Derived().retract(SE23.identity(), np.zeros(9)), SE23.identity())
 
 
-def test_between_needs_a_group() -> None:
-    graph, x = graph_with(S2, 2)
-    with pytest.raises(fg.GraphError, match="between needs a Lie group, found S2; use difference"):
-        graph.minimize(fg.between, x[0], x[1], S2.identity())
-
-
 # ---------------------------------------------------------------- problems
 
 SIGMA, SMOOTH, COUNT = 0.1, 2.0, 5

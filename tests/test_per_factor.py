@@ -191,7 +191,7 @@ def solved(folder: Path, *changes: str) -> tuple[str, list[tuple[int, float]]]:
             changed = source.replace("made(2.0)", "unknown") if value >= 3.0 else source
             (folder / change / name).write_text(changed.replace(before, after), encoding="utf-8")
     place = {VARIABLE: str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
-    ended = run_script(SCRIPTS, folder / "run", *(folder / change for change in changes), **place)
+    ended = run_script(SCRIPTS, folder / "run", *(folder / change for change in changes), variables=place)
     lines = [line.split() for line in ended.stdout.splitlines()]
     return ended.stderr, [(int(count), float(answer)) for count, answer in lines]
 

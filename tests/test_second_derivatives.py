@@ -48,9 +48,9 @@ def hessian(which: Residual, points: list[Array], manifolds: list[Manifold], con
 @pytest.mark.parametrize("soft", [False, True])
 @pytest.mark.parametrize("name", CURVED)
 def test_second_derivatives_match_differences(name: str, soft: bool) -> None:
-    which, *stated = CASES[name]
+    which, points, manifolds, constants = CASES[name]
     plain = residual(which.function, which.jacobian, derivatives=None if which.jacobian else "differences")
-    own, differenced = hessian(which, *stated, soft), hessian(plain, *stated, soft)
+    own, differenced = (hessian(one, points, manifolds, constants, soft) for one in (which, plain))
     assert np.abs(differenced).max() > 1e-2, "a term without curvature tests nothing"
     np.testing.assert_allclose(own, differenced, atol=1e-4 * max(1.0, float(np.abs(differenced).max())))
 
@@ -67,7 +67,7 @@ def test_second_derivatives_of_kernels_are_those_of_their_jacobians(name: str) -
 
     def pull(*moved: Array) -> Array:
         assert case.jacobian is not None
-        return np.einsum("nm,nmd->nd", weights, np.concatenate(case.jacobian(*moved, *constants), axis=2))
+        return np.asarray(np.einsum("nm,nmd->nd", weights, np.concatenate(case.jacobian(*moved, *constants), axis=2)))
 
     bend = differences(pull, manifolds, points)
     found = case.kernel.second_derivatives(weights, *points, *constants)

@@ -106,12 +106,12 @@ def test_one_sensor_stands_in_both_graphs_of_a_joint_loop(rng: Generator) -> Non
         window = Window(robot, 8, [Dynamics(drift, H, sigma=0.01), sensor, known], start=np.zeros(2), sigma=0.2)
 
         class Goal(Term):
-            def state(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> None:
+            def state(self, graph: fg.Graph, x: fg.Selection, u: fg.Family) -> None:
                 graph.minimize(fg.prior, x[1:], [5.0, 3.0], sigma=1.0, name="goal")
                 graph.bound(u, lower=-1.0, upper=1.0)
 
         terms = [Dynamics(drift, H), Goal(), ControlCost(sigma=[3.0, 3.0])]
-        loop = RecedingHorizon(robot, 6, terms, solver=SQP(), window=window, coupling=coupling)  # type: ignore[arg-type]
+        loop = RecedingHorizon(robot, 6, terms, solver=SQP(), window=window, coupling=coupling)
         truth, before = np.zeros(2), np.zeros(2)
         for tick in range(count):
             for s in (0.5, 0.9) if tick else ():  # stamps of a clock that is behind

@@ -264,11 +264,14 @@ def test_order_of_a_tree() -> None:
             Tree.branched(shared, tails)
 
 
-class Stating(Term):
+class Stating:
     """A term that states what it is given."""
 
     def __init__(self, state: Any) -> None:
         self.state = state
+
+    def data(self, now: Context[Any]) -> dict[str, ArrayLike]:
+        return {}
 
 
 def scalar(x: Array) -> Array:

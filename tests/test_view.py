@@ -217,9 +217,9 @@ def test_same_bytes_for_the_same_input(tmp_path: Path) -> None:
         "import hashlib; from test_view import everything;"
         "print(hashlib.sha256(everything().html().encode()).hexdigest())"
     )
-    printed = run_script(code, PYTHONPATH=f"{CHECKOUT / 'tests'}:{CHECKOUT}", PYTHONHASHSEED="7").stdout.strip()
+    printed = run_script(code, variables={"PYTHONPATH": f"{CHECKOUT / 'tests'}:{CHECKOUT}", "PYTHONHASHSEED": "7"})
     page = everything().save(tmp_path / "a.html").read_text(encoding="utf-8")
-    assert printed == hashlib.sha256(page.encode()).hexdigest()
+    assert printed.stdout.strip() == hashlib.sha256(page.encode()).hexdigest()
 
 
 def everything() -> Scene:
