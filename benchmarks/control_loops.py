@@ -62,11 +62,9 @@ class Contestant(Protocol):
 
     def control(self, state: Array, index: int) -> Tick:
         """Solve for one step, from what the last one ended with."""
-        ...
 
     def again(self) -> float:
         """Processor time of the same solve, when everything it needs is in the caches [ms]."""
-        ...
 
 
 def contestant(problem: Problem, name: str) -> Contestant:

@@ -13,24 +13,20 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import COUPLINGS, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
+from unifg.horizon import COUPLINGS, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.models import bicycle, rkmk
 from unifg.solvers import InteriorPoint
-from unifg.typing import Array
 
 STATE, h, goal = bicycle.STATE, 0.2, np.array([6.0, 3.0, 0.0, 0.0])  # a step [s]; pose and speed
 noise, gps = np.array([0.01, 0.01, 0.005, 0.02]), 0.1  # of a step; of a position [m]
 field, motion = bicycle.field(bicycle.Bicycle()), bicycle.dynamics(bicycle.Bicycle())
 
 
-class Parking:  # what the future is to be, besides the dynamics
+class Parking(Term):  # what the future is to be, besides the dynamics
     def state(self, graph: fg.Graph, x: fg.Selection, u: fg.Family) -> None:
         graph.minimize(fg.prior, x[1:], goal, sigma=[1.0, 1.0, 1.0, 2.0], name="approach")
         graph.bound(u, lower=[-1.0, -0.5], upper=[1.0, 0.5], name="limits")
         graph.bound(x.speed[1:], lower=-1.5, upper=1.5, name="speed")
-
-    def data(self, now: Context[None]) -> dict[str, Array]:
-        return {}
 
 
 results, (figure, axes) = {}, plt.subplots(1, 2, figsize=(8.0, 2.6), sharey=True, layout="constrained")

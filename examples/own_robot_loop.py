@@ -13,7 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import unifg as fg
-from unifg.horizon import COUPLINGS, Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
+from unifg.horizon import COUPLINGS, Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.models import manipulator, rkmk
 from unifg.solvers import SQP
 from unifg.typing import Array
@@ -26,13 +26,10 @@ def arm(x: Array, tau: Array, rho: Array) -> Array:
     return bare(x, tau - rho * x[:, 2:])
 
 
-class Reach:  # what the future is to be, besides the dynamics
+class Reach(Term):  # what the future is to be, besides the dynamics
     def state(self, graph: fg.Graph, x: fg.Selection, u: fg.Family) -> None:
         graph.minimize(fg.prior, x[1:], goal, sigma=[1.0, 1.0, 3.0, 3.0], name="reach")
         graph.bound(u, lower=-most, upper=most, name="limits")
-
-    def data(self, now: object) -> dict[str, Array]:
-        return {}
 
 
 motion, rho, results = rkmk.integrator(STATE, arm, "rk4"), ("friction",), {}

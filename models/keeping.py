@@ -36,7 +36,6 @@ class Answer(Protocol):
 
     def __getitem__(self, variable: Any) -> Array:
         """Values of a family."""
-        ...
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,6 @@ class Nodes(Protocol):
     @property
     def empty(self) -> int:
         """Places that no node has entered yet; the index of the oldest node."""
-        ...
 
 
 class Present(Protocol):
@@ -45,12 +44,10 @@ class Present(Protocol):
     @property
     def constants(self) -> Mapping[str, Array]:
         """(count, storage) believed constants, by name."""
-        ...
 
     @property
     def past(self) -> Any:
         """The history: :class:`Nodes`, and what is believed of their states."""
-        ...
 
 
 @dataclass(frozen=True)

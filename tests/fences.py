@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-CHECKOUT = Path(__file__).resolve().parent.parent
+from scripts import CHECKOUT
 
 PYTHON = frozenset({"python"})
 SHELL = frozenset({"sh", "bash"})

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.random import Generator
@@ -84,6 +85,15 @@ def exponentials(matrices: Array) -> Array:
         return np.zeros_like(matrices)
     result: Array = expm(matrices)
     return result
+
+
+def integrated(generators: Array, exponential: Callable[[Array], Any] = exponentials) -> Any:
+    """Return the integral of expm(s G) over s in [0, 1]: the corner of expm([[G, I], [0, 0]])."""
+    size = generators.shape[-1]
+    block = np.zeros((*generators.shape[:-2], 2 * size, 2 * size))
+    block[..., :size, :size] = generators
+    block[..., :size, size:] = np.eye(size)
+    return exponential(block)[..., :size, size:]
 
 
 def times(matrices: Array, vectors: Array) -> Array:

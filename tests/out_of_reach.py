@@ -7,6 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models import obstacles, unicycle
 from unifg.typing import Array
 
@@ -30,8 +31,7 @@ def cart(steps: int, speed: float, tracking: float, wanted: float) -> tuple[fg.G
         tracking: weight of the distance to the place and of the speed.
         wanted: the place [m].
     """
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), steps + 1)
+    graph, x = graph_with(fg.Rn(2), steps + 1)
     a = graph.variables("a", fg.Rn(1), steps)
     graph.fix(x[0], [0.0, speed])
     graph.minimize(fg.prior, a, [0.0], name="effort")
@@ -67,8 +67,7 @@ def wall_too_close(speed: float, steps: int = 20, tracking: float = 0.0) -> Stat
 
 def blocked_corridor(goal: bool) -> Stated:
     """A unicycle in a corridor of 2 m that two discs close; the guess drives through them, perhaps to a goal."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 31)
+    graph, x = graph_with(fg.SE2, 31)
     u = graph.variables("u", fg.Rn(2), 30)
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, u, [0.0, 0.0])

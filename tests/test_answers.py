@@ -9,6 +9,7 @@ import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.solvers import (
     SQP,
     GaussNewton,
@@ -116,8 +117,7 @@ def test_one_inequality_among_equalities_is_refused_and_named() -> None:
 
 
 def test_the_first_unknown_of_a_graph_is_one_like_all_others() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     graph.minimize(lambda a, b: b - a, x[:-1], x[1:], sigma=0.5, name="step")
     graph.minimize(fg.prior, x[2], np.zeros(1), name="end")
     solution = GaussNewton().solve(graph, {x: np.ones((3, 1))}, check=True)
@@ -132,8 +132,7 @@ def test_the_first_unknown_of_a_graph_is_one_like_all_others() -> None:
 
 
 def test_a_fixed_member_has_no_variance_and_the_others_have_theirs() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 4)
+    graph, x = graph_with(fg.Rn(1), 4)
     graph.fix(x[2], np.zeros(1))
     graph.minimize(lambda a, b: b - a, x[:-1], x[1:], sigma=0.5, name="step")
     solution = GaussNewton().solve(graph, {x: np.ones((4, 1))}, check=True)
@@ -154,8 +153,7 @@ def test_one_direction_that_nothing_determines_is_enough_to_refuse() -> None:
     solution = GaussNewton(max_iterations=0).solve(graph, {x: np.ones((1, 3)), y: np.ones((1, 1))})
     with pytest.raises(fg.GraphError, match="not determined"):
         solution.covariance(x)
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 2)
+    graph, x = graph_with(fg.Rn(2), 2)
     graph.minimize(lambda a, b: a - b, x[0], x[1], sigma=1e-3, name="relative")
     graph.minimize(lambda a: a[:, :1], x[0], sigma=1e3, name="first coordinate")
     solution = GaussNewton(max_iterations=0).solve(graph, {x: np.ones((2, 2))})
@@ -168,8 +166,7 @@ def test_rounding_does_not_pass_for_information(unit: float) -> None:
     """A chain that hangs on nothing in one direction: what its last pivot has left is rounding, sometimes positive."""
     rng = np.random.default_rng(0)
     for _ in range(20):
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(2), 6)
+        graph, x = graph_with(fg.Rn(2), 6)
         sigmas = unit * rng.uniform(0.1, 1.0, (5, 2))
         graph.minimize(lambda a, b: a - b, x[:-1], x[1:], sigma=sigmas, name="relative")
         graph.minimize(lambda a: a[:, :1], x[0], sigma=unit, name="first coordinate")
@@ -180,8 +177,7 @@ def test_rounding_does_not_pass_for_information(unit: float) -> None:
 
 def test_solutions_with_other_active_limits_share_no_structure() -> None:
     """Asked in turn, each answers for the limits that are active in it."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     target = graph.data("target", np.zeros(2))
     graph.minimize(lambda a, b, t: np.concatenate([a, b], axis=1) - t, x[0], x[1], target, sigma=2.0, name="wish")
     graph.minimize(lambda a, b: b - a, x[0], x[1], sigma=1.0, name="alike")
@@ -206,8 +202,7 @@ def test_solutions_with_other_active_limits_share_no_structure() -> None:
 
 
 def test_reactions_balance_the_gradient() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 2)
+    graph, x = graph_with(fg.Rn(2), 2)
     graph.fix(x[0], np.array([1.0, 2.0]), name="anchor")
     graph.minimize(lambda a, b: b - a, x[0], x[1], sigma=0.5, name="step")
     graph.minimize(fg.prior, x[1], np.array([4.0, -4.0]), name="end")
@@ -246,8 +241,7 @@ def test_a_shift_moves_values_and_multipliers_and_repeats_the_end() -> None:
 
 
 def test_the_worst_row_is_named_where_something_is_violated() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     graph.minimize(fg.prior, x, np.zeros(1), name="wish")
     graph.bound(x, upper=5.0, name="loose")
     graph.constrain(lambda a: a, x, lower=np.array([[0.0], [2.0], [1.0]]), name="tight")
@@ -287,22 +281,19 @@ def test_check_names_the_place_of_every_mistake() -> None:
 
 
 def test_check_accepts_jacobians_that_are_as_good_as_differences() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     graph.minimize(
         fg.residual(lambda a: 1e4 * a**2, lambda a: [(2e4 * a + 0.04)[:, :, None]], "steep"), x, name="steep"
     )
     assert graph.check({x: np.ones((2, 1))})  # a relative error of 2e-6
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     graph.minimize(fg.residual(lambda a: 1e4 * a**2, lambda a: [(2e4 * a + 1.0)[:, :, None]], "steep"), x, name="steep")
     assert not graph.check({x: np.ones((2, 1))})
 
 
 @pytest.mark.parametrize("sigma", [1e-9, 1.0, 1e9])
 def test_check_finds_what_is_undetermined_whatever_the_unit(sigma: float) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     graph.minimize(lambda a, b: b - a, x[:-1], x[1:], sigma=sigma, name="steps")
     assert [finding.family for finding in graph.check({x: np.zeros((3, 1))}).findings] == ["x"], (
         "nothing says where they begin"
@@ -313,8 +304,7 @@ def test_check_finds_what_is_undetermined_whatever_the_unit(sigma: float) -> Non
 
 @pytest.mark.parametrize("sigma", [1e-6, 1.0, 1e6])
 def test_a_prior_of_what_leaves_is_the_same_in_every_unit(sigma: float) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 2)
+    graph, x = graph_with(fg.Rn(2), 2)
     graph.minimize(fg.prior, x[0], [1.0, -2.0], sigma=sigma, name="prior")
     graph.minimize(lambda a, b: b - a - [3.0, 0.5], x[0], x[1], sigma=2.0 * sigma, name="step")
     solution = GaussNewton().solve(graph, {x: np.zeros((2, 2))})
@@ -327,8 +317,7 @@ def test_a_prior_of_what_leaves_is_the_same_in_every_unit(sigma: float) -> None:
 
 
 def test_a_report_gives_the_number_that_decided() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [2.0])
     text = GaussNewton().solve(graph, {x: np.zeros((1, 1))}).report()
     assert "relative offset" in text and "violation" not in text
@@ -338,8 +327,7 @@ def test_a_report_gives_the_number_that_decided() -> None:
 
 
 def test_no_iteration_is_a_limit_like_any_other() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [2.0])
     solution = GaussNewton(max_iterations=0).solve(graph, {x: np.ones((1, 1))})
     assert solution.status is fg.Status.ITERATION_LIMIT and solution[x] == 1.0
@@ -351,8 +339,7 @@ STEPPING = backends(*LEAST_SQUARES, *CONSTRAINED, keep_values=True)
 @pytest.mark.parametrize("name", STEPPING)
 def test_a_history_gives_the_length_of_the_step_that_was_taken(name: str) -> None:
     """Far out the arctangent is so flat that full steps overshoot: what was shortened is counted as it was taken."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(lambda p: np.arctan(p - 1.0), x, name="bend")
     if name not in LEAST_SQUARES:
         y = graph.variables("y", fg.Rn(1), 1)

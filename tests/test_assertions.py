@@ -10,6 +10,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import unifg as fg
 from asserting import below, decides, edge, nested, newton, perhaps, spread
+from problems.graphs import graph_with
 from test_derive import curved, evaluated
 from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.rates import rate
@@ -124,8 +125,7 @@ def test_masks_that_are_not_traced_are_named(function: Function, words: str) -> 
 
 
 def pulled(function: Any, count: int = N) -> tuple[fg.Graph, fg.Family, fg.Data]:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), count)
+    graph, x = graph_with(fg.Rn(1), count)
     target = graph.data("target", np.zeros((count, 1)))
     graph.minimize(fg.prior, x, target, sigma=1.0, name="pull")
     graph.minimize(function, x, sigma=1.0, name="own")
@@ -167,8 +167,7 @@ def test_python_says_the_same() -> None:
 
 def test_a_factor_that_is_switched_off_asserts_too() -> None:
     """As in Python, where the function is called for the whole batch."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), N)
+    graph, x = graph_with(fg.Rn(1), N)
     active = graph.data("active", np.ones(N, dtype=bool), each=True)
     graph.minimize(fg.prior, x, [1.9], sigma=1.0, name="pull")
     graph.minimize(below, x, active=active, sigma=1.0, name="own")
@@ -181,8 +180,7 @@ def test_a_factor_that_is_switched_off_asserts_too() -> None:
 def test_an_answer_at_the_edge_of_an_assertion_stands() -> None:
     """Beside it the function raises, where verification would call it."""
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), N)
+    graph, x = graph_with(fg.Rn(1), N)
     graph.minimize(edge, x, name="own", sigma=1.0)
     graph.minimize(fg.prior, x, [5.0], sigma=1.0, name="pull")
     graph.bound(x, upper=1.0, name="bound")
@@ -197,8 +195,7 @@ def test_a_demand_about_data_is_kept() -> None:
             raise ValueError("gains must be positive")
         return x * gain
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), N)
+    graph, x = graph_with(fg.Rn(1), N)
     gain = graph.data("gain", np.ones(1))
     graph.minimize(fg.prior, x, [1.0], sigma=1.0, name="pull")
     graph.minimize(scaled, x, gain, sigma=1.0, name="own")

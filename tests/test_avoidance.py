@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.errors import GraphError
 from unifg.factors.residuals import Residual, residual
 from unifg.models import avoidance, obstacles
@@ -138,8 +139,7 @@ def test_the_least_squares_twin_is_the_same_objective() -> None:
 
 def pushed(form: str, start: tuple[float, float, float], solver: fg.Solver) -> fg.Solution:
     """A position drawn to a goal behind a cylinder of radius 0.5, off the line."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 1)
+    graph, p = graph_with(fg.Rn(3), 1, "p")
     graph.minimize(fg.prior, p, [0.6, 0.1, 1.0], sigma=0.5)
     if form == "scalar":
         potential = avoidance.inverse_distance(avoidance.cylinder_clearance, NEAREST, weight=0.25)
@@ -167,8 +167,7 @@ def test_both_forms_have_the_same_optimum(solver: fg.Solver, start: tuple[float,
 
 def test_potentials_are_traced_in_graphs() -> None:
     """As sums of squares and as scalar costs, of clearances that are themselves made of other functions."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 4)
+    graph, p = graph_with(fg.Rn(3), 4, "p")
     for k, clearance in enumerate((avoidance.cylinder_clearance, avoidance.sphere_clearance)):
         centre = CENTRES if k == 0 else np.hstack([CENTRES, np.zeros((len(CENTRES), 1))])
         graph.minimize(avoidance.inverse_distance_root(clearance), p, centre, RADII, name=f"root {k}")

@@ -12,6 +12,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.graphs import graph_with
 from problems.guarded_flight import NAMES, SPHERES, START, GuardedFlight
 from unifg.errors import GraphError, ModelError
 from unifg.factors.autodiff.operations import Op
@@ -87,8 +88,7 @@ def test_nothing_is_left_of_the_parameter_of_a_path() -> None:
 
 
 def test_a_rate_of_what_is_known_is_refused_in_a_trace() -> None:
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 2)
+    graph, p = graph_with(fg.Rn(3), 2, "p")
     wrong = fg.residual(lambda p: p + rate(lambda s, c: s * c, 2.0), derivatives="trace")
     graph.minimize(wrong, p)
     with pytest.raises(GraphError, match="depends on nothing unknown"):
@@ -133,8 +133,7 @@ def test_the_same_function_of_another_residual_is_another() -> None:
         return found
 
     manhattan = fg.residual(StatedKernel(near, (fg.Rn(3), (2, 3), (2,)), 2))
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 3)
+    graph, p = graph_with(fg.Rn(3), 3, "p")
     both = [avoidance.sphere_clearance, manhattan]
     for number, clearance in enumerate(both):
         kept = barriers.decay(barriers.still(clearance), 1.0)
@@ -353,8 +352,7 @@ def test_any_motion_is_a_function_of_the_time() -> None:
     step = 1e-6
     whole = barriers.decay(h, 1.0)(p, p + step * u, t, step, 1.5) / step
     np.testing.assert_allclose(barriers.condition(h, 1.0, fg.Rn(3), lambda p, u: u)(p, u, t, 1.5), whole, atol=1e-4)
-    graph = fg.Graph()
-    x = graph.variables("p", fg.Rn(3), 5)
+    graph, x = graph_with(fg.Rn(3), 5, "p")
     graph.minimize(fg.prior, x, np.array([0.0, 1.5, 0.0]))
     times = 0.2 * np.arange(4)
     kept = keeping.keep(graph, barriers.decay(h, 1.0), x[:-1], x[1:], times, 0.2, 1.5, obstacles=["moon"])
@@ -391,8 +389,7 @@ def push(
     form: keeping.Form, start: Array, centre: Array, radius: Array, alpha: float = 2.0, dt: Any = 0.1, **more: Any
 ) -> Any:
     """A point that wants to be at (3, 0.1, 0), six steps, no faster than 5 m/s; spheres in between."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 7)
+    graph, p = graph_with(fg.Rn(3), 7, "p")
     graph.fix(p[0], start)
     graph.minimize(fg.prior, p[1:], np.array([3.0, 0.1, 0.0]), sigma=1.0, name="goal")
     graph.minimize(fg.difference, p[:-1], p[1:], sigma=0.2, name="slow")
@@ -439,8 +436,7 @@ def test_backends_answer_barriers(name: str, where: str) -> None:
     for form in ("hinge", "hard", "slack"):
         weight = None if form == "hard" else 1e3
         graph, p, _, guess = push(form, start, centre, radius, alpha, dt, weight=weight)
-        found = solver.solve(graph, guess)
-        assert found.converged, (form, found.report())
+        found = solver.solve(graph, guess, check=True)
         assert judge(graph, found).worst() < 1e-4, form
         assert np.isfinite(found[p]).all()
 
@@ -461,15 +457,13 @@ def test_gauss_newton_creeps_past_a_sphere_and_sqp_turns_to_the_exact_hessian() 
 def test_a_start_at_the_very_centre_is_left() -> None:
     """The norm has no direction there; the plan finds one, and the slack says which sphere it was."""
     graph, p, _, guess = push("slack", np.zeros(3), CENTRE, RADIUS, 5.0, 0.1)
-    found = InteriorPoint().solve(graph, guess)
-    assert found.converged
+    found = InteriorPoint().solve(graph, guess, check=True)
     assert spheres(found[p])[-1].min() > -0.05
 
 
 def test_the_slack_names_the_obstacle() -> None:
     """A wall of speed that is too low to get out of the way of what comes: only the first of two is hit."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 6)
+    graph, p = graph_with(fg.Rn(3), 6, "p")
     start = np.array([0.0, 0.05, 0.0])
     graph.fix(p[0], start)
     graph.minimize(fg.prior, p[1:], start, sigma=1.0)
@@ -479,8 +473,7 @@ def test_the_slack_names_the_obstacle() -> None:
     barrier = barriers.decay(barriers.moving(avoidance.sphere_clearance), 1.0)
     arguments = p[:-1], p[1:], times, 0.1, centre, velocity, np.array([0.3, 0.3])
     kept = keeping.keep(graph, barrier, *arguments, obstacles=("lorry", "tree"))
-    found = InteriorPoint().solve(graph, {p: np.tile(start, (6, 1)), **kept.guess()})
-    assert found.converged
+    found = InteriorPoint().solve(graph, {p: np.tile(start, (6, 1)), **kept.guess()}, check=True)
     used = kept.used(found)
     assert [use.obstacle for use in used] == ["lorry"]
     assert 0.1 < used[0].amount and used[0].interval <= 2
@@ -491,8 +484,7 @@ def test_the_slack_names_the_obstacle() -> None:
 
 
 def test_uses_are_told_the_most_first_from_where_they_begin() -> None:
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 3)
+    graph, p = graph_with(fg.Rn(3), 3, "p")
     kept = keeping.keep(graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=("near", "far"))
     assert kept.slack is not None
     amounts = {kept.slack: np.array([[0.0, 0.1], [0.2, 0.0], [0.3, 1e-4]])}
@@ -520,8 +512,7 @@ def test_a_slack_that_is_not_needed_costs_a_millimetre_or_nothing() -> None:
 
 
 def test_what_cannot_be_held_is_refused_by_name() -> None:
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 2)
+    graph, p = graph_with(fg.Rn(3), 2, "p")
     with pytest.raises(ModelError, match="found 'soft'"):
         keeping.keep(graph, spheres, p, obstacles=2, form="soft")  # type: ignore[arg-type]
     with pytest.raises(ModelError, match="no obstacle"):
@@ -539,8 +530,7 @@ def test_what_cannot_be_held_is_refused_by_name() -> None:
 @pytest.mark.parametrize("form", ["hinge", "hard", "slack", "exact slack"])
 def test_as_many_obstacles_are_named_as_the_barrier_has(form: keeping.Form) -> None:
     """One slack for two obstacles is another problem than it says; a refused barrier leaves nothing behind."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 2)
+    graph, p = graph_with(fg.Rn(3), 2, "p")
     for named in (1, 3, ("lorry",), ("lorry", "tree", "ball")):
         with pytest.raises(ModelError, match="'spheres': the barrier says something of 2 obstacles, found"):
             keeping.keep(
@@ -558,8 +548,7 @@ def test_as_many_obstacles_are_named_as_the_barrier_has(form: keeping.Form) -> N
 
 
 def test_inactive_intervals_are_not_held() -> None:
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 2)
+    graph, p = graph_with(fg.Rn(3), 2, "p")
     graph.minimize(fg.prior, p, np.array([0.1, 0.0, 0.0]))
     kept = keeping.keep(
         graph, avoidance.sphere_clearance, p, CENTRE, RADIUS, obstacles=2, active=np.array([True, False])
@@ -615,8 +604,7 @@ def test_neither_units_nor_offsets_nor_the_robot_matter(name: str, form: keeping
         graph, guess, least, (x, start) = past_two(form, unit, offset, flat)
         if (form, flat) == ("hinge", True):
             continue  # beside hard dynamics, a hinge of such a weight is for the interior point
-        found = INEQUALITIES[name].solve(graph, guess)
-        assert found.converged, (unit, offset, flat, found.report())
+        found = INEQUALITIES[name].solve(graph, guess, check=True)
         assert least(found) > (-5e-3 if form == "hinge" else -1e-4), (unit, offset, flat)
         assert found[x][-1, 0] - start[0] > 0.5 * unit, (unit, offset, flat)  # it is no way out to stay
 
@@ -647,8 +635,7 @@ def catch_sight(k: float, seed: int, sightings: int = 8) -> tuple[Array, Array]:
     before = -dt * np.arange(sightings)[:, None]
     seen = place + before * speed + before**2 * down + sigma * rng.normal(size=(sightings, 3))
     ahead = dt * np.arange(n + 1)
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), n + 1)
+    graph, p = graph_with(fg.Rn(3), n + 1, "p")
     ball, throw = graph.variables("ball", fg.Rn(3), 1), graph.variables("throw", fg.Rn(3), 1)
     graph.minimize(fg.prior, p[0], np.zeros(3), sigma=0.02, name="where we are")
 
@@ -741,8 +728,7 @@ def test_passing_is_the_least_of_dense_samples() -> None:
 
 
 def test_passing_has_exact_derivatives_in_a_graph() -> None:
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(3), 9)
+    graph, p = graph_with(fg.Rn(3), 9, "p")
     graph.minimize(fg.prior, p, np.zeros(3))
     graph.constrain(between_nodes.passing, p[:-1], p[1:], CENTRE, CENTRE + 0.2, RADIUS, lower=-10.0, name="passing")
     found = graph.check({p: RNG.normal(size=(9, 3))})
@@ -922,8 +908,7 @@ def test_braking_stays_in_the_set() -> None:
 @pytest.mark.product(2)
 def test_a_tick_of_the_guarded_flight(name: str) -> None:
     flight, solver = GuardedFlight("slack"), replace(INEQUALITIES[name], tolerance=1e-5)
-    found = solver.solve(flight.graph, flight.guess())
-    assert found.converged, found.report()
+    found = solver.solve(flight.graph, flight.guess(), check=True)
     assert judge(flight.graph, found).worst() < 1e-3
     routes = flight.graph.check(flight.guess()).routes
     assert routes["motion"] == routes["spheres"] == EXACT

@@ -12,6 +12,7 @@ import pytest
 
 import unifg as fg
 from maps import building, field, stop_after, walled
+from problems.graphs import graph_with
 from unifg.errors import ModelError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, save_map
 from unifg.models import obstacles, unicycle
@@ -96,8 +97,7 @@ def test_rows_of_a_body_are_those_of_its_discs(text: str) -> None:
     apart = np.hypot(offset[..., 0], offset[..., 1]) - radii + body.smaller[:, None]
     np.testing.assert_allclose(to_discs(x, centres, radii), apart.reshape(20, -1), atol=1e-12)
     np.testing.assert_allclose(to_walls(x), walls.distance(body.places(x)) + body.smaller, atol=1e-12)
-    graph = fg.Graph()
-    nodes = graph.variables("x", fg.SE2, 20)
+    graph, nodes = graph_with(fg.SE2, 20)
     graph.constrain(to_walls, nodes, lower=0.1)
     graph.constrain(to_discs, nodes, graph.data("centres", centres), graph.data("radii", radii), lower=0.1)
     assert not graph.check({nodes: x}).findings

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.files.g2o import read_g2o
 from unifg.lie import Product
 from unifg.models.odometry import driven, held
@@ -182,8 +183,7 @@ def test_members_come_in_when_enough_says_where_they_are() -> None:
 
 
 def test_no_chain_is_an_error_with_a_remedy() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 3)
+    graph, x = graph_with(fg.Rn(2), 3)
     graph.minimize(fg.prior, x, np.zeros(2))
     with pytest.raises(fg.GraphError, match="along="):
         fg.best_guess(graph, {x: np.ones((3, 2))})
@@ -223,8 +223,7 @@ def test_a_file_without_poses_begins_with_a_map_that_grows(tmp_path: Path) -> No
 
 def chain(at: Any = (0.0, 0.0, 0.0)) -> tuple[fg.Graph, fg.Family]:
     """Five poses, a metre apart."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 5)
+    graph, x = graph_with(fg.SE2, 5)
     graph.fix(x[0], at(graph) if callable(at) else at)
     graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0, 0.0], sigma=0.1)
     return graph, x

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.problem.binding import Binding
 from unifg.problem.by_term import ByTerm
 from unifg.problem.columns import Values
@@ -223,8 +224,7 @@ def test_values_that_were_replaced_are_not_read_from_the_flat_array() -> None:
 
 
 def test_penalties_move_with_the_stages_too() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 4)
+    graph, x = graph_with(fg.Rn(1), 4)
     graph.minimize(fg.prior, x, np.arange(4.0)[:, None], sigma=1.0)
     graph.constrain(fg.prior, x, [0.5], upper=0.0, name="below")
     solution = AugmentedLagrangian().solve(graph, {x: np.zeros((4, 1))})

@@ -86,8 +86,7 @@ def test_a_map_is_found_up_to_place_and_scale(unit: float, calibrated: bool) -> 
     focal = 1.0 if calibrated else 1.02
     begun = replace(problem, poses=fg.SE3.retract(poses, moves), intrinsics=problem.intrinsics * [focal, 1.0, 1.0])
     graph, guess = replace(begun, points=triangulate(begun)).graph(sigma=0.5, calibrated=calibrated)
-    solution = LevenbergMarquardt().solve(graph, guess)
-    assert solution.converged
+    solution = LevenbergMarquardt().solve(graph, guess, check=True)
     assert 2.0 * solution.cost == pytest.approx(2 * len(problem.pixels) - graph.compile().size, rel=0.25)
     np.testing.assert_allclose(solution["intrinsics"][:, 0], 800.0, rtol=1e-12 if calibrated else 0.02)
     apart = [np.linalg.norm(p[:, None] - p, axis=2) for p in (solution["points"], problem.points)]

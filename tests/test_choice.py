@@ -68,8 +68,7 @@ ONE_OF_EACH = ("square of poses", "hs48", "active bounds", "inverse distance")
 
 @pytest.mark.parametrize("problem", [p for p in PROBLEMS if p.name in ONE_OF_EACH], ids=lambda p: p.name)
 def test_known_answers(problem: Problem) -> None:
-    solution = fg.solve(*problem.build())
-    assert solution.converged
+    solution = fg.solve(*problem.build(), check=True)
     assert abs(solution.cost - problem.cost) < 1e-4 * max(1.0, abs(problem.cost))
 
 
@@ -87,8 +86,7 @@ def test_another_one_tries_where_the_first_fails(monkeypatch: pytest.MonkeyPatch
     limited = choose(graph)
     short = replace(limited, first=InteriorPoint(max_iterations=1))
     monkeypatch.setattr(choice, "choose", lambda *_, **__: short)
-    solution = fg.solve(graph, guess)
-    assert solution.converged
+    solution = fg.solve(graph, guess, check=True)
     assert solution.solver == "AugmentedLagrangian"
     assert "picked for the inequality 'box', after InteriorPoint ended as iteration limit" in solution.report()
     assert fg.solve(graph, guess, time_limit=1e-9).solver == "InteriorPoint", "there is no time for another one"

@@ -6,8 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +16,7 @@ import pytest
 
 from episodes import episode, room
 from fences import fences
+from scripts import CHECKOUT, run_script
 from unifg import __version__
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
@@ -339,11 +338,8 @@ def test_help_loads_the_scenario_it_speaks_of_and_no_other() -> None:
         "    assert command.main(words) == 0\n"
         "    assert not absent & {*sys.modules}, (words, absent & {*sys.modules})"
     )
-    root = Path(__file__).parent.parent
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(root)}
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    done = run_script(code)
+    assert done.stderr == ""
     for words, _ in ABSENT:
         assert f"usage: unifg {' '.join(words[:-1])}".rstrip() in done.stdout
 
@@ -374,12 +370,7 @@ def test_without_extras_everything_works_or_names_the_extra(tmp_path: Path) -> N
     helps = [f"run {name} --help" for name in SCENARIOS]
     example = next(block for block in fences(Path(__file__).parent.parent / "README.md") if block.language == "python")
     words = [example.code, *works, *extras, *helps]
-    root = str(Path(__file__).parent.parent)
-    done = subprocess.run(
-        [sys.executable, "-c", BARE, *words], capture_output=True, text=True, cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": root}, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    done = run_script(BARE, *words, cwd=tmp_path, variables={"PYTHONPATH": str(CHECKOUT)})
     example_said, *lines = done.stdout.splitlines()
     assert "The KKT conditions of the problem hold" in example_said
     for asked, status, said in map(json.loads, lines):

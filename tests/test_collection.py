@@ -12,6 +12,7 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems.collection import BACKENDS, CASES, GROUPS, OPTIMUM, RIGHT, ipopt, verdict
+from problems.graphs import graph_with
 from problems.hock_schittkowski import Case
 from problems.known import short_drive
 from problems.lie import LieCase
@@ -224,8 +225,7 @@ def test_limits_and_interruptions_are_told_apart(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name, (_, scalars) in CLASSES.items() if scalars])
 @pytest.mark.parametrize("bounded", [True, False], ids=["bounded", "free"])
 def test_an_objective_without_minimum_is_unbounded(name: str, bounded: bool) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize_scalar(lambda p: p[:, 1] ** 2 - np.exp(p[:, 0]), x, name="downhill")
     if bounded:
         graph.bound(x, lower=0.0, name="half plane")

@@ -18,6 +18,7 @@ import numba
 import numpy as np
 import pytest
 
+from scripts import run_script
 from unifg.codegen import cache_folder, jit
 from unifg.codegen.artifact import Artifact
 from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON, UseDispatcher
@@ -171,11 +172,8 @@ print(bool(tally.compiled))
 @pytest.mark.product(4, of="processes of their own")
 def test_what_processes_have_compiled_meets_in_a_third(tmp_path: Path, runs: list[str]) -> None:
     """Numba numbers the functions of each process from one: two callers took the first one's copy of their callee."""
-    place = {**os.environ, cache_folder.VARIABLE: str(tmp_path)}
     for run in (*runs, "here 2 3"):
-        command = [sys.executable, "-c", MEET, *run.split()]
-        ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=False)
-        assert ended.returncode == 0, ended.stderr
+        ended = run_script(MEET, *run.split(), variables={cache_folder.VARIABLE: str(tmp_path)})
     assert ended.stdout.strip() == "False"
 
 
@@ -267,11 +265,7 @@ assert function(3.0) == 6.0
 @pytest.mark.product(4, of="processes of their own")
 def test_without_a_folder_to_write_to_everything_works_after_one_warning(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder", encoding="utf-8")
-    ended = subprocess.run(
-        [sys.executable, "-c", NOWHERE], capture_output=True, text=True, cwd=Path(__file__).parent.parent, timeout=120,
-        env={**os.environ, cache_folder.VARIABLE: str(tmp_path / "file" / "below")},
-    )  # fmt: skip
-    assert ended.returncode == 0, ended.stderr
+    ended = run_script(NOWHERE, variables={cache_folder.VARIABLE: str(tmp_path / "file" / "below")})
     assert ended.stderr.count("\n") == 1 and cache_folder.VARIABLE in ended.stderr
 
 
@@ -377,10 +371,7 @@ def test_a_newer_numba_works_from_sources(tmp_path: Path) -> None:
     """Its layout is not the archive's, which is said once; what it has renamed the cache does without."""
 
     def said(*how: str) -> tuple[str, int, int]:
-        place = {**os.environ, cache_folder.VARIABLE: str(tmp_path)}
-        command = [sys.executable, "-c", NEWER, *how]
-        ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=False)
-        assert ended.returncode == 0, ended.stderr
+        ended = run_script(NEWER, *how, variables={cache_folder.VARIABLE: str(tmp_path)})
         return ended.stdout.strip(), ended.stderr.count("not for Numba 99.0.0"), ended.stderr.count("than unifg knows")
 
     assert said() == ("True False False", 1, 0)

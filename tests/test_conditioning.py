@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
 
 
 def chain(anchor: float, unit: float = 1.0, weight: float = 1.0) -> tuple[fg.Graph, fg.Family, Array]:
     """Thirty poses with odometry of a millimetre, tied to the world by a prior of this sigma."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 30)
+    graph, x = graph_with(fg.Rn(2), 30)
     rng = np.random.default_rng(0)
     steps = unit * (np.array([1.0, 0.5]) + 1e-3 * rng.standard_normal((29, 2)))
     graph.minimize(fg.prior, x[0], np.zeros(2), sigma=anchor * unit / np.sqrt(weight))
@@ -29,8 +29,7 @@ def test_the_status_between_converged_and_singular(unit: float, weight: float) -
     for anchor, status in ((1.0, fg.Status.CONVERGED), (300.0, fg.Status.HARDLY_DETERMINED)):
         graph, x, guess = chain(anchor, unit, weight)
         for backend in (GaussNewton(), LevenbergMarquardt(damping=1e-20)):
-            solution = backend.solve(graph, {x: guess})
-            assert solution.converged
+            solution = backend.solve(graph, {x: guess}, check=True)
             assert solution.status is status
             assert ("few digits" in solution.report()) == (status is not fg.Status.CONVERGED)
 
@@ -55,8 +54,7 @@ def test_the_estimate_is_that_of_a_dense_matrix_and_has_no_units() -> None:
 
 
 def test_of_constrained_problems_nothing_is_said_and_of_singular_ones_that_it_is_infinite() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     graph.minimize(fg.between, x[0], x[1], np.ones(1), sigma=1.0)
     loose = LevenbergMarquardt().solve(graph, {x: np.zeros((2, 1))})
     assert loose.conditioning is not None and loose.conditioning.condition > 1e15

@@ -10,6 +10,7 @@ import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
+from problems.graphs import graph_with
 from test_kkt import chain
 from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.typing import Array
@@ -98,8 +99,7 @@ INFORMATION = np.array([[4.0, 1.0, 0.5], [1.0, 3.0, -0.5], [0.5, -0.5, 2.0]])
 
 def pressed(limit: float) -> tuple[fg.Graph, fg.Family, fg.Data]:
     """A point that wants to be at (2, 1, 3), below a plane whose height is data, under a bound and above another."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 1)
+    graph, x = graph_with(fg.Rn(3))
     height = graph.data("height", limit)
     graph.minimize(fg.prior, x, [2.0, 1.0, 3.0], information=INFORMATION)
     graph.constrain(lambda p: p[:, :1] + 2.0 * p[:, 1:2], x, upper=height, name="plane")

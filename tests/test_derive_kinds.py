@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-import unifg as fg
+from problems.graphs import graph_with
 from unifg.factors.autodiff.captured import captured_by
 from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.symbols import TraceError
@@ -243,8 +243,7 @@ DRAW = np.random.default_rng(0)
     ],
 )
 def test_clocks_and_random_numbers_are_refused_by_name(function: Function, why: str) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", Rn(2), 3)
+    graph, x = graph_with(Rn(2), 3)
     graph.minimize(function, x, name="own")
     route = graph.compile().terms[0].route
     assert route.startswith("evaluated by Python") and why in route

@@ -8,73 +8,17 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from own_manifolds import OWN
+from own_manifolds import OWN, S2, XYZW, SphereManifold, along, sphere_retract
+from own_manifolds import SE23 as EXTENDED
 from test_derive import compared, curved, evaluated, packed, points
 from unifg.codegen.native import Native
 from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.symbols import TraceError
 from unifg.factors.kernel import Argument, evaluate_rows
-from unifg.lie import SE2, SE3, SO2, SO3, Rn
+from unifg.lie import SE2, SE3, SE23, SO2, SO3, Rn
 from unifg.typing import Array, ArrayLike
 
 # ---------------------------------------------------------------- groups of one's own
-
-
-@fg.compiled
-def quaternion_exp(d: Array, out: Array) -> None:
-    theta = math.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    if theta < 1e-8:  # first order: no second derivative to be had here
-        out[0] = 1.0
-        scale = 0.5
-    else:
-        out[0] = math.cos(0.5 * theta)
-        scale = math.sin(0.5 * theta) / theta
-    for i in range(3):
-        out[1 + i] = scale * d[i]
-
-
-@fg.compiled
-def quaternion_log(q: Array, out: Array) -> None:
-    length = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    if length < 1e-9:
-        scale = 2.0 / q[0]
-    elif q[0] < 0.0:
-        scale = -2.0 * math.atan2(length, -q[0]) / length
-    else:
-        scale = 2.0 * math.atan2(length, q[0]) / length
-    for i in range(3):
-        out[i] = scale * q[1 + i]
-
-
-@fg.compiled
-def quaternion_product(p: Array, q: Array, out: Array) -> None:
-    w = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
-    x = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
-    y = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
-    z = p[0] * q[3] + p[1] * q[2] - p[2] * q[1] + p[3] * q[0]
-    sign = -1.0 if w < 0.0 else 1.0
-    out[0], out[1], out[2], out[3] = sign * w, sign * x, sign * y, sign * z
-
-
-@fg.compiled
-def quaternion_inverse(q: Array, out: Array) -> None:
-    out[0] = q[0]
-    for i in range(1, 4):
-        out[i] = -q[i]
-
-
-class Turns(fg.LieGroup):
-    name, storage, dim = "Turns", 4, 3
-    exp = fg.elementwise(quaternion_exp)
-    log = fg.elementwise(quaternion_log)
-    compose = fg.elementwise(quaternion_product)
-    inverse = fg.elementwise(quaternion_inverse)
-
-    def identity(self) -> Array:
-        return np.array([1.0, 0.0, 0.0, 0.0])
-
-    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
-        return SO3.random(rng, shape)
 
 
 class Complex(fg.LieGroup):
@@ -105,66 +49,17 @@ class Complex(fg.LieGroup):
         return np.asarray(x) * np.array([1.0, -1.0])
 
 
-@fg.compiled
-def pose_compose(a: Array, b: Array, out: Array) -> None:
-    c, s = a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
-    x, y = a[2] + a[0] * b[2] - a[1] * b[3], a[3] + a[1] * b[2] + a[0] * b[3]
-    out[0], out[1], out[2], out[3] = c, s, x, y
-
-
-@fg.compiled
-def pose_inverse(a: Array, out: Array) -> None:
-    c, s, x, y = a[0], a[1], a[2], a[3]
-    out[0], out[1], out[2], out[3] = c, -s, -c * x - s * y, s * x - c * y
-
-
-@fg.compiled
-def pose_exp(d: Array, out: Array) -> None:
-    t = d[2]
-    if abs(t) < 1e-4:
-        a, b = 1.0 - t * t / 6.0, 0.5 * t
-    else:
-        a, b = math.sin(t) / t, (1.0 - math.cos(t)) / t
-    out[0], out[1], out[2], out[3] = math.cos(t), math.sin(t), a * d[0] - b * d[1], b * d[0] + a * d[1]
-
-
-@fg.compiled
-def pose_log(a: Array, out: Array) -> None:
-    t = math.atan2(a[1], a[0])
-    k = 1.0 - t * t / 12.0 if abs(t) < 1e-4 else 0.5 * t / math.tan(0.5 * t)
-    out[0], out[1], out[2] = k * a[2] + 0.5 * t * a[3], k * a[3] - 0.5 * t * a[2], t
-
-
-class Poses(fg.LieGroup):
-    """SE(2) with its matrix's entries for an angle, (c, s, x, y)."""
-
-    name, storage, dim = "Poses", 4, 3
-
-    def identity(self) -> Array:
-        return np.array([1.0, 0.0, 0.0, 0.0])
-
-    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
-        return from_se2(SE2.random(rng, shape))
-
-    exp = fg.elementwise(pose_exp)
-    log = fg.elementwise(pose_log)
-    compose = fg.elementwise(pose_compose)
-    inverse = fg.elementwise(pose_inverse)
-
-
-def from_se2(x: Array) -> Array:
-    return np.concatenate([np.cos(x[..., 2:]), np.sin(x[..., 2:]), x[..., :2]], axis=-1)
-
-
-TURNS, COMPLEX, POSES = Turns(), Complex(), Poses()
+COMPLEX = Complex()
 TWINS: dict[str, tuple[Any, Any, Any]] = {  # of the user's, of the library, and from there to here
-    "compiled with branches": (TURNS, SO3, lambda x: x),
+    "compiled with branches": (XYZW, SO3, lambda x: np.roll(x, -1, axis=-1)),
     "by NumPy": (COMPLEX, SO2, lambda x: np.concatenate([np.cos(x), np.sin(x)], axis=-1)),
-    "compiled, other storage": (POSES, SE2, from_se2),
+    "compiled, by parts": (EXTENDED, SE23, lambda x: x),
     "product": (
-        fg.Product(a=TURNS, v=Rn(2), b=POSES),
-        fg.Product(a=SO3, v=Rn(2), b=SE2),
-        lambda x: np.concatenate([x[..., :6], from_se2(x[..., 6:])], axis=-1),
+        fg.Product(a=XYZW, v=Rn(2), b=COMPLEX),
+        fg.Product(a=SO3, v=Rn(2), b=SO2),
+        lambda x: np.concatenate(
+            [np.roll(x[..., :4], -1, axis=-1), x[..., 4:6], np.cos(x[..., 6:]), np.sin(x[..., 6:])], axis=-1
+        ),
     ),
 }
 
@@ -193,58 +88,28 @@ def test_a_group_of_ones_own_has_the_derivatives_of_its_twin(name: str) -> None:
 # ---------------------------------------------------------------- a manifold that is no group
 
 
-def sphere_retraction(terms: int) -> Any:
-    @fg.compiled
-    def retract(x: Array, d: Array, out: Array) -> None:
-        n = math.sqrt(d[0] * d[0] + d[1] * d[1])
-        if n < 1e-7:
-            c = 1.0 - 0.5 * n * n if terms > 1 else 1.0
-            s = 1.0
-        else:
-            c, s = math.cos(n), math.sin(n) / n
-        # Two directions across x: from the axis that it is least along.
-        if abs(x[0]) < 0.6:
-            a0, a1, a2 = 0.0, x[2], -x[1]
-        else:
-            a0, a1, a2 = -x[2], 0.0, x[0]
-        length = math.sqrt(a0 * a0 + a1 * a1 + a2 * a2)
-        a0, a1, a2 = a0 / length, a1 / length, a2 / length
-        b0, b1, b2 = x[1] * a2 - x[2] * a1, x[2] * a0 - x[0] * a2, x[0] * a1 - x[1] * a0
-        out[0] = c * x[0] + s * (d[0] * a0 + d[1] * b0)
-        out[1] = c * x[1] + s * (d[0] * a1 + d[1] * b1)
-        out[2] = c * x[2] + s * (d[0] * a2 + d[1] * b2)
-
-    return retract
+@fg.compiled
+def short_retract(x: Array, d: Array, out: Array) -> None:
+    sphere_retract(x, d, out)
+    if math.hypot(d[0], d[1]) < 1e-7:
+        basis = np.empty((2, 3))
+        along(x, basis)
+        for i in range(3):
+            out[i] = x[i] + d[0] * basis[0, i] + d[1] * basis[1, i]
 
 
-class Directions(fg.ManifoldBase):
-    name, storage, dim = "Directions", 3, 2
-    retract = fg.elementwise(sphere_retraction(2))
-
-    def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        raise NotImplementedError
-
-    def identity(self) -> Array:
-        return np.array([1.0, 0.0, 0.0])
-
-    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Any:
-        x = rng.normal(size=(*shape, 3))
-        return x / np.linalg.norm(x, axis=-1, keepdims=True)
-
-
-class Careless(Directions):
+class Careless(SphereManifold):
     name = "Careless"
-    retract = fg.elementwise(sphere_retraction(1))
+    retract = fg.elementwise(short_retract)
 
 
 def test_a_manifold_is_moved_along_its_retraction() -> None:
     """On the unit sphere w'x bends by -w'x in every direction: points move along great circles."""
-    manifold = Directions()
-    x = manifold.random(np.random.default_rng(0), (12,))
+    x = S2.random(np.random.default_rng(0), (12,))
     w = np.random.default_rng(1).normal(size=(12, 3))
-    expression = traced(lambda x: x, (manifold,))
+    expression = traced(lambda x: x, (S2,))
     r, J = evaluated(expression, x, np.zeros((1, 0)))
-    np.testing.assert_array_equal(r, x)
+    np.testing.assert_allclose(r, x, rtol=0, atol=1e-15)
     np.testing.assert_allclose(np.swapaxes(J, 1, 2) @ J, np.broadcast_to(np.eye(2), (12, 2, 2)), rtol=0, atol=1e-14)
     np.testing.assert_allclose(np.einsum("ni,nij->nj", x, J), 0.0, rtol=0, atol=1e-14)
     S = curved(expression, x, np.zeros((1, 0)), w)

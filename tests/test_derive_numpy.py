@@ -9,10 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import unifg as fg
-from test_derive import curved, evaluated
+from test_derive import compared_with_differences, curved, differences, evaluated
 from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.symbols import TraceError
-from unifg.factors.kernel import evaluate_rows
 from unifg.lie import Rn
 from unifg.typing import Array
 
@@ -293,29 +292,13 @@ def test_what_numpy_offers(name: str) -> None:
     away = [0.42, 0.47, 0.53, 0.57, 0.63, 0.68, 0.74, 0.77, 0.83, 0.88, 1.07, 1.13, 1.22, 1.28]  # from kinks and jumps
     v = np.stack([rng.permutation(away)[:7] for _ in range(4)]) * rng.choice([-1.0, 1.0], (4, 7))
 
-    def alone(v: Array) -> Array:
+    def alone(x: Array, y: Array) -> Array:
         with np.errstate(all="ignore"):
-            return np.stack([np.asarray(function(row[None, :4].copy(), row[None, 4:].copy()))[0] for row in v])
+            rows = zip(x, y, strict=True)
+            return np.stack([np.asarray(function(a[None].copy(), b[None].copy()))[0] for a, b in rows])
 
-    expression = traced(function, (Rn(4), Rn(3)), name=name)
-    code, rows = expression.residual(), len(expression.rows)
-
-    def derived(v: Array) -> tuple[Array, Array]:
-        r, J = np.empty((len(v), rows)), np.empty((len(v), rows, 7))
-        evaluate_rows(code.address, v, np.zeros((1, 0)), expression.table, r, J)
-        return r, J
-
-    r, J = derived(v)
-    np.testing.assert_allclose(r, alone(v), rtol=0, atol=1e-13)
-    w, h = rng.normal(size=r.shape), 1e-3
-    S = curved(expression, v, np.zeros((1, 0)), w)
-    for k in range(7):
-        d = h * np.eye(7)[k]
-        around = [(c / (12.0 * h), v + step) for c, step in ((8.0, d), (-8.0, -d), (-1.0, 2 * d), (1.0, -2 * d))]
-        slope = sum(c * alone(point) for c, point in around)
-        np.testing.assert_allclose(J[:, :, k], slope, rtol=0, atol=1e-8 * (1.0 + np.abs(slope).max()))
-        bend = sum(c * np.einsum("nmd,nm->nd", derived(point)[1], w) for c, point in around)
-        np.testing.assert_allclose(S[:, k], bend, rtol=0, atol=1e-8 * (1.0 + np.abs(bend).max()))
+    arguments = (Rn(4), Rn(3))
+    compared_with_differences(traced(function, arguments, name=name), alone, arguments, [v[:, :4], v[:, 4:]])
 
 
 # ---------------------------------------------------------------- where functions are not smooth
@@ -406,18 +389,15 @@ def test_a_compiled_function_of_one_factor() -> None:
     expression = traced(chain, (Rn(3), (3,), ()), rows=3)
     shared = np.ascontiguousarray(np.broadcast_to(np.append(lengths, gain), (5, 4)))
     r, J = evaluated(expression, q, shared)
-    expected = np.empty((5, 3))
-    for k in range(5):
-        chain(q[k], lengths, gain, expected[k])
-    np.testing.assert_allclose(r, expected, rtol=0, atol=1e-15)
-    h = 1e-3
-    for k in range(3):
-        rows = np.empty((4, 5, 3))
-        for j, step in enumerate((1, -1, 2, -2)):
-            for i in range(5):
-                chain(q[i] + step * h * np.eye(3)[k], lengths, gain, rows[j, i])
-        slope = (8.0 * (rows[0] - rows[1]) - (rows[2] - rows[3])) / (12.0 * h)
-        np.testing.assert_allclose(J[:, :, k], slope, rtol=0, atol=1e-9)
+
+    def one_by_one(q: Array) -> Array:
+        rows = np.empty((5, 3))
+        for joints, row in zip(q, rows, strict=True):
+            chain(joints, lengths, gain, row)
+        return rows
+
+    np.testing.assert_allclose(r, one_by_one(q), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(J, differences(one_by_one, (Rn(3),), [q]), rtol=0, atol=1e-9)
 
 
 # ---------------------------------------------------------------- what cannot be traced is said, with its line

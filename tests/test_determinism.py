@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from problems.known import Guess, short_drive
 from unifg.solvers import (
     KKT,
@@ -82,8 +83,7 @@ def open_drive() -> tuple[fg.Graph, Guess, Guess]:
 def ring() -> tuple[fg.Graph, Guess, Guess]:
     """Poses around a ring with one wrong closure."""
     count = 12
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, count)
+    graph, x = graph_with(fg.SE2, count)
     graph.fix(x[0], [0.0, 0.0, 0.0])
     after = (np.arange(count) + 1) % count
     graph.minimize(fg.between, x, x[after], [1.0, 0.0, 2.0 * np.pi / count], sigma=0.1, name="odometry")

@@ -11,7 +11,8 @@ from types import ModuleType
 
 import pytest
 
-from fences import CHECKOUT, PYTHON, SHELL, SHOWN, Fence, documents, fences, relative
+from fences import PYTHON, SHELL, SHOWN, Fence, documents, fences, relative
+from scripts import CHECKOUT, files_in_git
 
 PAGES = documents()
 # Reasons that have been agreed to. A skip with any other reason fails.
@@ -137,13 +138,7 @@ def test_the_changelog_is_short() -> None:
 
 def test_linked_files_are_in_git() -> None:
     """A link to a file that only exists on the author's disk is broken for everybody else."""
-    git = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
-        cwd=CHECKOUT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if git.returncode != 0:
-        pytest.skip("not a git checkout")
-    known = {(CHECKOUT / name).resolve() for name in git.stdout.splitlines()}
+    known = {path.resolve() for path in files_in_git()}
     lost = [
         f"{relative(page)} -> {target}"
         for page in PAGES

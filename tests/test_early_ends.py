@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models import obstacles, unicycle
 from unifg.problem.linearization import Linearization
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
@@ -55,8 +56,7 @@ class RecedingHorizon:
         """Converged plan for the first goal."""
         line = np.linspace(0.0, 1.0, N + 1)[:, None] * [*NEAR, 0.0]
         rest = {self.x: line, self.u: np.zeros((N, 2))}
-        solution = InteriorPoint().solve(self.graph, rest)
-        assert solution.converged
+        solution = InteriorPoint().solve(self.graph, rest, check=True)
         return solution
 
     def drive(self, solver: fg.Solver, feasible: bool) -> Array:
@@ -177,8 +177,7 @@ def test_the_manoeuvre_behind_in_the_paper_s_form() -> None:
 
 @pytest.mark.parametrize("solver", [SQP(max_iterations=2000), InteriorPoint(max_iterations=2000)])
 def test_an_unbounded_solve_returns_its_last_finite_iterate(solver: fg.Solver) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)
     graph.bound(x, lower=0.0)
     solution = solver.solve(graph, {x: [[1.0]]})
@@ -201,8 +200,7 @@ class Flies(fg.Solver):
 
 
 def test_where_the_last_iterate_is_not_finite_another_stands_in() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [1.0], name="wish")
     graph.minimize(fg.prior, x, [3.2], name="other wish")
     solution = Flies().solve(graph, {x: [[0.0]]})
@@ -214,8 +212,7 @@ def test_where_the_last_iterate_is_not_finite_another_stands_in() -> None:
 
 def test_nothing_unbounded_is_called_converged() -> None:
     """Beyond 1e10 a difference of a scalar cost may vanish, and a vanishing gradient passes for a stationary one."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize_scalar(lambda p: np.minimum(-p[:, 0], -2e20), x)
     solution = SQP().solve(graph, {x: [[1.0]]})
     assert solution.status is fg.Status.UNBOUNDED
@@ -299,8 +296,7 @@ ENDINGS = [
 
 def wall(most: float) -> tuple[fg.Graph, fg.Family]:
     """Minimise 1/2 (x - 5)^2 where x is at most ``most``."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [5.0])
     graph.constrain(lambda p: p, x, upper=most)
     return graph, x

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from own_manifolds import SphereManifold
+from own_manifolds import S2, XYZW
+from problems.graphs import graph_with
 from unifg.solvers import GaussNewton
-from unifg.typing import Array, ArrayLike, BoolArray
+from unifg.typing import Array, ArrayLike
 
 UNIT = np.array([0.5, -0.5, 0.5, 0.5])
 POSE = np.array([1.0, 2.0, 3.0, *UNIT])
@@ -27,8 +28,7 @@ def scaled(pose: Array, by: float) -> Array:
 
 
 def solved(manifold: fg.Manifold, value: ArrayLike, **options: Any) -> Array:
-    graph = fg.Graph()
-    x = graph.variables("x", manifold, 1)
+    graph, x = graph_with(manifold)
     graph.minimize(fg.prior, x, value, **options)
     return np.asarray(fg.solve(graph, {x: manifold.identity()[None]})[x][0])
 
@@ -62,8 +62,7 @@ def test_a_negative_quaternion_nearly_of_norm_one_is_normalised() -> None:
 
 
 def test_a_refusal_names_the_row_and_leaves_the_graph_as_it_was() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 4)
+    graph, x = graph_with(fg.SE3, 4)
     measured = np.tile(STEP, (3, 1))
     measured[2] = scaled(measured[2], 0.5)
     with pytest.raises(fg.GraphError, match=r"row 2.*family 'x'") as raised:
@@ -73,8 +72,7 @@ def test_a_refusal_names_the_row_and_leaves_the_graph_as_it_was() -> None:
 
 
 def test_a_constant_pose_in_the_place_of_a_variable_is_an_element() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 1)
+    graph, x = graph_with(fg.SE3)
     with pytest.raises(fg.GraphError, match=r"argument 0.*w first, norm 1"):
         graph.minimize(fg.between, scaled(POSE, 2.0), x, STEP)
 
@@ -107,77 +105,27 @@ def test_measurements_of_other_kernels_are_finite_too() -> None:
 
 
 def test_a_placeholder_in_a_row_that_is_never_active_may_be_anything() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 2)
+    graph, x = graph_with(fg.SE3, 2)
     graph.minimize(fg.prior, x, np.stack([POSE, np.zeros(7)]), active=[True, False])
     with pytest.raises(fg.GraphError, match="row 1"):
         graph.minimize(fg.prior, x, np.stack([POSE, np.zeros(7)]), active=[True, True])
 
 
-class Matrices(fg.LieGroup):
-    """Rotation matrices of the plane, row by row, by NumPy."""
-
-    name, storage, dim = "matrices", 4, 1
-
-    def identity(self) -> Array:
-        return np.array([1.0, 0.0, 0.0, 1.0])
-
-    def exp(self, d: ArrayLike, /) -> Array:
-        angle = np.asarray(d)[..., 0]
-        return np.stack([np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)], axis=-1)
-
-    def log(self, x: ArrayLike, /) -> Array:
-        x = np.asarray(x)
-        angle: Array = np.arctan2(x[..., 2], x[..., 0])[..., None]
-        return angle
-
-    def compose(self, x: ArrayLike, y: ArrayLike, /) -> Array:
-        return self.exp(self.log(x) + self.log(y))
-
-    def inverse(self, x: ArrayLike, /) -> Array:
-        return self.exp(-self.log(x))
-
-    def adjoint(self, x: ArrayLike, /) -> Array:
-        return np.ones((*np.shape(x)[:-1], 1, 1))
-
-    def right_jacobian(self, d: ArrayLike, /) -> Array:
-        return np.ones((*np.shape(d)[:-1], 1, 1))
-
-    right_jacobian_inverse = right_jacobian
-
-    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
-        return self.exp(rng.uniform(-3.0, 3.0, (*shape, 1)))
-
-    def is_valid(self, x: ArrayLike, /) -> BoolArray:
-        x = np.asarray(x, dtype=np.float64)
-        matrix = x.reshape(*x.shape[:-1], 2, 2)
-        return np.asarray(np.isclose(matrix @ np.swapaxes(matrix, -1, -2), np.eye(2), atol=1e-9).all(axis=(-2, -1)))
-
-
 def test_a_manifold_of_ones_own_is_asked_by_its_own_test() -> None:
-    matrices = Matrices()
-    with pytest.raises(fg.GraphError, match=r"argument 1.*row 0.*matrices"):
-        solved(matrices, 2.0 * matrices.identity())
-    found = solved(matrices, 1.0005 * matrices.exp([0.3]))
-    np.testing.assert_allclose(matrices.log(found), 0.3, atol=1e-9)
-
-
-class Unit(SphereManifold):
-    """Directions that say which vectors they are."""
-
-    def is_valid(self, x: ArrayLike, /) -> BoolArray:
-        return np.asarray(np.abs(np.linalg.norm(x, axis=-1) - 1.0) < 1e-9)
+    with pytest.raises(fg.GraphError, match=r"argument 1.*row 0.*SO3 xyzw"):
+        solved(XYZW, 2.0 * XYZW.identity())
+    turn = XYZW.exp([0.3, -0.2, 0.1])
+    np.testing.assert_allclose(XYZW.local(turn, solved(XYZW, 1.0005 * turn)), 0.0, atol=1e-9)
 
 
 def test_points_that_cannot_be_composed_are_asked_too() -> None:
     with pytest.raises(fg.GraphError, match=r"argument 1.*row 0.*S2"):
-        solved(Unit(), [0.0, 0.0, 1.1])
-    np.testing.assert_allclose(solved(Unit(), [0.0, 0.0, 1.0005]), [0.0, 0.0, 1.0], atol=1e-6)
+        solved(S2, [0.0, 0.0, 1.1])
+    np.testing.assert_allclose(solved(S2, [0.0, 0.0, 1.0005]), [0.0, 0.0, 1.0], atol=1e-6)
 
 
 def test_data_are_checked_at_statement_and_at_every_binding() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 1)
+    graph, x = graph_with(fg.SE3)
     wrong = graph.data("wrong", scaled(POSE, 0.5))
     with pytest.raises(fg.GraphError, match=r"argument 1.*row 0.*w first, norm 1"):
         graph.minimize(fg.prior, x, wrong)
@@ -196,8 +144,7 @@ def test_data_are_checked_at_statement_and_at_every_binding() -> None:
 
 
 def test_inactive_rows_of_data_may_be_anything() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 2)
+    graph, x = graph_with(fg.SE3, 2)
     goals = graph.data("goals", np.stack([POSE, np.zeros(7)]), each=True)
     used = graph.data("used", np.array([True, False]))
     graph.minimize(fg.prior, x, goals, active=used)
@@ -226,7 +173,7 @@ def test_smoothers_check_every_factor_alike(smoother: Callable[[], Any]) -> None
 
 def test_smoothers_ask_every_element_of_a_manifold_of_ones_own() -> None:
     graph = fg.Incremental()
-    x = graph.variables("x", Unit())
+    x = graph.variables("x", S2)
     for _ in range(2):
         graph.minimize(fg.prior, x[0], np.array([0.0, 0.0, 1.0]), sigma=0.1)
     with pytest.raises(fg.GraphError, match=r"row 0.*S2"):
@@ -249,8 +196,7 @@ MASKED = np.ma.MaskedArray([1.0, 2.0], mask=[False, True])
     ],
 )
 def test_masked_arrays_are_refused(state: Callable[[fg.Graph, fg.Family], object]) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 2)
+    graph, x = graph_with(fg.Rn(2), 2)
     graph.minimize(fg.prior, x, [0.0, 0.0], name="origin")
     with pytest.raises(fg.GraphError, match="masked"):
         state(graph, x)
@@ -268,8 +214,7 @@ def test_smoothers_refuse_masked_arrays() -> None:
 
 @pytest.mark.parametrize("value", [[1.0, 2.0, 90.0], [[0.0, 0.0, 0.1], [0.0, 0.0, -7.0]]])
 def test_a_prior_with_headings_beyond_a_turn_names_degrees(value: list[Any], caplog: pytest.LogCaptureFixture) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, len(np.atleast_2d(value)))
+    graph, x = graph_with(fg.SE2, len(np.atleast_2d(value)))
     with caplog.at_level(logging.WARNING, "unifg"):
         graph.minimize(fg.prior, x, value, name=f"compass {np.ndim(value)}")
     assert f"term 'compass {np.ndim(value)}'" in caplog.text and "degrees" in caplog.text

@@ -13,9 +13,9 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from scripts import CHECKOUT
 from unifg.models import rkmk
 
-CHECKOUT = Path(__file__).resolve().parent.parent
 EXAMPLES = sorted((CHECKOUT / "examples").glob("*.py"))
 PAGE = CHECKOUT / "docs" / "guide" / "examples.md"
 PICTURES = CHECKOUT / "docs" / "images" / "examples"

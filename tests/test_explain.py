@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array
 
@@ -91,8 +92,7 @@ def test_the_slow_term_is_named_with_the_way_to_write_it() -> None:
     def looped(x: Array) -> Array:
         return np.array([[sum(float(f"{v:.17g}") for v in row for _ in range(20))] for row in x])
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 30)
+    graph, x = graph_with(fg.Rn(2), 30)
     graph.minimize(fg.prior, x, [1.0, 2.0], name="near")
     graph.minimize(looped, x, sigma=10.0, name="looped")
     loop = GaussNewton().prepare(graph)

@@ -17,9 +17,11 @@ import pytest
 
 import unifg as fg
 from asserting import below
-from fences import CHECKOUT, fences
+from fences import fences
 from problems.around_a_disc import around_a_disc
 from problems.control import Quadrotor, Stated, Unicycle
+from problems.graphs import graph_with
+from scripts import CHECKOUT
 from unifg.codegen import standalone
 from unifg.errors import BackendError
 from unifg.solution.solver import Prepared
@@ -300,8 +302,7 @@ def test_backends_whose_loop_is_python_are_refused() -> None:
 
 def test_parts_of_python_are_refused_by_name() -> None:
     def graph() -> tuple[fg.Graph, fg.Family, dict[fg.Family, Array]]:
-        made = fg.Graph()
-        x = made.variables("x", fg.Rn(2), 2)
+        made, x = graph_with(fg.Rn(2), 2)
         made.minimize(fg.prior, x, [1.0, 2.0], name="there")
         return made, x, {x: np.zeros((2, 2))}
 

@@ -10,7 +10,7 @@ from scipy.linalg import solve_discrete_are
 
 import unifg as fg
 from problems.control import Problem, Quadrotor, Stated, Unicycle
-from unifg.horizon import ControlCost, Dynamics, RecedingHorizon, Robot
+from unifg.horizon import ControlCost, Dynamics, RecedingHorizon, Robot, Term
 from unifg.solvers import SQP, InteriorPoint
 from unifg.typing import Array
 
@@ -137,13 +137,10 @@ def test_families_side_by_side_and_an_unknown_first_state() -> None:
 
 
 def test_a_loop_has_gains_and_a_fixed_control_has_none() -> None:
-    class Target:
+    class Target(Term):
         def state(self, graph: fg.Graph, x: Any, u: Any) -> None:
             graph.minimize(fg.prior, x[1:], np.zeros(3), information=Q, name="target")
             graph.fix(u[2], [0.1, 0.2])
-
-        def data(self, now: Any) -> dict[str, Any]:
-            return {}
 
     robot = Robot(fg.Rn(3), fg.Rn(2))
     dynamics = Dynamics(lambda x, u, y, h: motion(x, u, y), 1.0)

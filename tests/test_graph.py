@@ -7,6 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.graphs import graph_with
 from problems.known import line, short_drive
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
 
@@ -46,8 +47,7 @@ def test_information_and_sigma_agree() -> None:
     omega = root @ root.T
     costs = []
     for information in (omega, np.tile(omega, (2, 1, 1))):
-        graph = fg.Graph()
-        x = graph.variables("x", fg.SE2, 2)
+        graph, x = graph_with(fg.SE2, 2)
         graph.minimize(fg.prior, x, np.array([1.0, 2.0, 0.3]), information=information)
         lin = graph.compile().linearize({x: np.zeros((2, 3))})
         costs.append(lin.cost)
@@ -56,8 +56,7 @@ def test_information_and_sigma_agree() -> None:
 
 
 def test_fixed_component_of_a_product() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Product(pose=fg.SE2, v=fg.Rn(1)), 2)
+    graph, x = graph_with(fg.Product(pose=fg.SE2, v=fg.Rn(1)), 2)
     graph.fix(x.v[0], 0.5)
     graph.minimize(fg.prior, x.pose, [1.0, 0.0, 0.0])
     graph.minimize(fg.prior, x.v, [2.0])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.codegen.compile_counter import counting
 from unifg.horizon import (
     COUPLINGS,
@@ -65,8 +66,7 @@ class Drive:
 
     def batch(self, ticks: int, static: bool) -> tuple[Array, Array, Array]:
         """State, covariance and bias after some ticks, from everything at once."""
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(2), ticks + 1)
+        graph, x = graph_with(fg.Rn(2), ticks + 1)
         graph.minimize(fg.prior, x[0], START, sigma=0.8)
         about: list[fg.Family | fg.Selection] = [x[-1]]
         guess = {x: np.zeros((ticks + 1, 2))}
@@ -121,7 +121,7 @@ def test_a_window_says_what_the_whole_history_says(length: int, static: bool) ->
     assert window.history.full and window.left.arrival is not None
 
 
-class Pushed:
+class Pushed(Term):
     """Exact dynamics pushed by one noise per step, fewer than there are states: constraints of the past."""
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
@@ -131,9 +131,6 @@ class Pushed:
             lambda x, u, w, y: y - x @ T.T - (u + w) @ B.T, x[:-1], u, noise, x[1:], lower=0, upper=0, name="pushed"
         )
         graph.constrain(lambda w: w, noise, lower=-50.0, upper=50.0, name="weak")  # an inequality that never holds
-
-    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        return {}
 
 
 @pytest.mark.parametrize(
@@ -732,14 +729,11 @@ def test_a_horizon_without_a_window() -> None:
         loop.tick(TARGET)
 
 
-class Scalar:
+class Scalar(Term):
     """A cost that is no square."""
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize_scalar(lambda x: x[:, 0] ** 2, x, name="seen")
-
-    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        return {}
 
 
 class Ahead(Scalar):
@@ -817,7 +811,7 @@ class Lamp:
         return {"ranges": ranges, "in sight": seen}
 
 
-class Towards:
+class Towards(Term):
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize(unicycle.tracking, x[1:], [4.0, 1.0, 0.0], sigma=[1.0, 1.0, 2.0], name="towards")
         graph.minimize(
@@ -827,9 +821,6 @@ class Towards:
             name="shy",
         )
         graph.bound(u, lower=[0.0, -1.0], upper=[1.0, 1.0], name="limits")
-
-    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        return {}
 
 
 @pytest.mark.product(4, of="drives and flights")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.horizon import Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
+from unifg.horizon import ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.models import obstacles, unicycle
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
@@ -25,16 +25,13 @@ def advance(x: Array, u: Array) -> Array:
 CAR = Robot(fg.SE2, fg.Rn(2), predict=advance)
 
 
-class Course:
+class Course(Term):
     """To a goal behind a disc."""
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize(unicycle.tracking, x[1:], [3.0, 0.5, 0.0], sigma=[0.5, 0.5, 1.0], name="goal")
         graph.constrain(obstacles.disc_clearance, x[1:], [DISC], [0.4], lower=0.0, name="disc")
         graph.bound(u, lower=LIMITS[0], upper=LIMITS[1], name="limits")
-
-    def data(self, now: Context[Any]) -> dict[str, Array]:
-        return {}
 
 
 def loop_of(**options: Any) -> RecedingHorizon:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from hostile import CARMEN, PGM, PLANAR, PROFILE, READERS, SPATIAL, TUM, YAML, Reader, at_most, bomb, trouble
+from scripts import CHECKOUT, run_script
 from unifg.atomic_write import replacing, write_atomically
 from unifg.errors import FileFormatError
 from unifg.files.carmen import read_carmen
@@ -28,7 +29,6 @@ from unifg.scenarios import pose_graph
 from unifg.scenarios.command import main
 from unifg.scenarios.planning.speed_profile import read_profile
 
-CHECKOUT = Path(__file__).resolve().parent.parent
 NUMBERS = range(40)
 KEPT: dict[str, tuple[int, ...]] = {"carmen": (1967,), "euroc": (1770, 4702), "map": (1388,)}
 """Numbers of mutations that once ended wrongly, by reader."""
@@ -301,9 +301,7 @@ sys.exit(main(sys.argv[1:]))
 @pytest.mark.product(4, of="processes of their own")
 def test_numbers_need_nothing_but_the_library(tmp_path: Path) -> None:
     path = put(tmp_path, "g.g2o", PLANAR)
-    command = [sys.executable, "-c", WITHOUT, "solve", str(path), "--out", str(tmp_path / "out")]
-    run = subprocess.run(command, capture_output=True, text=True, cwd=CHECKOUT, timeout=120)
-    assert run.returncode == 0, run.stderr
+    run = run_script(WITHOUT, "solve", path, "--out", tmp_path / "out")
     written = sorted(p.name for p in (tmp_path / "out").iterdir())
     assert written == ["graph.g2o", "metrics.json", "trajectory.tum"]
     assert "pip install 'unifg[view]'" in run.stderr and "Traceback" not in run.stderr

@@ -4,13 +4,13 @@ import ast
 import importlib
 import inspect
 import re
-import subprocess
 from functools import cache
 from pathlib import Path
 
 import pytest
 
-CHECKOUT = Path(__file__).resolve().parent.parent
+from scripts import CHECKOUT, files_in_git
+
 pytestmark = pytest.mark.xdist_group("house")  # what one process has parsed
 
 # Import name of each package -> its folder in the checkout.
@@ -367,13 +367,7 @@ def test_products_of_long_vectors_wake_no_threads() -> None:
 
 
 def test_no_machine_paths() -> None:
-    listing = subprocess.run(
-        ["git", "ls-files", "--cached", "--others", "--exclude-standard"],
-        cwd=CHECKOUT, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    if listing.returncode != 0:
-        pytest.skip("not a git checkout")
-    files = [CHECKOUT / name for name in listing.stdout.splitlines()]
+    files = files_in_git()
     found = [
         f"{name_of(path)}:{number}: {line.strip()}"
         for path in files

@@ -11,6 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.codegen.compile_counter import counting
 from unifg.errors import ModelError
 from unifg.lie import SE23, SO3
@@ -234,8 +235,7 @@ def test_a_covariance_without_an_inverse_is_refused(rng: Generator) -> None:
 
 def test_biases_without_a_walk_are_one() -> None:
     for noise in (ImuNoise(gyro_walk=0.0), ImuNoise(accelerometer_walk=0.0)):
-        graph = fg.Graph()
-        x = graph.variables("x", SE23, 3)
+        graph, x = graph_with(SE23, 3)
         graph.variables("bias", BIAS, 3)
         with pytest.raises(ModelError, match="which must be positive; one bias that stays"):
             InertialMeasurements(noise).state(graph, x)

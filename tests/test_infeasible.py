@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models import obstacles, unicycle
 from unifg.solution.optimality import infeasible_stationary
 from unifg.solvers import SQP, AugmentedLagrangian
@@ -24,8 +25,7 @@ Problem = tuple[fg.Graph, dict[fg.Family, Array]]
 
 def two_values(weight: float) -> Problem:
     """x = 0 and weight (x - 1) = 0."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [5.0])
     graph.constrain(fg.prior, x, [0.0], lower=0.0, upper=0.0, name="zero")
     graph.constrain(lambda v: weight * (v - 1.0), x, lower=0.0, upper=0.0, name="one")
@@ -34,8 +34,7 @@ def two_values(weight: float) -> Problem:
 
 def chain() -> Problem:
     """A chain of points whose ends are given; one in the middle is to have a square of -1."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 4)
+    graph, x = graph_with(fg.Rn(2), 4)
     graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0])
     graph.constrain(fg.prior, x[0], [0.0, 0.0], lower=0.0, upper=0.0, name="start")
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x[2], lower=-1.0, upper=-1.0, name="square")
@@ -70,8 +69,7 @@ def test_one_impossible_row_among_others_is_named(name: str) -> None:
 
 def saddle(away: float = 0.0) -> Problem:
     """1 + x^2 = y^2: at the origin the violation is stationary, yet along y it falls."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [0.0, 0.5])
     graph.constrain(lambda p: 1.0 + p[:, :1] ** 2 - p[:, 1:] ** 2, x, lower=0.0, upper=0.0, name="hyperbola")
     return graph, {x: np.array([[away, 0.0]])}
@@ -101,8 +99,7 @@ def test_least_violation_is_stationary_or_none(build: Callable[[], Problem]) -> 
 
 def bay() -> Problem:
     """x^3 - 3 x + 3 = 0 has its root at -2.1; at 1, where the cost pulls, it is 1 and no nearer root is in sight."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [1.0], sigma=0.01)
     graph.constrain(lambda p: p**3 - 3.0 * p + 3.0, x, lower=0.0, upper=0.0, name="cubic")
     return graph, {x: np.array([[np.roots([1.0, 0.0, -3.0, 3.0])[0].real]])}
@@ -192,6 +189,5 @@ def test_a_plan_is_found_from_one_that_violates_nothing(seed: int) -> None:
     """Led astray through shelves, the augmented Lagrangian goes back to where it was feasible, and starts anew."""
     graph, guess = shelves(seed)
     assert SQP().solve(graph, guess).converged
-    solution = AugmentedLagrangian().solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = AugmentedLagrangian().solve(graph, guess, check=True)
     assert solution.cost < 0.9 * solution.history[0].cost

@@ -9,6 +9,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.graphs import graph_with
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 from units import COST, OTHER_COST, drive
@@ -34,8 +35,7 @@ DRIVES: list[dict[str, Any]] = [
 @pytest.mark.parametrize("units", DRIVES, ids=str)
 def test_a_drive_is_solved_in_any_units(units: dict[str, Any]) -> None:
     graph, guess = drive(**units)
-    solution = InteriorPoint().solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = InteriorPoint().solve(graph, guess, check=True)
     assert solution.iterations <= 60
     weight = units.get("cost", 1.0) ** 2
     known = np.array([COST, OTHER_COST]) * weight
@@ -67,12 +67,10 @@ def test_scalar_costs_in_any_units(unit: float, row: float) -> None:
         p = v * unit
         return np.asarray((1.0 - p[:, 0]) ** 2 + 100.0 * (p[:, 1] - p[:, 0] ** 2) ** 2)
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize_scalar(valley, x)
     graph.constrain(lambda v: row * ((v * unit) ** 2).sum(axis=1, keepdims=True), x, upper=row, name="disc")
-    solution = InteriorPoint().solve(graph, {x: np.array([[-1.0, 0.5]]) / unit})
-    assert solution.converged, solution.report()
+    solution = InteriorPoint().solve(graph, {x: np.array([[-1.0, 0.5]]) / unit}, check=True)
     if row >= 1.0 and unit >= 1.0:  # elsewhere the tolerance, which is in the units of the problem, asks for less
         np.testing.assert_allclose(solution[x] * unit, [[0.786415, 0.617698]], atol=1e-4)
 

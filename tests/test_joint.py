@@ -9,6 +9,7 @@ import pytest
 
 import maps
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_past import WINDOW, Registration, Smoother
@@ -28,8 +29,7 @@ def field() -> DistanceMap:
 
 def chain(count: int, rng: np.random.Generator) -> tuple[fg.Graph, fg.Family, Array]:
     """A linear chain: prior on the first, noisy steps, a fix on position now and then."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), count)
+    graph, x = graph_with(fg.Rn(2), count)
     graph.minimize(fg.prior, x[0], [0.3, -0.2], sigma=0.5, name="prior")
     steps = rng.normal(size=(count - 1, 2))
     graph.minimize(lambda a, b, z: b - a - z, x[:-1], x[1:], steps, sigma=[0.1, 0.2], name="step")

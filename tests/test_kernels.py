@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.errors import GraphError
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.kernel import Kernel
@@ -85,8 +86,7 @@ def test_everything_at_once() -> None:
     """Components of a product, some members fixed, some factors inactive, robust, shared and own parameters."""
 
     def build(rewrite: Rewrite) -> tuple[fg.Graph, dict[fg.Family, Array]]:
-        graph = fg.Graph()
-        s = graph.variables("s", fg.Product(v=fg.Rn(2), p=fg.SE2), COUNT)
+        graph, s = graph_with(fg.Product(v=fg.Rn(2), p=fg.SE2), COUNT, "s")
         seen = graph.data("seen", np.arange(COUNT) % 3 > 0, each=True)
         centres = graph.data("centres", CENTRES + np.linspace(0.0, 1.0, COUNT)[:, None, None], each=True)
         graph.fix(s.p[0], poses()[0])
@@ -112,8 +112,7 @@ def test_shared_variable() -> None:
     """All beams of a scan see one pose."""
 
     def build(rewrite: Rewrite) -> tuple[fg.Graph, dict[fg.Family, Array]]:
-        graph = fg.Graph()
-        x = graph.variables("x", fg.SE2, 2)
+        graph, x = graph_with(fg.SE2, 2)
         beams = graph.data("beams", np.random.default_rng(5).uniform(-2.0, 2.0, (40, 2)), each=True)
         loss = lidar.endpoint_loss(0.1, 0.25)
         graph.minimize(rewrite(ENDPOINT), x[1], beams, sigma=0.1, robust=loss)
@@ -128,8 +127,7 @@ def test_one_variable_in_both_places_of_a_factor(measured: Array) -> None:
     """Its two blocks add up: J'J is that of their sum, cross products counted twice."""
 
     def build(rewrite: Rewrite) -> tuple[fg.Graph, dict[fg.Family, Array]]:
-        graph = fg.Graph()
-        x = graph.variables("x", fg.SE2, 2)
+        graph, x = graph_with(fg.SE2, 2)
         graph.minimize(rewrite(BETWEEN), x, x, measured, sigma=0.7)
         graph.minimize(fg.prior, x, np.zeros(3))
         graph.constrain(rewrite(unicycle.dynamics), x, controls(2), x, 0.1, upper=0.0)
@@ -155,8 +153,7 @@ def test_search_by_numpy_beside_a_kernel() -> None:
     def looked_in(x: Array, centre: Array, radius: Array) -> list[Array]:
         return [2.0 * disc_clearance.jacobian(x, centre, radius)[0]]  # type: ignore[misc]
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, COUNT)
+    graph, x = graph_with(fg.SE2, COUNT)
     graph.minimize(replace(disc_clearance, search=looked_in), x, CENTRES, RADII)
     graph.minimize(disc_clearance, x[::-1], CENTRES, RADII)
     program = graph.compile()
@@ -166,8 +163,7 @@ def test_search_by_numpy_beside_a_kernel() -> None:
 
 
 def test_data_reaches_the_kernels() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, COUNT)
+    graph, x = graph_with(fg.SE2, COUNT)
     centres, radii = graph.data("centres", CENTRES), graph.data("radii", np.tile(RADII, (COUNT, 1)), each=True)
     seen = graph.data("seen", np.ones(COUNT, dtype=bool), each=True)
     graph.constrain(disc_clearance, x, centres, radii, lower=0.0, active=seen)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models import unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
@@ -48,8 +49,7 @@ def heavy_rows() -> Expected:
 
 def rim() -> Expected:
     """A point of a square is to be on a circle of radius 4 around (0, -2): its upper corners are nearest."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(2), 1)
+    graph, p = graph_with(fg.Rn(2), 1, "p")
     graph.minimize(fg.prior, p, [3.0, 3.0])
     graph.constrain(
         lambda p: np.sqrt(p[:, :1] ** 2 + (p[:, 1:] + 2.0) ** 2 + 1e-9), p, lower=4.0, upper=4.0, name="circle"

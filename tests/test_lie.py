@@ -27,6 +27,7 @@ from groups import (
     assert_same,
     elements,
     exponentials,
+    integrated,
     tangents,
     times,
 )
@@ -169,22 +170,13 @@ def test_adjoints(drawn: Drawn) -> None:
     assert_close(group.adjoint(group.exp(d)), exponentials(group.ad(d)))
 
 
-def phi(generator: Array) -> Array:
-    """Return the integral of expm(s G) over s in [0, 1], read off expm([[G, I], [0, 0]])."""
-    size = generator.shape[-1]
-    block = np.zeros((*generator.shape[:-2], 2 * size, 2 * size))
-    block[..., :size, :size] = generator
-    block[..., :size, size:] = np.eye(size)
-    return exponentials(block)[..., :size, size:]
-
-
 @pytest.mark.product(80)
 def test_jacobians(drawn: Drawn) -> None:
     """They are integrals of the adjoint, which fixes their signs, and their inverses are inverses."""
     _, group, _, _, _, _, d, _ = drawn
     right, left = group.right_jacobian(d), group.left_jacobian(d)
-    assert_close(right, phi(-group.ad(d)))
-    assert_close(left, phi(group.ad(d)))
+    assert_close(right, integrated(-group.ad(d)))
+    assert_close(left, integrated(group.ad(d)))
     unit = np.broadcast_to(np.eye(group.dim), right.shape)
     assert_close(group.right_jacobian_inverse(d) @ right, unit)
     assert_close(group.left_jacobian_inverse(d) @ left, unit)
@@ -245,7 +237,7 @@ def test_se2_jacobians_over_all_angles() -> None:
     omega = np.concatenate([small, seam, np.linspace(0.55, 6.0, 60)])
     omega = np.concatenate([-omega, [0.0], omega])
     d = np.stack([np.full_like(omega, 0.7), np.full_like(omega, -1.3), omega], axis=-1)
-    right = phi(-SE2.ad(d))
+    right = integrated(-SE2.ad(d))
     np.testing.assert_allclose(SE2.right_jacobian(d), right, rtol=0, atol=2e-14)
     inverse = np.linalg.inv(right)
     error = np.abs(SE2.right_jacobian_inverse(d) - inverse).max(axis=(1, 2))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from groups import PI, assert_close, assert_same
+from groups import PI, assert_close, assert_same, integrated
 from unifg.errors import UnifgError
 from unifg.lie import SE3, SO3
 from unifg.lie.se3 import SE3Group
@@ -54,15 +54,6 @@ def long_exponential(generator: Array) -> Long:
     return result
 
 
-def long_integral(generator: Array) -> Long:
-    """Return the integral of expm(s G) over s in [0, 1]: the corner of expm([[G, I], [0, 0]])."""
-    size = generator.shape[-1]
-    block = np.zeros((*generator.shape[:-2], 2 * size, 2 * size))
-    block[..., :size, :size] = generator
-    block[..., :size, size:] = np.eye(size)
-    return long_exponential(block)[..., :size, size:]
-
-
 # -- accuracy --
 
 
@@ -73,7 +64,7 @@ def test_exponential_and_jacobians(group: Spatial, angle: float, rng: Generator)
     error = np.abs(group.matrix(group.exp(d)) - long_exponential(group.hat(d))).max()
     assert error < EXACT * max(1.0, angle)
     for jacobian, sign in ((group.right_jacobian, -1.0), (group.left_jacobian, 1.0)):
-        assert np.abs(jacobian(d) - long_integral(sign * group.ad(d))).max() < EXACT
+        assert np.abs(jacobian(d) - integrated(sign * group.ad(d), long_exponential)).max() < EXACT
 
 
 @GROUPS
@@ -82,7 +73,7 @@ def test_inverse_jacobians(group: Spatial, angle: float, rng: Generator) -> None
     d = with_angle(group, angle, rng)
     unit = np.eye(group.dim)
     for inverse, sign in ((group.right_jacobian_inverse, -1.0), (group.left_jacobian_inverse, 1.0)):
-        jacobian = long_integral(sign * group.ad(d))
+        jacobian = integrated(sign * group.ad(d), long_exponential)
         size = np.abs(inverse(d)).max()
         assert np.abs(inverse(d) @ jacobian - unit).max() < EXACT * size
         assert np.abs(jacobian @ inverse(d) - unit).max() < EXACT * size

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from problems.known import PROBLEMS, Guess, ecg2o, ecg2o_inequality, three_variable_qp
 from test_sqp_exact import two_rotations
 from unifg.models import unicycle
@@ -40,8 +41,7 @@ def drive_to_a_pose() -> tuple[fg.Graph, Guess]:
 
 def repulsion() -> tuple[fg.Graph, Guess]:
     """Ta's obstacle cost 1/d, on a line."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 2)
+    graph, x = graph_with(fg.Rn(2), 2)
     graph.minimize(fg.prior, x, [1.0, 0.0], sigma=0.4, name="goal")
     graph.minimize_scalar(lambda p: 1.0 / np.hypot(p[:, 0], p[:, 1] - 0.1), x, name="push")
     graph.constrain(lambda p, q: p[:, :1] * q[:, 1:] - 0.1, x[0], x[1], lower=0.0, upper=0.0, name="product")
@@ -119,8 +119,7 @@ def test_the_same_with_the_exact_hessian(name: str, rng: np.random.Generator) ->
 @pytest.mark.product(10)
 def test_a_solve_by_elimination_alone(name: str, hessian: str) -> None:
     graph, guess = BUILD[name]()
-    mine = SQP(qp="elimination", fallback=None, hessian=hessian, tolerance=1e-8).solve(graph, guess)  # type: ignore[arg-type]
-    assert mine.converged, mine.report()
+    mine = SQP(qp="elimination", fallback=None, hessian=hessian, tolerance=1e-8).solve(graph, guess, check=True)  # type: ignore[arg-type]
     assert {row.details["qp"] for row in mine.history[1:]} == {"elimination"}
     theirs = SQP(qp="graph", hessian=hessian, tolerance=1e-8).solve(graph, guess, check=True)  # type: ignore[arg-type]
     for family in guess:
@@ -241,8 +240,7 @@ def test_inequalities_are_refused_by_name() -> None:
     with pytest.raises(fg.BackendError, match="'ellipse'"):
         LinearGraphs.at(graph, guess)
     # What data turn into an inequality is refused when it becomes one.
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     upper = graph.data("upper", np.zeros(1))
     graph.minimize(fg.prior, x, [1.0])
     graph.constrain(lambda p: p, x, lower=0.0, upper=upper, name="wall")
@@ -261,8 +259,7 @@ def test_contradictions_and_missing_information() -> None:
     answer = SQP(qp="elimination", fallback=None).solve(graph, guess)
     assert not answer.converged
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 1)
+    graph, x = graph_with(fg.Rn(3))
     graph.minimize(lambda p: p[:, :1], x, name="first")
     graph.constrain(lambda p: p[:, 1:2], x, lower=0.0, upper=0.0, name="second")
     with pytest.raises(Undetermined, match=r"1 coordinates of x\[0\]"):
@@ -301,8 +298,7 @@ def test_damping_is_a_factor_of_its_own() -> None:
 
 
 def test_switched_off_factors_are_left_out() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 3)
+    graph, x = graph_with(fg.Rn(2), 3)
     graph.minimize(fg.prior, x, [1.0, 2.0], name="prior")
     graph.minimize(fg.prior, x, [5.0, 5.0], active=np.array([True, False, False]), name="some")
     graph.constrain(lambda p: p[:, :1], x, lower=0.0, upper=0.0, active=np.array([False, True, False]), name="wall")

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from scenes import without_viewer
 from unifg.errors import ViewError
 from unifg.solvers import GaussNewton
@@ -209,8 +210,7 @@ def _none_free(*args: object) -> None:
 
 
 def test_a_solution_is_added_to_what_is_watched() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 3)
+    graph, x = graph_with(fg.SE2, 3)
     graph.minimize(fg.prior, x, np.zeros(3), sigma=1.0)
     solution = GaussNewton().solve(graph, {x: np.ones((3, 3))})
     scene = Scene.of(solution, x, dt=0.1)

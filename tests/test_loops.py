@@ -78,7 +78,7 @@ def numbers(function: Function, manifold: Manifold, count: int) -> tuple[Array, 
     return alone, r, J, S
 
 
-@pytest.mark.parametrize("count", [loops.FEWEST, 9, 18])
+@pytest.mark.parametrize("count", [loops.FEWEST, 9, 16])
 @pytest.mark.parametrize("manifold", [SE2, Rn(3)], ids=lambda m: m.name)
 @pytest.mark.parametrize("function", [distances, softest, alternating, mixed, signed, chained])
 @pytest.mark.product(3)

@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 import unifg as fg
 from problems.control import Unicycle
+from problems.graphs import graph_with
 from unifg.factors.robust import Formula, Loss, bend_of, form_of
 from unifg.modeling.terms import Cost
 from unifg.problem.compiled_problem import CompiledProblem
@@ -202,8 +203,7 @@ def test_every_backend_finds_the_optimum_of_every_loss(name: str) -> None:
         start = np.array([*guess[graph.families["place"]][0], 0.1])
         known = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-14, "maxiter": 2000})
         options = {"max_iterations": 300} if name != "penalty" else {"max_iterations": 300, "tolerance": 1e-5}
-        solution = backend(name, **options).solve(graph, guess)
-        assert solution.converged, (name, loss, solution.report())
+        solution = backend(name, **options).solve(graph, guess, check=True)
         assert solution.cost == pytest.approx(known.fun, rel=1e-6), (name, loss)
         found = np.concatenate([solution[graph.families["place"]][0], solution[graph.families["bias"]][0]])
         np.testing.assert_allclose(found, known.x, atol=2e-5, err_msg=f"{name} {loss}")
@@ -236,8 +236,7 @@ def test_shipped_losses_leave_nothing_to_python() -> None:
 def test_masks_come_and_go_with_data() -> None:
     """A factor switched off by data counts for nothing, whatever its loss, and comes back."""
     for loss in [*LOSSES, Welsch(), HALF]:
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(1), 1)
+        graph, x = graph_with(fg.Rn(1))
         on = graph.data("on", np.array([True, True]), each=True)
         graph.minimize(fg.prior, x, np.array([[0.0], [0.5]]), robust=loss, active=on)
         graph.bound(x, upper=9.0)

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.codegen import native, objects
 from unifg.codegen.native import Native
 from unifg.codegen.objects import SWITCH, Objects
@@ -57,8 +58,7 @@ def forget() -> None:
 
 
 def stated(function: Function) -> tuple[fg.Graph, Any]:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), N)
+    graph, x = graph_with(fg.Rn(2), N)
     graph.minimize(function, x, name="own")
     return graph, x
 
@@ -210,8 +210,7 @@ def along(x: Array) -> Array:
 
 
 def test_a_function_that_is_traced_again_reads_its_own_tables(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), N)
+    graph, x = graph_with(fg.Rn(1), N)
     graph.minimize(fg.residual(along, derivatives="trace"), x)
     prepared, guess = GaussNewton().prepare(graph), {x: np.full((N, 1), 2.5)}
     np.testing.assert_allclose(prepared.solve(guess)[x], 2.0, atol=1e-6)

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from own_manifolds import Sphere
+from problems.graphs import graph_with
 from unifg.errors import GraphError
 from unifg.lie import Manifold
 from unifg.pose_graphs import manhattan
 from unifg.solution import marginal
 from unifg.solvers import SQP, GaussNewton
-from unifg.typing import Array, BoolArray
+from unifg.typing import Array
 
 STATE, NOISE, BIAS, MARK = fg.Rn(2), fg.Rn(1), fg.Rn(1), fg.Rn(1)
 TRANSITION, INPUT = np.array([[1.0, 0.1], [0.0, 1.0]]), np.array([0.0, 0.1])
@@ -138,30 +140,7 @@ def test_a_joint_prior_is_priors_side_by_side(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(solution.covariance(*families), np.linalg.inv(information), rtol=1e-6, atol=1e-9)
 
 
-class Own:
-    """A manifold without compiled functions."""
-
-    name, storage, dim = "own", 2, 1
-
-    def identity(self) -> Array:
-        return np.array([1.0, 0.0])
-
-    def retract(self, x: Array, d: Array, /) -> Array:
-        angle = np.arctan2(x[..., 1], x[..., 0]) + d[..., 0]
-        return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-
-    def local(self, x: Array, y: Array, /) -> Array:
-        between = np.arctan2(y[..., 1], y[..., 0]) - np.arctan2(x[..., 1], x[..., 0])
-        return np.asarray((between + np.pi) % (2.0 * np.pi) - np.pi)[..., None]
-
-    def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
-        return self.retract(np.broadcast_to(self.identity(), (*shape, 2)), rng.normal(size=(*shape, 1)))
-
-    def is_valid(self, x: Array, /) -> BoolArray:
-        return np.asarray(np.abs(np.linalg.norm(x, axis=-1) - 1.0) < 1e-9)
-
-
-@pytest.mark.parametrize("kind", [Own, lambda: fg.Product(a=Own(), b=fg.Rn(1))], ids=["own", "product"])
+@pytest.mark.parametrize("kind", [Sphere, lambda: fg.Product(a=Sphere(), b=fg.Rn(1))], ids=["own", "product"])
 def test_a_joint_prior_takes_manifolds_of_the_user(kind: Callable[[], Manifold], rng: np.random.Generator) -> None:
     one, other = kind(), fg.SE2
     graph = fg.Graph()
@@ -176,7 +155,7 @@ def test_a_joint_prior_takes_manifolds_of_the_user(kind: Callable[[], Manifold],
 
 def test_an_offset_moves_a_joint_prior_along_the_tangents(rng: np.random.Generator) -> None:
     """Farther than a turn, too: a quadratic has its lowest point where no point of a group is."""
-    for kinds in (manifolds(), (Own(), fg.SE2)):
+    for kinds in (manifolds(), (Sphere(), fg.SE2)):
         graph = fg.Graph()
         families = [graph.variables(f"v{k}", kind, 1) for k, kind in enumerate(kinds)]
         size = sum(kind.dim for kind in kinds)
@@ -231,8 +210,7 @@ def test_many_are_eliminated_by_the_tree_as_by_dense_matrices(monkeypatch: pytes
     assert np.abs(other - reference).max() < 1e-9
     assert np.abs(same - information).max() < 1e-10 * np.abs(information).max()
     assert not same[9:12].any() and np.linalg.eigvalsh(same)[3] > 1.0  # that of the fixed one, and no other
-    loose = fg.Graph()
-    y = loose.variables("y", fg.SE2, 200)
+    loose, y = graph_with(fg.SE2, 200, "y")
     loose.minimize(fg.between, y[:-2], y[1:-1], [1.0, 0.0, 0.0], sigma=0.1)
     loose.minimize(fg.prior, y[-1], np.zeros(3), sigma=0.1)
     unsolved = GaussNewton(max_iterations=0).solve(loose, {y: np.zeros((200, 3))})

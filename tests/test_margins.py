@@ -11,7 +11,7 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
-from unifg.horizon import Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Tree, Window
+from unifg.horizon import Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Tree, Window
 from unifg.models import unicycle
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
@@ -134,7 +134,7 @@ def test_a_soft_constraint_is_tightened_itself_and_a_hard_one_once_more():
 
 
 @dataclass
-class Pillar:
+class Pillar(Term):
     """A pillar whose place is estimated with the robot's."""
 
     reach: float = 0.3
@@ -144,9 +144,6 @@ class Pillar:
         graph.bound(u, lower=[0.0, -1.5], upper=[1.0, 1.5], name="limits")
         pillar = graph.families["pillar"]
         graph.constrain(apart, x[1:], pillar, lower=self.reach, name="pillar kept off")
-
-    def data(self, now):
-        return {}
 
 
 def apart(x, place):

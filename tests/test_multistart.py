@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.horizon import Context, ControlCost, Dynamics, InitialGuesses, RecedingHorizon, Robot, Term, cheapest
 from unifg.horizon.multistart import Jumps
 from unifg.models.detours import detours, headed
@@ -136,8 +137,7 @@ def test_what_the_deadline_leaves_no_time_for_is_tried_in_the_next_ticks() -> No
 
 
 def graph_of_two_valleys() -> tuple[fg.Graph, fg.Family]:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(lambda x: (x * x - 1.0) * 2.0, x, sigma=1.0)
     graph.minimize(fg.prior, x, [-1.0], sigma=2.0)
     graph.constrain(lambda x: x, x, lower=-3.0, name="least")

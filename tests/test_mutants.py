@@ -5,13 +5,12 @@ from __future__ import annotations
 import ast
 import json
 import shutil
-import subprocess
-import sys
 import tomllib
 from pathlib import Path
 
 import pytest
 
+from scripts import run_script
 from tools.mutants import CHECKOUT, SURVIVORS, TARGETS
 from tools.mutations import mutations
 
@@ -145,9 +144,7 @@ def test_width_again(wide):
 """,
         encoding="utf-8",
     )
-    done = subprocess.run(
-        [sys.executable, "-c", HUNTED, str(tmp_path)], cwd=tmp_path, capture_output=True, text=True, check=True
-    )
+    done = run_script(HUNTED, tmp_path, cwd=tmp_path)
     said, users, restored = json.loads(done.stdout.splitlines()[-1])
     assert said == {
         "closes: gap < least -> gap >= least": "killed",

@@ -5,6 +5,8 @@ from pathlib import Path
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
+from scripts import CHECKOUT
 from unifg import solvers
 from unifg.scenarios import command as shell
 from unifg.scenarios.commands.catalogue import FROM_FILES, SCENARIOS
@@ -28,8 +30,7 @@ def test_lists_follow_from_the_classes() -> None:
 def test_a_class_takes_what_it_says(name: str) -> None:
     solver = names.backend(name)
     for limits, taken in (((0.0, 0.0), solver.constraints != "none"), ((-1.0, 1.0), solver.constraints == "all")):
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(1), 1)
+        graph, x = graph_with(fg.Rn(1))
         graph.minimize(fg.prior, x, [1.0])
         graph.constrain(lambda x: x, x, lower=limits[0], upper=limits[1], name="limits")
         if taken:
@@ -37,8 +38,7 @@ def test_a_class_takes_what_it_says(name: str) -> None:
         else:
             with pytest.raises(fg.BackendError, match=f"{solver.name} cannot take the .* 'limits'"):
                 solver.prepare(graph)
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize_scalar(lambda x: x[:, 0] ** 2, x, name="general")
     if solver.scalar_costs:
         solver.prepare(graph)
@@ -68,11 +68,10 @@ def test_commands_offer_names_with_titles(command: tuple[str, ...], capsys: pyte
 
 
 def test_a_short_name_stands_in_no_second_table() -> None:
-    checkout = Path(__file__).resolve().parent.parent
     found = [
         path.name
         for folder in ("solvers", "scenarios", "benchmarks", "tools", "tests")
-        for path in (checkout / folder).rglob("*.py")
+        for path in (CHECKOUT / folder).rglob("*.py")
         if path != Path(__file__).resolve() and '"ipm": InteriorPoint' in path.read_text(encoding="utf-8")
     ]
     assert sorted(found) == []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fences import CHECKOUT
+from scripts import CHECKOUT
 from unifg.view import Scene
 
 NOTEBOOKS = sorted((CHECKOUT / "docs" / "notebooks").glob("*.ipynb"))

@@ -12,6 +12,7 @@ import pytest
 import unifg as fg
 from counts import Count, counting
 from problems.control import problems
+from problems.graphs import graph_with
 from problems.known import active_bounds, short_drive
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import SQP
@@ -88,15 +89,13 @@ def test_the_limit_is_counted_on_the_graph() -> None:
     assert abs(counted_iterations(short) - counted_iterations(longer)) <= 20
     assert 30 <= counted_iterations(short) <= 300
     assert OsqpRoute(short, 17).max_iterations == 17
-    empty = fg.Graph()
-    x = empty.variables("x", fg.Rn(1), 1)
+    empty, x = graph_with(fg.Rn(1))
     empty.minimize(fg.prior, x, [0.0])
     assert counted_iterations(empty.compile()) > 0
 
 
 def test_contradictions_and_crossed_limits_are_told() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [0.0])
     graph.constrain(lambda p: p, x, lower=1.0, upper=1.0, name="one")
     graph.constrain(lambda p: p, x, upper=0.0, name="none")

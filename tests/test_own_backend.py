@@ -39,8 +39,7 @@ def test_solves_what_has_no_constraints_and_refuses_the_rest(backend: fg.Solver,
         with pytest.raises(fg.BackendError):
             backend.solve(graph, guess)
         return
-    solution = backend.solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = backend.solve(graph, guess, check=True)
     assert judge(graph, solution).worst() < 2e-6
     if np.isfinite(problem.cost):
         assert solution.cost == pytest.approx(problem.cost, rel=1e-6, abs=1e-7)

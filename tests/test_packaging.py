@@ -16,7 +16,8 @@ from typing import Any
 
 import pytest
 
-CHECKOUT = Path(__file__).resolve().parent.parent
+from scripts import CHECKOUT
+
 pytestmark = pytest.mark.xdist_group("packaging")
 SIDES = ("solvers", "models", "scenarios")
 # Only the extra `scenarios` installs these; the language, the backends and the models must do without.

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.files.g2o import read_g2o
 from unifg.lie import LieGroup
 from unifg.problem.compiled_problem import CompiledProblem
@@ -29,8 +30,7 @@ def random_information(rng: np.random.Generator, count: int, dim: int) -> Array:
 def web(group: LieGroup, seed: int, **options: Any) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """Twelve poses, edges in both directions, some fixed, another family of variables in front and behind."""
     rng = np.random.default_rng(seed)
-    graph = fg.Graph()
-    before = graph.variables("before", fg.Rn(2), 3)
+    graph, before = graph_with(fg.Rn(2), 3, "before")
     x = graph.variables("poses", group, 12)
     after = graph.variables("after", group, 4)
     first, second = rng.permuted(np.tile(np.arange(12), (40, 1)), axis=1)[:, :2].T
@@ -83,8 +83,7 @@ def test_fixed_sizes_add_up_what_general_loops_do(group: LieGroup, seed: int, ro
 def test_factors_that_are_switched_off_add_nothing() -> None:
     on = np.arange(40) % 3 > 0
     rng = np.random.default_rng(5)
-    graph = fg.Graph()
-    x = graph.variables("poses", fg.SE3, 41)
+    graph, x = graph_with(fg.SE3, 41, "poses")
     graph.minimize(
         fg.between, x[1:], x[:-1], fg.SE3.random(rng, (40,)), information=random_information(rng, 40, 6), active=on,
         name="chain",
@@ -100,8 +99,7 @@ def test_factors_that_are_switched_off_add_nothing() -> None:
 
 def test_one_variable_twice_and_constants_take_the_general_loops() -> None:
     rng = np.random.default_rng(6)
-    graph = fg.Graph()
-    x = graph.variables("poses", fg.SE2, 5)
+    graph, x = graph_with(fg.SE2, 5, "poses")
     graph.minimize(fg.between, x[[0, 1, 2]], x[[1, 1, 3]], fg.SE2.random(rng, (3,)), sigma=1.0, name="twice")
     graph.minimize(fg.between, x, fg.SE2.random(rng), fg.SE2.random(rng, (5,)), sigma=1.0, name="constant")
     program = graph.compile()

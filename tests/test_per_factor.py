@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
+from scripts import run_script
 from unifg.codegen.cache_folder import VARIABLE
 from unifg.solvers import AugmentedLagrangian, GaussNewton
 from unifg.typing import Array
@@ -63,8 +64,7 @@ def batched(x: Array, y: Array, measured: Array, scale: float) -> Array:
 
 def chain(residual: fg.Residual | Callable[..., Array]) -> tuple[fg.Graph, fg.Family, Array]:
     poses = RNG.normal(size=(6, 3))
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 6)
+    graph, x = graph_with(fg.SE2, 6)
     graph.minimize(residual, x[:-1], x[1:], np.full((5, 2), 0.3), 2.0, sigma=0.1)
     graph.minimize(fg.prior, x, poses, sigma=1.0)
     return graph, x, poses
@@ -94,14 +94,12 @@ def test_a_wrong_compiled_jacobian_is_found() -> None:
 
 
 def test_constrains_a_component_of_a_product_with_a_shared_matrix() -> None:
-    graph = fg.Graph()
-    state = graph.variables("state", fg.Product(p=fg.Rn(3), R=fg.SO2), 4)
+    graph, state = graph_with(fg.Product(p=fg.Rn(3), R=fg.SO2), 4, "state")
     direction = graph.data("direction", np.array([[1.0, 0.0], [0.0, 2.0]]))
     graph.minimize(fg.prior, state.p, np.array([1.0, 2.0, 3.0]))
     graph.minimize(fg.prior, state.R, np.zeros(1))
     graph.constrain(fg.residual(speed, rows=1), state.p, direction, lower=0.0, upper=0.0, name="still")
-    solution = AugmentedLagrangian().solve(graph, {state: np.ones((4, 4))})
-    assert solution.converged
+    solution = AugmentedLagrangian().solve(graph, {state: np.ones((4, 4))}, check=True)
     p = solution[state][:, :3]
     np.testing.assert_allclose(p[:, 0] + 2.0 * p[:, 2], 0.0, atol=1e-6)
 
@@ -111,8 +109,7 @@ def test_differences_reach_every_component_of_a_product() -> None:
     def heading(state: Array, r: Array) -> None:
         r[0] = state[0] * np.cos(state[3]) + state[2]
 
-    graph = fg.Graph()
-    state = graph.variables("state", fg.Product(p=fg.Rn(3), R=fg.SO2), 2)
+    graph, state = graph_with(fg.Product(p=fg.Rn(3), R=fg.SO2), 2, "state")
     graph.minimize(fg.residual(heading, rows=1), state)
     point = RNG.normal(size=(2, 4))
     jacobian = graph.compile().linearize({state: point}).jacobian.reshape(2, 4)
@@ -193,9 +190,8 @@ def solved(folder: Path, *changes: str) -> tuple[str, list[tuple[int, float]]]:
         for name, source in (("script.py", KEPT), ("outside.py", OUTSIDE)):
             changed = source.replace("made(2.0)", "unknown") if value >= 3.0 else source
             (folder / change / name).write_text(changed.replace(before, after), encoding="utf-8")
-    place = {**os.environ, VARIABLE: str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
-    command = [sys.executable, "-c", SCRIPTS, str(folder / "run"), *(str(folder / change) for change in changes)]
-    ended = subprocess.run(command, capture_output=True, text=True, env=place, timeout=300, check=True)
+    place = {VARIABLE: str(folder / "cache"), "PYTHONPATH": os.pathsep.join(sys.path)}
+    ended = run_script(SCRIPTS, folder / "run", *(folder / change for change in changes), variables=place)
     lines = [line.split() for line in ended.stdout.splitlines()]
     return ended.stderr, [(int(count), float(answer)) for count, answer in lines]
 

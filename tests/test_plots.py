@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,14 +15,14 @@ from matplotlib.quiver import Quiver
 
 import unifg as fg
 from own_manifolds import S2
+from problems.graphs import graph_with
 from problems.known import line, short_drive
+from scripts import run_script
 from unifg.plots import factor_graph, shown
 from unifg.plots.factor_graph import _apart
 from unifg.solution.history import History
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array
-
-CHECKOUT = Path(__file__).resolve().parent.parent
 
 SILENT = """
 import sys
@@ -48,10 +47,7 @@ figures[0].savefig(sys.argv[1])
 @pytest.mark.product(4, of="processes of their own")
 def test_matplotlib_is_imported_when_something_is_drawn_and_pyplot_never(tmp_path: Path) -> None:
     target = tmp_path / "graph.png"
-    done = subprocess.run(
-        [sys.executable, "-c", SILENT, str(target)], cwd=CHECKOUT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    run_script(SILENT, target)
     assert target.read_bytes()[:4] == b"\x89PNG"
 
 
@@ -251,8 +247,7 @@ def test_limits_are_shaded_or_dashed(different: bool) -> None:
 
 
 def test_ellipses_and_bands_are_two_standard_deviations() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 3)
+    graph, x = graph_with(fg.SE2, 3)
     graph.minimize(fg.prior, x, [[0.0, 0.0, 0.5], [1.0, 0.0, 1.5], [2.0, 1.0, -2.0]], sigma=[0.3, 0.1, 0.05])
     solution = GaussNewton().solve(graph, {x: np.zeros((3, 3))})
     ax = titled(solution.plot(marginals=True))["x"]
@@ -271,8 +266,7 @@ def test_ellipses_and_bands_are_two_standard_deviations() -> None:
 
 def test_rotations_are_roll_pitch_and_yaw_and_products_are_taken_apart() -> None:
     state = fg.Product(pose=fg.SE3, arm=fg.Product(lift=fg.SO2, wrist=fg.SO3), speed=fg.Rn(1), eye=S2)
-    graph = fg.Graph()
-    s = graph.variables("s", state, 9)
+    graph, s = graph_with(state, 9, "s")
     rng = np.random.default_rng(3)
     truth = state.random(rng, (9,))
     turns = np.stack([np.linspace(0.0, 0.4, 9), np.linspace(0.1, 0.3, 9), np.linspace(0.0, 5.0, 9)], axis=1)
@@ -298,8 +292,7 @@ def test_rotations_are_roll_pitch_and_yaw_and_products_are_taken_apart() -> None
 
 
 def test_extended_poses_have_their_velocity_beside() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE23, 5)
+    graph, x = graph_with(fg.SE23, 5)
     truth = fg.SE23.random(np.random.default_rng(0), (5,))
     graph.minimize(fg.prior, x, truth, sigma=0.1)
     figure = GaussNewton().solve(graph, {x: truth}).plot(marginals=True)
@@ -313,8 +306,7 @@ def test_extended_poses_have_their_velocity_beside() -> None:
 
 
 def test_factors_between_poses_apart_are_lines() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 6)
+    graph, x = graph_with(fg.SE2, 6)
     graph.fix(x[0], np.zeros(3))
     graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0, 1.0])
     graph.minimize(fg.between, x[[0, 1]], x[[5, 4]], np.zeros(3))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.horizon import ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
 from unifg.models import quadrotor
 from unifg.scenarios.planning.flat_path import Line
@@ -23,8 +24,7 @@ LINE = Line((-4.0, 0.0, 1.0), (4.0, 0.0, 1.0), 2.0, 1.5)
 
 def chain() -> tuple[fg.Graph, fg.Family, fg.Data]:
     """Points on a line that keep off a disc: an answer that takes some iterations."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 8)
+    graph, x = graph_with(fg.Rn(2), 8)
     goal = graph.data("goal", np.array([3.0, 0.1]))
     graph.minimize(fg.prior, x[-1], goal, sigma=0.1)
     graph.minimize(lambda a, b: b - a, x[:-1], x[1:], sigma=1.0, name="steps")

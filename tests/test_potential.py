@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.obstacles import disc_clearance, wall_distance
 from unifg.models.potential import FAR, NEAR, SCALE, Sense, potential
@@ -84,8 +85,7 @@ def test_vortex_is_off_by_default_and_bad_thresholds_are_refused() -> None:
 
 def well(lie: float, constrained: bool) -> tuple[fg.Graph, fg.Family, Array]:
     """A point drawn to (1, 0); its search Jacobian claims that moving along y helps too."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(2), 1)
+    graph, p = graph_with(fg.Rn(2), 1, "p")
 
     def true(x: Array) -> list[Array]:
         return [np.broadcast_to(np.eye(2), (len(x), 2, 2))]
@@ -136,8 +136,7 @@ def test_search_steers_only_the_first_steps(solver: type[fg.Solver], constrained
 
 @pytest.mark.parametrize(("solver", "constrained"), SOLVERS, ids=lambda v: getattr(v, "__name__", ""))
 def test_without_search_jacobians_the_option_changes_nothing(solver: type[fg.Solver], constrained: bool) -> None:
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(2), 1)
+    graph, p = graph_with(fg.Rn(2), 1, "p")
     graph.minimize(lambda x: np.stack([10.0 * (x[:, 1] - x[:, 0] ** 2), 1.0 - x[:, 0]], axis=1), p)
     if constrained:
         graph.bound(p, lower=-50.0, upper=50.0)
@@ -147,14 +146,12 @@ def test_without_search_jacobians_the_option_changes_nothing(solver: type[fg.Sol
 
 def test_search_that_leaves_the_domain_is_abandoned() -> None:
     """A step to where the residual does not exist is not taken, and the solve goes on by the true derivatives."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(1), 1)
+    graph, p = graph_with(fg.Rn(1), 1, "p")
     graph.minimize(
         fg.residual(np.log, lambda x: [1.0 / x[:, :, None]], "log", search=lambda x: [np.full((len(x), 1, 1), 1e-3)]),
         p,
     )
-    solution = LevenbergMarquardt(search_iterations=5).solve(graph, {p: [[2.5]]})
-    assert solution.converged, solution.report()
+    solution = LevenbergMarquardt(search_iterations=5).solve(graph, {p: [[2.5]]}, check=True)
     assert solution[p][0, 0] == pytest.approx(1.0, abs=1e-6)
     assert not any("search" in row.details for row in solution.history)
 
@@ -201,8 +198,7 @@ def test_vortex_leads_around_an_obstacle(
     """The textbook trap: a goal straight behind a disc. The vortex gets there, on the side its sign says."""
     answers = []
     for weight in (0.0, vortex):
-        graph = fg.Graph()
-        x = graph.variables("x", fg.SE2, 1)
+        graph, x = graph_with(fg.SE2)
         graph.minimize(fg.prior, x, [1.6, 0.0, 0.0], sigma=[1.0, 1.0, 0.3])
         push = potential(disc_clearance, vortex=weight, sense=sense)
         graph.minimize(push, x, CENTRE, np.array([1.0]), sigma=0.05)

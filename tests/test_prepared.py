@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
+from scripts import run_script
 from unifg.solvers import GaussNewton
-
-CHECKOUT = Path(__file__).resolve().parent.parent
 
 # In a process of its own: in this one, other tests have long compiled everything.
 SOLVES = """
@@ -147,8 +144,7 @@ class Particular(GaussNewton):
 
 
 def test_a_rehearsal_that_fails_fails_nothing() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [2.0], sigma=1.0)
     solution = Particular().prepare(graph).solve({x: [[0.0]]})
     assert solution.converged and solution[x][0, 0] == pytest.approx(2.0)
@@ -156,11 +152,7 @@ def test_a_rehearsal_that_fails_fails_nothing() -> None:
 
 def said(source: str, *words: str) -> object:
     """Last line that a script prints, decoded from JSON."""
-    done = subprocess.run(
-        [sys.executable, "-c", source, *words], cwd=CHECKOUT, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout.splitlines()[-1])
+    return json.loads(run_script(source, *words).stdout.splitlines()[-1])
 
 
 @pytest.mark.product(4, of="processes of their own")

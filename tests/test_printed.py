@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from benchmarks import ecg2o
+from scripts import CHECKOUT
 from unifg.errors import ScenarioError
 from unifg.scenarios.papers.bazzana import PAPER as LEGS
 from unifg.scenarios.papers.control_instances import PAPER as ROWS
 from unifg.scenarios.papers.ecg2o import drive
 from unifg.scenarios.papers.printed import numbers, pairs, printed, texts
 
-CHECKOUT = Path(__file__).resolve().parent.parent
 PAPERS = CHECKOUT.parent / "shared" / "papers"
 PLACES = [(paper, place) for paper, found in printed().items() for place in found if place not in ("title", "text")]
 

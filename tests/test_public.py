@@ -7,8 +7,6 @@ import importlib
 import inspect
 import pkgutil
 import pydoc
-import subprocess
-import sys
 from types import ModuleType
 from typing import Literal, get_origin
 
@@ -16,6 +14,7 @@ import pytest
 
 import unifg as fg
 from fences import PYTHON, documents, fences
+from scripts import run_script
 
 # Rooms whose modules a user imports by name; all others are organs, but for what a backend of one's own is made of.
 OPEN = (
@@ -81,8 +80,7 @@ with event.install_listener("numba:compile", listener):
     numba.njit(lambda x: x + 1)(1.0)
 assert listener.buffer  # the witness sees what there is to see
 """
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=120)
-    assert ended.returncode == 0, ended.stderr
+    run_script(script)
 
 
 @pytest.mark.parametrize("room", [room for room in OPEN if room != "unifg.scenarios"])

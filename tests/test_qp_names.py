@@ -7,6 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.graphs import graph_with
 from problems.known import PROBLEMS, Problem, active_bounds, short_drive
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
@@ -23,8 +24,7 @@ CONSTRAINED = [problem for problem in PROBLEMS if problem.constrained]
 def test_solves_by_name(name: str, problem: Problem) -> None:
     """The same optimum and multipliers as every other route finds."""
     graph, guess = problem.build()
-    solution = SQP(qp=name).solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = SQP(qp=name).solve(graph, guess, check=True)
     assert judge(graph, solution).worst() < 5e-6
     if np.isfinite(problem.cost):
         assert solution.cost == pytest.approx(problem.cost, abs=1e-5)
@@ -36,8 +36,7 @@ def test_solves_by_name(name: str, problem: Problem) -> None:
 def test_the_named_solver_does_the_work(name: str) -> None:
     """Solve with the named solver alone, without ours behind it, beside a disc; on bounds alone, where signs show."""
     graph, guess = short_drive()
-    solution = SQP(qp=name, fallback=None).solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = SQP(qp=name, fallback=None).solve(graph, guess, check=True)
     assert {row.details["qp"] for row in solution.history[1:]} == {name}
     graph, guess = active_bounds()
     bounded = SQP(qp=name, fallback=None).solve(graph, guess, check=True)
@@ -61,11 +60,9 @@ def test_one_subproblem_is_what_the_engine_finds(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_contradictions_are_left_to_the_elastic_problem(name: str) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 1.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
     graph.bound(x, lower=-2.0, upper=2.0)
-    solution = SQP(qp=name).solve(graph, {x: np.array([[0.01, 0.02]])})
-    assert solution.converged, solution.report()
+    solution = SQP(qp=name).solve(graph, {x: np.array([[0.01, 0.02]])}, check=True)
     assert "elastic" in {row.details["qp"] for row in solution.history[1:]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -184,16 +183,13 @@ def test_terms_of_the_estimate_can_be_replaced() -> None:
         Constant(name, kind, value, 0.0) for (name, kind), value in zip(MANIFOLDS.items(), values, strict=True)
     ]
 
-    class Places:
+    class Places(Term):
         def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
             least, places = HULL + ControllerSettings().margin, graph.families["places"]
             for k, radius in enumerate(AHEAD.radii.tolist()):
                 graph.constrain(
                     avoidance.landmark_clearance, x.p[1:], places[k], radius, lower=least, name=f"landmark {k}"
                 )
-
-        def data(self, now: object) -> Mapping[str, Array]:
-            return {}
 
     class Shared(GivenFlight):
         def __init__(self, settings: ControllerSettings) -> None:

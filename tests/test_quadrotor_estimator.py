@@ -190,8 +190,7 @@ def test_the_window_is_a_problem_for_newton_too() -> None:
         estimator.predict(reading, control)
         estimator.see(reading)
         window = estimator.window
-        solution = run.solve(window.guess(), data=window.data())
-        assert solution.converged, solution.report()
+        solution = run.solve(window.guess(), data=window.data(), check=True)
         assert solution.iterations <= 6
         estimator.estimate()
 

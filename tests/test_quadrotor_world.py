@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from test_quadrotor_scene import flight
 from unifg.errors import FileFormatError, ScenarioError
 from unifg.lie import SO3
 from unifg.models import quadrotor
-from unifg.scenarios.logs.columns import Recorder
-from unifg.scenarios.logs.flight_log import FlightLog, landmark_rows
+from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.perception.readings import NOTHING
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS, QuadrotorWorld
@@ -355,38 +355,15 @@ def test_disturbances_have_the_promised_statistics() -> None:
 # ------------------------------------------------------------------- flight log
 
 
-def flown(ticks: int) -> FlightLog:
-    """A short flight with lists of changing length."""
-    layout = corridor(2)
-    world = QuadrotorWorld(layout, 2, PARAMETERS, movers=2)
-    known = {"layout": layout, "settings": {"solver": "sqp", "seed": 2}, "dt": 0.05}
-    recorder = Recorder(FlightLog, parameters_true=PARAMETERS.packed, **known)
-    for tick in range(ticks):
-        reading, state = world.sense(), world.state
-        count = len(reading.ids)
-        recorder.add(
-            truth=state, believed=state, believed_sigma=np.full(9, 0.1), controls=HOVER,
-            plans=np.tile(state[:3], (21, 1)), pasts=np.tile(state[:3], (tick, 1)),
-            landmarks=landmark_rows(
-                reading.ids, world.things()[reading.ids, :2], np.tile(np.eye(2), (count, 1, 1)), reading.radii
-            ),
-            parameters=PARAMETERS.packed, parameters_sigma=np.zeros(7), seen=reading.ids, movers=world.discs()[:, :3],
-            estimate_ms=1.0, plan_ms=2.0, compiled=0, statuses="converged", clearance=world.clearance(),
-            emergency=tick == 1, health="ok", causes="", fault="gust" if tick == 1 else "",
-        )  # fmt: skip
-        world.step(HOVER)
-    return recorder.finish(collisions=world.collisions, reached=False)
-
-
 @pytest.mark.parametrize("ticks", [0, 1, 6])
 def test_a_flight_log_survives_its_file(ticks: int, tmp_path: Path) -> None:
-    log = flown(ticks)
+    log = flight(ticks)
     assert log.ticks == ticks and len(log.seen) == ticks
     np.testing.assert_allclose(log.time, 0.05 * np.arange(ticks))
     if ticks:
-        assert log.plans.shape == (ticks, 21, 3) and log.movers.shape == (ticks, 2, 3)
-        assert log.target_distance[0] == pytest.approx(28.0)
-        assert len(log.pasts[-1]) == ticks - 1
+        assert log.plans.shape == (ticks, 21, 3) and log.movers.shape == (ticks, 1, 3)
+        assert log.target_distance[0] == pytest.approx(11.0)
+        assert len(log.pasts[-1]) == ticks
     path = tmp_path / "flight.npz"
     log.save(path)
     read = FlightLog.load(path)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from fences import CHECKOUT, PYTHON, fences
+from fences import PYTHON, fences
+from scripts import CHECKOUT
 
 README = CHECKOUT / "README.md"
 PICTURES = re.compile(r"docs/images/[\w/-]+\.(?:gif|png)")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from problems.known import line, short_drive
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton
 from unifg.typing import Array
@@ -117,8 +118,7 @@ def test_check_finds_nothing_in_a_sound_graph() -> None:
 
 
 def test_check_finds_what_nothing_determines() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 4)
+    graph, x = graph_with(fg.SE2, 4)
     graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0, 0.0])
     report = graph.check({x: np.zeros((4, 3))})
     assert [(f.kind, f.family, f.index) for f in report.findings] == [("undetermined", "x", 0)]

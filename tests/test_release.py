@@ -11,7 +11,7 @@ from types import ModuleType
 
 import pytest
 
-from fences import CHECKOUT
+from scripts import CHECKOUT
 
 
 @pytest.fixture(scope="module")

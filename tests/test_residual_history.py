@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from problems.known import short_drive
 from unifg.scenarios.scenes.residual_plot import ResidualMonitor, residual_picture
 from unifg.solution.history import factor_norms
@@ -92,8 +93,7 @@ BACKENDS: list[fg.Solver] = [
 @pytest.mark.parametrize("solver", BACKENDS, ids=lambda solver: solver.name)
 def test_every_backend_keeps_them_when_asked_and_nothing_else_changes(solver: fg.Solver) -> None:
     if isinstance(solver, GaussNewton | LevenbergMarquardt | DogLeg | KKT):
-        graph = fg.Graph()
-        x = graph.variables("x", fg.SE2, 5)
+        graph, x = graph_with(fg.SE2, 5)
         if isinstance(solver, KKT):
             graph.constrain(fg.prior, x[-1], np.array([1.0, 2.0, 1.0]), lower=0.0, upper=0.0, name="end")
         graph.minimize(fg.prior, x[0], np.zeros(3), name="first")
@@ -155,8 +155,7 @@ def test_nothing_is_worked_out_unless_asked(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_the_data_of_a_row_are_those_of_its_solve() -> None:
     """A prepared solver goes on with other data; what a solution says of its own factors does not move."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     target, limit = graph.data("target", np.array([1.0])), graph.data("limit", np.array([0.5]))
     graph.minimize(fg.prior, x, target, name="prior")
     graph.constrain(lambda a: a, x[0], upper=limit, name="limit")
@@ -170,8 +169,7 @@ def test_the_data_of_a_row_are_those_of_its_solve() -> None:
 
 
 def test_stages_of_another_solver_keep_theirs() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, np.zeros(1), name="prior")
     measured = graph.data("measured", [[0.1], [0.2], [9.0]], each=True)
     graph.minimize(lambda a, z: a - z, x, measured, robust=fg.TruncatedLeastSquares(1.0), name="range")
@@ -228,8 +226,7 @@ def test_a_monitor_draws_while_the_solver_goes_on(tmp_path: Path) -> None:
 
 def test_what_fits_exactly_can_be_drawn() -> None:
     """Zeros have no logarithm; a term without any error is one even colour."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     graph.minimize(fg.prior, x, np.zeros(1), name="prior")
     solution = GaussNewton(keep_residuals=True).solve(graph, {x: np.zeros((2, 1))})
     figure = residual_picture(solution.history)

@@ -84,8 +84,7 @@ def test_drives_as_a_hard_constraint(form: Method) -> None:
     dynamics = rkmk.integrator(fg.SE2, current, form)
     graph.constrain(dynamics, x[:-1], u, x[1:], h, lower=0.0, upper=0.0, name="dynamics")
     start = {x: np.zeros((count + 1, 3)), u: np.zeros((count, 2))}
-    solution = SQP().solve(graph, start)
-    assert solution.converged, solution.report()
+    solution = SQP().solve(graph, start, check=True)
     nodes = zip(solution[x][:-1], solution[u], strict=True)
     moved = np.concatenate([implicit_step(form, pose[None], control[None], h) for pose, control in nodes])
     assert np.abs(fg.SE2.local(moved, solution[x][1:])).max() < 1e-5

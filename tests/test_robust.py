@@ -15,6 +15,7 @@ import unifg as fg
 from benchmarks import gtsam_peer
 from benchmarks.wrong_closures import COLUMNS, METHODS, aligned_error, attempt
 from problems.closures import Claim, with_wrong_closures
+from problems.graphs import graph_with
 from unifg.errors import BackendError, GraphError
 from unifg.factors.robust import Graduated, Loss
 from unifg.files.g2o import read_g2o
@@ -72,8 +73,7 @@ def line_with_outliers() -> tuple[fg.Graph, fg.Family, BoolArray, dict[fg.Family
     y = 2.0 * x + 1.0 + 0.01 * rng.standard_normal(40)
     wrong = rng.random(40) < 0.45
     y[wrong] += rng.uniform(1.0, 6.0, int(wrong.sum()))
-    graph = fg.Graph()
-    line = graph.variables("line", fg.Rn(2), 1)
+    graph, line = graph_with(fg.Rn(2), 1, "line")
 
     def misfit(line: Array, x: Array, y: Array) -> Array:
         return line[:, :1] * x + line[:, 1:] - y
@@ -147,8 +147,7 @@ def test_data_and_interruptions_reach_the_stages() -> None:
 
 
 def test_graduation_wants_a_loss_it_can_graduate() -> None:
-    graph = fg.Graph()
-    line = graph.variables("x", fg.Rn(1), 1)
+    graph, line = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, line, [1.0], robust=fg.Huber())
     with pytest.raises(BackendError, match="no term has a loss with surrogates"):
         GraduatedNonConvexity().solve(graph, {line: [[0.0]]})
@@ -374,8 +373,7 @@ def test_wrong_closures_that_agree_with_each_other(seed: int) -> None:
 
 def test_a_verdict_names_what_is_doubted_and_what_is_inactive() -> None:
     """Within the threshold a measurement counts, though nothing else is as far off; an inactive one does not count."""
-    graph = fg.Graph()
-    point = graph.variables("point", fg.Rn(1), 1)
+    graph, point = graph_with(fg.Rn(1), 1, "point")
     y = np.concatenate([1e-3 * np.random.default_rng(1).standard_normal(40), [0.5, 9.0, 0.0]])
     active = np.arange(43) < 42
     loss = fg.TruncatedLeastSquares(3.0)

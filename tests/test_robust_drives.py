@@ -12,6 +12,7 @@ import pytest
 import unifg as fg
 from problems.closures import with_wrong_closures
 from problems.drives import Kind, aliased, drive, slipped
+from problems.graphs import graph_with
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.pose_graphs import Edges, PoseGraph, chordal, lago, manhattan, odometric, pairwise_consistent
 from unifg.scenarios import command
@@ -227,8 +228,7 @@ def test_a_group_is_taken_out_as_dense_algebra_does() -> None:
 
 def test_groups_join_the_same_stretches() -> None:
     ends = [(0, 100), (10, 95), (20, 90), (20, 130), (200, 100), (205, 110), (400, 3), (401, 4), (402, 5), (403, 300)]
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 500)
+    graph, x = graph_with(fg.Rn(1), 500)
     first, second = np.array(ends).T
     graph.minimize(fg.between, x[first], x[second], [0.0], name="pairs")
     graph.minimize(fg.prior, x[np.arange(500)], np.zeros((500, 1)), name="alone")

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.errors import GraphError
 from unifg.factors.autodiff.captured import captured_by
 from unifg.factors.autodiff.lookup import Lookup
@@ -39,8 +40,7 @@ def own_clearance(x: Array, c: Array) -> Array:
 
 def route(function: Function, *arguments: Any, count: int = 6, size: int = 3) -> str:
     """Route of the only term of a graph."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(size), count)
+    graph, x = graph_with(fg.Rn(size), count)
     graph.minimize(function, x, *arguments, name="term")
     return graph.compile().terms[0].route
 
@@ -54,8 +54,7 @@ def test_a_flat_guess_does_not_decide_how_an_array_is_read(solver: fg.Solver, fu
     array = np.zeros_like(OBSTACLES) if given == "changed" else OBSTACLES.copy()
     scene = types.ModuleType("scene")
     setattr(scene, "c", array)  # noqa: B010
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), N)
+    graph, x = graph_with(fg.Rn(2), N)
     graph.minimize(lambda x, a: x - a, x, NODES)
     called: dict[str, tuple[Function, tuple[Any, ...]]] = {
         "data": (function, (x, graph.data("c", array))),
@@ -74,8 +73,7 @@ def test_a_flat_guess_does_not_decide_how_an_array_is_read(solver: fg.Solver, fu
     true = float(np.maximum(-np.asarray(function(solution[x], OBSTACLES)), 0.0).max())
     assert solution.converged and solution.violation == pytest.approx(true, abs=1e-12)
     assert np.asarray(function(NODES, OBSTACLES)).min() < -0.2  # the constraint matters at the answer
-    expected = fg.Graph()
-    y = expected.variables("x", fg.Rn(2), N)
+    expected, y = graph_with(fg.Rn(2), N)
     expected.minimize(lambda x, a: x - a, y, NODES)
     declared = fg.shared(OBSTACLES) if function is clearance else fg.each(OBSTACLES)
     expected.constrain(function, y, declared, lower=0.0, upper=10.0)
@@ -83,8 +81,7 @@ def test_a_flat_guess_does_not_decide_how_an_array_is_read(solver: fg.Solver, fu
 
 
 def test_a_reported_cost_is_that_of_the_function() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), N)
+    graph, x = graph_with(fg.Rn(2), N)
     graph.minimize(lambda x: 100.0 * np.maximum(0.5 - np.linalg.norm(x[:, None] - OBSTACLES, axis=2), 0.0).sum(
         axis=1, keepdims=True), x)  # fmt: skip
     graph.minimize(lambda x, a: x - a, x, NODES)
@@ -141,8 +138,7 @@ def test_long_batches_that_two_short_ones_do_not_decide_stay_in_python(function:
     """At two short lengths their rows look alike: only the use of the length tells."""
     count = traced.WHOLE + 1
     assert "which factor they belong to" in route(function, count=count)
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), count)
+    graph, x = graph_with(fg.Rn(3), count)
     graph.minimize(function, x, name="term")
     program = graph.compile()
     values = program.values_from({x: np.ones((count, 3))})
@@ -179,22 +175,19 @@ def test_what_is_declared_is_obeyed(make: str) -> None:
         return fg.each(value) if each else fg.shared(value)
 
     for each, expected in ((True, ROWS), (False, ROWS[0])):
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(3), 6)
+        graph, x = graph_with(fg.Rn(3), 6)
         function: Function = (lambda x, c: x - c) if each else (lambda x, c: x - c[0])
         graph.minimize(function, x, declared(graph, ROWS, each), name="term")
         assert graph.compile().terms[0].route == EXACT
         found = GaussNewton().solve(graph, {x: np.zeros((6, 3))})[x]
         np.testing.assert_allclose(found, expected + np.zeros((6, 3)), atol=1e-9)
-        wrong = fg.Graph()
-        y = wrong.variables("x", fg.Rn(3), 6)
+        wrong, y = graph_with(fg.Rn(3), 6)
         wrong.minimize(function, y, declared(wrong, ROWS, not each), name="term")
         assert wrong.compile().terms[0].route.startswith("evaluated by Python")
 
 
 def test_declarations_are_checked() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 6)
+    graph, x = graph_with(fg.Rn(3), 6)
     with pytest.raises(GraphError, match=r"argument 1, by fg\.each, has 5"):
         graph.minimize(lambda x, c: x - c, x, fg.each(ROWS[:5]))
     with pytest.raises(GraphError, match="found a scalar"):
@@ -212,8 +205,7 @@ def test_unclear_arrays_of_functions_in_python_get_a_call_for_each_move() -> Non
         return np.asarray(x - float(np.max(c)))
 
     for argument in (WEIGHTS, fg.shared(WEIGHTS), fg.each(WEIGHTS)):
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(3), 6)
+        graph, x = graph_with(fg.Rn(3), 6)
         graph.minimize(seen, x, argument, name="term")
         program = graph.compile()
         values = program.values_from({x: np.zeros((6, 3))})
@@ -258,8 +250,7 @@ class Stairs(Lookup):
 def test_tables_are_read_in_batches() -> None:
     """Two tables, of which the second stands behind the first."""
     first, second = Stairs([1.0, 2.0, 4.0]), Stairs([10.0, 20.0, 40.0, 80.0])
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     graph.minimize(fg.residual(lambda x: first(x) + second(x), derivatives="trace"), x)
     program = graph.compile()
     assert program.terms[0].route.startswith("traced")

@@ -10,6 +10,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.graphs import graph_with
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
 from unifg.solvers.quadratic_programs.scaling import MODEST, Scaling
@@ -45,8 +46,7 @@ def named(units: dict[str, float]) -> str:
 def test_units_do_not_decide_whether_sqp_converges(units: dict[str, Any], hessian: Any) -> None:
     """The same optimum in about as many steps; the judge keeps to the units of the graph, in which slopes are large."""
     graph, guess = drive(**units)
-    solution = SQP(hessian=hessian).solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = SQP(hessian=hessian).solve(graph, guess, check=True)
     assert min(abs(solution.cost / cost - 1.0) for cost in (COST, OTHER_COST)) < 1e-4, solution.report()
     assert solution.iterations <= 25, solution.report()
     if max(units.values()) <= 1e4:  # the judge's differences are too coarse for the others
@@ -100,8 +100,7 @@ def test_a_scaled_subproblem_is_the_same_subproblem() -> None:
 
 def beside_disc(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
     """A point in a disc of radius one and beyond a wall ``gap`` outside of it."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [2.0, 0.5])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="disc")
     graph.constrain(lambda p: p[:, :1], x, lower=1.0 + gap, name="wall")
@@ -110,8 +109,7 @@ def beside_disc(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
 
 def between_lines(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
     """Two half planes that miss each other by ``gap``."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [2.0, 0.5])
     graph.constrain(lambda p: p.sum(axis=1, keepdims=True), x, upper=1.0, name="below")
     graph.constrain(lambda p: p.sum(axis=1, keepdims=True), x, lower=1.0 + gap, name="above")
@@ -132,26 +130,22 @@ def test_constraints_that_miss_each_other_by_little_are_infeasible(build: Any, g
 @pytest.mark.parametrize("build", [beside_disc, between_lines])
 def test_constraints_that_just_meet_are_not(build: Any) -> None:
     for gap in (-1e-5, -1e-3):
-        solution = replace(SQP()).solve(*build(gap))
-        assert solution.converged, solution.report()
+        replace(SQP()).solve(*build(gap), check=True)
 
 
 @pytest.mark.parametrize("information", [1e-24, 1e-12, 1e-6, 1e6, 1e12, 1e24])
 @pytest.mark.parametrize("hessian", ["gauss-newton", "exact"])
 def test_least_squares_has_no_unit_of_cost(hessian: Literal["gauss-newton", "exact"], information: float) -> None:
     """Neither damping nor what counts as rounding may have one: a curved valley, and eight poses around a loop."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(2), 1)
+    graph, p = graph_with(fg.Rn(2), 1, "p")
     graph.minimize(
         lambda v: np.stack([10.0 * (v[:, 1] - v[:, 0] ** 2), 1.0 - v[:, 0] + 0.1 * v[:, 1] ** 3], axis=1),
         p, information=information * np.eye(2),
     )  # fmt: skip
-    solution = SQP(hessian=hessian).solve(graph, {p: [[-1.2, 1.0]]})
-    assert solution.converged, solution.report()
+    solution = SQP(hessian=hessian).solve(graph, {p: [[-1.2, 1.0]]}, check=True)
     assert solution.iterations <= 50
     rng = np.random.default_rng(3)
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 8)
+    graph, x = graph_with(fg.SE2, 8)
     graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], information=information * np.eye(3))
     steps = np.array([1.0, 0.1, 0.5]) + 0.1 * rng.standard_normal((7, 3))
     graph.minimize(fg.between, x[:-1], x[1:], steps, information=information * np.diag([1.0, 2.0, 10.0]))

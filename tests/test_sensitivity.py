@@ -13,6 +13,7 @@ import pytest
 
 import unifg as fg
 from problems.control import Problem, Unicycle, problems, sixteen
+from problems.graphs import graph_with
 from unifg.models import unicycle
 from unifg.pose_graphs import manhattan, sphere
 from unifg.problem.fixed_columns import FixedColumns
@@ -114,8 +115,7 @@ def test_control_cases(problem: Problem) -> None:
 
 def walk(state: Callable[..., Any]) -> tuple[fg.Graph, fg.Family]:
     """Five poses that are drawn to places, with whatever is stated besides."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 5)
+    graph, x = graph_with(fg.SE2, 5)
     graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.1, 0.2], sigma=[0.2, 0.3, 0.1], name="steps")
     graph.minimize(fg.prior, x[0], [0.1, 0.0, 0.3], sigma=[0.4, 0.5, 0.3], name="first")
     state(graph, x)
@@ -248,8 +248,7 @@ def test_every_backend_has_the_same(name: str) -> None:
 def test_measurements_of_a_pose_graph(space: bool, loss: Any) -> None:
     made = sphere(4, 8, seed=1) if space else manhattan(60, seed=1)
     edges, poses = made.pose_graph.edges, made.pose_graph.poses
-    graph = fg.Graph()
-    x = graph.variables("x", made.pose_graph.group, len(poses))
+    graph, x = graph_with(made.pose_graph.group, len(poses))
     graph.fix(x[0], poses[0])
     measured = graph.data("measured", edges.measured, each=True)
     sigma = graph.data("sigma", np.repeat([0.05, 0.02], 3 if space else [2, 1]))
@@ -262,8 +261,7 @@ def test_measurements_of_a_pose_graph(space: bool, loss: Any) -> None:
 def test_graduated_non_convexity_keeps_what_it_believes() -> None:
     made = manhattan(60, seed=1, outliers=0.2)
     edges = made.pose_graph.edges
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 60)
+    graph, x = graph_with(fg.SE2, 60)
     graph.fix(x[0], made.pose_graph.poses[0])
     measured = graph.data("measured", edges.measured, each=True)
     loss = fg.TruncatedLeastSquares(5.0)
@@ -331,16 +329,14 @@ def refused(solution: fg.Solution, words: str, of: Any = "x", wrt: Any = "p") ->
 
 def point(state: Callable[[fg.Graph, fg.Family], Any], tolerance: float = 1e-8, begin: Any = 0.1) -> fg.Solution:
     """One point in the plane."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     state(graph, x)
     guess = {x: np.broadcast_to(np.asarray(begin, dtype=float), (1, 2))}
     return InteriorPoint(tolerance=tolerance).solve(graph, guess)
 
 
 def test_what_did_not_converge_has_no_sensitivities() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(lambda x, p: np.sin(x) - p, x, graph.data("p", [0.3, 0.1]))
     refused(LevenbergMarquardt(max_iterations=1).solve(graph, {x: [[1.0, 1.0]]}), "ITERATION_LIMIT")
 
@@ -412,8 +408,7 @@ def test_a_saddle_is_refused() -> None:
         graph.minimize_scalar(lambda x, p: np.cos(x[:, 0]) + 0.5 * (x[:, 1] - p) ** 2, x, graph.data("p", 1.0))
         graph.constrain(lambda x: x, x, upper=9.0, name="wall")
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     state(graph, x)
     refused(SQP().solve(graph, {x: [[0.0, 1.0]]}, check=True), "reduced Hessian is indefinite")
 
@@ -449,8 +444,7 @@ def test_kinks_flags_losses_and_names_are_refused() -> None:
 
 def test_rows_between_fixed_variables_say_nothing() -> None:
     """Neither that they are weakly active, nor that they depend on others."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 2)
+    graph, x = graph_with(fg.Rn(2), 2)
     p = graph.data("p", [1.0, 2.0])
     graph.fix(x[0], p)
     graph.constrain(lambda x: x, x[0], lower=[1.0, 2.0], upper=[1.0, 9.0], name="kept")
@@ -463,8 +457,7 @@ def test_rows_between_fixed_variables_say_nothing() -> None:
 
 
 def test_data_that_have_been_replaced_are_noticed() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     p = graph.data("p", [1.0, 2.0])
     graph.minimize(lambda x, p: np.sinh(x - p * p), x, p)
     run = LevenbergMarquardt(tolerance=TIGHT).prepare(graph)
@@ -535,8 +528,7 @@ BESIDE: dict[str, Callable[[fg.Graph, fg.Family], Any]] = {
 
 @pytest.mark.parametrize("kind", BESIDE)
 def test_columns_of_fixed_variables_are_those_of_the_problem_without_the_fix(kind: str) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 4)
+    graph, x = graph_with(fg.Rn(2), 4)
     graph.fix(x[[0, 2]], [[0.3, -0.5], [0.8, 0.2]])
     graph.minimize(fg.prior, x, np.array([[0.2, 0.1], [1.0, 0.7], [0.4, 0.4], [-0.6, 1.2]]), name="prior")
     BESIDE[kind](graph, x)

@@ -7,7 +7,8 @@ import pytest
 from numpy.random import Generator
 
 import unifg as fg
-from unifg.horizon import Constant, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
+from problems.graphs import graph_with
+from unifg.horizon import Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.lie import SE23, SO3
 from unifg.models.inertial import InertialMeasurements
 from unifg.models.interpolation import cubic
@@ -65,8 +66,7 @@ def test_a_window_equals_the_whole_history(rng: Generator) -> None:
             fed += 1
         window.estimate()
 
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(2), tick + 1)
+        graph, x = graph_with(fg.Rn(2), tick + 1)
         graph.minimize(fg.prior, x[0], start, sigma=0.2)
         graph.minimize(drift, x[:-1], controls[:tick], x[1:], H, sigma=0.01)
         whole = fixes_of(16)
@@ -105,16 +105,13 @@ def test_one_sensor_stands_in_both_graphs_of_a_joint_loop(rng: Generator) -> Non
         known = Measurement("own", fg.prior, (2,), 0.01)
         window = Window(robot, 8, [Dynamics(drift, H, sigma=0.01), sensor, known], start=np.zeros(2), sigma=0.2)
 
-        class Goal:
-            def state(self, graph: fg.Graph, x: fg.Family, u: fg.Family) -> None:
+        class Goal(Term):
+            def state(self, graph: fg.Graph, x: fg.Selection, u: fg.Family) -> None:
                 graph.minimize(fg.prior, x[1:], [5.0, 3.0], sigma=1.0, name="goal")
                 graph.bound(u, lower=-1.0, upper=1.0)
 
-            def data(self, now: Context[None]) -> dict[str, Array]:
-                return {}
-
         terms = [Dynamics(drift, H), Goal(), ControlCost(sigma=[3.0, 3.0])]
-        loop = RecedingHorizon(robot, 6, terms, solver=SQP(), window=window, coupling=coupling)  # type: ignore[arg-type]
+        loop = RecedingHorizon(robot, 6, terms, solver=SQP(), window=window, coupling=coupling)
         truth, before = np.zeros(2), np.zeros(2)
         for tick in range(count):
             for s in (0.5, 0.9) if tick else ():  # stamps of a clock that is behind

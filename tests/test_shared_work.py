@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -15,6 +13,8 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
+from scripts import run_script
 from unifg.codegen import threads as crews
 from unifg.codegen.jit import compiled
 from unifg.codegen.threads import cores, share, threads
@@ -146,7 +146,7 @@ def test_a_forked_child_has_threads_of_its_own() -> None:
         "    os._exit(0 if np.array_equal(run.solve(guess)[x], here) and hands == 2 else 1)\n"
         "raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
     )
-    assert subprocess.run([sys.executable, "-c", script], timeout=120).returncode == 0
+    run_script(script)
 
 
 def test_little_work_is_not_shared_out() -> None:
@@ -216,8 +216,7 @@ def test_entries_that_several_shares_write_to_stand_beside_the_matrix(lattice: P
 def test_shares_that_meet_in_parts_of_blocks() -> None:
     """Positions alone in another share than the steps: beside the matrix, rows of blocks do not follow each other."""
     count = 9000
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Product(position=fg.Rn(2), heading=fg.Rn(1)), count)
+    graph, x = graph_with(fg.Product(position=fg.Rn(2), heading=fg.Rn(1)), count)
     here, there = np.arange(count - 1), np.arange(1, count)
     moved = np.tile([0.1, 0.0, 0.01], (count - 1, 1))
     graph.minimize(fg.between, x[here], x[there], graph.data("moved", moved, each=True), sigma=0.1, name="steps")

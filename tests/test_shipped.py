@@ -7,7 +7,6 @@ import importlib.util
 import logging
 import lzma
 import re
-import subprocess
 import sys
 import zipfile
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from scripts import run_script
 from unifg.codegen import compile_counter, fingerprint, jit, precompiled
 from unifg.codegen.compile_counter import Tally, counting
 from unifg.codegen.jit import compiled, in_order
@@ -209,9 +209,7 @@ def test_the_first_function_of_a_process_can_be_generated(archive: Path, tmp_pat
     with precompiled.recording() as recorder:
         compiled(module(tmp_path / "there" / "doubling.py", source).first)((3.0, 1.0))
     recorder.write(archive)
-    command = [sys.executable, "-c", FIRST, str(archive), str(tmp_path / "there" / "doubling.py")]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    run_script(FIRST, archive, tmp_path / "there" / "doubling.py")
 
 
 @pytest.mark.parametrize(

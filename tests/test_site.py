@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import importlib
 import sys
-from pathlib import Path
 
 import pytest
 import yaml
 
 import unifg as fg
+from scripts import CHECKOUT
 
-CHECKOUT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(CHECKOUT / "docs" / "site"))
 
-import reference  # noqa: E402
+import reference
 
 
 def test_every_page_has_a_place() -> None:

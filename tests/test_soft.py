@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.modeling.soft import SlackFamily
 from unifg.models.obstacles import disc_clearance
 from unifg.models.unicycle import dynamics
@@ -36,8 +37,7 @@ def length(x: Array) -> Array:
 
 def ring(soft: Any, lower: Any = 1.0, upper: Any = None, **options: Any) -> tuple[fg.Graph, fg.Family]:
     """Points pulled to places of which some are nearer to the origin than they may be."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), N)
+    graph, x = graph_with(fg.Rn(2), N)
     graph.minimize(fg.prior, x, FAR, sigma=1.0, name="pull")
     limits = {} if lower is None else {"lower": lower}
     limits |= {} if upper is None else {"upper": upper}
@@ -69,12 +69,10 @@ def test_the_answer_is_that_of_slack_variables_by_hand(
     solver: fg.Solver, price: tuple[float, float], limits: tuple[float, float]
 ) -> None:
     own, guess = by_hand(*price, *limits)
-    expected = InteriorPoint(tolerance=1e-9).solve(own, guess)
-    assert expected.converged
+    expected = InteriorPoint(tolerance=1e-9).solve(own, guess, check=True)
     x, s, t = own.families.values()
     graph, y = ring(fg.Soft(*price), *limits)
-    found = (solver if solver.name == "Penalty" else tight(solver)).solve(graph, {y: np.full((N, 2), 0.5)})
-    assert found.converged
+    found = (solver if solver.name == "Penalty" else tight(solver)).solve(graph, {y: np.full((N, 2), 0.5)}, check=True)
     np.testing.assert_allclose(found[y], expected[x], atol=2e-5)
     np.testing.assert_allclose(found.slack("ring"), expected[t] - expected[s], atol=2e-5)
     np.testing.assert_allclose(found.dual("ring"), expected.dual("ring"), atol=5e-5)
@@ -140,8 +138,7 @@ def test_a_drive_past_a_disc(solver: fg.Solver) -> None:
 @pytest.mark.parametrize("solver", [InteriorPoint(), SQP(), AugmentedLagrangian()], ids=named)
 def test_limits_that_exclude_each_other_give_way(solver: fg.Solver) -> None:
     def stated(soft: Any) -> tuple[fg.Graph, fg.Family]:
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(1), 2)
+        graph, x = graph_with(fg.Rn(1), 2)
         graph.minimize(fg.prior, x, [0.0], sigma=1.0)
         graph.bound(x, lower=2.0, name="least")
         graph.constrain(lambda x: x, x, upper=1.0, soft=soft, name="most")
@@ -173,8 +170,7 @@ def stretch(x: Array) -> Array:
 def test_weights_of_rows_and_of_stages(each: bool, as_data: bool) -> None:
     """Row 0 pulls x down by w0 above 1, row 1 by 2 w1 above 1 / 2."""
     weights = np.array([[0.6, 0.25], [0.2, 0.1], [0.1, 0.9]]) if each else np.array([0.6, 0.25])
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     graph.minimize(fg.prior, x, [3.0], sigma=1.0)
     price: Any = graph.data("price", weights) if as_data else weights
     graph.constrain(stretch, x, upper=1.0, soft=price, name="both")
@@ -190,8 +186,7 @@ def test_weights_of_rows_and_of_stages(each: bool, as_data: bool) -> None:
 
 @pytest.mark.parametrize("solver", [InteriorPoint(), SQP(), AugmentedLagrangian()], ids=named)
 def test_data_as_limits_and_masks(solver: fg.Solver) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     upper = graph.data("upper", np.array([[1.0], [2.0], [np.inf]]))
     active = graph.data("active", np.ones(3, dtype=bool), each=True)
     graph.minimize(fg.prior, x, [3.0], sigma=1.0)
@@ -204,8 +199,7 @@ def test_data_as_limits_and_masks(solver: fg.Solver) -> None:
 
     for most, mask in (([1.0, 2.0, np.inf], [1, 1, 1]), ([1.0, 2.0, -1.0], [1, 0, 1]), ([2.9, 3.2, 4.0], [1, 1, 1])):
         on = np.array(mask, dtype=bool)
-        found = run.solve(guess, data={upper: np.array(most)[:, None], active: on})
-        assert found.converged
+        found = run.solve(guess, data={upper: np.array(most)[:, None], active: on}, check=True)
         right = np.where(np.asarray(most) >= 2.8, np.minimum(most, 3.0), expected(most, on))
         right = np.where(on, right, 3.0)
         np.testing.assert_allclose(found[x].ravel(), right, atol=2e-5)
@@ -233,8 +227,7 @@ def test_attached_differenced_and_demanded_derivatives() -> None:
         fg.residual(bent, derivatives="differences"),
         fg.residual(bent, bent_jacobian, derivatives="trace"),
     ):
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(2), N)
+        graph, x = graph_with(fg.Rn(2), N)
         graph.minimize(fg.prior, x, FAR + 1.0, sigma=1.0)
         graph.constrain(own, x, 1.5, lower=-0.5, upper=[0.5, 1.0], soft=0.4, name="own")
         found = SQP().solve(graph, {x: np.full((N, 2), 0.3)})
@@ -255,12 +248,10 @@ def test_attached_differenced_and_demanded_derivatives() -> None:
 
 def test_bounds_give_way_too() -> None:
     state = fg.Product(p=fg.SE2, v=fg.Rn(2))
-    graph = fg.Graph()
-    x = graph.variables("x", state, 3)
+    graph, x = graph_with(state, 3)
     graph.minimize(fg.prior, x, state.pack(p=[1.0, 2.0, 0.3], v=[2.0, -3.0]), sigma=1.0)
     graph.bound(x.v, lower=-1.0, upper=[1.0, np.inf], soft=[0.3, 50.0], name="speed")
-    found = InteriorPoint().solve(graph, {x: np.tile(state.identity(), (3, 1))})
-    assert found.converged
+    found = InteriorPoint().solve(graph, {x: np.tile(state.identity(), (3, 1))}, check=True)
     np.testing.assert_allclose(found[x.v], np.tile([1.7, -1.0], (3, 1)), atol=1e-5)
     np.testing.assert_allclose(found.slack("speed"), np.tile([0.7, 0.0], (3, 1)), atol=1e-5)
     np.testing.assert_allclose(found.dual("speed"), np.tile([0.3, -2.0], (3, 1)), atol=1e-5)
@@ -305,8 +296,7 @@ def test_a_graph_with_soft_constraints_changes_as_any_other() -> None:
 
 
 def test_data_of_prices_leave_with_their_term() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     price = graph.data("price", 2.0)
     graph.minimize(fg.prior, x, [3.0], sigma=1.0)
     graph.constrain(lambda x: x, x, upper=1.0, soft=price, name="most")

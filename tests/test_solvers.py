@@ -9,6 +9,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.graphs import graph_with
 from problems.known import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
 from unifg.solvers import (
     KKT,
@@ -59,8 +60,7 @@ def test_backend_solves_or_refuses(solver: fg.Solver, problem: Problem) -> None:
             solver.solve(graph, guess)
         return
     untouched = {family: np.array(array) for family, array in guess.items()}
-    solution = solver.solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = solver.solve(graph, guess, check=True)
     assert judge(graph, solution).worst() < 2e-6
     # A penalty leaves violations: the cost falls by what they are worth.
     bought = sum(float(np.abs(dual).sum()) for dual in solution.multipliers.values()) * solution.violation
@@ -85,8 +85,7 @@ def test_backend_solves_or_refuses(solver: fg.Solver, problem: Problem) -> None:
 def test_started_at_the_answer_takes_no_step(solver: fg.Solver) -> None:
     graph, guess = short_drive()
     first = solver.solve(graph, guess, check=True)
-    again = solver.solve(graph, first)
-    assert again.converged
+    again = solver.solve(graph, first, check=True)
     assert again.iterations == 0
     assert again.cost == first.cost
 
@@ -111,12 +110,10 @@ def test_single_solves_share_a_workspace_and_nothing_else(solver: fg.Solver) -> 
 def test_bazzana_schedule_is_the_literal_loop() -> None:
     """One primal and one dual step per iteration at constant penalty, in PHR form."""
     graph, guess = inactive_inequality()
-    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess)
-    assert solution.converged
+    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess, check=True)
     assert solution[graph.families["x"]][0, 0] == pytest.approx(0.2, abs=1e-7)
     graph, guess = ecg2o((-0.2, -0.2))
-    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess)
-    assert solution.converged
+    solution = AugmentedLagrangian(schedule="bazzana", penalty=10.0).solve(graph, guess, check=True)
     assert {row.details["penalty"] for row in solution.history[1:]} == {10.0}
 
 
@@ -133,8 +130,7 @@ def test_bazzana_stop_rule_does_not_claim_convergence() -> None:
 
 @pytest.mark.parametrize("solver", [AugmentedLagrangian(), SQP()], ids=["alm", "sqp"])
 def test_infeasible_problem_is_named(solver: fg.Solver) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [0.0, 0.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="inside")
     graph.bound(x, lower=[2.0, -9.0], upper=[9.0, 9.0], name="outside")
@@ -146,8 +142,7 @@ def test_infeasible_problem_is_named(solver: fg.Solver) -> None:
 
 def test_sqp_history_names_the_route() -> None:
     graph, guess = short_drive()
-    solution = SQP(qp_iterations=1).solve(graph, guess)
-    assert solution.converged
+    solution = SQP(qp_iterations=1).solve(graph, guess, check=True)
     routes = {str(row.details["qp"]) for row in solution.history[1:]}
     assert routes <= {"osqp", "piqp", "elastic"}
     assert "piqp" in routes, "one iteration is too few for OSQP here, so the fallback must appear"
@@ -155,13 +150,11 @@ def test_sqp_history_names_the_route() -> None:
 
 def test_sqp_is_elastic_when_the_linearisation_is_infeasible() -> None:
     """At the origin the linearised circle asks for an impossible step within the box."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 1.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
     graph.bound(x, lower=-2.0, upper=2.0)
-    solution = SQP().solve(graph, {x: np.array([[0.01, 0.02]])})
-    assert solution.converged, solution.report()
+    solution = SQP().solve(graph, {x: np.array([[0.01, 0.02]])}, check=True)
     assert any("elastic" in str(row.details.get("qp")) for row in solution.history)
     np.testing.assert_allclose(solution[x], 0.5**0.5, atol=1e-6)
 
@@ -182,14 +175,12 @@ def test_warm_start_needs_fewer_iterations() -> None:
         cold = run.solve(guess)
         shifted = cold.shifted(x, u, by=0)
         values = {**shifted.values, u: shifted.values[u] + 1e-4}
-        warm = run.solve(fg.Guess(values, shifted.multipliers))
-        assert warm.converged
+        warm = run.solve(fg.Guess(values, shifted.multipliers), check=True)
         assert warm.iterations < cold.iterations
 
 
 def test_unbounded_objective_is_reported() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)
     graph.bound(x, lower=0.0)
     solution = SQP(max_iterations=500).solve(graph, {x: np.array([[1.0]])})
@@ -212,13 +203,11 @@ def test_time_limit_and_callback_end_a_solve() -> None:
 
 def test_full_steps_and_no_fallback_are_options() -> None:
     graph, guess = ecg2o((0.5, -0.5))
-    solution = SQP(full_steps=True).solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = SQP(full_steps=True).solve(graph, guess, check=True)
     # Equalities only: every subproblem is one linear system, which the engine solves.
     assert {row.details["qp"] for row in solution.history[1:]} == {"graph"}
     graph, guess = inactive_inequality()
-    solution = SQP(full_steps=True, fallback=None, qp_iterations=4000).solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = SQP(full_steps=True, fallback=None, qp_iterations=4000).solve(graph, guess, check=True)
     assert {row.details["qp"] for row in solution.history[1:]} == {"osqp"}
 
 
@@ -253,8 +242,7 @@ def test_alm_leaves_a_subproblem_whose_steps_are_too_short_to_be_of_use() -> Non
 @pytest.mark.parametrize("solver", BACKENDS, ids=IDS)
 def test_a_far_start_overflows_in_silence(solver: fg.Solver) -> None:
     """Squares of 1e160 overflow; that is for the status to say, not for a warning or an error of a QP solver."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(lambda p: np.stack([p[:, 0] + np.exp(-p[:, 1]), p[:, 0] ** 2 + 2.0 * p[:, 1]], axis=1), x)
     constrained = not isinstance(solver, GaussNewton | LevenbergMarquardt | DogLeg)
     if constrained:

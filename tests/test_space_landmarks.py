@@ -7,6 +7,7 @@ import pytest
 from numpy.random import Generator
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.errors import ModelError
 from unifg.lie import SE3, SE23, SO3
 from unifg.models.quadrotor import STATE
@@ -119,8 +120,7 @@ def test_a_direction_without_length_is_refused(
     z = observe_3d(SE3.identity(), marks)
     z[3, :3] = 0.0
     for active in (None, np.arange(4) < 3):
-        graph = fg.Graph()
-        x = graph.variables("x", SE3, 1)
+        graph, x = graph_with(SE3)
         given = graph.data("z", z, each=True) if data else z
         graph.minimize(bearing_range_3d(), x[[0] * 4], marks, given, sigma=0.1, active=active, name="seen")
         start = {x: SE3.exp(np.full(6, 0.1))[None]}

@@ -7,6 +7,7 @@ import pytest
 from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 import unifg as fg
+from problems.graphs import graph_with
 from test_derive import compared, curved, evaluated
 from unifg.errors import ModelError
 from unifg.factors.autodiff.rows import traced
@@ -174,8 +175,7 @@ def test_fields_that_compute_the_same_are_known_as_equal() -> None:
 def test_a_graph_is_traced_through_a_field() -> None:
     """A function that reaches a field is compiled with its table, and solved with exact derivatives."""
     bowl = SplineField(np.add.outer((np.arange(8.0) - 3.3) ** 2, (np.arange(9.0) - 4.6) ** 2), 1.0)
-    graph = fg.Graph()
-    x = graph.variables("x", Rn(2), 3)
+    graph, x = graph_with(Rn(2), 3)
     graph.minimize(lambda p: bowl(p)[:, None], x, name="bowl")
     assert bowl(np.array([[4.6, 3.3]]))[0] == pytest.approx(0.0, abs=1e-12)
     solution = LevenbergMarquardt(max_iterations=60).solve(graph, {x: np.array([[4.0, 3.0], [5.0, 4.0], [4.5, 2.8]])})

@@ -11,6 +11,7 @@ import pytest
 
 import unifg as fg
 from problems.control import Quadrotor, Unicycle
+from problems.graphs import graph_with
 from problems.hock_schittkowski import SMALL
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution.solution import values_of
@@ -77,8 +78,7 @@ def test_completing_repairs_a_rough_answer() -> None:
 @pytest.mark.parametrize(("limit", "contradicts"), [(1.0 - 1e-4, True), (1.0 + 1e-4, False)])
 def test_contradicting_rows_are_proved_and_no_others(limit: float, contradicts: bool) -> None:
     """A sum that has to reach one beside limits that let it almost, or just."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [0.3, -5.0])
     graph.constrain(lambda p: p[:, :1] + p[:, 1:], x, lower=1.0, name="sum")
     graph.bound(x, lower=[-np.inf, -np.inf], upper=[0.5, limit - 0.5])

@@ -11,6 +11,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.graphs import graph_with
 from problems.hock_schittkowski import SMALL
 from problems.known import PROBLEMS, Guess, Problem, ecg2o, ecg2o_inequality, hs6, pose_beside_disc, short_drive
 from unifg.problem.compiled_problem import CompiledProblem
@@ -30,8 +31,7 @@ CASES = {case.name: case for case in SMALL}
 
 def two_rotations() -> tuple[fg.Graph, Guess]:
     """Two attitudes with priors, one axis of the first held, and a given angle between the axes of both."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO3, 2)
+    graph, r = graph_with(fg.SO3, 2, "r")
     graph.minimize(fg.prior, r, fg.SO3.exp(np.array([[0.3, -0.5, 0.8], [0.2, 0.9, -0.1]])), sigma=0.5)
     graph.minimize(fg.between, r[0], r[1], fg.SO3.exp(np.array([0.1, 0.2, -0.3])))
     graph.constrain(lambda q: fg.SO3.matrix(q)[:, 2, :2], r[0], lower=[0.6, 0.3], upper=[0.6, 0.3], name="axis")
@@ -46,8 +46,7 @@ def two_rotations() -> tuple[fg.Graph, Guess]:
 
 def saddle(equality: bool, level: float = 0.3) -> tuple[fg.Graph, Guess]:
     """x y, a saddle, where x - y = level, or -0.2 <= x - y <= level: 4 x y = (x + y)^2 - (x - y)^2."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize_scalar(lambda p: p[:, 0] * p[:, 1], x, name="saddle")
     graph.constrain(lambda p: p[:, :1] - p[:, 1:], x, lower=level if equality else -np.inf, upper=level, name="gap")
     if not equality:
@@ -103,8 +102,7 @@ def test_convergence_is_quadratic(name: str) -> None:
 @pytest.mark.product(15)
 def test_exact_solves_what_gauss_newton_solves(problem: Problem, qp: str) -> None:
     graph, guess = problem.build()
-    solution = SQP(hessian="exact", qp=qp).solve(graph, guess)
-    assert solution.converged, solution.report()
+    solution = SQP(hessian="exact", qp=qp).solve(graph, guess, check=True)
     assert judge(graph, solution).worst() < 2e-6
     if np.isfinite(problem.cost):
         assert solution.cost == pytest.approx(problem.cost, abs=1e-7, rel=1e-6)
@@ -200,8 +198,7 @@ def test_an_inequality_that_lets_go_is_noticed() -> None:
 
 def test_wrong_inertia_takes_gauss_newton_and_right_inertia_does_not() -> None:
     """On the circle H = (1 + 2 lambda) I: negative along the tangent for lambda < -1/2."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 0.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
     program = graph.compile()

@@ -11,6 +11,7 @@ import pytest
 
 import unifg as fg
 from problems.control import Quadrotor, Unicycle
+from problems.graphs import graph_with
 from problems.hock_schittkowski import SMALL
 from unifg.errors import GraphError
 from unifg.solution.solver import SolveState
@@ -64,8 +65,7 @@ def drive(*problem: Any) -> Callable[[], Stated]:
 
 def beyond() -> Stated:
     """A start beyond bounds, of a component too, and a fixed variable within none."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 3)
+    graph, x = graph_with(fg.SE2, 3)
     u = graph.variables("u", fg.Rn(2), 2)
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, x[1:], np.array([2.0, 1.0, 0.5]))
@@ -77,8 +77,7 @@ def beyond() -> Stated:
 
 def apart() -> Stated:
     """Two circles that do not meet."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 0.3])
     for k, place in enumerate((0.0, 3.0)):
         graph.constrain(lambda p, c: ((p - c) ** 2).sum(axis=1, keepdims=True), x, [place, 0.0], upper=1.0, name=f"{k}")
@@ -87,8 +86,7 @@ def apart() -> Stated:
 
 def missed() -> Stated:
     """A square that is to be negative by a little: every linearisation can be met."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [0.3])
     graph.constrain(lambda p: p**2, x, upper=-1e-3, name="square")
     return graph, {x: np.ones((1, 1))}
@@ -96,8 +94,7 @@ def missed() -> Stated:
 
 def kink() -> Stated:
     """The cost has its kink next to the start: no length of the step lowers it."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize_scalar(lambda p: np.abs(p[:, 0]), x)
     graph.bound(x, upper=3.0)
     return graph, {x: np.full((1, 1), 1e-40)}
@@ -105,8 +102,7 @@ def kink() -> Stated:
 
 def endless() -> Stated:
     """A cost without a lower bound."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)
     graph.bound(x, lower=1.0)
     return graph, {x: np.full((1, 1), 2.0)}
@@ -114,8 +110,7 @@ def endless() -> Stated:
 
 def units() -> Stated:
     """A length in units of a micrometre beside one in kilometres."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1e6, 2e-3], sigma=[1e5, 1e-4])
     graph.constrain(lambda p: p[:, :1] * 1e-6 + p[:, 1:] * 1e3, x, upper=2.0, name="sum")
     return graph, {x: np.zeros((1, 2))}
@@ -275,8 +270,7 @@ def test_the_exact_hessian_is_only_begun_in_compiled_code(answers: list[int]) ->
 
 
 def test_a_violated_row_of_fixed_variables_is_found_before_the_first_step() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     graph.fix(x[0], [2.0])
     graph.minimize(fg.prior, x[1], [0.0])
     graph.bound(x, upper=[1.0])
@@ -285,8 +279,7 @@ def test_a_violated_row_of_fixed_variables_is_found_before_the_first_step() -> N
 
 
 def test_a_start_that_cannot_be_evaluated_is_refused_by_name() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [5.0])
     graph.constrain(lambda p: np.log(p), x, lower=-3.0, name="log")
     with pytest.raises(GraphError, match="log"):
@@ -336,8 +329,7 @@ def test_small_rules_by_hand() -> None:
 
 
 def test_bounds_are_kept_where_they_are_of_components() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 4)
+    graph, x = graph_with(fg.Rn(3), 4)
     pose = graph.variables("pose", fg.Product(place=fg.Rn(2), turn=fg.SO2), 2)
     graph.minimize(fg.prior, x, np.zeros(3))
     graph.minimize(fg.prior, pose, pose.manifold.identity())

@@ -7,6 +7,7 @@ import pytest
 
 import unifg as fg
 from problems.control import Unicycle
+from problems.graphs import graph_with
 from problems.hock_schittkowski import SMALL
 from unifg.solution.optimality import Tolerances
 from unifg.solvers import SQP
@@ -25,8 +26,7 @@ def maratos(angle: float) -> tuple[fg.Graph, fg.Guess]:
     From any point of the circle, with the multiplier of the answer, the full Newton step converges quadratically, and
     raises both the cost and the violation.
     """
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize_scalar(lambda p: 2.0 * ((p**2).sum(axis=1) - 1.0) - p[:, 0], x, name="cost")
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
     return graph, fg.Guess({x: np.array([[np.cos(angle), np.sin(angle)]])}, {"circle": np.array([[-1.5]])})
@@ -54,8 +54,7 @@ def test_curvature_that_gauss_newton_lacks_is_seen_along_the_step(name: str, mos
 
 def test_missing_curvature_by_hand() -> None:
     """On the rim of a circle the Lagrangian's curvature is 1 + 2 lambda; Gauss-Newton knows the one."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 0.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="circle")
     program = graph.compile()
@@ -91,12 +90,10 @@ def test_subproblems_on_the_graph_begin_from_the_last_multipliers() -> None:
 @pytest.mark.parametrize("correction", [True, False])
 def test_a_point_that_cannot_be_evaluated_is_not_taken(correction: bool) -> None:
     """The first step leads to where there is no logarithm."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [-5.0])
     graph.constrain(lambda p: np.log(p), x, lower=-3.0, name="log")
-    solution = SQP(qp="graph", second_order_correction=correction).solve(graph, {x: np.ones((1, 1))})
-    assert solution.converged
+    solution = SQP(qp="graph", second_order_correction=correction).solve(graph, {x: np.ones((1, 1))}, check=True)
     assert solution[x][0, 0] == pytest.approx(np.exp(-3.0), rel=1e-4)
 
 
@@ -124,8 +121,7 @@ def test_positions_in_small_units_beside_headings_are_scaled() -> None:
 
 
 def test_limits_may_change_in_kind_between_solves() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SO3, 3)
+    graph, x = graph_with(fg.SO3, 3)
     start = graph.data("start", [1.0, 0.0, 0.0, 0.0])
     lower, upper = graph.data("lower", np.zeros(3)), graph.data("upper", np.zeros(3))
     graph.fix(x[0], start)

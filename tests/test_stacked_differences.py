@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
@@ -94,8 +95,7 @@ def test_long_batches_are_cut() -> None:
         longest = max(longest, x.size)
         return np.asarray((x**2).sum(axis=1, keepdims=True))
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(40), 200)
+    graph, x = graph_with(fg.Rn(40), 200)
     graph.minimize(wide, x, name="wide")
     program = graph.compile()
     program.bind({})
@@ -177,8 +177,7 @@ def test_a_function_may_refuse_points_that_only_the_trial_asks_for() -> None:
             raise ValueError("outside")
         return x + x**2
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 3)
+    graph, x = graph_with(fg.Rn(2), 3)
     graph.minimize(edge, x, name="edge")
     program = graph.compile()
     program.bind({})
@@ -188,8 +187,7 @@ def test_a_function_may_refuse_points_that_only_the_trial_asks_for() -> None:
 
 @pytest.mark.parametrize("derivatives", ["differences", "trace"])
 def test_rows_for_each_factor_may_change(derivatives: Any) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 5)
+    graph, x = graph_with(fg.Rn(2), 5)
     own = graph.data("own", np.ones((5, 2)), each=True)
     graph.minimize(fg.residual(lambda x, own: own * x**2, derivatives=derivatives), x, own, name="term")
     program = graph.compile()
@@ -203,8 +201,7 @@ def test_rows_for_each_factor_may_change(derivatives: Any) -> None:
 @pytest.mark.parametrize("derivatives", ["differences", "trace"])
 def test_a_term_may_be_straight_at_one_point_and_bent_at_another(derivatives: Any) -> None:
     """Straight terms are examined again: a hinge that is inactive at the guess bends later."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 4)
+    graph, x = graph_with(fg.Rn(3), 4)
     hinge = fg.residual(lambda x: np.maximum(x[:, :1] - 1.0, 0.0) * x[:, 1:2], derivatives=derivatives)
     graph.constrain(hinge, x, upper=0.0, name="hinge")
     program = graph.compile()

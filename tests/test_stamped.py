@@ -17,6 +17,7 @@ from numpy.random import Generator
 from scipy.io import loadmat
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.codegen.compile_counter import counting
 from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
@@ -174,8 +175,7 @@ def test_cubics_need_velocities() -> None:
 
 
 def window(count: int = 5, capacity: int = 3) -> tuple[fg.Graph, fg.Family, StampedMeasurements]:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, count)
+    graph, x = graph_with(fg.SE2, count)
     fixes = StampedMeasurements(place, 2, capacity=capacity, sigma=0.05, name="fixes")
     fixes.state(graph, x)
     moved = graph.data("moved", np.tile([0.1, 0.0, 0.05], (count - 1, 1)), each=True)
@@ -342,8 +342,7 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
         graph.minimize(fg.between, x[:-1], x[1:], odometry, sigma=[0.01, 0.01, 0.01])
         return sensors
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, count)
+    graph, x = graph_with(fg.SE2, count)
     sensors = stated(graph, x)
     start = graph.data("start", drive(0.0))
     graph.minimize(fg.prior, x[0], start, sigma=0.02)
@@ -367,8 +366,7 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
         if tick % 5:
             continue
 
-        own = fg.Graph()
-        y = own.variables("x", fg.SE2, count)
+        own, y = graph_with(fg.SE2, count)
         own.minimize(fg.prior, y[0], data[start], sigma=0.02)
         own.minimize(fg.between, y[:-1], y[1:], fg.SE2.exp(step * np.array([1.0, 0.0, 0.6])), sigma=[0.01, 0.01, 0.01])
         for arrival, name, stamp, value in readings:
@@ -459,8 +457,7 @@ def test_threads_add_while_others_ask() -> None:
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
     try:
-        graph = fg.Graph()
-        x = graph.variables("x", SE23, 5)
+        graph, x = graph_with(SE23, 5)
         graph.variables("bias", BIAS, 1)
         y = graph.variables("y", fg.Rn(1), 5)
         count, fixes = 600, StampedMeasurements(lambda x, z: x - z, 1, capacity=2000, sigma=1.0, name="fixes")
@@ -497,8 +494,7 @@ def test_threads_add_while_others_ask() -> None:
 
 
 def test_a_refused_sensor_leaves_the_graph_as_it_was() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", SE23, 3)
+    graph, x = graph_with(SE23, 3)
     bias = graph.variables("bias", BIAS, 3)
     before = str(graph)
     with pytest.raises(fg.GraphError, match="sigma"):
@@ -535,8 +531,7 @@ def test_untraceable_errors_still_work(solver: Callable[[], fg.Solver]) -> None:
     def odd(x: Array, z: Array) -> Array:
         return x[:, :2] - z if float(z[0, 0]) < 1e9 else x[:, :2]
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 3)
+    graph, x = graph_with(fg.SE2, 3)
     fixes = StampedMeasurements(odd, 2, capacity=2, sigma=0.1, name="fixes")
     fixes.state(graph, x)
     graph.minimize(fg.prior, x, np.zeros(3), sigma=1.0)

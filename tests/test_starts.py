@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models import obstacles, unicycle
 
 
 def waves() -> tuple[fg.Graph, fg.Family]:
     """Many minima, the lowest of which lies at 3.8 in a plane of its own units."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize_scalar(lambda x: (np.sin(5.0 * x) + 0.1 * (x - 4.0) ** 2).sum(axis=1), x, name="waves")
     graph.bound(x, lower=-6.0, upper=6.0, name="box")
     return graph, x

@@ -10,7 +10,7 @@ from importlib import metadata
 
 import pytest
 
-from fences import CHECKOUT
+from scripts import CHECKOUT
 
 sys.path.insert(0, str(CHECKOUT / "docs" / "site"))
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.elimination import analysis, factorization
 from unifg.problem.systems import KEPT
 from unifg.solution.warmup_run import rehearse
@@ -53,8 +54,7 @@ def advance(a: Array, b: Array) -> Array:
 
 def chain(kind: str, poses: int = 12) -> tuple[fg.Graph, fg.Family, fg.Data]:
     """Poses along a line with measured steps; some distances must be kept, or not exceeded."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, poses)
+    graph, x = graph_with(fg.SE2, poses)
     start = graph.data("start", np.zeros(3))
     graph.minimize(fg.prior, x[0], start, sigma=0.1)
     graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0, 0.1], sigma=[0.1, 0.1, 0.05])

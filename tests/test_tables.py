@@ -17,6 +17,7 @@ from scipy.interpolate import (
 )
 
 import unifg as fg
+from problems.graphs import graph_with
 from test_derive import curved, evaluated
 from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.operations import Op
@@ -217,8 +218,7 @@ def test_what_is_not_traced_is_named(function: Function, words: str) -> None:
 
 
 def stated(function: Function, *arguments: Any, count: int = 3) -> tuple[fg.Graph, fg.Family]:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), count)
+    graph, x = graph_with(fg.Rn(1), count)
     graph.minimize(function, x, *arguments, sigma=1.0, name="own")
     return graph, x
 
@@ -226,8 +226,7 @@ def stated(function: Function, *arguments: Any, count: int = 3) -> tuple[fg.Grap
 @pytest.mark.parametrize("count", [3, 200], ids=["few factors", "as many factors as points"])
 def test_tables_that_are_data_change_between_solves(count: int) -> None:
     """Their numbers are parameters, and are bisected where they stand."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), count)
+    graph, x = graph_with(fg.Rn(1), count)
     points, heights = graph.data("points", np.linspace(-3.0, 3.0, 200)), graph.data("heights", np.linspace(-1, 1, 200))
     graph.minimize(lambda x, p, h: np.asarray(np.interp(x, p, h) - 0.2), x, points, heights, name="own")
     run, guess = GaussNewton().prepare(graph), {x: np.full((count, 1), 0.9)}
@@ -238,8 +237,7 @@ def test_tables_that_are_data_change_between_solves(count: int) -> None:
 
 
 def test_a_table_for_each_factor() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     heights = np.linspace(-1.0, 1.0, 9) * np.array([[1.0], [2.0], [4.0]])
     table = graph.data("table", heights, each=True)
     at = np.linspace(-2.0, 2.0, 9)

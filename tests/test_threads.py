@@ -13,6 +13,7 @@ import pytest
 
 import unifg as fg
 from backends import BACKENDS, LENGTH, Walk, goal_of
+from problems.graphs import graph_with
 from test_horizon_hostile import loop_of, window_of
 from unifg.codegen.jit import compiled
 from unifg.errors import BackendError
@@ -261,8 +262,7 @@ def test_graphs_come_and_go_while_others_are_solved() -> None:
     def use(number: int) -> float:
         worst = 0.0
         for k in range(8):
-            graph = fg.Graph()
-            x = graph.variables("x", fg.Rn(2), LENGTH)
+            graph, x = graph_with(fg.Rn(2), LENGTH)
             shift = 1.0 + number + 0.1 * k
             graph.minimize(lambda p, s=shift: 0.3 * np.sin(p - s) + (p - s), x)
             solver = (GaussNewton(), InteriorPoint(), SQP())[k % 3]

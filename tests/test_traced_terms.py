@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.errors import GraphError
 from unifg.factors.autodiff.captured import captured_by
 from unifg.factors.autodiff.derived import derived
@@ -34,8 +35,7 @@ GAIN = 2.0
 
 def stated(function: Any, *arguments: Any, manifold: Any = None, count: int = N) -> tuple[fg.Graph, fg.Family]:
     """A graph of one cost of every variable."""
-    graph = fg.Graph()
-    x = graph.variables("x", manifold or fg.Rn(3), count)
+    graph, x = graph_with(manifold or fg.Rn(3), count)
     graph.minimize(function, x, *arguments, name="term")
     return graph, x
 
@@ -108,8 +108,7 @@ def test_an_element_of_a_group_may_be_a_constant() -> None:
 )
 def test_a_norm_is_flat_where_it_is_zero(length: Function) -> None:
     """Differences say so too; and guesses at rest are common."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 2)
+    graph, x = graph_with(fg.Rn(3), 2)
     graph.minimize(length, x)
     program = graph.compile()
     lin = program.linearize(program.values_from({x: np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0]])}))
@@ -127,8 +126,7 @@ def test_derivatives_that_do_not_exist_at_the_guess_are_left_to_differences() ->
 
 def test_lambdas_made_in_a_loop_keep_what_they_mean() -> None:
     """All of them mean the last number, as anywhere in Python, unless it is a default."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     for k in range(3):
         graph.minimize(lambda x, k=k: x - k, x[k])
         graph.minimize(lambda x: x - k, x[k])  # noqa: B023
@@ -137,8 +135,7 @@ def test_lambdas_made_in_a_loop_keep_what_they_mean() -> None:
 
 
 def test_data_are_inputs_of_a_trace() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), N)
+    graph, x = graph_with(fg.Rn(2), N)
     goal, rows = graph.data("goal", np.zeros(2)), graph.data("rows", np.zeros((N, 2)), each=True)
     switch = graph.data("switch", np.ones(N, dtype=bool), each=True)
     graph.minimize(lambda x, g, r, s: np.where(s[:, None], x - g - r, x), x, goal, rows, switch)
@@ -153,8 +150,7 @@ def test_data_are_inputs_of_a_trace() -> None:
 
 
 def test_a_decision_about_data_is_left_to_python() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     sign = graph.data("sign", 1.0)
     graph.minimize(lambda x, s: x - 1.0 if s > 0 else x + 1.0, x, sign)
     for value in (1.0, -1.0):
@@ -221,8 +217,7 @@ def test_functions_of_one_factor_are_refused_as_ever(function: Any, rows: int, m
 
 @pytest.mark.parametrize("derivatives", [None, "differences"])
 def test_scalar_costs_have_exact_derivatives(derivatives: Any) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 3)
+    graph, x = graph_with(fg.SE2, 3)
     top = graph.data("top", TARGETS[:3], each=True)
     graph.minimize_scalar(
         fg.residual(lambda x, top: np.cosh(fg.SE2.log(x) - top).sum(axis=1), derivatives=derivatives), x, top
@@ -379,8 +374,7 @@ def test_what_cannot_be_traced_is_an_error_when_asked(function: Function) -> Non
 
 
 def test_check_and_report_say_what_python_evaluates() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), N)
+    graph, x = graph_with(fg.Rn(3), N)
     graph.minimize(branching, x, name="slow")
     graph.minimize(lambda x: x, x, name="fast")
     graph.minimize(fg.prior, x, np.zeros(3), name="shipped")
@@ -507,8 +501,7 @@ def test_a_straight_function_may_become_a_bent_one() -> None:
     def function(x: Array) -> Array:
         return np.asarray(x**power - 2.0)
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     graph.constrain(function, x, lower=0.0, upper=0.0)
     graph.minimize(lambda x: x, x)
     prepared = InteriorPoint().prepare(graph)
@@ -612,8 +605,7 @@ def test_a_function_that_would_take_seconds_to_compile_is_left_alone() -> None:
 def test_derivatives_do_not_mind_where_the_origin_is(offset: float) -> None:
     beacons = np.array([[3.0, 4.0], [-2.0, 1.0], [0.5, -3.0]]) + offset
     ranges = np.array([5.0, 2.2, 3.1])
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 3)
+    graph, x = graph_with(fg.Rn(2), 3)
     graph.minimize(lambda x, b, r: np.linalg.norm(x - b, axis=1, keepdims=True) - r[:, None], x, beacons, ranges)
     graph.minimize(lambda x: x - offset, x, sigma=10.0)
     program = graph.compile()
@@ -649,8 +641,7 @@ def test_equal_rows_do_not_say_whether_they_belong_to_factors(function: Function
     prepared.solve(start)
     array[...] = np.random.default_rng(1).uniform(1.0, 2.0, first.shape)
     found = prepared.solve(start, data={datum: array})[x]
-    again = fg.Graph()
-    y = again.variables("x", fg.Rn(3), 3)
+    again, y = graph_with(fg.Rn(3), 3)
     again.minimize(fg.residual(function, derivatives="differences"), y, array)
     np.testing.assert_allclose(found, GaussNewton().solve(again, {y: np.zeros((3, 3))})[y], atol=1e-6)
 
@@ -733,8 +724,7 @@ def test_what_changes_between_solves_is_noticed(
 @pytest.mark.parametrize("off", [np.zeros(()), np.zeros(1), np.zeros((), dtype=bool)])
 def test_what_is_switched_off_is_looked_at_too(off: Array) -> None:
     """A row of another factor that counts for nothing yet."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), N)
+    graph, x = graph_with(fg.Rn(3), N)
     gain, target = graph.data("gain", off), graph.data("target", TARGETS, each=True)
     graph.minimize(lambda x, s, t: x - np.where(s, t[0], t), x, gain, target)
     prepared = GaussNewton().prepare(graph)

@@ -230,14 +230,11 @@ def test_past_and_branching_future_are_one_graph() -> None:
     assert plans[0][0] == pytest.approx(plans[1][0], abs=1e-5) and plans[0][1] == pytest.approx(plans[1][1], abs=1e-6)
 
 
-class Far:
+class Far(Term):
     """Cost of every node but the present."""
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize(fg.prior, x[1:], TARGET, sigma=1.0, name="far")
-
-    def data(self, now: Context[Any]) -> dict[str, ArrayLike]:
-        return {}
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.factors.autodiff.intervals import bounds
 from unifg.factors.autodiff.rows import traced
 from unifg.models import obstacles, unicycle
@@ -76,8 +77,7 @@ def test_a_disc_between_two_nodes_is_seen() -> None:
 
 
 def test_headings_go_the_short_way_round() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 2)
+    graph, x = graph_with(fg.SE2, 2)
     graph.minimize(lambda x: np.cos(x[:, 2:]), x, name="ahead")
     graph.fix(x, [[0.0, 0.0, 3.1], [0.0, 0.0, -3.1]])
     free = graph.variables("free", fg.Rn(1), 1)
@@ -91,8 +91,7 @@ def test_other_terms_are_refused_by_name() -> None:
     solution, _ = plan(0.15)
     with pytest.raises(fg.GraphError, match="no term is called 'wall'"):
         solution.tube("wall")
-    graph = fg.Graph()
-    q = graph.variables("q", fg.SO3, 2)
+    graph, q = graph_with(fg.SO3, 2, "q")
     graph.minimize(lambda q: q[:, :3] / q[:, 3:], q, name="lean")
     graph.minimize(fg.prior, q, [0.0, 0.0, 0.0, 1.0], sigma=1.0)
     graph.minimize(fg.between, q[0], q[1], [0.0, 0.0, 0.0, 1.0], sigma=1.0, name="level")

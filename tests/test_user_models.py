@@ -111,8 +111,7 @@ def test_a_boat_finds_the_current_and_plans_with_it(method: Method) -> None:
     graph.minimize(fg.prior, x[-1].pose, [5.0, 0.0, 0.0], sigma=0.01)
     graph.minimize(fg.prior, u[past:], np.zeros(2), sigma=30.0)
     guess = {x: np.concatenate([sailed, np.repeat(sailed[-1:], count - past, axis=0)]), u: np.zeros((count, 2))}
-    solution = SQP().solve(graph, guess | {current: np.zeros((1, 2))})
-    assert solution.converged, solution.report()
+    solution = SQP().solve(graph, guess | {current: np.zeros((1, 2))}, check=True)
     np.testing.assert_allclose(solution[current][0], truth, atol=2e-2)
     again = rkmk.rollout(BOAT, boat, solution[x][0], solution[u], solution[current], h=h, method=method)
     np.testing.assert_allclose(BOAT.local(again, solution[x]), 0.0, atol=1e-4)

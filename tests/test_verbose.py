@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
+from scripts import run_script
 from unifg.solvers import SQP, GaussNewton
 
 SCRIPT = """
@@ -29,9 +29,7 @@ for verbose in (True, False):
 @pytest.mark.parametrize("configure", ["", "logging.basicConfig()"])
 @pytest.mark.product(1)
 def test_verbose_prints_although_logging_is_not_configured(configure: str) -> None:
-    script = SCRIPT.format(configure=configure)
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    verbose, silent, rest = done.stderr.split("solved\n")
+    verbose, silent, rest = run_script(SCRIPT.format(configure=configure)).stderr.split("solved\n")
     assert sum(line.startswith("iter ") for line in verbose.splitlines()) == 1 and verbose.count("\n") >= 3
     assert "iter" not in silent and not rest
 
@@ -39,8 +37,7 @@ def test_verbose_prints_although_logging_is_not_configured(configure: str) -> No
 def test_verbose_logs_where_logging_is_configured(
     caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 2.0])
     with caplog.at_level(logging.INFO, "unifg"):
         GaussNewton(verbose=True).solve(graph, {x: np.zeros((1, 2))})
@@ -49,8 +46,7 @@ def test_verbose_logs_where_logging_is_configured(
 
 
 def test_costs_that_were_traced_take_no_time_in_python() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize_scalar(lambda p: np.cosh(p[:, 0] - 1.0) + p[:, 1] ** 2, x, name="bowl")
     solution = SQP(hessian="exact").solve(graph, {x: np.full((1, 2), 3.0)}, check=True)
     assert solution.converged and solution.in_python == 0.0

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.factors.autodiff import symbols
 from unifg.factors.autodiff.calculus import jacobian
 from unifg.factors.autodiff.operations import Op
@@ -42,8 +43,7 @@ def wrong_above() -> Iterator[Function]:
 
 def stated(function: Function, *, constrained: bool) -> tuple[fg.Graph, fg.Family, fg.Data]:
     """Members pulled to a target; a function of one's own is a cost or a constraint."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), N)
+    graph, x = graph_with(fg.Rn(1), N)
     target = graph.data("target", np.zeros((N, 1)))
     graph.minimize(fg.prior, x, target, name="pull")
     if constrained:
@@ -103,8 +103,7 @@ def test_a_wrong_derivative_at_the_answer_is_found(solver: fg.Solver, monkeypatc
 
 def test_one_wrong_factor_is_named_and_a_factor_that_is_switched_off_is_not(wrong_above: Function) -> None:
     wrong_above(1.2)
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), N)
+    graph, x = graph_with(fg.Rn(1), N)
     active = graph.data("active", np.ones(N, dtype=bool), each=True)
     graph.minimize(lambda x: np.tanh(x) + 0.0, x, active=active, name="own")
     program = graph.compile()
@@ -124,8 +123,7 @@ def test_derivatives_are_compared_when_asked_and_along_another_direction_each_ti
 
     monkeypatch.setattr("unifg.factors.autodiff.expression.jacobian", doubled)
     monkeypatch.setattr("unifg.factors.autodiff.expression._WRITERS", "")
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), N)
+    graph, x = graph_with(fg.Rn(1), N)
     graph.minimize(lambda x: np.sinh(x) * 0.5, x, name="own")
     program = graph.compile()
     values = program.values_from({x: np.full((N, 1), 0.3)})
@@ -170,8 +168,7 @@ def test_a_solve_without_time_left_is_verified_after_the_next() -> None:
 
 
 def test_where_nothing_is_traced_nothing_is_left_unchecked() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [1.0])
     prepared = GaussNewton().prepare(graph)
     assert all(prepared.solve({x: np.zeros((1, 1))}).checked for _ in range(4))
@@ -197,8 +194,7 @@ def test_a_fault_that_begins_to_matter_late_is_found(wrong_above: Function, prep
 
 def test_branches_are_verified_once_and_within_a_ration() -> None:
     """In a noisy loop comparisons come out otherwise at every tick: most answers would be verified."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(8), 1)
+    graph, x = graph_with(fg.Rn(8))
     target = graph.data("target", np.zeros(8))
     graph.minimize(lambda x, target: np.where(x > 0.0, x, 2.0 * x) - target, x, target, name="own")
     prepared = GaussNewton().prepare(graph)
@@ -238,8 +234,7 @@ RNG = np.random.default_rng(0)
     ],
 )
 def test_kinks_jumps_and_noise_are_no_differences(function: Function, at: float) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 40)
+    graph, x = graph_with(fg.Rn(2), 40)
     graph.minimize(function, x, name="own")
     program = graph.compile()
     values = program.values_from({x: np.full((40, 2), at)})

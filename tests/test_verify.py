@@ -10,6 +10,7 @@ import pytest
 from numba import njit
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.modeling.variables import Data
 from unifg.models import unicycle
 from unifg.solution import as_written
@@ -132,8 +133,7 @@ def test_estimates_of_all_backends_pass(solver: fg.Solver) -> None:
 
 
 def test_a_perfect_fit_passes() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 3)
+    graph, x = graph_with(fg.SE2, 3)
     graph.minimize(fg.prior, x[0], [1.0, 2.0, 0.5], sigma=0.1)
     graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.2, 0.3], sigma=0.01)
     assert GaussNewton().solve(graph, {x: np.zeros((3, 3))}, check=True).verify()
@@ -160,8 +160,7 @@ def _turned(x: Array, matrix: Array, r: Array) -> None:
 
 @pytest.mark.parametrize("count", [3, 2])
 def test_a_function_of_one_factor_takes_matrices_that_all_share(count: int) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), count)
+    graph, x = graph_with(fg.Rn(2), count)
     graph.minimize(fg.prior, x, [1.0, 2.0])
     matrix = np.array([[0.0, -1.0], [1.0, 0.0]])
     graph.constrain(fg.residual(_turned, rows=2), x, fg.shared(matrix), lower=-1.0, upper=0.5, name="turned")
@@ -230,8 +229,7 @@ def test_a_moved_landmark_is_named() -> None:
 
 
 def test_a_function_that_raises_is_named_and_nothing_is_raised() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     broken: list[int] = []
 
     def own(x: Array) -> Array:
@@ -258,8 +256,7 @@ def test_tolerance_counts(plan: fg.Solution) -> None:
 
 
 def test_constraints_of_fixed_variables_alone_pass() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
+    graph, x = graph_with(fg.Rn(1), 2)
     graph.fix(x, [[1.0], [2.0]])
     graph.minimize(fg.prior, x, [0.0], name="cost")
     graph.constrain(lambda a, b: b - a, x[:1], x[1:], lower=0.5, name="apart")
@@ -281,8 +278,7 @@ def test_data_are_those_of_the_solve() -> None:
 
 
 def test_flags_are_those_of_the_solve() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     known = graph.data("known", np.array([True, False, True]))
     graph.minimize(fg.prior, x, [[1.0], [2.0], [4.0]], active=known, name="seen")
     graph.minimize(fg.difference, x[:-1], x[1:], name="smooth")
@@ -312,8 +308,7 @@ def test_a_solution_whose_data_are_gone_is_refused() -> None:
 
 
 def test_slopes_that_differences_cannot_tell_are_undecided() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [1.0])
     graph.constrain(lambda x: np.sin(6e4 * (x - 1.0)), x, upper=0.0, name="steep")
     solution = SQP().solve(graph, {x: [[1.0]]}, check=True)
@@ -327,8 +322,7 @@ def test_slopes_that_differences_cannot_tell_are_undecided() -> None:
 @pytest.mark.parametrize("beside", [0.0, 1e-5, 2e-5, 3e-5, 5e-5])
 def test_a_kink_is_undecided(beside: float) -> None:
     """At a kink there is no slope, and beside it steps reach across: the bound tells, wherever it lies."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [2.0])
     graph.constrain(lambda x: np.maximum(x, 3.0 * x - 2.0), x, upper=1.0 - beside, name="bent")
     solution = InteriorPoint(tolerance=1e-9).solve(graph, {x: [[0.5]]})
@@ -343,8 +337,7 @@ def test_a_kink_is_undecided(beside: float) -> None:
 @pytest.mark.parametrize("solver", [SQP(hessian="exact"), AugmentedLagrangian()], ids=lambda s: s.name)
 def test_a_direction_without_curvature_is_undecided(solver: fg.Solver) -> None:
     """Jennrich and Sampson: both unknowns are alike at the optimum, so that no row tells them apart."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     k = np.arange(1.0, 11.0)
     graph.minimize(lambda x: 2.0 + 2.0 * k - np.exp(k * x[:, :1]) - np.exp(k * x[:, 1:]), x, name="sums")
     solution = solver.solve(graph, {x: [[0.3, 0.4]]}, check=True)
@@ -399,8 +392,7 @@ def test_a_large_term_is_moved_call_by_call(monkeypatch: pytest.MonkeyPatch) -> 
         lengths.append(len(x))
         return np.asarray(np.sin(x))
 
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 10)
+    graph, x = graph_with(fg.Rn(1), 10)
     graph.minimize(counted, x)
     program = graph.compile()
     term = WrittenTerm(program.terms[0].term, program.columns, {x: np.zeros((10, 1))}, {})

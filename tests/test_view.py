@@ -7,7 +7,6 @@ import math
 import re
 import shutil
 import subprocess
-import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,9 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
+from scripts import CHECKOUT, run_script
 from unifg import view
 from unifg.errors import GraphError, ViewError
 from unifg.files.ros_map import OccupancyMap
@@ -113,8 +114,7 @@ def test_ellipses_are_the_marginals_in_the_world(group: Any) -> None:
 
 
 def test_covariances_of_places_that_a_function_gives_are_carried_through_it() -> None:
-    graph = fg.Graph()
-    arm = graph.variables("arm", fg.SO2, 1)
+    graph, arm = graph_with(fg.SO2, 1, "arm")
     graph.minimize(fg.prior, arm, [0.5], sigma=0.1)
     solution = GaussNewton().solve(graph, {arm: [[0.4]]})
     scene = Scene.of(
@@ -138,8 +138,7 @@ def test_iterates_are_on_the_slider_with_their_numbers(solved: tuple[fg.Solution
     assert data["play"] is False
     assert dict(tracks["x/1"][".visible"])[0] is False
     with pytest.raises(ViewError, match="keep_values=True"):
-        graph = fg.Graph()
-        y = graph.variables("y", POINT, 1)
+        graph, y = graph_with(POINT, 1, "y")
         graph.minimize(fg.prior, y, [0.0, 0.0], sigma=1.0)
         Scene.of(GaussNewton().solve(graph, {y: [[1.0, 1.0]]}), y, over="iterates")
 
@@ -218,13 +217,9 @@ def test_same_bytes_for_the_same_input(tmp_path: Path) -> None:
         "import hashlib; from test_view import everything;"
         "print(hashlib.sha256(everything().html().encode()).hexdigest())"
     )
-    here = Path(__file__).parent
-    environment = {"PYTHONPATH": f"{here}:{here.parent}", "PYTHONHASHSEED": "7"}
-    printed = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
-    ).stdout.strip()
-    assert printed == hashlib.sha256(everything().html().encode()).hexdigest()
-    assert everything().save(tmp_path / "a.html").read_text(encoding="utf-8") == everything().html()
+    printed = run_script(code, variables={"PYTHONPATH": f"{CHECKOUT / 'tests'}:{CHECKOUT}", "PYTHONHASHSEED": "7"})
+    page = everything().save(tmp_path / "a.html").read_text(encoding="utf-8")
+    assert printed.stdout.strip() == hashlib.sha256(page.encode()).hexdigest()
 
 
 def everything() -> Scene:

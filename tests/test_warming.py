@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
-import sys
 from functools import partial
 from pathlib import Path
 
 import pytest
 
+from scripts import run_script
 from unifg import precompile
 from unifg.codegen import precompiled
 from unifg.codegen.compile_counter import tally
@@ -126,8 +125,7 @@ sys.exit(command.main(["warmup"]))
 
 @pytest.mark.product(4, of="processes of their own")
 def test_the_library_is_compiled_without_extras() -> None:
-    done = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    done = run_script(WITHOUT_EXTRAS)
     assert done.stdout.startswith("library 2\n")
     assert "scenarios are left out, they need pymunk: pip install 'unifg[scenarios]'" in done.stdout
     assert missing() == ""
@@ -171,8 +169,5 @@ def test_a_first_use_compiles_nothing_that_could_have_come(script: str, tmp_path
         path.write_text(COMMAND, encoding="utf-8")
     else:
         path = EXAMPLES[0].parent / f"{script}.py"
-    run = [sys.executable, "-c", FIRST_USE, str(path), str(tmp_path)]
-    done = subprocess.run(run, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    said = done.stdout.splitlines()[-1]
+    said = run_script(FIRST_USE, path, tmp_path, cwd=tmp_path).stdout.splitlines()[-1]
     assert re.fullmatch(r"looked for \d\d+ and compiled", said.strip()), f"{said}: add a job, then make kernels"

@@ -138,11 +138,9 @@ class Route(Protocol):
 
     def begin(self) -> None:
         """Forget what the last solve of the program has left."""
-        ...
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve, starting from the step zero and ``multipliers`` if the route can."""
-        ...
 
 
 def qp_error(qp: QP, step: Array, multipliers: Array) -> float:

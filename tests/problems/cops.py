@@ -15,6 +15,7 @@ import numpy as np
 from numpy import cos, exp, sin, sqrt
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Family, Selection
 from unifg.typing import Array, IntArray
@@ -75,8 +76,7 @@ def flight(
 
 def polygon(corners: int) -> Stated:
     """Area of a polygon of unit diameter, in polar coordinates around its last corner."""
-    graph = fg.Graph()
-    p = graph.variables("corner", fg.Rn(2), corners)  # radius and angle
+    graph, p = graph_with(fg.Rn(2), corners, "corner")  # radius and angle
     i, j = np.triu_indices(corners, 1)
     graph.constrain(
         lambda a, b: (a[:, 0] ** 2 + b[:, 0] ** 2 - 2.0 * a[:, 0] * b[:, 0] * cos(a[:, 1] - b[:, 1]))[:, None],
@@ -94,8 +94,7 @@ def polygon(corners: int) -> Stated:
 
 def electrons(count: int) -> Stated:
     """Energy of charges on a sphere."""
-    graph = fg.Graph()
-    p = graph.variables("charge", fg.Rn(3), count)
+    graph, p = graph_with(fg.Rn(3), count, "charge")
     i, j = np.triu_indices(count, 1)
     graph.constrain(lambda a: (a**2).sum(axis=1, keepdims=True), p, lower=1.0, upper=1.0, name="sphere")
     graph.minimize_scalar(lambda a, b: 1.0 / sqrt(((a - b) ** 2).sum(axis=1)), p[i], p[j], name="energy")
@@ -124,8 +123,7 @@ def chain(steps: int) -> Stated:
 
 def cam(count: int) -> Stated:
     """Valve opening of a convex cam."""
-    graph = fg.Graph()
-    r = graph.variables("radius", fg.Rn(1), count)
+    graph, r = graph_with(fg.Rn(1), count, "radius")
     step, steepest = 2.0 * pi / (5.0 * (count + 1)), 1.5 * 2.0 * pi / (5.0 * (count + 1))
 
     def bent(a: Any, b: Any, c: Any) -> Any:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy import cos, exp, log, sin
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.typing import Array
 
 Formula: TypeAlias = Callable[..., Any]
@@ -68,8 +69,7 @@ class Case:
 
     def build(self) -> tuple[fg.Graph, dict[fg.Family, Array]]:
         """The case as a graph, and its guess."""
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(len(self.start)), 1)
+        graph, x = graph_with(fg.Rn(len(self.start)))
         if self.squares is not None:
             graph.minimize(_rows(self.squares), x, sigma=math.sqrt(0.5), name="squares")
         if self.cost is not None:

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.papers import ecg2o as study
 from unifg.typing import Array
@@ -48,8 +49,7 @@ def line(count: int = 4) -> tuple[fg.Graph, fg.Family]:
 
 def ecg2o_inequality() -> tuple[fg.Graph, Guess]:
     """A circle cut by an ellipse."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 1.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
     graph.constrain(lambda p: p**2 @ np.array([[4.0], [0.25]]), x, upper=1.0, name="ellipse")
@@ -69,8 +69,7 @@ def three_variable_qp() -> tuple[fg.Graph, Guess]:
 
 def inactive_inequality() -> tuple[fg.Graph, Guess]:
     """Read literally, Bazzana's eq. 19 answers 0.867 here."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [0.2], sigma=0.5**0.5)
     graph.bound(x, upper=1.0, name="limit")
     return graph, {x: np.array([[5.0]])}
@@ -78,8 +77,7 @@ def inactive_inequality() -> tuple[fg.Graph, Guess]:
 
 def active_bounds() -> tuple[fg.Graph, Guess]:
     """One bound active above, one below, one not: the signs of the multipliers."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 1)
+    graph, x = graph_with(fg.Rn(3))
     graph.minimize(fg.prior, x, [3.0, -3.0, 0.5])
     graph.bound(x, lower=-1.0, upper=1.0, name="box")
     return graph, {x: np.zeros((1, 3))}
@@ -87,16 +85,14 @@ def active_bounds() -> tuple[fg.Graph, Guess]:
 
 def rosenbrock() -> tuple[fg.Graph, Guess]:
     """The banana valley as least squares."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(lambda p: np.stack([10.0 * (p[:, 1] - p[:, 0] ** 2), 1.0 - p[:, 0]], axis=1), x)
     return graph, {x: np.array([[-1.2, 1.0]])}
 
 
 def hs6() -> tuple[fg.Graph, Guess]:
     """Hock-Schittkowski 6."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     graph.minimize(lambda p: 1.0 - p[:, :1], x)
     graph.constrain(lambda p: 10.0 * (p[:, 1:] - p[:, :1] ** 2), x, lower=0.0, upper=0.0)
     return graph, {x: np.array([[-1.2, 1.0]])}
@@ -104,8 +100,7 @@ def hs6() -> tuple[fg.Graph, Guess]:
 
 def hs65() -> tuple[fg.Graph, Guess]:
     """Hock-Schittkowski 65: least squares, a ball and bounds."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 1)
+    graph, x = graph_with(fg.Rn(3))
 
     def residual(p: Array) -> Array:
         a, b, c = p.T
@@ -119,8 +114,7 @@ def hs65() -> tuple[fg.Graph, Guess]:
 
 def hs48() -> tuple[fg.Graph, Guess]:
     """Hock-Schittkowski 48: two linear equalities, singular Hessian."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(5), 1)
+    graph, x = graph_with(fg.Rn(5))
     graph.minimize(lambda p: np.stack([p[:, 0] - 1.0, p[:, 1] - p[:, 2], p[:, 3] - p[:, 4]], axis=1), x)
     graph.constrain(
         lambda p: np.stack([p.sum(axis=1), p[:, 2] - 2.0 * (p[:, 3] + p[:, 4])], axis=1),
@@ -133,8 +127,7 @@ def hs48() -> tuple[fg.Graph, Guess]:
 
 def square_of_poses() -> tuple[fg.Graph, Guess]:
     """Four exact relative poses around a square, closed: cost zero at the square."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 4)
+    graph, x = graph_with(fg.SE2, 4)
     quarter = [1.0, 0.0, np.pi / 2.0]
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.between, x, x[[1, 2, 3, 0]], quarter, information=np.diag([4.0, 4.0, 25.0]))
@@ -143,8 +136,7 @@ def square_of_poses() -> tuple[fg.Graph, Guess]:
 
 def huber_line() -> tuple[fg.Graph, Guess]:
     """Median-like mean of one scalar with an outlier: optimum by hand at the Huber stationarity condition."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     measured = graph.data("measured", np.array([[0.0], [0.2], [0.1], [8.0]]), each=True)
     graph.minimize(lambda p, z: p - z, x, measured, robust=fg.Huber(0.5))
     return graph, {x: np.array([[4.0]])}
@@ -152,8 +144,7 @@ def huber_line() -> tuple[fg.Graph, Guess]:
 
 def pose_beside_disc() -> tuple[fg.Graph, Guess]:
     """A pose pulled into a disc comes to rest on its rim, 0.5 m from the centre."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 1)
+    graph, x = graph_with(fg.SE2)
     graph.minimize(fg.prior, x, [0.1, 0.0, 0.3], sigma=0.5)
     graph.constrain(obstacles.disc_clearance, x, np.array([[0.0, 0.0]]), np.array([0.5]), lower=0.0, name="keep-out")
     return graph, {x: np.array([[1.0, 0.4, 0.0]])}
@@ -161,8 +152,7 @@ def pose_beside_disc() -> tuple[fg.Graph, Guess]:
 
 def rotation_within_limits() -> tuple[fg.Graph, Guess]:
     """An angle on SO(2) held beyond half a turn by a chord constraint."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO2, 1)
+    graph, r = graph_with(fg.SO2, 1, "r")
     graph.minimize(fg.prior, r, [3.0])
     graph.constrain(lambda a: np.cos(a), r, lower=-0.5, name="chord")
     return graph, {r: np.array([[1.0]])}
@@ -170,8 +160,7 @@ def rotation_within_limits() -> tuple[fg.Graph, Guess]:
 
 def product_state() -> tuple[fg.Graph, Guess]:
     """A product of a pose and a velocity; the velocity component is bounded."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Product(pose=fg.SE2, v=fg.Rn(1)), 2)
+    graph, x = graph_with(fg.Product(pose=fg.SE2, v=fg.Rn(1)), 2)
     graph.fix(x[0], [0.0, 0.0, 0.0, 1.0])
     graph.minimize(fg.prior, x.pose, [2.0, 0.0, 0.0])
     graph.constrain(lambda a, v, b: b[:, :1] - a[:, :1] - v, x.pose[:-1], x.v[:-1], x.pose[1:], lower=0.0, upper=0.0)
@@ -216,8 +205,7 @@ def pose_chain(
     poses = [manifold.identity()]
     for step in steps:
         poses.append(manifold.retract(poses[-1], step))
-    graph = fg.Graph()
-    x = graph.variables("x", manifold, count)
+    graph, x = graph_with(manifold, count)
     moves = steps + 0.05 * scale * rng.normal(size=steps.shape)
     measured = np.stack([manifold.retract(manifold.identity(), move) for move in moves])
     graph.minimize(fg.between, x[:-1], x[1:], measured, sigma=0.1 * scale / information**0.5)
@@ -231,8 +219,7 @@ def pose_chain(
 
 def anchored_square() -> tuple[fg.Graph, Guess]:
     """The square of poses, its first one held by a constraint that the guess keeps."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 4)
+    graph, x = graph_with(fg.SE2, 4)
     quarter = [1.0, 0.0, np.pi / 2.0]
     graph.constrain(fg.prior, x[0], [0.0, 0.0, 0.0], lower=0.0, upper=0.0, name="anchor")
     graph.minimize(fg.between, x, x[[1, 2, 3, 0]], quarter, information=np.diag([4.0, 4.0, 25.0]))
@@ -257,8 +244,7 @@ def rolled_out_drive() -> tuple[fg.Graph, Guess]:
 
 def inverse_distance() -> tuple[fg.Graph, Guess]:
     """A scalar cost 1/d that pushes away from the origin against a quadratic pull: d^3 = 1 by hand."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 1)
+    graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [0.0])
     graph.minimize_scalar(lambda p: 1.0 / p[:, 0], x, name="push")
     graph.bound(x, lower=0.1, name="positive")

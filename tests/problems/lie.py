@@ -10,6 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.typing import Array, ArrayLike
 
 Built: TypeAlias = tuple[fg.Graph, dict[fg.Family, Array]]
@@ -85,8 +86,7 @@ def davenport() -> tuple[Array, float]:
 
 def wahba() -> Built:
     """Attitude from star sightings, as squares."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO3, 1)
+    graph, r = graph_with(fg.SO3, 1, "r")
     stars, sighted = graph.data("stars", STARS, each=True), graph.data("sighted", SIGHTED, each=True)
     graph.minimize(
         lambda x, a, b: a - fg.SO3.act(x, b),
@@ -101,16 +101,14 @@ def wahba() -> Built:
 
 def wahba_trace() -> Built:
     """The same as a scalar cost, minus the trace of B'R."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO3, 1)
+    graph, r = graph_with(fg.SO3, 1, "r")
     graph.minimize_scalar(lambda x: -np.einsum("ab,nab->n", PROFILE, fg.SO3.to_matrix(x)), r, name="gain")
     return graph, {r: turned(AXES[0], 2.0)}
 
 
 def brockett() -> Built:
     """Sort the eigenvalues 1, 2, 4 of a symmetric matrix: minimise -tr(N R'AR) with N = diag(1, 2, 3)."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO3, 1)
+    graph, r = graph_with(fg.SO3, 1, "r")
     basis = fg.SO3.to_matrix(SEEN)[0]
     symmetric = basis @ np.diag([1.0, 2.0, 4.0]) @ basis.T
 
@@ -124,8 +122,7 @@ def brockett() -> Built:
 
 def cone(inside: bool) -> Built:
     """The nearest attitude whose boresight is at most 0.3 rad, or at least 0.9 rad, from the vertical."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO3, 1)
+    graph, r = graph_with(fg.SO3, 1, "r")
     graph.minimize(fg.prior, r, turned(TILTED, 0.8 if inside else 0.5)[0], name="wanted")
     limits = {"lower": math.cos(0.3)} if inside else {"upper": math.cos(0.9)}
     graph.constrain(lambda x: rotated(x, UP)[:, 2:], r, **limits, name="cone")
@@ -134,8 +131,7 @@ def cone(inside: bool) -> Built:
 
 def levelled() -> Built:
     """The nearest attitude whose x axis is horizontal; the wanted one points 0.7 rad down."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO3, 1)
+    graph, r = graph_with(fg.SO3, 1, "r")
     graph.minimize(fg.prior, r, turned(AXES[1], 0.7)[0], name="wanted")
     graph.constrain(lambda x: rotated(x, AXES[0])[:, 2:], r, lower=0.0, upper=0.0, name="level")
     return graph, {r: turned(np.array([0.6, 0.0, 0.8]), 1.0)}
@@ -143,8 +139,7 @@ def levelled() -> Built:
 
 def disjoint_cones() -> Built:
     """A boresight within 0.4 rad of two directions that are 1.2 rad apart: it ends half way between them."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO3, 1)
+    graph, r = graph_with(fg.SO3, 1, "r")
     graph.minimize(fg.prior, r, turned(UP, 0.3)[0], sigma=10.0, name="wanted")
     for name, angle in (("first", 0.6), ("second", -0.6)):
         target = rotated(turned(AXES[0], angle), UP)[0]
@@ -154,8 +149,7 @@ def disjoint_cones() -> Built:
 
 def mean_with_limit() -> Built:
     """Mean of rotations about one axis, limited to 0.5 rad about it."""
-    graph = fg.Graph()
-    r = graph.variables("r", fg.SO3, 1)
+    graph, r = graph_with(fg.SO3, 1, "r")
     axis = np.array([2.0, -1.0, 2.0]) / 3.0
     measured = graph.data("measured", fg.SO3.exp(np.outer([0.2, 0.9, 1.3], axis)), each=True)
     graph.minimize(fg.prior, r, measured, name="measured")
@@ -183,8 +177,7 @@ def slew(steps: int = 6) -> Built:
 
 def sector() -> Built:
     """Mean heading of three compasses, one beyond the seam, kept within 0.2 rad of south."""
-    graph = fg.Graph()
-    h = graph.variables("h", fg.SO2, 1)
+    graph, h = graph_with(fg.SO2, 1, "h")
     measured = graph.data("measured", np.array([[2.5], [2.7], [-3.1]]), each=True)
     graph.minimize(fg.prior, h, measured, name="compasses")
     graph.constrain(lambda x: -np.cos(x), h, lower=math.cos(0.2), name="sector")
@@ -193,8 +186,7 @@ def sector() -> Built:
 
 def loop_of_angles(count: int = 5) -> Built:
     """Measured turns that do not add up to a full one, closed by a constraint: the error is shared by variance."""
-    graph = fg.Graph()
-    h = graph.variables("h", fg.SO2, count)
+    graph, h = graph_with(fg.SO2, count, "h")
     sigma = np.linspace(0.1, 0.3, count)[:, None]
     measured = graph.data("measured", np.full((count, 1), 2.0 * np.pi / count + 0.05), each=True)
     turn = graph.variables("turn", fg.Rn(1), count)
@@ -207,8 +199,7 @@ def loop_of_angles(count: int = 5) -> Built:
 
 def facing_on_rim() -> Built:
     """A pose on a circle of radius 2 that looks at its centre, near a wanted position."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE2, 1)
+    graph, x = graph_with(fg.SE2)
     graph.minimize(lambda p: p[:, :2] - np.array([3.0, 4.0]), x, name="near")
     graph.constrain(lambda p: (p[:, :2] ** 2).sum(axis=1, keepdims=True), x, lower=4.0, upper=4.0, name="rim")
     graph.constrain(
@@ -257,8 +248,7 @@ TARGETS = np.asarray(fg.SE3.act(np.repeat(PLACED, 4, axis=0), CORNERS))
 
 def tethered_registration() -> Built:
     """Fit points to points while the origin stays on a sphere of radius 2: rotation as without, position shortened."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 1)
+    graph, x = graph_with(fg.SE3)
     corners, targets = graph.data("corners", CORNERS, each=True), graph.data("targets", TARGETS, each=True)
     graph.minimize(lambda p, a, b: fg.SE3.act(p, a) - b, x, corners, targets, name="fit")
     graph.constrain(lambda p: (p[:, :3] ** 2).sum(axis=1, keepdims=True), x, lower=4.0, upper=4.0, name="tether")
@@ -267,8 +257,7 @@ def tethered_registration() -> Built:
 
 def screw_chain(count: int = 5) -> Built:
     """Poses along a screw, each step measured a tenth too short, both ends fixed: every step stretches alike."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, count + 1)
+    graph, x = graph_with(fg.SE3, count + 1)
     step = SCREW / 1.1
     graph.fix(x[0], fg.SE3.identity())
     graph.fix(x[-1], fg.SE3.exp(count * SCREW))
@@ -295,8 +284,7 @@ def rigid_link() -> Built:
 
 def hand_eye() -> Built:
     """A camera on a hand, A X = X B for three motions without noise: cost zero at the mounting."""
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 1)
+    graph, x = graph_with(fg.SE3)
     motions = fg.SE3.exp(np.array([[0.2, 0.1, 0, 0.8, 0, 0], [0, 0.3, 0.1, 0, 0.9, 0.2], [0.1, 0, 0.2, 0.3, 0, 1.0]]))
     mounting = np.repeat(MOUNTING, 3, axis=0)
     seen = fg.SE3.compose(fg.SE3.inverse(mounting), fg.SE3.compose(motions, mounting))
@@ -315,8 +303,7 @@ def biased_level() -> Built:
 
     Gravity is read 0.3 rad from where the prior has it; the heading about the vertical is held by its prior.
     """
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Product(r=fg.SO3, b=fg.Rn(1)), 1)
+    graph, x = graph_with(fg.Product(r=fg.SO3, b=fg.Rn(1)))
     graph.minimize(fg.prior, x.r, turned(AXES[0], 0.0)[0], name="heading")
     graph.minimize(fg.prior, x.b, [0.4], sigma=0.1, name="bias")
     graph.bound(x.b, lower=-0.2, upper=0.2, name="range")

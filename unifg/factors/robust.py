@@ -38,11 +38,9 @@ class Loss(Protocol):
 
     def value(self, squared: Array) -> Array:
         """rho(s) for (n,) squared norms."""
-        ...
 
     def weight(self, squared: Array) -> Array:
         """rho'(s) for (n,) squared norms, non-negative."""
-        ...
 
 
 @runtime_checkable
@@ -51,7 +49,6 @@ class Graduated(Loss, Protocol):
 
     def surrogates(self, largest: float, growth: float) -> Iterator[Loss]:
         """Losses from nearly convex at squared norms up to ``largest`` to this one, the last."""
-        ...
 
 
 class Formula:

@@ -46,15 +46,12 @@ class PresentCoupling(Protocol):
 
     def data(self, now: Context[Any]) -> dict[Data, ArrayLike]:
         """Values of the data it declared."""
-        ...
 
     def begin(self, guess: Guess, now: Context[Any]) -> Guess:
         """The guess for a solve, from one for the horizon alone or the shifted last answer."""
-        ...
 
     def believed(self, solution: Solution) -> tuple[Array, dict[str, Array]] | None:
         """Present state (storage,) and constants (count, storage) of a solve; None where it was given them."""
-        ...
 
 
 class FixedPresent:

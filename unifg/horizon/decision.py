@@ -137,7 +137,6 @@ class AcceptancePolicy(Protocol):
             now: what the terms were asked with.
             kept: the last plan that was accepted; its age counts this tick already.
         """
-        ...
 
 
 @dataclass(frozen=True)

@@ -41,11 +41,9 @@ class Arrival(Protocol):
 
         The reference is (S,), the storage of all variables side by side, followed by what :meth:`express` adds.
         """
-        ...
 
     def more(self, dim: int) -> int:
         """Numbers that follow the storage in the reference, for a prior over ``dim`` tangents; at rest all zero."""
-        ...
 
     def express(self, here: Array, step: Array, lowest: Array, information: Array) -> tuple[Array, Array]:
         """Reference and information (D, D) in these coordinates.
@@ -56,7 +54,6 @@ class Arrival(Protocol):
             lowest: (S,) that point.
             information: (D, D) over right perturbations.
         """
-        ...
 
 
 class Tangent:

@@ -81,11 +81,13 @@ class Term(Protocol):
         Which node follows which, :func:`unifg.horizon.tree_of` tells of x; in a horizon that branches slices as
         ``x[:-1]`` are refused.
         """
-        ...
 
     def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        """Values of the data that :meth:`state` declared, by name; others keep what they were declared with."""
-        ...
+        """Values of the data that :meth:`state` declared, by name; others keep what they were declared with.
+
+        A class that inherits from this one declares nothing that changes, unless it says otherwise.
+        """
+        return {}
 
 
 @runtime_checkable
@@ -95,7 +97,6 @@ class Recording(Protocol):
     @property
     def records(self) -> Mapping[str, tuple[int, ...]]:
         """Shape of a measurement at one node, by name."""
-        ...
 
 
 @runtime_checkable
@@ -104,7 +105,6 @@ class Resetting(Protocol):
 
     def reset(self) -> None:
         """Forget it: the window or the loop begins anew."""
-        ...
 
 
 @runtime_checkable
@@ -113,7 +113,6 @@ class Guessing(Protocol):
 
     def guess(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
         """Values (count, storage) for a first guess, by the names of the families."""
-        ...
 
 
 @dataclass(frozen=True)

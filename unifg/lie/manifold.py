@@ -35,37 +35,29 @@ class Manifold(Protocol):
     @property
     def name(self) -> str:
         """Short name for tables and messages."""
-        ...
 
     @property
     def storage(self) -> int:
         """Length of the vector that stores a point."""
-        ...
 
     @property
     def dim(self) -> int:
         """Dimension of the tangent space."""
-        ...
 
     def identity(self) -> Array:
         """Return the (storage,) point to start from when nothing better is known."""
-        ...
 
     def retract(self, x: Array, d: Array, /) -> Array:
         """Move (..., storage) points by (..., dim) steps: ``x [+] d``."""
-        ...
 
     def local(self, x: Array, y: Array, /) -> Array:
         """Return the (..., dim) step ``d`` with ``x [+] d = y``."""
-        ...
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
         """Draw (*shape, storage) points that reach every part of the manifold."""
-        ...
 
     def is_valid(self, x: Array, /) -> BoolArray:
         """Tell for each of (..., storage) vectors whether it is a point of the manifold."""
-        ...
 
 
 class ManifoldBase(ABC):

@@ -53,23 +53,18 @@ class Worker(Protocol):
     @property
     def solves_each(self) -> bool:
         """True if :meth:`solve_part` may be asked."""
-        ...
 
     def solve(self, guess: AnyGuess, *, data: Mapping[Data, Numbers] | None = None) -> Solution:
         """Solve one instance."""
-        ...
 
     def read(self, guess: AnyGuess) -> tuple[Values, Array, Array]:
         """Values, multipliers and penalties of a guess."""
-        ...
 
     def twins(self, count: int) -> Sequence[Worker]:
         """Workers of other threads."""
-        ...
 
     def solve_part(self, guesses: tuple[Array, Array], data: Mapping[Data, Array], count: int) -> Outcomes | None:
         """Some instances in one compiled call, or None."""
-        ...
 
 
 class Batch:

@@ -108,7 +108,6 @@ class Exportable(Protocol):
 
     def entry(self) -> Exported:
         """The solver's."""
-        ...
 
 
 def export(prepared: Exportable, folder: Path, name: str, target: str) -> list[Path]:
