@@ -71,8 +71,10 @@ def motion(x: Array, u: Array, mass: Array, drag: Array, weights: Array, after: 
     """(n, 9) defect of a step by the trapezoid."""
     known = mass, drag, weights
     meant = 0.5 * (modelled(x, u, *known) + modelled(after, u, *known))
-    ahead = after[:, :3] - x[:, :3] - 0.5 * step * (x[:, 7:10] + after[:, 7:10])
-    turn = fg.SO3.log(fg.SO3.compose(fg.SO3.inverse(x[:, 3:7]), after[:, 3:7])) - step * u[:, :3]
+    speed = 0.5 * (x[:, 7:10] + after[:, 7:10])
+    ahead = after[:, :3] - x[:, :3] - step * speed
+    turned = fg.SO3.compose(fg.SO3.inverse(x[:, 3:7]), after[:, 3:7])
+    turn = fg.SO3.log(turned) - step * u[:, :3]
     return np.concatenate([ahead, turn, after[:, 7:10] - x[:, 7:10] - step * meant], axis=1)
 
 

@@ -11,12 +11,24 @@ import pytest
 
 import unifg as fg
 from unifg.errors import GraphError
-from unifg.horizon import Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Tree, Window
+from unifg.horizon import (
+    Constant,
+    Context,
+    ControlCost,
+    Dynamics,
+    Measurement,
+    RecedingHorizon,
+    Robot,
+    Term,
+    Tree,
+    Window,
+)
 from unifg.models import unicycle
 from unifg.solvers import InteriorPoint
-from unifg.typing import Array
+from unifg.typing import Array, ArrayLike
 
 STEP, STEPS = 0.1, 12
+START = (0.0, 0.4, 0.0)
 SPREAD = np.diag([0.05, 0.01, 0.02]) ** 2
 
 
@@ -30,34 +42,40 @@ class Wall:
     data_lower: Mapping[str, Array] = field(default_factory=dict)
     goal: tuple[float, float, float] = (1.0, -0.5, 0.0)
 
-    def state(self, graph, x, u):
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize(fg.prior, x[1:], list(self.goal), sigma=[1.0, 1.0, 3.0], name="goal")
         graph.bound(u, lower=[0.0, -1.5], upper=[1.0, 1.5], name="limits")
         lower = graph.data("edge", [float(self.lower)]) if self.data_lower else self.lower
         graph.constrain(height, x[1:], lower=lower, upper=self.upper, soft=self.soft, name="wall")
 
-    def data(self, now):
+    def data(self, now: Context[Any]) -> Mapping[str, Array]:
         return self.data_lower
 
 
-def height(x):
+def height(x: Array) -> Array:
     return x[:, 1:2]
 
 
-def loop_of(wall, **options):
+def loop_of(wall: Wall, **options: Any) -> RecedingHorizon:
     robot = Robot(fg.SE2, fg.Rn(2))
-    terms = [Dynamics(unicycle.dynamics, STEP), wall, ControlCost(sigma=[3.0, 3.0])]
+    terms: list[Term] = [Dynamics(unicycle.dynamics, STEP), wall, ControlCost(sigma=[3.0, 3.0])]
     return RecedingHorizon(robot, STEPS, terms, solver=InteriorPoint(), **options)
 
 
-def planned(wall, start=(0.0, 0.4, 0.0), covariance=SPREAD, **options):
+def planned(wall: Wall, start: ArrayLike = START, covariance: Array | None = SPREAD, **options: Any) -> Array:
     loop = loop_of(wall, **options)
     for _ in range(6):  # a margin is that at the guess: the plan settles
         loop.plan(start, covariance=covariance)
+    return nodes(loop)
+
+
+def nodes(loop: RecedingHorizon) -> Array:
+    """(N + 1, 3) of the last plan."""
+    assert loop.solution is not None
     return loop.solution[loop.x]
 
 
-def deviations(states, covariance=SPREAD):
+def deviations(states: Array, covariance: Array = SPREAD) -> Array:
     """Standard deviations of y when the error of the present moves the plan as a rigid body, by differences."""
     start, found, eps = states[0], np.zeros(len(states)), 1e-6
     for k, state in enumerate(states):
@@ -72,7 +90,7 @@ def deviations(states, covariance=SPREAD):
     return found
 
 
-def test_every_node_keeps_its_number_of_standard_deviations():
+def test_every_node_keeps_its_number_of_standard_deviations() -> None:
     states = planned(Wall(), sigmas=3.0)
     wanted = 3.0 * deviations(states)
     assert (states[1:, 1] > wanted[1:] - 1e-5).all()
@@ -82,7 +100,7 @@ def test_every_node_keeps_its_number_of_standard_deviations():
 
 
 @pytest.mark.parametrize("start", [(0.0, 0.4, 0.0), (0.2, 0.4, 1.2)])
-def test_without_sigmas_or_covariance_plans_keep_their_bits(start):
+def test_without_sigmas_or_covariance_plans_keep_their_bits(start: tuple[float, float, float]) -> None:
     usual = planned(Wall(), start, None)
     assert np.array_equal(planned(Wall(), start, sigmas=0.0), usual)
     assert np.array_equal(planned(Wall(), start, sigmas={}), usual)
@@ -90,7 +108,7 @@ def test_without_sigmas_or_covariance_plans_keep_their_bits(start):
     assert np.allclose(certain, usual, atol=1e-6)
 
 
-def test_limits_that_are_data_and_upper_limits_get_margins():
+def test_limits_that_are_data_and_upper_limits_get_margins() -> None:
     states = planned(Wall(data_lower={"edge": np.array([0.1])}), sigmas={"wall": 2.0})
     assert ((states[:, 1] - 0.1 - 2.0 * deviations(states))[1:] > -1e-5).all()
     assert (states[:, 1] - 0.1 - 2.0 * deviations(states))[1:].min() < 1e-3
@@ -99,14 +117,14 @@ def test_limits_that_are_data_and_upper_limits_get_margins():
     assert -1e-5 < spare.min() < 1e-3
 
 
-def test_two_limits_leave_something_between_them():
+def test_two_limits_leave_something_between_them() -> None:
     loop = loop_of(Wall(lower=0.35, upper=0.45), sigmas=30.0)
     assert loop.plan((0.0, 0.4, 0.0), covariance=SPREAD).status is fg.Status.CONVERGED
-    states = loop.solution[loop.x]
+    states = nodes(loop)
     assert (np.abs(states[1:, 1] - 0.4) < 0.05 * 0.1 + 1e-5).all()
 
 
-def test_a_robot_nearer_than_its_margin_has_plans_and_leaves():
+def test_a_robot_nearer_than_its_margin_has_plans_and_leaves() -> None:
     loop = loop_of(Wall(goal=(1.0, 0.02, 0.0)), sigmas=3.0)
     state, spare = np.array([0.0, 0.02, 0.0]), []
     for _ in range(60):
@@ -119,12 +137,13 @@ def test_a_robot_nearer_than_its_margin_has_plans_and_leaves():
     assert min(spare) > 0.0
 
 
-def test_a_soft_constraint_is_tightened_itself_and_a_hard_one_once_more():
-    ends = {}
+def test_a_soft_constraint_is_tightened_itself_and_a_hard_one_once_more() -> None:
+    ends = dict[float | None, fg.Solution]()
     for soft in (None, 1e3):
         loop = loop_of(Wall(soft=soft, goal=(1.0, 0.02, 0.0)), sigmas=3.0)
         for _ in range(6):
             loop.plan((0.0, 0.02, 0.0), covariance=SPREAD)
+        assert loop.solution is not None
         ends[soft] = loop.solution
     with pytest.raises(GraphError, match="with a margin"):
         ends[1e3].slack("wall, with a margin")
@@ -139,43 +158,47 @@ class Pillar(Term):
 
     reach: float = 0.3
 
-    def state(self, graph, x, u):
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize(fg.prior, x[1:], [2.0, 0.05, 0.0], sigma=[1.0, 1.0, 3.0], name="goal")
         graph.bound(u, lower=[0.0, -1.5], upper=[1.0, 1.5], name="limits")
         pillar = graph.families["pillar"]
         graph.constrain(apart, x[1:], pillar, lower=self.reach, name="pillar kept off")
 
 
-def apart(x, place):
-    away = x[:, :2] - place
-    return np.sqrt((away**2).sum(axis=1, keepdims=True))
+def apart(x: Array, place: Array) -> Array:
+    found: Array = np.linalg.norm(x[:, :2] - place, axis=1, keepdims=True)
+    return found
 
 
 @pytest.mark.parametrize("shared", [0.0, 1.0], ids=["independent", "moves with the robot"])
-def test_constants_count_with_their_correlation(shared):
+def test_constants_count_with_their_correlation(shared: float) -> None:
     pillar = Constant("pillar", fg.Rn(2), [[1.0, 0.0]], 0.1)
     robot = Robot(fg.SE2, fg.Rn(2), constants=(pillar,))
-    terms = [Dynamics(unicycle.dynamics, STEP), Pillar(), ControlCost(sigma=[3.0, 3.0])]
+    terms: list[Term] = [Dynamics(unicycle.dynamics, STEP), Pillar(), ControlCost(sigma=[3.0, 3.0])]
     loop = RecedingHorizon(robot, 20, terms, solver=InteriorPoint(), sigmas=2.0)
     spread = np.zeros((5, 5))
     spread[:2, :2] = spread[3:, 3:] = 0.04**2 * np.eye(2)
     spread[:2, 3:] = spread[3:, :2] = shared * 0.04**2 * np.eye(2)
     for _ in range(8):
         loop.plan((0.0, 0.1, 0.0), covariance=spread)
-    states = loop.solution[loop.x]
+    states = nodes(loop)
     gap = np.hypot(*(states[1:, :2] - [1.0, 0.0]).T).min() - 0.3
     wanted = 0.0 if shared else 2.0 * np.sqrt(2.0) * 0.04
     assert gap == pytest.approx(wanted, abs=2e-3)
 
 
-def test_a_window_gives_its_own_covariance():
+def test_a_window_gives_its_own_covariance() -> None:
     robot = Robot(fg.SE2, fg.Rn(2))
     fixes = Measurement("fix", lambda pose, z: pose[:, :2] - z, (2,), 0.1)
     wheels = Dynamics(unicycle.dynamics, STEP, sigma=[0.02, 0.02, 0.02])
-    nearest = {}
+    nearest = dict[float, float]()
     for sigmas in (0.0, 3.0):
         window = Window(robot, 8, [fixes, wheels], start=[0.0, 0.3, 0.0], sigma=0.1)
-        terms = [Dynamics(unicycle.dynamics, STEP), Wall(goal=(2.0, 0.0, 0.0)), ControlCost(sigma=[3.0, 3.0])]
+        terms: list[Term] = [
+            Dynamics(unicycle.dynamics, STEP),
+            Wall(goal=(2.0, 0.0, 0.0)),
+            ControlCost(sigma=[3.0, 3.0]),
+        ]
         loop = RecedingHorizon(robot, STEPS, terms, solver=InteriorPoint(), window=window, sigmas=sigmas)
         pose, rng = np.array([[0.0, 0.3, 0.0]]), np.random.default_rng(1)
         seen = []
@@ -189,7 +212,7 @@ def test_a_window_gives_its_own_covariance():
         loop.plan((0.0, 0.3, 0.0), covariance=np.eye(2))
 
 
-def test_errors_name_what_was_given():
+def test_errors_name_what_was_given() -> None:
     with pytest.raises(GraphError, match=r"'walls' is no inequality constraint on states \(there are: 'wall'\)"):
         loop_of(Wall(), sigmas={"walls": 2.0})
     with pytest.raises(GraphError, match="'limits' is no inequality"):
@@ -206,16 +229,22 @@ def test_errors_name_what_was_given():
         loop_of(Wall(), sigmas=1.0).plan((0.0, 0.4, 0.0))
 
 
-def test_a_joint_graph_and_a_horizon_that_branches_have_margins():
+def test_a_joint_graph_and_a_horizon_that_branches_have_margins() -> None:
     robot = Robot(fg.SE2, fg.Rn(2))
     fixes = Measurement("fix", lambda pose, z: pose[:, :2] - z, (2,), 0.1)
     window = Window(robot, 4, [fixes, Dynamics(unicycle.dynamics, STEP, sigma=0.02)], start=[0.0, 0.4, 0.0], sigma=0.05)
-    tree = Tree((0, 1, 2, 2, 3, 4))
-    for steps, options in ((STEPS, {"window": window, "coupling": "joint"}), (tree, {"window": window})):
-        terms = [Dynamics(unicycle.dynamics, STEP), Wall(goal=(1.0, -2.0, 0.0)), ControlCost(sigma=[3.0, 3.0])]
-        loop = RecedingHorizon(robot, steps, terms, solver=InteriorPoint(), sigmas=2.0, **options)
+    variants: list[tuple[int | Tree, Any]] = [(STEPS, "joint"), (Tree((0, 1, 2, 2, 3, 4)), "sequential")]
+    for steps, coupling in variants:
+        terms: list[Term] = [
+            Dynamics(unicycle.dynamics, STEP),
+            Wall(goal=(1.0, -2.0, 0.0)),
+            ControlCost(sigma=[3.0, 3.0]),
+        ]
+        loop = RecedingHorizon(
+            robot, steps, terms, solver=InteriorPoint(), sigmas=2.0, window=window, coupling=coupling
+        )
         for _ in range(8):
             loop.tick(applied=[0.0, 0.0], measured={"fix": [0.0, 0.4]})
-        states = loop.solution[loop.x]
+        states = nodes(loop)
         spare = (states[:, 1] - 2.0 * deviations(states, window.covariance))[1:]
         assert spare.min() > -2e-3

@@ -49,8 +49,8 @@ def test_counts_are_kept_apart() -> None:
 
 
 def test_control_c_that_osqp_has_taken_ends_the_solve(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(osqp.OSQP, "solve", lambda *_, **__: SimpleNamespace(info=told))
     told = SimpleNamespace(status_val=osqp.SolverStatus.OSQP_SIGINT, iter=1, rho_updates=0)
+    monkeypatch.setattr(osqp.OSQP, "solve", lambda *_, **__: SimpleNamespace(info=told))
     graph, guess = active_bounds()
     assert SQP().solve(graph, guess).status is fg.Status.INTERRUPTED
 
