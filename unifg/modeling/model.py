@@ -396,9 +396,7 @@ class Model:
     ) -> dict[str, Any]:
         """Parts that every kind of term has, by their names in :class:`Term`."""
         wrapped = complete(function, arguments, name)
-        if (
-            wrapped.kernel is not None
-        ):  # a function in Python sees what becomes of its arrays, as of all that it reaches
+        if wrapped.kernel is not None:  # else a function in Python, which sees what becomes of all that it reaches
             arguments = tuple(
                 replace(a, value=kept(a.value)) if isinstance(a, Declared) else kept(a) for a in arguments
             )

@@ -10,7 +10,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import Loss
-from unifg.modeling.duplicates import doubles, kept
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.soft import Slack, Soft
 from unifg.modeling.variables import Data, Declared, Family, Selection
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -198,7 +198,7 @@ def prepare_arguments(
         raise GraphError(f"term '{name}' has no variable among its arguments: pass a family or a selection", term=name)
     if active is not None:
         if not isinstance(active, Data):
-            active = kept(doubles(f"term '{name}': active=", active, term=name, flags=True))
+            active = np.array(doubles(f"term '{name}': active=", active, term=name, flags=True))
         value = active.value if isinstance(active, Data) else active
         if value.dtype != bool:
             raise GraphError(

@@ -10,7 +10,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.factors.whitening import reciprocals, square_roots
-from unifg.modeling.duplicates import doubles, kept
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.terms import Parameter
 from unifg.modeling.variables import Data, as_selection, is_variable
 from unifg.typing import Array
@@ -42,11 +42,11 @@ def check_weights(
             no standard deviation or information matrix.
     """
     if sigma is not None:
-        sigma = sigma if isinstance(sigma, Data) else kept(doubles(f"term '{name}': sigma", sigma, term=name))
+        sigma = sigma if isinstance(sigma, Data) else np.array(doubles(f"term '{name}': sigma", sigma, term=name))
         reciprocals(name, _present(sigma), count, size)
     if information is not None:
         if not isinstance(information, Data):
-            information = kept(doubles(f"term '{name}': information", information, term=name))
+            information = np.array(doubles(f"term '{name}': information", information, term=name))
         square_roots(name, _present(information), count, size)
     return sigma, information
 
@@ -61,7 +61,7 @@ def check_limits(name: str, lower: Parameter, upper: Parameter, count: int, size
     for which, limit in (("lower", lower), ("upper", upper)):
         if limit is None:
             raise GraphError(f"term '{name}': {which} is None: leave it out where there is no limit", term=name)
-        made = limit if isinstance(limit, Data) else kept(doubles(f"term '{name}': {which}", limit, term=name))
+        made = limit if isinstance(limit, Data) else np.array(doubles(f"term '{name}': {which}", limit, term=name))
         _check_limit(name, which, _present(made), count, size)
         both.append(made)
     least, most = (_present(limit) for limit in both)
