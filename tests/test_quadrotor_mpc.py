@@ -348,7 +348,7 @@ def test_in_clutter_a_cylinder_counts_once_enough_readings_show_it() -> None:
             assert not any(len(reading.ids) for reading in told)
     near = [np.hypot(*(np.cos(r.bearings) * r.ranges - 3.0, np.sin(r.bearings) * r.ranges - 0.5)) for r in told]
     assert sum(len(own) for own in near) > 0.9 * shown
-    assert max(float(own.max(initial=0.0)) for own in near) < 0.7
+    assert max(float(own.max(initial=0.0)) for own in near) < 0.31
     known = LineTracker().told(sighting(0.0, np.array([[1.0, 0.0], [2.0, 0.0]]), [5, NOTHING], state), state)
     assert known.ids.tolist() == [5]
 
@@ -364,7 +364,7 @@ def test_clutter_misses_and_wrong_radii_cost_a_flight_little(association: str) -
     assert np.linalg.norm(log.truth[-1, :3] - plain.truth[-1, :3]) < 1.0  # after the same time
     mapped = log.landmarks[-1]["mean"][log.landmarks[-1]["radius"] > 0.0]
     gaps = np.linalg.norm(mapped[:, None] - flight.world.layout.cylinders[None, :, :2], axis=2).min(axis=1)
-    assert len(mapped) and gaps.max() < 0.5  # nothing false is on the map
+    assert len(mapped) and gaps.max() < 0.1  # nothing false is on the map, and nothing stands beside its place
 
 
 @pytest.mark.product(4, of="drives and flights")

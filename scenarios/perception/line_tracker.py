@@ -24,6 +24,7 @@ MEMORY, WATCH = 0.6, 1.0  # [s]; age of the oldest detection that counts, and th
 PATIENCE = 1.5  # [s] for which a track that is not seen goes on
 LEAST = 6  # detections before a velocity is believed; until then a disc stands
 GATE = 0.6  # [m] of a detection from where its track is expected, at most; for unknown association
+APART = 0.3  # [m] of a detection from the others of its track, at most; in clutter
 SPEED_LIMIT, SLOWEST = 1.5, 0.2  # [m/s] that is believed, and of what moves: corrections make all things seem to
 SURE = 5.0  # standard deviations from rest beyond which it does
 
@@ -76,8 +77,14 @@ class LineTracker:
         moving[rows] = [track.moves for track in tracks]
         self._confirmation.note(names)
         counts = reading.kinds != Landmarks.CYLINDER
-        counts[rows] = [self._confirmation.holds(track.name) for track in tracks]
+        counts[rows] = [self._confirmation.holds(track.name) and not self._false(track) for track in tracks]
         return replace(reading, ids=names, moving=moving).only(counts)
+
+    def _false(self, track: _Track) -> bool:
+        """Test whether, in clutter, the last detection of a track that stands is far from where most of them are."""
+        if track.moves or not self._confirmation.wants_more:
+            return False
+        return float(np.linalg.norm(track.places[-1] - np.median(track.places, axis=0))) > APART
 
     def update(self, reading: Reading, state: Array) -> Tracks:
         """Tracks of the discs that move, now.
