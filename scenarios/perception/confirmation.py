@@ -1,7 +1,7 @@
 """Confirmation of new tracks by M of the last N readings, the usual rule against false detections.
 
-Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 3.4: with false
-detections that are spread out, few are in one place M times in N readings.
+Few false detections that are spread out are in one place M times in N readings (Bar-Shalom and Li,
+Multitarget-Multisensor Tracking, 1995).
 """
 
 from __future__ import annotations
