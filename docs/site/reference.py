@@ -126,12 +126,9 @@ def entry(module: str, name: str) -> str:
 
 def told(module: str, name: str) -> str | None:
     """The text that a residual was given; None for what is no residual."""
+    module, name = origin(module, name)
     values = {}
     for node in tree_of(module).body:
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("unifg"):
-            for alias in node.names:
-                if (alias.asname or alias.name) == name:
-                    return told(node.module, alias.name)
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
             values[node.targets[0].id] = node.value
     value = values.get(name)

@@ -19,11 +19,6 @@ class Confirmation:
         self._needed = needed
         self._seen: deque[frozenset[int]] = deque(maxlen=readings)
 
-    @property
-    def wants_more(self) -> bool:
-        """True if one reading is not enough."""
-        return self._needed > 1
-
     def note(self, names: IntArray) -> None:
         """Take in the names of a reading."""
         self._seen.append(frozenset(names.tolist()))

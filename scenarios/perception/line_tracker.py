@@ -54,7 +54,7 @@ class LineTracker:
             association: "known" trusts the readings' names and flags, "unknown" finds out.
             confirmation: M and N: where it is unknown, cylinders are told of once M of the last N readings show them.
         """
-        self._confirmation = Confirmation(*confirmation)
+        self._confirmation, self._cluttered = Confirmation(*confirmation), confirmation[0] > 1
         self._known = association == "known"
         self._tracks: list[_Track] = []
         self._count = 0
@@ -69,7 +69,7 @@ class LineTracker:
             state: (10,) predicted for its time.
         """
         if self._known:
-            return reading if (reading.ids != NOTHING).all() else reading.only(reading.ids != NOTHING)
+            return reading.only(reading.ids != NOTHING)
         rows = np.flatnonzero(reading.kinds == Landmarks.CYLINDER)
         tracks = self._follow(reading, state, rows)
         names, moving = np.full(len(reading.ids), -1, dtype=np.intp), np.zeros(len(reading.ids), dtype=bool)
@@ -82,7 +82,7 @@ class LineTracker:
 
     def _false(self, track: _Track) -> bool:
         """Test whether, in clutter, the last detection of a track that stands is far from where most of them are."""
-        if track.moves or not self._confirmation.wants_more:
+        if track.moves or not self._cluttered:
             return False
         return float(np.linalg.norm(track.places[-1] - np.median(track.places, axis=0))) > APART
 

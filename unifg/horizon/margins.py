@@ -19,7 +19,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.term import CompiledTerm
 from unifg.solution.graph import Graph
 from unifg.solution.solution import Guess
-from unifg.typing import Array, ArrayLike, IntArray
+from unifg.typing import Array, ArrayLike
 
 WIDEST = 0.45  # of what lies between two limits, so that something is left between them
 ROUNDING = 1e-9  # of a covariance
@@ -78,6 +78,8 @@ class Margins:
             GraphError: when a number is negative or not finite, or a name is none of such a constraint.
         """
         self._robot, self._x, self._window = robot, x, window
+        self._columns = {name: robot.state.dim + places for name, places in robot.places("dim").items()}
+        self._size = robot.state.dim + sum(columns.size for columns in self._columns.values())
         own = {term.name: term for term in terms if isinstance(term, Constraint) and self._limits_state(term)}
         given = dict(sigmas) if isinstance(sigmas, Mapping) else dict.fromkeys(own, 0.0 if sigmas is None else sigmas)
         chosen = {name: float(numbers(count, (), f"sigmas of '{name}'")) for name, count in given.items()}
@@ -137,7 +139,7 @@ class Margins:
         """
         if covariance is None and self._window is not None:
             covariance = self._window.covariance
-        size = self._robot.state.dim + sum(len(own.values) * own.manifold.dim for own in self._robot.constants)
+        size = self._size
         if covariance is None:
             raise GraphError(f"sigmas need the covariance of state and constants, ({size}, {size}), or a window")
         spread = numbers(covariance, (size, size), "sigmas: the covariance of state and constants")
@@ -173,27 +175,18 @@ class Margins:
     def _deviation(self, term: CompiledTerm, values: Values, covariance: Array, transport: Array) -> Array:
         """(n, m) standard deviations of a term's rows."""
         slopes = np.zeros((term.count, term.size, len(covariance)))
-        first, dim, columns = int(self._x.indices[0]), self._robot.state.dim, self._columns()
+        first, dim = int(self._x.indices[0]), self._robot.state.dim
         factors, rows = np.arange(term.count)[:, None, None], np.arange(term.size)[:, None]
         for gather, block in zip(term.gathers, term.jacobians(values), strict=True):
             chosen = gather.selection
             members = np.broadcast_to(chosen.indices, (term.count,))
             if chosen.family is self._x.family:
                 slopes[:, :, :dim] += block @ transport[members - first][:, chosen.tangent]
-            elif chosen.family.name in columns:
-                own = columns[chosen.family.name][members][:, chosen.tangent]
+            elif chosen.family.name in self._columns:
+                own = self._columns[chosen.family.name][members][:, chosen.tangent]
                 slopes[factors, rows, own[:, None]] += block
         variances: Array = np.einsum("nmi,ij,nmj->nm", slopes, covariance, slopes)
         return np.sqrt(np.maximum(variances, 0.0))
-
-    def _columns(self) -> dict[str, IntArray]:
-        """(count, d) columns of the covariance of each constant's members."""
-        at, found = self._robot.state.dim, dict[str, IntArray]()
-        for constant in self._robot.constants:
-            shape = len(constant.values), constant.manifold.dim
-            found[constant.name] = at + np.arange(shape[0] * shape[1]).reshape(shape)
-            at += shape[0] * shape[1]
-        return found
 
 
 def as_rows(limit: Parameter, handle: Data, given: Mapping[Data, ArrayLike]) -> Array:

@@ -387,14 +387,15 @@ class RecedingHorizon:
         self.waited = 0
         data = self.data(now)
         run, guess = self.begin(now)
-        if self._margins:
-            data = self._margins.data(run.program, self.tie.begin(guess, now), covariance, data)
         if run is self.warm and not self._fits(begin):
             return self._late(now, present, begin)
+        start = self.tie.begin(guess, now)
+        if self._margins:
+            data = self._margins.data(run.program, start, covariance, data)
         if np.isfinite(self._deadline) and self._portion is None:
             limit = self._limits[0 if run is self.warm else 1]
             run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
-        first, rescued = self._timed(lambda: run.solve(self.tie.begin(guess, now), data=data)), False
+        first, rescued = self._timed(lambda: run.solve(start, data=data)), False
         solution = self._search(first, now, data, begin)
         if self.second is not None and self._refuses(solution, now):
             solution, rescued = self._ask(self.second, solution, now, data, begin)

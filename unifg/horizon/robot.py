@@ -11,7 +11,7 @@ from unifg.errors import GraphError
 from unifg.lie import Manifold
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Family
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array, ArrayLike, IntArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +101,15 @@ class Robot:
     steps: Mapping[str, Manifold] = field(default_factory=dict)
     predict: Callable[..., Array] | None = None
     tick: float | None = None
+
+    def places(self, size: str) -> dict[str, IntArray]:
+        """(count, k) places of the members of each constant among all of them, counted in "dim" or in "storage"."""
+        at, found = 0, dict[str, IntArray]()
+        for constant in self.constants:
+            shape = len(constant.values), int(getattr(constant.manifold, size))
+            found[constant.name] = at + np.arange(shape[0] * shape[1]).reshape(shape)
+            at += shape[0] * shape[1]
+        return found
 
     def predicted(self, state: Array, control: Array, seconds: float | None = None) -> Array:
         """(storage,) state after a step with a control (m,).

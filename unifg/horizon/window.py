@@ -157,20 +157,18 @@ class Window:
         return self._member(name, member, self.robot.state.dim, "dim")
 
     def _member(self, name: str, member: int, at: int, size: str) -> slice:
-        for static in self.robot.constants:
-            own = getattr(static.manifold, size)
-            if static.name == name and 0 <= member < len(static.values):
-                return slice(at + member * own, at + (member + 1) * own)
-            at += own * len(static.values)
-        raise GraphError(f"the robot has no static '{name}' with a member {member}", family=name)
+        places = self.robot.places(size).get(name, ())
+        if not 0 <= member < len(places):
+            raise GraphError(f"the robot has no static '{name}' with a member {member}", family=name)
+        own = places[member]
+        return slice(at + int(own[0]), at + int(own[-1]) + 1)
 
     def _arriving(self, name: str, member: int) -> Place:
         """Position of a static's member in the arrival."""
         state, reach = self.robot.state, self._past.reach
         sizes = (reach * state.storage, "storage"), (reach * state.dim, "dim")
         reference, information = (self._member(name, member, at, size) for at, size in sizes)
-        constants = sum(len(static.values) * static.manifold.storage for static in self.robot.constants)
-        behind = reach * state.storage + constants
+        behind = reach * state.storage + sum(places.size for places in self.robot.places("storage").values())
         return reference, information, slice(behind + information.start, behind + information.stop)
 
     @synchronized

@@ -19,19 +19,22 @@ the end, each is compared with the map of the rest.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from unifg.elimination.factorization import Factorization
-from unifg.modeling.variables import Data
+from unifg.modeling.variables import Data, Family
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, ResidualName
 from unifg.pose_graphs.verdict import Kind
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.term import CompiledTerm
 from unifg.solution.conditioning import HARDLY
+from unifg.solution.graph import Graph
+from unifg.solution.solution import Solution
 from unifg.solvers.gating import NEAR, UNCHECKED, Innovations, VarianceFactor, neighbours
 from unifg.solvers.least_squares import MAP, GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, BoolArray, IntArray
@@ -201,16 +204,23 @@ class Partial:
                 used = self._stated.data(f"{name} that count", np.ones(int(chosen.sum()), dtype=np.bool_), each=True)
                 self._stated.replace(name, active=used)
                 self._counting.append((used, chosen))
-        self._solver = GaussNewton(tolerance=MAP, max_iterations=FEW).prepare(self._stated)
 
     def optimum(self, active: BoolArray) -> tuple[PoseGraph, float]:
         """Minimum of plain squares of some edges (m,), to within 1e-5 of chi2, and chi2 there."""
         data = {used: active[chosen] for used, chosen in self._counting}
-        solution = self._solver.solve(self._guess, data=data)
-        if not solution.converged:
-            solution = LevenbergMarquardt(tolerance=MAP).prepare(self._stated).solve(solution, data=data)
-        landmarks = solution[self._stated.families["landmarks"]] if len(self.graph.landmarks) else None
-        return self.graph.with_poses(solution[self._x], landmarks), 2.0 * solution.cost
+        solution, solved = _solved(self.graph, self._stated, self._x, self._guess, data)
+        return solved, 2.0 * solution.cost
+
+
+def _solved(
+    pose_graph: PoseGraph, stated: Graph, x: Family, guess: Mapping[Family, Array], data: Mapping[Data, BoolArray]
+) -> tuple[Solution, PoseGraph]:
+    """Optimum of a stated graph, to within 1e-5 of chi2, and the pose graph there."""
+    solution = GaussNewton(tolerance=MAP, max_iterations=FEW).solve(stated, guess, data=data)
+    if not solution.converged:
+        solution = LevenbergMarquardt(tolerance=MAP).solve(stated, solution, data=data)
+    landmarks = solution[stated.families["landmarks"]] if len(pose_graph.landmarks) else None
+    return solution, pose_graph.with_poses(solution[x], landmarks)
 
 
 def _quantile(freedom: float, share: float) -> float:
@@ -251,11 +261,8 @@ class Map:
         """Solve."""
         part = replace(pose_graph, edges=pose_graph.edges[active])
         stated, x, guess = part.graph(residual=residual)
-        solution = GaussNewton(tolerance=MAP, max_iterations=FEW).solve(stated, guess)
-        if not solution.converged:
-            solution = LevenbergMarquardt(tolerance=MAP).solve(stated, solution)
-        landmarks = solution[stated.families["landmarks"]] if len(part.landmarks) else None
-        self.graph, self.active, self.residual = pose_graph.with_poses(solution[x], landmarks), active.copy(), residual
+        solution, self.graph = _solved(pose_graph, stated, x, guess, {})
+        self.active, self.residual = active.copy(), residual
         self.chi2 = 2.0 * solution.cost
         self._program, self._values = stated.compile(), solution.values
 
