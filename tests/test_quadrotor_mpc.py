@@ -349,6 +349,8 @@ def test_in_clutter_a_cylinder_counts_once_enough_readings_show_it() -> None:
     near = [np.hypot(*(np.cos(r.bearings) * r.ranges - 3.0, np.sin(r.bearings) * r.ranges - 0.5)) for r in told]
     assert sum(len(own) for own in near) > 0.9 * shown
     assert max(float(own.max(initial=0.0)) for own in near) < 0.31
+    beside = tracker.told(sighting(15.0, np.array([[3.45, 0.5]]), [NOTHING], state), state)
+    assert len(beside.ids) == 0  # a false one takes the track of a cylinder that was missed, and not its place
     known = LineTracker().told(sighting(0.0, np.array([[1.0, 0.0], [2.0, 0.0]]), [5, NOTHING], state), state)
     assert known.ids.tolist() == [5]
 
