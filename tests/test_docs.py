@@ -256,6 +256,7 @@ def test_shell_fences_run_in_a_copy(tmp_path: Path) -> None:
     assert not (CHECKOUT / "note.txt").exists()
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize(
     ("seconds", "codes", "messages"),
     [

@@ -44,7 +44,7 @@ figures[0].savefig(sys.argv[1])
 """
 
 
-@pytest.mark.product(4, of="processes of their own")
+@pytest.mark.product(3, of="processes of their own")
 def test_matplotlib_is_imported_when_something_is_drawn_and_pyplot_never(tmp_path: Path) -> None:
     target = tmp_path / "graph.png"
     run_script(SILENT, target)
@@ -320,7 +320,7 @@ def test_factors_between_poses_apart_are_lines() -> None:
             np.testing.assert_array_equal(drawn[0], [[at[i], at[j]] for i, j in pairs])
 
 
-@pytest.mark.product(3, of="scenes and pictures")
+@pytest.mark.product(2, of="scenes and pictures")
 def test_odd_selections_are_plotted_without_a_warning() -> None:
     graph, x = line(4)
     wide = graph.variables("wide", fg.Rn(12), 2)

@@ -407,7 +407,7 @@ def test_a_rival_loss_is_named_where_it_finds_more(caplog: pytest.LogCaptureFixt
     assert weights[sim.outliers].max() == 0.0 and weights[~sim.outliers].mean() > 0.98
 
 
-@pytest.mark.product(3, of="studies")
+@pytest.mark.product(2, of="studies")
 def test_the_study_of_wrong_closures_counts_what_each_method_keeps() -> None:
     """A row per method; GTSAM's GNC agrees with ours where nothing is in doubt, in the plane and in space."""
     path = np.random.default_rng(0).normal(size=(20, 3))

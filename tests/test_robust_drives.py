@@ -191,6 +191,7 @@ def test_a_group_that_agrees_with_itself_alone_is_named(seed: int, miss: tuple[f
     assert f"'poses' {member} by {far:.3g}" in said and group.sentence() in solution.report()
 
 
+@pytest.mark.product(2, of="large maps")
 def test_the_command_names_groups(tmp_path: Path) -> None:
     clean, truth = drive(4, replace(CALM, closures=20))
     graph, wrong = aliased(clean, truth, 4, (20.0, 5.0, 0.1))
@@ -240,6 +241,7 @@ def test_groups_join_the_same_stretches() -> None:
     assert groups_of(terms["alone"], np.ones(500, dtype=bool)) == []
 
 
+@pytest.mark.product(2, of="large maps")
 def test_the_size_of_noise_is_that_of_each_term_over_what_either_keeps() -> None:
     """Odometry and closures apart; a closure that one answer leaves out counts as the other one has it."""
     graph, _ = with_wrong_closures(drive(2, replace(CALM, count=600))[0], 0.2, 1, "same place")

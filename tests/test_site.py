@@ -24,6 +24,7 @@ def test_every_page_has_a_place() -> None:
     assert sorted(listed) == sorted((written | made) - {"license.md"})
 
 
+@pytest.mark.product(1)
 @pytest.mark.parametrize("room", ["unifg", "unifg.solvers", "unifg.horizon", "unifg.pose_graphs", "unifg.view"])
 def test_every_public_name_has_an_entry(room: str) -> None:
     page = reference.pages()[f"api/{room}.md"]

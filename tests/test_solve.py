@@ -45,7 +45,7 @@ def numbers(folder: Path) -> dict[str, Any]:
     return loaded
 
 
-@pytest.mark.product(3, of="scenes and pictures")
+@pytest.mark.product(2, of="scenes and pictures")
 @pytest.mark.parametrize("name", ["city", "globe"])
 def test_writes_every_file_and_says_what_came_out(
     name: str, request: pytest.FixtureRequest, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -173,7 +173,7 @@ def test_lidar_noise_dropouts_and_range() -> None:
     assert true.ranges.min() > 1.7
 
 
-@pytest.mark.product(4, of="drives and flights")
+@pytest.mark.product(3, of="drives and flights")
 def test_odometry_statistics() -> None:
     """Scale errors: once per episode, 5 %. Noise: every step, 2 %. Both in proportion to the motion."""
     scales = []
@@ -233,6 +233,7 @@ def test_bad_input_is_refused(start: tuple[float, float, float], command: float,
         quiet_world(start).step(command, 0.0, dt=dt)
 
 
+@pytest.mark.product(2, of="studies")
 @pytest.mark.data
 def test_department_map_is_quick(shared_data: Path) -> None:
     """A real building of 54 m x 51 m builds and scans in good time."""

@@ -54,8 +54,8 @@ from unifg.solvers.interior_point.state import (
     STOPPED,
     TRY,
     VIOLATED,
-    Records,
 )
+from unifg.solvers.workspace import Records
 from unifg.typing import Array, IntArray
 
 KAPPA = 50.0  # mu is lowered when the error of the barrier problem is below KAPPA mu

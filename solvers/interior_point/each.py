@@ -20,8 +20,8 @@ from unifg.solvers.interior_point.state import (
     STALLED,
     STOPPED,
     VIOLATED,
-    Records,
 )
+from unifg.solvers.workspace import Records
 from unifg.typing import Array, IntArray
 
 ANSWER, ITERATIONS, COST, SUSPICION, STATIONARITY, VIOLATION, COMPLEMENTARITY, NUMBERS = range(8)

@@ -43,9 +43,9 @@ from unifg.solvers.interior_point.state import (
     TRY,
     UNKNOWN,
     Problem,
-    Records,
     Work,
 )
+from unifg.solvers.workspace import Records
 from unifg.typing import Array
 
 FEW = 5  # steps of a tick

@@ -36,7 +36,8 @@ from unifg.solvers.globalize.feasibility_restoration import nearest
 from unifg.solvers.interior_point import each, state
 from unifg.solvers.interior_point.barrier import FINER
 from unifg.solvers.interior_point.loop import addresses, call
-from unifg.solvers.interior_point.state import Fields, Problem, empty_work
+from unifg.solvers.interior_point.state import Problem, Work
+from unifg.solvers.workspace import Fields, empty
 from unifg.typing import Array, IntArray
 
 ENDINGS = {
@@ -126,7 +127,7 @@ class InteriorPoint(Solver):
 
     def workspace(self, program: CompiledProblem) -> Workspace:
         """Structure of the KKT matrix."""
-        return Workspace(program)
+        return Workspace(program, self.max_iterations)
 
     def search_step(self, run: SolveState, workspace: Workspace, lin: Linearization) -> Array | None:
         """The first step of a solve from there, by Gauss-Newton, as far as slacks and multipliers stay positive."""
@@ -299,11 +300,11 @@ class Workspace:
     # Options, the bytes of the scalars, and what these are where a solve with such options begins.
     _settings: tuple[dict[str, Any], NDArray[np.uint8], NDArray[np.uint8]] | None = None
 
-    def __init__(self, program: CompiledProblem) -> None:
-        """Analyse the KKT matrix and compile."""
+    def __init__(self, program: CompiledProblem, iterations: int) -> None:
+        """Analyse the KKT matrix and compile, with room for the history of so many iterations."""
         self.program = program
         self._taken: Linearization | None = None
-        self._build(1)
+        self._build(iterations)
 
     def _build(self, iterations: int) -> None:
         program = self.program
@@ -311,7 +312,8 @@ class Workspace:
         arrays, table = self.system.arrays, program.table
         plan, doubles = stacked(arrays)
         equalities, constraints = len(arrays.rows), table.constraints
-        self.work = empty_work(
+        self.work = empty(
+            Work,
             stored=program.columns.stored,
             width=program.columns.width,
             unknowns=program.size,

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple, TypeAlias, get_type_hints
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unifg.elimination.plan import Plan
 from unifg.problem.table import TermArrays
 from unifg.problem.units import Units
 from unifg.solution.optimality import NUMBERS
+from unifg.solvers.workspace import Records
 from unifg.typing import Array, IntArray
-
-Records: TypeAlias = NDArray[np.void]
 
 # Scalars.
 NOW = np.dtype(
@@ -173,7 +171,7 @@ class Problem(NamedTuple):
 
 
 class Work(NamedTuple):
-    """Arrays of the method with their shapes, whose words :func:`empty_work` is given.
+    """Arrays of the method with their shapes, whose words :func:`unifg.solvers.workspace.empty` is given.
 
     Attributes:
         scalars: (1,) of `NOW`.
@@ -249,28 +247,3 @@ class Work(NamedTuple):
     data: Annotated[Array, "data"]
     filter: Annotated[Array, FILTER, 2]
     log: Annotated[Array, "log", 9]
-
-
-def empty_work(**sizes: int) -> Work:
-    """Arrays of the shapes that :class:`Work` gives them, all zero; ``sizes`` says what the words in them mean."""
-    arrays: dict[str, Any] = {}
-    for name, hint in get_type_hints(Work, include_extras=True).items():
-        kind, *shape = hint.__metadata__ if hint.__origin__ == Records else (np.float64, *hint.__metadata__)
-        arrays[name] = np.zeros([sizes.get(size, size) for size in shape], dtype=kind)
-    return Work(**arrays)
-
-
-class Fields:
-    """One record by the names of its fields: NumPy takes a microsecond for each, which a control loop feels."""
-
-    def __init__(self, record: Records) -> None:
-        """View the only record of a (1,) array."""
-        self._views: dict[str, Any] = {name: record[name].data for name in record.dtype.names or ()}
-
-    def __getitem__(self, name: str) -> Any:
-        """A plain float or int."""
-        return self._views[name][0]
-
-    def __setitem__(self, name: str, value: float) -> None:
-        """Write to the record."""
-        self._views[name][0] = value

@@ -11,10 +11,9 @@ corrected for curved constraints, then halved until it meets Armijo's condition.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, NamedTuple, TypeAlias, get_type_hints
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unifg.codegen.function_pointers import number, run
 from unifg.codegen.jit import compiled
@@ -29,9 +28,8 @@ from unifg.solvers.globalize.norms import norm
 from unifg.solvers.quadratic_programs.graph_route import PATIENCE, TIGHTEST, Stacked, list_sides, multiply
 from unifg.solvers.quadratic_programs.scaling import Patterns
 from unifg.solvers.quadratic_programs.subproblem import leaves_most
+from unifg.solvers.workspace import Records
 from unifg.typing import Array, BoolArray, IntArray
-
-Records: TypeAlias = NDArray[np.void]
 
 NOISE, ROUNDING = 1e-8, 1e-13  # of the merit: for each unit of the penalty, and relative
 SECANT_MATTERS = 0.5  # of the known curvature; less only slows convergence down
@@ -195,16 +193,6 @@ class Work(NamedTuple):
     steepest_jacobian: Annotated[Array, "row_entries"]
     steepest_gradient: Annotated[Array, "width"]
     log: Annotated[Array, "log"]
-
-
-def empty_work(**sizes: int) -> Work:
-    """Arrays of the shapes that :class:`Work` gives them, all zero; ``sizes`` says what the words in them mean."""
-    arrays: dict[str, Any] = {}
-    for name, hint in get_type_hints(Work, include_extras=True).items():
-        *kinds, size = hint.__metadata__
-        kind = kinds[0] if kinds else np.int64 if hint.__origin__ == IntArray else np.float64
-        arrays[name] = np.zeros(sizes.get(size, size), dtype=kind)
-    return Work(**arrays)
 
 
 @compiled

@@ -29,13 +29,13 @@ from unifg.solvers.quadratic_programs.attempt import (
     TAKEN,
     UNBEGUN,
     Problem,
-    Records,
     Work,
     attempt,
     linearize,
     scaled_violation,
 )
 from unifg.solvers.quadratic_programs.graph_route import PATIENCE
+from unifg.solvers.workspace import Records
 from unifg.typing import Array
 
 # Numbers of an iterate in the log, before norms and heights, stored values, constraints and multipliers.

@@ -20,7 +20,6 @@ from unifg.problem.snapshot import LinearizationMemory
 from unifg.solution.history import Iteration
 from unifg.solution.optimality import Tolerances, read_numbers
 from unifg.solution.solver import SolveState
-from unifg.solvers.interior_point.state import Fields
 from unifg.solvers.quadratic_programs.attempt import (
     AIMED,
     CORRECT,
@@ -36,7 +35,6 @@ from unifg.solvers.quadratic_programs.attempt import (
     UNBEGUN,
     Problem,
     Work,
-    empty_work,
 )
 from unifg.solvers.quadratic_programs.graph_route import PATIENCE, Stacked, hopeless, minimize_quadratic
 from unifg.solvers.quadratic_programs.loop import (
@@ -55,6 +53,7 @@ from unifg.solvers.quadratic_programs.loop import (
 )
 from unifg.solvers.quadratic_programs.scaling import Patterns, Scaling, find_units
 from unifg.solvers.quadratic_programs.subproblem import QPAnswer
+from unifg.solvers.workspace import Fields, empty
 from unifg.typing import Array
 
 REACHED = {
@@ -298,7 +297,8 @@ def _history(program: CompiledProblem, known: list[Iteration], log: Array, secon
 def _empty(program: CompiledProblem) -> Work:
     """Memory for attempts on a program."""
     table, columns = program.table, program.columns
-    return empty_work(
+    return empty(
+        Work,
         unknowns=program.size,
         rows=table.constraints,
         width=columns.width,

@@ -106,6 +106,7 @@ class Memory:
     def __init__(self) -> None:
         """Nothing is described yet."""
         self.kind: Any = None
+        self._known: list[object] = []  # the layouts that were last found to be of that type
 
     def __repr__(self) -> str:
         """The same in every process, since fingerprints of functions have it; the kind is a part of their keys."""
@@ -123,18 +124,29 @@ class Memory:
         found = tuple(default_manager[types.Array(types.float64, 1, "C")]._fields)
         if found != LAYOUT:
             raise UnifgError(f"Numba describes arrays by {found}, expected {LAYOUT}: use a version up to 0.68")
-        kind = typeof(arrays)
-        if self.kind is None:
-            self.kind = kind
-        if kind != self.kind:
-            raise UnifgError(f"compiled for arrays of type {self.kind}, found {kind}")
-        return np.array(_words(arrays), dtype=np.int64)
+        words: list[int] = []
+        layouts: list[object] = []
+        _describe(arrays, words, layouts)
+        if layouts != self._known:  # Numba takes milliseconds to name the type
+            kind = typeof(arrays)
+            if self.kind is None:
+                self.kind = kind
+            if kind != self.kind:
+                raise UnifgError(f"compiled for arrays of type {self.kind}, found {kind}")
+            self._known = layouts
+        return np.array(words, dtype=np.int64)
 
 
-def _words(part: Any) -> list[int]:
+def _describe(part: Any, words: list[int], layouts: list[object]) -> None:
+    """Append the words of all arrays in a part, and all that their Numba types depend on."""
     if isinstance(part, tuple):
-        return [word for item in part for word in _words(item)]
-    return [0, 0, part.size, part.itemsize, part.ctypes.data, *part.shape, *part.strides]
+        layouts += type(part), len(part)
+        for item in part:
+            _describe(item, words, layouts)
+    else:
+        flags = part.flags
+        layouts += part.dtype, part.ndim, flags.c_contiguous or flags.num, flags.writeable, flags.aligned
+        words += 0, 0, part.size, part.itemsize, part.ctypes.data, *part.shape, *part.strides
 
 
 memory = Memory()
