@@ -135,8 +135,9 @@ class FlightSettings(Settings):
 
     @property
     def known(self) -> EstimatorSettings:
-        """Settings of the past, which knows whether its sensor sees what is not there."""
-        return replace(self.estimator, confirmation=CONFIRMATION) if self.clutter else self.estimator
+        """Settings of the past, which knows whether its sensor sees what is not there, unless they say how it counts."""
+        stated = self.estimator.confirmation != EstimatorSettings.confirmation
+        return replace(self.estimator, confirmation=CONFIRMATION) if self.clutter and not stated else self.estimator
 
     @property
     def flown(self) -> ControllerSettings:

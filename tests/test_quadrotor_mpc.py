@@ -357,6 +357,13 @@ def test_in_clutter_a_cylinder_counts_once_enough_readings_show_it() -> None:
     assert known.ids.tolist() == [5]
 
 
+def test_clutter_asks_for_confirmation_unless_it_is_stated() -> None:
+    assert replace(short(4.0), clutter=1.0).known.confirmation == (4, 6)
+    stated = EstimatorSettings(confirmation=(2, 3))
+    assert replace(short(4.0), clutter=1.0, estimator=stated).known.confirmation == (2, 3)
+    assert replace(short(4.0), estimator=stated).known.confirmation == (2, 3)
+
+
 @pytest.mark.product(1, of="drives and flights")
 @pytest.mark.parametrize("association", ["known", "unknown"])
 def test_clutter_misses_and_wrong_radii_cost_a_flight_little(association: str) -> None:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import re
 from typing import Any
 
 import numba
@@ -351,6 +352,24 @@ def one(x: Array, r: Array) -> None:
 def test_prices_that_are_none_are_refused(soft: Any, words: str) -> None:
     with pytest.raises(fg.GraphError, match=words):
         ring(soft)
+
+
+@pytest.mark.parametrize("which", ["linear", "quadratic"])
+@pytest.mark.parametrize("wrong", [-1.0, np.inf])
+def test_wrong_prices_by_data_are_refused_and_leave_nothing(which: str, wrong: float) -> None:
+    graph = fg.Graph()
+    x, price = graph.variables("x", fg.Rn(1), 2), graph.data("price", np.ones((2, 1)))
+    graph.minimize(fg.prior, x, [3.0])
+    graph.constrain(lambda x: x, x, upper=1.0, soft=fg.Soft(**{which: price}), name="most")
+    prepared, guess, prices = InteriorPoint().prepare(graph), {x: np.zeros((2, 1))}, [[[1.0], [1.0]], [[1.0], [wrong]]]
+    first = prepared.solve(guess, data={price: prices[0]})
+    words = f"term 'most': the {which} weight of soft= is {wrong} in factor 1, row 0"
+    for _ in range(2):
+        with pytest.raises(fg.GraphError, match=re.escape(words)):
+            prepared.solve(guess, data={price: prices[1]})
+    np.testing.assert_array_equal(prepared.solve(guess, data={price: prices[0]})[x], first[x])
+    with pytest.raises(fg.GraphError, match="instance 1: " + re.escape(words)):
+        prepared.solve_many(guess, data={price: prices})
 
 
 def test_what_takes_no_soft_constraint_says_so() -> None:

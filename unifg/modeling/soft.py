@@ -121,6 +121,12 @@ def _weight(name: str, which: str, weight: Any, count: int, size: int) -> Array:
             f"{(count, size)}{each}",
             term=name,
         ) from None
+    require_prices(name, which, found)
+    return found
+
+
+def require_prices(name: str, which: str, found: Array) -> None:
+    """Refuse (n, m) weights that are negative or not finite, by the name of the term."""
     wrong = np.argwhere(~(np.isfinite(found) & (found >= 0.0)))
     if len(wrong):
         factor, row = map(int, wrong[0])
@@ -130,7 +136,6 @@ def _weight(name: str, which: str, weight: Any, count: int, size: int) -> Array:
             term=name,
             index=factor,
         )
-    return found
 
 
 def _anywhere(limit: Any, none: float) -> bool:

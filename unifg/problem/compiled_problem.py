@@ -6,7 +6,7 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, cached_property
 from itertools import pairwise
 from time import perf_counter
@@ -22,6 +22,7 @@ from unifg.errors import GraphError
 from unifg.factors.differences import convexified
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
+from unifg.modeling.soft import require_prices
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
@@ -103,6 +104,11 @@ class CompiledProblem:
         declared = graph._data
         self.graph = graph.snapshot()
         self.soft = {t.name: t.slack for t in self.graph.terms if isinstance(t, Constraint) and t.slack}
+        self._priced: dict[Data, list[tuple[Constraint, str]]] = {}
+        for term in self.graph.terms:
+            for which in ("linear", "quadratic") if isinstance(term, Constraint) and term.slack else ():
+                if isinstance(price := getattr(term.slack.soft, which), Data):
+                    self._priced.setdefault(price, []).append((term, which))
         graph = softened(graph.snapshot()) if self.soft else self.graph
         self.lock = ReentrantLock()
         self.families = list(graph.families.values())
@@ -210,14 +216,33 @@ class CompiledProblem:
         """Take new data; everything not named returns to its default.
 
         Raises:
-            GraphError: on unknown data, a changed shape, NaN, or crossed limits.
+            GraphError: on unknown data, a changed shape, NaN, crossed limits, or prices below zero.
         """
         changed = self.binding.take(data)
+        if self._priced:
+            self._require_prices(changed)
         for handle in changed:
             for term in self._readers[handle].told:
                 term.forget()
         if self.rebinds:
             self._rebind([term for handle in changed for term in self._readers[handle].bound])
+
+    def _require_prices(self, changed: Iterable[Data]) -> None:
+        """Refuse prices of soft constraints that are negative or not finite."""
+        for handle in changed:
+            for term, which in self._priced.get(handle, ()):
+                value, shape = self.binding.present[handle], (term.count, term.size)
+                try:
+                    require_prices(term.name, which, np.broadcast_to(value, shape))
+                except GraphError:
+                    self.binding.forget()
+                    raise
+
+    def rows(self, data: Mapping[Data, Array], count: int) -> Array | None:
+        """(count, D) numbers of all data of many instances; None where single solves have to look at them."""
+        prices = [data[handle] for handle in self._priced if handle in data]
+        refused = any(not (np.isfinite(price) & (price >= 0.0)).all() for price in prices)
+        return None if refused else self.binding.rows(data, count)
 
     def data_of(self, holder: Holder) -> dict[Data, Array] | None:
         """Values of all data that a solution was found with; None where they were replaced by way of another one."""

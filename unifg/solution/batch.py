@@ -180,7 +180,15 @@ def solve_batch(
     each = guesses if isinstance(guesses, Sequence) else [guesses] * count
     if count == 0:
         return batch
-    batch.take(0, prepared.solve(each[0], data=batch.data_of(0)))  # verified, as a first answer is
+
+    def solve_one(index: int) -> None:
+        try:
+            batch.take(index, prepared.solve(each[index], data=batch.data_of(index)))
+        except GraphError as error:
+            error.args = (f"instance {index}: {error}",)
+            raise
+
+    solve_one(0)  # verified, as a first answer is
     left = np.arange(1, count)
     if prepared.solves_each and count > 1:
         stored = flat_guesses(prepared, guesses)
@@ -189,5 +197,5 @@ def solve_batch(
         with ThreadPoolExecutor(len(workers)) as pool:
             left = np.sort(np.concatenate(list(pool.map(batch.solve_part, workers, parts, repeat(stored)))))
     for index in left.tolist():
-        batch.take(index, prepared.solve(each[index], data=batch.data_of(index)))
+        solve_one(index)
     return batch

@@ -823,7 +823,7 @@ class Prepared:
         """Some instances in one compiled call; None where single solves have to look at their data or answers."""
         self._enter()
         try:
-            rows = self.program.binding.rows(data, count)
+            rows = self.program.rows(data, count)
             if rows is None:
                 return None
             self.allocate()
