@@ -135,7 +135,7 @@ class FlightSettings(Settings):
 
     @property
     def known(self) -> EstimatorSettings:
-        """Settings of the past, which knows whether its sensor sees what is not there, unless they say how it counts."""
+        """Settings of the past: in clutter a cylinder needs confirmation, this one unless another is stated."""
         stated = self.estimator.confirmation != EstimatorSettings.confirmation
         return replace(self.estimator, confirmation=CONFIRMATION) if self.clutter and not stated else self.estimator
 

@@ -6,7 +6,7 @@ costs; rows of constraints read ``lower <= g <= upper``. Columns are tangent coo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property
 from itertools import pairwise
 from time import perf_counter
@@ -103,12 +103,14 @@ class CompiledProblem:
             raise GraphError("the graph has no variables: add a family with graph.variables(...)")
         declared = graph._data
         self.graph = graph.snapshot()
-        self.soft = {t.name: t.slack for t in self.graph.terms if isinstance(t, Constraint) and t.slack}
-        self._priced: dict[Data, list[tuple[Constraint, str]]] = {}
-        for term in self.graph.terms:
-            for which in ("linear", "quadratic") if isinstance(term, Constraint) and term.slack else ():
-                if isinstance(price := getattr(term.slack.soft, which), Data):
-                    self._priced.setdefault(price, []).append((term, which))
+        limits = [t for t in self.graph.terms if isinstance(t, Constraint)]
+        self.soft = {t.name: t.slack for t in limits if t.slack}
+        self._prices = [
+            (price, which, t)
+            for t in limits
+            for which, price in (vars(t.slack.soft).items() if t.slack else ())
+            if isinstance(price, Data)
+        ]
         graph = softened(graph.snapshot()) if self.soft else self.graph
         self.lock = ReentrantLock()
         self.families = list(graph.families.values())
@@ -219,7 +221,7 @@ class CompiledProblem:
             GraphError: on unknown data, a changed shape, NaN, crossed limits, or prices below zero.
         """
         changed = self.binding.take(data)
-        if self._priced:
+        if self._prices:
             self._require_prices(changed)
         for handle in changed:
             for term in self._readers[handle].told:
@@ -227,20 +229,20 @@ class CompiledProblem:
         if self.rebinds:
             self._rebind([term for handle in changed for term in self._readers[handle].bound])
 
-    def _require_prices(self, changed: Iterable[Data]) -> None:
+    def _require_prices(self, changed: Sequence[Data]) -> None:
         """Refuse prices of soft constraints that are negative or not finite."""
-        for handle in changed:
-            for term, which in self._priced.get(handle, ()):
-                value, shape = self.binding.present[handle], (term.count, term.size)
+        for price, which, term in self._prices:
+            if price in changed:
                 try:
-                    require_prices(term.name, which, np.broadcast_to(value, shape))
+                    value = self.binding.present[price]
+                    require_prices(term.name, which, np.broadcast_to(value, (term.count, term.size)))
                 except GraphError:
                     self.binding.forget()
                     raise
 
     def rows(self, data: Mapping[Data, Array], count: int) -> Array | None:
         """(count, D) numbers of all data of many instances; None where single solves have to look at them."""
-        prices = [data[handle] for handle in self._priced if handle in data]
+        prices = [data[price] for price, *_ in self._prices if price in data]
         refused = any(not (np.isfinite(price) & (price >= 0.0)).all() for price in prices)
         return None if refused else self.binding.rows(data, count)
 
