@@ -14,6 +14,7 @@ from benchmarks import (
     excluded_pasts,
     impossible_states,
     learned_residual,
+    many_landmarks,
     shared_dynamics,
 )
 
@@ -174,3 +175,16 @@ def test_a_network_without_weights_in_its_second_layer_says_nothing() -> None:
         np.concatenate([np.ones(learned_residual.FIRST), np.zeros(learned_residual.SECOND)])[None],
     )
     assert np.array_equal(learned_residual.network(air, weights), np.zeros((2, 3)))
+
+
+def test_plans_that_reuse_their_elimination_fly_as_those_solved_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(many_landmarks, "TICKS", 8)
+    row = {"seed": 0, "count": 10, **many_landmarks.measure(0, 10)}
+    anew, every, reuse = (many_landmarks.ANEW, *many_landmarks.THRESHOLDS)
+    for name in (every, reuse):
+        assert abs(row[f"{name}, off"] - row[f"{anew}, off"]) < 2e-3
+        assert abs(row[f"{name}, clear"] - row[f"{anew}, clear"]) < 2e-3
+    assert row[f"{reuse}, linearised"] < 0.2 * row[f"{every}, linearised"]
+    assert row[f"{reuse}, eliminated"] < row[f"{every}, eliminated"]
+    table = many_landmarks.tables([row])
+    assert table.count(f"| {reuse} |") == len(many_landmarks.COUNTS) and "unknown map" in table
