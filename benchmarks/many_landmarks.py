@@ -44,7 +44,7 @@ def places(nodes: ArrayLike) -> Array:
     return np.stack([ahead, np.zeros(len(ahead)), np.full(len(ahead), HEIGHT)], axis=1)
 
 
-def on_line(node: int | np.integer[Any]) -> Array:
+def on_line(node: int) -> Array:
     """Wanted state of a node."""
     return quadrotor.STATE.pack(p=places([node])[0], R=fg.SO3.identity(), v=np.array([SPEED, 0.0, 0.0]))
 
@@ -84,7 +84,7 @@ class Anew:
         graph.minimize(fg.prior, u, quadrotor.hover(BOOKS), sigma=EFFORT)
         graph.minimize(fg.prior, x[1:].p, self.line, sigma=TRACKING)
         node, number = (index.ravel() for index in np.indices((NODES, len(cylinders))))
-        guess: dict[fg.Family, Array] = {x: np.stack([on_line(k) for k in nodes]), u: hovering(NODES)}
+        guess: dict[fg.Family, Array] = {x: np.stack([on_line(k) for k in range(NODES + 1)]), u: hovering(NODES)}
         near: Any = fg.each(cylinders[number])
         if unknown:
             seen = graph.variables("cylinders", fg.Rn(2), len(cylinders))
