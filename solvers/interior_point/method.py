@@ -427,10 +427,9 @@ class Workspace:
         now["feasible"], now["violation_unit"] = violation, unit
         now["scaling"], now["assisted"] = bool(options.scaling), not self.program.fully_compiled
         now["step_tolerance"] = options.step_tolerance
-        now["violation_tolerance"], now["clocked"] = (
-            options.violation_tolerance,
-            clocked or options.time_limit < np.inf,
-        )
+        now["violation_tolerance"] = options.violation_tolerance
+        # An interrupt waits for the end of a compiled call: a long solve comes back before every step.
+        now["clocked"] = clocked or options.time_limit < np.inf or self.program.large
         now["keeping"] = max(violation, options.violation_tolerance if options.step_tolerance > 0.0 else 0.0)
         self.call("reset")
         now["limit"], now["exact"] = options.max_iterations, options.hessian == "exact"
@@ -466,7 +465,7 @@ class Workspace:
         """Arguments of one compiled call that solves many instances."""
         program, work, count = self.program, self.work, len(rows)
         now = self.prepare(options, guesses[0], duals[0])
-        now["watched"] = 0
+        now["watched"] = now["clocked"] = 0
         sizes = len(work.values), len(work.multipliers), each.NUMBERS
         functions = np.array([self._links["solve_once"], self._address])
         starts, binding = np.array([options.barrier, options.penalty]), program.binding
