@@ -100,6 +100,9 @@ def test_a_frequent_longest_range_means_that_nothing_was_hit(log: RangeLog, tmp_
         ("time,x,y,theta,0.1\n0,0,0,0,1\n", "at least two scans"),
         ("time,x,y,theta\n0,0,0,0\n1,0,0,0\n", "at least two scans"),
         ("time,x,y,theta,0.1\n0,0,0,inf,1\n1,0,0,0,1\n", "finite times and poses"),
+        ("time,x,y,theta,-90,90\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "-90 is no direction of a beam"),
+        ("time,x,y,theta,0,nan\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "nan is no direction"),
+        ("time,x,y,theta,x,0\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "the header has 'x' twice"),
     ],
 )
 def test_a_table_that_is_none_is_refused(tmp_path: Path, text: str, said: str) -> None:
