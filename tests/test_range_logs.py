@@ -8,6 +8,7 @@ import math
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 from hostile import drive_file
 from recorded import cast, corridors, recorded, wheels, write_csv
 from unifg.errors import FileFormatError, ScenarioError
+from unifg.files import rosbag as recordings
 from unifg.files.range_log import RangeLog, aligned, read_range_log
 from unifg.files.ros_map import load_map
 from unifg.files.tum import read_tum
@@ -237,6 +239,40 @@ def test_a_drive_of_the_simulation_is_read(log: RangeLog, tmp_path: Path) -> Non
         (tmp_path / "drive.npz").write_bytes(wrong)
         with pytest.raises(FileFormatError, match=r"is no drive\.npz of `unifg run`"):
             read_range_log(tmp_path / "drive.npz")
+
+
+def messages(times: list[float], first: float = -1.0) -> list[tuple[str, str, Any]]:
+    """Scans of five beams at some times, and odometry along x from 0 to 4 s."""
+
+    def header(time: float) -> Any:
+        return SimpleNamespace(stamp=SimpleNamespace(sec=int(time), nanosec=0), frame_id="laser")
+
+    scan = {"ranges": [1.0, 2.0, 0.05, 40.0, 3.0], "range_min": 0.1, "range_max": 30.0, "angle_increment": 0.5}
+    turn = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    poses = [SimpleNamespace(position=SimpleNamespace(x=float(k), y=0.0), orientation=turn) for k in range(5)]
+    return [
+        *(("/scan", "LaserScan", SimpleNamespace(header=header(t), angle_min=first, **scan)) for t in times),
+        *(
+            ("/odom", "Odometry", SimpleNamespace(header=header(p.position.x), pose=SimpleNamespace(pose=p)))
+            for p in poses
+        ),
+    ]
+
+
+def test_scans_that_nothing_moves_or_of_other_beams_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ranges below the least one, such as of the robot itself, are lost, as REP 117 says."""
+    others = [*messages([1.0, 3.0, 4.0, 5.0, 9.0]), *messages([2.0], first=1.0)[:1]]
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter(others))
+    read = read_range_log("drive.mcap")
+    np.testing.assert_array_equal(read.time, [1.0, 3.0, 4.0])
+    np.testing.assert_array_equal(read.odometry[:, 0], read.time)
+    np.testing.assert_array_equal(read.ranges[0], [1.0, 2.0, np.nan, np.inf, 3.0])
+    assert "3 of 6 scans left out" in caplog.text
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter(messages([1001.0, 1002.0, 1003.0])))
+    with pytest.raises(FileFormatError, match=r"drive\.mcap: 0 of 3 scans have odometry at their time"):
+        read_range_log("drive.mcap")
 
 
 def test_a_broken_recording_is_refused(tmp_path: Path) -> None:
