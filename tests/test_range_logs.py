@@ -228,6 +228,9 @@ def test_what_reads_a_recording_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     assert main(["map", str(tmp_path / name), "--out", str(tmp_path)]) == 2
     assert "pip install 'unifg[logs]'" in capsys.readouterr().err
+    (tmp_path / "drive.npz").write_bytes(b"")
+    assert main(["map", str(tmp_path / name), "--out", str(tmp_path)]) == 2
+    assert "drive.npz is read" in capsys.readouterr().err
 
 
 def test_a_drive_of_the_simulation_is_read(log: RangeLog, tmp_path: Path) -> None:

@@ -55,6 +55,8 @@ def read_rosbag(path: Path) -> Recorded:
         FileFormatError: it cannot be read, or holds no scans or no odometry.
         ImportError: the package that reads it is not installed.
     """
+    own = path.with_name("drive.npz")
+    hint = f"; of a run of unifg {legible(own)} is read" if path.is_file() and own.is_file() else ""
     name, topics, mounts = legible(path), dict[str, dict[str, list[Any]]](), dict[str, Array]()
     try:
         for topic, kind, message in _mcap(path) if path.suffix == ".mcap" else _bag(path):
@@ -63,13 +65,13 @@ def read_rosbag(path: Path) -> Recorded:
                     mounts |= {one.child_frame_id: _planar(one.transform) for one in message.transforms}
             else:
                 topics.setdefault(kind, {}).setdefault(topic, []).append(message)
-    except (ImportError, MemoryError):
+    except MemoryError:
         raise
+    except ImportError as error:
+        raise ImportError(f"{error}{hint}") from error
     except Exception as error:  # each of these packages lets out whatever its parts raise
         raise FileFormatError(f"{name}: cannot be read ({type(error).__name__}: {error})") from error
     if lacking := [kind for kind in (SCAN, ODOMETRY) if kind not in topics]:
-        own = next(path.parent.glob("drive.npz"), None) if path.is_file() else None
-        hint = f"; of a run of unifg {legible(own)} is read" if own else ""
         raise FileFormatError(f"{name}: no message of ROS of the kind {' and '.join(lacking)}{hint}")
     scans, wheels = (max(topics[kind].values(), key=len) for kind in (SCAN, ODOMETRY))
     forms = Counter((len(scan.ranges), scan.angle_min, scan.angle_increment) for scan in scans)
