@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import logging
 import math
@@ -62,6 +63,8 @@ def test_a_table_is_read_as_it_was_written(log: RangeLog, tmp_path: Path) -> Non
     read = read_range_log(tmp_path / "log.csv")
     for name in ("time", "angles", "ranges", "odometry", "corrected"):
         np.testing.assert_array_equal(getattr(read, name), getattr(log, name))
+    (tmp_path / "log.CSV.gz").write_bytes(gzip.compress((tmp_path / "log.csv").read_bytes()))
+    np.testing.assert_array_equal(read_range_log(tmp_path / "log.CSV.gz").ranges, log.ranges)
 
 
 def test_beams_and_scans_in_any_order_and_unit_are_one_log(

@@ -86,7 +86,7 @@ class RangeLog:
 
 
 def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
-    """Read a log: ``.csv``; MCAP, rosbag2 (a folder), rosbag; ``.npz`` of a drive; else CARMEN, gzipped or not.
+    """Read a log: CARMEN or ``.csv``, gzipped or not; MCAP, rosbag2 (a folder), rosbag; ``.npz`` of a drive.
 
     Of several lasers, that with most scans is taken. Of a CARMEN log whose scans bear corrected poses, the odometry is
     that of the robot, or of the ODOM lines where the robot's poses are corrected, too. Times in milliseconds or smaller
@@ -101,7 +101,7 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
         ImportError: a package that reads it is not installed; the message names it.
     """
     path = Path(path)
-    if path.suffix == ".csv":
+    if (path.with_suffix("") if path.suffix == ".gz" else path).suffix.lower() == ".csv":
         return _table(path, limits)
     name = legible(path.name)
     if path.suffix == ".npz":
