@@ -13,6 +13,8 @@ run stands in `unifg.scenarios.commands.catalogue`; only the scenario that is na
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import re
 import shlex
 import shutil
@@ -83,6 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments without the program's name; None takes those of the process.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    _legible_streams()
     try:
         chosen, unknown = _parser(arguments).parse_known_args(arguments)
         if unknown:
@@ -101,10 +104,19 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise
         return _refuse(said)
     except OSError as error:
-        return _refuse(f"{error.filename}: cannot be written ({error.strerror})")
+        return _refuse(f"{error.filename or 'the output'}: cannot be written ({error.strerror})")
     except KeyboardInterrupt:
         print("unifg: interrupted before there was anything to write", file=sys.stderr)
         return INTERRUPTED
+
+
+def _legible_streams() -> None:
+    """Let streams spell characters that their encoding lacks, and errors of a closed one go nowhere."""
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w", encoding="utf-8")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _parser(words: Sequence[str]) -> argparse.ArgumentParser:

@@ -176,6 +176,16 @@ def test_names_that_are_no_text_are_spelled(tmp_path: Path, capsys: pytest.Captu
     assert "\\xff.g2o" in capsys.readouterr().out
 
 
+def test_streams_that_are_closed_or_lack_characters_take_what_is_said(tmp_path: Path) -> None:
+    put(tmp_path, "g.g2o", PLANAR)
+    script = (
+        "import sys; sys.stderr = None; from unifg.scenarios.command import main; "
+        "sys.exit(main(['solve', 'g.g2o', '--out', '\xfc', '--no-scene']))"
+    )
+    said = run_script(script, cwd=tmp_path, variables={"PYTHONIOENCODING": "ascii"}).stdout
+    assert "\\xfc/graph.g2o" in said and (tmp_path / "\xfc" / "graph.g2o").is_file()
+
+
 # ---------------------------------------------------------------- writing
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import logging
 import math
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ import pytest
 from hostile import drive_file
 from recorded import cast, corridors, recorded, wheels, write_csv
 from unifg.errors import FileFormatError, ScenarioError
+from unifg.files import rosbag as recordings
 from unifg.files.range_log import RangeLog, aligned, read_range_log
 from unifg.files.ros_map import load_map
 from unifg.files.tum import read_tum
@@ -60,6 +63,8 @@ def test_a_table_is_read_as_it_was_written(log: RangeLog, tmp_path: Path) -> Non
     read = read_range_log(tmp_path / "log.csv")
     for name in ("time", "angles", "ranges", "odometry", "corrected"):
         np.testing.assert_array_equal(getattr(read, name), getattr(log, name))
+    (tmp_path / "log.CSV.gz").write_bytes(gzip.compress((tmp_path / "log.csv").read_bytes()))
+    np.testing.assert_array_equal(read_range_log(tmp_path / "log.CSV.gz").ranges, log.ranges)
 
 
 def test_beams_and_scans_in_any_order_and_unit_are_one_log(
@@ -100,6 +105,9 @@ def test_a_frequent_longest_range_means_that_nothing_was_hit(log: RangeLog, tmp_
         ("time,x,y,theta,0.1\n0,0,0,0,1\n", "at least two scans"),
         ("time,x,y,theta\n0,0,0,0\n1,0,0,0\n", "at least two scans"),
         ("time,x,y,theta,0.1\n0,0,0,inf,1\n1,0,0,0,1\n", "finite times and poses"),
+        ("time,x,y,theta,-90,90\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "-90 is no direction of a beam"),
+        ("time,x,y,theta,0,nan\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "nan is no direction"),
+        ("time,x,y,theta,x,0\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "the header has 'x' twice"),
     ],
 )
 def test_a_table_that_is_none_is_refused(tmp_path: Path, text: str, said: str) -> None:
@@ -223,6 +231,9 @@ def test_what_reads_a_recording_is_named(
     monkeypatch.setitem(sys.modules, package, None)
     assert main(["map", str(tmp_path / name), "--out", str(tmp_path)]) == 2
     assert "pip install 'unifg[logs]'" in capsys.readouterr().err
+    (tmp_path / "drive.npz").write_bytes(b"")
+    assert main(["map", str(tmp_path / name), "--out", str(tmp_path)]) == 2
+    assert "drive.npz is read" in capsys.readouterr().err
 
 
 def test_a_drive_of_the_simulation_is_read(log: RangeLog, tmp_path: Path) -> None:
@@ -234,6 +245,40 @@ def test_a_drive_of_the_simulation_is_read(log: RangeLog, tmp_path: Path) -> Non
         (tmp_path / "drive.npz").write_bytes(wrong)
         with pytest.raises(FileFormatError, match=r"is no drive\.npz of `unifg run`"):
             read_range_log(tmp_path / "drive.npz")
+
+
+def messages(times: list[float], first: float = -1.0) -> list[tuple[str, str, Any]]:
+    """Scans of five beams at some times, and odometry along x from 0 to 4 s."""
+
+    def header(time: float) -> Any:
+        return SimpleNamespace(stamp=SimpleNamespace(sec=int(time), nanosec=0), frame_id="laser")
+
+    scan = {"ranges": [1.0, 2.0, 0.05, 40.0, 3.0], "range_min": 0.1, "range_max": 30.0, "angle_increment": 0.5}
+    turn = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
+    poses = [SimpleNamespace(position=SimpleNamespace(x=float(k), y=0.0), orientation=turn) for k in range(5)]
+    return [
+        *(("/scan", "LaserScan", SimpleNamespace(header=header(t), angle_min=first, **scan)) for t in times),
+        *(
+            ("/odom", "Odometry", SimpleNamespace(header=header(p.position.x), pose=SimpleNamespace(pose=p)))
+            for p in poses
+        ),
+    ]
+
+
+def test_scans_that_nothing_moves_or_of_other_beams_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Ranges below the least one, such as of the robot itself, are lost, as REP 117 says."""
+    others = [*messages([1.0, 3.0, 4.0, 5.0, 9.0]), *messages([2.0], first=1.0)[:1]]
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter(others))
+    read = read_range_log("drive.mcap")
+    np.testing.assert_array_equal(read.time, [1.0, 3.0, 4.0])
+    np.testing.assert_array_equal(read.odometry[:, 0], read.time)
+    np.testing.assert_array_equal(read.ranges[0], [1.0, 2.0, np.nan, np.inf, 3.0])
+    assert "3 of 6 scans left out" in caplog.text
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter(messages([1001.0, 1002.0, 1003.0])))
+    with pytest.raises(FileFormatError, match=r"drive\.mcap: 0 of 3 scans have odometry at their time"):
+        read_range_log("drive.mcap")
 
 
 def test_a_broken_recording_is_refused(tmp_path: Path) -> None:

@@ -178,3 +178,9 @@ def test_places_of_the_department_map_are_where_they_should_be(shared_data: Path
     columns, rows = np.floor(occupancy.world_to_grid(places)).astype(int).T
     assert occupancy.free[rows, columns].tolist() == [True, True, True, False]
     assert not occupancy.occupied[rows, columns].any()
+
+
+def test_a_map_may_have_any_name(tmp_path: Path) -> None:
+    cells = np.eye(3, dtype=bool)
+    save_map(tmp_path / 'hall "3"\\ü.yaml', OccupancyMap(cells, ~cells, 0.05, (0.0, 0.0, 0.0)))
+    np.testing.assert_array_equal(load_map(tmp_path / 'hall "3"\\ü.yaml').occupied, cells)

@@ -11,7 +11,7 @@ import pytest
 from problems.closures import adrift, aliased, drive, slipped
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
-from unifg.pose_graphs import PoseGraph, best_guess, manhattan, sphere
+from unifg.pose_graphs import Edges, PoseGraph, best_guess, manhattan, sphere
 from unifg.pose_graphs.clusters import Map, _clusters, optimum
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import IntArray
@@ -129,6 +129,15 @@ def test_noise_larger_than_stated_contradicts_nothing() -> None:
     verdict = solved(sure).verdict(effort="cheap")
     assert not verdict.of("contradicted") and not verdict.of("slipped")
     assert "times as large as stated" in verdict.sentence()
+
+
+def test_measurements_without_sense_are_judged() -> None:
+    """Rounding of lengths of 1e5 m must not hide the suspect that the search takes out."""
+    first, second = np.array([*range(7), 7, 4]), np.array([*range(1, 8), 0, 0])
+    measured = np.random.default_rng(8).normal(0.0, [1e5, 1e5, 2.0], (9, 3))
+    edges = Edges(first, second, measured, np.tile(100.0 * np.eye(3), (9, 1, 1)))
+    verdict = solved(PoseGraph(np.arange(8), np.zeros((8, 3)), edges)).verdict(effort="cheap")
+    assert verdict.of("slipped")
 
 
 def test_effort_decides_what_is_claimed() -> None:

@@ -17,7 +17,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path that atomically replaces ``path`` on success.
 
     The name ends as that of ``path`` does, for writers that look at it. Links are followed; what is no file, such as
-    ``/dev/stdout``, is written to directly.
+    ``/dev/stdout``, is written to directly. Errors name ``path``.
     """
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
@@ -30,7 +30,9 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         with suppress(OSError):  # there was none before
             os.chmod(own, target.stat().st_mode)
         os.replace(own, target)
-    except BaseException:
+    except BaseException as error:
+        if isinstance(error, OSError) and str(error.filename) == str(own):
+            error.filename = os.fspath(path)  # for people
         with suppress(OSError):
             own.unlink()
         raise

@@ -52,7 +52,7 @@ LIMITS = Limits()
 
 def legible(path: str | os.PathLike[str]) -> str:
     """The name of a file for people; bytes that are no text are spelled by their numbers."""
-    return os.fsencode(path).decode("utf-8", errors="backslashreplace")
+    return os.fspath(path).encode("utf-8", errors="surrogateescape").decode("utf-8", errors="backslashreplace")
 
 
 def read_bytes(path: str | os.PathLike[str], limits: Limits = LIMITS) -> bytes:

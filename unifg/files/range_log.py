@@ -37,6 +37,7 @@ SLOWEST = 0.005  # [m/s]; who is slower counts time in thousandths
 AT_MOST = 0.99  # of the longest range
 OFTEN, PEAK = 0.005, 3.0  # share of the ranges there, and over those a little shorter, if it means that nothing was hit
 LONGEST = 10**6  # characters of a line, which has no blanks
+ROUND = 2.0 * math.pi + 0.1  # beyond which a direction is in degrees [rad]
 ROSBAGS = (".mcap", ".bag", ".db3")
 UNREADABLE = (
     OSError, ValueError, LookupError, TypeError, RuntimeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error,
@@ -67,11 +68,13 @@ class RangeLog:
         """Refuse what is no log.
 
         Raises:
-            FileFormatError: there are less than two scans, or a time or a pose is not finite.
+            FileFormatError: there are less than two scans, a time or a pose is not finite, or a direction is none.
         """
         numbers = np.column_stack([self.time, self.odometry, *([] if self.corrected is None else [self.corrected])])
         if len(self.time) < 2 or not len(self.angles) or not np.isfinite(numbers).all():
             raise FileFormatError(f"{self.name}: at least two scans with finite times and poses make a log")
+        if odd := [angle for angle in self.angles.tolist() if not abs(angle) <= ROUND]:
+            raise FileFormatError(f"{self.name}: {odd[0]:g} is no direction of a beam; directions are in radians")
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -83,7 +86,7 @@ class RangeLog:
 
 
 def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
-    """Read a log: ``.csv``; MCAP, rosbag2 (a folder), rosbag; ``.npz`` of a drive; else CARMEN, gzipped or not.
+    """Read a log: CARMEN or ``.csv``, gzipped or not; MCAP, rosbag2 (a folder), rosbag; ``.npz`` of a drive.
 
     Of several lasers, that with most scans is taken. Of a CARMEN log whose scans bear corrected poses, the odometry is
     that of the robot, or of the ODOM lines where the robot's poses are corrected, too. Times in milliseconds or smaller
@@ -98,7 +101,7 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
         ImportError: a package that reads it is not installed; the message names it.
     """
     path = Path(path)
-    if path.suffix == ".csv":
+    if (path.with_suffix("") if path.suffix == ".gz" else path).suffix.lower() == ".csv":
         return _table(path, limits)
     name = legible(path.name)
     if path.suffix == ".npz":
@@ -195,6 +198,8 @@ def _table(path: Path, limits: Limits) -> RangeLog:
     beams = [k for k, word in enumerate(header) if _number(word) is not None]
     if missing := [word for word in ("time", *POSE) if word not in header]:
         raise FileFormatError(f"{name}: the header has no {', '.join(missing)}; it needs time, x, y, theta and beams")
+    if twice := [word for k, word in enumerate(header) if word in header[:k]]:
+        raise FileFormatError(f"{name}: the header has {twice[0]!r} twice; leave one of the columns out")
     rows = [line for line in lines[1:] if line]
     values = np.empty((len(rows), len(header)))
     for number, row in enumerate(rows):

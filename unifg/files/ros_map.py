@@ -9,6 +9,7 @@ unknown, which is neither.
 
 from __future__ import annotations
 
+import json
 import math
 import reprlib
 from dataclasses import dataclass
@@ -187,7 +188,8 @@ def save_map(path: str | Path, occupancy: OccupancyMap) -> None:
     x, y, yaw = (float(value) for value in occupancy.origin)
     write_atomically(
         path,
-        f'image: "{image.name}"\nmode: trinary\nresolution: {_yaml_float(occupancy.resolution)}\n'
+        f"image: {json.dumps(image.name, ensure_ascii=False)}\nmode: trinary\n"
+        f"resolution: {_yaml_float(occupancy.resolution)}\n"
         f"origin: [{_yaml_float(x)}, {_yaml_float(y)}, {_yaml_float(yaw)}]\nnegate: 0\n"
         f"occupied_thresh: {_DEFAULT_OCCUPIED}\nfree_thresh: {_DEFAULT_FREE}\n",
     )

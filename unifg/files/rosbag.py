@@ -7,6 +7,7 @@ Messages: ``sensor_msgs/LaserScan``, ``nav_msgs/Odometry`` and, for where the la
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import Counter
 from collections.abc import Iterator
@@ -22,6 +23,8 @@ from unifg.typing import Array
 
 __all__ = ["Recorded", "read_rosbag"]
 
+logger = logging.getLogger("unifg")
+
 SCAN, ODOMETRY, FRAMES = "LaserScan", "Odometry", "TFMessage"
 
 
@@ -31,7 +34,7 @@ class Recorded(NamedTuple):
     Attributes:
         time: (n,) of their stamps [s].
         angles: (b,) directions of the beams [rad].
-        ranges: (n, b) [m].
+        ranges: (n, b) [m]; NaN below the least range of the laser.
         maximum: of a range [m].
         odometry: (n, 3) poses of the laser by the wheels, interpolated [m, m, rad].
     """
@@ -46,10 +49,14 @@ class Recorded(NamedTuple):
 def read_rosbag(path: Path) -> Recorded:
     """Read the topic with most scans, and the one with most odometry.
 
+    Scans before or after all odometry, or with other directions than most, are left out with a warning.
+
     Raises:
         FileFormatError: it cannot be read, or holds no scans or no odometry.
         ImportError: the package that reads it is not installed.
     """
+    own = path.with_name("drive.npz")
+    hint = f"; of a run of unifg {legible(own)} is read" if path.is_file() and own.is_file() else ""
     name, topics, mounts = legible(path), dict[str, dict[str, list[Any]]](), dict[str, Array]()
     try:
         for topic, kind, message in _mcap(path) if path.suffix == ".mcap" else _bag(path):
@@ -58,24 +65,36 @@ def read_rosbag(path: Path) -> Recorded:
                     mounts |= {one.child_frame_id: _planar(one.transform) for one in message.transforms}
             else:
                 topics.setdefault(kind, {}).setdefault(topic, []).append(message)
-    except (ImportError, MemoryError):
+    except MemoryError:
         raise
+    except ImportError as error:
+        raise ImportError(f"{error}{hint}") from error
     except Exception as error:  # each of these packages lets out whatever its parts raise
         raise FileFormatError(f"{name}: cannot be read ({type(error).__name__}: {error})") from error
     if lacking := [kind for kind in (SCAN, ODOMETRY) if kind not in topics]:
-        own = next(path.parent.glob("drive.npz"), None) if path.is_file() else None
-        hint = f"; of a run of unifg {legible(own)} is read" if own else ""
         raise FileFormatError(f"{name}: no message of ROS of the kind {' and '.join(lacking)}{hint}")
     scans, wheels = (max(topics[kind].values(), key=len) for kind in (SCAN, ODOMETRY))
     forms = Counter((len(scan.ranges), scan.angle_min, scan.angle_increment) for scan in scans)
     (count, first, step), _ = forms.most_common(1)[0]
-    scans = [scan for scan in scans if len(scan.ranges) == count]
-    time, known = (np.array([_stamp(one) for one in messages]) for messages in (scans, wheels))
+    known, every = np.array([_stamp(one) for one in wheels]), len(scans)
+    scans = [
+        scan
+        for scan in scans
+        if known.min() <= _stamp(scan) <= known.max()
+        and len(scan.ranges) == count
+        and abs(scan.angle_min - first) + count * abs(scan.angle_increment - step) < abs(step)
+    ]
+    if len(scans) < 2:
+        raise FileFormatError(f"{name}: {len(scans)} of {every} scans have odometry at their time: are clocks apart?")
+    if len(scans) < every:
+        logger.warning("%s: %d of %d scans left out: no odometry then, or other beams", name, every - len(scans), every)
+    time = np.array([_stamp(scan) for scan in scans])
     poses = np.array([_planar(one.pose.pose) for one in wheels])[np.argsort(known, kind="stable")]
     columns = (*poses[:, :2].T, np.unwrap(poses[:, 2]))
     at = np.column_stack([np.interp(time, np.sort(known), column) for column in columns])
     mount = mounts.get(scans[0].header.frame_id, np.zeros(3))
     ranges = np.array([scan.ranges for scan in scans], dtype=np.float64)
+    ranges[ranges < scans[0].range_min] = np.nan
     angles = first + step * np.arange(count, dtype=np.float64)
     return Recorded(time, angles, ranges, float(scans[0].range_max), SE2.compose(at, mount))
 

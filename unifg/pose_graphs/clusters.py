@@ -118,7 +118,8 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         for one in clusters:
             leverage[one.edges] = one.leverage
         alone = now.alone()
-        worst = max([0.0, *(one.fall for one in clusters), *(alone[one.edges].max() for one in clusters)])
+        several = [one for one in clusters if len(one.edges) > 1]  # rounding parts the two falls of a single closure
+        worst = max([0.0, *(one.fall for one in clusters), *(alone[one.edges].max() for one in several)])
         steps = np.where(edges.odometry, alone, 0.0)
         slip, left = float(steps.max(initial=0.0)), freedom - dim * len(taken)
         limit = limit_of(now.chi2 - max(worst, slip), left - dim, dim, len(edges))
@@ -132,8 +133,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         else:
             single = [
                 replace(one, edges=k[None], alike=k[None], fall=float(alone[k]))
-                for one in clusters
-                if len(one.edges) > 1
+                for one in several
                 for k in one.edges[alone[one.edges] >= AS_MUCH * worst]
             ]
             found = sorted([*clusters, *single], key=lambda one: -one.fall)
