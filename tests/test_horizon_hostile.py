@@ -310,6 +310,24 @@ def test_a_first_tick_refuses_what_later_ones_refuse(before: int, wrong: dict[st
     np.testing.assert_array_equal(plan.controls, again.controls)
 
 
+class Fence:
+    """A soft limit whose price changes with every tick."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.bound(x, upper=[1.0, np.inf], soft=graph.data("price", 1.0), name="fence")
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        return {"price": now.given}
+
+
+def test_prices_of_soft_constraints_are_data_of_terms() -> None:
+    loop = loop_of(Fence())
+    for price in (0.5, 0.01, 0.3):
+        loop.plan([1.5, 0.0], given=price)
+        assert loop.solution is not None and loop.solution.converged
+        np.testing.assert_allclose(np.abs(loop.solution.dual("fence")).max(), price, rtol=1e-4)
+
+
 class Mute:
     """A term that forgot to give its data."""
 

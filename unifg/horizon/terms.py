@@ -297,8 +297,5 @@ def reset_all(terms: Iterable[Term]) -> None:
 
 def handles_of(graph: Graph) -> dict[str, Data]:
     """The data that the terms and fixes of a graph read, by name."""
-    shaping = "active", "sigma", "information", "lower", "upper"
-    read: list[Any] = [fix.value for fix in graph.fixes]
-    for term in graph.terms:
-        read += [*term.arguments, *(getattr(term, name, None) for name in shaping)]
-    return {value.name: value for value in read if isinstance(value, Data)}
+    read = [fix.data for fix in graph.fixes] + [term.data for term in graph.terms]
+    return {value.name: value for data in read for value in data}
