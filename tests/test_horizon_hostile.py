@@ -148,6 +148,32 @@ def test_a_common_factor_changes_no_plan(loss: Any) -> None:
     assert costs[1] == pytest.approx(16.0 * costs[0], rel=1e-6)
 
 
+@dataclass
+class Rail:
+    """A limit of the state that gives way."""
+
+    price: Any
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        price = graph.data("price", 1.0) if self.price is None else self.price
+        graph.bound(x, lower=[-0.2, -0.1], upper=[1.5, 0.4], soft=price, name="rail")
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        return {}
+
+
+@pytest.mark.parametrize("price", [0.3, fg.Soft(linear=[0.3, 0.1], quadratic=2.0)])
+def test_a_common_factor_is_one_of_soft_constraints_too(price: Any) -> None:
+    found = []
+    for weight in (1.0, 16.0):
+        loop = loop_of(Wish(), ControlCost([0.7]), Rail(price), control_weight=weight, window=None)
+        found.append(loop.plan([1.0, 0.5]).controls)
+        assert loop.solution is not None and loop.solution.converged and loop.solution.slack("rail").max() > 0.1
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+    with pytest.raises(fg.GraphError, match=r"'rail' cannot be weighed"):
+        loop_of(Rail(None), control_weight=16.0)
+
+
 class Own(fg.Huber):
     """A loss of somebody's own."""
 
