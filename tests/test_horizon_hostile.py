@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.horizon import Constant, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
+from unifg.horizon import (
+    Constant,
+    Context,
+    ControlCost,
+    Dynamics,
+    InitialGuesses,
+    Measurement,
+    RecedingHorizon,
+    Robot,
+    Term,
+    Window,
+)
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array, ArrayLike
 
@@ -352,6 +363,33 @@ def test_prices_of_soft_constraints_are_data_of_terms() -> None:
         loop.plan([1.5, 0.0], given=price)
         assert loop.solution is not None and loop.solution.converged
         np.testing.assert_allclose(np.abs(loop.solution.dual("fence")).max(), price, rtol=1e-4)
+
+
+NO_NUMBERS: dict[str, tuple[Any, str]] = {
+    "a masked measurement": (lambda: window_of().record("p", np.ma.array([1.0], mask=[True])), "'p'.*masked"),
+    "a date measured": (lambda: window_of().record("p", np.array(["2020"], "M8[D]")), "'p'.*dates"),
+    "rounds": (lambda: window_of(rounds=0), "one round"),
+    "length": (lambda: window_of(length=2.5), "length=2.5"),  # type: ignore[arg-type]
+    "prediction": (lambda: window_of(robot=Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: "x")).move([0.0]), "predict"),  # type: ignore[arg-type,return-value]
+    "start": (lambda: Constant("b", fg.Rn(1), "x", 1.0), "'b'.*start"),
+    "steps": (lambda: RecedingHorizon(POINT, 2.5, [Wish()], solver=SQP()), "steps=2.5"),  # type: ignore[arg-type]
+    "present": (lambda: loop_of().plan("x"), "present"),
+    "present of another shape": (lambda: loop_of().plan([[0.0, 0.0]]), "present"),
+    "times": (lambda: loop_of().set_times("x"), "times"),
+    "wanted": (lambda: loop_of(ControlCost([1.0], wanted=[1.0, 2.0, 3.0])), "wanted"),
+    "guess": (lambda: guessing((np.zeros((3, 2)), np.zeros((4, 1)))), r"states of a guess.*\(3, 2\).*\(5, 2\)"),
+    "guess of controls": (lambda: guessing((np.zeros((5, 2)), np.zeros((4, 2)))), "controls of a guess"),
+}
+
+
+def guessing(guess: Any) -> None:
+    loop_of(starts=InitialGuesses(cold=lambda now: guess)).plan([0.0, 0.0])
+
+
+@pytest.mark.parametrize(("make", "message"), NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_what_is_no_number_is_refused_by_name(make: Any, message: str) -> None:
+    with pytest.raises(fg.GraphError, match=message):
+        make()
 
 
 class Mute:

@@ -222,7 +222,7 @@ class ControlCost:
         """Add the costs."""
         shape = len(u), u.manifold.storage
         constant = 0.0 if callable(self.wanted) else self.wanted
-        wanted = graph.data("wanted controls", np.broadcast_to(np.asarray(constant), shape), each=True)
+        wanted = graph.data("wanted controls", _spread_out(constant, shape), each=True)
         graph.minimize(prior, u, wanted, sigma=self.sigma, name="effort")
         if self.change is not None:
             last = graph.data("last control", np.zeros(shape[1]))
