@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from unifg.horizon import Constant, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
+from unifg.horizon import (
+    Constant,
+    Context,
+    ControlCost,
+    Dynamics,
+    InitialGuesses,
+    Measurement,
+    RecedingHorizon,
+    Robot,
+    Term,
+    Window,
+)
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array, ArrayLike
 
@@ -146,6 +157,32 @@ def test_a_common_factor_changes_no_plan(loss: Any) -> None:
         costs.append(loop.solution.cost)
     np.testing.assert_allclose(found[0], found[1], atol=1e-6)
     assert costs[1] == pytest.approx(16.0 * costs[0], rel=1e-6)
+
+
+@dataclass
+class Rail:
+    """A limit of the state that gives way."""
+
+    price: Any
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        price = graph.data("price", 1.0) if self.price is None else self.price
+        graph.bound(x, lower=[-0.2, -0.1], upper=[1.5, 0.4], soft=price, name="rail")
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        return {}
+
+
+@pytest.mark.parametrize("price", [0.3, fg.Soft(linear=[0.3, 0.1], quadratic=2.0)])
+def test_a_common_factor_is_one_of_soft_constraints_too(price: Any) -> None:
+    found = []
+    for weight in (1.0, 16.0):
+        loop = loop_of(Wish(), ControlCost([0.7]), Rail(price), control_weight=weight, window=None)
+        found.append(loop.plan([1.0, 0.5]).controls)
+        assert loop.solution is not None and loop.solution.converged and loop.solution.slack("rail").max() > 0.1
+    np.testing.assert_allclose(found[0], found[1], atol=1e-5)
+    with pytest.raises(fg.GraphError, match=r"'rail' cannot be weighed"):
+        loop_of(Rail(None), control_weight=16.0)
 
 
 class Own(fg.Huber):
@@ -308,6 +345,51 @@ def test_a_first_tick_refuses_what_later_ones_refuse(before: int, wrong: dict[st
         loop.tick(**{"measured": {"p": [1.0]}} | wrong)
     plan, again = (own.tick(measured={"p": [1.0]}, time=5.0) for own in (loop, fresh))
     np.testing.assert_array_equal(plan.controls, again.controls)
+
+
+class Fence:
+    """A soft limit whose price changes with every tick."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.bound(x, upper=[1.0, np.inf], soft=graph.data("price", 1.0), name="fence")
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        return {"price": now.given}
+
+
+def test_prices_of_soft_constraints_are_data_of_terms() -> None:
+    loop = loop_of(Fence())
+    for price in (0.5, 0.01, 0.3):
+        loop.plan([1.5, 0.0], given=price)
+        assert loop.solution is not None and loop.solution.converged
+        np.testing.assert_allclose(np.abs(loop.solution.dual("fence")).max(), price, rtol=1e-4)
+
+
+NO_NUMBERS: dict[str, tuple[Any, str]] = {
+    "a masked measurement": (lambda: window_of().record("p", np.ma.array([1.0], mask=[True])), "'p'.*masked"),
+    "a date measured": (lambda: window_of().record("p", np.array(["2020"], "M8[D]")), "'p'.*dates"),
+    "rounds": (lambda: window_of(rounds=0), "one round"),
+    "length": (lambda: window_of(length=2.5), "length=2.5"),  # type: ignore[arg-type]
+    "prediction": (lambda: window_of(robot=Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: "x")).move([0.0]), "predict"),  # type: ignore[arg-type,return-value]
+    "start": (lambda: Constant("b", fg.Rn(1), "x", 1.0), "'b'.*start"),
+    "steps": (lambda: RecedingHorizon(POINT, 2.5, [Wish()], solver=SQP()), "steps=2.5"),  # type: ignore[arg-type]
+    "present": (lambda: loop_of().plan("x"), "present"),
+    "present of another shape": (lambda: loop_of().plan([[0.0, 0.0]]), "present"),
+    "times": (lambda: loop_of().set_times("x"), "times"),
+    "wanted": (lambda: loop_of(ControlCost([1.0], wanted=[1.0, 2.0, 3.0])), "wanted"),
+    "guess": (lambda: guessing((np.zeros((3, 2)), np.zeros((4, 1)))), r"states of a guess.*\(3, 2\).*\(5, 2\)"),
+    "guess of controls": (lambda: guessing((np.zeros((5, 2)), np.zeros((4, 2)))), "controls of a guess"),
+}
+
+
+def guessing(guess: Any) -> None:
+    loop_of(starts=InitialGuesses(cold=lambda now: guess)).plan([0.0, 0.0])
+
+
+@pytest.mark.parametrize(("make", "message"), NO_NUMBERS.values(), ids=NO_NUMBERS)
+def test_what_is_no_number_is_refused_by_name(make: Any, message: str) -> None:
+    with pytest.raises(fg.GraphError, match=message):
+        make()
 
 
 class Mute:

@@ -200,6 +200,25 @@ def test_control_c_before_the_compiled_loop_is_passed_on(monkeypatch: pytest.Mon
     assert again.iterations == before.iterations
 
 
+@pytest.mark.parametrize("soft", [None, 5.0])
+@pytest.mark.parametrize("by", ["active", "upper"])
+def test_a_warm_start_forgets_the_multipliers_of_rows_without_limit(by: str, soft: float | None) -> None:
+    """What pressed at the last tick and is switched off at this one presses no more."""
+    graph, x = graph_with(fg.Rn(1), 3)
+    on = np.array([True, False, True])
+    active, upper = graph.data("active", [True] * 3, each=True), graph.data("upper", np.full((3, 1), 0.5))
+    graph.minimize(fg.prior, x, [1.0])
+    graph.constrain(lambda x: x, x, upper=upper, active=active, soft=soft, name="wall")
+    run = InteriorPoint().prepare(graph)
+    first = run.solve({x: np.zeros((3, 1))}, check=True)
+    data = {active: on} if by == "active" else {upper: np.where(on, 0.5, np.inf)[:, None]}
+    for start in (first, first.shifted(x, by=0)):
+        freed = run.solve(start, data=data)
+        assert freed.converged and freed.iterations < 20
+        np.testing.assert_allclose(freed[x].ravel(), [0.5, 1.0, 0.5], atol=1e-5)
+        assert freed.dual("wall")[1, 0] == 0.0
+
+
 def test_a_warm_tick_on_its_way_raises_no_price() -> None:
     """One step before the end, hard equalities still miss the tolerance: no elastic variable was too cheap."""
     problem = Quadrotor("figure8", False, 20)

@@ -437,6 +437,10 @@ def test_kinks_flags_losses_and_names_are_refused() -> None:
     refused(solution, "does not belong", "x", fg.Graph().data("p", 1.0))
     with pytest.raises(fg.GraphError, match=r"weights of <1 of x> have shape \(3,\), expected \(1, 2\)"):
         solution.gradient({"x": [1.0, 2.0, 3.0]}, "q")
+    none: list[tuple[Any, str]] = [([np.nan, 1.0], "finite"), (["a", "b"], "text"), (np.ma.array([1.0, 1.0]), "masked")]
+    for weights, why in none:
+        with pytest.raises(fg.GraphError, match=f"gradient: weights of .*{why}"):
+            solution.gradient({"x": weights}, "q")
     with pytest.raises(fg.GraphError, match="of what"):
         solution.sensitivity([], "q")
     refused(point(lambda g, x: g.minimize(fg.prior, x, g.data("p", [0.0, 1.0]), robust=Own(), name="own")), "'own'")

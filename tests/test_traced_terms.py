@@ -134,6 +134,16 @@ def test_lambdas_made_in_a_loop_keep_what_they_mean() -> None:
     np.testing.assert_allclose(solution[x].ravel(), [1.0, 1.5, 2.0], atol=1e-9)
 
 
+def test_a_term_of_no_rows_says_nothing() -> None:
+    graph, x = graph_with(fg.Rn(3), N)
+    graph.minimize(lambda x: x - TARGETS, x)
+    graph.minimize(lambda x: x[:, :0], x, name="no cost")
+    graph.constrain(lambda x: x[:, :0], x, lower=0.0, name="no constraint")
+    solution = InteriorPoint().solve(graph, {x: np.zeros((N, 3))}, check=True)
+    np.testing.assert_allclose(solution[x], TARGETS, atol=1e-6)
+    assert solution.dual("no constraint").shape == (N, 0)
+
+
 def test_data_are_inputs_of_a_trace() -> None:
     graph, x = graph_with(fg.Rn(2), N)
     goal, rows = graph.data("goal", np.zeros(2)), graph.data("rows", np.zeros((N, 2)), each=True)

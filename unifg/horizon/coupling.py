@@ -17,7 +17,8 @@ from unifg.horizon.robot import Robot
 from unifg.horizon.terms import Context
 from unifg.horizon.window import Window
 from unifg.modeling.factors import prior
-from unifg.modeling.terms import Cost, ScalarCost
+from unifg.modeling.soft import Soft
+from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.terms import Term as Stated
 from unifg.modeling.variables import Data, Family, Selection
 from unifg.solution.graph import Graph
@@ -212,16 +213,19 @@ def _stretched(rule: Callable[[Array], Array], weight: float, squared: Array) ->
 def weigh(terms: Sequence[Stated], weight: float) -> None:
     """Multiply costs, as they have been stated, by a common weight; losses bend where they did.
 
+    Prices of soft constraints are costs, too.
+
     Raises:
-        GraphError: when the weight is not one: for a cost that is not a square, whose standard deviations are data, or
-            whose loss is not one of the library's.
+        GraphError: when the weight is not one: for a cost that is not a square, whose standard deviations or prices are
+            data, or whose loss is not one of the library's.
     """
     if weight == 1.0:
         return
     for term in terms:
-        if isinstance(term, ScalarCost) or (
-            isinstance(term, Cost) and (isinstance(term.sigma, Data) or isinstance(term.information, Data))
-        ):
+        slack = term.slack if isinstance(term, Constraint) else None
+        factors: tuple[Any, ...] = (term.sigma, term.information) if isinstance(term, Cost) else ()
+        prices: tuple[Any, ...] = () if slack is None else (slack.soft.linear, slack.soft.quadratic)
+        if isinstance(term, ScalarCost) or any(isinstance(factor, Data) for factor in (*factors, *prices)):
             raise GraphError(
                 f"term '{term.name}' cannot be weighed by control_weight: state its weight in the term", term=term.name
             )
@@ -234,6 +238,8 @@ def weigh(terms: Sequence[Stated], weight: float) -> None:
                     term=term.name,
                 )
             term.robust = loss
+        if isinstance(term, Constraint) and slack is not None:
+            term.slack = replace(slack, soft=Soft(*(weight * np.asarray(price) for price in prices)))
         if isinstance(term, Cost) and term.information is not None:
             term.information = np.asarray(term.information, dtype=np.float64) * weight
         elif isinstance(term, Cost):

@@ -49,8 +49,8 @@ class History:
         Raises:
             GraphError: when there is no step, or the start is not on the robot's manifold.
         """
-        if length < 1:
-            raise GraphError(f"a window needs at least one step, found length={length}")
+        if not isinstance(length, int | np.integer) or length < 1:
+            raise GraphError(f"a window needs at least one step, a whole number of them; found length={length!r}")
         present = robot.point(start, "the start")
         self.length, self.filled = length, filled
         self.states = np.tile(present, (length + 1, 1))

@@ -23,6 +23,7 @@ from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, 
 from unifg.horizon.tree import BranchedSelection, ExpectedCost, Tree
 from unifg.horizon.window import Window
 from unifg.locks import ReentrantLock
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data
 from unifg.solution.graph import Graph
 from unifg.solution.history import subproblems
@@ -172,8 +173,8 @@ class RecedingHorizon:
             raise GraphError(f"portion={portion}: one iteration or more, of a plan that acts at once and is not joint")
         if coupling not in COUPLINGS:
             raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
-        if not isinstance(steps, Tree) and steps < 1:
-            raise GraphError(f"a horizon needs at least one step, found steps={steps}")
+        if not isinstance(steps, Tree) and (not isinstance(steps, int | np.integer) or steps < 1):
+            raise GraphError(f"a horizon needs at least one step, a whole number of them; found steps={steps!r}")
         tree = steps if isinstance(steps, Tree) else Tree(tuple(range(steps)))
         if not deadline > 0.0:
             raise GraphError(f"the deadline must be positive, got {deadline} s")
@@ -359,7 +360,7 @@ class RecedingHorizon:
         )
         stated = {name: self._constant(name, value, known) for name, value in (constants or {}).items()}
         known = {name: values.copy() for name, values in known.items()} | stated
-        here = np.array(present, dtype=np.float64)
+        here = self.robot.point(present, "the present state")
         return Context(given, here, self.applied.copy(), known, history, self.times, self._branches)
 
     def _constant(self, name: str, value: ArrayLike, known: Mapping[str, Array]) -> Array:
@@ -566,8 +567,9 @@ class RecedingHorizon:
             acting = self.robot.between(path, states, controls, begins)[1]
             states, controls = self.robot.between(path, states, controls, self.times)[0], acting
         nodes = np.tile(now.present, (len(x), 1))
-        nodes[len(x) - self.steps - 1 :] = states
-        values = {x: nodes, self.u: np.asarray(controls, dtype=np.float64)}
+        count, kinds = self.steps, self.robot
+        nodes[len(x) - count - 1 :] = numbers(states, (count + 1, kinds.state.storage), "the states of a guess")
+        values = {x: nodes, self.u: numbers(controls, (count, kinds.control.storage), "the controls of a guess")}
         for term in self._terms:
             if isinstance(term, Guessing):
                 for name, value in term.guess(now).items():
@@ -685,7 +687,7 @@ def _node_times(times: ArrayLike | None, tree: Tree, robot: Robot) -> Array:
     """(N + 1,) times of the nodes."""
     if times is None:
         return tree.depths.astype(np.float64) * (robot.tick or 1.0)
-    nodes, count = np.array(times, dtype=np.float64), len(tree) + 1
+    nodes, count = doubles("the times of the nodes", times).copy(), len(tree) + 1
     growing = nodes.shape == (count,) and nodes[0] == 0.0 and np.isfinite(nodes).all()
     if not (growing and (nodes[1:] > nodes[tree.begins]).all()):
         raise GraphError(f"the times must be {count} growing numbers from 0 on, one for each node; got {times}")

@@ -9,6 +9,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.lie import Manifold
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Family
 from unifg.typing import Array, ArrayLike, IntArray
@@ -37,7 +38,7 @@ class Constant:
 
     def __post_init__(self) -> None:
         """Refuse what cannot be believed, and keep the rest, whatever the caller does with its arrays."""
-        start = np.atleast_2d(np.array(self.start, dtype=np.float64))
+        start = np.atleast_2d(doubles(f"static '{self.name}': its start", self.start)).copy()
         if start.ndim != 2 or start.shape[1] != self.manifold.storage or not np.all(self.manifold.is_valid(start)):
             raise GraphError(
                 f"static '{self.name}': its start has shape {start.shape}, expected (count, {self.manifold.storage}), "
@@ -45,7 +46,8 @@ class Constant:
                 family=self.name,
             )
         try:
-            sigma = np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (len(start), self.manifold.dim))
+            given = doubles(f"static '{self.name}': sigma", self.sigma)
+            sigma = np.broadcast_to(given, (len(start), self.manifold.dim))
         except ValueError as error:
             raise GraphError(
                 f"static '{self.name}': sigma does not fit ({len(start)}, {self.manifold.dim})", family=self.name
@@ -125,7 +127,7 @@ class Robot:
         if self.predict is None:
             return state.copy()
         length = () if self.tick is None else (self.tick if seconds is None else seconds,)
-        found = np.asarray(self.predict(state, control, *length), dtype=np.float64)
+        found = doubles("the state that predict gives", self.predict(state, control, *length))
         if found.size != self.state.storage:
             raise GraphError(f"predict must give a state ({self.state.storage},), found {found.shape}")
         return found.reshape(self.state.storage)
@@ -189,12 +191,9 @@ def numbers(value: ArrayLike, shape: tuple[int, ...], what: str, *, finite: bool
     """An array of that shape.
 
     Raises:
-        GraphError: when the value is none, or holds numbers that are not finite where they should be.
+        GraphError: when the value is none, is masked, or holds numbers that are not finite where they should be.
     """
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise GraphError(f"{what} must be {shape} numbers, got {value!r}", family=family) from error
+    array = np.asarray(doubles(what, value, flags=True), dtype=np.float64)
     if array.shape != shape:
         raise GraphError(f"{what} has shape {array.shape}, expected {shape}", family=family)
     if finite and not np.isfinite(array).all():

@@ -222,7 +222,7 @@ class ControlCost:
         """Add the costs."""
         shape = len(u), u.manifold.storage
         constant = 0.0 if callable(self.wanted) else self.wanted
-        wanted = graph.data("wanted controls", np.broadcast_to(np.asarray(constant), shape), each=True)
+        wanted = graph.data("wanted controls", _spread_out(constant, shape), each=True)
         graph.minimize(prior, u, wanted, sigma=self.sigma, name="effort")
         if self.change is not None:
             last = graph.data("last control", np.zeros(shape[1]))
@@ -297,8 +297,5 @@ def reset_all(terms: Iterable[Term]) -> None:
 
 def handles_of(graph: Graph) -> dict[str, Data]:
     """The data that the terms and fixes of a graph read, by name."""
-    shaping = "active", "sigma", "information", "lower", "upper"
-    read: list[Any] = [fix.value for fix in graph.fixes]
-    for term in graph.terms:
-        read += [*term.arguments, *(getattr(term, name, None) for name in shaping)]
-    return {value.name: value for value in read if isinstance(value, Data)}
+    read = [fix.data for fix in graph.fixes] + [term.data for term in graph.terms]
+    return {value.name: value for data in read for value in data}

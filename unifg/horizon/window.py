@@ -86,6 +86,8 @@ class Window:
         Raises:
             GraphError: when sizes do not fit, or a term cannot stand in a window.
         """
+        if rounds < 1:
+            raise GraphError(f"an estimate takes one round or more, found rounds={rounds}")
         self._lock = ReentrantLock()
         self.robot, self.terms, self.length = robot, looked_at(terms), length
         self._arrival = arrival or Tangent()

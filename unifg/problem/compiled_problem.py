@@ -73,6 +73,7 @@ class CompiledProblem:
         blocks: (size,) the variable that every unknown belongs to.
         lower, upper: (M,) limits with the present data.
         equality, sided: (M,) whether a row's are the same, and whether those of some row are not.
+        unlimited: rows without a limit, those of factors that are not active among them.
         cost_terms, scalar_terms, constraint_terms: compiled terms in row order.
         slices: rows of each constraint term.
         places: name, rows and shape of each constraint term.
@@ -313,6 +314,7 @@ class CompiledProblem:
             raise GraphError(f"term '{name}': lower exceeds upper in factor {index}", term=name, index=index)
         self.equality = self.lower == self.upper
         self.sided = not self.equality.all()
+        self.unlimited = np.flatnonzero((self.lower == -np.inf) & (self.upper == np.inf))
 
     def values_from(self, guess: Mapping[Family, ArrayLike] | Array) -> Values:
         """Copy and check a guess, by families or as it is stored, and give fixed variables their values.

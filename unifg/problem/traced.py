@@ -188,7 +188,7 @@ class Trace:
         with np.errstate(all="ignore"):
             ours = self.kernel(*given)
             ours = np.broadcast_to(ours, theirs.shape) if len(ours) == 1 else ours
-            size: Array = np.abs(theirs).max(axis=1)
+            size: Array = np.abs(theirs).max(axis=1, initial=0.0)
             for array in (*variables, *parameters):
                 size = size + np.abs(array.reshape(len(array), -1)).max(axis=1, initial=0.0)
             size = np.where(np.isfinite(size), size, 1.0)

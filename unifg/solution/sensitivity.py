@@ -277,7 +277,7 @@ class Sensitivities:
         total, asked = np.zeros(change.count), False
         for what, weights in of.items():
             places, columns, unknown = self._rows([what])
-            given = weights if unknown and not weights.ndim else self._weights(what, weights)
+            given = self._weights(what, weights)
             if not unknown:
                 if (places == HEIGHT).any():
                     total += given * self._heights(change)
@@ -297,8 +297,10 @@ class Sensitivities:
         """Weights of what is asked for, one each.
 
         Raises:
-            GraphError: they have another shape.
+            GraphError: they have another shape, or are not finite.
         """
+        if not np.isfinite(weights).all():
+            raise GraphError(f"gradient: weights of {of!r} must be finite numbers")
         if not isinstance(of, str):
             shape: tuple[int, ...] = len(of), of.manifold.dim
         else:

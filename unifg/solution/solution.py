@@ -14,6 +14,7 @@ from weakref import ref
 import numpy as np
 
 from unifg.errors import GraphError, UnifgError
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
@@ -396,7 +397,7 @@ class Solution:
             GraphError: as :meth:`sensitivity`.
         """
         weights = {of: 1.0} if isinstance(of, str) else of
-        parts = {self._part(part): np.asarray(given, dtype=np.float64) for part, given in weights.items()}
+        parts = {self._part(part): doubles(f"gradient: weights of {part!r}", own) for part, own in weights.items()}
         return self._sensitivities.gradient(parts, wrt)
 
     def _part(self, named: Named) -> Selection | str:

@@ -910,14 +910,20 @@ class Prepared:
             self._require_finite("multipliers", multipliers)
             if penalties is not program.no_penalties:
                 self._require_finite("penalties", penalties)
-            return program.values_from(flat), multipliers.copy(), penalties
+            return program.values_from(flat), self._pressing(multipliers.copy()), penalties
         values = program.values_from(values_of(guess))
         carried: Mapping[str, Numbers] = {}
         penalties = program.no_penalties
         if not isinstance(guess, Mapping):
             carried = guess.multipliers
             penalties = self._stacked("penalties", guess.penalties) if guess.penalties else penalties
-        return values, self._stacked("multipliers", {**carried, **duals} if duals else carried), penalties
+        multipliers = self._stacked("multipliers", {**carried, **duals} if duals else carried)
+        return values, self._pressing(multipliers), penalties
+
+    def _pressing(self, multipliers: Array) -> Array:
+        """Multipliers without those of rows that have no limit, as of factors that have been switched off."""
+        multipliers[self.program.unlimited] = 0.0
+        return multipliers
 
     def _verified(self, solution: Solution, began: float, callback: Callback | None) -> Solution:
         """Evaluate traced functions as written at an answer, and solve again without the traces that differ."""
