@@ -143,6 +143,18 @@ def test_data_are_checked_at_statement_and_at_every_binding() -> None:
     np.testing.assert_allclose(fg.SE3.local(POSE, solver.solve(guess)[x][0]), 0.0, atol=1e-9)
 
 
+def test_a_fix_by_data_is_named_as_what_fixes() -> None:
+    graph = fg.Graph()
+    x, start = graph.variables("x", fg.SE3, 2), graph.data("start", fg.SE3.identity())
+    graph.fix(x[1], start)
+    graph.minimize(fg.between, x[0], x[1], fg.SE3.identity())
+    prepared, poses = GaussNewton().prepare(graph), np.stack([fg.SE3.identity(), fg.SE3.identity()])
+    with pytest.raises(fg.GraphError, match=r"the value that fixes x\[1\] is not on SE3"):
+        prepared.solve({x: poses}, data={start: 1.1 * fg.SE3.identity()})
+    with pytest.raises(fg.GraphError, match=r"the guess for x\[0\] is not on SE3"):
+        prepared.solve({x: 1.1 * poses})
+
+
 def test_inactive_rows_of_data_may_be_anything() -> None:
     graph, x = graph_with(fg.SE3, 2)
     goals = graph.data("goals", np.stack([POSE, np.zeros(7)]), each=True)

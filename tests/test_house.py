@@ -287,8 +287,8 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 33_014, "scenarios": 12_900, "benchmarks": 4_820, "tests": 36_517,
-    "docs examples": 1_984, "unifg/factors": 4_302, "unifg/problem": 3_448, "models": 2_237,
+    "unifg solvers models": 33_017, "scenarios": 12_900, "benchmarks": 4_820, "tests": 36_527,
+    "docs examples": 1_984, "unifg/factors": 4_302, "unifg/problem": 3_451, "models": 2_237,
     "unifg/elimination": 2_156, "solvers": 5_136, "unifg/solution": 3_193, "unifg/smoothing": 1_886,
     "unifg/lie": 1_395, "unifg/view": 1_518, "unifg/files": 1_246, "unifg/pose_graphs": 1_610,
     "unifg/horizon": 1_498, "unifg/modeling": 1_167, "unifg/codegen": 1_331, "unifg/plots": 415,

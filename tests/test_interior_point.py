@@ -203,7 +203,7 @@ def test_control_c_before_the_compiled_loop_is_passed_on(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("soft", [None, 5.0])
 @pytest.mark.parametrize("by", ["active", "upper"])
 def test_a_warm_start_forgets_the_multipliers_of_rows_without_limit(by: str, soft: float | None) -> None:
-    """What pressed at the last tick and is switched off at this one presses no more."""
+    """A row that pressed at the last tick and is switched off at this one has no multiplier."""
     graph, x = graph_with(fg.Rn(1), 3)
     on = np.array([True, False, True])
     active, upper = graph.data("active", [True] * 3, each=True), graph.data("upper", np.full((3, 1), 0.5))

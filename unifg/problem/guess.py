@@ -97,8 +97,11 @@ class GuessReader:
             valid = family.manifold.is_valid(array)
             if not valid.all():
                 index = int(np.flatnonzero(~valid)[0])
+                part, (_, storage) = self._columns.place(family)
+                own = np.arange(storage) + part.start + index * storage
+                what = "the value that fixes" if np.isin(own, self._retraction.fixed).all() else "the guess for"
                 raise GraphError(
-                    f"the guess for {family.name}[{index}] is not on {family.manifold.name}: {array[index]}",
+                    f"{what} {family.name}[{index}] is not on {family.manifold.name}: {array[index]}",
                     family=family.name,
                     index=index,
                 )
