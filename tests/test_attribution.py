@@ -220,7 +220,7 @@ def test_a_staged_contact_has_its_cause(name: str, tmp_path: Path, monkeypatch: 
     assert judged(EpisodeLog.load(tmp_path / "drive.npz")) == judged(log)
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_clean_drive_breaks_nothing_and_says_how_often_deviations_were_exceeded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -196,7 +196,7 @@ def test_a_body_that_turns_is_stopped_where_a_corner_would_touch() -> None:
 # ------------------------------------------------------------------------ ways
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_way_of_a_car_has_no_tighter_turns_and_leads_backwards_into_the_bay() -> None:
     occupancy, body, car = yard(), body_of(CAR), base_of("ackermann")
     walls = SmoothField(field(occupancy))
@@ -293,7 +293,7 @@ def test_every_robot_parks_in_the_bay_of_the_yard(base: str, body: str, coupling
 # --------------------------------------------------------------------- options
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 @pytest.mark.parametrize("thickness", [2, 3, 4])
 def test_a_door_of_half_a_metre_is_passed_by_a_robot_of_a_third(thickness: int, tmp_path: Path) -> None:
     """Its middle line runs between two cells, where the field that the plan keeps to is highest."""
@@ -311,7 +311,7 @@ def test_a_door_of_half_a_metre_is_passed_by_a_robot_of_a_third(thickness: int, 
         run_navigation(behind(8))
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_fewer_obstacles_than_asked_for_are_said() -> None:
     settings = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((10.5, 14.1, 0.0),), obstacles=30)
     log = Episode(settings, rehearsal=True).run(stop_after(3))
@@ -320,7 +320,7 @@ def test_fewer_obstacles_than_asked_for_are_said() -> None:
     assert f"{metrics['obstacles']} of 30 found a place" in summary(log)
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_speed_plant_and_belief_are_those_asked_for() -> None:
     corridor = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),))
     fast = run_navigation(replace(corridor, controller=ControllerSettings(speed=1.6)))

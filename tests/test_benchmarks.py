@@ -310,7 +310,7 @@ def test_a_moved_goal_among_discs_costs_no_more_than_with_twenty_starts(seed: in
     assert "| loop, 20 ms |" in text and "1 fields" in text
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 @pytest.mark.skipif(shutil.which(os.environ.get("CC", "cc")) is None, reason="no C compiler is here")
 def test_exported_solvers_are_beside_python() -> None:
     row = exported.measure(None, rounds=1)

@@ -45,7 +45,7 @@ def settings(folder: Path, occupancy: OccupancyMap, start: float, *goals: float)
 
 
 @pytest.mark.parametrize("solver", ["ipm", "alm"])
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_closed_corridor_is_not_hit_and_said_to_be_blocked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, solver: str
 ) -> None:

@@ -324,7 +324,7 @@ def test_drives_without_a_fault_name_none(seed: int, plant: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_robot_whose_motors_are_stuck_has_its_power_cut(seed: int) -> None:
     settings = replace(CORRIDOR, seed=seed, faults=(Fault("actuator-stuck", 2.0),))
     log = Episode(settings).run(maps.stop_after(50))
@@ -367,7 +367,7 @@ def test_a_thrust_that_is_missing_is_asked_for() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_vehicle_that_is_loaded_in_flight_flies_on(seed: int) -> None:
     log = run_flight(FlightSettings(seed=seed, time_limit=5.0, faults=(Fault("payload", 3.0),)))
     named = [time for time, cause in zip(log.time, log.causes, strict=True) if cause]

@@ -457,7 +457,7 @@ def test_changes_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     }  # fmt: skip
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_workers_are_processes_of_one_thread_that_are_replaced(tmp_path: Path) -> None:
     mark = tmp_path / "died"
     grid = {"behaviour": ["threads", "die once", "raise"]}
@@ -472,7 +472,7 @@ def dies() -> None:
     os._exit(3)
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_workers_that_cannot_start_are_no_lost_episodes() -> None:
     with pytest.raises(ScenarioError, match="no worker can be started"):
         Workers(1, dies)
@@ -490,7 +490,7 @@ if __name__ == "__main__":
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_a_campaign_that_is_killed_loses_and_repeats_nothing(tmp_path: Path) -> None:
     file, script, out = tmp_path / "slow.toml", tmp_path / "killed.py", tmp_path / "out ü"
     file.write_text(f'scenario = "{WALKS}"\nseeds = {{spawn = 40}}\nsettings = {{behaviour = "slow", pace = 0.05}}\n')

@@ -330,7 +330,7 @@ ABSENT = [  # in one process, from what needs least to what needs most
 ]
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_help_loads_the_scenario_it_speaks_of_and_no_other() -> None:
     code = (
         "import sys\nfrom unifg.scenarios import command\n"
@@ -358,7 +358,7 @@ for words in commands:
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_without_extras_everything_works_or_names_the_extra(tmp_path: Path) -> None:
     """Plain ``pip install .``: README's first example, every help, and every command."""
     (tmp_path / "p.g2o").write_text("EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 1 1 0 0 1 0 1\n")

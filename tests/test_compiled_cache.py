@@ -169,7 +169,7 @@ print(bool(tally.compiled))
 
 
 @pytest.mark.parametrize("runs", [["here 2", "here 3"], pytest.param(["fork 2 3"], marks=FORKS)], ids=["runs", "forks"])
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_what_processes_have_compiled_meets_in_a_third(tmp_path: Path, runs: list[str]) -> None:
     """Numba numbers the functions of each process from one: two callers took the first one's copy of their callee."""
     for run in (*runs, "here 2 3"):
@@ -262,7 +262,7 @@ assert function(3.0) == 6.0
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_without_a_folder_to_write_to_everything_works_after_one_warning(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no folder", encoding="utf-8")
     ended = run_script(NOWHERE, variables={cache_folder.VARIABLE: str(tmp_path / "file" / "below")})
@@ -304,7 +304,7 @@ for k in range(4):
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_processes_compile_at_once_and_one_is_killed(tmp_path: Path) -> None:
     (tmp_path / "doubling.py").write_text(SOURCE, encoding="utf-8")
     command = [sys.executable, "-c", HAMMER, str(tmp_path / "doubling.py")]
@@ -319,7 +319,7 @@ def test_processes_compile_at_once_and_one_is_killed(tmp_path: Path) -> None:
     assert not [file for file in tmp_path.rglob("*.code") if read_sealed(file) is None]
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_what_is_read_needs_no_compiler_until_a_function_of_ones_own_does() -> None:
     script = (
         "import sys\n"
@@ -366,7 +366,7 @@ print(bool(tally.compiled), bool(tally.generated), bool(tally.read))
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_a_newer_numba_works_from_sources(tmp_path: Path) -> None:
     """Its layout is not the archive's, which is said once; what it has renamed the cache does without."""
 

@@ -67,7 +67,7 @@ def ahead(pose: Array = OPEN, way: Array | None = None) -> Array:
 
 @pytest.mark.parametrize("speed", [0.3, 0.6, 1.0])
 @pytest.mark.parametrize("slant", [0.0, 0.1])
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_the_robot_makes_way_for_one_who_does_not_wait(controller: Controller, speed: float, slant: float) -> None:
     """Somebody walks straight into a robot that has nothing to do; it is not run over, and comes back."""
     s, pose, begin = SETTINGS, OPEN.copy(), np.array([OPEN[0] + 2.5, OPEN[1] + slant])
@@ -239,7 +239,7 @@ def driven_through(field: DistanceMap, place: float, heading: float, squeeze: fl
 
 @pytest.mark.parametrize("heading", [0.0, 0.2])
 @pytest.mark.parametrize("place", [0.1, 0.15])
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_squeezing_lets_a_robot_out_of_a_gap_that_is_too_narrow(
     field: DistanceMap, place: float, heading: float
 ) -> None:

@@ -284,6 +284,7 @@ SINCE_TWO = {"vecdot", "vecnorm", "mT", "isclose"}
 """What NumPy has not had before, or has had as functions that look at the numbers themselves."""
 
 
+@pytest.mark.product(60)
 @pytest.mark.filterwarnings("ignore:numpy.fix is deprecated:DeprecationWarning")
 @pytest.mark.parametrize("name", [name for name in SURFACE if not OLD or name not in SINCE_TWO])
 def test_what_numpy_offers(name: str) -> None:

@@ -100,7 +100,7 @@ def test_every_case_can_be_timed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert performance.report(now, performance.compared(now, shipped)).count("\n") == len(now.ratios)
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_a_healthy_installation_is_called_well(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["doctor"]) == 0
     out = capsys.readouterr().out

@@ -221,7 +221,7 @@ def test_nothing_unbounded_is_called_converged() -> None:
 @pytest.mark.parametrize("name", BACKENDS)
 @pytest.mark.parametrize("feasible", [True, False])
 @pytest.mark.parametrize("iterations", [4, 5, 7, 9])
-@pytest.mark.product(30)
+@pytest.mark.product(12)
 def test_a_limit_returns_the_iterate_of_least_merit(
     name: str, iterations: int, feasible: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -248,7 +248,7 @@ def test_bad_structure_is_refused(rng: np.random.Generator) -> None:
         Factorization(pattern, label, ordering=np.zeros(9, dtype=np.intp)).factor(np.zeros(pattern.nnz))
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_literals_make_no_functions_of_their_own() -> None:
     """A count that begins as a literal was passed to callees as one first: each was compiled twice, and half unused."""
     caller: Any = symbolic._eliminate

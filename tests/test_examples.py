@@ -20,7 +20,7 @@ EXAMPLES = sorted((CHECKOUT / "examples").glob("*.py"))
 PAGE = CHECKOUT / "docs" / "guide" / "examples.md"
 PICTURES = CHECKOUT / "docs" / "images" / "examples"
 LONGEST, LARGEST = 60, 60_000  # lines of a script, bytes of a picture
-run_by_draw = pytest.mark.product(5, of="examples")
+run_by_draw = pytest.mark.product(4, of="examples")
 
 
 class Ran(dict[str, Any]):

@@ -106,7 +106,7 @@ def with_losses() -> tuple[fg.Graph, dict[fg.Family, Array], fg.Data]:
     return graph, {q: np.tile(fg.SO3.identity(), (3, 1)), p: np.full((3, 2), 0.3)}, place
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 @compiled_by_c
 @pytest.mark.parametrize("make", [around_a_disc, with_losses])
 def test_c_gives_the_bits_of_python(make: Callable[[], tuple[fg.Graph, Any, fg.Data]], tmp_path: Path) -> None:
@@ -121,7 +121,7 @@ def test_c_gives_the_bits_of_python(make: Callable[[], tuple[fg.Graph, Any, fg.D
     assert_same(prepared, tmp_path, guess, each)
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 @compiled_by_c
 @pytest.mark.parametrize("case", [Unicycle("straight", True, 20), Quadrotor("goto", True, 20)], ids=str)
 def test_ticks_of_control_problems_are_the_same(case: Unicycle | Quadrotor, tmp_path: Path) -> None:
@@ -134,7 +134,7 @@ def test_ticks_of_control_problems_are_the_same(case: Unicycle | Quadrotor, tmp_
     assert_same(prepared, tmp_path, stated.guess, [stated.data(start, 0) for start in starts])
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 @compiled_by_c
 def test_nothing_but_mathematics_is_expected_of_others(tmp_path: Path) -> None:
     """The shared object is linked without any symbol left open, and keeps its own names to itself."""
@@ -168,7 +168,7 @@ def test_code_that_needs_more_than_mathematics_is_refused(tmp_path: Path, monkey
         prepared.export(tmp_path)
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 @compiled_by_c
 def test_input_that_python_refuses_is_refused(tmp_path: Path) -> None:
     graph, guess, _ = with_losses()
@@ -188,7 +188,7 @@ def test_input_that_python_refuses_is_refused(tmp_path: Path) -> None:
     assert found[-1][0] == enumerated["CONVERGED"]
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 @compiled_by_c
 def test_a_workspace_that_was_moved_is_set_up_anew(tmp_path: Path) -> None:
     """It would refer to where it was before; one of another solver, to functions of that."""
@@ -214,7 +214,7 @@ def test_a_workspace_that_was_moved_is_set_up_anew(tmp_path: Path) -> None:
     assert arrays[-1][1] == 2.0
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 @compiled_by_c
 def test_too_little_room_is_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled functions that find none go on with what they have not computed."""
@@ -228,7 +228,7 @@ def test_too_little_room_is_an_answer(tmp_path: Path, monkeypatch: pytest.Monkey
     assert status == words(tmp_path)["NO_ROOM"]
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 @compiled_by_c
 def test_the_program_of_the_page_plans(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its ticks are those of Python."""
@@ -245,7 +245,7 @@ def test_the_program_of_the_page_plans(tmp_path: Path, monkeypatch: pytest.Monke
         assert line.split() == [str(plan.iterations), f"{plan[u][0, 0]:.17g}", f"{plan.cost:.17g}"]
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 def test_an_object_file_for_another_processor(tmp_path: Path) -> None:
     graph, guess, _ = with_losses()
     prepared = InteriorPoint().prepare(graph)
@@ -260,7 +260,7 @@ def test_an_object_file_for_another_processor(tmp_path: Path) -> None:
         prepared.export(tmp_path, target="moon")
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 def test_without_a_compiler_it_says_how_to_link(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -327,7 +327,7 @@ def test_parts_of_python_are_refused_by_name() -> None:
     assert "shown" in refused(made, guess)
 
 
-@pytest.mark.product(2, of="exports")
+@pytest.mark.product(1, of="exports")
 def test_the_header_tells_order_shapes_and_units(tmp_path: Path) -> None:
     graph, guess, _ = around_a_disc()
     prepared = InteriorPoint().prepare(graph)

@@ -450,7 +450,7 @@ def drive(loop: RecedingHorizon, ticks: int, seed: int = 0) -> tuple[list[Plan],
 BACKENDS = backends("ipm", "sqp", "alm")
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_backends_and_couplings_find_the_same_way() -> None:
     ends = {}
     for name, solver in BACKENDS.items():
@@ -823,7 +823,7 @@ class Towards(Term):
         graph.bound(u, lower=[0.0, -1.0], upper=[1.0, 1.0], name="limits")
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
 def test_a_robot_on_se2_finds_a_lamp_while_it_drives(coupling: Any) -> None:
     h, lamp = 0.2, np.array([2.0, -0.8])

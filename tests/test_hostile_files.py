@@ -308,7 +308,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_numbers_need_nothing_but_the_library(tmp_path: Path) -> None:
     path = put(tmp_path, "g.g2o", PLANAR)
     run = run_script(WITHOUT, "solve", path, "--out", tmp_path / "out")

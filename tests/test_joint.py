@@ -135,7 +135,7 @@ def test_covariance_counts_the_past_alone(past: Smoother) -> None:
 
 
 @pytest.mark.parametrize("solver", ["ipm", "sqp", "alm"])
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_joint_episode_reaches_its_goal(solver: str) -> None:
     settings = NavigationSettings(start=HERE, goals=(THERE,), coupling="joint", solver=solver, obstacles=1, seed=1)
     metrics = episode_metrics(run_navigation(settings))

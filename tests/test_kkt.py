@@ -254,6 +254,7 @@ def mover(steps: int, dt: float, dimension: int, seen: int | None) -> tuple[fg.G
     return graph, {f: rng.normal(size=(f.count, dimension)) for f in (p, v)}
 
 
+@pytest.mark.product(16)
 @pytest.mark.parametrize("globalization", ["line-search", "levenberg-marquardt"])
 @pytest.mark.parametrize("seen", [None, 1])
 @pytest.mark.parametrize("dimension", [2, 3])

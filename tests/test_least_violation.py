@@ -67,6 +67,7 @@ CASES: dict[str, Callable[[], Expected]] = {
 }
 
 
+@pytest.mark.product(20)
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("name", [*BACKENDS, *EQUALITIES])
 def test_bounds_are_kept_and_the_squares_of_the_rest_are_least(name: str, case: str) -> None:

@@ -109,7 +109,7 @@ def test_a_track_is_seen_through_by_beams_as_wide_as_they_stand() -> None:
     assert tracker._seen_through(np.ones(1, dtype=bool), scan, np.zeros(3)).all()
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_lidar_that_sees_half_a_turn_drives_into_nothing() -> None:
     log = Episode(replace(SHORT, lidar=HALF, obstacles=3, seed=4)).run(stop_after(150))
     assert log.collisions == 0 and np.hypot(*(log.true_pose[-1] - log.true_pose[0])[:2]) > 3.0
@@ -119,7 +119,7 @@ def test_a_lidar_that_sees_half_a_turn_drives_into_nothing() -> None:
 # ---------------------------------------------------------------- blind and without time
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_blind_sector_ahead_stops_the_robot_and_is_named() -> None:
     log = Episode(replace(SHORT, faults=(one_of(DRIVE_FAULTS)("lidar-blind@1"),))).run(stop_after(40))
     assert log.control[5, 0] > 0.3 and not log.control[25:, 0].any() and log.collisions == 0
@@ -233,7 +233,7 @@ def test_a_scan_again_and_again_makes_no_surer() -> None:
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_errors_are_as_large_as_their_covariances(coupling: str) -> None:
     lidar = LidarModel(turn=0.1)
     log = Episode(

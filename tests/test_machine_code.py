@@ -126,7 +126,7 @@ def resident() -> int:
         return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") // 1024
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="needs /proc")
 def test_functions_that_keep_changing_leave_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(derived_room, "KEPT", 4)

@@ -262,7 +262,7 @@ def test_other_bases_and_stated_slip_are_refused() -> None:
 # ------------------------------------------------------------------ closed loops
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_flight_repeats_and_is_not_that_of_the_own_plant() -> None:
     def flown(world: str, seconds: float = 2.0) -> Array:
         settings = FlightSettings(seed=1003, world=world, time_limit=seconds)
@@ -276,7 +276,7 @@ def test_a_flight_repeats_and_is_not_that_of_the_own_plant() -> None:
     assert first[-1, 0] > 2.5 and 1e-3 < np.linalg.norm(first[-1, :3] - own[-1, :3]) < 0.3
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_drive_reaches_its_goal_and_repeats() -> None:
     def driven(ticks: int) -> tuple[Array, bool]:
         settings = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((8.5, 14.1, 0.0),), world="mujoco")

@@ -103,7 +103,7 @@ print(json.dumps([said, seen.tests([9]), (scratch / "gate.py").read_text() == hu
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_a_hunt_tells_what_is_noticed_from_what_is_not(tmp_path: Path) -> None:
     (tmp_path / "tests").mkdir()
     for folder in ("benchmarks", "tools"):

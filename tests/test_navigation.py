@@ -42,7 +42,7 @@ CORNER = NavigationSettings(start=(10.8, 17.0, -1.57), goals=((16.5, 14.0, 0.0),
     [replace(CORRIDOR, obstacles=2, seed=1), replace(CORNER, obstacles=1, seed=2)],
     ids=["corridor", "corner"],
 )
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_short_drive_reaches_its_goal(settings: NavigationSettings, solver: str) -> None:
     log = run_navigation(replace(settings, solver=solver))
     metrics = episode_metrics(log)
@@ -94,7 +94,7 @@ def test_turtlebot_world(shared_data: Path, solver: str) -> None:
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_same_seed_same_drive(solver: str) -> None:
     settings = replace(CORRIDOR, solver=solver, obstacles=2, seed=5)
     one, two = (Episode(settings).run(stop_after(40)) for _ in range(2))
@@ -169,7 +169,7 @@ def replace_solver(monkeypatch: pytest.MonkeyPatch, episode: Episode, double: ob
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("good", [12, 30], ids=["straight", "in the turn"])
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_failed_solves_brake_to_rest_along_the_stored_plan(
     monkeypatch: pytest.MonkeyPatch, solver: str, good: int
 ) -> None:
@@ -198,7 +198,7 @@ def test_failed_solves_brake_to_rest_along_the_stored_plan(
     assert episode_metrics(log)["solver_failures"] == log.ticks - good
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     episode = Episode(replace(CORRIDOR, seed=3))
     run = episode.pilot.controller.loop.warm
@@ -218,7 +218,7 @@ def test_one_failed_solve_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     assert log.emergency.sum() == 1 and not log.rescued.any()
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_rescued_tick_is_no_emergency_and_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Failure of the requested backend for good: the second drives, and nothing is lost but time."""
     episode = Episode(replace(CORRIDOR, solver="alm", seed=3))

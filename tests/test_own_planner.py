@@ -104,7 +104,7 @@ def ahead() -> np.ndarray:
     return np.column_stack([way, np.zeros_like(way), np.zeros_like(way)])
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_planner_of_the_working_directory_drives(own: Path) -> None:
     words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=0.8,0,0", "--obstacles", "0"]
     assert main([*words, "--planner", "my_planners:Straight", "--out", "out"]) == 0
@@ -153,7 +153,7 @@ def test_an_answer_of_another_shape_is_refused(own: Path) -> None:
         adapter.plan(np.zeros(3), ahead(), Tracks.none())
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_an_answer_that_stays_wrong_is_told_once(own: Path, caplog: pytest.LogCaptureFixture) -> None:
     words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=0.8,0,0", "--obstacles", "0"]
     assert main([*words, "--planner", "my_planners:Wrong", "--out", "out"]) == 1

@@ -130,7 +130,7 @@ def clean(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return scripts
 
 
-@pytest.mark.product(2, of="wheels")
+@pytest.mark.product(1, of="wheels")
 def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) -> None:
     assert wheel.name == f"unifg-{config()['project']['version']}-py3-none-any.whl"
     names = zipfile.ZipFile(wheel).namelist()
@@ -161,7 +161,7 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
     assert {name for name in names if ".dist-info/" not in name} == expected
 
 
-@pytest.mark.product(2, of="wheels")
+@pytest.mark.product(1, of="wheels")
 def test_sdist_holds_the_examples(source: Path, wheel: Path) -> None:
     del wheel  # building it leaves the sdist beside it
     (sdist,) = (source / "dist").glob("*.tar.gz")
@@ -169,7 +169,7 @@ def test_sdist_holds_the_examples(source: Path, wheel: Path) -> None:
     assert names >= {path.name for path in (CHECKOUT / "examples").glob("*.py")}
 
 
-@pytest.mark.product(2, of="wheels")
+@pytest.mark.product(1, of="wheels")
 def test_wheel_is_the_same_without_links(source: Path, wheel: Path, tmp_path: Path) -> None:
     """Git on Windows, and some archives, turn a link into a small text file that holds its target."""
     bare = copy_checkout(source, tmp_path / "unifg")
@@ -181,7 +181,7 @@ def test_wheel_is_the_same_without_links(source: Path, wheel: Path, tmp_path: Pa
     assert [n for n in first.namelist() if first.read(n) != second.read(n)] == []
 
 
-@pytest.mark.product(2, of="wheels")
+@pytest.mark.product(1, of="wheels")
 def test_imports_come_from_the_wheel(clean: Path) -> None:
     # Deliberately started in the checkout: -I keeps the working directory off the path.
     out = run(
@@ -201,7 +201,7 @@ def test_imports_come_from_the_wheel(clean: Path) -> None:
         assert Path(file).resolve().is_relative_to(home), file
 
 
-@pytest.mark.product(2, of="wheels")
+@pytest.mark.product(1, of="wheels")
 def test_bare_side_folders_are_not_installed(clean: Path) -> None:
     out = run(
         clean / "python", "-I", "-c",
@@ -210,7 +210,7 @@ def test_bare_side_folders_are_not_installed(clean: Path) -> None:
     assert out.strip() == "[]"
 
 
-@pytest.mark.product(2, of="wheels")
+@pytest.mark.product(1, of="wheels")
 def test_the_shipped_map_can_be_loaded(clean: Path) -> None:
     pytest.importorskip("yaml")
     out = run(
@@ -225,14 +225,14 @@ def test_the_shipped_map_can_be_loaded(clean: Path) -> None:
     assert out.strip() != ""
 
 
-@pytest.mark.product(2, of="wheels")
+@pytest.mark.product(1, of="wheels")
 def test_console_script(clean: Path) -> None:
     for extra in EXTRAS:
         pytest.importorskip(extra)
     assert config()["project"]["version"] in run(clean / "unifg", "--version", cwd=clean)
 
 
-@pytest.mark.product(2, of="wheels")
+@pytest.mark.product(1, of="wheels")
 def test_a_table_of_a_paper_from_the_wheel(clean: Path, tmp_path: Path) -> None:
     for extra in EXTRAS:
         pytest.importorskip(extra)
@@ -250,7 +250,7 @@ def test_a_table_of_a_paper_from_the_wheel(clean: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("installed", [False, True], ids=["not installed", "installed"])
 @pytest.mark.parametrize("links", ["text files", "missing"])
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_a_checkout_without_links_finds_its_side_folders(links: str, installed: bool, tmp_path: Path) -> None:
     """Imports from a checkout work even where Git or an archive makes no symbolic links."""
     ignored = shutil.ignore_patterns("__pycache__", *SIDES)

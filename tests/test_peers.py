@@ -79,7 +79,7 @@ def test_loops_are_driven_in_turn_and_failures_end_the_comparison() -> None:
     assert 0.02 < peers.compiled_share(problem, ours.control) < 1.0
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_page_is_left_out_without_the_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -196,7 +196,7 @@ def solved(folder: Path, *changes: str) -> tuple[str, list[tuple[int, float]]]:
     return ended.stderr, [(int(count), float(answer)) for count, answer in lines]
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_a_differenced_function_is_compiled_once_on_a_machine(tmp_path: Path) -> None:
     """A second process compiles nothing; a change of what the function computes is seen, one of a comment is not."""
     unknown = list(CHANGES)[-2]

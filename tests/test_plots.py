@@ -44,7 +44,7 @@ figures[0].savefig(sys.argv[1])
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_matplotlib_is_imported_when_something_is_drawn_and_pyplot_never(tmp_path: Path) -> None:
     target = tmp_path / "graph.png"
     run_script(SILENT, target)

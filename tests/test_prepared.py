@@ -155,7 +155,7 @@ def said(source: str, *words: str) -> object:
     return json.loads(run_script(source, *words).stdout.splitlines()[-1])
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_no_backend_compiles_after_prepare_however_its_solves_end() -> None:
     found = said(SOLVES)
     assert isinstance(found, dict) and len(found) >= 4
@@ -175,7 +175,7 @@ def test_no_tick_compiles_though_solves_fail(what: str, coupling: str) -> None:
     assert new == [[], [], []] and columns == [0] * 16
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_no_tick_compiles_whatever_it_turns_to() -> None:
     """A route repaired nearby and on the whole map, a step aside, the last stop, a way back, a robot found again."""
     found = said(TURNS)

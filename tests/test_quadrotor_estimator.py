@@ -181,7 +181,7 @@ def test_the_covariance_is_that_of_the_terms() -> None:
     np.testing.assert_allclose(block / scale, dense[np.ix_(own, own)] / scale, atol=1e-8)
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_the_window_is_a_problem_for_newton_too() -> None:
     """Hard dynamics with noise on some rows, metres beside kilograms and radians: full steps, no line search."""
     estimator = begin(1)

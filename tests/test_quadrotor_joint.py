@@ -129,7 +129,7 @@ def defects(plan: Plan, parameters: quadrotor.Parameters, dt: float) -> Array:
 # ---------------------------------------------------------------- what the graph says
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_without_wishes_the_past_decides(past: Past) -> None:
     """A future that costs nothing leaves states, parameters and landmarks where the past alone puts them."""
     # With weights of 1e-9 rounding keeps one solve in forty above 1e-7.
@@ -212,7 +212,7 @@ def test_ta_s_costs_pull_on_the_map_too_and_are_bounded(past: Past) -> None:
     assert 0.45 < found[1] < 0.51
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_no_wish_makes_drag_negative() -> None:
     """Ta's goal is far away: a vehicle that air pushes along would be there sooner, if there were one."""
     settings = FlightSettings(seed=SEED, coupling="joint")
@@ -272,7 +272,7 @@ def test_multipliers_stay_with_what_they_belong_to(past: Past) -> None:
     assert np.array_equal(guess.multipliers["dynamics"][-1:], before[-1:])
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_the_structure_is_compiled_once(compilations: list[int]) -> None:
     """Landmarks come into view and leave the map of the window; nothing is compiled again."""
     settings = FlightSettings(seed=SEED, coupling="joint")
@@ -330,7 +330,7 @@ def test_a_pull_of_nothing_is_refused() -> None:
 # ---------------------------------------------------------------- what is measured
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_the_pull_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two short flights of the benchmark: without a bound, and with so small a weight that nothing pulls."""
     monkeypatch.setattr(quadrotor_pull, "SECONDS", 0.5)

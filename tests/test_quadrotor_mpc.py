@@ -67,7 +67,7 @@ def test_every_backend_flies(solver: str) -> None:
     assert log.truth[-1, 0] > log.truth[0, 0] + 0.3
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_flight_reaches_the_target_and_learns_the_mass() -> None:
     log = run_flight(FlightSettings(seed=SEED))
     assert log.succeeded
@@ -108,7 +108,7 @@ def test_walls_on_the_map_correct_the_heading_and_cylinders_do_not(association: 
     assert headings[1] > 0.01
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_the_separate_coupling_learns_no_parameters_and_the_others_do() -> None:
     logs = {coupling: run_flight(short(1.0, coupling=coupling)) for coupling in COUPLINGS}
     nominal = draw_conditions(SEED).nominal.packed
@@ -136,7 +136,7 @@ def overheard(flight: Flight) -> tuple[list[Reading], list[Array]]:
     return readings, states
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_variants_of_a_seed_meet_the_same_world_and_noise() -> None:
     noise: list[Array] = []
     paths = []
@@ -165,7 +165,7 @@ def test_a_flight_repeats_itself() -> None:
     np.testing.assert_array_equal(first.believed, second.believed)
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_conditions_depend_on_the_seed_alone() -> None:
     found = [draw_conditions(seed) for seed in range(1000, 1040)]
     again = draw_conditions(1000)
@@ -378,7 +378,7 @@ def test_clutter_misses_and_wrong_radii_cost_a_flight_little(association: str) -
     assert len(mapped) and gaps.max() < 0.1  # nothing false is on the map, and nothing stands beside its place
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_what_turns_out_to_move_leaves_the_map() -> None:
     flight = Flight(replace(short(3.0, movers=2), seed=7, estimator=EstimatorSettings(association="unknown")))
     log = flight.run(silent)

@@ -205,7 +205,7 @@ def test_a_picture_shows_every_factor_at_every_iteration() -> None:
         residual_picture(SQP().solve(graph, guess).history)
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_a_monitor_draws_while_the_solver_goes_on(tmp_path: Path) -> None:
     graph, guess = short_drive()
     sizes: list[int] = []

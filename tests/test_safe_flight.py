@@ -348,7 +348,7 @@ def test_situations_are_what_they_are_called_and_a_seed_moves_them() -> None:
         SafeSettings(case="flat")  # type: ignore[arg-type]
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_the_same_seed_flies_the_same_flight() -> None:
     settings = SafeSettings(alpha=(3.0,), seed=4)
     one, two = (short(settings, 0.4).run() for _ in range(2))
@@ -403,7 +403,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_the_cylinder_is_passed_beyond_the_margin(folder: Path) -> None:
     told = json.loads((folder / "metrics.json").read_text())
     (flight,) = told["flights"]
@@ -421,7 +421,7 @@ def test_a_flight_leaves_a_picture_and_a_scene(folder: Path) -> None:
     assert "quadrotor-cbf, static" in page and "kept its distance, arrived" in page
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_smaller_alpha_keeps_farther_away() -> None:
     """Fig. 5, on the way to the cylinder."""
     near = {}

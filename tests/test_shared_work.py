@@ -100,7 +100,7 @@ def test_chunks_of_a_triangle_cover_it_once_in_rows_of_eight() -> None:
     assert np.diff(entries, prepend=0.0) == pytest.approx(20_000, rel=0.1)
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_two_threads_that_solve_share_one_crew(lattice: PoseGraph) -> None:
     """Each with two more hands, on a graph of its own."""
     graphs = [lattice.graph() for _ in range(2)]
@@ -128,7 +128,7 @@ def test_threads_that_were_sent_away_leave() -> None:
     assert not hands()
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
 def test_a_forked_child_has_threads_of_its_own() -> None:
     script = (
@@ -165,7 +165,7 @@ def apart(x: Array, y: Array, r: Array) -> None:
 
 
 @pytest.mark.parametrize("robust", [None, fg.Huber(1.0)], ids=["squares", "Huber"])
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_a_solve_with_threads_repeats_itself(lattice: PoseGraph, robust: fg.Loss | None) -> None:
     """With a function of one's own beside the shipped ones, and one factor left out."""
     graph, x, guess = lattice.graph(robust=robust)

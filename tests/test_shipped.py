@@ -83,7 +83,7 @@ def test_only_code_is_generated_and_then_read(archive: Path, tmp_path: Path) -> 
     assert (second.compiled, second.generated, second.read) == ([], [], ["doubling.twice"])
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 @pytest.mark.parametrize(
     ("source", "how"),
     [
@@ -156,7 +156,7 @@ def test_members_that_are_damaged_are_none(
     assert caplog.text.count(f"{archive} is damaged") == 1
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_nothing_of_python_is_archived() -> None:
     """Every member that ships expects LLVM's, Numba's and C's functions alone, and holds neither objects nor errors."""
     shipped = precompiled.Archive(precompiled.ARCHIVE)
@@ -202,7 +202,7 @@ assert (counted.compiled, counted.generated) == ([], ["unifg.doubling.first"]), 
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_the_first_function_of_a_process_can_be_generated(archive: Path, tmp_path: Path) -> None:
     """Nothing has been compiled there that would have loaded Numba's rules for tuples."""
     source = "def first(pair):\n    return pair[0] + 0.0\n"

@@ -325,7 +325,7 @@ def searched(search: Relocaliser, sample: Scan) -> tuple[Found, int]:
     raise AssertionError
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 @pytest.mark.parametrize("place", [(3.0, 25.2, 2.0), (21.0, 9.6, -2.0)], ids=str)
 def test_a_robot_put_down_anywhere_is_found(place: tuple[float, float, float]) -> None:
     occupancy, field = maps.building()
@@ -337,7 +337,7 @@ def test_a_robot_put_down_anywhere_is_found(place: tuple[float, float, float]) -
     assert ticks == math.ceil(len(search.places) / PORTION) and not search.searching
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_scan_of_another_building_is_found_nowhere() -> None:
     occupancy, field = maps.building()
     other = askew(occupancy, np.array([10.8, 17.0, 0.0]))
@@ -392,7 +392,7 @@ def test_a_blind_robot_brakes_at_once_and_says_why(kind: str) -> None:
     assert m["health"]["lost"] == 5 and sum(m["dropped_samples"].values()) == 16
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_robot_that_sees_again_goes_on() -> None:
     log = faulty("lidar-nan@1:1.5")
     assert log.health[25] == "lost" and log.health[-1] == "ok" and log.control[-1, 0] > 0.9
@@ -409,7 +409,7 @@ def test_a_robot_without_odometry_goes_on_slowly(coupling: str) -> None:
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_kidnapped_robot_stops_and_finds_itself(coupling: str) -> None:
     log = faulty("kidnapped@1", coupling, 60)
     assert np.hypot(*(log.true_pose[10] - log.true_pose[9])[:2]) > 3.0
@@ -418,7 +418,7 @@ def test_a_kidnapped_robot_stops_and_finds_itself(coupling: str) -> None:
     assert any(cause == "the scan does not fit the map" for cause in log.cause)
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_robot_with_the_wrong_map_rests_and_says_so() -> None:
     log = faulty("wrong-map@1")
     assert log.health[-1] == "lost" and log.cause[-1] == "the scan does not fit the map"
@@ -433,7 +433,7 @@ def test_a_robot_with_the_wrong_map_rests_and_says_so() -> None:
         ("solver-timeout@1", "no plan"),
     ],
 )
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_other_faults_are_named_too(fault: str, cause: str) -> None:
     log = faulty(fault)
     assert cause in log.cause and log.collisions == 0
@@ -586,7 +586,7 @@ def test_a_landing_is_broken_off_when_all_is_well_again_but_not_near_the_floor()
         assert watch.verdict.health is not Health.LOST and watch.lands is lands
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_flight_without_its_detector_hovers_and_its_pictures_say_why(tmp_path: Path) -> None:
     fault = one_of(FLIGHT_FAULTS)("detector-lost@0.5")
     log = Flight(FlightSettings(faults=(fault,), time_limit=1.6)).run(lambda done, text: None)

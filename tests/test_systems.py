@@ -65,6 +65,7 @@ def chain(kind: str, poses: int = 12) -> tuple[fg.Graph, fg.Family, fg.Data]:
     return graph, x, start
 
 
+@pytest.mark.product(4)
 @pytest.mark.parametrize(
     ("solver", "kind"),
     [

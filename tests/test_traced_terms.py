@@ -314,6 +314,7 @@ def halved(self: Model, x: Array) -> Array:
     return 4.0 * x - self.offset
 
 
+@pytest.mark.product(20)
 @pytest.mark.parametrize("of", ["method", "call", "function"])
 @pytest.mark.parametrize("derivatives", [None, "trace"])
 @pytest.mark.parametrize(

@@ -111,7 +111,7 @@ def test_no_room_is_a_sentence() -> None:
         draw_traffic(Traffic(people=1), field(hall()), PATH[:20], np.random.default_rng(0))
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_drive_meets_its_people_and_keeps_a_log_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     drive = Episode(NavigationSettings(seed=3, traffic=Traffic(people=2)), rehearsal=True)
     alone = Episode(NavigationSettings(seed=3), rehearsal=True)
@@ -132,7 +132,7 @@ def test_a_map_of_half_a_kilometre_is_read(monkeypatch: pytest.MonkeyPatch, tmp_
         Episode(NavigationSettings(map=tmp_path / "town.yaml", start=(1.0, 1.0, 0.0), goals=((2.0, 1.0, 0.0),)))
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_obstacles_may_be_other_than_the_robot_expects() -> None:
     def radii(between: tuple[float, float]) -> Array:
         settings = NavigationSettings(obstacles=6, seed=2, obstacle_radius=between)

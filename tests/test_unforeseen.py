@@ -106,7 +106,7 @@ def way(occupancy: OccupancyMap) -> Array:
     return route(occupancy, START, GOALS)
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_promises_hold_over_many_seeds() -> None:
     """Thirty draws of four obstacles on a floor with narrow doors."""
     occupancy, near_door = floor(), 0

@@ -93,7 +93,7 @@ def boat(x: Array, u: Array, current: Array) -> Array:
 
 
 @pytest.mark.parametrize("method", NAMES)
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_a_boat_finds_the_current_and_plans_with_it(method: Method) -> None:
     """One family of length 1 holds the current; past and future share it."""
     count, past, h = 30, 15, 0.2

@@ -69,7 +69,7 @@ def leave(path: Path) -> None:
     path.write_text(str(os.getpid()), encoding="utf-8")
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_where_nothing_came_precompiled_processes_compile_at_once(
     done: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -123,7 +123,7 @@ sys.exit(command.main(["warmup"]))
 """
 
 
-@pytest.mark.product(3, of="processes of their own")
+@pytest.mark.product(2, of="processes of their own")
 def test_the_library_is_compiled_without_extras() -> None:
     done = run_script(WITHOUT_EXTRAS)
     assert done.stdout.startswith("library 2\n")

@@ -173,7 +173,7 @@ def test_lidar_noise_dropouts_and_range() -> None:
     assert true.ranges.min() > 1.7
 
 
-@pytest.mark.product(3, of="drives and flights")
+@pytest.mark.product(2, of="drives and flights")
 def test_odometry_statistics() -> None:
     """Scale errors: once per episode, 5 %. Noise: every step, 2 %. Both in proportion to the motion."""
     scales = []
