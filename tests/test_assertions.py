@@ -256,7 +256,7 @@ def test_what_is_asserted_of_the_batch_as_a_whole_is_left_to_python() -> None:
     assert route.startswith("evaluated by Python") and "asserts something about several factors together" in route
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_smoothers_leave_functions_that_assert_to_python() -> None:
     smoother = fg.Incremental()
     x = smoother.variables("x", fg.Rn(1))

@@ -75,7 +75,7 @@ def test_a_batch_keeps_its_data_when_the_caller_changes_them() -> None:
     np.testing.assert_allclose(batch.solution(1)[x], [[0.0, 1.0]], atol=1e-6)
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_what_compiled_code_leaves_is_solved_as_usual() -> None:
     """Other backends, a time limit, and data that single solves refuse."""
     stated, each = instances(Quadrotor("goto", False, 20), 6)

@@ -134,7 +134,7 @@ def test_the_page_of_the_collection_counts_what_was_found(monkeypatch: pytest.Mo
     assert outcome is not None and f"| HS21 | {outcome.iterations} |" in text
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 @pytest.mark.parametrize("title", own_functions.problems())
 def test_every_way_to_state_a_problem_is_the_same_problem(title: str) -> None:
     """The same iterations and the same answer; only differences are Python's."""
@@ -300,7 +300,7 @@ def test_flights_are_compared_seed_by_seed() -> None:
 
 
 @pytest.mark.parametrize("seed", [102, 104])
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_a_moved_goal_among_discs_costs_no_more_than_with_twenty_starts(seed: int) -> None:
     row = moved_goals.measure(seed)
     assert row["warm, plan"] > 1.5 * row["best"] and row["loop, plan"] <= 1.02 * row["best"]
@@ -362,7 +362,7 @@ def test_contacts_are_told_apart_by_the_motion_before(
     assert movers.touched(log) == kind
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_thirty_seeds_are_ten_routes_and_the_next_are_others() -> None:
     routes = [movers.settings(0.3, 2.5, seed).start for seed in (0, 10, 29, 30, 39)]
     assert routes[0] == routes[1] and len({*routes}) == 4

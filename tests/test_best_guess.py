@@ -68,7 +68,7 @@ class Room:
         self.degrees = 3 * (len(path) - 1) + 2 * len(node) - graph.compile().size
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 @pytest.mark.parametrize("seed", range(3))
 def test_a_map_is_found_where_least_squares_from_dead_reckoning_fails(seed: int) -> None:
     room = Room(seed)
@@ -121,7 +121,7 @@ def ranges(seed: int) -> tuple[fg.Graph, dict[fg.Family, Array], int]:
     return graph, {x: path, b: path[:6, :2] + rng.normal(0.0, 1.0, (6, 2))}, 4 * count
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_beacons_are_found_by_ranges_alone() -> None:
     """From the guess itself where that leads to the answer, as with seed 4, and else along the trajectory."""
     solver, solved = LevenbergMarquardt(), []
@@ -189,7 +189,7 @@ def test_no_chain_is_an_error_with_a_remedy() -> None:
         fg.best_guess(graph, {x: np.ones((3, 2))})
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 @pytest.mark.data
 def test_victoria_park_needs_no_robust_loss(shared_data: Path) -> None:
     path = shared_data / "landmarks" / "victoria_park.txt.gz"

@@ -583,7 +583,7 @@ def test_signals_end_a_campaign_with_what_there_is(tmp_path: Path, monkeypatch: 
 # ---------------------------------------------------------------- what it says
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_a_report_says_what_the_rows_say(tmp_path: Path) -> None:
     from unifg.scenarios.campaigns.report import write_report
     from unifg.scenarios.campaigns.sheet import load

@@ -384,7 +384,7 @@ def test_an_interval_is_claimed_of_plain_squares_of_the_logarithm_alone() -> Non
     ("name", "least", "certified"),
     [("M3500", 137.9, True), ("intel", 22.0, False), ("sphere2500", 1351.0, True), ("parking-garage", 1.2, False)],
 )
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_real_maps_are_certified_and_bounded(shared_data: Path, name: str, least: float, certified: bool) -> None:
     """Two of four are certified; with means for weights the dual of parking-garage lies above its chi2."""
     read = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz")

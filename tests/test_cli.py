@@ -74,7 +74,7 @@ def run(tmp_path: Path, *words: str) -> int:
     return command.main(["run", "navigation", *words, "--out", str(tmp_path / "out")])
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_writes_every_file_and_names_it(
     navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

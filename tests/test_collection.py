@@ -93,7 +93,7 @@ def test_backend_solves_what_its_class_allows(name: str, case: str) -> None:
             assert np.abs(distance).max() < 1e-5
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_the_aims_are_met() -> None:
     """Shares of what a backend takes; the test above holds the lists to the truth."""
     assert sum(len(GROUPS[name]) for name in ("Hock and Schittkowski",)) >= 60
@@ -104,7 +104,7 @@ def test_the_aims_are_met() -> None:
         assert 1.0 - len(UNSOLVED[name]) / len(taken) >= aim
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_ipopt_confirms_the_formulas() -> None:
     """The same expressions, differentiated and solved by others, lead to the published optima."""
     pytest.importorskip("casadi")

@@ -31,7 +31,7 @@ def test_control_case(solver: str, problem: Problem) -> None:
         assert judge(stated.graph, solution).worst() < 1e-3
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 @pytest.mark.parametrize(("instance", "best"), [("ahead", 580.25905), ("goto", 3387.08409)])
 def test_a_better_optimum_than_that_of_ipopt_is_listed(instance: str, best: float) -> None:
     """IPOPT ends at the first of the list; it stays where it is started at the others (tests/problems/control.py)."""

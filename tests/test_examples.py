@@ -178,7 +178,7 @@ def test_joint_past_future(run: Run) -> None:
         assert converged == 60
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 @run_by_draw
 def test_own_robot_loop(run: Run) -> None:
     ran = run("own_robot_loop")
@@ -319,7 +319,7 @@ def test_first_order_tick(run: Run) -> None:
     assert gaps.min() > -0.05
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 @run_by_draw
 def test_branching_plan(run: Run) -> None:
     """Both cases are left room for, at less than a fifth of the time that plans for the worst lose."""
@@ -354,7 +354,7 @@ def test_checked_answer(run: Run) -> None:
         assert size < 5e-6 or verdict.verdict == "fails", name
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 @run_by_draw
 def test_deployed_loop(run: Run) -> None:
     if shutil.which("cc") is None:

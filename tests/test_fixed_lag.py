@@ -227,7 +227,7 @@ def test_a_variable_may_be_older_than_the_newest() -> None:
     assert list(smoother.window(v).indices) == [24, 25, 26]
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 @pytest.mark.data
 def test_manhattan_3500_in_a_window(shared_data: Path) -> None:
     """Relative poses inside the window agree with the optimum of the whole graph where the window saw its loops."""

@@ -199,7 +199,7 @@ def test_cliques_hold_what_they_must(seed: int) -> None:
             assert set(members) <= cliques[parent[k]] | set(separators[parent[k]])
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 @pytest.mark.data
 def test_manhattan_3500_pose_by_pose(shared_data: Path) -> None:
     """The optimum of the batch problem, 1/2 chi2 = 68.9574391, is reached on the way, not afterwards."""

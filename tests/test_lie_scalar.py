@@ -26,7 +26,7 @@ PARTS: list[LieGroup] = [
 
 
 @pytest.mark.parametrize("group", PARTS, ids=str)
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_one_element_and_a_batch_of_products_agree(group: LieGroup) -> None:
     """Of the groups themselves `test_own_manifolds.test_axioms_hold` compares them."""
     report = check_manifold(group)

@@ -101,7 +101,7 @@ def test_the_short_way_round(group: Spatial, angle: float, rng: Generator) -> No
     assert_close(group.matrix(group.exp(back)), group.matrix(group.exp(d)), 1e-13)
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 @given(vectors(6), vectors(6))
 def test_retract_and_local_anywhere(start: Array, d: Array) -> None:
     x = SE3.exp(start)

@@ -252,7 +252,7 @@ def test_the_scene_drives_what_was_found(name: str) -> None:
 
 
 @both
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_command_writes_its_files(solver: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["run", "manoeuvres", "--solver", solver, "--out", str(tmp_path / "out")]) == 0
     said = capsys.readouterr()

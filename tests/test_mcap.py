@@ -157,7 +157,7 @@ def test_a_flight_is_read_back(tmp_path: Path) -> None:
         assert tick["statuses"] == log.statuses[k] and "landmarks" not in tick
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_a_flight_past_bodies_is_read_back(tmp_path: Path) -> None:
     def stop(done: float, text: str) -> None:
         if done > 0.05:
@@ -177,7 +177,7 @@ def test_a_flight_past_bodies_is_read_back(tmp_path: Path) -> None:
         np.testing.assert_allclose(x, bodies[~log.upright, 0], atol=1e-12)
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 @pytest.mark.usefixtures("undrawn")
 def test_every_scenario_writes_one(tmp_path: Path) -> None:
     """Numbers of the file are those of the run, which is repeated."""

@@ -92,7 +92,7 @@ def test_from_everywhere_it_finds_itself_with_many_particles_first() -> None:
     assert own.iterations == 500
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_a_kidnapped_robot_is_found_only_with_particles_drawn_anywhere() -> None:
     elsewhere = np.array([4.5, 2.8, 2.0])
     errors = {}

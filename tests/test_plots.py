@@ -320,7 +320,7 @@ def test_factors_between_poses_apart_are_lines() -> None:
             np.testing.assert_array_equal(drawn[0], [[at[i], at[j]] for i, j in pairs])
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_odd_selections_are_plotted_without_a_warning() -> None:
     graph, x = line(4)
     wide = graph.variables("wide", fg.Rn(12), 2)

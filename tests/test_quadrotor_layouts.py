@@ -25,7 +25,7 @@ from unifg.typing import Array
 
 
 @pytest.mark.parametrize("count", [0, 10, 25])
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_corridors_keep_their_promises(count: int) -> None:
     for seed in range(20):
         layout = corridor(seed, count)
@@ -49,7 +49,7 @@ def test_corridor_measures() -> None:
     assert len(layout.corners) == 4
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_corridor_radii_and_centres_are_uniform() -> None:
     every = np.concatenate([corridor(seed).cylinders for seed in range(100)])
     assert every[:, 2].mean() == pytest.approx(0.45, abs=0.01)
@@ -117,7 +117,7 @@ def grid_way(layout: Layout, clearance: float, pitch: float = 0.05, margin: floa
     return bool(free[begin] and free[end] and labels[begin] == labels[end])
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_widest_way_agrees_with_a_flood_fill() -> None:
     """Ragged rings and crossing walls; a decision is asked well above and well below the bottleneck."""
     rng = np.random.default_rng(4)

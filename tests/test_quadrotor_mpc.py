@@ -430,7 +430,7 @@ def only_a_moment(monkeypatch: pytest.MonkeyPatch, change: Callable[[FlightLog],
     monkeypatch.setattr(episode, "run_flight", fly)
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_the_command_writes_its_results(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     only_a_moment(monkeypatch, lambda log: log)
     no_scene = SimpleNamespace(save=lambda path: path)  # takes seconds, as pictures do, and has tests of its own

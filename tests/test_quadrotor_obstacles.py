@@ -155,7 +155,7 @@ def test_a_guess_along_a_way_needs_one() -> None:
         course_guess(CourseSettings(guess="way"), closed)
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_pictures_show_four_iterates_and_every_number() -> None:
     course = flown(guess="hover")
     assert len(course.iterates) == course.solution.iterations + 1
@@ -191,7 +191,7 @@ def test_numbers_and_words() -> None:
     assert "NOT ARRIVED" in summary(flown(avoidance="hard", guess="hover"))
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 @pytest.mark.usefixtures("undrawn")
 def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "quadrotor-obstacles", "--out", str(tmp_path)]

@@ -361,7 +361,7 @@ def written(folder: Path, log: FlightLog, metrics: dict[str, Any]) -> list[Path]
     return Outcome(True, False, "", metrics, results.results(log, metrics)).write(folder, silent)
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_results_leave_files_that_can_be_read_again(log: FlightLog, tmp_path: Path) -> None:
     files = written(tmp_path, log, flight_metrics(log))
     names = ["scene.html", "control.png", "estimates.png", "overview.png", "flight.npz", "metrics.json"]

@@ -253,7 +253,7 @@ def test_things_beyond_the_range_are_not_seen() -> None:
     assert world.state[0] == pytest.approx(1.0, abs=0.06)  # within one tick of 8 m to the axis
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_misses_and_clutter_are_as_frequent_as_promised_and_shift_no_other_noise() -> None:
     layout, model = field([(3.0, 0.0, 0.3), (0.0, 5.0, 0.4)]), SensorModel(misses=0.3, clutter=1.5)
     worlds = QuadrotorWorld(layout, 1, PARAMETERS, sensor=model), QuadrotorWorld(layout, 1, PARAMETERS)
@@ -271,7 +271,7 @@ def test_misses_and_clutter_are_as_frequent_as_promised_and_shift_no_other_noise
         np.testing.assert_array_equal(reading.force, full.force)
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_noise_is_as_large_as_promised() -> None:
     layout = field([(3.0, 0.0, 0.3), (0.0, 5.0, 0.4)])
     world, model = QuadrotorWorld(layout, 1, PARAMETERS), SensorModel()
@@ -335,7 +335,7 @@ def test_one_seed_is_one_noise_whatever_is_flown_and_seen() -> None:
     assert not np.array_equal(other.sense().ranges, worlds[0].sense().ranges)
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_disturbances_have_the_promised_statistics() -> None:
     """Means over 50 ms: white parts as documented, gusts correlated over their time."""
     model = DisturbanceModel(gust=(0.3, 0.2, 0.1), gust_time=0.5)

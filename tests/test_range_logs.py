@@ -320,7 +320,7 @@ def test_a_map_of_true_poses_is_the_building(log: RangeLog) -> None:
         ({"view": 1.5 * math.pi, "beams": 270, "noise": 0.08, "slips": 3}, 0.15),
     ],
 )
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_a_map_from_poor_odometry_is_consistent(kind: dict[str, Any], most: float) -> None:
     log = recorded(*corridors(seed=1), seed=1, **kind)
     assert log.corrected is not None
@@ -371,7 +371,7 @@ def test_draws_that_lie_together_are_one_hypothesis() -> None:
     "kind", [{}, {"step": 1.0, "noise": 0.06, "slips": 4}, {"step": 0.2, "reach": 8.0}, {"reach": 50.0, "beams": 361}]
 )
 @pytest.mark.parametrize("seed", [2, 3])
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_a_log_is_followed_to_its_end_on_a_map_of_other_scans(kind: dict[str, Any], seed: int) -> None:
     log = recorded(*corridors(seed=seed), seed=seed, **kind)
     assert log.corrected is not None
@@ -428,7 +428,7 @@ def test_a_scan_that_does_not_fit_makes_hypotheses_of_which_one_has_to_fit_well(
     assert np.mean(np.array(pushed) < 0.1) > 0.5 and max(hidden) < 0.05
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_a_start_that_nobody_knows_is_searched_for(log: RangeLog) -> None:
     truth, occupancy = log.corrected, corridors()[0]
     assert truth is not None
@@ -443,7 +443,7 @@ def test_a_start_that_nobody_knows_is_searched_for(log: RangeLog) -> None:
 # ---------------------------------------------------------------- the command
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_a_map_is_written_and_localised_on(made: Path, log: RangeLog, capsys: pytest.CaptureFixture[str]) -> None:
     numbers = json.loads((made / "metrics.json").read_text())
     assert numbers["aligned_error_m"]["rms"] < 0.15 and numbers["loop_closures"] > 10
@@ -465,7 +465,7 @@ def test_a_map_is_written_and_localised_on(made: Path, log: RangeLog, capsys: py
     assert json.loads((out / "metrics.json").read_text())["end_error_m"] == numbers["end_error_m"]
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_a_recorded_drive_needs_a_map_and_a_localiser(made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["run", "navigation", "--log", str(made / "log.csv"), "--out", str(made / "none")]
     assert main(words) == 2 and "give --map" in capsys.readouterr().err
@@ -473,7 +473,7 @@ def test_a_recorded_drive_needs_a_map_and_a_localiser(made: Path, capsys: pytest
     assert "choose graph, amcl" in capsys.readouterr().err
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_odometry_is_made_of_corrected_poses(made: Path) -> None:
     simulated = LogSettings(made / "log.csv", simulated_odometry=True)
     one, again, other = (replace(simulated, seed=seed).opened() for seed in (4, 4, 5))
@@ -485,7 +485,7 @@ def test_odometry_is_made_of_corrected_poses(made: Path) -> None:
     np.testing.assert_allclose(SE2.between(plain, mounted), np.tile([0.3, 0.0, 0.2], (len(plain), 1)), atol=1e-12)
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_an_interrupt_leaves_the_map_so_far(log: RangeLog) -> None:
     def stop(done: float, text: str) -> None:
         if done > 0.3:
@@ -498,7 +498,7 @@ def test_an_interrupt_leaves_the_map_so_far(log: RangeLog) -> None:
 
 
 @pytest.mark.data
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_the_log_of_a_lab_becomes_a_map(shared_data: Path) -> None:
     whole = read_range_log(shared_data / "lidar" / "intel-corrected.log.gz")
     part = slice(0, 240)

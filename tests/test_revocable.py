@@ -94,7 +94,7 @@ def test_wrong_closures_are_left_out_and_right_ones_are_not(groups: int, size: i
     assert found.cost == pytest.approx(best.cost, abs=0.5)
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 @pytest.mark.data
 @pytest.mark.parametrize("size", [1, 4])
 def test_wrong_closures_of_a_city(shared_data: Path, size: int) -> None:

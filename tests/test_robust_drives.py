@@ -49,7 +49,7 @@ def apart(one: PoseGraph, other: PoseGraph) -> float:
     ("seed", "kind"),
     [(0, Kind()), (5, Kind(noise=0.05, tail=0.1)), (0, HEAVY), (6, HEAVY), (0, UNEVEN), (6, UNEVEN), (7, UNEVEN)],
 )
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_a_clean_drive_keeps_every_closure(seed: int, kind: Kind) -> None:
     """Up to 69 of 100 right closures were given up, for a map 56 m off, CONVERGED."""
     graph, _ = drive(seed, kind)
@@ -61,7 +61,7 @@ def test_a_clean_drive_keeps_every_closure(seed: int, kind: Kind) -> None:
 
 @pytest.mark.data
 @pytest.mark.parametrize("name", ["tinyGrid3D.g2o", "smallGrid3D.g2o", "intel.g2o.gz", "M3500.g2o.gz"])
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_a_published_graph_keeps_every_closure(shared_data: Path, name: str) -> None:
     graph = read_g2o(shared_data / "pose_graphs" / name)
     solution, found, kept = robust(graph, fg.TruncatedLeastSquares(THRESHOLD if graph.group is fg.SE2 else 4.1))
@@ -82,7 +82,7 @@ def test_what_is_improbable_as_stated_is_not_kept() -> None:
 
 
 @pytest.mark.parametrize("share", [0.1, 0.3])
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_uneven_closures_are_kept_beside_wrong_ones(share: float) -> None:
     """Two right ones with more noise than the others were given up together with the wrong ones."""
     clean, _ = drive(10, HEAVY)
@@ -119,7 +119,7 @@ def test_a_group_that_contradicts_the_others_is_left_out(seed: int, count: int) 
 
 
 @pytest.mark.parametrize("seed", [0, 6, 9])
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_wrong_odometry_is_found_and_no_start_leads_lower(seed: int) -> None:
     """Each start alone, and its Huber optimum: local descent of the stated objective ends no lower.
 
@@ -155,7 +155,7 @@ def test_a_graph_names_further_starts_where_nothing_is_trusted() -> None:
     assert len(stated.starts) == 3
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_the_command_doubts_odometry_when_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clean, _ = drive(0, CALM)
     graph, _ = slipped(clean, 100)
@@ -191,7 +191,7 @@ def test_a_group_that_agrees_with_itself_alone_is_named(seed: int, miss: tuple[f
     assert f"'poses' {member} by {far:.3g}" in said and group.sentence() in solution.report()
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_the_command_names_groups(tmp_path: Path) -> None:
     clean, truth = drive(4, replace(CALM, closures=20))
     graph, wrong = aliased(clean, truth, 4, (20.0, 5.0, 0.1))
@@ -241,7 +241,7 @@ def test_groups_join_the_same_stretches() -> None:
     assert groups_of(terms["alone"], np.ones(500, dtype=bool)) == []
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_the_size_of_noise_is_that_of_each_term_over_what_either_keeps() -> None:
     """Odometry and closures apart; a closure that one answer leaves out counts as the other one has it."""
     graph, _ = with_wrong_closures(drive(2, replace(CALM, count=600))[0], 0.2, 1, "same place")

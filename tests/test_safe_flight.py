@@ -414,7 +414,7 @@ def test_the_cylinder_is_passed_beyond_the_margin(folder: Path) -> None:
     assert flight["statuses"].get("not_finite", 0) == 0
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_a_flight_leaves_a_picture_and_a_scene(folder: Path) -> None:
     assert (folder / "flights.png").stat().st_size > 20_000
     page = (folder / "scene.html").read_text(encoding="utf-8")

@@ -157,7 +157,7 @@ def test_scan_points_skip_dropouts_and_misses(log: EpisodeLog) -> None:
     )
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_long_episodes_are_thinned_and_small() -> None:
     log = episode(ticks=1001)
     ticks = frame_ticks(log.ticks)
@@ -233,7 +233,7 @@ def test_ribbon_keeps_its_width_also_where_points_coincide() -> None:
     np.testing.assert_allclose(np.ptp(vertices, axis=0), [2.0, 0.2, 0.0])
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_overview_is_a_picture_and_deterministic(log: EpisodeLog, tmp_path: Path) -> None:
     from matplotlib.image import imread
 

@@ -82,7 +82,7 @@ def test_a_map_that_grew_has_the_verdict_of_its_file(spatial: bool, tmp_path: Pa
     assert judge(graph).freedom == judge(solved).freedom
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_wrong_closures_are_not_used_and_named_as_in_the_file(tmp_path: Path) -> None:
     made = manhattan(250, 3)
     dirty, (fault,) = aliased(made.pose_graph, made.truth, 1, 3)

@@ -219,7 +219,7 @@ def test_components_constants_repetitions_and_many_variables(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["incremental", "fixed lag"])
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_a_manifold_that_only_numpy_moves(kind: str) -> None:
     sphere, generator = Sphere(), np.random.default_rng(2)
     truth = sphere.retract(np.array([0.6, 0.0, 0.8]), 0.3 * generator.standard_normal((COUNT, 2)))
@@ -275,7 +275,7 @@ class Plain(fg.Manifold):
 
 
 @pytest.mark.parametrize("fixed_points", [False, True])
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 def test_windows_forget_alike_whoever_evaluates(fixed_points: bool) -> None:
     """Marginalised factors of NumPy functions, losses of a user's own and manifolds that NumPy moves count the same."""
 

@@ -88,7 +88,7 @@ def fly(smoother: Any, flown: Flight) -> tuple[Array, Array, Array]:
     return np.array(states), np.array(biases), np.array(sigmas)
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 @pytest.mark.parametrize("smoother", [Incremental(), FixedLag(20)], ids=["all of it", "ten seconds"])
 def test_biases_that_walk_are_followed(smoother: Any) -> None:
     flown = flight(np.random.default_rng(0))

@@ -45,7 +45,7 @@ def numbers(folder: Path) -> dict[str, Any]:
     return loaded
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 @pytest.mark.parametrize("name", ["city", "globe"])
 def test_writes_every_file_and_says_what_came_out(
     name: str, request: pytest.FixtureRequest, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -108,7 +108,7 @@ def test_residuals_have_their_own_optima(globe: Path) -> None:
     assert chart.chi2[2] < log.after.chi2("g2o") and log.chi2[2] < chart.after.chi2()
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 def test_outliers_are_found_and_named(dirty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert command.main(["solve", str(dirty), "--robust", "gnc", "--out", str(out)]) == 0
@@ -328,7 +328,7 @@ def test_the_scene_needs_nothing_else(city: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(np.ptp(vertices[:4], axis=0), [2.2, 0.2, 0.0], atol=1e-12)
 
 
-@pytest.mark.product(2, of="large maps")
+@pytest.mark.product(1, of="large maps")
 @pytest.mark.data
 @pytest.mark.parametrize(("name", "chi2"), [("M3500.g2o.gz", 137.9148782), ("sphere2500.g2o.gz", 1351.4019259)])
 def test_published_graphs(shared_data: Path, name: str, chi2: float) -> None:

@@ -240,7 +240,7 @@ def run(folder: Path, *words: str) -> int:
     return command.main(["run", "velocity-tracking", *words, "--out", str(folder)])
 
 
-@pytest.mark.product(2, of="scenes and pictures")
+@pytest.mark.product(1, of="scenes and pictures")
 def test_command_writes_its_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(tmp_path, "--length", "60") == 0
     said = capsys.readouterr()

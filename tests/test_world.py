@@ -233,7 +233,7 @@ def test_bad_input_is_refused(start: tuple[float, float, float], command: float,
         quiet_world(start).step(command, 0.0, dt=dt)
 
 
-@pytest.mark.product(2, of="studies")
+@pytest.mark.product(1, of="studies")
 @pytest.mark.data
 def test_department_map_is_quick(shared_data: Path) -> None:
     """A real building of 54 m x 51 m builds and scans in good time."""
