@@ -16,11 +16,13 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from benchmarks.comparison import Row, where
+from benchmarks.comparison import Row, interval, where
 from benchmarks.report import listing
 from benchmarks.runner import Cell, Study
 from benchmarks.timing import clocked
 from unifg.models import quadrotor
+from unifg.models.avoidance import landmark_clearance
+from unifg.models.obstacles import shortfall
 from unifg.smoothing import Incremental
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array, ArrayLike
@@ -30,12 +32,15 @@ SPEED, HEIGHT = 2.0, 1.5  # of the line [m/s, m]
 RADIUS, MARGIN = 0.25, 0.6  # [m]
 COUNTS = 2, 10, 30, 100
 BOOKS = quadrotor.Parameters()
-EFFORT, TRACKING, PUSH, MAPPED = [2.0, 2.0, 1.0, 2.0], 0.5, 0.1, 0.05  # standard deviations of costs
+EFFORT = [2.0, 2.0, 1.0, 2.0]  # standard deviations of costs
+TRACKING, PUSH, MAPPED = 0.5, 0.1, 0.05
 NOISE = np.repeat([0.01, 0.005, 0.02], 3)  # of a tick: position [m], attitude [rad], velocity [m/s]
 DYNAMICS, PRESENT = 1e-3, 1e-4
+NEAR = shortfall(landmark_clearance, MARGIN)
 ANEW = "solved anew"
 THRESHOLDS = {"one step, all anew": (0.0, 0.0), "one step, reuse": (0.05, 1e-5)}
 """Of the smoothers: of linearisation points, and of steps."""
+BASES = ANEW, "one step, all anew"
 
 
 def places(nodes: ArrayLike) -> Array:
@@ -52,13 +57,6 @@ def on_line(node: int) -> Array:
 def hovering(count: int) -> Array:
     """(count, 4) controls."""
     return np.repeat(quadrotor.hover(BOOKS)[None], count, axis=0)
-
-
-def push(x: Array, cylinder: Array) -> Array:
-    """(n, 1) lack of clearance [m]."""
-    away = np.sqrt(np.square(x[:, :2] - cylinder).sum(axis=1, keepdims=True) + 1e-6)
-    lacking: Array = np.maximum(RADIUS + MARGIN - away, 0.0)
-    return lacking
 
 
 def field(count: int, rng: np.random.Generator) -> Array:
@@ -90,7 +88,7 @@ class Anew:
             seen = graph.variables("cylinders", fg.Rn(2), len(cylinders))
             graph.minimize(fg.prior, seen, fg.each(cylinders), sigma=MAPPED)
             guess[seen], near = cylinders, seen[number]
-        graph.minimize(push, x[node + 1], near, sigma=PUSH)
+        graph.minimize(NEAR, x[node + 1].p, near, RADIUS, sigma=PUSH)
         self.u, self.run = u, InteriorPoint(tolerance=1e-4).prepare(graph)
         self.x, self.guess, self.found = x, guess, self.run.solve(guess)
 
@@ -126,7 +124,7 @@ class Kept:
         minimize(quadrotor.dynamics, x[k], u[k], x[k + 1], BOOKS.packed, TICK, sigma=DYNAMICS)
         minimize(fg.prior, u[k], quadrotor.hover(BOOKS), sigma=EFFORT)
         minimize(fg.prior, x[k + 1].p, places([k + 1])[0], sigma=TRACKING)
-        minimize(push, x[np.full(len(self.cylinders), k + 1)], fg.each(self.cylinders), sigma=PUSH)
+        minimize(NEAR, x[np.full(len(self.cylinders), k + 1)].p, fg.each(self.cylinders), RADIUS, sigma=PUSH)
 
     def tick(self, tick: int, state: Array) -> Array:
         """Control for the state at a tick, with a new node at the far end."""
@@ -143,10 +141,15 @@ class Kept:
 
 
 def measure(seed: int, count: int) -> Row:
-    """Fly all planners side by side, in turn within each tick, and time plans with a map that is unknown."""
+    """Time plans with a map that is known and unknown; fly all planners side by side, in random order at each tick."""
     rng = np.random.default_rng(seed)
+    turns = np.random.default_rng(seed)
     cylinders = field(count, rng)
     first = Anew(cylinders)
+    row: Row = {}
+    for name, plan in (("known", first), ("unknown", Anew(cylinders, unknown=True))):
+        again = [clocked(partial(plan.run.solve, plan.guess))[1] for _ in range(5)]
+        row[f"{name} map, ms"] = 1e3 * min(again) / max(plan.found.iterations, 1)
     kept = {name: Kept(cylinders, first, known) for name, known in THRESHOLDS.items()}
     planners: dict[str, Anew | Kept] = {ANEW: first, **kept}
     states = dict.fromkeys(planners, on_line(0))
@@ -155,8 +158,8 @@ def measure(seed: int, count: int) -> Row:
     redone = {name: np.zeros((TICKS, 2)) for name in kept}
     for tick in range(TICKS):
         noise = NOISE * rng.normal(size=9)
-        for name, planner in planners.items():
-            control, seconds = clocked(partial(planner.tick, tick, states[name]))
+        for name in turns.permutation(list(planners)).tolist():
+            control, seconds = clocked(partial(planners[name].tick, tick, states[name]))
             times[name][tick] = 1e3 * seconds
             moved = quadrotor.fly(states[name], control, TICK, BOOKS)
             states[name] = quadrotor.STATE.retract(moved[None], noise[None])[0]
@@ -164,34 +167,41 @@ def measure(seed: int, count: int) -> Row:
             clear[name][tick] = np.linalg.norm(cylinders - states[name][:2], axis=1).min() - RADIUS
         for name, planner in kept.items():
             redone[name][tick] = planner.effort.eliminated, planner.effort.linearized
-    row: Row = {}
     for name in planners:
         row[f"{name}, ms"], row[f"{name}, p99"] = np.percentile(times[name][1:], [50.0, 99.0]).tolist()
+        for base in BASES:
+            row[f"{name}, {base}"] = float(np.median(times[name][1:] / times[base][1:]))
         row[f"{name}, off"] = float(np.sqrt(np.square(off[name]).mean()))
         row[f"{name}, clear"] = float(clear[name].min())
     for name, found in redone.items():
         row[f"{name}, eliminated"], row[f"{name}, linearised"] = np.median(found[1:], axis=0).tolist()
-    for name, unknown in (("known", False), ("unknown", True)):
-        plan = Anew(cylinders, unknown)
-        again = [clocked(lambda plan=plan: plan.run.solve(plan.guess))[1] for _ in range(5)]
-        row[f"{name} map, ms"] = 1e3 * min(again) / max(plan.found.iterations, 1)
     return row
 
 
 def tables(rows: list[Row]) -> str:
     """Loops by planner and number of cylinders, and time of an iteration by what is known of the map."""
-    groups = {(name, str(count)): where(rows, count=count) for count in COUNTS for name in (ANEW, *THRESHOLDS)}
+    groups = {(name, str(count)): (name, where(rows, count=count)) for count in COUNTS for name in (ANEW, *THRESHOLDS)}
 
     def mean(what: str) -> Callable[[tuple[str, list[Row]]], str]:
         return lambda named: _mean(named[1], f"{named[0]}, {what}")
 
+    def ratio(base: str) -> Callable[[tuple[str, list[Row]]], str]:
+        def shown(named: tuple[str, list[Row]]) -> str:
+            values = np.array([row[f"{named[0]}, {base}"] for row in named[1]])
+            if not len(values):
+                return "-"
+            low, high = interval(values)
+            return f"{values.mean():.2f} ({low:.2f} to {high:.2f})"
+
+        return shown
+
     heads = {
-        "tick, median [ms]": mean("ms"), "p99": mean("p99"), "variables eliminated": mean("eliminated"),
+        "tick, median [ms]": mean("ms"), "p99": mean("p99"), **{f"of {base}": ratio(base) for base in BASES},
+        "variables eliminated": mean("eliminated"),
         "factors linearised": mean("linearised"), "from the line [m rms]": mean("off"),
         "least clearance [m]": mean("clear"),
     }  # fmt: skip
-    named = {key: (key[0], own) for key, own in groups.items()}
-    loops = listing(["plan", "cylinders"], named, heads)
+    loops = listing(["plan", "cylinders"], groups, heads)
     maps = {(str(count),): where(rows, count=count) for count in COUNTS}
     columns = {f"{name} map": partial(_mean, name=f"{name} map, ms") for name in ("known", "unknown")}
     growth = listing(["cylinders"], maps, columns)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from functools import cache
-from typing import Any, TypeAlias, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_type_hints
 
 import numpy as np
-from numpy.typing import NDArray
 
-Records: TypeAlias = NDArray[np.void]
+from unifg.typing import Records
+
 W = TypeVar("W", bound="tuple[object, ...]")
 
 

@@ -1,7 +1,8 @@
 """Fixtures every test may use: the shared data beside the checkout, and reproducible randomness.
 
 A test marked ``product(n)`` is a large table, of which n cases are drawn; another commit draws others. Tests marked
-``product(n, of="name")`` are one table together. ``--all`` runs the whole, ``UNIFG_TEST_SEED`` repeats a draw.
+``product(n, of="name")`` are one table together; of ``product(0)`` none is drawn. ``--all`` runs the whole,
+``UNIFG_TEST_SEED`` repeats a draw.
 """
 
 import gc

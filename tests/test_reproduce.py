@@ -23,7 +23,7 @@ from unifg.scenarios.papers.printed import numbers, pairs, printed
 ITEMS = [(paper, item) for paper, found in catalogue.PAPERS.items() for item in found]
 # Legs of 170 m take minutes: `test_a_quick_campaign_...` looks at what is run.
 ERRORS = (bazzana.POSITION, bazzana.HEADING)
-LONG = [("bazzana", "--table I"), ("bazzana", "--table II"), ("factormpc", "--figure 10")]
+LONG = [("bazzana", "--table I"), ("bazzana", "--table II"), ("factormpc", "--figure 10")]  # more than a minute each
 MINUTE = ("bazzana", "--figure 6")  # three legs of 170 m
 SHORT = [(paper, item) for paper, item in ITEMS if (paper, item.option) not in [*LONG, MINUTE]]
 

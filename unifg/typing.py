@@ -14,6 +14,7 @@ else:
 Array: TypeAlias = NDArray[np.float64]
 IntArray: TypeAlias = NDArray[np.intp]
 BoolArray: TypeAlias = NDArray[np.bool_]
+Records: TypeAlias = NDArray[np.void]
 Numbers: TypeAlias = Any
 """What becomes an array, as a value of a dictionary: ``{x: array, tree: [[1, 2.0]]}`` has no `ArrayLike` in common."""
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from unifg.errors import FileFormatError
-from unifg.files.contents import legible
+from unifg.files.contents import legible, suffix_of
 from unifg.files.euroc import read_euroc
 from unifg.files.g2o import write_g2o
 from unifg.files.kitti import read_kitti, write_kitti
@@ -39,11 +39,11 @@ def convert(source: Path, target: Path) -> str:
         FileFormatError: the source cannot be read, the target's ending is none of these, or a trajectory is to become
             a graph.
     """
-    ending = _ending(target)
+    ending = suffix_of(target)
     known = {**GRAPHS, **TRAJECTORIES}
     if ending not in known:
         raise FileFormatError(f"{legible(target)}: no format ends in '{ending}': choose {', '.join(known)}, also .gz")
-    graph = None if _ending(source) in (".kitti", ".tum", ".csv") else read_pose_graph(source)
+    graph = None if suffix_of(source) in (".kitti", ".tum", ".csv") else read_pose_graph(source)
     if ending in TRAJECTORIES:
         time, poses = (_numbers(graph.poses), graph.poses) if graph else _read_trajectory(source)
         TRAJECTORIES[ending](target, time, poses)
@@ -54,11 +54,6 @@ def convert(source: Path, target: Path) -> str:
     return f"{len(graph.poses)} poses, {len(graph.edges)} edges"
 
 
-def _ending(path: Path) -> str:
-    """Ending of a name, without that of compression."""
-    return (path.with_suffix("") if path.suffix == ".gz" else path).suffix.lower()
-
-
 def _numbers(poses: Array) -> Array:
     """Numbers of poses, in the place of times."""
     return np.arange(len(poses), dtype=np.float64)
@@ -66,8 +61,8 @@ def _numbers(poses: Array) -> Array:
 
 def _read_trajectory(path: Path) -> tuple[Array, Array]:
     """Times [s], or numbers where there are none, and poses (n, 7)."""
-    if _ending(path) == ".kitti":
+    if suffix_of(path) == ".kitti":
         poses = read_kitti(path)
         return _numbers(poses), poses
-    found: Trajectory = (read_tum if _ending(path) == ".tum" else read_euroc)(path)
+    found: Trajectory = (read_tum if suffix_of(path) == ".tum" else read_euroc)(path)
     return found.time, np.column_stack([found.position, found.quaternion_xyzw[:, 3:], found.quaternion_xyzw[:, :3]])

@@ -55,8 +55,7 @@ from unifg.solvers.interior_point.state import (
     TRY,
     VIOLATED,
 )
-from unifg.solvers.workspace import Records
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, IntArray, Records
 
 KAPPA = 50.0  # mu is lowered when the error of the barrier problem is below KAPPA mu
 SOLVED = 50.0  # penalties are looked at when it is below SOLVED mu

@@ -21,8 +21,7 @@ from unifg.solvers.interior_point.state import (
     STOPPED,
     VIOLATED,
 )
-from unifg.solvers.workspace import Records
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, IntArray, Records
 
 ANSWER, ITERATIONS, COST, SUSPICION, STATIONARITY, VIOLATION, COMPLEMENTARITY, NUMBERS = range(8)
 """Columns of ``Instances.numbers``, and how many there are."""

@@ -45,8 +45,7 @@ from unifg.solvers.interior_point.state import (
     Problem,
     Work,
 )
-from unifg.solvers.workspace import Records
-from unifg.typing import Array
+from unifg.typing import Array, Records
 
 FEW = 5  # steps of a tick
 

@@ -10,8 +10,7 @@ from unifg.elimination.plan import Plan
 from unifg.problem.table import TermArrays
 from unifg.problem.units import Units
 from unifg.solution.optimality import NUMBERS
-from unifg.solvers.workspace import Records
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, IntArray, Records
 
 # Scalars.
 NOW = np.dtype(

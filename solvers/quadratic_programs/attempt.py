@@ -28,8 +28,7 @@ from unifg.solvers.globalize.norms import norm
 from unifg.solvers.quadratic_programs.graph_route import PATIENCE, TIGHTEST, Stacked, list_sides, multiply
 from unifg.solvers.quadratic_programs.scaling import Patterns
 from unifg.solvers.quadratic_programs.subproblem import leaves_most
-from unifg.solvers.workspace import Records
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import Array, BoolArray, IntArray, Records
 
 NOISE, ROUNDING = 1e-8, 1e-13  # of the merit: for each unit of the penalty, and relative
 SECANT_MATTERS = 0.5  # of the known curvature; less only slows convergence down

@@ -35,8 +35,7 @@ from unifg.solvers.quadratic_programs.attempt import (
     scaled_violation,
 )
 from unifg.solvers.quadratic_programs.graph_route import PATIENCE
-from unifg.solvers.workspace import Records
-from unifg.typing import Array
+from unifg.typing import Array, Records
 
 # Numbers of an iterate in the log, before norms and heights, stored values, constraints and multipliers.
 SHOWN, COST, STATIONARITY, VIOLATION, COMPLEMENTARITY, SIZE, LENGTH, SECONDS, DAMPING, ITERATIONS, BEGUN = range(11)

@@ -121,13 +121,13 @@ class Memory:
             UnifgError: the arrays have other types than the first ones, or this version of Numba describes arrays in
                 another way.
         """
-        found = tuple(default_manager[types.Array(types.float64, 1, "C")]._fields)
-        if found != LAYOUT:
-            raise UnifgError(f"Numba describes arrays by {found}, expected {LAYOUT}: use a version up to 0.68")
         words: list[int] = []
         layouts: list[object] = []
         _describe(arrays, words, layouts)
         if layouts != self._known:  # Numba takes milliseconds to name the type
+            found = tuple(default_manager[types.Array(types.float64, 1, "C")]._fields)
+            if found != LAYOUT:
+                raise UnifgError(f"Numba describes arrays by {found}, expected {LAYOUT}: use a version up to 0.68")
             kind = typeof(arrays)
             if self.kind is None:
                 self.kind = kind

@@ -55,6 +55,11 @@ def legible(path: str | os.PathLike[str]) -> str:
     return os.fspath(path).encode("utf-8", errors="surrogateescape").decode("utf-8", errors="backslashreplace")
 
 
+def suffix_of(path: Path) -> str:
+    """The ending of a name in small letters, without that of compression."""
+    return (path.with_suffix("") if path.suffix == ".gz" else path).suffix.lower()
+
+
 def read_bytes(path: str | os.PathLike[str], limits: Limits = LIMITS) -> bytes:
     """The content of a file, unpacked when it is gzipped.
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.files.carmen import CarmenLog, Odometry, Scans, read_carmen
-from unifg.files.contents import LIMITS, Limits, legible, read_text
+from unifg.files.contents import LIMITS, Limits, legible, read_text, suffix_of
 from unifg.files.rosbag import read_rosbag
 from unifg.lie import SE2, wrap_angle
 from unifg.typing import Array
@@ -101,7 +101,7 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
         ImportError: a package that reads it is not installed; the message names it.
     """
     path = Path(path)
-    if (path.with_suffix("") if path.suffix == ".gz" else path).suffix.lower() == ".csv":
+    if suffix_of(path) == ".csv":
         return _table(path, limits)
     name = legible(path.name)
     if path.suffix == ".npz":

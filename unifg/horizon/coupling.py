@@ -223,9 +223,10 @@ def weigh(terms: Sequence[Stated], weight: float) -> None:
         return
     for term in terms:
         slack = term.slack if isinstance(term, Constraint) else None
-        factors: tuple[Any, ...] = (term.sigma, term.information) if isinstance(term, Cost) else ()
-        prices: tuple[Any, ...] = () if slack is None else (slack.soft.linear, slack.soft.quadratic)
-        if isinstance(term, ScalarCost) or any(isinstance(factor, Data) for factor in (*factors, *prices)):
+        weights: tuple[Any, ...] = () if slack is None else (slack.soft.linear, slack.soft.quadratic)
+        if isinstance(term, Cost):
+            weights = term.sigma, term.information
+        if isinstance(term, ScalarCost) or any(isinstance(own, Data) for own in weights):
             raise GraphError(
                 f"term '{term.name}' cannot be weighed by control_weight: state its weight in the term", term=term.name
             )
@@ -239,7 +240,7 @@ def weigh(terms: Sequence[Stated], weight: float) -> None:
                 )
             term.robust = loss
         if isinstance(term, Constraint) and slack is not None:
-            term.slack = replace(slack, soft=Soft(*(weight * np.asarray(price) for price in prices)))
+            term.slack = replace(slack, soft=Soft(*(weight * np.asarray(price) for price in weights)))
         if isinstance(term, Cost) and term.information is not None:
             term.information = np.asarray(term.information, dtype=np.float64) * weight
         elif isinstance(term, Cost):

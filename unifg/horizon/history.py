@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.horizon.robot import Robot, numbers
+from unifg.horizon.robot import Robot, numbers, require_steps
 from unifg.typing import Array, ArrayLike, BoolArray
 
 
@@ -49,8 +49,7 @@ class History:
         Raises:
             GraphError: when there is no step, or the start is not on the robot's manifold.
         """
-        if not isinstance(length, int | np.integer) or length < 1:
-            raise GraphError(f"a window needs at least one step, a whole number of them; found length={length!r}")
+        require_steps("a window", "length", length)
         present = robot.point(start, "the start")
         self.length, self.filled = length, filled
         self.states = np.tile(present, (length + 1, 1))

@@ -18,7 +18,7 @@ from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPla
 from unifg.horizon.history import instant
 from unifg.horizon.margins import Margins
 from unifg.horizon.multistart import LEAST_TIME, Jumps, cheapest
-from unifg.horizon.robot import Robot, control_limits, numbers
+from unifg.horizon.robot import Robot, control_limits, numbers, require_steps
 from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.tree import BranchedSelection, ExpectedCost, Tree
 from unifg.horizon.window import Window
@@ -173,8 +173,8 @@ class RecedingHorizon:
             raise GraphError(f"portion={portion}: one iteration or more, of a plan that acts at once and is not joint")
         if coupling not in COUPLINGS:
             raise GraphError(f"unknown coupling '{coupling}': choose {', '.join(COUPLINGS)}")
-        if not isinstance(steps, Tree) and (not isinstance(steps, int | np.integer) or steps < 1):
-            raise GraphError(f"a horizon needs at least one step, a whole number of them; found steps={steps!r}")
+        if not isinstance(steps, Tree):
+            require_steps("a horizon", "steps", steps)
         tree = steps if isinstance(steps, Tree) else Tree(tuple(range(steps)))
         if not deadline > 0.0:
             raise GraphError(f"the deadline must be positive, got {deadline} s")

@@ -187,6 +187,12 @@ def control_limits(limits: tuple[ArrayLike, ArrayLike], size: int) -> tuple[Arra
     return least, most
 
 
+def require_steps(what: str, name: str, count: object) -> None:
+    """Refuse a number of steps that is not whole, or below one."""
+    if not isinstance(count, int | np.integer) or count < 1:
+        raise GraphError(f"{what} needs at least one step, a whole number of them; found {name}={count!r}")
+
+
 def numbers(value: ArrayLike, shape: tuple[int, ...], what: str, *, finite: bool = True, family: str = "") -> Array:
     """An array of that shape.
 

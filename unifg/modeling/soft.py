@@ -18,7 +18,7 @@ from unifg.factors.residuals import Residual
 from unifg.lie import Rn
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data, Family
-from unifg.typing import Array, ArrayLike
+from unifg.typing import Array, ArrayLike, BoolArray
 
 UPPER, LOWER = 1, 2  # sides that give way
 SLACK = ": slack"  # after the name of a constraint: that of its slack variables, and of their limit
@@ -125,9 +125,14 @@ def _weight(name: str, which: str, weight: Any, count: int, size: int) -> Array:
     return found
 
 
+def are_prices(found: Array) -> BoolArray:
+    """Test which weights are finite and not negative."""
+    return np.isfinite(found) & (found >= 0.0)
+
+
 def require_prices(name: str, which: str, found: Array) -> None:
     """Refuse (n, m) weights that are negative or not finite, by the name of the term."""
-    wrong = np.argwhere(~(np.isfinite(found) & (found >= 0.0)))
+    wrong = np.argwhere(~are_prices(found))
     if len(wrong):
         factor, row = map(int, wrong[0])
         raise GraphError(

@@ -22,7 +22,7 @@ from unifg.errors import GraphError
 from unifg.factors.differences import convexified
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
-from unifg.modeling.soft import require_prices
+from unifg.modeling.soft import are_prices, require_prices
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
@@ -222,30 +222,24 @@ class CompiledProblem:
             GraphError: on unknown data, a changed shape, NaN, crossed limits, or prices below zero.
         """
         changed = self.binding.take(data)
-        if self._prices:
-            self._require_prices(changed)
         for handle in changed:
             for term in self._readers[handle].told:
                 term.forget()
-        if self.rebinds:
-            self._rebind([term for handle in changed for term in self._readers[handle].bound])
-
-    def _require_prices(self, changed: Sequence[Data]) -> None:
-        """Refuse prices of soft constraints that are negative or not finite."""
-        for price, which, term in self._prices:
-            if price in changed:
-                try:
+        try:
+            for price, which, stated in self._prices:
+                if price in changed:
                     value = self.binding.present[price]
-                    require_prices(term.name, which, np.broadcast_to(value, (term.count, term.size)))
-                except GraphError:
-                    self.binding.forget()
-                    raise
+                    require_prices(stated.name, which, np.broadcast_to(value, (stated.count, stated.size)))
+            if self.rebinds:
+                self._rebind([term for handle in changed for term in self._readers[handle].bound])
+        except GraphError:
+            self.binding.forget()
+            raise
 
     def rows(self, data: Mapping[Data, Array], count: int) -> Array | None:
         """(count, D) numbers of all data of many instances; None where single solves have to look at them."""
         prices = [data[price] for price, *_ in self._prices if price in data]
-        refused = any(not (np.isfinite(price) & (price >= 0.0)).all() for price in prices)
-        return None if refused else self.binding.rows(data, count)
+        return self.binding.rows(data, count) if all(are_prices(price).all() for price in prices) else None
 
     def data_of(self, holder: Holder) -> dict[Data, Array] | None:
         """Values of all data that a solution was found with; None where they were replaced by way of another one."""
@@ -257,14 +251,10 @@ class CompiledProblem:
     def _rebind(self, terms: Sequence[CompiledTerm]) -> None:
         """Work out anew what terms make of their data."""
         rebound = list(dict.fromkeys(terms))
-        try:
-            for term in rebound:
-                term.bind(self.binding.present)
-            if any(isinstance(term.term, Constraint) for term in rebound):
-                self._bind_limits()
-        except GraphError:
-            self.binding.forget()
-            raise
+        for term in rebound:
+            term.bind(self.binding.present)
+        if any(isinstance(term.term, Constraint) for term in rebound):
+            self._bind_limits()
         if rebound:
             self.table.bind(rebound, self.lower, self.upper)
 

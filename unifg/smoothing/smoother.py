@@ -28,11 +28,11 @@ from unifg.smoothing.queries import (
     full_steps,
     total_cost,
 )
-from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, Records, State, empty_state
+from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, State, empty_state
 from unifg.smoothing.tree import give_up
 from unifg.smoothing.undetermined import enough
 from unifg.smoothing.update import begin, renew
-from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers
+from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers, Records
 
 FIRST_MADE = PLACE[MADE[0]]
 VARIABLE_END, FACTOR_END, CLIQUE_END = PLACE["variable_end"], PLACE["factor_end"], PLACE["clique_end"]

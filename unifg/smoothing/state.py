@@ -11,14 +11,12 @@ from __future__ import annotations
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from unifg.codegen.jit import inlined
 from unifg.codegen.vectors import Address
 from unifg.codegen.views import opener
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, IntArray, Records
 
-Records: TypeAlias = NDArray[np.void]
 Record: TypeAlias = Any  # one of them, inside compiled code
 
 
