@@ -22,7 +22,6 @@ from benchmarks.runner import Cell, Study
 from benchmarks.timing import clocked
 from unifg.models import quadrotor
 from unifg.models.avoidance import landmark_clearance
-from unifg.models.obstacles import shortfall
 from unifg.smoothing import Incremental
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array, ArrayLike
@@ -36,7 +35,6 @@ EFFORT = [2.0, 2.0, 1.0, 2.0]  # standard deviations of costs
 TRACKING, PUSH, MAPPED = 0.5, 0.1, 0.05
 NOISE = np.repeat([0.01, 0.005, 0.02], 3)  # of a tick: position [m], attitude [rad], velocity [m/s]
 DYNAMICS, PRESENT = 1e-3, 1e-4
-NEAR = shortfall(landmark_clearance, MARGIN)
 ANEW = "solved anew"
 THRESHOLDS = {"one step, all anew": (0.0, 0.0), "one step, reuse": (0.05, 1e-5)}
 """Of the smoothers: of linearisation points, and of steps."""
@@ -57,6 +55,12 @@ def on_line(node: int) -> Array:
 def hovering(count: int) -> Array:
     """(count, 4) controls."""
     return np.repeat(quadrotor.hover(BOOKS)[None], count, axis=0)
+
+
+def push(p: Array, cylinder: Array) -> Array:
+    """(n, 1) lack of clearance [m]."""
+    lacking: Array = np.maximum(MARGIN - landmark_clearance(p, cylinder, RADIUS), 0.0)
+    return lacking
 
 
 def field(count: int, rng: np.random.Generator) -> Array:
@@ -88,7 +92,7 @@ class Anew:
             seen = graph.variables("cylinders", fg.Rn(2), len(cylinders))
             graph.minimize(fg.prior, seen, fg.each(cylinders), sigma=MAPPED)
             guess[seen], near = cylinders, seen[number]
-        graph.minimize(NEAR, x[node + 1].p, near, RADIUS, sigma=PUSH)
+        graph.minimize(push, x[node + 1].p, near, sigma=PUSH)
         self.u, self.run = u, InteriorPoint(tolerance=1e-4).prepare(graph)
         self.x, self.guess, self.found = x, guess, self.run.solve(guess)
 
@@ -124,7 +128,7 @@ class Kept:
         minimize(quadrotor.dynamics, x[k], u[k], x[k + 1], BOOKS.packed, TICK, sigma=DYNAMICS)
         minimize(fg.prior, u[k], quadrotor.hover(BOOKS), sigma=EFFORT)
         minimize(fg.prior, x[k + 1].p, places([k + 1])[0], sigma=TRACKING)
-        minimize(NEAR, x[np.full(len(self.cylinders), k + 1)].p, fg.each(self.cylinders), RADIUS, sigma=PUSH)
+        minimize(push, x[np.full(len(self.cylinders), k + 1)].p, fg.each(self.cylinders), sigma=PUSH)
 
     def tick(self, tick: int, state: Array) -> Array:
         """Control for the state at a tick, with a new node at the far end."""

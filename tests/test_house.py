@@ -287,7 +287,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 33_016, "scenarios": 12_898, "benchmarks": 4_828, "tests": 36_527,
+    "unifg solvers models": 33_016, "scenarios": 12_898, "benchmarks": 4_830, "tests": 36_527,
     "docs examples": 1_984, "unifg/factors": 4_302, "unifg/problem": 3_444, "models": 2_237,
     "unifg/elimination": 2_156, "solvers": 5_135, "unifg/solution": 3_193, "unifg/smoothing": 1_885,
     "unifg/lie": 1_395, "unifg/view": 1_518, "unifg/files": 1_248, "unifg/pose_graphs": 1_610,
