@@ -15,6 +15,7 @@ import unifg as fg
 from dense import seen_once
 from own_manifolds import Sphere
 from unifg.errors import GraphError
+from unifg.models.avoidance import landmark_clearance
 from unifg.smoothing import FixedLag, Incremental
 from unifg.solvers import LevenbergMarquardt
 from unifg.typing import Array
@@ -292,6 +293,55 @@ def test_windows_forget_alike_whoever_evaluates(fixed_points: bool) -> None:
         assert held == 0, "a traced function is a kernel"
         found, _ = drive_window(window(), fg.residual(place_from), by_python, Plain())
         np.testing.assert_allclose(found, wanted, atol=1e-7)
+
+
+@pytest.mark.parametrize("alone", [False, True])
+def test_known_elements_of_shipped_residuals_are_parameters(alone: bool) -> None:
+    """Python evaluates nothing where a landmark is known, and it is estimated as from an unknown one there."""
+    places, ranges = np.array([[2.0, 0.5], [-1.0, 2.0], [1.0, -3.0]]), np.array([2.0, 2.4, 3.0])
+    found = []
+    for known in (True, False):
+        smoother = Incremental(relinearize=0.0)
+        p, y = smoother.variables("p", fg.Rn(3)), smoother.variables("y", fg.Rn(2))
+        smoother.minimize(fg.prior, p[0], np.zeros(3), sigma=1.0)
+        smoother.minimize(fg.prior, y[np.arange(3)], fg.each(places), sigma=1e-7)
+        for k in range(3) if alone else [np.arange(3)]:
+            near = places[k] if alone else fg.each(places)
+            length = ranges[k] if alone else fg.each(ranges)
+            smoother.minimize(landmark_clearance, p[0], near if known else y[k], length, sigma=0.1)
+        smoother.update({p: np.zeros((1, 3)), y: places}, iterations=9)
+        assert len(smoother._batches._held) == 0
+        found.append(smoother.estimate(p))
+    np.testing.assert_allclose(found[0], found[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["compiled", "traced", "differenced", "between"])
+def test_one_variable_is_seen_by_all_factors_of_a_statement(kind: str) -> None:
+    """Constants alone tell how many factors there are; each of them counts, but for one that is not active."""
+    generator, truth = np.random.default_rng(6), np.array([[0.3, -0.2, 0.4]])
+    seen_from = generator.standard_normal((4, 3))
+    ahead = fg.SE2.between(seen_from, truth) + 0.05 * generator.standard_normal((4, 3))
+    points = seen_from[:, :2]
+    measured = seen(truth, points, 0.0) + 0.05 * generator.standard_normal((4, 2))
+    function = {"compiled": fg.residual(seen_once, rows=2), "traced": seen, "between": fg.between}.get(
+        kind, fg.residual(seen, derivatives="differences")
+    )
+    found: list[Array] = []
+    for made in (fg.Graph(), Incremental(relinearize=0.0)):
+        x = made.variables("x", fg.SE2, 1) if isinstance(made, fg.Graph) else made.variables("x", fg.SE2)
+        made.minimize(fg.prior, x[0], np.zeros(3), sigma=1.0)
+        arguments = (x[0], fg.each(points), fg.each(measured))
+        if kind == "between":
+            arguments = (fg.each(seen_from), x[0], fg.each(ahead))
+        made.minimize(function, *arguments, sigma=0.5, active=np.arange(4) != 2)
+        if isinstance(made, fg.Graph):
+            solution = LevenbergMarquardt(tolerance=1e-12).solve(made, {x: np.zeros((1, 3))})
+            found += [solution[x], np.array(solution.cost)]
+        else:
+            made.update({x: np.zeros((1, 3))}, iterations=20)
+            found += [made.estimate(x), np.array(made.cost)]
+    np.testing.assert_allclose(found[2], found[0], atol=1e-7)
+    np.testing.assert_allclose(found[3], found[1], atol=1e-7)
 
 
 def test_a_function_that_fails_loses_nothing() -> None:

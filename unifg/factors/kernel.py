@@ -13,7 +13,7 @@ One compiled loop runs the kernels of all terms of a graph; called with arrays, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from math import prod
@@ -94,6 +94,10 @@ class Kernel:
     def of_shapes(self, shapes: Sequence[tuple[int, ...]]) -> Kernel:
         """The kernel for parameters of these shapes, for one factor: itself, unless code depends on them."""
         return self
+
+    def knowing(self, places: Container[int]) -> Kernel | None:
+        """The kernel that takes the elements of manifolds at these places as parameters; None where there is none."""
+        return None
 
     def rows_of(self, arguments: Sequence[Any]) -> list[Any]:
         """The arguments with one row per factor or a single one.

@@ -190,12 +190,15 @@ class Types:
             size = rows_of(name, wrapped, normal, count)
             stated = _by_itself(normal)
             term = _compiled(Cost(name, wrapped, stated, None, count, size, sigma, information, robust, rows=rows))
-            if term.kernel is None or form is None or len(term.kernel.manifolds) > len(selections):
+            kernel = term.kernel
+            if kernel is not None and len(kernel.manifolds) > len(selections):
+                kernel = kernel.knowing([k for k, a in enumerate(normal) if not isinstance(a, Selection)])
+            if kernel is None or form is None:
                 rest = np.zeros((count, 0))
                 kind = self._kind(None, (0, 0, 0, term.size), selections, (), *PLAIN)
                 staged = Staged(kind, families, members, rest, name, term, np.arange(count))
                 return _active(staged, active), None
-            known = term.kernel, wrapped, term.trace
+            known = kernel, wrapped, term.trace
             if term.trace is None or not _compiled_in(term.trace, normal):
                 if len(self._kernels) >= REMEMBERED:  # functions made anew for each statement are not kept for ever
                     self._kernels.clear()

@@ -479,7 +479,7 @@ def _touched(item: Staged) -> IntArray:
     pairs = zip(item.families, item.members, strict=True)
     if len(item.data) == 1:
         return np.array([[family.lowest(members) for family, members in pairs]])
-    return np.stack(np.broadcast_arrays(*(family.rows(members) for family, members in pairs)), axis=1)
+    return np.stack([np.broadcast_to(family.rows(members), len(item.data)) for family, members in pairs], axis=1)
 
 
 def _batch(item: Staged, touched: IntArray) -> Batch:

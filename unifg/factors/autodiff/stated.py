@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, cast
@@ -10,7 +10,7 @@ from typing import Any, cast
 from unifg.factors.autodiff.expression import Expression, generating
 from unifg.factors.autodiff.rows import traced
 from unifg.factors.autodiff.symbols import TraceError
-from unifg.factors.kernel import Kernel
+from unifg.factors.kernel import Argument, Kernel
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +29,29 @@ class StatedKernel(Kernel):
 
     def of_shapes(self, shapes: Sequence[tuple[int, ...]]) -> Kernel:
         """The kernel for parameters of these shapes, for one factor."""
-        if not any(isinstance(argument, int) for argument in self.arguments):
+        rest = iter(shapes)
+        return self._taking([next(rest) if isinstance(a, int | tuple) else a for a in self.arguments])
+
+    def knowing(self, places: Container[int]) -> Kernel:
+        """The kernel that takes the elements of manifolds at these places as parameters."""
+        return self._taking(
+            [
+                (a.storage,) if k in places and not isinstance(a, int | tuple) else a
+                for k, a in enumerate(self.arguments)
+            ]
+        )
+
+    def _taking(self, arguments: Sequence[Argument]) -> Kernel:
+        """The same function of other arguments, derived once."""
+        stated = tuple(arguments)
+        if stated == self.arguments:
             return self
         with generating:
-            known: dict[tuple[tuple[int, ...], ...], Kernel] = self.__dict__.setdefault("_shaped", {})
-            found = known.get(tuple(shapes))
-            if found is None:
-                rest = iter(shapes)
-                stated = [a if not isinstance(a, int | tuple) else next(rest) for a in self.arguments]
-                found = known[tuple(shapes)] = replace(self, arguments=tuple(stated), rows=self.size(shapes))
-            return found
+            known: dict[tuple[Argument, ...], Kernel] = self.__dict__.setdefault("_shaped", {})
+            if stated not in known:
+                shapes = [a for own, a in zip(self.arguments, stated, strict=True) if isinstance(own, int | tuple)]
+                known[stated] = replace(self, arguments=stated, rows=self.size(shapes))
+            return known[stated]
 
     @property
     def expression(self) -> Expression:
