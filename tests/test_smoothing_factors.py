@@ -344,6 +344,15 @@ def test_one_variable_is_seen_by_all_factors_of_a_statement(kind: str) -> None:
     np.testing.assert_allclose(found[3], found[1], atol=1e-7)
 
 
+def test_a_statement_without_active_factors_states_nothing() -> None:
+    smoother = Incremental()
+    x = smoother.variables("x", fg.Rn(2))
+    smoother.minimize(fg.prior, x[np.arange(2)], fg.each(np.eye(2)), sigma=fg.each(np.ones((2, 2))))
+    smoother.minimize(fg.prior, x[np.arange(2)], np.ones(2), active=np.zeros(2, dtype=bool))
+    smoother.update({x: np.zeros((2, 2))})
+    np.testing.assert_allclose(smoother.estimate(x), np.eye(2), atol=1e-12)
+
+
 def test_a_function_that_fails_loses_nothing() -> None:
     smoother, calls = Incremental(relinearize=0.0), [0]
 

@@ -13,7 +13,7 @@ import pytest
 import unifg as fg
 from problems.known import line, short_drive
 from unifg.models import obstacles, unicycle
-from unifg.solvers import SQP, GaussNewton, LevenbergMarquardt
+from unifg.solvers import SQP, GaussNewton, InteriorPoint, LevenbergMarquardt
 from unifg.typing import Array
 
 STATE = fg.Product(pose=fg.SE2, steer=fg.Rn(1), wheel=fg.SO2)
@@ -512,3 +512,42 @@ def test_numbers_that_differ_by_rounding_are_told_as_they_are() -> None:
     information = np.array([[1e7, 3e6 + 1.0], [3e6, 1e7]])
     with pytest.raises(fg.GraphError, match=r"3000001\.0 at .* 3000000\.0 at .*S\.T"):
         graph.minimize(fg.prior, x, np.zeros(2), information=information)
+
+
+WEIGHTED = {
+    "sigma": lambda graph, x, given: graph.minimize(fg.prior, x, np.zeros(3), sigma=given),
+    "information": lambda graph, x, given: graph.minimize(fg.prior, x, np.zeros(3), information=given),
+    "lower": lambda graph, x, given: graph.bound(x, lower=given),
+    "soft": lambda graph, x, given: graph.bound(x, lower=5.0, soft=given),
+    "fix": lambda graph, x, given: graph.fix(x, given),
+    "active": lambda graph, x, given: graph.minimize(fg.prior, x, np.zeros(3), active=given),
+}
+
+
+@pytest.mark.parametrize("state", WEIGHTED.values(), ids=WEIGHTED)
+def test_weights_and_limits_are_declared_to_have_a_row_for_each_factor(state: States) -> None:
+    """Three factors of three rows: what belongs to the factors is not taken for what belongs to the rows."""
+    row: Array = np.array([True, False, True]) if state is WEIGHTED["active"] else np.array([1.0, 2.0, 3.0])
+    row = np.diag(row) if state is WEIGHTED["information"] else row
+    full = row if row.dtype == bool else np.tile(row, (3,) + (1,) * row.ndim)
+
+    def solved(declare: Callable[[fg.Graph, Array], Any], numbers: Array) -> Array:
+        graph = fg.Graph()
+        x = graph.variables("x", fg.Rn(3), 3)
+        graph.minimize(fg.prior, x, 4.0 * np.ones(3))
+        state(graph, x, declare(graph, numbers))
+        return InteriorPoint(tolerance=1e-9).solve(graph, {x: np.full((3, 3), 4.5)})[x]
+
+    def kept(graph: fg.Graph, numbers: Array) -> fg.Data:
+        return graph.data("kept", numbers, each=True)
+
+    wanted = solved(lambda _, numbers: numbers, full)
+    for declare in (lambda _, numbers: fg.each(numbers), kept):
+        np.testing.assert_array_equal(solved(declare, full), wanted)
+        if full is not row:
+            with pytest.raises(fg.GraphError, match="is declared to have a row for each factor, found shape"):
+                solved(declare, row)
+    if full is not row:
+        np.testing.assert_allclose(solved(lambda _, numbers: fg.shared(numbers), row), wanted, atol=1e-9)
+        with pytest.raises(fg.GraphError, match="is declared to be shared by all factors, found shape"):
+            solved(lambda _, numbers: fg.shared(numbers), full)

@@ -160,6 +160,23 @@ def test_frames_of_other_names_are_refused() -> None:
     assert "'mm'" in said(lambda: limit.bound(p, upper=corner))
 
 
+def test_sigma_of_a_deviation_is_in_tangent_coordinates() -> None:
+    graph, x = plane()
+    assert "argument 1 of sigma, a constant, declares 'deg' for number 2, family 'x' 'rad'" in said(
+        lambda: graph.minimize(fg.prior, x, np.zeros(3), sigma=fg.shared([0.1, 0.1, 5.0], units="m, m, deg"))
+    )
+    graph.minimize(fg.prior, x, np.zeros(3), sigma=fg.shared([0.1, 0.1, 100.0], units="m, m, rad"))
+
+
+def test_limits_of_angles_may_be_none_or_count_turns(caplog: pytest.LogCaptureFixture) -> None:
+    graph = fg.Graph()
+    wheel = graph.variables("wheel", fg.Rn(2), 2, units="m, rad")
+    graph.bound(wheel, lower=-np.inf, upper=[1.0, np.inf])
+    assert not caplog.records
+    graph.bound(wheel, upper=[1.0, 90.0])
+    assert "row 0 has 90 for number 1" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("manifold", "units"),
     [(fg.SE2, "m, m"), (fg.SE3, "m, m, m, rad"), (fg.Rn(3), "m, m"), (fg.SO2, "m, m"), (quadrotor.STATE, "m, m, m")],

@@ -40,6 +40,7 @@ from unifg.modeling.variables import (
     Variable,
     as_selection,
     is_variable,
+    undeclared,
 )
 from unifg.modeling.weights import check_limits, check_weights, placed
 from unifg.typing import Array, ArrayLike, IntArray
@@ -429,9 +430,12 @@ class Model:
                 raise GraphError(
                     f"term '{unique}': robust= must be a loss such as fg.Huber(1.345), found {robust!r}", term=unique
                 )
-            sigma, information = check_weights(unique, sigma, information, parts["count"], parts["size"])
-            self._own_data(unique, sigma, information)
-            return Cost(**parts, sigma=sigma, information=information, robust=robust)
+            weights = check_weights(unique, sigma, information, parts["count"], parts["size"])
+            if isinstance(function, ManifoldResidual) and sigma is not None:  # both in tangent coordinates
+                first = next(argument for argument in parts["arguments"] if isinstance(argument, Selection))
+                compare(unique, "sigma", (first, sigma), ("*", "*"), {1: Rn(parts["size"])})
+            self._own_data(unique, *weights)
+            return Cost(**parts, sigma=weights[0], information=weights[1], robust=robust)
 
     def _scalar_cost(
         self,
@@ -461,13 +465,14 @@ class Model:
             parts = self._begun(name, function, arguments, active, replaced, default)
             unique, wrapped, shape = parts["name"], parts["residual"], (parts["count"], parts["size"])
             lower, upper = _given("a bound" if is_bound else "a constraint", unique, lower, upper)
-            lower, upper = check_limits(unique, lower, upper, *shape)
-            self._own_data(unique, lower, upper)
+            limits = check_limits(unique, lower, upper, *shape)
+            self._own_data(unique, *limits)
             if is_bound:
-                compare(unique, "bound", (*parts["arguments"], lower, upper), ALIKE, {})
-            slack = None if soft is None else slack_of(unique, soft, lower, upper, *shape, wrapped)
+                manifolds = dict.fromkeys((1, 2), Rn(parts["size"]))
+                compare(unique, "bound", (*parts["arguments"], lower, upper), ALIKE, manifolds)
+            slack = None if soft is None else slack_of(unique, soft, *limits, *shape, wrapped)
             self._own_data(unique, *(slack.soft.data if slack is not None else ()))
-            return Constraint(**parts, lower=lower, upper=upper, is_bound=is_bound, slack=slack)
+            return Constraint(**parts, lower=limits[0], upper=limits[1], is_bound=is_bound, slack=slack)
 
     def _bound(
         self,
@@ -494,15 +499,13 @@ class Model:
             raise GraphError(f"a fix is stated by a variable and its value, found {len(stated)} arguments", term=name)
         selection, value = _one_variable("a fix", stated[:1], name), stated[1]
         unique = self._unique(name, f"{selection.family.name} fixed", replaced is not None)
-        held = (
-            value
-            if isinstance(value, Data)
-            else np.array(doubles(f"fix '{unique}': value", value, term=unique), ndmin=1)
-        )
+        held = undeclared(unique, "the value of a fix", value, 2)
+        if not isinstance(held, Data):
+            held = np.array(doubles(f"fix '{unique}': value", held, term=unique), ndmin=1)
         self._own(selection, unique)
         self._own_data(unique, held)
         check_fix(unique, selection, held.value if isinstance(held, Data) else held)
-        compare(unique, "fix", (selection, held), ALIKE, {1: selection.manifold})
+        compare(unique, "fix", (selection, value), ALIKE, {1: selection.manifold})
         for other in self.fixes:
             if other is not replaced and other.selection.family is selection.family:
                 if _overlap(other.selection, selection):

@@ -17,7 +17,7 @@ from unifg.errors import GraphError
 from unifg.factors.residuals import Residual
 from unifg.lie import Rn
 from unifg.modeling.duplicates import doubles
-from unifg.modeling.variables import Data, Family
+from unifg.modeling.variables import Data, Family, undeclared
 from unifg.typing import Array, ArrayLike, BoolArray
 
 UPPER, LOWER = 1, 2  # sides that give way
@@ -91,7 +91,8 @@ def slack_of(
         GraphError: naming the term, when a weight has another shape, is negative or not finite, no row has a price, or
             the function is compiled for one factor.
     """
-    soft = soft if isinstance(soft, Soft) else Soft(soft)
+    given = soft if isinstance(soft, Soft) else Soft(soft)
+    soft = Soft(*(undeclared(name, "a weight of soft=", weight, 2) for weight in (given.linear, given.quadratic)))
     if wrapped.rows:
         raise GraphError(
             f"term '{name}': soft= takes batched functions, and '{wrapped.name}' is compiled for one factor; write it "

@@ -197,6 +197,7 @@ def prepare_arguments(
     if not any(isinstance(argument, Selection) for argument in normal):
         raise GraphError(f"term '{name}' has no variable among its arguments: pass a family or a selection", term=name)
     if active is not None:
+        active = active.value if isinstance(active, Declared) else active
         if not isinstance(active, Data):
             active = np.array(doubles(f"term '{name}': active=", active, term=name, flags=True))
         value = active.value if isinstance(active, Data) else active

@@ -170,7 +170,7 @@ class Declared:
 
 
 def each(value: ArrayLike, *, units: str | None = None, frame: str | None = None) -> Declared:
-    """Declare that the first axis of a constant argument runs over the factors of its term.
+    """Declare that the first axis of a constant argument, weight or limit runs over the factors of its term.
 
     ``units`` and ``frame`` are those of :meth:`unifg.Graph.data`.
 
@@ -184,7 +184,7 @@ def each(value: ArrayLike, *, units: str | None = None, frame: str | None = None
 
 
 def shared(value: ArrayLike, *, units: str | None = None, frame: str | None = None) -> Declared:
-    """Declare that all factors of a term share a constant argument, however long it is.
+    """Declare that all factors of a term share a constant argument, weight or limit, however long it is.
 
     ``units`` and ``frame`` are those of :meth:`unifg.Graph.data`.
 
@@ -193,6 +193,22 @@ def shared(value: ArrayLike, *, units: str | None = None, frame: str | None = No
     """
     array = doubles("an argument of fg.shared", value, flags=True)
     return Declared(array, False, quantity("fg.shared", units, frame))
+
+
+def undeclared(name: str, which: str, given: Any, axes: int) -> Any:
+    """Weights or limits without their declaration; ``axes`` is how many they have with a row for each factor.
+
+    Raises:
+        GraphError: naming the term, when they are declared to have a row for each factor, or none, and have others.
+    """
+    if isinstance(given, Data | Declared) and given.each is not None and given.value.ndim:
+        if (given.value.ndim == axes) != given.each:
+            declared = "to have a row for each factor" if given.each else "to be shared by all factors"
+            column = f"; for one number of each factor give (n, 1): {which}[:, None]" if given.value.ndim == 1 else ""
+            raise GraphError(
+                f"term '{name}': {which} is declared {declared}, found shape {given.value.shape}{column}", term=name
+            )
+    return given.value if isinstance(given, Declared) else given
 
 
 Variable: TypeAlias = Family | Selection

@@ -12,7 +12,7 @@ from unifg.errors import GraphError
 from unifg.factors.whitening import reciprocals, square_roots
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.terms import Parameter
-from unifg.modeling.variables import Data, as_selection, is_variable
+from unifg.modeling.variables import Data, as_selection, is_variable, undeclared
 from unifg.typing import Array
 
 
@@ -41,6 +41,7 @@ def check_weights(
         GraphError: naming the term, when one of them has another shape, holds something else than real numbers, or is
             no standard deviation or information matrix.
     """
+    sigma, information = undeclared(name, "sigma", sigma, 2), undeclared(name, "information", information, 3)
     if sigma is not None:
         sigma = sigma if isinstance(sigma, Data) else np.array(doubles(f"term '{name}': sigma", sigma, term=name))
         reciprocals(name, _present(sigma), count, size)
@@ -61,7 +62,9 @@ def check_limits(name: str, lower: Parameter, upper: Parameter, count: int, size
     for which, limit in (("lower", lower), ("upper", upper)):
         if limit is None:
             raise GraphError(f"term '{name}': {which} is None: leave it out where there is no limit", term=name)
-        made = limit if isinstance(limit, Data) else np.array(doubles(f"term '{name}': {which}", limit, term=name))
+        made = limit = undeclared(name, which, limit, 2)
+        if not isinstance(limit, Data):
+            made = np.array(doubles(f"term '{name}': {which}", limit, term=name))
         _check_limit(name, which, _present(made), count, size)
         both.append(made)
     least, most = (_present(limit) for limit in both)

@@ -27,7 +27,7 @@ from unifg.modeling.factors import prior
 from unifg.modeling.model import AnyResidual, complete
 from unifg.modeling.probing import rows_of
 from unifg.modeling.terms import Cost, Parameter, prepare_arguments
-from unifg.modeling.variables import Data, Family, Selection
+from unifg.modeling.variables import Data, Family, Selection, undeclared
 from unifg.problem.columns import Columns
 from unifg.problem.term import CompiledTerm
 from unifg.problem.traced import Trace, reach_of_value
@@ -170,6 +170,7 @@ class Types:
         name = given or wrapped.name
         if sigma is not None and information is not None:
             raise GraphError(f"term '{name}': give sigma or information, not both", term=name)
+        sigma, information = undeclared(name, "sigma", sigma, 2), undeclared(name, "information", information, 3)
         normal, rows, active, count = prepare_arguments(name, arguments, active)
         normal = on_manifolds(name, wrapped, normal, active)
         selections = [argument for argument in normal if isinstance(argument, Selection)]

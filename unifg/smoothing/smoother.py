@@ -194,7 +194,8 @@ class Smoother:
                     term=staged.name,
                     family=family.name,
                 )
-        self._staged.append(staged)
+        if len(staged.data):  # some factor is active
+            self._staged.append(staged)
 
     def minimize_scalar(self, *arguments: Any, **options: Any) -> NoReturn:
         """Refused: see the message."""
