@@ -24,7 +24,7 @@ from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.ground.drive_parts import bounds
-from unifg.scenarios.ground.drive_pilot import STOPPED, Pilot, make_pilot
+from unifg.scenarios.ground.drive_pilot import CREEPING, STOPPED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
 from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load_class, name_of
@@ -360,7 +360,7 @@ class Episode:
     def _outcome(self, goal: int) -> str | None:
         """Outcome of a goal; None while the robot is on its way."""
         pilot, dt = self.pilot, self.settings.controller.dt
-        helpless = pilot.verdict.rests or pilot.planless_for > dt
+        helpless = (pilot.verdict.rests and not pilot.creeping) or pilot.planless_for > dt
         self._helpless = self._helpless + dt if helpless else 0.0
         if self._arrived(goal):
             if _near(self.world.pose, self.goals[goal], TRUE_DISTANCE, TRUE_HEADING):
@@ -448,11 +448,11 @@ class Episode:
             compiled=compiled,
             localisation_iterations=pilot.estimator.iterations,
             plan_iterations=plan.iterations,
-            status=STOPPED if plan.source == STOPPED else plan.status.name.lower(),
+            status=plan.source if plan.source in (STOPPED, CREEPING) else plan.status.name.lower(),
             bound_violation=plan.excess,
             clearance=world.clearance(),
             goal_index=self._goal,
-            emergency=plan.emergency and plan.source != STOPPED,
+            emergency=plan.emergency and plan.source not in (STOPPED, CREEPING),
             rescued=plan.rescued,
             health=verdict.health.value,
             cause=verdict.cause,

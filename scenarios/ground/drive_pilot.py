@@ -12,8 +12,10 @@ import unifg as fg
 from unifg.errors import UnifgError
 from unifg.files.ros_map import OccupancyMap
 from unifg.horizon import Plan
+from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.calibration import Calibration
+from unifg.scenarios.ground.creeping import Creeping
 from unifg.scenarios.ground.drive_control import Controller
 from unifg.scenarios.ground.drive_past import Smoother
 from unifg.scenarios.ground.drive_settings import ControllerSettings
@@ -22,7 +24,7 @@ from unifg.scenarios.ground.emergency_stop import EmergencyStop
 from unifg.scenarios.ground.local_planner import PlannerAdapter
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.protocols import Estimator
-from unifg.scenarios.ground.relocalise import Relocaliser
+from unifg.scenarios.ground.relocalise import BELIEVED, BESIDE, PORTION, Relocaliser, fit, refine
 from unifg.scenarios.ground.route import Route
 from unifg.scenarios.ground.waiting import LOOK, waiting
 from unifg.scenarios.monitoring.supervisor import Health, HealthReport, Supervisor
@@ -38,10 +40,14 @@ COUPLINGS = ("sequential", "joint")
 AT_REST = 0.02  # [m/s]; slower is rest
 HELD = 0.5  # of the way that it could go: a robot that gets no farther is held by movers
 SEARCH_AGAIN = 20  # ticks after a search that found nothing
+FITS = 0.7  # share of the beams that the map explains, below which the robot doubts where it is
+DOUBTFUL = 10  # ticks of doubt after which the rest of the map is searched beside the drive
 FOUND_SIGMA = np.array([0.05, 0.05, 0.02])  # of a pose that a search has found [m, m, rad]
 DECIMETRE = np.array([0.12, 0.12, 0.05])  # standard deviations of a pose that calibration goes by [m, m, rad]
 STOPPED = "stopped"
 """Source of a plan that the supervisor has made: come to rest."""
+CREEPING = "creeping"
+"""The same of one to tell places apart."""
 
 
 logger = logging.getLogger("unifg")
@@ -96,7 +102,9 @@ class Pilot(Generic[PlannerT]):
         self._map, self._search = distance_map, Relocaliser(occupancy, distance_map, s.robot_radius)
         self._signals = DriveSignals(s.dt, s.most, s.kind)
         self.calibration, self.recalibrated = Calibration(distance_map, s.dt, s.kind), False
-        self._pause = 0
+        self._pause, self._doubt, self._elsewhere = 0, 0, 0.0
+        self._creeping: Creeping | None = None
+        self._moved = np.zeros(3)  # since the scan that is searched for was taken
         self._awake, self._failed = False, ""
         self._first: Scan | None = None
 
@@ -104,6 +112,11 @@ class Pilot(Generic[PlannerT]):
     def verdict(self) -> HealthReport:
         """Report of the supervisor at the last tick."""
         return self.supervisor.verdict
+
+    @property
+    def creeping(self) -> bool:
+        """True while the robot, which is lost, moves to tell places apart."""
+        return self._creeping is not None and not self._creeping.ended
 
     @property
     def power_off(self) -> bool:
@@ -182,10 +195,13 @@ class Pilot(Generic[PlannerT]):
         )  # fmt: skip
         refused = self.validator.refused
         why = {"fix": refused.get("lidar", "") or self.estimator.refused, "odometry": refused.get("wheels", "")}
-        verdict = self.supervisor.judge({**signals.values(), **self._calibrate(seen, predicted, wheels)}, why)
-        self._find_again(seen)
+        others = {"elsewhere": self._elsewhere, **self._calibrate(seen, predicted, wheels)}
+        verdict = self.supervisor.judge({**signals.values(), **others}, why)
+        self._find_again(seen, wheels)
         if verdict.rests:
             plan = self._rest(pose)
+            if self._creeping is not None and self.creeping and seen is not None:
+                plan = self._creep(self._creeping, plan, seen)
             self.clock.split("route")
         else:
             if route.repair(pose, self.tracks):
@@ -270,25 +286,49 @@ class Pilot(Generic[PlannerT]):
         controls, states = self.controller.rest(pose)
         return Plan(controls, states, fg.Status.INTERRUPTED, 0, STOPPED, 0.0, 0.0)
 
-    def _find_again(self, scan: Scan | None) -> None:
-        """Search the map while the robot is lost, sees and rests."""
-        velocity = self.controller.settings.kind.of(self.driven)
-        search, at_rest = self._search, not (np.abs(velocity) > AT_REST).any()
-        if self.verdict.health is not Health.LOST or scan is None or not at_rest:
+    def _creep(self, creeping: Creeping, rest: Plan, scan: Scan) -> Plan:
+        """The plan to rest, after one more control that leads to where places can be told apart."""
+        s = self.controller.settings
+        wanted, (speed, turn) = np.zeros(s.kind.size), creeping.control(scan, s.hull.bound)
+        wanted[0], wanted[-1] = min(speed, s.speed), turn
+        wanted = self.driven + np.clip(wanted - self.driven, -s.most, s.most)
+        plan = self._stop(replace(rest, controls=np.concatenate([wanted[None], rest.controls[1:]])), scan)
+        if self.slowed and speed:
+            creeping.blocked()
+        self.controller.driven(plan.controls[0])
+        return replace(plan, source=CREEPING)
+
+    def _find_again(self, scan: Scan | None, wheels: Array | None) -> None:
+        """Search the map while the robot is lost and rests or creeps, or drives where scans fit badly."""
+        s, search, lost = self.controller.settings, self._search, self.verdict.health is Health.LOST
+        self._doubt = self._doubt + 1 if self.share < FITS else 0
+        if wheels is None or not lost:
+            self._creeping = None
+        elif self._creeping is not None:
+            self._moved = s.kind.step(self._moved[None], wheels[None], s.dt)[0]
+            self._creeping.moved(s.kind.of(wheels) * s.dt)
+        slow = self._creeping is not None or not (np.abs(s.kind.of(self.driven)) > AT_REST).any()
+        if scan is None or not (slow if lost else self._doubt >= DOUBTFUL):
             search.begin(None)
+            self._elsewhere = 0.0
             return
         self._pause = max(0, self._pause - 1)
         if not search.searching and not self._pause:
             search.begin(scan)
-        result = search.search()
+            self._moved = np.zeros(3)
+        result = search.search(PORTION if lost else BESIDE)
         if result is None:
             return
-        self._pause = SEARCH_AGAIN
-        if result.pose is None:
-            return
-        self.estimator.reset(result.pose, FOUND_SIGMA)
-        self.pose, self.relocated, self.calibration.pose = self.estimator.pose, True, None
-        self._forget_tracks()
+        self._elsewhere = result.share - self.share if result.share >= BELIEVED and not lost else 0.0
+        pose = refine(self._map, scan, SE2.compose(result.pose, self._moved)) if result.pose is not None else None
+        if lost and pose is not None and fit(self._map, scan, pose) >= BELIEVED:
+            self._creeping = None
+            self.estimator.reset(pose, FOUND_SIGMA)
+            self.pose, self.relocated, self.calibration.pose = self.estimator.pose, True, None
+            self._forget_tracks()
+        elif lost and len(result.rivals) > 1 and s.kind.steering is None:
+            self._creeping = self._creeping or Creeping()
+        self._pause = 0 if self.creeping else SEARCH_AGAIN
 
     def take_over(self, other: Pilot[PlannerT]) -> None:
         """Go on where another pilot, with another map, was."""

@@ -20,6 +20,7 @@ __all__ = ["RAMPS", "DriveSignals"]
 RAMPS: Mapping[str, Ramp] = {
     "fix": Ramp("no scan says where it is", 0.15, 0.2, lost=1.0),  # [s] since the last that did
     "unexplained": Ramp("the scan does not fit the map", 0.45, 0.6, lost=0.6),  # share of beams
+    "elsewhere": Ramp("another place on the map fits the scan better", 0.2, 0.3, lost=0.3),  # share of beams
     "blind": Ramp("the lidar sees nothing in a sector", 0.15, 1.0, least=0.3),  # [rad]
     "spread": Ramp("where it is, is known to decimetres only", 0.12, 0.35, lost=0.5),  # [m]
     "plan": Ramp("no plan", 0.45, 1.0, least=0.3),  # [s] since the last; at rest there is nothing to plan from

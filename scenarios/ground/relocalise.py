@@ -3,7 +3,7 @@
 Every free place of a coarse grid is tried with every heading of a fan; those whose beams end nearest to surfaces are
 refined by matching on the beams that count, and the best of them is believed if most of its beams end at surfaces and
 pass none, and no other place fits nearly as well. The search is done in portions of a fixed size, so that no tick takes
-long, while the robot rests.
+long: large ones while the robot rests, small ones while it drives and doubts where it is.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from unifg.scenarios.perception.explaining import FARTHEST
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array
 
-__all__ = ["Found", "Relocaliser", "nearest_fit"]
+__all__ = ["Found", "Relocaliser", "fit", "nearest_fit", "refine"]
 
 SPACING = 0.2  # [m] between places
 FAN = 2.0 * np.pi * np.arange(48) / 48  # headings [rad]
 BEAMS = 45  # of the scan that are held against the map
 CUT = 0.5  # [m]; a beam farther from everything costs no more
-PORTION = 1500  # places of one tick
+PORTION, BESIDE = 1500, 150  # places of one tick: at rest, and beside a drive
 CANDIDATES = 24  # poses that are refined
 SEPARATE = 0.5  # [m] or [rad], apart from which two candidates are two places
 STEPS = 12  # of the refinement
@@ -50,11 +50,13 @@ class Found:
         pose: (3,) [m, m, rad]; None where it is not known.
         share: of the beams that fit there.
         cause: why it is not known.
+        rivals: poses (3,) that cannot be told apart, the best first.
     """
 
     pose: Array | None
     share: float
     cause: str
+    rivals: tuple[Array, ...] = ()
 
 
 class Relocaliser:
@@ -80,16 +82,16 @@ class Relocaliser:
         """True while a search goes on."""
         return self._scan is not None
 
-    def search(self) -> Found | None:
-        """Go on with the search; what it has found, once it is at its end."""
+    def search(self, portion: int = PORTION) -> Found | None:
+        """Go on with the search, by a number of places; what it has found, once it is at its end."""
         if self._scan is None:
             return None
-        chosen = slice(self._at, self._at + PORTION)
+        chosen = slice(self._at, self._at + portion)
         tips = _tips(self._scan)
         best = np.empty((len(self.places[chosen]), 2))
         _try_all(self._map.table, self.places[chosen], tips, best)
         self._cost[chosen], self._heading[chosen] = best[:, 0], FAN[best[:, 1].astype(np.intp)]
-        self._at += PORTION
+        self._at += portion
         if self._at < len(self.places):
             return None
         scan, self._scan = self._scan, None
@@ -112,12 +114,13 @@ class Relocaliser:
                 kept.append((fit(self._map, scan, refined), refined))
         kept.sort(key=lambda row: -row[0])
         share, best = kept[0] if kept else (0.0, None)
+        rivals = tuple(pose for other, pose in kept if other > share - CLEARLY)
         cause = first_true(
             (best is None, "no place on the map"),
             (share < BELIEVED, "no place on the map fits the scan"),
-            (any(rival > share - CLEARLY for rival, _ in kept[1:]), "several places on the map look alike"),
+            (len(rivals) > 1, "several places on the map look alike"),
         )
-        return Found(None if cause else best, share, cause)
+        return Found(None if cause else best, share, cause, rivals if share >= BELIEVED else ())
 
 
 def fit(distance_map: DistanceMap, scan: Scan, pose: Array) -> float:
@@ -175,6 +178,7 @@ def _tips(scan: Scan, fan: Array = FAN) -> Array:
 
 
 def _same(one: Array, other: Array) -> bool:
+    """Test whether two poses (3,) are one place."""
     away = float(np.hypot(*(one - other)[:2]))
     return away < SEPARATE and abs(float(wrap_angle(one[2] - other[2]))) < SEPARATE
 

@@ -1,0 +1,62 @@
+"""Creeping of a lost robot, from a place that looks like others to one that does not.
+
+The way is free as far as the beams of the last scan say so, and they, not a map, stop the robot. It is active
+localisation (Fox, Burgard, Thrun, *Robotics and Autonomous Systems* 25 (1998)) in its plainest form: straight on, and
+where that ends, to where there is most room, until a search of the map finds one place alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.lie import wrap_angle
+from unifg.scenarios.ground.emergency_stop import agreed
+from unifg.scenarios.perception.readings import Scan
+from unifg.typing import Array
+
+__all__ = ["Creeping"]
+
+FARTHEST = 30.0  # [m] after which the robot rests
+SPEED, TURN = 0.3, 0.5  # [m/s, rad/s]
+FAN = 2.0 * np.pi * np.arange(36) / 36 - np.pi  # directions [rad]
+HALF = 0.3  # [rad] to both sides of a direction that has to be free
+ROOM = 3.0  # [m] of free way that is enough
+NEAR = 0.6  # [m] from the hull where the way ends
+ASIDE = 0.5  # [m] of free way that a radian less to turn is worth
+AHEAD = 0.35  # [rad] beside the heading; farther aside the robot turns on the spot
+
+
+class Creeping:
+    """Direction and length of the way so far.
+
+    Attributes:
+        travelled: [m].
+    """
+
+    def __init__(self) -> None:
+        """Begin straight on."""
+        self.travelled, self._heading = 0.0, 0.0
+
+    @property
+    def ended(self) -> bool:
+        """True after the farthest way."""
+        return self.travelled >= FARTHEST
+
+    def moved(self, step: Array) -> None:
+        """Take in a motion (k,) of the body, the last number of which turns it [m, rad]."""
+        self.travelled += float(np.linalg.norm(step[:-1]))
+        self._heading = float(wrap_angle(self._heading - step[-1]))
+
+    def control(self, scan: Scan, bound: float) -> tuple[float, float]:
+        """Speed [m/s] and turning rate [rad/s] to where beams say that it is free, for a hull within a radius [m]."""
+        ranges, aside = agreed(scan), np.abs(wrap_angle(scan.angles - FAN[:, None]))
+        free = np.where(aside < HALF, np.minimum(ranges, ROOM), ROOM).min(axis=1)
+        free[~(aside < HALF).any(axis=1)] = 0.0
+        if free[int(np.argmin(np.abs(wrap_angle(FAN - self._heading))))] < bound + NEAR:
+            self._heading = float(FAN[int(np.argmax(free - ASIDE * np.abs(FAN)))])
+        turn = float(np.clip(2.0 * self._heading, -TURN, TURN))
+        return (SPEED if abs(self._heading) < AHEAD else 0.0), turn
+
+    def blocked(self) -> None:
+        """Look for another way: something stops the robot that beams ahead do not see."""
+        self._heading += 0.5 * np.pi
