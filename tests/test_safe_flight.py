@@ -430,6 +430,23 @@ def test_a_smaller_alpha_keeps_farther_away() -> None:
     assert near[0.1] > near[3.0] + 0.5
 
 
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "dt=0", "dt=1e9", "faster=0", "faster=-2", "margin=-1", "patience=-5", "seen=[1.0, -1.0, 1.0]",
+        "seen=[inf, 1, 1]", "keeper.horizon=0", "keeper.slots=-1", "keeper.iterations=0",
+        "keeper.step=0", "keeper.speed=-1",
+    ],
+)  # fmt: skip
+def test_numbers_that_no_flight_can_have_are_refused_by_name(
+    setting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["run", "quadrotor-cbf", "--case", "ball", "--controller", "flatness", "--out", str(tmp_path)]
+    assert command.main([*words, "--set", setting]) == 2
+    name = setting.partition("=")[0].rpartition(".")[2]
+    assert f"error: {name}: " in capsys.readouterr().err
+
+
 def judged(near: float, end: float) -> SafeLog:
     """A record of two ticks."""
     zero = np.zeros(2)
