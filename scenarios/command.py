@@ -34,7 +34,7 @@ from unifg import __version__
 from unifg.codegen import precompiled
 from unifg.codegen.cache_folder import place
 from unifg.codegen.threads import cores
-from unifg.errors import UnifgError
+from unifg.errors import FileFormatError, UnifgError
 from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import FROM_FILES, SCENARIOS
 from unifg.scenarios.commands.extras import absent, remedy
@@ -187,9 +187,19 @@ def _mcap(chosen: argparse.Namespace) -> int:
 
     stored: Path = chosen.folder
     if stored.is_dir():
-        stored /= "flight.npz" if (stored / "flight.npz").is_file() else "drive.npz"
+        logs = [file for name in ("drive.npz", "flight.npz") if (file := stored / name).is_file()]
+        stored = max(logs, key=lambda file: file.stat().st_mtime, default=stored / "drive.npz")
     out: Path = chosen.out or stored.with_suffix(".mcap")
-    write_mcap(out, (FlightLog if stored.name == "flight.npz" else EpisodeLog).load(stored))
+    kinds: list[type[EpisodeLog | FlightLog]] = [EpisodeLog, FlightLog]
+    first, other = reversed(kinds) if stored.name == "flight.npz" else kinds  # a log may have been renamed
+    try:
+        log = first.load(stored)
+    except FileFormatError as error:
+        try:
+            log = other.load(stored)
+        except FileFormatError:
+            raise error from None
+    write_mcap(out, log)
     print(legible(out))
     return SUCCEEDED
 
@@ -553,7 +563,7 @@ COMMANDS = {
         _mcap, "export a drive or a flight",
         "Write a log, drive.npz or flight.npz, as messages that Foxglove, PlotJuggler and mcap's tools play.",
         {
-            "folder": {"type": Path, "metavar": "DIR", "help": "results of unifg run, or the log itself"},
+            "folder": {"type": Path, "metavar": "DIR", "help": "results of unifg run, its latest log, or a log itself"},
             "--out": {"type": Path, "metavar": "FILE", "help": "to write (default: beside the log)"},
         },
     ),

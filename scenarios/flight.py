@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -99,11 +100,14 @@ class FlightSettings(Settings):
         """Refuse a time that cannot be flown.
 
         Raises:
-            ScenarioError: if the time limit is not positive.
+            ScenarioError: if the time limit is shorter than a tick, or infinite.
         """
         super().__post_init__()
-        if not self.time_limit > 0.0:
-            raise ScenarioError(f"the time limit must be positive, got {self.time_limit} s")
+        if not self.controller.dt <= self.time_limit < math.inf:
+            raise ScenarioError(
+                f"the time limit must be finite and no shorter than a tick of {self.controller.dt:g} s, "
+                f"got {self.time_limit:g} s"
+            )
 
     def summary(self) -> dict[str, Any]:
         """JSON values that say how the flight is made."""

@@ -39,6 +39,7 @@ __all__ = [
     "number",
     "option",
     "pair",
+    "permitted",
     "plain",
     "pose",
     "positive",
@@ -144,10 +145,7 @@ class Settings:
                 if leaf.choices and one is not None and one not in leaf.choices:
                     raise ScenarioError(f"unknown {name} {one!r}: choose {', '.join(leaf.choices)}")
                 if leaf.text is not None and isinstance(one, int | float) and not isinstance(one, bool):
-                    try:
-                        leaf.text(str(one))
-                    except argparse.ArgumentTypeError as error:
-                        raise ScenarioError(f"{name}: {error}") from None
+                    permitted(leaf.text, **{name: one})
 
 
 @cache
@@ -286,6 +284,23 @@ def number(what: str, permitted: Callable[[float], bool]) -> Text:
         return value
 
     return read
+
+
+def permitted(read: Text, /, **values: float) -> None:
+    """Refuse numbers that a reader of the command line refuses.
+
+    Args:
+        read: such as :data:`positive`.
+        values: by the name of their field.
+
+    Raises:
+        ScenarioError: naming the field.
+    """
+    for name, value in values.items():
+        try:
+            read(str(value))
+        except argparse.ArgumentTypeError as error:
+            raise ScenarioError(f"{name}: {error}") from None
 
 
 positive = number("a positive number", lambda value: 0.0 < value < math.inf)

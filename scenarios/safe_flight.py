@@ -21,7 +21,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, run_ticks, silent
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.safe_log import SafeLog
-from unifg.scenarios.options import Settings, count, not_negative, option, positive
+from unifg.scenarios.options import Settings, count, not_negative, number, option, permitted, positive
 from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.quadrotor.cascade import CascadeSettings, Track
 from unifg.scenarios.quadrotor.cbf_mpc import (
@@ -142,6 +142,19 @@ class SafeSettings(Settings):
     weighing: WeighingSettings = field(default_factory=WeighingSettings)
     seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
     disturbance: DisturbanceModel = field(default_factory=DisturbanceModel)
+
+    def __post_init__(self) -> None:
+        """Refuse ticks that no flight has, speed limits of nothing, and negative distances, times and deviations.
+
+        Raises:
+            ScenarioError: naming the field.
+        """
+        super().__post_init__()
+        permitted(number("a tick in (0, 1] s", lambda value: 0.0 < value <= 1.0), dt=self.dt)
+        permitted(positive, faster=self.faster)
+        permitted(not_negative, margin=self.margin, patience=self.patience)
+        for sigma in self.seen:
+            permitted(not_negative, seen=sigma)
 
 
 class SafeFlight:

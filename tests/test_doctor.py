@@ -59,6 +59,9 @@ def test_records_go_to_a_file_and_back(tmp_path: Path) -> None:
         performance.history(file)
     with pytest.raises(ScenarioError, match="cannot be read"):
         performance.history(tmp_path / "none")
+    file.write_bytes(b"\xfc\x00")
+    with pytest.raises(ScenarioError, match="no record"):
+        performance.history(file)
 
 
 @pytest.mark.parametrize("ratios", ["[]", '{"a": []}', '{"a": 1.0}', '{"a": ["b"]}', '{"a": [0.0]}'])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -114,6 +115,29 @@ def test_the_command_takes_a_folder_or_a_log(tmp_path: Path, capsys: pytest.Capt
     said = capsys.readouterr()
     assert "drive.mcap" in said.out
     assert "nowhere is no unifg drive log" in said.err
+
+
+def test_the_command_takes_the_latest_log_under_any_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("mcap")
+    flight().save(tmp_path / "flight.npz")
+    flight().save(tmp_path / "seed 3.npz")
+    episode(ticks=2).save(tmp_path / "drive.npz")
+    os.utime(tmp_path / "flight.npz", (1, 1))
+    assert main(["mcap", str(tmp_path)]) == 0
+    assert capsys.readouterr().out.endswith("drive.mcap\n")
+    os.utime(tmp_path / "drive.npz", (0, 0))
+    assert main(["mcap", str(tmp_path)]) == main(["mcap", str(tmp_path / "seed 3.npz")]) == 0
+    assert (tmp_path / "flight.mcap").read_bytes() == (tmp_path / "seed 3.mcap").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["drive", "flight"])
+def test_a_file_that_is_no_log_is_not_taken_for_one_to_trust(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    (tmp_path / f"{name}.npz").write_text('{"kind": "metrics"}', encoding="utf-8")
+    assert main(["mcap", str(tmp_path / f"{name}.npz")]) == 2
+    said = capsys.readouterr().err
+    assert f"is no unifg {name} log" in said and "pickle" not in said
 
 
 def test_without_mcap_it_says_what_to_install(

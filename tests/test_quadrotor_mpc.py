@@ -421,6 +421,22 @@ def test_wrong_arguments_are_refused(words: tuple[str, ...], tmp_path: Path) -> 
     assert command.main(["run", "quadrotor-mpc", *words, "--out", str(tmp_path)]) == 2
 
 
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "controller.dt=0", "controller.dt=-0.05", "controller.margin=-1", "controller.vehicle_radius=-1",
+        "controller.cylinders=-1", "controller.movers=-1", "controller.height_limits=[3.0, 0.3]",
+        "controller.lean_limit=0", "controller.control_weight=0", "time_limit=inf", "time_limit=0.01",
+    ],
+)  # fmt: skip
+def test_numbers_that_no_flight_can_have_are_refused_by_name(
+    setting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main(["run", "quadrotor-mpc", "--out", str(tmp_path), "--set", setting]) == 2
+    name = setting.partition("=")[0].rpartition(".")[2].replace("time_limit", "the time limit must be")
+    assert name in capsys.readouterr().err
+
+
 def only_a_moment(monkeypatch: pytest.MonkeyPatch, change: Callable[[FlightLog], FlightLog]) -> None:
     """Let the command fly for half a second."""
 

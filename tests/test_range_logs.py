@@ -234,6 +234,10 @@ def test_what_reads_a_recording_is_named(
     (tmp_path / "drive.npz").write_bytes(b"")
     assert main(["map", str(tmp_path / name), "--out", str(tmp_path)]) == 2
     assert "drive.npz is read" in capsys.readouterr().err
+    if name == "drive.bag":  # the folder of a run
+        (tmp_path / name).unlink()
+        assert main(["map", str(tmp_path), "--out", str(tmp_path)]) == 2
+        assert "drive.npz is read" in capsys.readouterr().err
 
 
 def test_a_drive_of_the_simulation_is_read(log: RangeLog, tmp_path: Path) -> None:

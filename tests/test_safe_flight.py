@@ -348,6 +348,14 @@ def test_situations_are_what_they_are_called_and_a_seed_moves_them() -> None:
         SafeSettings(case="flat")  # type: ignore[arg-type]
 
 
+def test_a_path_too_short_for_its_speed_says_which_it_reaches(caplog: pytest.LogCaptureFixture) -> None:
+    for speed, said in ((3.4, False), (6.0, True)):
+        about = situation("static", speed)
+        fastest = np.linalg.norm(about.path.at(np.linspace(0.0, about.duration, 5001)).velocity, axis=1).max()
+        assert ("too short for 6 m/s: it reaches" in caplog.text) == said
+        assert abs(fastest - speed) < 0.01 or f"{fastest:.2f} m/s" in caplog.text
+
+
 @pytest.mark.product(2, of="drives and flights")
 def test_the_same_seed_flies_the_same_flight() -> None:
     settings = SafeSettings(alpha=(3.0,), seed=4)
@@ -428,6 +436,23 @@ def test_a_smaller_alpha_keeps_farther_away() -> None:
     for alpha in (0.1, 3.0):
         near[alpha] = short(SafeSettings(alpha=(alpha,)), 1.6).run().boundary.min()
     assert near[0.1] > near[3.0] + 0.5
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "dt=0", "dt=1e9", "faster=0", "faster=-2", "margin=-1", "patience=-5", "seen=[1.0, -1.0, 1.0]",
+        "seen=[inf, 1, 1]", "keeper.horizon=0", "keeper.slots=-1", "keeper.iterations=0",
+        "keeper.step=0", "keeper.speed=-1",
+    ],
+)  # fmt: skip
+def test_numbers_that_no_flight_can_have_are_refused_by_name(
+    setting: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["run", "quadrotor-cbf", "--case", "ball", "--controller", "flatness", "--out", str(tmp_path)]
+    assert command.main([*words, "--set", setting]) == 2
+    name = setting.partition("=")[0].rpartition(".")[2]
+    assert f"error: {name}: " in capsys.readouterr().err
 
 
 def judged(near: float, end: float) -> SafeLog:

@@ -214,7 +214,7 @@ def history(file: Path = HISTORY) -> list[Record]:
         ScenarioError: for a line that is none.
     """
     try:
-        lines = file.read_text(encoding="utf-8").splitlines()
+        lines = file.read_bytes().splitlines()
     except OSError as error:
         raise ScenarioError(f"{file}: cannot be read ({error.strerror})") from error
     try:

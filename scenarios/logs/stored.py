@@ -60,7 +60,7 @@ class StoredLog:
         """
         where = os.fspath(path)
         try:
-            with open(path, "rb") as own, np.load(own, allow_pickle=False) as file:
+            with open(path, "rb") as own, zipfile.ZipFile(own), np.load(own, allow_pickle=False) as file:
                 stored = {name: file[name] for name in file.files}
             about: dict[str, Any] = json.loads(str(stored.pop("about")))
             if about.pop("kind") != cls.KIND:

@@ -21,6 +21,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -40,6 +41,7 @@ from unifg.horizon import (
 from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
+from unifg.scenarios.options import count, permitted, positive
 from unifg.scenarios.planning.flat_path import Flown
 from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.scenarios.quadrotor.flatness import FlatnessController, Gains, flat_flight
@@ -121,6 +123,16 @@ class KeeperSettings:
     portion: int | None = 4
     iterations: int = 20
     decide_ms: float = np.inf
+
+    def __post_init__(self) -> None:
+        """Refuse a horizon that is none, and less than no obstacle.
+
+        Raises:
+            ScenarioError: naming the field.
+        """
+        permitted(partial(count, least=1), horizon=self.horizon, iterations=self.iterations)
+        permitted(count, slots=self.slots)
+        permitted(positive, step=self.step, speed=self.speed)
 
 
 TRACKING = KeeperSettings(

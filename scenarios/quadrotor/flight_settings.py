@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 import unifg as fg
-from unifg.scenarios.options import Settings, option
+from unifg.scenarios.options import Settings, count, not_negative, option, permitted, positive
 from unifg.scenarios.quadrotor.guide import GuideSettings
 from unifg.solvers import names
 from unifg.typing import Array, ArrayLike
@@ -81,6 +81,26 @@ class ControllerSettings(Settings):
     step_tolerance: float = 1e-2
     feasible: float = 1e-2
     give: float = 0.04
+
+    def __post_init__(self) -> None:
+        """Refuse negative distances and counts, steps of no length, and heights that leave no room.
+
+        Raises:
+            ScenarioError: naming the field.
+        """
+        super().__post_init__()
+        permitted(
+            positive, dt=self.dt, control_weight=self.control_weight, lean_limit=self.lean_limit,
+            vehicle_radius=self.vehicle_radius,
+        )  # fmt: skip
+        permitted(
+            not_negative, margin=self.margin, sigmas=self.sigmas, margin_limit=self.margin_limit,
+            mover_margin=self.mover_margin, mover_growth=self.mover_growth,
+        )  # fmt: skip
+        permitted(count, cylinders=self.cylinders, movers=self.movers)
+        low, high = self.height_limits
+        if not low < high:
+            raise fg.ScenarioError(f"height_limits: the first must be below the second, found {low:g} and {high:g} m")
 
     def weighted(self, sigma: ArrayLike) -> Array:
         """Standard deviations of costs of the controller, scaled by their common weight."""

@@ -5,6 +5,7 @@ Without a seed they stand as they are described; a seed moves sizes, places and 
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, get_args
 
@@ -14,6 +15,8 @@ from unifg.scenarios.planning.flat_path import FigureEight, FlatPath, Hover, Lin
 from unifg.scenarios.simulation.bodies import Bodies, Body, Ellipse, Shuttle, Still, Thrown
 
 __all__ = ["SITUATIONS", "Kind", "Situation", "situation"]
+
+logger = logging.getLogger("unifg")
 
 Kind: TypeAlias = Literal["static", "ellipse", "cluttered", "figure8", "ball"]
 SITUATIONS: tuple[Kind, ...] = get_args(Kind)
@@ -114,4 +117,6 @@ def _ball(speed: float, rng: np.random.Generator | None) -> Situation:
 
 def _along_line(kind: Kind, speed: float, bodies: list[Body], half: float) -> Situation:
     line = Line((-half, 0.0, HEIGHT), (half, 0.0, HEIGHT), speed, 1.5)
+    if (top := line.acceleration * line.ramp) < 0.999 * speed:
+        logger.warning("the path of %g m is too short for %g m/s: it reaches %.2f m/s", line.length, speed, top)
     return Situation(kind, line, Bodies(bodies), line.duration + 3.0, line.end)

@@ -55,8 +55,8 @@ def read_rosbag(path: Path) -> Recorded:
         FileFormatError: it cannot be read, or holds no scans or no odometry.
         ImportError: the package that reads it is not installed.
     """
-    own = path.with_name("drive.npz")
-    hint = f"; of a run of unifg {legible(own)} is read" if path.is_file() and own.is_file() else ""
+    own = path / "drive.npz" if path.is_dir() else path.with_name("drive.npz")
+    hint = f"; of a run of unifg {legible(own)} is read" if path.exists() and own.is_file() else ""
     name, topics, mounts = legible(path), dict[str, dict[str, list[Any]]](), dict[str, Array]()
     try:
         for topic, kind, message in _mcap(path) if path.suffix == ".mcap" else _bag(path):
