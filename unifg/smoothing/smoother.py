@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from unifg.codegen.views import described
-from unifg.errors import GraphError
+from unifg.errors import GraphError, require_kinds
 from unifg.factors.robust import Loss
 from unifg.lie import Manifold
 from unifg.locks import ReentrantLock, synchronized
@@ -88,6 +88,8 @@ class Smoother:
 
     def __init__(self, relinearize: float, every: int, wildfire: float) -> None:
         """Start empty."""
+        options = {"relinearize": relinearize, "every": every, "wildfire": wildfire}
+        require_kinds(type(self).__name__, GraphError, Smoother.__init__.__annotations__, options)
         for name, value in (("relinearize", relinearize), ("wildfire", wildfire)):
             if not value >= 0.0:
                 raise GraphError(f"{type(self).__name__}: {name} must not be negative, found {value}")

@@ -143,6 +143,8 @@ def stacked_data(data: Mapping[Data, Numbers]) -> tuple[dict[Data, Array], int |
     """
     found: dict[Data, Array] = {}
     count: int | None = None
+    if not (isinstance(data, Mapping) and all(isinstance(handle, Data) for handle in data)):
+        raise GraphError(f"data of many instances are {{handle: values, ...}}, found {f'{data!r}'[:80]}")
     for handle, given in data.items():
         array = np.array(given)  # a copy: the batch reads it later, and the caller may change it
         if array.shape[1:] != handle.value.shape:
