@@ -493,7 +493,7 @@ def _batch(item: Staged, touched: IntArray) -> Batch:
         own[item.items if len(own) > 1 else slice(None)] = touched[:, slot] if len(own) > 1 else touched[0, slot]
         rows.append(own)
         values.append(np.tile(selection.family.manifold.identity(), (len(own), 1)))
-    return Batch(item.term, rows, values)
+    return Batch(item.term, rows, values, item.reach)
 
 
 def longer(table: Records, rows: int) -> Records:
