@@ -7,7 +7,7 @@ what Python itself asks for: ``AttributeError`` from ``__getattr__`` (``hasattr`
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from numbers import Integral, Real
 from typing import Any
 
@@ -39,19 +39,21 @@ class UnifgError(ValueError):
 def require_kinds(
     who: str, error: type[UnifgError], annotations: Mapping[str, Any], options: Mapping[str, Any], *classes: type
 ) -> None:
-    """Refuse options that are not of the kind that their annotations name: numbers, or objects of ``classes``.
+    """Refuse options that are not of the kind that their annotations name: numbers, functions, objects of ``classes``.
 
     Args:
         who: whose options they are.
         error: what is raised.
         annotations: text for each option; one that names several kinds is not looked at.
         options: by name.
-        *classes: that annotations name, besides ``float`` and ``int``.
+        *classes: that annotations name, besides ``float``, ``int`` and ``Callable``.
     """
-    known: dict[str, tuple[type, str]] = {"float": (Real, "a number"), "int": (Integral, "a whole number")}
+    known: dict[str, tuple[Any, str]] = {"float": (Real, "a number"), "int": (Integral, "a whole number")}
+    known["Callable"] = Callable, "a function"
     known |= {kind.__name__: (kind, f"of the class {kind.__name__}") for kind in classes}
     for name, value in options.items():
         kind, _, rest = str(annotations.get(name, "")).partition(" | ")
+        kind = kind.partition("[")[0]
         if kind not in known or rest not in ("", "None") or (rest and value is None):
             continue
         wanted, words = known[kind]
