@@ -232,7 +232,7 @@ class Types:
         return _active(Staged(kind, families, members, data, name), active), trace
 
     def _read_by(self, function: Callable[..., Any]) -> Captured:
-        """What a function in Python reads; looked for again only if that has changed since the last factor."""
+        """Reach of a function in Python, looked for again only if that has changed since the last factor."""
         last, reach = self._last_read
         if last is not function or reach is None or reach.changed:
             reach = captured_by(function)
