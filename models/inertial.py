@@ -30,7 +30,7 @@ from unifg.locks import ReentrantLock
 from unifg.modeling.factors import difference
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data, Selection, Variable, as_selection
-from unifg.models.preintegration import BIAS, CLOSE, GRAVITY, ImuNoise, Preintegrated, preintegrate
+from unifg.models.preintegration import BIAS, CLOSE, GRAVITY, ImuNoise, Preintegrated, down, preintegrate
 from unifg.models.rigid import motion_parts
 from unifg.models.stamped import Present, by_handle, state_whole
 from unifg.typing import Array, ArrayLike
@@ -54,15 +54,7 @@ def motion(state: Manifold = SE23, gravity: tuple[float, float, float] = GRAVITY
         ModelError: for another manifold.
     """
     takes = ("in W_T_B", "in W_T_B", "in B", None, None, "in B", "s")
-    return residual(_kernel(cast(Hashable, state), _down(gravity)), takes=takes)
-
-
-def _down(gravity: tuple[float, float, float]) -> tuple[float, ...]:
-    """Gravity as three numbers."""
-    down = np.asarray(gravity, dtype=np.float64)
-    if down.shape != (3,) or not np.isfinite(down).all():
-        raise ModelError(f"gravity must be three finite numbers, found {gravity}")
-    return tuple(down.tolist())
+    return residual(_kernel(cast(Hashable, state), down(gravity)), takes=takes)
 
 
 @cache
@@ -101,7 +93,7 @@ def specific_force(state: Manifold = SE23, gravity: tuple[float, float, float] =
         ModelError: for another manifold.
     """
     takes = ("in W_T_B", "in W_T_B", "m/s^2 in B", "1/s")
-    return residual(_felt(cast(Hashable, state), _down(gravity)), takes=takes)
+    return residual(_felt(cast(Hashable, state), down(gravity)), takes=takes)
 
 
 @cache

@@ -27,9 +27,10 @@ from typing import NamedTuple
 import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
 from unifg.lie import SE23, SO3, Product, Rn, se3, se23, so3
 from unifg.lie.series import c_slope, c_value
+from unifg.modeling.duplicates import doubles
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["BIAS", "ImuNoise", "Preintegrated", "at_rest", "predict", "preintegrate"]
@@ -66,6 +67,7 @@ class ImuNoise:
 
     def __post_init__(self) -> None:
         """Look at the densities."""
+        require_kinds("ImuNoise", ModelError, type(self).__annotations__, vars(self))
         least, most = DENSITIES
         for name in ("gyro", "accelerometer"):
             if not least <= getattr(self, name) <= most:
@@ -149,9 +151,11 @@ def preintegrate(
 
     Raises:
         ModelError: on other shapes, numbers that are not finite, or stamps or times that do not increase.
+        GraphError: on masked arrays, and what is no real number.
     """
-    t, at = np.array(stamps, dtype=np.float64), np.array(times, dtype=np.float64)
-    w, a = (np.ascontiguousarray(part, dtype=np.float64) for part in (gyro, accelerometer))
+    require_kinds("preintegrate", ModelError, preintegrate.__annotations__, {"noise": noise}, ImuNoise)
+    t, at = np.array(doubles("stamps", stamps)), np.array(doubles("times of nodes", times))
+    w, a = (np.ascontiguousarray(doubles(*part)) for part in (("rates", gyro), ("specific forces", accelerometer)))
     if t.ndim != 1 or w.shape != (len(t), 3) or a.shape != (len(t), 3):
         raise ModelError(f"preintegrate: {t.shape} stamps need (k, 3) rates and forces, found {w.shape}, {a.shape}")
     if at.ndim != 1 or len(at) < 2:
@@ -160,7 +164,10 @@ def preintegrate(
         if not (np.isfinite(part).all() and (np.diff(part) > 0.0).all()):
             raise ModelError(f"preintegrate: {name} must be finite and increase")
     n = len(at) - 1
-    b = np.array(np.broadcast_to(np.asarray(bias, dtype=np.float64), (n, 6)), order="C")
+    b = doubles("biases", bias)
+    if b.shape not in ((6,), (n, 6)):
+        raise ModelError(f"preintegrate: a bias is (6,), of rates and of forces, or ({n}, 6); found {b.shape}")
+    b = np.array(np.broadcast_to(b, (n, 6)), order="C")
     if not (np.isfinite(w).all() and np.isfinite(a).all() and np.isfinite(b).all()):
         raise ModelError("preintegrate: rates, forces and biases must be finite; leave out samples that are not")
     density = np.array([noise.gyro, noise.accelerometer])
@@ -172,16 +179,30 @@ def preintegrate(
 
 
 def predict(x: ArrayLike, motion: Preintegrated, gravity: ArrayLike = GRAVITY) -> Array:
-    """(n + 1, 10) states of SE23 that follow from the first, (10,), at the biases of the integration."""
-    g = np.asarray(gravity, dtype=np.float64)
+    """(n + 1, 10) states of SE23 that follow from the first, (10,), at the biases of the integration.
+
+    Raises:
+        ModelError: for a state or a gravity of another shape.
+    """
+    g, first = np.array(down(gravity)), np.asarray(x, dtype=np.float64)
+    if first.size != SE23.storage:
+        raise ModelError(f"predict: the first state is one of SE23, (10,), found {first.shape}")
     states = np.empty((len(motion.duration) + 1, 10))
-    states[0] = x
+    states[0] = first.ravel()
     for k, (increment, h) in enumerate(zip(motion.increment, motion.duration, strict=True)):
         drifted = states[k].copy()
         drifted[:3] += h * (drifted[3:6] + 0.5 * h * g)
         drifted[3:6] += h * g
         states[k + 1] = SE23.compose(drifted, increment)
     return states
+
+
+def down(gravity: ArrayLike) -> tuple[float, ...]:
+    """Gravity as three numbers."""
+    found = np.asarray(gravity, dtype=np.float64)
+    if found.shape != (3,) or not np.isfinite(found).all():
+        raise ModelError(f"gravity must be three finite numbers, found {gravity!r}")
+    return tuple(found.tolist())
 
 
 @compiled
@@ -317,4 +338,4 @@ def _add_noise(G: Array, density: Array, h: float, P: Array) -> None:
 
 def at_rest(rotation: ArrayLike, gravity: ArrayLike = GRAVITY) -> Array:
     """(..., 3) specific forces that an accelerometer shows at rest, [m/s^2], for orientations (..., 4)."""
-    return SO3.act(SO3.inverse(rotation), -np.asarray(gravity, dtype=np.float64))
+    return SO3.act(SO3.inverse(rotation), -np.array(down(gravity)))

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from unifg.errors import GraphError, require_kinds
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
@@ -105,6 +106,9 @@ def solve(
     starts: int = 1,
 ) -> Solution:
     """Do as ``fg.solve`` says."""
+    require_kinds("solve", GraphError, solve.__annotations__, {"starts": starts})
+    if starts < 1:
+        raise GraphError(f"solve: starts must be 1, the guess alone, or more, found {starts}")
     choice = choose(graph, data, tolerance=tolerance, time_limit=time_limit, verbose=verbose)
     logger.info("picked %s for %s", choice.first.name, choice.reason)
     others: tuple[Found, ...] = ()

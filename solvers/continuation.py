@@ -56,6 +56,8 @@ def best_guess(
 ) -> Guess:
     """Do as ``fg.best_guess`` says."""
     program = graph.compile()
+    if along is not None and not isinstance(along, Family):
+        raise GraphError(f"best_guess: along= is a family, as graph.variables returned it, found {along!r}")
     with program.lock:
         program.bind(data or {})
         start = program.values_from(values_of(guess))

@@ -154,3 +154,18 @@ def test_data_off_their_manifold_are_refused_as_by_single_solves() -> None:
     given[2, 1] = 0.5
     with pytest.raises(fg.GraphError, match="is not on SO3"):
         prepared.solve_many({x: given[:1]}, data={seen: given})
+
+
+def test_answers_are_asked_for_by_name_and_by_numbers_there_are() -> None:
+    graph = fg.Graph()
+    x, seen = graph.variables("x", fg.Rn(1), 1), graph.data("seen", [1.0])
+    graph.minimize(fg.prior, x, seen, sigma=1.0)
+    batch = InteriorPoint().prepare(graph).solve_many({x: [[0.0]]}, data={seen: [[1.0], [2.0]]})
+    assert np.array_equal(batch["x"], batch[x]) and batch.solution(-1)[x][0, 0] == pytest.approx(2.0)
+    for ask, message in (
+        (lambda: batch["y"], r"'y' is no family of these instances \(there are: x\)"),
+        (lambda: batch[fg.Graph().variables("x", fg.Rn(1), 1)], "is no family of these instances"),
+        (lambda: batch.solution(2), "there is no instance 2: 2 were solved, 0 to 1"),
+    ):
+        with pytest.raises(fg.GraphError, match=message):
+            ask()

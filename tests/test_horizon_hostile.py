@@ -20,6 +20,7 @@ from unifg.horizon import (
     RecedingHorizon,
     Robot,
     Term,
+    Tree,
     Window,
 )
 from unifg.solvers import SQP, GaussNewton, InteriorPoint
@@ -373,6 +374,17 @@ NO_NUMBERS: dict[str, tuple[Any, str]] = {
     "prediction": (lambda: window_of(robot=Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: "x")).move([0.0]), "predict"),  # type: ignore[arg-type,return-value]
     "start": (lambda: Constant("b", fg.Rn(1), "x", 1.0), "'b'.*start"),
     "steps": (lambda: RecedingHorizon(POINT, 2.5, [Wish()], solver=SQP()), "steps=2.5"),  # type: ignore[arg-type]
+    "solver": (lambda: loop_of(solver=SQP), "solver must be of the class Solver.*a class: give an object"),  # type: ignore[arg-type]
+    "deadline": (lambda: loop_of(deadline="a"), "deadline must be a number, found 'a'"),
+    "delay": (lambda: loop_of(delay=1.5), "delay must be a whole number, found 1.5"),
+    "clock": (lambda: loop_of(clock=3), "clock must be a function, found 3"),
+    "probabilities": (lambda: loop_of(probabilities=[1.0]), r"probabilities must be a function or None, found \[1.0\]"),
+    "patience": (lambda: loop_of(patience=None), "patience must be a whole number"),
+    "starts": (lambda: loop_of(starts=lambda now: ()), "starts must be of the class InitialGuesses or None"),
+    "terms": (lambda: RecedingHorizon(POINT, 2, Wish(), solver=SQP()), "terms are a list"),  # type: ignore[arg-type]
+    "tree": (lambda: Tree("ab"), "a tree is made of whole numbers.*found 'ab'"),  # type: ignore[arg-type]
+    "tails": (lambda: Tree.branched(1, [1.5]), "tails=1.5"),  # type: ignore[list-item]
+    "one tail": (lambda: Tree.branched(1, 3), "the tails of a tree are a list"),  # type: ignore[arg-type]
     "present": (lambda: loop_of().plan("x"), "present"),
     "present of another shape": (lambda: loop_of().plan([[0.0, 0.0]]), "present"),
     "times": (lambda: loop_of().set_times("x"), "times"),

@@ -199,6 +199,14 @@ def test_bad_logs_are_refused(rng: Generator) -> None:
             preintegrate(*arguments, NOISE, NONE)
     with pytest.raises(ModelError, match="must be finite"):
         preintegrate(t, w, a, [0.0, 1.0], NOISE, np.full(6, np.nan))
+    with pytest.raises(ModelError, match=r"a bias is \(6,\).*found \(3,\)"):
+        preintegrate(t, w, a, [0.0, 1.0], NOISE, np.zeros(3))
+    for wrong, words in ((np.ma.masked_array(w, w > 0.0), "rates is a masked"), (w + 0j, "found complex numbers")):
+        with pytest.raises(fg.GraphError, match=words):
+            preintegrate(t, wrong, a, [0.0, 1.0], NOISE, NONE)
+    for noise in (ImuNoise, None):  # the class has attributes of these names, too: its defaults
+        with pytest.raises(ModelError, match="noise must be of the class ImuNoise"):
+            preintegrate(t, w, a, [0.0, 1.0], noise, NONE)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("density", [0.0, -1e-3, np.nan, np.inf, 1e-200, 1e200])
@@ -319,6 +327,14 @@ def test_manifolds_and_gravity_are_checked() -> None:
         for gravity in ((0.0, 0.0), (0.0, 0.0, np.nan)):
             with pytest.raises(ModelError, match="three finite numbers"):
                 made(gravity=gravity)  # type: ignore[arg-type]
+    moved = preintegrate(*log_of(5, np.random.default_rng(0)), [0.0, 0.01], NOISE, NONE)
+    for wrong in (-9.81, [0.0, -9.81]):  # a number for all axes is no gravity
+        with pytest.raises(ModelError, match="three finite numbers"):
+            predict(SE23.identity(), moved, wrong)
+        with pytest.raises(ModelError, match="three finite numbers"):
+            at_rest(SO3.identity(), wrong)
+    with pytest.raises(ModelError, match=r"SE23, \(10,\), found \(7,\)"):
+        predict(np.zeros(7), moved)
     assert inertial.motion().kernel is inertial.motion().kernel  # derived once
 
 

@@ -180,3 +180,56 @@ def test_a_limit_may_be_infinite_if_it_is_given() -> None:
     graph.minimize(fg.prior, x, [0.0, 0.0])
     graph.bound(x, lower=-np.inf, upper=np.inf)
     assert AugmentedLagrangian().solve(graph, {x: np.ones((len(x), 2))}).converged
+
+
+OPTIONS: list[tuple[Callable[[fg.Graph, fg.Family, Any], object], Any, str]] = [
+    (lambda g, x, bad: SQP(time_limit=bad), "a", "SQP: time_limit must be a number, found 'a'"),
+    (lambda g, x, bad: GaussNewton(tolerance=bad), None, "tolerance must be a number, found None"),
+    (lambda g, x, bad: SQP(max_iterations=bad), 1.5, "max_iterations must be a whole number, found 1.5"),
+    (lambda g, x, bad: AugmentedLagrangian(penalty=bad), "a", "penalty must be a number or None"),
+    (lambda g, x, bad: fg.Huber(bad), "a", "Huber: .* must be a number"),
+    (lambda g, x, bad: fg.Incremental(every=bad), 1.5, "Incremental: every must be a whole number"),
+    (lambda g, x, bad: fg.FixedLag(bad), "a", "FixedLag: lag must be a whole number"),
+    (lambda g, x, bad: fg.solve(g, guess_of(x), starts=bad), len, "starts must be a whole number"),
+    (lambda g, x, bad: fg.solve(g, guess_of(x), starts=bad), 0, "starts must be 1, the guess alone"),
+    (lambda g, x, bad: GaussNewton().solve(g, guess_of(x), data=bad), 3, "data of a solve are"),
+    (lambda g, x, bad: GaussNewton().solve(bad, guess_of(x)), {}, "takes a graph, as fg.Graph"),
+    (lambda g, x, bad: fg.solve(bad, guess_of(x)), fg.Graph, "takes a graph, as fg.Graph"),
+    (lambda g, x, bad: fg.best_guess(g, guess_of(x), along=bad), "x", "along= is a family"),
+]
+
+
+def guess_of(x: fg.Family) -> dict[fg.Family, Array]:
+    return {x: np.zeros((4, 2))}
+
+
+@pytest.mark.parametrize(("make", "bad", "message"), OPTIONS, ids=[message for *_, message in OPTIONS])
+def test_options_of_another_kind_are_refused(make: Any, bad: Any, message: str) -> None:
+    graph, x = line()
+    graph.minimize(fg.prior, x, [0.0, 0.0])
+    with pytest.raises(fg.UnifgError, match=message):
+        make(graph, x, bad)
+
+
+def test_questions_of_another_kind_are_refused() -> None:
+    graph, x = line()
+    wish = graph.data("wish", [0.0, 0.0])
+    graph.minimize(fg.prior, x, wish, name="wish")
+    prepared = GaussNewton(max_iterations=np.int32(5), time_limit=np.array(60)).prepare(graph)  # type: ignore[arg-type]
+    solution = prepared.solve({x: np.zeros((4, 2))})
+    asked: list[tuple[Any, str]] = [
+        (lambda: solution.shifted(3), "shifted takes whole families"),  # type: ignore[arg-type]
+        (lambda: solution.shifted([x]), "shifted takes whole families"),  # type: ignore[arg-type]
+        (lambda: solution.shifted(x, by=1.5), "by must be a whole number"),  # type: ignore[arg-type]
+        (lambda: solution.sensitivity(3, wish), "expected a family"),  # type: ignore[arg-type]
+        (lambda: solution.sensitivity(x, 3), "no data or variable"),  # type: ignore[arg-type]
+        (lambda: solution.gradient(3, wish), "gradient of what"),  # type: ignore[arg-type]
+        (lambda: solution.verify("a"), "tolerance must be a number"),  # type: ignore[arg-type]
+        (lambda: prepared.solve_many(solution, data={"wish": np.zeros((2, 2))}), "many instances are"),  # type: ignore[dict-item]
+        (lambda: prepared.solve_many(solution, data={wish: np.zeros((2, 2))}, threads=0), "threads must be at least 1"),
+        (lambda: solution.information("goal", x), "no cost is called 'goal'"),
+    ]
+    for ask, message in asked:
+        with pytest.raises(fg.GraphError, match=message):
+            ask()
+    assert np.array_equal(solution.information("wish", x), np.eye(8))  # one name

@@ -196,6 +196,18 @@ def test_a_graph_that_floats_is_undetermined(solver: fg.Solver, times: float) ->
     assert GaussNewton().solve(graph, solution).status is fg.Status.UNDETERMINED
 
 
+@pytest.mark.parametrize("solver", [LevenbergMarquardt(), InteriorPoint(), SQP()], ids=lambda s: s.name)
+@pytest.mark.parametrize("seed", range(4))
+def test_a_graph_that_floats_and_fits_exactly_is_undetermined(solver: fg.Solver, seed: int) -> None:
+    rng, graph = np.random.default_rng(seed), fg.Graph()
+    x, near = graph.variables("x", fg.SE2, 10), np.cumsum(np.full((10, 3), [1.0, 0.2, 0.3]), axis=0)
+    first = np.array([0, 1, 2, 3, 5, 6, 7, 8])  # two parts, of which one is tied to the world
+    graph.minimize(fg.between, x[first], x[first + 1], [1.0, 0.1, 0.3] + 0.02 * rng.standard_normal((8, 3)), sigma=0.1)
+    graph.minimize(fg.prior, x[0], [0.0, 0.0, 0.0], sigma=0.01)
+    solution = solver.solve(graph, {x: near + 0.05 * rng.standard_normal((10, 3))})
+    assert (solution.status, solution.stationarity) == (fg.Status.UNDETERMINED, 0.0)
+
+
 def test_a_landmark_whose_only_sighting_is_rejected_is_undetermined() -> None:
     """A truncated loss takes away in the last step what held the landmark in the one before."""
     graph, x = graph_with(fg.Rn(2), 2)

@@ -380,6 +380,35 @@ def test_a_function_that_fails_loses_nothing() -> None:
     assert twin.estimate(twin.families["y"])[0, 0] > 1.5 and smoother.estimate(y)[0, 0] == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize("late", [True, False])
+def test_a_function_in_python_that_reads_something_else_later_is_named(
+    late: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    smoother, name, truth = Incremental(relinearize=0.0), f"ranges {late}", np.array([1.0, 2.0])
+    x = smoother.variables("x", fg.Rn(2))
+    smoother.minimize(fg.prior, x[0], [0.2, 0.5], sigma=5.0)
+    smoother.update({x: [0.2, 0.5]})
+    now: dict[str, Any] = {}
+
+    def measured(point: Array) -> Array:
+        a, seen = now["anchor"], now["seen"]
+        return np.array([[float(one[0] - a[0]) ** 2 + float(one[1] - a[1]) ** 2 - seen] for one in point])
+
+    def given(point: Array, a: Array, seen: Array) -> Array:
+        return np.array([[float(one[0] - a[0]) ** 2 + float(one[1] - a[1]) ** 2 - seen[0]] for one in point])
+
+    for anchor in ([4.0, 0.0], [0.0, 5.0], [-3.0, -1.0]):
+        now.update(anchor=anchor, seen=float(((truth - anchor) ** 2).sum()))
+        if late:
+            smoother.minimize(measured, x[0], sigma=0.01, name=name)
+        else:
+            smoother.minimize(given, x[0], anchor, [now["seen"]], sigma=0.01, name=name)
+        smoother.update(iterations=5)
+    said = [record.message for record in caplog.records if "has changed since a factor was stated" in record.message]
+    assert len(said) == late and all(f"term '{name}'" in message for message in said)
+    assert (np.abs(smoother.estimate(x[0]) - truth).max() < 1e-3) is not late
+
+
 @pytest.mark.parametrize("method", ["constrain", "bound", "fix", "minimize_scalar"])
 def test_what_is_no_least_squares_is_refused(method: str) -> None:
     smoother = FixedLag(3)

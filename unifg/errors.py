@@ -7,6 +7,10 @@ what Python itself asks for: ``AttributeError`` from ``__getattr__`` (``hasattr`
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from numbers import Integral, Real
+from typing import Any
+
 
 class UnifgError(ValueError):
     """Base of every error raised by unifg.
@@ -30,6 +34,33 @@ class UnifgError(ValueError):
         self.term = term
         self.family = family
         self.index = index
+
+
+def require_kinds(
+    who: str, error: type[UnifgError], annotations: Mapping[str, Any], options: Mapping[str, Any], *classes: type
+) -> None:
+    """Refuse options that are not of the kind that their annotations name: numbers, functions, objects of ``classes``.
+
+    Args:
+        who: whose options they are.
+        error: what is raised.
+        annotations: text for each option; one that names several kinds is not looked at.
+        options: by name.
+        *classes: that annotations name, besides ``float``, ``int`` and ``Callable``.
+    """
+    known: dict[str, tuple[Any, str]] = {"float": (Real, "a number"), "int": (Integral, "a whole number")}
+    known["Callable"] = Callable, "a function"
+    known |= {kind.__name__: (kind, f"of the class {kind.__name__}") for kind in classes}
+    for name, value in options.items():
+        kind, _, rest = str(annotations.get(name, "")).partition(" | ")
+        kind = kind.partition("[")[0]
+        if kind not in known or rest not in ("", "None") or (rest and value is None):
+            continue
+        wanted, words = known[kind]
+        found = value.item() if isinstance(getattr(value, "shape", None), tuple) and not value.shape else value
+        if isinstance(found, bool) or not isinstance(found, wanted):
+            how = f", a class: give an object of it, as {found.__name__}(...)" if isinstance(found, type) else ""
+            raise error(f"{who}: {name} must be {words}{' or None' if rest else ''}, found {f'{value!r}'[:80]}{how}")
 
 
 def name_term(error: Exception, term: str) -> None:

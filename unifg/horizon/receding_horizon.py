@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import BackendError, GraphError
+from unifg.errors import BackendError, GraphError, require_kinds
 from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
@@ -165,10 +165,14 @@ class RecedingHorizon:
             clock: seconds of the wall.
 
         Raises:
-            GraphError: for an unknown coupling, a joint one without a window, sizes and limits that do not fit, a term
-                that cannot be stated, times that do not grow or begin with another step than a tick, or a delay of a
-                joint coupling or of a robot without a model; portions of what begins anew with every tick.
+            GraphError: for options of another kind, an unknown coupling, a joint one without a window, sizes and limits
+                that do not fit, a term that cannot be stated, times that do not grow or begin with another step than a
+                tick, or a delay of a joint coupling or of a robot without a model; portions of what begins anew with
+                every tick.
         """
+        given = dict(locals())
+        kinds = (Robot, Solver, Window, InitialGuesses)
+        require_kinds("RecedingHorizon", GraphError, RecedingHorizon.__init__.__annotations__, given, *kinds)
         if portion is not None and (portion < 1 or coupling == "joint" or delay):
             raise GraphError(f"portion={portion}: one iteration or more, of a plan that acts at once and is not joint")
         if coupling not in COUPLINGS:

@@ -279,6 +279,8 @@ def looked_at(terms: Iterable[Term]) -> tuple[Term, ...]:
     Raises:
         GraphError: for an object without the methods of a term, or a class that has not been called.
     """
+    if not isinstance(terms, Iterable):
+        raise GraphError(f"terms are a list, as [Dynamics(...), goal], found {type(terms).__name__}")
     found = tuple(terms)
     for term in found:
         lacking = [name for name in ("state", "data") if not callable(getattr(term, name, None))]

@@ -11,10 +11,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from operator import index
 
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.horizon.robot import require_steps
 from unifg.modeling.terms import Cost, ScalarCost, Term
 from unifg.modeling.variables import Data, Family, Index, Selection
 from unifg.solution.graph import Graph
@@ -42,6 +44,13 @@ class Tree:
         Raises:
             GraphError: when a node follows none that is before it, or several follow the present.
         """
+        try:
+            object.__setattr__(self, "parents", tuple(index(parent) for parent in self.parents))
+        except TypeError as error:
+            raise GraphError(
+                f"a tree is made of whole numbers, the node that each step begins at, as Tree((0, 1, 1)); found "
+                f"{self.parents!r}"
+            ) from error
         for node, parent in enumerate(self.parents, start=1):
             if not 0 <= parent < node:
                 raise GraphError(f"node {node} of the tree must follow one of 0 ... {node - 1}, found {parent}")
@@ -57,10 +66,11 @@ class Tree:
         Raises:
             GraphError: unless a step is shared and each tail has one.
         """
-        if shared < 1 or not all(length >= 1 for length in tails):
-            raise GraphError(
-                f"a tree shares at least one step and its tails have one: found {shared} and {list(tails)}"
-            )
+        if not isinstance(tails, Sequence | np.ndarray):
+            raise GraphError(f"the tails of a tree are a list of their numbers of steps, found {tails!r}")
+        require_steps("a tree", "shared", shared)
+        for length in tails:
+            require_steps("each tail of a tree", "tails", length)
         parents = list(range(shared))
         for length in tails:
             parents += [shared, *range(len(parents) + 1, len(parents) + length)]

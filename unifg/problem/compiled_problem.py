@@ -686,7 +686,7 @@ class CompiledProblem:
         """
         chosen = np.zeros(self.costs.count, dtype=bool)
         slices = {term.name: rows for term, rows in zip(self.cost_terms, self._cost_slices, strict=True)}
-        for name in names:
+        for name in [names] if isinstance(names, str) else names:
             if name not in slices:
                 raise GraphError(f"no cost is called '{name}' (there are: {', '.join(slices) or 'none'})", term=name)
             chosen[slices[name]] = True
@@ -770,8 +770,10 @@ def compile_graph(graph: Model) -> CompiledProblem:
     """Offsets, ordering and sparsity; computed once and kept until the graph changes.
 
     Raises:
-        GraphError: when the graph has no variable, or a variable no term touches.
+        GraphError: when it is no graph, has no variable, or a variable no term touches.
     """
+    if not isinstance(graph, Model):
+        raise GraphError(f"a solve takes a graph, as fg.Graph(), and then a guess; found {f'{graph!r}'[:80]}")
     if not isinstance(graph.compiled, CompiledProblem):
         program = CompiledProblem(graph)
         program.graph.compiled = graph.compiled = program

@@ -7,11 +7,14 @@ variables then stay where they were last seen.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 
 from unifg.codegen.vectors import Address
+from unifg.factors.autodiff.captured import Captured
 from unifg.factors.differences import jacobian
 from unifg.factors.whitening import whiten_rows
 from unifg.modeling.factors import prior
@@ -24,6 +27,9 @@ from unifg.smoothing.queries import estimates
 from unifg.smoothing.state import State
 from unifg.typing import Array, IntArray
 
+logger = logging.getLogger("unifg")
+_told: set[str] = set()  # terms whose functions have changed, which is said once
+
 
 class Batch:
     """The factors of one statement, evaluated together.
@@ -31,14 +37,21 @@ class Batch:
     Attributes:
         term: the statement, whose families have as many members as it selects.
         rows: for each of them the variables of the smoother.
+        reach: what its function read when it was stated; None where that is known to have changed, or not known.
         values: of all its variables, as last seen.
     """
 
-    def __init__(self, term: CompiledTerm, rows: list[IntArray], values: list[Array]) -> None:
+    def __init__(
+        self, term: CompiledTerm, rows: list[IntArray], values: list[Array], reach: Captured | None = None
+    ) -> None:
         """Take a statement and where its variables stand."""
-        self.term, self.rows = term, rows
+        self.term, self.rows, self.reach = term, rows, reach
         families = [selection.family for selection in term.term.selections]
         self.values: Values = Columns(families, ()).values(dict(zip(families, values, strict=True)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """In another process names mean what they mean there."""
+        return {**vars(self), "reach": None}
 
     def _look(self, memory: Address, items: IntArray, points: bool) -> None:
         """Read the variables of some of its factors."""
@@ -110,12 +123,34 @@ class Batches:
             self._held = {number: batch for number, batch in self._held.items() if number in left}
             self._limit = 64 + 2 * len(self._held)
 
+    def _watch(self, batches: list[Batch]) -> None:
+        """Say once for each term if its function reads something else by now than when a factor was stated."""
+        for reach in {id(batch.reach): batch.reach for batch in batches if batch.reach is not None}.values():
+            if reach.changed:
+                for batch in batches:
+                    if batch.reach is reach:
+                        batch.reach = None
+                        tell(batch.term.name)
+
     def _by_batch(self, state: State, factors: IntArray) -> Iterable[tuple[int, IntArray, IntArray]]:
         """Number of each batch among some factors, those of its own, and which they are within it."""
         numbers = state.factors["batch"][factors]
-        for number in np.unique(numbers[numbers > 0]).tolist():
+        asked = np.unique(numbers[numbers > 0]).tolist()
+        self._watch([self._held[number] for number in asked])
+        for number in asked:
             own = factors[numbers == number]
             yield number, own, state.factors["item"][own]
+
+
+def tell(name: str) -> None:
+    """Say of a term, once, that factors have changed with what its function reads."""
+    if name not in _told:
+        _told.add(name)
+        logger.warning(
+            "term '%s': what its function reads has changed since a factor was stated, and the factor with it: "
+            "give numbers that belong to a factor as an argument, as in minimize(f, x[0], number)",
+            name,
+        )
 
 
 def move_by_python(state: State, family: GrowingFamily, rewritten: bool) -> None:

@@ -7,13 +7,14 @@ next statement only lays out its numbers. What a traced function reaches counts 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.factors.autodiff.captured import Captured, captured_by
 from unifg.factors.kernel import Kernel, side_by_side
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import QUADRATIC, Form, Loss, form_of
@@ -54,6 +55,7 @@ class Staged:
         name: for messages.
         term: what evaluates them, where that is Python.
         items: (n,) their numbers within it.
+        reach: what a function in Python read when they were stated.
     """
 
     kind: int
@@ -64,6 +66,7 @@ class Staged:
     term: CompiledTerm | None = None
     items: IntArray = field(default_factory=lambda: NOBODY)
     limit: float = 0.0
+    reach: Captured | None = None
 
     def keep(self, wanted: BoolArray) -> None:
         """Leave out the others."""
@@ -87,12 +90,13 @@ class Types:
         self.slots: list[tuple[int, ...]] = []
         self.scratch = 8
         self._numbers: dict[tuple[Any, ...], int] = {}  # by kernels, which are kept: compiled code has their addresses
+        self._last_read: tuple[Callable[..., Any] | None, Captured | None] = None, None
         self._kernels: dict[tuple[Any, ...], tuple[Kernel, Residual, Trace | None]] = {}
         self._kinds: dict[Key, Kind] = {}  # of single factors
 
     def __getstate__(self) -> dict[str, Any]:
         """Copy without what is found by the ids of objects, which are others in a copy."""
-        return {**self.__dict__, "_kernels": {}, "_kinds": {}}
+        return {**self.__dict__, "_kernels": {}, "_kinds": {}, "_last_read": (None, None)}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """The kernels of a copy stand elsewhere."""
@@ -198,6 +202,7 @@ class Types:
                 rest = np.zeros((count, 0))
                 kind = self._kind(None, (0, 0, 0, term.size), selections, (), *PLAIN)
                 staged = Staged(kind, families, members, rest, name, term, np.arange(count))
+                staged.reach = None if term.kernel else self._read_by(wrapped.function)
                 return _active(staged, active), None
             known = kernel, wrapped, term.trace
             if term.trace is None or not _compiled_in(term.trace, normal):
@@ -229,6 +234,14 @@ class Types:
         counts = data.shape[1] - whitener[0].size, data.shape[1], whitening, size
         kind = self._kind(kernel, counts, selections, shapes, *form)
         return _active(Staged(kind, families, members, data, name), active), trace
+
+    def _read_by(self, function: Callable[..., Any]) -> Captured:
+        """Reach of a function in Python, looked for again only if that has changed since the last factor."""
+        last, reach = self._last_read
+        if last is not function or reach is None or reach.changed:
+            reach = captured_by(function)
+            self._last_read = function, reach
+        return reach
 
     def _kind(
         self,

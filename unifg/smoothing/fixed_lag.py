@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.errors import GraphError
+from unifg.errors import GraphError, require_kinds
 from unifg.locks import synchronized
 from unifg.modeling.variables import Selection, Variable, as_selection
 from unifg.smoothing.factors import Staged
@@ -69,6 +69,7 @@ class FixedLag(Smoother):
         super().__init__(relinearize, every, wildfire)
         if (lag is None) == (seconds is None):
             raise GraphError("FixedLag: give either lag= (a number of members) or seconds=")
+        require_kinds("FixedLag", GraphError, FixedLag.__init__.__annotations__, {"lag": lag, "seconds": seconds})
         self.lag = float(lag if lag is not None else seconds)  # type: ignore[arg-type]
         if not self.lag > 0.0:
             raise GraphError(f"FixedLag: the lag must be positive, found {self.lag}")

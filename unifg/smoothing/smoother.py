@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 
 from unifg.codegen.views import described
-from unifg.errors import GraphError
+from unifg.errors import GraphError, require_kinds
 from unifg.factors.robust import Loss
 from unifg.lie import Manifold
 from unifg.locks import ReentrantLock, synchronized
@@ -88,6 +88,8 @@ class Smoother:
 
     def __init__(self, relinearize: float, every: int, wildfire: float) -> None:
         """Start empty."""
+        options = {"relinearize": relinearize, "every": every, "wildfire": wildfire}
+        require_kinds(type(self).__name__, GraphError, Smoother.__init__.__annotations__, options)
         for name, value in (("relinearize", relinearize), ("wildfire", wildfire)):
             if not value >= 0.0:
                 raise GraphError(f"{type(self).__name__}: {name} must not be negative, found {value}")
@@ -492,7 +494,7 @@ def _batch(item: Staged, touched: IntArray) -> Batch:
         own[item.items if len(own) > 1 else slice(None)] = touched[:, slot] if len(own) > 1 else touched[0, slot]
         rows.append(own)
         values.append(np.tile(selection.family.manifold.identity(), (len(own), 1)))
-    return Batch(item.term, rows, values)
+    return Batch(item.term, rows, values, item.reach)
 
 
 def longer(table: Records, rows: int) -> Records:

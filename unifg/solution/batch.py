@@ -90,9 +90,18 @@ class Batch:
         """Number of instances."""
         return len(self.statuses)
 
-    def __getitem__(self, family: Family) -> Array:
-        """(K, count, storage) values of a family."""
-        part, shape = self._prepared.program.columns.place(family)
+    def __getitem__(self, family: Family | str) -> Array:
+        """(K, count, storage) values of a family, by itself or by name.
+
+        Raises:
+            GraphError: there is no such family.
+        """
+        columns = self._prepared.program.columns
+        known = {own.name: own for own in columns.storage}
+        own = known.get(family) if isinstance(family, str) else family
+        if own is None or own not in columns.storage:
+            raise GraphError(f"{family!r} is no family of these instances (there are: {', '.join(known)})")
+        part, shape = columns.place(own)
         return self.values[:, part].reshape(len(self), *shape).copy()
 
     @property
@@ -105,7 +114,13 @@ class Batch:
         return {handle: given[index] for handle, given in self._data.items()}
 
     def solution(self, index: int) -> Solution:
-        """A solution with all that belongs to it, by a solve from the answer of an instance."""
+        """A solution with all that belongs to it, by a solve from the answer of an instance.
+
+        Raises:
+            GraphError: there is no such instance.
+        """
+        if not -len(self) <= index < len(self):
+            raise GraphError(f"there is no instance {index}: {len(self)} were solved, 0 to {len(self) - 1}")
         program = self._prepared.program
         arrays = self.values[index].copy(), self.multipliers[index].copy(), program.no_penalties
         return self._prepared.solve(Guess.stored(program, arrays), data=self.data_of(index))
@@ -143,6 +158,8 @@ def stacked_data(data: Mapping[Data, Numbers]) -> tuple[dict[Data, Array], int |
     """
     found: dict[Data, Array] = {}
     count: int | None = None
+    if not (isinstance(data, Mapping) and all(isinstance(handle, Data) for handle in data)):
+        raise GraphError(f"data of many instances are {{handle: values, ...}}, found {f'{data!r}'[:80]}")
     for handle, given in data.items():
         array = np.array(given)  # a copy: the batch reads it later, and the caller may change it
         if array.shape[1:] != handle.value.shape:

@@ -155,7 +155,7 @@ class Structure:
         limit = max(enough, floor)
         if enough > 0.0 and cosine > limit:
             return Offset(cosine, True, True)
-        local = Local(program, lin, self.variable, sizes, enough)
+        local = Local(program, lin, self.variable, sizes, enough, (floor * size) ** 2)
         with program.systems.borrowed() as own:
             bound = (limit * size) ** 2 if enough > 0.0 else np.inf
             energy, determined = _energy(program, lin, bound, lent, own, local)
@@ -175,11 +175,17 @@ class Local:
 
     Attributes:
         worst: largest ratio of a variable that does not pass; zero where all do.
-        sizes: see :meth:`__init__`.
+        sizes, noise: see :meth:`__init__`.
     """
 
     def __init__(
-        self, program: CompiledProblem, lin: Linearization, variable: IntArray, sizes: Array, enough: float
+        self,
+        program: CompiledProblem,
+        lin: Linearization,
+        variable: IntArray,
+        sizes: Array,
+        enough: float,
+        noise: float,
     ) -> None:
         """Nothing is computed until there is a step.
 
@@ -189,8 +195,10 @@ class Local:
             variable: (width,) the variable of every tangent coordinate.
             sizes: (n,) how large the numbers are, or were at the guess, that each unknown stands for.
             enough: the tolerance; zero for no test.
+            noise: square of the rounding errors of r.
         """
         self._program, self._lin, self._variable, self.sizes, self._enough = program, lin, variable, sizes, enough
+        self.noise = noise
         self.worst = 0.0
 
     def settled(self, step: Array, missing: Array | None = None) -> bool:
@@ -252,7 +260,7 @@ def _energy(
     bent = _bent(program, lin, own)
     if bent is not None:
         return _promised(bent, gradient, local), True
-    return _beside(program, lin, own, free, local.sizes, energy) if energy <= limit else (energy, False)
+    return _beside(program, lin, own, free, local, energy) if energy <= limit else (energy, False)
 
 
 def _free_direction(solver: Factorization, unit: Array) -> Array:
@@ -265,15 +273,15 @@ def _free_direction(solver: Factorization, unit: Array) -> Array:
 
 
 def _beside(
-    program: CompiledProblem, lin: Linearization, solver: Factorization, free: Array, sizes: Array, energy: float
+    program: CompiledProblem, lin: Linearization, solver: Factorization, free: Array, local: Local, energy: float
 ) -> tuple[float, bool]:
     """Energy, infinite at a maximum or saddle, and whether the Hessian is regular a little further along ``free``."""
-    step = ASIDE * (sizes[np.abs(free) > 0.1].max() or 1.0) * free
+    step = ASIDE * (local.sizes[np.abs(free) > 0.1].max() or 1.0) * free
     sides = [program.linearize(program.retract(lin.values, sign * step)) for sign in (1.0, -1.0)]
     for side in sides:
         change = side.residual - lin.residual
         before = lin.residual[change != 0.0]  # however large the others are
-        if inner(change, side.residual + lin.residual) < -LESS * inner(before, before):
+        if inner(change, side.residual + lin.residual) < -max(LESS * inner(before, before), local.noise):
             return np.inf, True
     entries = sides[0].hessian
     regular = solver.factor(entries) and _sound(solver, entries[program.normal.diagonal], program.size)

@@ -13,7 +13,7 @@ from weakref import ref
 
 import numpy as np
 
-from unifg.errors import GraphError, UnifgError
+from unifg.errors import GraphError, UnifgError, require_kinds
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
@@ -377,8 +377,8 @@ class Solution:
                 scaled multiplier both below 10 times the root of the tolerance), the reduced Hessian is singular or
                 indefinite, multipliers are not unique, or a function has a kink.
         """
-        asked = [of] if isinstance(of, Variable | str) else of
-        by = [wrt] if isinstance(wrt, Data | Variable | str) else wrt
+        asked = [of] if isinstance(of, str) or not isinstance(of, Sequence) else of
+        by = [wrt] if isinstance(wrt, str) or not isinstance(wrt, Sequence) else wrt
         return self._sensitivities.matrix([self._part(part) for part in asked], by)
 
     def gradient(self, of: Weights | str, wrt: Wrt) -> Array:
@@ -397,6 +397,8 @@ class Solution:
             GraphError: as :meth:`sensitivity`.
         """
         weights = {of: 1.0} if isinstance(of, str) else of
+        if not isinstance(weights, Mapping):
+            raise GraphError(f'gradient of what? "cost", or {{x: weights}}, found {f"{of!r}"[:80]}')
         parts = {self._part(part): doubles(f"gradient: weights of {part!r}", own) for part, own in weights.items()}
         return self._sensitivities.gradient(parts, wrt)
 
@@ -516,6 +518,7 @@ class Solution:
         Raises:
             GraphError: for a solution that was not returned: another one has taken its place, and its data.
         """
+        require_kinds("verify", GraphError, Solution.verify.__annotations__, {"tolerance": tolerance})
         return verified(*self._claims("verify"), tolerance)
 
     def save(self, path: str | PathLike[str]) -> None:

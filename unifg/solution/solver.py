@@ -8,7 +8,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, TypeAlias
 from weakref import ReferenceType, ref
@@ -16,7 +16,7 @@ from weakref import ReferenceType, ref
 import numpy as np
 
 from unifg.codegen.inner import inner
-from unifg.errors import BackendError, GraphError
+from unifg.errors import BackendError, GraphError, require_kinds
 from unifg.factors.steps import EPSILON
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
@@ -160,6 +160,8 @@ class Solver(Backend):
 
     def __post_init__(self) -> None:
         """Refuse options no solve could honour."""
+        kinds = {field.name: field.type for field in fields(self)}
+        require_kinds(self.name, BackendError, kinds, vars(self))
         if not self.tolerance > 0.0:
             raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
         if self.feasibility_tolerance is not None and not self.feasibility_tolerance > 0.0:
@@ -763,6 +765,9 @@ class Prepared:
         Raises:
             GraphError: numbers of instances or shapes do not fit, and as of :meth:`solve`.
         """
+        require_kinds("solve_many", GraphError, Prepared.solve_many.__annotations__, {"threads": threads})
+        if threads < 1:
+            raise GraphError(f"solve_many: threads must be at least 1, found {threads}")
         return solve_batch(self, guesses, data or {}, threads)
 
     def export(self, folder: str | Path, *, name: str = "solver", target: str = "") -> list[Path]:

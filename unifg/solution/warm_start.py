@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.errors import GraphError
+from unifg.errors import GraphError, require_kinds
 from unifg.locks import ReentrantLock
 from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Family
@@ -32,8 +32,12 @@ class Shifts:
         Raises:
             GraphError: when a family is of another graph, or ``by`` is negative.
         """
+        for family in families:
+            if not isinstance(family, Family):
+                raise GraphError(f"shifted takes whole families, as shifted(x, u), found {family!r}")
         known = self._known.get((families, by))
         if known is None:
+            require_kinds("shifted", GraphError, Shifts.__call__.__annotations__, {"by": by})
             if by < 0:
                 raise GraphError(f"shifted: by must not be negative, found {by}")
             known = self._stored(families, by), self._rows(families, by)
