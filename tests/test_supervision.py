@@ -14,13 +14,17 @@ import numpy as np
 import pytest
 
 import maps
+from unifg.files.ros_map import save_map
 from unifg.models import quadrotor
 from unifg.models.footprint import Body
 from unifg.scenarios.flight import Flight, FlightSettings
+from unifg.scenarios.ground.creeping import Creeping
+from unifg.scenarios.ground.drive_pilot import make_pilot
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
 from unifg.scenarios.ground.motor_lag import MotorLag
-from unifg.scenarios.ground.relocalise import PORTION, Found, Relocaliser
+from unifg.scenarios.ground.relocalise import BELIEVED, PORTION, Found, Relocaliser
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.flight_log import FlightLog
@@ -29,6 +33,7 @@ from unifg.scenarios.monitoring.supervisor import RISE, STEADY, Health, Ramp, Su
 from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.navigation import Episode, NavigationSettings, askew
 from unifg.scenarios.perception.belief import Belief, Landmarks
+from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.line_tracker import LineTracker
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.scenarios.quadrotor.flight_watch import FlightWatch
@@ -344,6 +349,84 @@ def test_a_scan_of_another_building_is_found_nowhere() -> None:
     where = World(other, (10.8, 17.0, 0.0))
     found, _ = searched(Relocaliser(occupancy, field, 0.17), where.scan())
     assert found.pose is None and found.cause
+
+
+def cells(begin: float, end: float) -> slice:
+    """Cells of a map from a place to another [m]."""
+    return slice(round(begin / maps.CELL), round(end / maps.CELL))
+
+
+SHELVES = [(cells(y, y + 0.6), cells(4.0, 22.0)) for y in (2.0, 4.4)]
+HALL = maps.walled(
+    26.0, 8.0, blocks=[*SHELVES, (cells(5.0, 6.0), cells(0.0, 1.0)), (cells(1.0, 3.0), cells(24.5, 26.0))]
+)
+
+
+def test_places_in_an_aisle_look_alike_and_those_at_its_end_do_not() -> None:
+    search = Relocaliser(HALL, maps.field(HALL), 0.34)
+    inside, _ = searched(search, World(HALL, (13.0, 3.5, 0.3)).scan())
+    assert inside.pose is None and inside.cause == "several places on the map look alike"
+    assert len(inside.rivals) > 1 and inside.share > BELIEVED
+    outside, _ = searched(search, World(HALL, (23.2, 3.9, -0.4)).scan())
+    assert outside.pose is not None and len(outside.rivals) == 1
+    np.testing.assert_allclose(outside.pose, [23.2, 3.9, -0.4], atol=0.05)
+
+
+def test_creeping_goes_straight_on_and_turns_to_where_there_is_room() -> None:
+    creeping, bound = Creeping(), 0.34
+    speed, turn = creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)
+    assert speed > 0.0 and abs(turn) < 0.1, "along the aisle"
+    corner = World(HALL, (25.0, 7.2, 0.0)).scan()  # walls ahead and to the left
+    speed, turn = creeping.control(corner, bound)
+    assert speed == 0.0 and turn < -0.3
+    creeping.moved(np.array([0.0, -1.5]))
+    assert creeping.control(World(HALL, (25.0, 7.2, -1.5)).scan(), bound)[0] > 0.0, "turned, it goes on"
+    _, before = creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)
+    creeping.blocked()
+    assert creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)[1] > before
+    assert not creeping.ended
+    creeping.moved(np.array([-30.0, 0.0]))
+    assert creeping.ended, "a way that never ends is no way"
+
+
+@pytest.mark.product(1, of="drives and flights")
+def test_a_robot_lost_in_an_aisle_creeps_to_its_end_and_finds_itself(tmp_path: Path) -> None:
+    save_map(tmp_path / "hall.yaml", HALL)
+    settings = NavigationSettings(
+        map=tmp_path / "hall.yaml",
+        start=(19.5, 3.5, 0.0),
+        believed=(2.0, 6.5, 0.0),
+        goals=((2.0, 1.0, 3.0),),
+        obstacles=0,
+    )
+    log = Episode(settings).run(maps.stop_after(150))
+    away = np.hypot(*(log.estimate - log.true_pose)[:, :2].T)
+    creeping = np.array([status == "creeping" for status in log.status])
+    assert away[0] > 10.0 and away[-1] < 0.05 and log.health[-1] == "ok" and log.collisions == 0
+    assert 40 < creeping.sum() < 120 and np.ptp(log.true_pose[creeping, 0]) > 1.5
+    assert np.abs(log.control[creeping, 0]).max() < 0.31 and not log.emergency[creeping].any()
+
+
+@pytest.mark.product(1, of="drives and flights")
+def test_a_robot_whose_scan_fits_another_place_better_is_lost() -> None:
+    """Half of the beams end where the map says, as among people, too: that alone leaves it driving slowly."""
+    field, where = maps.field(HALL), np.array([22.6, 3.5, -2.5])
+    believed, settings = np.array([10.8, 0.99, 0.72]), ControllerSettings()
+    sigma, ramp = np.array([0.02, 0.02, 0.01]), RAMPS["elsewhere"]
+    sample = World(HALL, tuple(where.tolist())).scan()
+    hidden = np.where(np.arange(BEAMS) % 180 < 80, np.minimum(sample.ranges, 0.9), sample.ranges)
+    for scan, pose, elsewhere in ((sample, believed, True), (replace(sample, ranges=hidden), where, False)):
+        pilot = make_pilot("sequential", HALL, field, "ipm", settings, pose, sigma, BEAMS)
+        pilot.share = explained(field, scan, pose).share
+        assert 1.0 - pilot.share < RAMPS["unexplained"].lost and ramp.share(pilot._elsewhere) == 1.0
+        for _ in range(100):
+            pilot._find_again(scan, np.zeros(2))
+            if pilot._elsewhere:
+                break
+        assert (pilot._elsewhere > ramp.lost) == elsewhere, pilot._elsewhere
+        pilot.share = 1.0
+        pilot._find_again(scan, np.zeros(2))
+        assert pilot._elsewhere == 0.0, "a scan that fits leaves nothing to look for"
 
 
 def test_a_map_put_askew_leaves_the_robot_in_the_open() -> None:

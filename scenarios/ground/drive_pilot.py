@@ -231,7 +231,8 @@ class Pilot(Generic[PlannerT]):
     def _calibrate(self, scan: Scan | None, predicted: Array, wheels: Array | None) -> dict[str, float]:
         """Signals of the calibration, after a scan that was put right, and a pose (3,) predicted by the wheels."""
         known, spread = self.calibration, np.sqrt(np.diag(self.estimator.covariance))
-        sure = not self.estimator.refused and bool((spread < DECIMETRE).all())
+        placed = self.verdict.health is not Health.LOST and not self.estimator.refused
+        sure = placed and bool((spread < DECIMETRE).all())
         trusted = "wheels" not in self.validator.refused and not self.recalibrated
         known.note(scan if sure else None, predicted, self.estimator.pose, wheels if trusted else None)
         mount, bias = np.abs(known.used).tolist()
@@ -316,7 +317,7 @@ class Pilot(Generic[PlannerT]):
         if not search.searching and not self._pause:
             search.begin(scan)
             self._moved = np.zeros(3)
-        result = search.search(PORTION if lost else BESIDE)
+        result = search.search(PORTION if lost and not self.creeping else BESIDE)
         if result is None:
             return
         self._elsewhere = result.share - self.share if result.share >= BELIEVED and not lost else 0.0

@@ -64,7 +64,7 @@ class Relocaliser:
 
     def __init__(self, occupancy: OccupancyMap, distance_map: DistanceMap, robot_radius: float) -> None:
         """List the places where a robot can stand."""
-        self._map = distance_map
+        self._map, self._radius = distance_map, robot_radius
         stride = max(1, round(SPACING / occupancy.resolution))
         cells = np.argwhere(occupancy.free[::stride, ::stride])[:, ::-1].astype(np.float64) * stride
         places = occupancy.grid_to_world(cells + 0.5)
@@ -110,7 +110,8 @@ class Relocaliser:
                 continue
             tried.append(pose)
             refined = refine(self._map, scan, pose)
-            if not any(_same(refined, other) for _, other in kept):
+            room = self._map.distance(refined[None, :2])[0] > self._radius - END  # neither in a wall nor off the map
+            if room and not any(_same(refined, other) for _, other in kept):
                 kept.append((fit(self._map, scan, refined), refined))
         kept.sort(key=lambda row: -row[0])
         share, best = kept[0] if kept else (0.0, None)
