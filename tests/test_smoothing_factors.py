@@ -348,7 +348,8 @@ def test_a_statement_without_active_factors_states_nothing() -> None:
     smoother = Incremental()
     x = smoother.variables("x", fg.Rn(2))
     smoother.minimize(fg.prior, x[np.arange(2)], fg.each(np.eye(2)), sigma=fg.each(np.ones((2, 2))))
-    smoother.minimize(fg.prior, x[np.arange(2)], np.ones(2), active=np.zeros(2, dtype=bool))
+    for limit in (None, 3.0):
+        smoother.minimize(fg.prior, x[np.arange(2)], np.ones(2), active=np.zeros(2, dtype=bool), revocable=limit)
     smoother.update({x: np.zeros((2, 2))})
     np.testing.assert_allclose(smoother.estimate(x), np.eye(2), atol=1e-12)
 

@@ -196,8 +196,7 @@ class Smoother:
                     term=staged.name,
                     family=family.name,
                 )
-        if len(staged.data):  # some factor is active
-            self._staged.append(staged)
+        self._staged.append(staged)
 
     def minimize_scalar(self, *arguments: Any, **options: Any) -> NoReturn:
         """Refused: see the message."""
@@ -397,7 +396,7 @@ class Smoother:
 
     def _admit(self, new: Mapping[GrowingFamily, int]) -> None:
         """Check that all variables of staged factors have values, or get them now."""
-        for item in list(self._staged):
+        for item in [item for item in self._staged if len(item.data)]:  # others have no active factor
             pairs, late = list(zip(item.families, item.members, strict=True)), False
             for family, members in pairs:
                 row, single = family.lowest(members), len(members) == 1
