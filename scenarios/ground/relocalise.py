@@ -8,6 +8,7 @@ long: large ones while the robot rests, small ones while it drives and doubts wh
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +30,7 @@ BEAMS = 45  # of the scan that are held against the map
 CUT = 0.5  # [m]; a beam farther from everything costs no more
 PORTION, BESIDE = 1500, 150  # places of one tick: at rest, and beside a drive
 CANDIDATES = 24  # poses that are refined
+AS_LONG = 60  # places that take as long as one refinement
 SEPARATE = 0.5  # [m] or [rad], apart from which two candidates are two places
 STEPS = 12  # of the refinement
 END = 0.08  # [m] from a surface, within which a beam ends as it should
@@ -75,7 +77,10 @@ class Relocaliser:
     def begin(self, scan: Scan | None) -> None:
         """Search anew, with a scan; None for not at all."""
         self._scan, self._at = scan, 0
-        self._cost, self._heading = np.full(len(self.places), np.inf), np.zeros(len(self.places))
+        if scan is not None:
+            self._cost, self._heading = np.full(len(self.places), np.inf), np.zeros(len(self.places))
+            self._apart: list[Array] | None = None
+            self._kept: list[tuple[float, Array]] = []
 
     @property
     def searching(self) -> bool:
@@ -84,44 +89,51 @@ class Relocaliser:
 
     def search(self, portion: int = PORTION) -> Found | None:
         """Go on with the search, by a number of places; what it has found, once it is at its end."""
-        if self._scan is None:
+        scan = self._scan
+        if scan is None:
             return None
-        chosen = slice(self._at, self._at + portion)
-        tips = _tips(self._scan)
-        best = np.empty((len(self.places[chosen]), 2))
-        _try_all(self._map.table, self.places[chosen], tips, best)
-        self._cost[chosen], self._heading[chosen] = best[:, 0], FAN[best[:, 1].astype(np.intp)]
-        self._at += portion
         if self._at < len(self.places):
+            chosen = slice(self._at, self._at + portion)
+            best = np.empty((len(self.places[chosen]), 2))
+            _try_all(self._map.table, self.places[chosen], _tips(scan), best)
+            self._cost[chosen], self._heading[chosen] = best[:, 0], FAN[best[:, 1].astype(np.intp)]
+            self._at += portion
+            if self._at < len(self.places):
+                return None
+        if self._apart is None:
+            self._apart = self._best_apart()
+        for _ in range(min(portion // AS_LONG, len(self._apart))):
+            pose = refine(self._map, scan, self._apart.pop(0))
+            room = self._map.distance(pose[None, :2])[0] > self._radius - END  # neither in a wall nor off the map
+            if room and not any(_same(pose, other) for _, other in self._kept):
+                self._kept.append((fit(self._map, scan, pose), pose))
+        if self._apart:
             return None
-        scan, self._scan = self._scan, None
-        return self._decide(scan)
+        self._scan = None
+        return _decided(self._kept)
 
-    def _decide(self, scan: Scan) -> Found:
+    def _best_apart(self) -> list[Array]:
+        """Poses (3,) that are to be refined, the best first, each another place."""
         order = np.argsort(self._cost, kind="stable")[: 20 * CANDIDATES]
-        order = order[np.isfinite(self._cost[order])]
-        kept: list[tuple[float, Array]] = []
-        tried: list[Array] = []
-        for index in order.tolist():
+        found: list[Array] = []
+        for index in order[np.isfinite(self._cost[order])].tolist():
             pose = np.array([*self.places[index], self._heading[index]])
-            if len(tried) >= CANDIDATES:
-                break
-            if any(_same(pose, other) for other in tried):
-                continue
-            tried.append(pose)
-            refined = refine(self._map, scan, pose)
-            room = self._map.distance(refined[None, :2])[0] > self._radius - END  # neither in a wall nor off the map
-            if room and not any(_same(refined, other) for _, other in kept):
-                kept.append((fit(self._map, scan, refined), refined))
-        kept.sort(key=lambda row: -row[0])
-        share, best = kept[0] if kept else (0.0, None)
-        rivals = tuple(pose for other, pose in kept if other > share - CLEARLY)
-        cause = first_true(
-            (best is None, "no place on the map"),
-            (share < BELIEVED, "no place on the map fits the scan"),
-            (len(rivals) > 1, "several places on the map look alike"),
-        )
-        return Found(None if cause else best, share, cause, rivals if share >= BELIEVED else ())
+            if len(found) < CANDIDATES and not any(_same(pose, other) for other in found):
+                found.append(pose)
+        return found
+
+
+def _decided(fitting: Sequence[tuple[float, Array]]) -> Found:
+    """Result of refined poses (3,), each after the share of the beams that fit there."""
+    kept = sorted(fitting, key=lambda row: -row[0])
+    share, best = kept[0] if kept else (0.0, None)
+    rivals = tuple(pose for other, pose in kept if other > share - CLEARLY)
+    cause = first_true(
+        (best is None, "no place on the map"),
+        (share < BELIEVED, "no place on the map fits the scan"),
+        (len(rivals) > 1, "several places on the map look alike"),
+    )
+    return Found(None if cause else best, share, cause, rivals if share >= BELIEVED else ())
 
 
 def fit(distance_map: DistanceMap, scan: Scan, pose: Array) -> float:

@@ -49,7 +49,8 @@ class StatedKernel(Kernel):
         with generating:
             known: dict[tuple[Argument, ...], Kernel] = self.__dict__.setdefault("_shaped", {})
             if stated not in known:
-                shapes = [a for own, a in zip(self.arguments, stated, strict=True) if isinstance(own, int | tuple)]
+                pairs = zip(self.arguments, stated, strict=True)
+                shapes = [a for own, a in pairs if isinstance(own, int | tuple) and isinstance(a, tuple)]
                 known[stated] = replace(self, arguments=stated, rows=self.size(shapes))
             return known[stated]
 
