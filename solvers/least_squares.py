@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from unifg.codegen.inner import inner
-from unifg.errors import BackendError, require_kinds
+from unifg.errors import BackendError
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.solver import Solver, SolveState
@@ -60,7 +60,6 @@ class LeastSquares(Solver):
             if self.tolerance != "map":
                 raise BackendError(f"{self.name}: tolerance is a number or 'map', found {self.tolerance!r}")
             self.tolerance = MAP
-        require_kinds(self.name, BackendError, {"tolerance": "float"}, {"tolerance": self.tolerance})
         super().__post_init__()
 
     def workspace(self, program: CompiledProblem) -> Primal:

@@ -42,7 +42,7 @@ def compare(
     Raises:
         GraphError: naming term, argument, both declarations and a remedy.
     """
-    if not any(quantity_of(argument).declared for argument in arguments):
+    if all(quantity_of(argument) == NOTHING for argument in arguments):
         return
     wanted = [taken(text or "") for text in takes] + [NOTHING] * (len(arguments) - len(takes))
     alike: tuple[tuple[str, ...], str] | None = None

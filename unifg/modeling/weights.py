@@ -41,11 +41,12 @@ def check_weights(
         GraphError: naming the term, when one of them has another shape, holds something else than real numbers, or is
             no standard deviation or information matrix.
     """
-    sigma, information = undeclared(name, "sigma", sigma, 2), undeclared(name, "information", information, 3)
     if sigma is not None:
+        sigma = undeclared(name, "sigma", sigma, 2)
         sigma = sigma if isinstance(sigma, Data) else np.array(doubles(f"term '{name}': sigma", sigma, term=name))
         reciprocals(name, _present(sigma), count, size)
     if information is not None:
+        information = undeclared(name, "information", information, 3)
         if not isinstance(information, Data):
             information = np.array(doubles(f"term '{name}': information", information, term=name))
         square_roots(name, _present(information), count, size)

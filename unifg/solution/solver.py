@@ -160,7 +160,7 @@ class Solver(Backend):
 
     def __post_init__(self) -> None:
         """Refuse options no solve could honour."""
-        kinds = {field.name: field.type for field in fields(self)}
+        kinds = {field.name: field.type for field in fields(self)} | {"tolerance": "float"}
         require_kinds(self.name, BackendError, kinds, vars(self))
         if not self.tolerance > 0.0:
             raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
