@@ -323,14 +323,14 @@ def test_one_variable_is_seen_by_all_factors_of_a_statement(kind: str) -> None:
     ahead = fg.SE2.between(seen_from, truth) + 0.05 * generator.standard_normal((4, 3))
     points = seen_from[:, :2]
     measured = seen(truth, points, 0.0) + 0.05 * generator.standard_normal((4, 2))
-    function = {"compiled": fg.residual(seen_once, rows=2), "traced": seen, "between": fg.between}.get(
+    function: Any = {"compiled": fg.residual(seen_once, rows=2), "traced": seen, "between": fg.between}.get(
         kind, fg.residual(seen, derivatives="differences")
     )
     found: list[Array] = []
     for made in (fg.Graph(), Incremental(relinearize=0.0)):
-        x = made.variables("x", fg.SE2, 1) if isinstance(made, fg.Graph) else made.variables("x", fg.SE2)
+        x: Any = made.variables("x", fg.SE2, 1) if isinstance(made, fg.Graph) else made.variables("x", fg.SE2)
         made.minimize(fg.prior, x[0], np.zeros(3), sigma=1.0)
-        arguments = (x[0], fg.each(points), fg.each(measured))
+        arguments: tuple[Any, ...] = (x[0], fg.each(points), fg.each(measured))
         if kind == "between":
             arguments = (fg.each(seen_from), x[0], fg.each(ahead))
         made.minimize(function, *arguments, sigma=0.5, active=np.arange(4) != 2)

@@ -28,7 +28,7 @@ from unifg.modeling.probing import rows_of
 from unifg.modeling.quantities import quantity
 from unifg.modeling.soft import Soft, slack_of
 from unifg.modeling.summary import inventory
-from unifg.modeling.terms import Constraint, Cost, Fix, Parameter, ScalarCost, Term, prepare_arguments
+from unifg.modeling.terms import Constraint, Cost, Fix, ParameterLike, ScalarCost, Term, prepare_arguments
 from unifg.modeling.units import SAME as ALIKE
 from unifg.modeling.units import compare
 from unifg.modeling.variables import (
@@ -172,8 +172,8 @@ class Model:
         self,
         function: AnyResidual,
         *arguments: Any,
-        sigma: Parameter | None = None,
-        information: Parameter | None = None,
+        sigma: ParameterLike | None = None,
+        information: ParameterLike | None = None,
         robust: Loss | None = None,
         active: Any = None,
         name: str | None = None,
@@ -211,10 +211,10 @@ class Model:
         self,
         function: AnyResidual,
         *arguments: Any,
-        lower: Parameter = SAME,
-        upper: Parameter = SAME,
+        lower: ParameterLike = SAME,
+        upper: ParameterLike = SAME,
         active: Any = None,
-        soft: Soft | Parameter | None = None,
+        soft: Soft | ParameterLike | None = None,
         name: str | None = None,
     ) -> str:
         """Require ``lower <= g <= upper``; equal limits make an equality, a limit that is not given is none.
@@ -242,9 +242,9 @@ class Model:
         self,
         variable: Variable,
         *,
-        lower: Parameter = SAME,
-        upper: Parameter = SAME,
-        soft: Soft | Parameter | None = None,
+        lower: ParameterLike = SAME,
+        upper: ParameterLike = SAME,
+        soft: Soft | ParameterLike | None = None,
         name: str | None = None,
     ) -> str:
         """Limit Rn variables, or Rn components of a product, entry by entry; an infinite limit is none.
@@ -257,7 +257,7 @@ class Model:
         """
         return self._add(self._bound(name, (variable,), lower, upper, soft))
 
-    def fix(self, variable: Variable, value: ArrayLike | Data, *, name: str | None = None) -> str:
+    def fix(self, variable: Variable, value: ParameterLike, *, name: str | None = None) -> str:
         """Give variables a value; they leave the unknowns and ``dual(name)`` is their reaction.
 
         Args:
@@ -307,13 +307,13 @@ class Model:
         self,
         name: str,
         *stated: Any,
-        sigma: Parameter | None = SAME,
-        information: Parameter | None = SAME,
+        sigma: ParameterLike | None = SAME,
+        information: ParameterLike | None = SAME,
         robust: Loss | None = SAME,
         active: Any = SAME,
-        lower: Parameter = SAME,
-        upper: Parameter = SAME,
-        soft: Soft | Parameter | None = SAME,
+        lower: ParameterLike = SAME,
+        upper: ParameterLike = SAME,
+        soft: Soft | ParameterLike | None = SAME,
     ) -> None:
         """State a term anew in its place, under its name and of its kind; what is not given stays as it was.
 
@@ -415,8 +415,8 @@ class Model:
         name: str | None,
         function: AnyResidual,
         arguments: tuple[Any, ...],
-        sigma: Parameter | None,
-        information: Parameter | None,
+        sigma: ParameterLike | None,
+        information: ParameterLike | None,
         robust: Loss | None,
         active: Any,
         replaced: bool = False,
@@ -453,10 +453,10 @@ class Model:
         name: str | None,
         function: AnyResidual,
         arguments: tuple[Any, ...],
-        lower: Parameter,
-        upper: Parameter,
+        lower: ParameterLike,
+        upper: ParameterLike,
         active: Any,
-        soft: Soft | Parameter | None,
+        soft: Soft | ParameterLike | None,
         replaced: bool = False,
         default: str = "",
     ) -> Constraint:
@@ -478,9 +478,9 @@ class Model:
         self,
         name: str | None,
         stated: tuple[Any, ...],
-        lower: Parameter,
-        upper: Parameter,
-        soft: Soft | Parameter | None,
+        lower: ParameterLike,
+        upper: ParameterLike,
+        soft: Soft | ParameterLike | None,
         replaced: bool = False,
     ) -> Constraint:
         selection = _one_variable("a bound", stated, name)
@@ -644,7 +644,7 @@ def _require_name(what: str, name: Any) -> None:
         raise GraphError(f"the name of a {what} must be a text that is not empty, found {name!r}")
 
 
-def _given(what: str, name: str, lower: Parameter, upper: Parameter) -> tuple[Parameter, Parameter]:
+def _given(what: str, name: str, lower: ParameterLike, upper: ParameterLike) -> tuple[ParameterLike, ParameterLike]:
     """Limits with infinity for the one that is not given; that neither is, is a mistake."""
     if lower is SAME and upper is SAME:
         raise GraphError(f"term '{name}': {what} without limits says nothing: give lower=, upper= or both", term=name)

@@ -11,7 +11,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.factors.whitening import reciprocals, square_roots
 from unifg.modeling.duplicates import doubles
-from unifg.modeling.terms import Parameter
+from unifg.modeling.terms import Parameter, ParameterLike
 from unifg.modeling.variables import Data, as_selection, is_variable, undeclared
 from unifg.typing import Array
 
@@ -33,7 +33,7 @@ def placed(name: str | None, arguments: Sequence[Any]) -> Iterator[None]:
 
 
 def check_weights(
-    name: str, sigma: Parameter | None, information: Parameter | None, count: int, size: int
+    name: str, sigma: ParameterLike | None, information: ParameterLike | None, count: int, size: int
 ) -> tuple[Parameter | None, Parameter | None]:
     """Sigma and information as doubles, data as they are.
 
@@ -53,7 +53,9 @@ def check_weights(
     return sigma, information
 
 
-def check_limits(name: str, lower: Parameter, upper: Parameter, count: int, size: int) -> tuple[Parameter, Parameter]:
+def check_limits(
+    name: str, lower: ParameterLike, upper: ParameterLike, count: int, size: int
+) -> tuple[Parameter, Parameter]:
     """Limits as doubles, data as they are.
 
     Raises:

@@ -62,7 +62,10 @@ def expanded(term: Constraint, slack: Slack) -> list[Term]:
         )
     ]
     width = s.manifold.dim
-    linear_price, both = isinstance(soft.linear, Data) or bool(np.any(soft.linear)), slack.sides == UPPER | LOWER
+    linear_price, both = (
+        isinstance(soft.linear, Data) or bool(np.asarray(soft.linear).any()),
+        slack.sides == UPPER | LOWER,
+    )
     if linear_price or both:  # with a square as the price of one side, a negative slack never pays
         none, above = np.asarray(0.0), np.asarray(np.inf)
         made.append(
@@ -73,7 +76,7 @@ def expanded(term: Constraint, slack: Slack) -> list[Term]:
         linear, each = _argument(soft.linear)
         priced = residual(weigh, name=weigh.__name__)
         made.append(ScalarCost(f"{name}, linear cost", priced, (s, linear), None, count, 1, rows=(None, each)))
-    if isinstance(soft.quadratic, Data) or np.any(soft.quadratic):
+    if isinstance(soft.quadratic, Data) or np.asarray(soft.quadratic).any():
         root = _root_of_two if both else _root
         quadratic, each = _argument(soft.quadratic)
         squared = residual(root, name=root.__name__)

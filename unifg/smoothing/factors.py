@@ -27,7 +27,7 @@ from unifg.modeling.elements import elements_of, nearest, on_manifolds, quaterni
 from unifg.modeling.factors import prior
 from unifg.modeling.model import AnyResidual, complete
 from unifg.modeling.probing import rows_of
-from unifg.modeling.terms import Cost, Parameter, prepare_arguments
+from unifg.modeling.terms import Cost, Parameter, ParameterLike, prepare_arguments
 from unifg.modeling.variables import Data, Family, Selection, undeclared
 from unifg.problem.columns import Columns
 from unifg.problem.term import CompiledTerm
@@ -109,8 +109,8 @@ class Types:
         self,
         function: AnyResidual,
         arguments: tuple[Any, ...],
-        sigma: Parameter | None,
-        information: Parameter | None,
+        sigma: ParameterLike | None,
+        information: ParameterLike | None,
         robust: Loss | None,
         active: Any,
         given: str | None,
@@ -163,8 +163,8 @@ class Types:
         self,
         function: AnyResidual,
         arguments: tuple[Any, ...],
-        sigma: Parameter | None,
-        information: Parameter | None,
+        sigma: ParameterLike | None,
+        information: ParameterLike | None,
         robust: Loss | None,
         active: Any,
         given: str | None,
@@ -174,7 +174,7 @@ class Types:
         name = given or wrapped.name
         if sigma is not None and information is not None:
             raise GraphError(f"term '{name}': give sigma or information, not both", term=name)
-        sigma, information = undeclared(name, "sigma", sigma, 2), undeclared(name, "information", information, 3)
+        stated: tuple[Any, Any] = undeclared(name, "sigma", sigma, 2), undeclared(name, "information", information, 3)
         normal, rows, active, count = prepare_arguments(name, arguments, active)
         normal = on_manifolds(name, wrapped, normal, active)
         selections = [argument for argument in normal if isinstance(argument, Selection)]
@@ -193,8 +193,8 @@ class Types:
         known = self._kernels.get(key) if form is not None else None
         if known is None or (known[2] is not None and known[2].outdated):
             size = rows_of(name, wrapped, normal, count)
-            stated = _by_itself(normal)
-            term = _compiled(Cost(name, wrapped, stated, None, count, size, sigma, information, robust, rows=rows))
+            alone = _by_itself(normal)
+            term = _compiled(Cost(name, wrapped, alone, None, count, size, *stated, robust, rows=rows))
             kernel = term.kernel
             if kernel is not None and len(kernel.manifolds) > len(selections):
                 kernel = kernel.knowing([k for k, a in enumerate(normal) if not isinstance(a, Selection)])
@@ -224,7 +224,7 @@ class Types:
             raise GraphError(f"term '{name}': {error}", term=name) from None
         shapes = tuple([parameter.shape[1:] for parameter in parameters])
         size = kernel.size(shapes)
-        weights = _numbers(name, "sigma", sigma), _numbers(name, "information", information)
+        weights = _numbers(name, "sigma", stated[0]), _numbers(name, "information", stated[1])
         whitening, whitener = whitener_of(name, *weights, count, size)
         data = side_by_side([*parameters, whitener.reshape(len(whitener), -1)], count)
         finite = np.isfinite(data).all(axis=1)

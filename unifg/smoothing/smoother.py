@@ -15,7 +15,7 @@ from unifg.lie import Manifold
 from unifg.locks import ReentrantLock, synchronized
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.model import AnyResidual
-from unifg.modeling.terms import Parameter
+from unifg.modeling.terms import ParameterLike
 from unifg.modeling.variables import Data, Selection, Variable, as_selection
 from unifg.smoothing.batched import Batch, Batches, move_by_python
 from unifg.smoothing.factors import Parts, Staged, Types
@@ -166,8 +166,8 @@ class Smoother:
         self,
         function: AnyResidual,
         *arguments: Any,
-        sigma: Parameter | None = None,
-        information: Parameter | None = None,
+        sigma: ParameterLike | None = None,
+        information: ParameterLike | None = None,
         robust: Loss | None = None,
         active: Any = None,
         name: str | None = None,
