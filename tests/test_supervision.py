@@ -18,8 +18,9 @@ from unifg.files.ros_map import save_map
 from unifg.models import quadrotor
 from unifg.models.footprint import Body
 from unifg.scenarios.flight import Flight, FlightSettings
+from unifg.scenarios.ground.calibration import BIAS
 from unifg.scenarios.ground.creeping import Creeping
-from unifg.scenarios.ground.drive_pilot import make_pilot
+from unifg.scenarios.ground.drive_pilot import DOUBTFUL, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
@@ -29,7 +30,7 @@ from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics
-from unifg.scenarios.monitoring.supervisor import RISE, STEADY, Health, Ramp, Supervisor
+from unifg.scenarios.monitoring.supervisor import RISE, STEADY, Health, HealthReport, Ramp, Supervisor
 from unifg.scenarios.monitoring.validation import Validator
 from unifg.scenarios.navigation import Episode, NavigationSettings, askew
 from unifg.scenarios.perception.belief import Belief, Landmarks
@@ -372,6 +373,58 @@ def test_places_in_an_aisle_look_alike_and_those_at_its_end_do_not() -> None:
     np.testing.assert_allclose(outside.pose, [23.2, 3.9, -0.4], atol=0.05)
 
 
+def among_people(sample: Scan) -> Scan:
+    """Somebody stands to both sides."""
+    return replace(sample, ranges=np.where(np.arange(BEAMS) % 180 < 80, np.minimum(sample.ranges, 0.9), sample.ranges))
+
+
+def test_no_place_is_found_in_walls_or_off_the_map() -> None:
+    """Beams that end 0.9 m away fit walls from behind, too."""
+    sample = among_people(World(HALL, (22.6, 3.5, -2.5)).scan())
+    found, _ = searched(Relocaliser(HALL, maps.field(HALL), 0.17), sample)
+    assert found.pose is None and found.cause == "no place on the map fits the scan" and found.share < 0.8
+
+
+class Finding:
+    """A search whose result is known."""
+
+    def __init__(self, *results: Found | None) -> None:
+        self.results, self.searching = list(results), True
+
+    def begin(self, scan: Scan | None) -> None:
+        """There is nothing to begin."""
+
+    def search(self, portion: int) -> Found | None:
+        """One result after the other."""
+        return self.results.pop(0)
+
+
+def lost_pilot(*results: Found | None) -> Pilot[Any]:
+    """A pilot that is lost at rest, and a search of known results."""
+    believed, sigma = np.array([2.0, 6.5, 0.0]), np.array([0.02, 0.02, 0.01])
+    pilot = make_pilot("sequential", HALL, maps.field(HALL), "ipm", ControllerSettings(), believed, sigma, BEAMS)
+    for _ in range(3):
+        pilot.supervisor.judge({"fix": 2.0})
+    assert pilot.verdict.health is Health.LOST
+    pilot._search = Finding(*results)  # type: ignore[assignment]
+    return pilot
+
+
+def test_a_place_that_was_found_moves_on_by_the_wheels_and_has_to_fit_still() -> None:
+    at, wheels = np.array([24.0, 5.5, -2.9]), np.array([0.3, 0.1])
+    pilot = lost_pilot(*[None] * 39, Found(at, 1.0, "", (at,)))
+    pilot._creeping, now = Creeping(), at.copy()
+    for _ in range(40):
+        now = pilot.controller.settings.kind.step(now[None], wheels[None], DT)[0]
+        pilot._find_again(World(HALL, tuple(now.tolist())).scan(), wheels)
+    assert np.hypot(*(now - at)[:2]) > 1.0 and pilot.relocated and not pilot.creeping
+    np.testing.assert_allclose(pilot.pose, now, atol=0.05)
+    elsewhere = np.array([3.0, 7.0, 1.0])
+    pilot = lost_pilot(Found(elsewhere, 1.0, "", (elsewhere,)))
+    pilot._find_again(World(HALL, tuple(at.tolist())).scan(), np.zeros(2))
+    assert not pilot.relocated and np.hypot(*(pilot.pose - elsewhere)[:2]) > 0.5
+
+
 def test_creeping_goes_straight_on_and_turns_to_where_there_is_room() -> None:
     creeping, bound = Creeping(), 0.34
     speed, turn = creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)
@@ -399,7 +452,9 @@ def test_a_robot_lost_in_an_aisle_creeps_to_its_end_and_finds_itself(tmp_path: P
         goals=((2.0, 1.0, 3.0),),
         obstacles=0,
     )
-    log = Episode(settings).run(maps.stop_after(150))
+    episode = Episode(settings)
+    log = episode.run(maps.stop_after(150))
+    assert abs(episode.pilot.calibration.state[BIAS]) < 0.003, "a lost robot learns nothing of its lidar"
     away = np.hypot(*(log.estimate - log.true_pose)[:, :2].T)
     creeping = np.array([status == "creeping" for status in log.status])
     assert away[0] > 10.0 and away[-1] < 0.05 and log.health[-1] == "ok" and log.collisions == 0
@@ -414,8 +469,7 @@ def test_a_robot_whose_scan_fits_another_place_better_is_lost() -> None:
     believed, settings = np.array([10.8, 0.99, 0.72]), ControllerSettings()
     sigma, ramp = np.array([0.02, 0.02, 0.01]), RAMPS["elsewhere"]
     sample = World(HALL, tuple(where.tolist())).scan()
-    hidden = np.where(np.arange(BEAMS) % 180 < 80, np.minimum(sample.ranges, 0.9), sample.ranges)
-    for scan, pose, elsewhere in ((sample, believed, True), (replace(sample, ranges=hidden), where, False)):
+    for scan, pose, elsewhere in ((sample, believed, True), (among_people(sample), where, False)):
         pilot = make_pilot("sequential", HALL, field, "ipm", settings, pose, sigma, BEAMS)
         pilot.share = explained(field, scan, pose).share
         assert 1.0 - pilot.share < RAMPS["unexplained"].lost and ramp.share(pilot._elsewhere) == 1.0
@@ -427,6 +481,17 @@ def test_a_robot_whose_scan_fits_another_place_better_is_lost() -> None:
         pilot.share = 1.0
         pilot._find_again(scan, np.zeros(2))
         assert pilot._elsewhere == 0.0, "a scan that fits leaves nothing to look for"
+
+
+def test_a_place_that_fits_badly_itself_is_no_better_one() -> None:
+    pilot, sample = lost_pilot(), World(HALL, (22.6, 3.5, -2.5)).scan()
+    pilot.supervisor.verdict = HealthReport(Health.OK, 1.0, "")
+    for fitting, elsewhere in ((0.8, 0.0), (0.9, 0.45)):
+        pilot._search = Finding(*[Found(None, fitting, "")] * DOUBTFUL)  # type: ignore[assignment]
+        pilot.share = 0.45
+        for _ in range(DOUBTFUL):
+            pilot._find_again(sample, np.zeros(2))
+        assert pilot._elsewhere == pytest.approx(elsewhere)
 
 
 def test_a_map_put_askew_leaves_the_robot_in_the_open() -> None:
