@@ -24,7 +24,7 @@ from unifg.lie import wrap_angle
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.episode import Progress, rehearse, run_ticks, silent
 from unifg.scenarios.ground.drive_parts import bounds
-from unifg.scenarios.ground.drive_pilot import CREEPING, STOPPED, Pilot, make_pilot
+from unifg.scenarios.ground.drive_pilot import UNSOLVED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
 from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load_class, name_of
@@ -448,11 +448,11 @@ class Episode:
             compiled=compiled,
             localisation_iterations=pilot.estimator.iterations,
             plan_iterations=plan.iterations,
-            status=plan.source if plan.source in (STOPPED, CREEPING) else plan.status.name.lower(),
+            status=plan.source if plan.source in UNSOLVED else plan.status.name.lower(),
             bound_violation=plan.excess,
             clearance=world.clearance(),
             goal_index=self._goal,
-            emergency=plan.emergency and plan.source not in (STOPPED, CREEPING),
+            emergency=plan.emergency and plan.source not in UNSOLVED,
             rescued=plan.rescued,
             health=verdict.health.value,
             cause=verdict.cause,

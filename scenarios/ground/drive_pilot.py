@@ -48,6 +48,8 @@ STOPPED = "stopped"
 """Source of a plan that the supervisor has made: come to rest."""
 CREEPING = "creeping"
 """The same of one to tell places apart."""
+UNSOLVED = STOPPED, CREEPING
+"""Sources of plans that no solver has made, and that are no emergency."""
 
 
 logger = logging.getLogger("unifg")
@@ -200,7 +202,7 @@ class Pilot(Generic[PlannerT]):
         self._find_again(seen, wheels)
         if verdict.rests:
             plan = self._rest(pose)
-            if self._creeping is not None and self.creeping and seen is not None:
+            if self._creeping is not None and not self._creeping.ended and seen is not None:
                 plan = self._creep(self._creeping, plan, seen)
             self.clock.split("route")
         else:

@@ -28,7 +28,7 @@ from unifg.modeling.probing import rows_of
 from unifg.modeling.quantities import quantity
 from unifg.modeling.soft import Soft, slack_of
 from unifg.modeling.summary import inventory
-from unifg.modeling.terms import Constraint, Cost, Fix, ParameterLike, ScalarCost, Term, prepare_arguments
+from unifg.modeling.terms import Constraint, Cost, Fix, ScalarCost, Term, prepare_arguments
 from unifg.modeling.units import SAME as ALIKE
 from unifg.modeling.units import compare
 from unifg.modeling.variables import (
@@ -36,6 +36,7 @@ from unifg.modeling.variables import (
     Data,
     Declared,
     Family,
+    ParameterLike,
     Selection,
     Variable,
     as_selection,

@@ -17,8 +17,8 @@ from unifg.errors import GraphError
 from unifg.factors.residuals import Residual
 from unifg.lie import Rn
 from unifg.modeling.duplicates import doubles
-from unifg.modeling.variables import Data, Declared, Family, undeclared
-from unifg.typing import Array, ArrayLike, BoolArray
+from unifg.modeling.variables import Data, Family, ParameterLike, undeclared
+from unifg.typing import Array, BoolArray
 
 UPPER, LOWER = 1, 2  # sides that give way
 SLACK = ": slack"  # after the name of a constraint: that of its slack variables, and of their limit
@@ -36,8 +36,8 @@ class Soft:
         quadratic: in units of cost per square of that unit.
     """
 
-    linear: ArrayLike | Data | Declared = 0.0
-    quadratic: ArrayLike | Data | Declared = 0.0
+    linear: ParameterLike = 0.0
+    quadratic: ParameterLike = 0.0
 
     @property
     def data(self) -> list[Data]:
@@ -83,13 +83,7 @@ def signed(values: Array, sides: int) -> Array:
 
 
 def slack_of(
-    name: str,
-    soft: Soft | ArrayLike | Data | Declared,
-    lower: Any,
-    upper: Any,
-    count: int,
-    size: int,
-    wrapped: Residual,
+    name: str, soft: Soft | ParameterLike, lower: Any, upper: Any, count: int, size: int, wrapped: Residual
 ) -> Slack:
     """Slack variables for the limits of a constraint.
 

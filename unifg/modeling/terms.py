@@ -16,8 +16,6 @@ from unifg.modeling.variables import Data, Declared, Family, Selection
 from unifg.typing import Array, ArrayLike, BoolArray
 
 Parameter: TypeAlias = ArrayLike | Data
-ParameterLike: TypeAlias = Parameter | Declared
-"""As it may be stated."""
 
 
 @dataclass(eq=False, repr=False)

@@ -125,7 +125,8 @@ def _notice(
     array = np.asarray(given.value if isinstance(given, Data | Declared) else given, dtype=np.float64)
     rows = array.reshape(-1, array.shape[-1] if array.ndim and len(units) > 1 else 1)
     angles = [k for k, unit in enumerate(units) if unit == "rad"] if rows.shape[1] == len(units) else []
-    beyond = np.argwhere((np.abs(rows[:, angles]) > TURNS) & (np.abs(rows[:, angles]) < np.inf))
+    size = np.abs(rows[:, angles])
+    beyond = np.argwhere((size > TURNS) & (size < np.inf))
     if len(beyond):
         row, k = int(beyond[0][0]), angles[int(beyond[0][1])]
         said = (

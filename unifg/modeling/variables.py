@@ -195,6 +195,10 @@ def shared(value: ArrayLike, *, units: str | None = None, frame: str | None = No
     return Declared(array, False, quantity("fg.shared", units, frame))
 
 
+ParameterLike: TypeAlias = ArrayLike | Data | Declared
+"""A parameter of a term, as it may be stated."""
+
+
 def undeclared(name: str, which: str, given: Any, axes: int) -> Any:
     """Weights or limits without their declaration; ``axes`` is how many they have with a row for each factor.
 

@@ -11,8 +11,8 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.factors.whitening import reciprocals, square_roots
 from unifg.modeling.duplicates import doubles
-from unifg.modeling.terms import Parameter, ParameterLike
-from unifg.modeling.variables import Data, as_selection, is_variable, undeclared
+from unifg.modeling.terms import Parameter
+from unifg.modeling.variables import Data, ParameterLike, as_selection, is_variable, undeclared
 from unifg.typing import Array
 
 

@@ -62,10 +62,8 @@ def expanded(term: Constraint, slack: Slack) -> list[Term]:
         )
     ]
     width = s.manifold.dim
-    linear_price, both = (
-        isinstance(soft.linear, Data) or bool(np.asarray(soft.linear).any()),
-        slack.sides == UPPER | LOWER,
-    )
+    both = slack.sides == UPPER | LOWER
+    linear_price = isinstance(soft.linear, Data) or np.asarray(soft.linear).any()
     if linear_price or both:  # with a square as the price of one side, a negative slack never pays
         none, above = np.asarray(0.0), np.asarray(np.inf)
         made.append(

@@ -27,8 +27,8 @@ from unifg.modeling.elements import elements_of, nearest, on_manifolds, quaterni
 from unifg.modeling.factors import prior
 from unifg.modeling.model import AnyResidual, complete
 from unifg.modeling.probing import rows_of
-from unifg.modeling.terms import Cost, Parameter, ParameterLike, prepare_arguments
-from unifg.modeling.variables import Data, Family, Selection, undeclared
+from unifg.modeling.terms import Cost, Parameter, prepare_arguments
+from unifg.modeling.variables import Data, Family, ParameterLike, Selection, undeclared
 from unifg.problem.columns import Columns
 from unifg.problem.term import CompiledTerm
 from unifg.problem.traced import Trace, reach_of_value

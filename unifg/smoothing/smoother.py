@@ -15,8 +15,7 @@ from unifg.lie import Manifold
 from unifg.locks import ReentrantLock, synchronized
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.model import AnyResidual
-from unifg.modeling.terms import ParameterLike
-from unifg.modeling.variables import Data, Selection, Variable, as_selection
+from unifg.modeling.variables import Data, ParameterLike, Selection, Variable, as_selection
 from unifg.smoothing.batched import Batch, Batches, move_by_python
 from unifg.smoothing.factors import Parts, Staged, Types
 from unifg.smoothing.families import GrowingFamily

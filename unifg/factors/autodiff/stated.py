@@ -46,13 +46,14 @@ class StatedKernel(Kernel):
         stated = tuple(arguments)
         if stated == self.arguments:
             return self
+        key = tuple([a if isinstance(a, tuple) else None for a in stated])  # manifolds take longer to hash
         with generating:
-            known: dict[tuple[Argument, ...], Kernel] = self.__dict__.setdefault("_shaped", {})
-            if stated not in known:
-                pairs = zip(self.arguments, stated, strict=True)
-                shapes = [a for own, a in pairs if isinstance(own, int | tuple) and isinstance(a, tuple)]
-                known[stated] = replace(self, arguments=stated, rows=self.size(shapes))
-            return known[stated]
+            known: dict[tuple[tuple[int, ...] | None, ...], Kernel] = self.__dict__.setdefault("_shaped", {})
+            if key not in known:
+                pairs = zip(self.arguments, key, strict=True)
+                shapes = [a for own, a in pairs if a is not None and isinstance(own, int | tuple)]
+                known[key] = replace(self, arguments=stated, rows=self.size(shapes))
+            return known[key]
 
     @property
     def expression(self) -> Expression:
