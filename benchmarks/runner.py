@@ -107,7 +107,9 @@ PAGES: dict[str, dict[str, float]] = {
         "own_functions": 0.1, "claims": 0.2,
     },
     "collection": {"collection": 0.1, "cops": 0.05},
-    "pose-graphs": {"elimination": 0.1, "incremental": 0.1, "wrong_closures": 4.0, "verdicts": 0.3},
+    "pose-graphs": {
+        "elimination": 0.1, "incremental": 0.1, "wrong_closures": 4.0, "verdicts": 0.3, "beyond_memory": 0.6,
+    },
     "navigation": {"navigation": 0.1, "localisation": 0.15, "movers": 1.0},
     "reliability": {"faults": 0.3, "fault_search": 0.15, "mujoco": 0.25},
     "first-use": {"first_use": 0.2},

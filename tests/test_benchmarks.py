@@ -20,6 +20,7 @@ import pytest
 
 import unifg as fg
 from benchmarks import (
+    beyond_memory,
     collection,
     derivatives,
     elimination,
@@ -316,6 +317,13 @@ def test_exported_solvers_are_beside_python() -> None:
     row = exported.measure(None, rounds=1)
     assert row[0] == "README, N = 20" and len(row) == 6
     assert min(map(float, row[1:])) > 0.0
+
+
+@pytest.mark.product(2, of="processes of their own")
+def test_submaps_are_beside_the_whole_map() -> None:
+    whole, parted = beyond_memory.measure(2_000, 0), beyond_memory.measure(2_000, 600)
+    assert len(whole) == len(parted) == 9 and parted[1] == "4 submaps"
+    assert float(parted[5]) == pytest.approx(float(whole[5]), rel=1e-6)
 
 
 def test_many_instances_are_beside_a_loop() -> None:

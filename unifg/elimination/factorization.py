@@ -214,6 +214,23 @@ class Factorization:
         result: Array = (self.plan.signs / self.plan.pivots**2)[: self.pattern.size]
         return result
 
+    def root_block(self, scalars: IntArray) -> Array:
+        """(k, k) Schur complement of scalars that are the last of a root, in their order of elimination.
+
+        Raises:
+            UnifgError: there is no factorisation.
+        """
+        self._demand("root_block")
+        if not len(scalars):
+            return np.zeros((0, 0))
+        chosen = self._position[scalars]
+        first, width, _, panel, stride, *_ = self.plan.fronts[self._owner()[chosen[0]]].tolist()
+        at = int(chosen[0]) - first
+        rows = self.plan.numbers[panel : panel + width * stride].reshape(width, stride)[at:, at:width]
+        upper = np.triu(rows, 1) + np.diag(1.0 / self.plan.pivots[chosen])
+        block: Array = upper.T @ (self.plan.signs[chosen, None] * upper)
+        return block
+
     @property
     def tree(self) -> EliminationTree:
         """The elimination tree, to look at and to print."""

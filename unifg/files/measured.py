@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from unifg.elimination.symmetric import distinct
 from unifg.errors import FileFormatError, GraphError
 from unifg.files.contents import require_finite, write_text
 from unifg.files.text import Table, TextFile, norms
@@ -196,12 +197,12 @@ def parse(file: TextFile, formats: tuple[Format, Format], repair: Repair | None)
         poses = form.read(vertices, vertices.numbers, remarks.say)
         lines = np.concatenate([vertices.lines, points.lines])
     else:
-        ids = np.unique(edges.table.integers)
+        ids = distinct(edges.table.integers.ravel())
         if not len(ids):
             raise FileFormatError(f"{file.path}: neither poses nor edges between them")
         poses = np.tile(form.group.identity(), (len(ids), 1))
         placeable = [measured[kind].table.integers[:, 1] for kind in ("point", "bearing-range") if kind in measured]
-        point_ids = np.unique(np.concatenate([np.zeros(0, dtype=np.int64), *placeable]))
+        point_ids = distinct(np.concatenate([np.zeros(0, dtype=np.int64), *placeable]))
         landmarks, lines = np.zeros((len(point_ids), form.group.point_dim)), np.zeros(len(ids) + len(point_ids), int)
     names = np.concatenate([ids, point_ids])
     Table(file.path, lines, names[:, None], np.zeros((len(names), 0))).distinct(names, "vertex")

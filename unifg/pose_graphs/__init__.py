@@ -10,6 +10,7 @@ from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, Priors, Sightings
 from unifg.pose_graphs.residuals import bearing, bearing_range, chart_between, distance, sighting
 from unifg.pose_graphs.smoothed import from_smoother
+from unifg.pose_graphs.submaps import Submaps
 from unifg.pose_graphs.verdict import Certificate, Cluster, Judgement, Verdict
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "Sightings",
     "Simulated",
     "Start",
+    "Submaps",
     "Verdict",
     "bearing",
     "bearing_range",

@@ -14,8 +14,8 @@ from typing import TypeAlias
 
 import numpy as np
 
-from unifg.elimination.factorization import Factorization
-from unifg.elimination.symmetric import Symmetric
+from unifg.elimination.reduction import Reduction
+from unifg.elimination.symmetric import Symmetric, distinct, scatter
 from unifg.errors import GraphError
 from unifg.modeling.variables import Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
@@ -68,6 +68,7 @@ class Removal:
         gone: number of unknown columns that are removed; they come first.
         kept: full tangent columns of what stays.
         free: which of those are unknown; fixed ones take part as constants.
+        tree: elimination of many, once there was one.
     """
 
     costs: Dense
@@ -75,6 +76,7 @@ class Removal:
     gone: int
     kept: IntArray
     free: BoolArray
+    tree: tuple[Symmetric, Reduction] | None = None
 
 
 def information(
@@ -245,8 +247,8 @@ def _dense(
     entries, local = entries[local >= 0], local[local >= 0]
     number = np.cumsum(rows) - 1
     places = number[stacked.rows[entries]] * len(columns) + local
-    distinct = len(np.unique(places)) == len(places)
-    return Dense(np.flatnonzero(rows), entries, places, len(columns), distinct)
+    alone = len(distinct(places)) == len(places)
+    return Dense(np.flatnonzero(rows), entries, places, len(columns), alone)
 
 
 def _equalities(program: CompiledProblem, lin: Linearization, dense: Dense, equality: BoolArray) -> tuple[Array, Array]:
@@ -320,27 +322,19 @@ def _schur(gone: Array, rest: Array, r: Array) -> tuple[Array, Array, Array] | N
 
 
 def _schur_of_tree(removal: Removal, jacobian: Array, r: Array) -> tuple[Array, Array, Array] | None:
-    """Eliminate as :func:`_schur` does, by the elimination tree of what leaves."""
+    """Eliminate as :func:`_schur` does, by an elimination tree whose root is what is kept."""
     import scipy.sparse as sp
 
     costs, k = removal.costs, removal.gone
-    places = np.divmod(costs.places, costs.width)
-    J = sp.csc_array((jacobian[costs.entries], places), shape=(len(costs.rows), costs.width))
-    gone, rest = J[:, :k], J[:, k:] * removal.free
-    upper = sp.triu(gone.T @ gone, format="coo")
-    pattern = Symmetric(k, [(upper.row, upper.col)])
-    data = np.zeros(pattern.nnz)
-    data[pattern.positions(upper.row, upper.col)] = upper.data
-    factorization = Factorization(pattern)
-    if not (factorization.factor(data) and factorization.definite):
-        return None
-    between, matrix = sp.csr_array(gone.T @ rest), (rest.T @ rest).toarray()
-    squared, gradient = matrix.diagonal().copy(), rest.T @ r
-    rows = np.flatnonzero(np.diff(between.indptr))
-    if len(rows):
-        matrix -= factorization.products(np.array([0, len(rows)]), rows, between[rows].toarray())[0]
-        gradient -= between.T @ factorization.solve(gone.T @ r)
-    return matrix, gradient, squared
+    places, free = np.divmod(costs.places, costs.width), np.append(np.ones(k, bool), removal.free)
+    J = sp.csc_array((jacobian[costs.entries], places), shape=(len(costs.rows), costs.width)) * free
+    upper = sp.triu(J.T @ J, format="coo")
+    if removal.tree is None:
+        pattern = Symmetric(costs.width, [(upper.row, upper.col)])
+        removal.tree = pattern, Reduction(pattern, costs.width - k)
+    pattern, tree = removal.tree
+    data = scatter(pattern.positions(upper.row, upper.col), upper.data, pattern.nnz)
+    return (tree.matrix, tree.reduce(J.T @ r)[0], data[pattern.diagonal[k:]]) if tree.factor(data) else None
 
 
 def _lowest(matrix: Array, gradient: Array, rounding: Array) -> tuple[Array, Array]:

@@ -1,0 +1,218 @@
+"""Maps beyond memory give the answer of the whole graph, one submap at a time."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import unifg as fg
+from unifg.elimination.reduction import Reduction
+from unifg.elimination.symmetric import Symmetric, distinct
+from unifg.errors import GraphError
+from unifg.pose_graphs import Edges, PoseGraph, Sightings, Submaps, chordal, manhattan, sphere, submaps
+from unifg.solution.status import Status
+from unifg.solvers import GaussNewton
+from unifg.typing import Array, BoolArray
+
+PLANE = manhattan(300, seed=5).pose_graph
+SPACE = sphere(8, 12, seed=1).pose_graph
+
+
+def begun(made: PoseGraph) -> PoseGraph:
+    """The graph at its chordal guess."""
+    return made.with_poses(chordal(made))
+
+
+def whole(made: PoseGraph) -> tuple[fg.Solution, Array]:
+    """Solution of the whole graph, and its poses."""
+    graph, x, guess = made.graph()
+    solution = GaussNewton(tolerance=1e-11).solve(graph, guess, check=True)
+    return solution, solution[x]
+
+
+@pytest.mark.parametrize("made", [PLANE, SPACE], ids=["plane", "space"])
+@pytest.mark.parametrize("largest", [1000, 60, 25])
+def test_submaps_find_the_map_and_its_covariances(made: PoseGraph, largest: int, tmp_path: Path) -> None:
+    solution, poses = whole(begun(made))
+    parted = Submaps.split(begun(made), tmp_path / "map", largest)
+    assert (parted.count == 1) == (largest == 1000)
+    found = parted.optimize(tolerance=1e-9)
+    assert found.status is Status.CONVERGED
+    assert found.chi2 == pytest.approx(2.0 * solution.cost, rel=1e-10)
+    np.testing.assert_allclose(made.group.local(poses, parted.poses), 0.0, atol=1e-7)
+    x = solution.families["poses"]
+    again = Submaps(tmp_path / "map")
+    for pose in (0, 1, len(poses) // 2, *again._shared[1:3].tolist(), len(poses) - 1):
+        expected = solution.covariance(x[pose]) if pose else np.zeros((made.group.dim,) * 2)
+        for opened in (parted, again):
+            np.testing.assert_allclose(opened.covariance(pose), expected, rtol=1e-6, atol=1e-12)
+
+
+def test_known_poses_are_kept(tmp_path: Path) -> None:
+    made = replace(begun(PLANE), fixed_ids=(0, 140, 299))
+    _, poses = whole(made)
+    parted = Submaps.split(made, tmp_path, 60)
+    parted.optimize(tolerance=1e-9)
+    np.testing.assert_allclose(made.group.local(poses, parted.poses), 0.0, atol=1e-7)
+    np.testing.assert_array_equal(parted.poses[[0, 140, 299]], made.poses[[0, 140, 299]])
+    assert not parted.covariance(140).any()
+
+
+def test_two_maps_in_one_graph(tmp_path: Path) -> None:
+    """Parts without an edge between them have an anchor each."""
+    made = begun(PLANE)
+    edges, count = made.edges, len(made.poses)
+    first, second = (np.append(end, end + count) for end in (edges.first, edges.second))
+    measured, information = (np.concatenate([rows, rows]) for rows in (edges.measured, edges.information))
+    poses = np.concatenate([made.poses, made.poses + np.array([5.0, 3.0, 0.0])])
+    both = PoseGraph(np.arange(2 * count), poses, Edges(first, second, measured, information))
+    _, poses = whole(both)
+    parted = Submaps.split(both, tmp_path, 70)
+    assert parted.optimize(tolerance=1e-9).status is Status.CONVERGED
+    np.testing.assert_allclose(fg.SE2.local(poses, parted.poses), 0.0, atol=1e-7)
+
+
+def test_steps_are_halved_until_chi2_falls(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    rng = np.random.default_rng(3)
+    made = begun(PLANE)
+    far = made.with_poses(fg.SE2.retract(made.poses, 0.35 * rng.standard_normal(made.poses.shape)))
+    parted = Submaps.split(far, tmp_path, 60)
+    with caplog.at_level("INFO", logger="unifg"):
+        found = parted.optimize()
+    chi2 = [float(record.args[1]) for record in caplog.records if isinstance(record.args, tuple)]  # type: ignore[arg-type]
+    assert found.status is Status.CONVERGED
+    assert len(chi2) == found.iterations + 1
+    assert (np.diff(chi2) <= 1e-9 * chi2[-1]).all()
+    assert found.chi2 == pytest.approx(far.with_poses(np.array(parted.poses)).chi2(), rel=1e-9)
+
+
+def test_a_step_that_raises_chi2_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each step is made to lead the wrong way: what was begun with is kept, and its covariances are those there."""
+    made, step = begun(PLANE), submaps._Separator.solve
+
+    def backwards(separator: submaps._Separator) -> tuple[Array, float]:
+        found, fall = step(separator)
+        return -5.0 * found, fall
+
+    parted = Submaps.split(made, tmp_path, 60)
+    parted.optimize(max_iterations=0)
+    expected = parted.covariance(150)
+    monkeypatch.setattr(submaps._Separator, "solve", backwards)
+    found = parted.optimize()
+    assert (found.status, found.iterations) == (Status.STALLED, 0)
+    np.testing.assert_array_equal(parted.poses, made.poses)
+    np.testing.assert_allclose(parted.covariance(150), expected)
+
+
+def test_a_limit_and_an_interruption_leave_the_poses_of_the_last_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = begun(PLANE)
+    parted = Submaps.split(made, tmp_path, 60)
+    first = parted.optimize(max_iterations=1)
+    assert (first.status, first.iterations) == (Status.ITERATION_LIMIT, 1)
+    reached, passes = np.array(parted.poses), list[int]()
+    linearize = submaps._Submap.linearize
+
+    def interrupted(submap: submaps._Submap, poses: Array) -> object:
+        passes.append(1)
+        if len(passes) == 2 * parted.count:
+            raise KeyboardInterrupt
+        return linearize(submap, poses)
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(submaps._Submap, "linearize", interrupted)
+        parted.optimize()
+    np.testing.assert_array_equal(parted.poses, reached)
+    with pytest.raises(GraphError, match=r"no covariances yet; optimize\(\) comes first"):
+        Submaps(tmp_path).covariance(3)
+    assert Submaps(tmp_path).optimize().status is Status.CONVERGED
+
+
+def test_a_folder_is_written_over(tmp_path: Path) -> None:
+    Submaps.split(begun(PLANE), tmp_path, 25).optimize(max_iterations=0)
+    parted = Submaps.split(begun(SPACE), tmp_path, 40)
+    assert len(list(tmp_path.glob("[0-9]*.npz"))) == parted.count
+    with pytest.raises(GraphError, match="no covariances yet"):
+        parted.covariance(3)
+
+
+def test_refusals(tmp_path: Path) -> None:
+    made = begun(PLANE)
+    with pytest.raises(GraphError, match="no submaps here"):
+        Submaps(tmp_path / "nothing")
+    one = np.zeros(1, int)
+    seen = replace(made, sightings={"point": Sightings(one, one, np.zeros((1, 2)), np.eye(2)[None])})
+    lost = made.with_poses(np.where(np.arange(300)[:, None] == 7, np.nan, made.poses))
+    cases: list[tuple[PoseGraph, float, str]] = [
+        (replace(made, edges=made.edges[:0]), 10, "found 0 edges"),
+        (made, 0, "submaps of 0 poses"),
+        (made, 2.5, "largest must be a whole number, found 2.5"),
+        (lost, 10, "pose 7 is not finite"),
+        (seen, 10, "of poses and edges"),
+    ]
+    for graph, largest, words in cases:
+        with pytest.raises(GraphError, match=words):
+            Submaps.split(graph, tmp_path, largest)  # type: ignore[arg-type]
+    parted = Submaps.split(made, tmp_path, 60)
+    for pose, words in ((-1, "pose -1 of 300"), (300, "pose 300 of 300"), ("a", "pose must be a whole number")):
+        with pytest.raises(GraphError, match=words):
+            parted.covariance(pose)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("poses", [[200], [200, 201, 202]])
+@pytest.mark.parametrize("largest", [1000, 60])
+def test_poses_that_edges_do_not_determine_are_named(largest: int, poses: list[int], tmp_path: Path) -> None:
+    made = begun(PLANE)
+    information = made.edges.information.copy()
+    alone = np.isin(made.edges.first, poses) != np.isin(made.edges.second, poses)
+    information[alone] = 0.0
+    loose = replace(made, edges=replace(made.edges, information=information))
+    with pytest.raises(GraphError, match="the edges do not determine"):
+        Submaps.split(loose, tmp_path, largest).optimize()
+
+
+@pytest.mark.parametrize("kept", [0, 4, 12])
+@pytest.mark.parametrize("apart", [False, True])
+def test_reduction_is_the_schur_complement(kept: int, apart: bool) -> None:
+    """Also beside a component that touches nothing of what is kept, and where that is not determined."""
+    rng, n = np.random.default_rng(kept), 30
+    J = rng.standard_normal((60, n)) * (rng.random((60, n)) < 0.15)
+    J[:n, :n] += np.diag(np.where(np.arange(n) < n - kept, 3.0, 0.0))
+    if apart:
+        J[:, :8][J[:, 8:].any(axis=1)] = 0.0
+        J = np.vstack([J, np.eye(n)[:8], rng.standard_normal((8, 8)) @ np.eye(n)[:8]])
+    A, g = J.T @ J, rng.standard_normal(n)
+    rows, columns = np.nonzero(np.triu(A))
+    pattern = Symmetric(n, [(rows, columns)])
+    reduction = Reduction(pattern, kept)
+    assert reduction.factor(A[pattern.indices, pattern.columns])
+    k = n - kept
+    inner = np.linalg.inv(A[:k, :k])
+    np.testing.assert_allclose(reduction.matrix, A[k:, k:] - A[k:, :k] @ inner @ A[:k, k:], atol=1e-10)
+    left, fall = reduction.reduce(g)
+    np.testing.assert_allclose(left, g[k:] - A[k:, :k] @ inner @ g[:k], atol=1e-10)
+    assert fall == pytest.approx(g[:k] @ inner @ g[:k])
+    last = rng.standard_normal(kept)
+    step = reduction.step(g, last)
+    np.testing.assert_allclose(step[k:], last, atol=1e-9)
+    np.testing.assert_allclose(step[:k], -inner @ (g[:k] + A[:k, k:] @ last), atol=1e-9)
+    J[:, 2] = 0.0
+    A = J.T @ J
+    assert not reduction.factor(A[pattern.indices, pattern.columns])
+
+
+@pytest.mark.parametrize("numbers", [[], [3], [5, -2, 5, 5, -2, 0], [-(2**63), 2**63 - 1, 0]])
+def test_distinct_numbers(numbers: list[int]) -> None:
+    given = np.array(numbers, dtype=np.int64)
+    np.testing.assert_array_equal(distinct(given), np.unique(given))
+
+
+def test_parts_are_of_equal_size() -> None:
+    places = np.random.default_rng(0).uniform(0.0, [10.0, 1.0], (1000, 2))
+    part = submaps._cut(places, 100)
+    sizes: BoolArray = np.bincount(part) <= 100
+    assert sizes.all() and np.bincount(part).min() >= 50
+    spans = [np.ptp(places[part == k], axis=0) for k in range(part.max() + 1)]
+    assert max(span[0] for span in spans) < 1.5  # cut across the longer side

@@ -1,0 +1,59 @@
+"""Elimination of all but the last scalars of a system, which become the root of the tree."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from unifg.elimination.factorization import Factorization
+from unifg.elimination.ordering import indistinguishable
+from unifg.elimination.symmetric import Symmetric
+from unifg.typing import Array
+
+ROUNDING = 1e-13  # pivots that are smaller, of the entry on the diagonal, are made of rounding
+
+
+class Reduction:
+    """Schur complement of a positive semidefinite matrix A on its last scalars, which A need not determine.
+
+    A minimum of d'A d / 2 + g'd over the first scalars leaves s'S s / 2 + h's of the last: S is :attr:`matrix`, h is
+    :meth:`reduce` of g, and :meth:`step` is the minimum for given s. A is factorised with a diagonal added to the last.
+    """
+
+    def __init__(self, pattern: Symmetric, kept: int) -> None:
+        """Order the first scalars by themselves, and make one node of the last ``kept``."""
+        gone = pattern.size - kept
+        within = pattern.columns < gone
+        inner = Symmetric(gone, [(pattern.indices[within], pattern.columns[within])])
+        label = indistinguishable(inner.indptr.astype(np.int64), inner.indices.astype(np.int64))
+        nodes = int(label.max(initial=-1)) + 1
+        order = Factorization(inner, label).structure.order if gone else np.zeros(0, np.int64)
+        whole = np.append(label, np.full(kept, nodes))
+        self._tree = Factorization(pattern, whole, ordering=np.append(order, nodes)[: nodes + (kept > 0)])
+        self._kept, self._added, self._held = slice(gone, pattern.size), np.zeros(pattern.size), np.zeros((0, 0))
+
+    def factor(self, data: Array) -> bool:
+        """Factorise, from entries in the order of the pattern; False where the first scalars are not determined."""
+        tree, diagonal = self._tree, data[self._tree.pattern.diagonal]
+        self._added[self._kept] = np.where(diagonal > 0.0, diagonal, 1.0)[self._kept]
+        done = tree.factor(data, self._added) and tree.definite
+        done = done and bool((tree.pivots() > ROUNDING * (diagonal + self._added)[tree.plan.order]).all())
+        if done:
+            self._held = self._tree.root_block(np.arange(self._kept.start, self._kept.stop))
+        return done
+
+    @property
+    def matrix(self) -> Array:
+        """(k, k) Schur complement."""
+        return self._held - np.diag(self._added[self._kept])
+
+    def reduce(self, gradient: Array) -> tuple[Array, float]:
+        """(k,) gradient that is left of (n,), and how much eliminating lowers twice the cost."""
+        solved = self._tree.solve(gradient)
+        left: Array = self._held @ solved[self._kept]
+        return left, float(gradient @ solved - left @ solved[self._kept])
+
+    def step(self, gradient: Array, kept: Array) -> Array:
+        """(n,) lowest point for (k,) given last scalars."""
+        right = -gradient
+        right[self._kept] += self._held @ kept + self.reduce(gradient)[0]
+        return self._tree.solve(right)

@@ -1,0 +1,404 @@
+"""Maps beyond memory: a pose graph in a folder, cut into submaps of which one at a time is in memory.
+
+Two levels of nested dissection. Poses are cut by where they lie; the ends of edges across the cuts are the separator.
+A Gauss-Newton step is that of the whole graph: every submap eliminates its inner poses, what is left of all of them is
+solved for the separator, and the steps of the inner poses follow.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from unifg.atomic_write import replacing, write_atomically
+from unifg.elimination.factorization import Factorization
+from unifg.elimination.reduction import Reduction
+from unifg.elimination.symmetric import Symmetric, distinct
+from unifg.errors import GraphError, require_kinds
+from unifg.lie import SE2, SE3, LieGroup
+from unifg.modeling.factors import between
+from unifg.pose_graphs.pose_graph import Edges, PoseGraph
+from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.linearization import Linearization
+from unifg.solution.graph import Graph
+from unifg.solution.status import Status
+from unifg.typing import Array, BoolArray, IntArray
+
+logger = logging.getLogger("unifg")
+
+INDEX, SEPARATOR, INFORMATION = "submaps.json", "separator.npz", "information.npy"
+POSES, NEXT = "poses.npy", "next.npy"
+ARMIJO, SHORTEST = 1e-4, 2.0**-10
+
+
+class Optimized(NamedTuple):
+    """Outcome of :meth:`Submaps.optimize`.
+
+    Attributes:
+        status: CONVERGED, ITERATION_LIMIT or STALLED.
+        chi2: sum of r' Omega r, without 1/2.
+        iterations: Gauss-Newton steps taken.
+        offset: relative offset of Bates and Watts, of all unknowns together.
+    """
+
+    status: Status
+    chi2: float
+    iterations: int
+    offset: float
+
+
+class _Pass(NamedTuple):
+    """Outcome of eliminating the inner poses of all submaps.
+
+    Attributes:
+        step: (S, d) of the poses of the separator, zero for fixed ones.
+        chi2: where it was linearised.
+        fall: of chi2 by the whole step, by the quadratic model.
+    """
+
+    step: Array
+    chi2: float
+    fall: float
+
+
+class _Submap:
+    """A submap in memory: edges between inner poses and its rim, the poses of the separator that it touches."""
+
+    def __init__(self, file: Path, group: LieGroup) -> None:
+        with np.load(file) as known:
+            self.inner, self.rim = known["inner"], known["rim"]
+            self.members = np.concatenate([self.inner, self.rim])
+            graph = Graph()
+            x = graph.variables("x", group, len(self.members))
+            ends = x[known["first"]], x[known["second"]]
+            graph.minimize(between, *ends, known["measured"], information=known["information"], name="edges")
+        self._program, self._x = CompiledProblem(graph), x
+        self._tree = Reduction(self._program.normal, len(self.rim) * group.dim)
+
+    def linearize(self, poses: Array) -> Linearization:
+        """Linearise and eliminate the inner poses.
+
+        Raises:
+            GraphError: they are not determined.
+        """
+        lin = self._program.linearize(self._program.values_from({self._x: poses}))
+        if not self._tree.factor(lin.hessian):
+            raise GraphError(f"the edges do not determine all poses of the submap that holds pose {self.inner[0]}")
+        return lin
+
+    def reduced(self, gradient: Array) -> tuple[Array, Array, float]:
+        """Information and gradient that are left to the rim, and the fall of twice the cost by the inner poses."""
+        return self._tree.matrix, *self._tree.reduce(gradient)
+
+    def step(self, gradient: Array, rim: Array) -> Array:
+        """(n, d) step of all members, for a given one of the rim."""
+        return self._tree.step(gradient, rim.ravel()).reshape(len(self.members), -1)
+
+
+class Submaps:
+    """A pose graph in a folder.
+
+    Attributes:
+        folder: that of :meth:`split`.
+        count: number of submaps.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        """Open what :meth:`split` has written.
+
+        Raises:
+            GraphError: the folder holds no submaps.
+        """
+        self.folder = Path(folder)
+        try:
+            known = json.loads((self.folder / INDEX).read_text(encoding="utf-8"))
+            self.count, storage = int(known["submaps"]), int(known["storage"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise GraphError(f"{folder}: no submaps here; Submaps.split(pose_graph, folder) writes them") from error
+        self._group: LieGroup = SE2 if storage == SE2.storage else SE3
+        with np.load(self.folder / SEPARATOR) as file:
+            self._shared, self._fixed = file["shared"], file["fixed"]
+            self._across = Edges(file["first"], file["second"], file["measured"], file["information"])
+        self._rims = [self._places(k) for k in range(self.count)]
+        self._optimized = False
+
+    @classmethod
+    def split(cls, pose_graph: PoseGraph, folder: str | Path, largest: int = 50_000) -> Submaps:
+        """Write a pose graph to a folder as submaps.
+
+        Its arrays may be those of ``np.load(..., mmap_mode="r")``. Poses are cut where they lie, so the present ones
+        should be near the map: an earlier one, or positions of a satellite receiver.
+
+        Args:
+            pose_graph: poses and edges; known poses are kept, and the first one of every part without.
+            folder: to be made where there is none.
+            largest: number of poses of a submap at most.
+
+        Raises:
+            GraphError: sightings or priors, which submaps do not know; no edges; a submap of no pose; NaN.
+        """
+        require_kinds("split", GraphError, cls.split.__annotations__, {"largest": largest})
+        if pose_graph.sightings or pose_graph.priors:
+            raise GraphError("submaps are of poses and edges: solve sightings and priors with PoseGraph.graph()")
+        if not len(pose_graph.edges) or largest < 1:
+            raise GraphError(f"found {len(pose_graph.edges)} edges and submaps of {largest} poses: nothing to split")
+        home, edges, poses = Path(folder), pose_graph.edges, pose_graph.poses
+        for what, numbers in (("pose", poses), ("edge", edges.measured)):
+            if not np.isfinite(numbers).all():
+                at = int(np.flatnonzero(~np.isfinite(numbers).all(axis=1))[0])
+                raise GraphError(f"{what} {at} is not finite: {numbers[at]}", index=at)
+        home.mkdir(parents=True, exist_ok=True)
+        for old in (home / INDEX, home / INFORMATION, *home.glob("[0-9]*.npz")):
+            old.unlink(missing_ok=True)
+        part = _cut(np.asarray(poses[:, : pose_graph.group.point_dim]), largest)
+        fixed, shared = np.zeros(len(poses), np.bool_), np.zeros(len(poses), np.bool_)
+        fixed[pose_graph.anchors()[0]] = True
+        first, second = part[edges.first], part[edges.second]
+        shared[np.where(first < second, edges.first, edges.second)[first != second]] = True
+        shared |= fixed
+        part[~shared] = np.unique(part[~shared], return_inverse=True)[1]
+        part[shared] = -1
+        owner = np.maximum(part[edges.first], part[edges.second])  # an edge has inner poses of one submap
+        count = int(part.max()) + 1
+        members, rows = _groups(part, count), _groups(owner, count)
+        for k, (inner, own) in enumerate(zip(members, rows, strict=True), -1):
+            ends = np.concatenate([edges.first[own], edges.second[own]])
+            rim = np.zeros(0, np.int64) if k < 0 else distinct(ends[shared[ends]])
+            present = np.concatenate([inner, rim])
+            by_name = np.argsort(present)
+            at_first, at_second = by_name[np.searchsorted(present[by_name], ends)].reshape(2, -1)
+            names: dict[str, Any] = {"inner": inner, "rim": rim} if k >= 0 else {"shared": inner, "fixed": fixed[inner]}
+            measured, information = edges.measured[own], edges.information[own]
+            with replacing(home / SEPARATOR if k < 0 else home / f"{k}.npz") as file:
+                np.savez(file, first=at_first, second=at_second, measured=measured, information=information, **names)
+        with replacing(home / POSES) as file:
+            np.save(file, poses)
+        write_atomically(home / INDEX, json.dumps({"submaps": count, "storage": int(poses.shape[1])}))
+        return cls(home)
+
+    @property
+    def poses(self) -> Array:
+        """(n, storage) present poses, in the order of the pose graph, read from the disk as they are used."""
+        found: Array = np.load(self.folder / POSES, mmap_mode="r")
+        return found
+
+    def optimize(self, *, tolerance: float = 1e-6, max_iterations: int = 50) -> Optimized:
+        """Gauss-Newton steps of the whole graph from the present poses, halved until chi2 falls.
+
+        A submap is read once for each step. Ended by hand, it leaves the poses of the last step, from where the next
+        call goes on.
+
+        Args:
+            tolerance: of the relative offset.
+            max_iterations: steps at most.
+
+        Raises:
+            GraphError: the edges do not determine the poses.
+        """
+        self._optimized = False
+        (self.folder / INFORMATION).unlink(missing_ok=True)
+        result = self._optimize(tolerance, max_iterations)
+        np.save(self.folder / INFORMATION, self._separator.information)
+        self._optimized = True
+        return result
+
+    def _optimize(self, tolerance: float, most: int) -> Optimized:
+        now, taken = self._eliminated(), 0
+        while True:
+            offset = math.sqrt(max(now.fall, 0.0) / now.chi2) if now.chi2 > 0.0 else 0.0
+            logger.info("submaps: %d steps, chi2 %.9g, offset %.1e", taken, now.chi2, offset)
+            if offset <= tolerance:
+                return Optimized(Status.CONVERGED, now.chi2, taken, offset)
+            if taken >= most:
+                return Optimized(Status.ITERATION_LIMIT, now.chi2, taken, offset)
+            length, trial = 1.0, self._eliminated(now.step, 1.0)
+            while not trial.chi2 <= now.chi2 - ARMIJO * length * now.fall:
+                length *= 0.5
+                if length < SHORTEST:
+                    self._eliminated()  # what is left of the submaps belongs to the poses
+                    return Optimized(Status.STALLED, now.chi2, taken, offset)
+                trial = self._eliminated(now.step, length)
+            os.replace(self.folder / NEXT, self.folder / POSES)
+            now, taken = trial, taken + 1
+
+    def covariance(self, pose: int) -> Array:
+        """(d, d) marginal covariance of a pose, over its tangent space, at the present poses; zero for a fixed one.
+
+        Raises:
+            GraphError: there is no such pose, or nothing has been optimised yet.
+        """
+        count, dim = len(self.poses), self._group.dim
+        require_kinds("covariance", GraphError, {"pose": "int"}, {"pose": pose})
+        if not 0 <= pose < count:
+            raise GraphError(f"pose {pose} of {count}")
+        place = int(np.searchsorted(self._shared, pose))
+        if place < len(self._shared) and self._shared[place] == pose:
+            return self._known().covariance(np.array([place]))
+        for k in range(self.count):
+            with np.load(self.folder / f"{k}.npz") as file:
+                inner = file["inner"]
+            at = int(np.searchsorted(inner, pose))
+            if at < len(inner) and inner[at] == pose:
+                break
+        submap, places = _Submap(self.folder / f"{k}.npz", self._group), self._rims[k]
+        submap.linearize(self.poses[submap.members])
+        own, reach = np.empty((dim, dim)), np.empty((dim, len(places) * dim))
+        for axis in range(dim):
+            unit = np.zeros((len(submap.members), dim))
+            unit[at, axis] = 1.0
+            reach[axis] = submap.reduced(unit.ravel())[1]
+            own[axis] = -submap.step(unit.ravel(), np.zeros((len(places), dim)))[at]
+        result: Array = own + reach @ self._known().covariance(places) @ reach.T
+        return result
+
+    def _known(self) -> _Separator:
+        """The separator at the present poses."""
+        if not self._optimized:
+            try:
+                self._separator.information[:] = np.load(self.folder / INFORMATION)
+            except OSError:
+                raise GraphError(f"{self.folder}: no covariances yet; optimize() comes first") from None
+            self._separator.factor()
+            self._optimized = True
+        return self._separator
+
+    def _places(self, k: int) -> IntArray:
+        """Rim of a submap, as positions in the separator."""
+        with np.load(self.folder / f"{k}.npz") as file:
+            found: IntArray = np.searchsorted(self._shared, file["rim"])
+        return found
+
+    def _eliminated(self, step: Array | None = None, length: float = 1.0) -> _Pass:
+        """Take a step from the present poses, which writes the next ones, and eliminate all inner poses there."""
+        separator, poses, group = self._separator, self.poses, self._group
+        shared, fall = np.array(poses[self._shared]), 0.0
+        if step is not None:
+            following = np.lib.format.open_memmap(self.folder / NEXT, "w+", poses.dtype, poses.shape)
+            following[self._shared] = shared = group.retract(shared, length * step)
+        chi2 = separator.begin(shared)
+        for k, places in enumerate(self._rims):
+            submap = _Submap(self.folder / f"{k}.npz", group)
+            own = np.array(poses[submap.members])
+            lin = submap.linearize(own)
+            if step is not None:
+                own = group.retract(own, length * submap.step(lin.gradient, step[places]))
+                own[len(submap.inner) :] = shared[places]
+                following[submap.inner] = own[: len(submap.inner)]
+                lin = submap.linearize(own)
+            matrix, gradient, inside = submap.reduced(lin.gradient)
+            separator.add(places, matrix, gradient)
+            chi2, fall = chi2 + 2.0 * lin.cost, fall + inside
+        if step is not None:
+            following.flush()
+        found, outside = separator.solve()
+        return _Pass(found, chi2, fall + outside)
+
+    @cached_property
+    def _separator(self) -> _Separator:
+        return _Separator(self._group, self._fixed, self._across, self._rims)
+
+
+class _Separator:
+    """The poses of the separator: edges between them, and what is left of the submaps."""
+
+    def __init__(self, group: LieGroup, fixed: BoolArray, edges: Edges, rims: Sequence[IntArray]) -> None:
+        """Find the structure."""
+        free, dim = np.flatnonzero(~fixed), group.dim
+        number = np.full(len(fixed), -1)
+        number[free] = np.arange(len(free))
+        self._columns = (dim * number[:, None] + np.arange(dim)) * (number >= 0)[:, None] - (number < 0)[:, None]
+        pairs = [np.sort(np.stack([number[edges.first], number[edges.second]]), axis=0)]
+        for rim in rims:
+            own = number[rim][number[rim] >= 0]
+            pairs.append(own[np.stack(np.triu_indices(len(own)))])
+        first, second = np.concatenate(pairs, axis=1)
+        starts, known = dim * np.arange(len(free) + 1), first >= 0
+        self._pattern = Symmetric.of_blocks(starts, first[known], second[known])
+        self._tree = Factorization(self._pattern, np.repeat(np.arange(len(free)), dim))
+        self.information, self._gradient = np.zeros(self._pattern.nnz), np.zeros(self._pattern.size)
+        self._program: CompiledProblem | None = None
+        self._ends = distinct(np.concatenate([edges.first, edges.second]))
+        if len(edges):
+            graph = Graph()
+            self._x = graph.variables("x", group, len(self._ends))
+            ends = [self._x[np.searchsorted(self._ends, end)] for end in (edges.first, edges.second)]
+            graph.minimize(between, *ends, edges.measured, information=edges.information, name="edges")
+            self._program = CompiledProblem(graph)
+
+    def begin(self, poses: Array) -> float:
+        """Linearise the edges, of which nothing else is there yet; chi2 of them."""
+        self.information[:], self._gradient[:] = 0.0, 0.0
+        if self._program is None:
+            return 0.0
+        lin = self._program.linearize(self._program.values_from({self._x: poses[self._ends]}))
+        pattern, column = self._program.normal, self._columns[self._ends].ravel()
+        rows, columns = column[pattern.indices], column[pattern.columns]
+        free = (rows >= 0) & (columns >= 0)
+        np.add.at(self.information, self._pattern.positions(rows[free], columns[free]), lin.hessian[free])
+        self._gradient[column[column >= 0]] = lin.gradient[column >= 0]
+        return 2.0 * lin.cost
+
+    def add(self, rim: IntArray, matrix: Array, gradient: Array) -> None:
+        """Add what is left of a submap; positions of its rim are sorted."""
+        columns = self._columns[rim].ravel()
+        free = np.flatnonzero(columns >= 0)
+        columns = columns[free]
+        self._gradient[columns] += gradient[free]
+        for k, column in enumerate(columns.tolist()):
+            begin, end = self._pattern.indptr[column : column + 2]
+            at = begin + np.searchsorted(self._pattern.indices[begin:end], columns[: k + 1])
+            self.information[at] += matrix[free[: k + 1], free[k]]
+
+    def solve(self) -> tuple[Array, float]:
+        """(S, d) step of all poses, and the fall of chi2.
+
+        Raises:
+            GraphError: they are not determined.
+        """
+        self.factor()
+        found = -self._tree.solve(self._gradient) if len(self._gradient) else self._gradient
+        step = np.append(found, 0.0)[self._columns]  # the last one for fixed poses
+        return step, -float(found @ self._gradient)
+
+    def factor(self) -> None:
+        """Factorise."""
+        if len(self._gradient) and not (self._tree.factor(self.information) and self._tree.definite):
+            raise GraphError("the edges do not determine the poses where submaps meet")
+
+    def covariance(self, places: IntArray) -> Array:
+        """Joint covariance of some poses, zero for fixed ones."""
+        columns = self._columns[places].ravel()
+        result, free = np.zeros((len(columns), len(columns))), np.flatnonzero(columns >= 0)
+        if len(free):
+            result[np.ix_(free, free)] = self._tree.inverse_block(columns[free])
+        return result
+
+
+def _cut(places: Array, largest: int) -> IntArray:
+    """(n,) part of each place: halved across the longer side, until parts are small enough."""
+    part, count = np.zeros(len(places), np.int64), 0
+    waiting = [np.arange(len(places))]
+    while waiting:
+        members = waiting.pop()
+        if len(members) <= largest:
+            part[members], count = count, count + 1
+            continue
+        own, half = places[members], len(members) // 2
+        axis = int(np.ptp(own, axis=0).argmax())
+        order = np.argpartition(own[:, axis], half)
+        waiting += [members[order[half:]], members[order[:half]]]
+    return part
+
+
+def _groups(labels: IntArray, count: int) -> list[IntArray]:
+    """Positions of the labels -1, 0, ..., count - 1, in ascending order."""
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.searchsorted(labels[order], np.arange(count)))
