@@ -38,7 +38,7 @@ def test_submaps_find_the_map_and_its_covariances(made: PoseGraph, largest: int,
     parted = Submaps.split(begun(made), tmp_path / "map", largest)
     assert (parted.count == 1) == (largest == 1000)
     found = parted.optimize(tolerance=1e-9)
-    assert found.status is Status.CONVERGED
+    assert found.status is Status.CONVERGED and found.offset <= 1e-9
     assert found.chi2 == pytest.approx(2.0 * solution.cost, rel=1e-10)
     np.testing.assert_allclose(made.group.local(poses, parted.poses), 0.0, atol=1e-7)
     x = solution.families["poses"]
@@ -47,6 +47,24 @@ def test_submaps_find_the_map_and_its_covariances(made: PoseGraph, largest: int,
         expected = solution.covariance(x[pose]) if pose else np.zeros((made.group.dim,) * 2)
         for opened in (parted, again):
             np.testing.assert_allclose(opened.covariance(pose), expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("largest", [1000, 60])
+def test_a_step_is_that_of_the_whole_graph(largest: int, tmp_path: Path) -> None:
+    """Its offset and what is left of it at half its length, too."""
+    made = begun(PLANE)
+    graph, x, guess = made.graph()
+    program = graph.compile()
+    lin = program.linearize(program.values_from(guess))
+    gradient = lin.gradient[program.columns.free]
+    upper = program.normal.matrix(lin.hessian).toarray()
+    step = np.linalg.solve(upper + np.triu(upper, 1).T, -gradient)
+    parted = Submaps.split(made, tmp_path, largest)
+    found = parted.optimize(max_iterations=0)
+    assert found.offset == pytest.approx(np.sqrt(-gradient @ step / found.chi2), rel=1e-8)
+    parted._eliminated(parted._eliminated().step, 0.5)
+    expected = program.retract(program.values_from(guess), 0.5 * step)[x]
+    np.testing.assert_allclose(np.load(tmp_path / submaps.NEXT), expected, atol=1e-9)
 
 
 def test_known_poses_are_kept(tmp_path: Path) -> None:
@@ -180,6 +198,7 @@ def test_reduction_is_the_schur_complement(kept: int, apart: bool) -> None:
     rng, n = np.random.default_rng(kept), 30
     J = rng.standard_normal((60, n)) * (rng.random((60, n)) < 0.15)
     J[:n, :n] += np.diag(np.where(np.arange(n) < n - kept, 3.0, 0.0))
+    J[:, n - 1 :] *= kept == 0  # of which nothing is known
     if apart:
         J[:, :8][J[:, 8:].any(axis=1)] = 0.0
         J = np.vstack([J, np.eye(n)[:8], rng.standard_normal((8, 8)) @ np.eye(n)[:8]])
