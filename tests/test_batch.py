@@ -9,6 +9,7 @@ import pytest
 
 import unifg as fg
 from problems.control import Quadrotor, Stated, Unicycle
+from problems.graphs import graph_with
 from unifg.solution.batch import Batch
 from unifg.solvers import SQP, InteriorPoint
 from unifg.typing import Array
@@ -169,3 +170,18 @@ def test_answers_are_asked_for_by_name_and_by_numbers_there_are() -> None:
     ):
         with pytest.raises(fg.GraphError, match=message):
             ask()
+
+
+def test_a_cost_beyond_numbers_is_no_success() -> None:
+    """The gradient of a robust loss is zero where its cost has overflowed; a single solve refuses such data."""
+    graph, x = graph_with(fg.Rn(1), 1)
+    seen, slope = graph.data("seen", [1.0]), graph.data("slope", 1.0)
+    graph.minimize(lambda p, at: p - at, x, seen, robust=fg.Cauchy(1.0), name="seen")
+    graph.minimize_scalar(lambda p, times: times * p[:, 0], x, slope, name="slope")
+    graph.bound(x, lower=-1.0, upper=1.0, name="box")
+    prepared, guess = InteriorPoint().prepare(graph), {x: np.zeros((1, 1))}
+    with pytest.raises(fg.GraphError, match="instance 1: a Jacobian is not finite at the guess"):
+        prepared.solve_many(guess, data={seen: [[1.0], [1e200]], slope: [1.0, 0.0]})
+    batch = prepared.solve_many(guess, data={slope: [1.0, 1e30]})
+    assert batch.statuses == [prepared.solve(guess, data=batch.data_of(k)).status for k in range(2)]
+    assert batch.statuses[1] is fg.Status.UNBOUNDED
