@@ -33,7 +33,7 @@ from unifg.solution.saved import write_answer
 from unifg.solution.sensitivity import Named, Sensitivities, Weights, Wrt
 from unifg.solution.status import Found, Status
 from unifg.solution.tube import tube
-from unifg.solution.verify import Verified, verified
+from unifg.solution.verify import Verified, require_tolerance, verified
 from unifg.solution.warm_start import Shifts
 from unifg.typing import Array, BoolArray, Figure, Numbers
 
@@ -350,7 +350,10 @@ class Solution:
         if not self.converged:
             raise GraphError(f"gains need a solution that is CONVERGED, this one is {self.status.name}")
         x, u = (
-            [self._selection(v) for v in ([named] if isinstance(named, Variable | str) else named)]
+            [
+                self._selection(v)
+                for v in ([named] if isinstance(named, str) or not isinstance(named, Sequence) else named)
+            ]
             for named in (states, controls)
         )
         if all(len(s) == len(u[0]) + 1 for s in x):
@@ -516,9 +519,10 @@ class Solution:
             tolerance: of violation, stationarity and complementarity, as that of the solver.
 
         Raises:
-            GraphError: for a solution that was not returned: another one has taken its place, and its data.
+            GraphError: for a solution that was not returned: another one has taken its place, and its data; for a
+                tolerance that is no positive number.
         """
-        require_kinds("verify", GraphError, Solution.verify.__annotations__, {"tolerance": tolerance})
+        require_tolerance(tolerance)
         return verified(*self._claims("verify"), tolerance)
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -553,6 +557,9 @@ class Solution:
         Raises:
             GraphError: there is no such term, it is of another kind, or its data have been replaced since.
         """
+        require_kinds("tube", GraphError, Solution.tube.__annotations__, {"pieces": pieces})
+        if pieces < 1:
+            raise GraphError(f"tube: pieces must be at least 1, found {pieces}")
         return tube(self._program, self._lin.values, self._claims("tube")[-1], term, pieces)
 
     def report(self) -> str:
