@@ -315,6 +315,9 @@ def test_backends_whose_loop_is_python_are_refused() -> None:
     assert "time limit" in refused(graph, guess, time_limit=1.0)
     with pytest.raises(BackendError, match="'my solver' is no name in C"):
         prepared.export("nowhere", name="my solver")
+    for wrong in ({"name": 5}, {"target": None}):
+        with pytest.raises(BackendError, match="must be of the class str"):
+            prepared.export("nowhere", **wrong)
 
 
 def test_parts_of_python_are_refused_by_name() -> None:

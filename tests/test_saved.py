@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,7 +140,8 @@ def test_data_that_a_file_leaves_out_have_their_defaults(script: Path) -> None:
 @pytest.mark.filterwarnings("error")
 def test_tolerances_and_weights_that_check_nothing(script: Path, capsys: pytest.CaptureFixture[str]) -> None:
     graph, solution = graph_and_answer()
-    for tolerance in (-1.0, 0.0, np.nan, "a", None):
+    wrong: list[Any] = [-1.0, 0.0, np.nan, "a", None]
+    for tolerance in wrong:
         for check in (solution.verify, lambda tolerance: check_answer(graph, "answer.npz", tolerance)):
             with pytest.raises(GraphError, match="verify: tolerance must be"):
                 check(tolerance)
