@@ -30,7 +30,7 @@ from unifg.solution.multipliers import hold
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.saved import write_answer
-from unifg.solution.sensitivity import Named, Sensitivities, Weights, Wrt
+from unifg.solution.sensitivity import COST, Named, Sensitivities, Weights, Wrt
 from unifg.solution.status import Found, Status
 from unifg.solution.tube import tube
 from unifg.solution.verify import Verified, require_tolerance, verified
@@ -406,7 +406,20 @@ class Solution:
         return self._sensitivities.gradient(parts, wrt)
 
     def _part(self, named: Named) -> Selection | str:
-        """A selection, or the name of a constraint or the cost."""
+        """A selection, or the name of a constraint or the cost.
+
+        Raises:
+            GraphError: the name is that of several of them.
+        """
+        if isinstance(named, str):
+            known = {"a family": self.families, "a constraint": {name for name, *_ in self._program.places}}
+            owners = [what for what, names in (known | {"the cost": {COST}}).items() if named in names]
+            if len(owners) > 1:
+                raise GraphError(
+                    f"sensitivity: '{named}' is the name of {' and of '.join(owners)}: give the family itself, or "
+                    "another name to the constraint",
+                    term=named,
+                )
         return named if isinstance(named, str) and named not in self.families else self._selection(named)
 
     @cached_property
