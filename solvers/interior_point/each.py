@@ -121,11 +121,9 @@ def solve_each(address: int) -> None:
         met = max(kkt[0], kkt[2]) <= state.tolerance and kkt[1] <= state.feasible
         if not finite:
             answer = NOT_FINITE
-        elif state.cost < UNBOUNDED_COST:
-            answer = STALLED
-        elif met and state.suspicion <= SUSPICIOUS:
+        elif met and state.suspicion <= SUSPICIOUS and state.cost >= UNBOUNDED_COST:
             answer = CONVERGED
-        elif answer == CONVERGED or answer == VIOLATED:
+        elif answer == CONVERGED or answer == VIOLATED or state.cost < UNBOUNDED_COST:
             answer = STALLED
         number[ANSWER], number[ITERATIONS] = answer, state.iteration
         number[COST], number[SUSPICION] = state.cost, state.suspicion
