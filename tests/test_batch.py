@@ -9,8 +9,9 @@ import pytest
 
 import unifg as fg
 from problems.control import Quadrotor, Stated, Unicycle
+from problems.graphs import graph_with
 from unifg.solution.batch import Batch
-from unifg.solvers import SQP, InteriorPoint
+from unifg.solvers import SQP, GaussNewton, InteriorPoint
 from unifg.typing import Array
 
 COUNT = 130
@@ -128,6 +129,17 @@ def test_what_does_not_fit_is_refused() -> None:
     with pytest.raises(fg.GraphError, match="solve_many of what"):
         prepared.solve_many(stated.guess)
     assert len(prepared.solve_many([])) == 0
+    for wrong, message in (
+        ([[1.0, 2.0, 3.0], [1.0]], "data 'start' of many instances cannot be read as an array"),
+        ("here", "data 'start' of many instances must be real numbers, found 'here'"),
+    ):
+        with pytest.raises(fg.GraphError, match=message):
+            prepared.solve_many(stated.guess, data={start: wrong})
+    graph, x = graph_with(fg.Rn(1), 1)
+    number = graph.data("number", 1.0)
+    graph.minimize(lambda p, at: p - at, x, number, name="there")
+    with pytest.raises(fg.GraphError, match=r"data 'number' of many instances has shape \(\)"):
+        GaussNewton().prepare(graph).solve_many({x: [[0.0]]}, data={number: 3.0})
 
 
 def test_huge_multipliers_are_no_success() -> None:
@@ -166,6 +178,23 @@ def test_answers_are_asked_for_by_name_and_by_numbers_there_are() -> None:
         (lambda: batch["y"], r"'y' is no family of these instances \(there are: x\)"),
         (lambda: batch[fg.Graph().variables("x", fg.Rn(1), 1)], "is no family of these instances"),
         (lambda: batch.solution(2), "there is no instance 2: 2 were solved, 0 to 1"),
+        (lambda: batch.solution(0.5), "there is no instance 0.5"),  # type: ignore[arg-type]
+        (lambda: batch.data_of(-3), "there is no instance -3"),
     ):
         with pytest.raises(fg.GraphError, match=message):
             ask()
+
+
+def test_a_cost_beyond_numbers_is_no_success() -> None:
+    """The gradient of a robust loss is zero where its cost has overflowed; a single solve refuses such data."""
+    graph, x = graph_with(fg.Rn(1), 1)
+    seen, slope = graph.data("seen", [1.0]), graph.data("slope", 1.0)
+    graph.minimize(lambda p, at: p - at, x, seen, robust=fg.Cauchy(1.0), name="seen")
+    graph.minimize_scalar(lambda p, times: times * p[:, 0], x, slope, name="slope")
+    graph.bound(x, lower=-1.0, upper=1.0, name="box")
+    prepared, guess = InteriorPoint().prepare(graph), {x: np.zeros((1, 1))}
+    with pytest.raises(fg.GraphError, match="instance 1: a Jacobian is not finite at the guess"):
+        prepared.solve_many(guess, data={seen: [[1.0], [1e200]], slope: [1.0, 0.0]})
+    batch = prepared.solve_many(guess, data={slope: [1.0, 1e30]})
+    assert batch.statuses == [prepared.solve(guess, data=batch.data_of(k)).status for k in range(2)]
+    assert batch.statuses[1] is fg.Status.UNBOUNDED

@@ -190,6 +190,23 @@ def test_input_that_python_refuses_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.product(1, of="exports")
 @compiled_by_c
+def test_a_cost_beyond_numbers_is_no_success(tmp_path: Path) -> None:
+    graph, x = graph_with(fg.Rn(1), 1)
+    seen = graph.data("seen", [1.0])
+    graph.minimize(lambda p, at: p - at, x, seen, robust=fg.Cauchy(1.0), name="seen")
+    graph.bound(x, lower=-1.0, upper=1.0, name="box")
+    prepared = InteriorPoint().prepare(graph)
+    prepared.solve({x: np.zeros((1, 1))})
+    prepared.export(tmp_path)
+    found, enumerated = (
+        built(tmp_path)([(np.array([at]), np.zeros(1), np.zeros(1)) for at in (0.5, 1e200)]),
+        words(tmp_path),
+    )
+    assert [status for status, *_ in found] == [enumerated["CONVERGED"], enumerated["NOT_FINITE"]]
+
+
+@pytest.mark.product(1, of="exports")
+@compiled_by_c
 def test_a_workspace_that_was_moved_is_set_up_anew(tmp_path: Path) -> None:
     """It would refer to where it was before; one of another solver, to functions of that."""
     graph, guess, _ = around_a_disc()
@@ -298,6 +315,9 @@ def test_backends_whose_loop_is_python_are_refused() -> None:
     assert "time limit" in refused(graph, guess, time_limit=1.0)
     with pytest.raises(BackendError, match="'my solver' is no name in C"):
         prepared.export("nowhere", name="my solver")
+    for wrong in ({"name": 5}, {"target": None}):
+        with pytest.raises(BackendError, match="must be of the class str"):
+            prepared.export("nowhere", **wrong)
 
 
 def test_parts_of_python_are_refused_by_name() -> None:

@@ -162,6 +162,9 @@ def test_gains_are_refused_by_name() -> None:
     good = solved(graph)
     with pytest.raises(fg.GraphError, match=r"\[2\] states for \[3\] controls"):
         good.gains(x[:2], u)
+    for wrong in (5, None):
+        with pytest.raises(fg.GraphError, match="expected a family of variables"):
+            good.gains(x, wrong)  # type: ignore[arg-type]
     np.testing.assert_array_equal(good.gains(x[1:3], u[1:3]), good.gains(x, u)[1:])
     idle = fg.Graph()
     x, u = idle.variables("x", fg.Rn(1), 3), idle.variables("u", fg.Rn(2), 2)

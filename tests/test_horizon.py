@@ -727,6 +727,12 @@ def test_a_horizon_without_a_window() -> None:
     assert x == pytest.approx(TARGET, abs=0.05)
     with pytest.raises(fg.GraphError, match="without one, give the present"):
         loop.tick(TARGET)
+    for beginning in ({"start": x}, {"sigma": 1.0}):
+        with pytest.raises(fg.GraphError, match="a beginning needs a window; without one, give the present"):
+            loop.reset(**beginning)
+    loop.reset()
+    with pytest.raises(fg.GraphError, match="constants must be of the class Mapping or None, found 5"):
+        loop.plan(x, TARGET, 5)  # type: ignore[arg-type]
 
 
 class Scalar(Term):
@@ -751,6 +757,7 @@ class Ahead(Scalar):
         *(({"coupling": "joint", "pull": pull}, r"pull.*\(2,\)") for pull in ([1.0] * 3, [1.0], [[1.0, 2.0]], "far")),
         ({"steps": 0}, "at least one step"),
         ({"deadline": 0.0}, "deadline"),
+        ({"judge": 5}, "judge must be a function or None, found 5"),
         ({"control_weight": 0.0}, "control_weight"),
         ({"window": None, "coupling": "joint"}, "needs a window"),
         ({"window": line_window(3, replace(LINE, predict=None)), "coupling": "joint"}, "another robot"),

@@ -385,6 +385,10 @@ NO_NUMBERS: dict[str, tuple[Any, str]] = {
     "tree": (lambda: Tree("ab"), "a tree is made of whole numbers.*found 'ab'"),  # type: ignore[arg-type]
     "tails": (lambda: Tree.branched(1, [1.5]), "tails=1.5"),  # type: ignore[list-item]
     "one tail": (lambda: Tree.branched(1, 3), "the tails of a tree are a list"),  # type: ignore[arg-type]
+    "probabilities of tails": (
+        lambda: Tree.branched(1, (1, 1)).probabilities("ab"),
+        "the probabilities of the tails must be",
+    ),
     "present": (lambda: loop_of().plan("x"), "present"),
     "present of another shape": (lambda: loop_of().plan([[0.0, 0.0]]), "present"),
     "times": (lambda: loop_of().set_times("x"), "times"),

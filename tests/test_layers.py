@@ -117,6 +117,25 @@ def test_shapes_are_named(layer: Layer) -> None:
         layer.solve(STARTS[0], GOALS[0])
     with pytest.raises(fg.GraphError, match=r"data 'goal' have shape \(3,\), expected \(2,\)"):
         layer.solve(STARTS[0], np.zeros(3), 0.5)
+    with pytest.raises(fg.GraphError, match=r"layer: data 'goal' must be real numbers, found 'there'"):
+        layer.solve(STARTS[0], "there", 0.5)
+    answers = layer.solve(STARTS[0], GOALS[0], 0.5)
+    for slopes in ([], answers.values[:1], [value[None] for value in answers.values], [1.0] * len(answers.values)):
+        with pytest.raises(fg.GraphError, match="expected those of the outputs"):
+            layer.pull(answers, slopes)  # type: ignore[arg-type]
+
+
+def test_what_makes_no_layer_is_refused() -> None:
+    prepared, inputs, outputs, guess = arguments()
+    for changed, message in (
+        ((prepared, inputs[0], outputs, guess), "inputs are a list of objects of the class Data"),
+        ((prepared, ["goal"], outputs, guess), "inputs are a list of objects of the class Data"),
+        ((prepared, inputs, ["x"], guess), "outputs are a list of objects of the class Family"),
+    ):
+        with pytest.raises(fg.GraphError, match=message):
+            Layer(*changed)
+    with pytest.raises(fg.GraphError, match="failed must be 'raise' or 'zero', found 'none'"):
+        Layer(prepared, inputs, outputs, guess, failed="none")  # type: ignore[arg-type]
 
 
 def _torch() -> tuple[Callable[..., Any], Callable[..., Any]]:

@@ -216,3 +216,14 @@ def test_many_are_eliminated_by_the_tree_as_by_dense_matrices(monkeypatch: pytes
     unsolved = GaussNewton(max_iterations=0).solve(loose, {y: np.zeros((200, 3))})
     with pytest.raises(GraphError, match=r"y\[0\] cannot be eliminated: the terms between do not determine it"):
         unsolved.marginal_prior(["between"], y[:-1], y[-1])
+
+
+def test_one_name_is_one_term() -> None:
+    """Terms called by its letters do not stand for it."""
+    graph, x = graph_with(fg.Rn(1), 2)
+    graph.minimize(fg.prior, x[0], [0.0], sigma=0.1, name="p")
+    graph.minimize(fg.difference, x[0], x[1], sigma=1.0, name="q")
+    graph.minimize(lambda a, b: np.concatenate([a, a - 2.0 * b], axis=1), x[0], x[1], name="pq")
+    solution = GaussNewton().solve(graph, {x: np.zeros((2, 1))})
+    one, listed = (solution.marginal_prior(name, x[0], x[1])[1] for name in ("pq", ["pq"]))
+    np.testing.assert_array_equal(one, listed)

@@ -51,8 +51,8 @@ def dense(robot: Robot, found: MeshPlan, pieces: int = 50) -> list[Array]:
 def drive(**options: Any) -> MeshPlan:
     terms: list[Term] = [Dynamics(unicycle.dynamics), Course()]
     usual: dict[str, Any] = {"solver": InteriorPoint(), "between": clear, "defect": 1e-3, "violation": 1e-3}
-    start = options.pop("present", np.zeros(3))
-    return plan_on_mesh(CAR, terms, np.linspace(0.0, 4.0, 9), start, **usual | options)
+    start, times = options.pop("present", np.zeros(3)), options.pop("times", np.linspace(0.0, 4.0, 9))
+    return plan_on_mesh(CAR, terms, times, start, **usual | options)
 
 
 def test_a_plan_does_not_step_over_what_it_shall_avoid() -> None:
@@ -121,6 +121,28 @@ def test_a_plan_that_is_refused_ends_the_search() -> None:
     assert not found.met and found.steps == (8,) and found.plan.source != "solved"
     with pytest.raises(fg.GraphError, match="a robot that predicts"):
         plan_on_mesh(Robot(fg.SE2, fg.Rn(2)), [], [0.0, 1.0], np.zeros(3), solver=InteriorPoint())
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"rounds": 0}, "plan_on_mesh: takes positive numbers"),
+        ({"defect": 0.0}, "plan_on_mesh: takes positive numbers"),
+        ({"violation": np.nan}, "plan_on_mesh: takes positive numbers"),
+        ({"substeps": 1}, "at least two substeps"),
+        ({"substeps": 2.5}, "substeps must be a whole number, found 2.5"),
+        ({"defect": "small"}, "defect must be a number, found 'small'"),
+        ({"times": [0.0]}, "at least two of them"),
+        ({"times": 4.0}, "at least two of them"),
+        ({"times": "soon"}, "the times of the nodes must be real numbers, found 'soon'"),
+        ({"times": [0.0, np.nan]}, "growing numbers from 0 on"),
+    ],
+    ids=str,
+)
+def test_what_no_mesh_can_meet_is_refused(options: dict[str, Any], said: str) -> None:
+    """No round would have ended the search, or none of its numbers could be found."""
+    with pytest.raises(fg.GraphError, match=said):
+        drive(**options)
 
 
 def test_the_next_mesh_begins_on_the_plan_of_the_last() -> None:

@@ -6,11 +6,13 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.errors import FileFormatError, GraphError
 from unifg.scenarios.command import main
 from unifg.solution.saved import check_answer
@@ -46,11 +48,16 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     sys.modules.pop("wall_ahead", None)
 
 
-def graph_and_answer(path: str | os.PathLike[str] = "answer.npz") -> tuple[fg.Graph, fg.Solution]:
-    """The graph of the script, and an answer with other data than its own, in a file."""
+def fresh_graph() -> fg.Graph:
+    """The graph of the script."""
     names: dict[str, fg.Graph] = {}
     exec(SCRIPT, names)
-    graph = names["graph"]
+    return names["graph"]
+
+
+def graph_and_answer(path: str | os.PathLike[str] = "answer.npz") -> tuple[fg.Graph, fg.Solution]:
+    """The graph of the script, and an answer with other data than its own, in a file."""
+    graph = fresh_graph()
     x, goal, shown = graph.families["x"], graph._data["goal"], graph._data["shown"]
     data = {goal: [1.2, 0.4, 0.1], shown: [True, False, True]}
     solution = InteriorPoint().solve(graph, {x: np.zeros((3, 3))}, data=data, check=True)
@@ -120,6 +127,32 @@ def test_what_does_not_fit_is_refused_by_name(script: Path, capsys: pytest.Captu
     ):
         assert main(["check", name, file]) == 2
         assert reason in capsys.readouterr().err
+
+
+def test_data_that_a_file_leaves_out_have_their_defaults(script: Path) -> None:
+    """Not those of the last solve."""
+    graph, _ = graph_and_answer()
+    changed(data_goal=None, data_shown=None)
+    found = check_answer(graph, "answer.npz")
+    assert not found and found.cost == check_answer(fresh_graph(), "answer.npz").cost
+
+
+@pytest.mark.filterwarnings("error")
+def test_tolerances_and_weights_that_check_nothing(script: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    graph, solution = graph_and_answer()
+    wrong: list[Any] = [-1.0, 0.0, np.nan, "a", None]
+    for tolerance in wrong:
+        for check in (solution.verify, lambda tolerance: check_answer(graph, "answer.npz", tolerance)):
+            with pytest.raises(GraphError, match="verify: tolerance must be"):
+                check(tolerance)
+    assert main(["check", "wall_ahead.py:graph", "answer.npz", "--tolerance", "-1"]) == 2
+    assert "tolerance must be positive, found -1.0" in capsys.readouterr().err
+    weighed, x = graph_with(fg.Rn(1), 2)
+    sigma = weighed.data("sigma", 1.0)
+    weighed.minimize(fg.prior, x, [1.0], sigma=sigma, name="there")
+    fg.solve(weighed, {x: np.zeros((2, 1))}).save("answer.npz")
+    changed(data_sigma=0.0)
+    assert not check_answer(weighed, "answer.npz")
 
 
 def test_an_answer_whose_data_are_gone_is_not_saved(script: Path) -> None:

@@ -446,6 +446,20 @@ def test_kinks_flags_losses_and_names_are_refused() -> None:
     refused(point(lambda g, x: g.minimize(fg.prior, x, g.data("p", [0.0, 1.0]), robust=Own(), name="own")), "'own'")
 
 
+@pytest.mark.parametrize(("family", "limit"), [("x", "x"), ("x", "cost"), ("cost", "limit")])
+def test_a_name_of_two_things_is_refused(family: str, limit: str) -> None:
+    graph = fg.Graph()
+    x, to = graph.variables(family, fg.Rn(1), 2), graph.data("to", [2.0])
+    graph.minimize(fg.prior, x, to, name="there")
+    graph.bound(x, upper=1.0, name=limit)
+    solution = InteriorPoint(tolerance=1e-9).solve(graph, {x: np.zeros((2, 1))}, check=True)
+    shared = "x" if limit == "x" else "cost"
+    for ask in (solution.sensitivity, solution.gradient):
+        with pytest.raises(fg.GraphError, match=f"'{shared}' is the name of .* and of .*: give the family itself"):
+            ask(shared, to)
+    assert solution.sensitivity(x, to) == pytest.approx(0.0, abs=1e-9)
+
+
 def test_rows_between_fixed_variables_say_nothing() -> None:
     """Neither that they are weakly active, nor that they depend on others."""
     graph, x = graph_with(fg.Rn(2), 2)

@@ -99,6 +99,9 @@ def test_other_terms_are_refused_by_name() -> None:
     for term, why in (("lean", "leave SO3"), ("level", "has no tape")):
         with pytest.raises(fg.GraphError, match=why):
             turned.tube(term)
+    for pieces in (0, -1, 2.5, "a"):
+        with pytest.raises(fg.GraphError, match="tube: pieces must be"):
+            solution.tube("disc", pieces)  # type: ignore[arg-type]
 
 
 def test_data_of_a_later_solve_are_refused() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.lie import Manifold, Rn
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data, Family
 from unifg.problem.parameters import datum
 from unifg.solution.batch import Batch
@@ -70,8 +71,15 @@ class Layer:
             failed: whether an instance that does not converge raises, or is returned with slopes of zero.
 
         Raises:
-            GraphError: an input has no derivative.
+            GraphError: an input has no derivative, or something is of another kind.
         """
+        for what, given, kind in (("inputs", inputs, Data), ("outputs", outputs, Family)):
+            if not (isinstance(given, Sequence) and all(isinstance(one, kind) for one in given)):
+                raise GraphError(
+                    f"layer: {what} are a list of objects of the class {kind.__name__}, found {given!r}"[:200]
+                )
+        if failed not in ("raise", "zero"):
+            raise GraphError(f"layer: failed must be 'raise' or 'zero', found {failed!r}")
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
         self._prepared, self._guess, self._threads, self._failed = prepared, guess, threads, failed
         self._manifolds = [datum(prepared.program, handle).manifold for handle in inputs]
@@ -85,9 +93,9 @@ class Layer:
         Raises:
             GraphError: shapes do not fit; an instance does not converge.
         """
-        arrays = [np.asarray(one, dtype=np.float64) for one in given]
-        if len(arrays) != len(self.inputs):
-            raise GraphError(f"layer: takes {len(self.inputs)} inputs, found {len(arrays)}")
+        if len(given) != len(self.inputs):
+            raise GraphError(f"layer: takes {len(self.inputs)} inputs, found {len(given)}")
+        arrays = [doubles(f"layer: data '{h.name}'", one) for one, h in zip(given, self.inputs, strict=True)]
         leads = [a.shape[: max(0, a.ndim - h.value.ndim)] for a, h in zip(arrays, self.inputs, strict=True)]
         lead = max(leads, key=len, default=())
         data = {}
@@ -112,10 +120,13 @@ class Layer:
         """Slopes in the shapes of the inputs, from slopes in those of the outputs; the sums where instances share one.
 
         Raises:
-            GraphError: as of `unifg.Solution.gradient`.
+            GraphError: shapes do not fit; and as of `unifg.Solution.gradient`.
         """
-        batch = answers.batch
-        given = [np.asarray(s, np.float64).reshape(len(batch), *s.shape[-2:]) for s in slopes]
+        batch, given = answers.batch, [doubles("layer: a slope", slope) for slope in slopes]
+        found, wanted = ([array.shape for array in arrays] for arrays in (given, answers.values))
+        if found != wanted:
+            raise GraphError(f"layer: slopes have the shapes {found}, expected those of the outputs, {wanted}")
+        given = [slope.reshape(len(batch), *slope.shape[-2:]) for slope in given]
         pulled = [np.zeros((len(batch), *handle.value.shape)) for handle in self.inputs]
         for index in range(len(batch)):
             if not batch.statuses[index].converged:

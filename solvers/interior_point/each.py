@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from unifg.codegen.calls import vector
 from unifg.codegen.function_pointers import Memory, all_of, linked_to, run
 from unifg.lie.so3 import all_unit
@@ -11,6 +13,7 @@ from unifg.problem.guess import settle
 from unifg.problem.linearization import all_finite
 from unifg.solution.export import REFUSED
 from unifg.solution.multipliers import SUSPICIOUS
+from unifg.solution.solver import UNBOUNDED_COST
 from unifg.solvers.interior_point.state import (
     CONVERGED,
     LIMIT_REACHED,
@@ -114,13 +117,13 @@ def solve_each(address: int) -> None:
             given.found[k, i] = values[i]
         for i in range(len(multipliers)):
             given.found_multipliers[k, i] = multipliers[i]
-        finite, answer = kkt[4] > 0.0, state.answer
+        finite, answer = kkt[4] > 0.0 and abs(state.cost) < np.inf, state.answer
         met = max(kkt[0], kkt[2]) <= state.tolerance and kkt[1] <= state.feasible
-        if finite and met and state.suspicion <= SUSPICIOUS:
-            answer = CONVERGED
-        elif not finite:
+        if not finite:
             answer = NOT_FINITE
-        elif answer == CONVERGED or answer == VIOLATED:
+        elif met and state.suspicion <= SUSPICIOUS and state.cost >= UNBOUNDED_COST:
+            answer = CONVERGED
+        elif answer == CONVERGED or answer == VIOLATED or state.cost < UNBOUNDED_COST:
             answer = STALLED
         number[ANSWER], number[ITERATIONS] = answer, state.iteration
         number[COST], number[SUSPICION] = state.cost, state.suspicion

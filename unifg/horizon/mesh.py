@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import GraphError
+from unifg.errors import GraphError, require_kinds
 from unifg.horizon.decision import Plan
 from unifg.horizon.receding_horizon import InitialGuesses, RecedingHorizon
 from unifg.horizon.robot import Robot
 from unifg.horizon.terms import Context, Term
+from unifg.modeling.duplicates import doubles
 from unifg.solution.solution import Solution
 from unifg.solution.solver import Solver
 from unifg.typing import Array, ArrayLike
@@ -82,11 +83,18 @@ def plan_on_mesh(
         cold: first guess on the first mesh, as of :class:`unifg.horizon.InitialGuesses`.
 
     Raises:
-        GraphError: for a robot without a model, and as :class:`unifg.horizon.RecedingHorizon`.
+        GraphError: for a robot without a model, options that no plan could meet, and as
+            :class:`unifg.horizon.RecedingHorizon`.
     """
     if robot.predict is None:
         raise GraphError("a mesh needs a robot that predicts: its model says what happens between nodes")
-    nodes, start, made = np.array(times, dtype=np.float64), cold, list[int]()
+    options = {"defect": defect, "violation": violation, "substeps": substeps, "rounds": rounds}
+    require_kinds("plan_on_mesh", GraphError, plan_on_mesh.__annotations__, options)
+    if not (defect > 0.0 and violation > 0.0 and substeps > 1 and rounds > 0):
+        raise GraphError(f"plan_on_mesh: takes positive numbers, and at least two substeps, found {options}")
+    nodes, start, made = doubles("the times of the nodes", times).copy(), cold, list[int]()
+    if nodes.ndim != 1 or len(nodes) < 2:
+        raise GraphError(f"the times must be growing numbers from 0 on, at least two of them; got {times!r}")
     while True:
         made.append(len(nodes) - 1)
         moving = replace(robot, tick=float(nodes[1]))

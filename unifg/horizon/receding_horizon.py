@@ -171,8 +171,8 @@ class RecedingHorizon:
                 every tick.
         """
         given = dict(locals())
-        kinds = (Robot, Solver, Window, InitialGuesses)
-        require_kinds("RecedingHorizon", GraphError, RecedingHorizon.__init__.__annotations__, given, *kinds)
+        stated = RecedingHorizon.__init__.__annotations__ | {"judge": "Callable | None"}
+        require_kinds("RecedingHorizon", GraphError, stated, given, Robot, Solver, Window, InitialGuesses)
         if portion is not None and (portion < 1 or coupling == "joint" or delay):
             raise GraphError(f"portion={portion}: one iteration or more, of a plan that acts at once and is not joint")
         if coupling not in COUPLINGS:
@@ -358,6 +358,7 @@ class RecedingHorizon:
 
     def now(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Context[Any]:
         """Context for the terms; arguments as of :meth:`plan`."""
+        require_kinds("plan", GraphError, RecedingHorizon.now.__annotations__, {"constants": constants}, Mapping)
         history = None if self.window is None else self.window.history
         known = (
             {static.name: static.values for static in self.robot.constants} if history is None else history.constants
@@ -668,11 +669,14 @@ class RecedingHorizon:
             sigma: (d,) its standard deviations, or its covariance; None for those of the beginning.
 
         Raises:
+            GraphError: when a beginning is given to a loop without a window, which believes none.
             BackendError: while another thread ticks.
         """
         with self._alone():
             if self.window is not None:
                 self.window.reset(start, sigma)
+            elif start is not None or sigma is not None:
+                raise GraphError("reset: a beginning needs a window; without one, give the present to plan()")
             behind = () if self.window is None else self.window.terms
             reset_all(term for term in self._terms if not any(term is other for other in behind))
             self.abandon()

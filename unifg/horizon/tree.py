@@ -17,6 +17,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.horizon.robot import require_steps
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.terms import Cost, ScalarCost, Term
 from unifg.modeling.variables import Data, Family, Index, Selection
 from unifg.solution.graph import Graph
@@ -130,7 +131,7 @@ class Tree:
         Raises:
             GraphError: when they are not as many, or not finite, not negative and not all zero.
         """
-        given = np.asarray(leaves, dtype=np.float64)
+        given = doubles("the probabilities of the tails", leaves)
         if given.shape != self.leaves.shape or not (np.isfinite(given).all() and (given >= 0.0).all() and given.any()):
             raise GraphError(f"a tree with {len(self.leaves)} tails needs as many probabilities, found {leaves!r}")
         found = np.zeros(len(self) + 1)

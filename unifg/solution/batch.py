@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data, Family
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
@@ -110,7 +111,13 @@ class Batch:
         return all(status.converged for status in self.statuses)
 
     def data_of(self, index: int) -> dict[Data, Array]:
-        """The data of one instance."""
+        """The data of one instance.
+
+        Raises:
+            GraphError: there is no such instance.
+        """
+        if not (isinstance(index, int | np.integer) and -len(self) <= index < len(self)):
+            raise GraphError(f"there is no instance {index!r}: {len(self)} were solved, 0 to {len(self) - 1}")
         return {handle: given[index] for handle, given in self._data.items()}
 
     def solution(self, index: int) -> Solution:
@@ -119,11 +126,9 @@ class Batch:
         Raises:
             GraphError: there is no such instance.
         """
-        if not -len(self) <= index < len(self):
-            raise GraphError(f"there is no instance {index}: {len(self)} were solved, 0 to {len(self) - 1}")
-        program = self._prepared.program
+        program, data = self._prepared.program, self.data_of(index)
         arrays = self.values[index].copy(), self.multipliers[index].copy(), program.no_penalties
-        return self._prepared.solve(Guess.stored(program, arrays), data=self.data_of(index))
+        return self._prepared.solve(Guess.stored(program, arrays), data=data)
 
     def solve_part(self, worker: Worker, part: IntArray, guesses: tuple[Array, Array]) -> IntArray:
         """Have a worker solve some instances; returns those that are left to single solves."""
@@ -154,15 +159,16 @@ def stacked_data(data: Mapping[Data, Numbers]) -> tuple[dict[Data, Array], int |
     """Data with one value for each instance, and the number of instances; None without data.
 
     Raises:
-        GraphError: numbers of instances, or shapes, differ.
+        GraphError: numbers of instances, or shapes, differ, or something else than numbers is given.
     """
     found: dict[Data, Array] = {}
     count: int | None = None
     if not (isinstance(data, Mapping) and all(isinstance(handle, Data) for handle in data)):
         raise GraphError(f"data of many instances are {{handle: values, ...}}, found {f'{data!r}'[:80]}")
     for handle, given in data.items():
-        array = np.array(given)  # a copy: the batch reads it later, and the caller may change it
-        if array.shape[1:] != handle.value.shape:
+        # a copy: the batch reads it later, and the caller may change it
+        array = doubles(f"data '{handle.name}' of many instances", given, flags=True).copy()
+        if not array.ndim or array.shape[1:] != handle.value.shape:
             raise GraphError(
                 f"data '{handle.name}' of many instances has shape {array.shape}, expected (K, "
                 f"{', '.join(map(str, handle.value.shape))}): one value of shape {handle.value.shape} for each"

@@ -26,7 +26,7 @@ REPORT = ("status", "iterations", "cost", "multiplier_size", "stationarity", "vi
 REFUSED = -1
 """Answer of a solver that does not begin."""
 OTHERS = {
-    REFUSED: ("REFUSED", "Not solved: data or a guess are not finite, or a quaternion is not of norm 1."),
+    REFUSED: ("REFUSED", "Not solved: data hold NaN, a guess is not finite, or a quaternion is not of norm 1."),
     NO_ROOM: ("NO_ROOM", "The workspace had no room for arrays of compiled functions: please report it."),
 }
 HEADER = """\

@@ -136,6 +136,7 @@ def marginal_prior(
             or the constraints tie the kept variables to each other exactly.
     """
     leaving, staying = _selections(remove), _selections(keep)
+    terms = [terms] if isinstance(terms, str) else terms  # a name is no list of letters
     removal = _removal(program, tuple(terms), leaving, staying)
     r = lin.residual[removal.costs.rows]
     A, c = _equalities(program, lin, removal.constraints, program.equality if equality is None else equality)

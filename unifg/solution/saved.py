@@ -18,7 +18,7 @@ from unifg.errors import FileFormatError
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data, Family
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
-from unifg.solution.verify import Verified, verified
+from unifg.solution.verify import Verified, require_tolerance, verified
 from unifg.typing import Array
 
 VALUES, MULTIPLIERS, DATA, COST = "values/", "multipliers/", "data/", "cost"
@@ -48,7 +48,9 @@ def check_answer(graph: Model, path: str | os.PathLike[str], tolerance: float = 
 
     Raises:
         FileFormatError: it cannot be read, or is no answer of this graph, with the name of what does not fit.
+        GraphError: the tolerance is no positive number.
     """
+    require_tolerance(tolerance)
     try:
         with open(path, "rb") as file, np.load(file, allow_pickle=False) as stored:
             found = {name: stored[name] for name in stored.files}
@@ -71,7 +73,7 @@ def check_answer(graph: Model, path: str | os.PathLike[str], tolerance: float = 
     values = {family: take(VALUES + family.name, program.columns.place(family)[1]) for family in program.families}
     parts = [take(MULTIPLIERS + name, shape).ravel() for name, _, shape in program.places]
     data = {
-        handle: take(name, own.shape).astype(own.dtype) if (name := DATA + handle.name) in found else own.copy()
+        handle: take(name, own.shape).astype(own.dtype) if (name := DATA + handle.name) in found else handle.value
         for handle, own in program.binding.present.items()
     }
     cost = float(take(COST, ()))

@@ -30,10 +30,10 @@ from unifg.solution.multipliers import hold
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.saved import write_answer
-from unifg.solution.sensitivity import Named, Sensitivities, Weights, Wrt
+from unifg.solution.sensitivity import COST, Named, Sensitivities, Weights, Wrt
 from unifg.solution.status import Found, Status
 from unifg.solution.tube import tube
-from unifg.solution.verify import Verified, verified
+from unifg.solution.verify import Verified, require_tolerance, verified
 from unifg.solution.warm_start import Shifts
 from unifg.typing import Array, BoolArray, Figure, Numbers
 
@@ -350,7 +350,10 @@ class Solution:
         if not self.converged:
             raise GraphError(f"gains need a solution that is CONVERGED, this one is {self.status.name}")
         x, u = (
-            [self._selection(v) for v in ([named] if isinstance(named, Variable | str) else named)]
+            [
+                self._selection(v)
+                for v in ([named] if isinstance(named, str) or not isinstance(named, Sequence) else named)
+            ]
             for named in (states, controls)
         )
         if all(len(s) == len(u[0]) + 1 for s in x):
@@ -403,7 +406,20 @@ class Solution:
         return self._sensitivities.gradient(parts, wrt)
 
     def _part(self, named: Named) -> Selection | str:
-        """A selection, or the name of a constraint or the cost."""
+        """A selection, or the name of a constraint or the cost.
+
+        Raises:
+            GraphError: the name is that of several of them.
+        """
+        if isinstance(named, str):
+            known = {"a family": self.families, "a constraint": {name for name, *_ in self._program.places}}
+            owners = [what for what, names in (known | {"the cost": {COST}}).items() if named in names]
+            if len(owners) > 1:
+                raise GraphError(
+                    f"sensitivity: '{named}' is the name of {' and of '.join(owners)}: give the family itself, or "
+                    "another name to the constraint",
+                    term=named,
+                )
         return named if isinstance(named, str) and named not in self.families else self._selection(named)
 
     @cached_property
@@ -516,9 +532,10 @@ class Solution:
             tolerance: of violation, stationarity and complementarity, as that of the solver.
 
         Raises:
-            GraphError: for a solution that was not returned: another one has taken its place, and its data.
+            GraphError: for a solution that was not returned: another one has taken its place, and its data; for a
+                tolerance that is no positive number.
         """
-        require_kinds("verify", GraphError, Solution.verify.__annotations__, {"tolerance": tolerance})
+        require_tolerance(tolerance)
         return verified(*self._claims("verify"), tolerance)
 
     def save(self, path: str | PathLike[str]) -> None:
@@ -553,6 +570,9 @@ class Solution:
         Raises:
             GraphError: there is no such term, it is of another kind, or its data have been replaced since.
         """
+        require_kinds("tube", GraphError, Solution.tube.__annotations__, {"pieces": pieces})
+        if pieces < 1:
+            raise GraphError(f"tube: pieces must be at least 1, found {pieces}")
         return tube(self._program, self._lin.values, self._claims("tube")[-1], term, pieces)
 
     def report(self) -> str:

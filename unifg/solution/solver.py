@@ -788,6 +788,8 @@ class Prepared:
             BackendError: the backend or a part of the graph needs Python, which is named; no solve has been made; or
                 the compiler has failed, with what it says.
         """
+        options = {"name": name, "target": target}
+        require_kinds("export", BackendError, Prepared.export.__annotations__, options, str)
         self._enter()
         try:
             return export(self, Path(folder), name, target)

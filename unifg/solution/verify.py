@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from unifg.errors import GraphError, require_kinds
 from unifg.modeling.terms import Constraint
 from unifg.modeling.variables import Data, Family
 from unifg.problem.compiled_problem import CompiledProblem
@@ -248,6 +249,17 @@ class Conditions:
         return signed
 
 
+def require_tolerance(tolerance: float) -> None:
+    """Refuse what is no positive number.
+
+    Raises:
+        GraphError: with what was found.
+    """
+    require_kinds("verify", GraphError, require_tolerance.__annotations__, {"tolerance": tolerance})
+    if not tolerance > 0.0:
+        raise GraphError(f"verify: tolerance must be positive, found {tolerance}")
+
+
 def verified(
     program: CompiledProblem,
     values: Mapping[Family, Array],
@@ -279,7 +291,8 @@ def verified(
         bad = ~np.isfinite(terms[-1].rows).all(axis=1)
         if bad.any():
             return Verified("fails", f"term '{compiled.name}', factor {int(bad.argmax())} is not finite")
-    here = Conditions(program, terms)
+    with np.errstate(all="ignore"):
+        here = Conditions(program, terms)
     worst = program.row_place(here.worst) if here.worst >= 0 else None
     measured: dict[str, Any] = {"cost": here.cost, "violation": here.violation, "worst": worst}
     for fix in program.graph.fixes:
