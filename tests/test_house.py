@@ -287,11 +287,11 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 33_427, "scenarios": 13_002, "benchmarks": 4_877, "tests": 36_982,
+    "unifg solvers models": 33_469, "scenarios": 13_002, "benchmarks": 4_877, "tests": 37_090,
     "docs examples": 1_984, "unifg/factors": 4_311, "unifg/problem": 3_449, "models": 2_244,
-    "unifg/elimination": 2_200, "solvers": 5_140, "unifg/solution": 3_208, "unifg/smoothing": 1_918,
+    "unifg/elimination": 2_200, "solvers": 5_140, "unifg/solution": 3_233, "unifg/smoothing": 1_918,
     "unifg/lie": 1_395, "unifg/view": 1_518, "unifg/files": 1_248, "unifg/pose_graphs": 1_857,
-    "unifg/horizon": 1_512, "unifg/modeling": 1_190, "unifg/codegen": 1_331, "unifg/plots": 415,
+    "unifg/horizon": 1_521, "unifg/modeling": 1_190, "unifg/codegen": 1_331, "unifg/plots": 415,
     "scenarios/scenes": 1_323, "scenarios/simulation": 1_386, "scenarios/campaigns": 921,
     "scenarios/quadrotor": 1_761, "scenarios/ground": 1_833, "scenarios/commands": 677,
     "scenarios/logs": 648, "scenarios/perception": 953, "scenarios/planning": 875,

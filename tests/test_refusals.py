@@ -81,10 +81,18 @@ def test_bad_data_and_duals_are_refused() -> None:
         ({"data": {fg.Graph().data("t", [0.0]): [1.0]}}, "does not belong"),
         ({"duals": {"bax": np.zeros((4, 2))}}, "which is no constraint"),
         ({"duals": {"box": np.zeros(4)}}, "multipliers of 'box' have shape"),
+        ({"duals": {5: np.zeros(4)}}, "multipliers given for '5', which is no constraint"),
+        ({"duals": 5}, "duals must be of the class Mapping or None, found 5"),
+        ({"callback": 5}, "callback must be a function or None, found 5"),
     ]
     for given, message in refused:
-        with pytest.raises(fg.GraphError, match=message):
+        with pytest.raises(fg.UnifgError, match=message):
             run.solve(guess, **given)
+    for wrong in (5, {"values": {}, "multipliers": 5}):
+        with pytest.raises(fg.GraphError, match="must be of the class Mapping, found 5"):
+            fg.Guess(**wrong) if isinstance(wrong, dict) else fg.Guess(wrong)  # type: ignore[arg-type]
+    with pytest.raises(fg.GraphError, match="name the variables"):
+        run.solve(guess).information(["prior"])
     assert run.solve(guess).converged, "a refused solve leaves the prepared solver usable"
 
 

@@ -152,7 +152,8 @@ def test_tolerances_and_weights_that_check_nothing(script: Path, capsys: pytest.
     weighed.minimize(fg.prior, x, [1.0], sigma=sigma, name="there")
     fg.solve(weighed, {x: np.zeros((2, 1))}).save("answer.npz")
     changed(data_sigma=0.0)
-    assert not check_answer(weighed, "answer.npz")
+    found = check_answer(weighed, "answer.npz")
+    assert (found.verdict, found.sentence[:25]) == ("fails", "the cost is not finite: l")
 
 
 def test_an_answer_whose_data_are_gone_is_not_saved(script: Path) -> None:

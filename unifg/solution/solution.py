@@ -57,6 +57,10 @@ class Guess:
     multipliers: Mapping[str, Array] = field(default_factory=dict)
     penalties: Mapping[str, Array] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Refuse what is no mapping."""
+        require_kinds("Guess", GraphError, Guess.__annotations__, vars(self), Mapping)
+
     @classmethod
     def stored(cls, program: CompiledProblem, arrays: tuple[Array, Array, Array]) -> Guess:
         """A guess of flat arrays - stored values, multipliers (M,), penalties (M,) - viewed when somebody reads it."""
@@ -430,7 +434,13 @@ class Solution:
         return Sensitivities(self._program, self._lin, *given)
 
     def information(self, terms: Sequence[str], *variables: Variable) -> Array:
-        """(d, d) information of the named costs over the selected variables; see :mod:`unifg.solution.marginal`."""
+        """(d, d) information of the named costs over the selected variables; see :mod:`unifg.solution.marginal`.
+
+        Raises:
+            GraphError: no variables, an unknown cost, or one that reaches others.
+        """
+        if not variables:
+            raise GraphError("information: name the variables that it is over")
         columns = np.concatenate([self._program.columns.of(as_selection(v)).ravel() for v in variables])
         return information(self._program, self._lin, terms, columns)[0]
 

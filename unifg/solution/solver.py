@@ -306,6 +306,7 @@ class SolveState:
         self, solver: Solver, program: CompiledProblem, values: Values, multipliers: Array, callback: Callback | None
     ):
         """Linearise at the start and test it, unless the backend does."""
+        require_kinds(solver.name, BackendError, {"callback": "Callable | None"}, {"callback": callback})
         self._solver = solver
         self._callback = callback
         self._started = time.perf_counter()
@@ -919,6 +920,7 @@ class Prepared:
                 self._require_finite("penalties", penalties)
             return program.values_from(flat), self._pressing(multipliers.copy()), penalties
         values = program.values_from(values_of(guess))
+        require_kinds("solve", GraphError, Prepared.read.__annotations__, {"duals": duals}, Mapping)
         carried: Mapping[str, Numbers] = {}
         penalties = program.no_penalties
         if not isinstance(guess, Mapping):
@@ -1075,7 +1077,7 @@ class Prepared:
         """The same of arrays from anywhere."""
         result = np.zeros(self.program.constraints.count)
         for name, value in given.items():
-            if name not in self._constraints and name.endswith(SLACK):  # of a constraint that was soft
+            if name not in self._constraints and str(name).endswith(SLACK):  # of a constraint that was soft
                 continue
             if name not in self._constraints:
                 known = ", ".join(self._constraints) or "none"

@@ -293,6 +293,8 @@ def verified(
             return Verified("fails", f"term '{compiled.name}', factor {int(bad.argmax())} is not finite")
     with np.errstate(all="ignore"):
         here = Conditions(program, terms)
+    if not np.isfinite(here.cost):
+        return Verified("fails", "the cost is not finite: look at standard deviations, information and prices")
     worst = program.row_place(here.worst) if here.worst >= 0 else None
     measured: dict[str, Any] = {"cost": here.cost, "violation": here.violation, "worst": worst}
     for fix in program.graph.fixes:
