@@ -288,6 +288,8 @@ def _bench(chosen: argparse.Namespace) -> int:
     from unifg.scenarios.commands import performance
 
     records = performance.history(chosen.against or performance.HISTORY)
+    if chosen.record is not None:
+        chosen.record.open("a").close()  # better refused now than after the measurement
     with _progress_bar("bench") as progress:
         now = performance.measured(performance.QUICK if chosen.quick else performance.LONG, progress)
     alike = performance.last(records, now.machine)

@@ -87,6 +87,8 @@ def test_bench_fails_for_a_loss_on_a_machine_of_the_same_kind(
     assert ("another machine (here)" in out) == (machine == "there")
     assert len(performance.history(kept)) == 1
     assert command.main(words) == 0, "only when it is asked to be strict"
+    monkeypatch.setattr(performance, "measured", lambda rounds, progress: pytest.fail("measured in vain"))
+    assert command.main([*words[:-1], str(tmp_path / "absent" / "now.jsonl")]) == 2
 
 
 def test_the_record_that_ships_is_one() -> None:

@@ -171,6 +171,8 @@ def test_lago_is_planar(globe: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_bad_files_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["solve", "nowhere.g2o"]) == 2
     assert "nowhere.g2o: no such file" in capsys.readouterr().err
+    assert command.main(["solve", str(tmp_path)]) == 2
+    assert f"{tmp_path}: is no file; give a pose graph" in capsys.readouterr().err
     for text, message in (
         ("VERTEX_SE2 0 0 0 0\n", "there is no edge"),
         ("VERTEX_SE2 0 0\n", "line 1: VERTEX_SE2: 2 fields, expected 4"),
