@@ -145,6 +145,9 @@ def test_caches_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (tmp_path / "b.2.code").write_bytes(b"half of a file")
     (text,) = said(doctor._cache(tmp_path), None)
     assert text.startswith("1 of 2 damaged")
+    (tmp_path / "c.3.code").symlink_to(tmp_path / "absent")
+    (text,) = said(doctor._cache(tmp_path), None)
+    assert text.startswith("2 of 3 damaged")
     monkeypatch.setattr(doctor, "cache_folder", lambda: None)
     assert VARIABLE in said(doctor._caches(), False)[0]
 
