@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core.errors import NumbaError
+from numba import NumbaError
 
 from unifg.codegen.bisect import first_not_below
 from unifg.codegen.jit import compiled
@@ -304,9 +304,8 @@ class TermTable:
             except NumbaError as error:
                 raise GraphError(
                     f"term '{term.name}': Numba cannot compile its function, which gets variables, parameters, and the "
-                    f"rows to write to: {str(error).strip()}",
-                    term=term.name,
-                ) from error
+                    f"rows to write to: {str(error).strip()}", term=term.name,
+                ) from error  # fmt: skip
             if self._differencing is not None and second == 0 and row[PARTS] > 0:
                 row[DIFFERENCING] = self._differencing()
             table, size = kernel.table.ctypes.data, kernel.table.size
