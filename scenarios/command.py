@@ -22,7 +22,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
@@ -86,6 +86,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     _legible_streams()
+    status = FAILED
+    try:
+        status = _served(arguments)
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        if error.filename is None:  # of a stream, which Python would flush once more at the end
+            with suppress(OSError, AttributeError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):  # whose reader has had enough
+            return _refuse(f"{error.filename or 'the output'}: cannot be written ({error.strerror})")
+    return status
+
+
+def _served(arguments: list[str]) -> int:
+    """Serve the command line; the exit status."""
     try:
         chosen, unknown = _parser(arguments).parse_known_args(arguments)
         if unknown:
@@ -103,8 +119,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         if said is None:
             raise
         return _refuse(said)
-    except OSError as error:
-        return _refuse(f"{error.filename or 'the output'}: cannot be written ({error.strerror})")
     except KeyboardInterrupt:
         print("unifg: interrupted before there was anything to write", file=sys.stderr)
         return INTERRUPTED
@@ -241,7 +255,12 @@ def _cache(chosen: argparse.Namespace) -> int:
     """Name the folder of what is compiled, or delete it."""
     folder = place()
     if chosen.clear:
-        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            shutil.rmtree(folder)
+        except FileNotFoundError:  # there is none, or another process deletes it
+            pass
+        except OSError as error:
+            return _refuse(f"{folder}: cannot be deleted ({error.strerror}: {error.filename})")
     print(folder)
     return SUCCEEDED
 
@@ -269,6 +288,8 @@ def _bench(chosen: argparse.Namespace) -> int:
     from unifg.scenarios.commands import performance
 
     records = performance.history(chosen.against or performance.HISTORY)
+    if chosen.record is not None:
+        chosen.record.open("a").close()  # better refused now than after the measurement
     with _progress_bar("bench") as progress:
         now = performance.measured(performance.QUICK if chosen.quick else performance.LONG, progress)
     alike = performance.last(records, now.machine)
@@ -322,6 +343,8 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
         folder.mkdir(parents=True, exist_ok=True)  # better refused now than after the run
     except OSError as error:
         return _refuse(f"--out {folder}: cannot make this folder ({error.strerror})")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return _refuse(f"--out {folder}: cannot write to this folder")
     with _interrupts() as told:
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
         with _bar(name) as show:

@@ -349,7 +349,8 @@ def existing(what: str, folders: bool = False) -> Text:
     def path(text: str) -> Path:
         found = Path(text)
         if not (found.is_file() or (folders and found.is_dir())):
-            raise argparse.ArgumentTypeError(f"{legible(text)}: no such file; give {what}")
+            why = "is no file" if found.exists() else "no such file"
+            raise argparse.ArgumentTypeError(f"{legible(text)}: {why}; give {what}")
         return found
 
     return path

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -24,7 +25,7 @@ from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName, RobustOn
 from unifg.pose_graphs.verdict import Judgement, Verdict
 from unifg.scenarios.episode import Progress, silent
-from unifg.scenarios.options import Settings, existing, option
+from unifg.scenarios.options import Settings, count, existing, option
 from unifg.scenarios.stopwatch import Stopwatch
 from unifg.solution.history import Iteration
 from unifg.solution.solution import Solution
@@ -92,7 +93,7 @@ class SolveSettings(Settings):
     tolerance: Literal["optimum", "map"] = option("optimum")
     repair_information: Repair | None = option(None, choices=REPAIRS)
     max_iterations: int = option(100, metavar="N")
-    threads: int = option(1, metavar="N")
+    threads: int = option(1, text=partial(count, least=1), metavar="N")
     no_scene: bool = option(False)
     effort: Literal["none", "cheap", "full"] = option("cheap")
     keep_map: bool = option(False)

@@ -216,12 +216,16 @@ def test_broken_map_is_a_message(
     assert "gone.pgm" in capsys.readouterr().err.splitlines()[-1]
 
 
-def test_out_that_is_a_file_is_refused_before_the_run(
-    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_out_that_cannot_be_written_is_refused_before_the_run(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "out").write_text("in the way")
     assert run(tmp_path) == 2
     assert "cannot make this folder" in capsys.readouterr().err
+    (tmp_path / "out").unlink()
+    monkeypatch.setattr(os, "access", lambda path, mode: False)  # chmod would not stop root
+    assert run(tmp_path) == 2
+    assert "cannot write to this folder" in capsys.readouterr().err
     assert navigation.settings == []
 
 

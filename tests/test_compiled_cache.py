@@ -16,6 +16,7 @@ from typing import Any, cast
 
 import numba
 import numpy as np
+import platformdirs
 import pytest
 
 from scripts import run_script
@@ -25,6 +26,7 @@ from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON, UseDispatcher
 from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.jit import compiled
 from unifg.codegen.objects import read_sealed, write_sealed
+from unifg.scenarios.command import main
 
 FORKS = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this platform")
 SOURCE = "def twice(x):\n    return 2.0 * x\n"
@@ -285,6 +287,35 @@ def test_a_folder_that_others_may_write_to_or_own_is_refused(
     monkeypatch.undo()
     monkeypatch.setenv(cache_folder.VARIABLE, "")
     assert cache_folder.place().parent.name == "unifg" and tmp_path not in cache_folder.place().parents
+
+
+def test_a_user_without_a_home_keeps_nothing(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def homeless(*_: Any, **__: Any) -> None:
+        raise RuntimeError("could not determine the home directory")
+
+    monkeypatch.setattr(platformdirs, "user_cache_path", homeless)
+    monkeypatch.delenv(cache_folder.VARIABLE, raising=False)
+    monkeypatch.setattr(cache_folder, "_said", Event())
+    assert cache_folder.cache_folder.__wrapped__() is None and "there is no home" in caplog.text
+    assert main(["cache"]) == 2 and "there is no home" in capsys.readouterr().err
+
+
+def test_what_cannot_be_deleted_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv(cache_folder.VARIABLE, str(tmp_path))
+    assert main(["cache", "--clear"]) == 0  # there is none
+    assert capsys.readouterr().out == f"{cache_folder.place()}\n"
+    cache_folder.place().write_bytes(b"")  # no folder
+    assert main(["cache", "--clear"]) == 2
+    assert str(cache_folder.place()) in capsys.readouterr().err
+
+
+def test_a_numba_that_compiles_nothing_is_refused() -> None:
+    script = "try: import unifg\nexcept ValueError as error: assert 'unset it' in str(error)\nelse: raise SystemExit(1)"
+    run_script(script, variables={"NUMBA_DISABLE_JIT": "1"})
 
 
 HAMMER = """

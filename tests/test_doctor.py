@@ -87,6 +87,8 @@ def test_bench_fails_for_a_loss_on_a_machine_of_the_same_kind(
     assert ("another machine (here)" in out) == (machine == "there")
     assert len(performance.history(kept)) == 1
     assert command.main(words) == 0, "only when it is asked to be strict"
+    monkeypatch.setattr(performance, "measured", lambda rounds, progress: pytest.fail("measured in vain"))
+    assert command.main([*words[:-1], str(tmp_path / "absent" / "now.jsonl")]) == 2
 
 
 def test_the_record_that_ships_is_one() -> None:
@@ -143,6 +145,9 @@ def test_caches_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     (tmp_path / "b.2.code").write_bytes(b"half of a file")
     (text,) = said(doctor._cache(tmp_path), None)
     assert text.startswith("1 of 2 damaged")
+    (tmp_path / "c.3.code").symlink_to(tmp_path / "absent")
+    (text,) = said(doctor._cache(tmp_path), None)
+    assert text.startswith("2 of 3 damaged")
     monkeypatch.setattr(doctor, "cache_folder", lambda: None)
     assert VARIABLE in said(doctor._caches(), False)[0]
 

@@ -186,6 +186,17 @@ def test_streams_that_are_closed_or_lack_characters_take_what_is_said(tmp_path: 
     assert "\\xfc/graph.g2o" in said and (tmp_path / "\xfc" / "graph.g2o").is_file()
 
 
+@pytest.mark.parametrize(
+    ("reader", "message"), [("| true", ""), ("> /dev/full", "unifg: error: the output: cannot be written (No space")]
+)
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no device that is full")
+def test_an_output_that_takes_no_more_is_no_traceback(reader: str, message: str) -> None:
+    command = f"{sys.executable} -m unifg.scenarios.command cache {reader}"
+    said = subprocess.run(["sh", "-c", command], cwd=CHECKOUT, capture_output=True, text=True, check=False)
+    assert said.stderr.startswith(message) and said.stderr.count("\n") == bool(message), said.stderr
+    assert message == "" or said.returncode == 2
+
+
 # ---------------------------------------------------------------- writing
 
 

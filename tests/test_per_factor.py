@@ -122,6 +122,17 @@ def test_the_number_of_rows_must_be_told() -> None:
         fg.residual(relative)
 
 
+def test_a_function_that_cannot_be_compiled_is_refused_by_its_term() -> None:
+    @numba.njit  # type: ignore[untyped-decorator]
+    def returned(x: Array) -> Array:
+        return 2.0 * x
+
+    graph, x = graph_with(fg.Rn(1), 2)
+    graph.minimize(fg.residual(returned, rows=1, derivatives="differences"), x, name="doubled")
+    with pytest.raises(fg.GraphError, match=r"'doubled': Numba cannot compile.*rows to write to(.|\n)*too many pos"):
+        fg.solve(graph, {x: np.zeros((2, 1))})
+
+
 KEPT = """
 import numba, numpy as np
 import unifg as fg

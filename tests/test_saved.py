@@ -117,6 +117,7 @@ def test_what_does_not_fit_is_refused_by_name(script: Path, capsys: pytest.Captu
             check_answer(graph, "answer.npz")
         assert reason in str(caught.value)
     Path("other.npz").write_bytes(b"no file of arrays")
+    Path("broken.py").write_bytes(b"graph = \0")
     for name, file, reason in (
         ("wall_ahead.py:graph", "other.npz", "is no file of arrays"),
         ("wall_ahead.py:graph", "absent.npz", "absent.npz: No such file"),
@@ -124,6 +125,8 @@ def test_what_does_not_fit_is_refused_by_name(script: Path, capsys: pytest.Captu
         ("absent.py:graph", "answer.npz", "there is no script absent.py"),
         ("no_such_module:graph", "answer.npz", "cannot import no_such_module"),
         ("wall_ahead.py", "answer.npz", "names no graph: give SCRIPT.py:NAME"),
+        ("json:loads", "answer.npz", "json: 'loads' is called without arguments, and needs some"),
+        ("broken.py:graph", "answer.npz", "broken.py cannot be run as Python"),
     ):
         assert main(["check", name, file]) == 2
         assert reason in capsys.readouterr().err

@@ -98,7 +98,7 @@ def test_a_graph_by_two_threads_and_then_one_again(city: Path, globe: Path) -> N
             SolveSettings(write_g2o(city.with_name("globe.g2o"), sphere(4, 8).pose_graph), init="lago", threads=2)
         )
     assert threads() == 1
-    with pytest.raises(UnifgError, match="at least 1, got 0"):
+    with pytest.raises(UnifgError, match="threads: '0' is not a whole number of at least 1"):
         solve_file(SolveSettings(city, threads=0))
 
 
@@ -171,6 +171,10 @@ def test_lago_is_planar(globe: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_bad_files_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main(["solve", "nowhere.g2o"]) == 2
     assert "nowhere.g2o: no such file" in capsys.readouterr().err
+    assert command.main(["solve", __file__, "--threads", "0"]) == 2
+    assert "argument --threads: '0' is not a whole number of at least 1" in capsys.readouterr().err
+    assert command.main(["solve", str(tmp_path)]) == 2
+    assert f"{tmp_path}: is no file; give a pose graph" in capsys.readouterr().err
     for text, message in (
         ("VERTEX_SE2 0 0 0 0\n", "there is no edge"),
         ("VERTEX_SE2 0 0\n", "line 1: VERTEX_SE2: 2 fields, expected 4"),

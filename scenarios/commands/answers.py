@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
+from inspect import signature
 from pathlib import Path
 from types import ModuleType
 
@@ -30,6 +31,10 @@ def load_graph(name: str) -> Model:
         raise ScenarioError(f"'{name}' names no graph: give SCRIPT.py:NAME or MODULE:NAME, as in plan.py:graph")
     found = getattr(_module(where), attribute, None)
     if callable(found):
+        try:
+            signature(found).bind()
+        except (TypeError, ValueError) as error:
+            raise ScenarioError(f"{where}: '{attribute}' is called without arguments, and needs some") from error
         found = found()
     if not isinstance(found, Model):
         raise ScenarioError(f"{where} defines no graph '{attribute}', nor a function that returns one")
@@ -51,5 +56,8 @@ def _module(where: str) -> ModuleType:
         raise ScenarioError(f"there is no script {where}")
     module = module_from_spec(spec)
     sys.modules.setdefault(script.stem, module)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except SyntaxError as error:
+        raise ScenarioError(f"{where} cannot be run as Python: {error}") from error
     return module

@@ -113,7 +113,7 @@ def _caches() -> Iterator[Finding]:
 def _cache(folder: Path) -> Iterator[Finding]:
     """Files of compiled functions in a folder."""
     files = sorted(folder.glob("*.code"))
-    size = sum(file.stat().st_size for file in files)
+    size = sum(file.stat().st_size for file in files if file.is_file())  # a link, or another process, may lead nowhere
     yield Finding("caches", f"{len(files)} compiled functions, {size / 1e6:.0f} MB in {folder}")
     began, read, damaged = time.monotonic(), 0, list[Path]()
     for file in files:

@@ -11,6 +11,8 @@ from functools import cache
 from pathlib import Path
 from threading import Event
 
+from unifg.errors import UnifgError
+
 logger = logging.getLogger("unifg")
 
 VARIABLE = "UNIFG_CACHE_DIR"
@@ -22,9 +24,11 @@ _said = Event()
 @cache
 def cache_folder() -> Path | None:
     """The folder, made if need be; None where there can be none, which is logged once."""
-    folder = place()
-    if why := _refused(folder):
-        say_not_kept(why)
+    try:
+        folder = place()
+        _require_fit(folder)
+    except UnifgError as error:
+        say_not_kept(str(error))
         return None
     return folder
 
@@ -35,7 +39,13 @@ def place() -> Path:
         return Path(given) / version()
     from platformdirs import user_cache_path  # where a folder is named, it is not loaded
 
-    return Path(user_cache_path("unifg", appauthor=False)) / version()
+    try:
+        folder = Path(user_cache_path("unifg", appauthor=False))
+    except RuntimeError:  # without a home; older ones return "~", a folder of the present one
+        folder = Path("~")
+    if not folder.is_absolute():
+        raise UnifgError("there is no home for a folder of compiled functions")
+    return folder / version()
 
 
 def version() -> str:
@@ -48,18 +58,17 @@ def version() -> str:
         return "0.0.0"
 
 
-def _refused(folder: Path) -> str:
-    """Reason for which nothing is kept in a folder; empty where it is fit, and then it is there."""
-    if not folder.is_absolute() and VARIABLE not in os.environ:  # without a home, "~" is a folder of the present one
-        return "there is no home for a folder of compiled functions"
+def _require_fit(folder: Path) -> None:
+    """Make a folder, and refuse one in which nothing can be kept."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.stat()
     except OSError as error:
-        return f"{folder}: {error.strerror}"
+        raise UnifgError(f"{folder}: {error.strerror}") from error
     if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & OTHERS):
-        return f"{folder} belongs to another user, or others may write to it"
-    return "" if os.access(folder, os.W_OK) else f"{folder} cannot be written"
+        raise UnifgError(f"{folder} belongs to another user, or others may write to it")
+    if not os.access(folder, os.W_OK):
+        raise UnifgError(f"{folder} cannot be written")
 
 
 def say_not_kept(why: str) -> None:

@@ -50,6 +50,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 logger = logging.getLogger("unifg")
 
+if numba.config.DISABLE_JIT:
+    raise UnifgError("NUMBA_DISABLE_JIT is set, and nothing here works without Numba's compiler: unset it")
+
 LIBERTIES = {"contract", "reassoc", "nsz", "arcp"}
 NUMBERS = 2**40, 2**62  # of functions: the least first one of a process, and how many there are to choose from
 

@@ -10,11 +10,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import NumbaError
 
 from unifg.codegen.bisect import first_not_below
 from unifg.codegen.jit import compiled
 from unifg.codegen.native import Source
 from unifg.elimination.symmetric import Symmetric
+from unifg.errors import GraphError
 from unifg.factors.autodiff.expression import Expression
 from unifg.factors.kernel import Kernel
 from unifg.factors.robust import Loss, form_of
@@ -297,7 +299,13 @@ class TermTable:
         first = second = table = size = 0
         if kernel is not None:
             wanted = self._differencing is not None or row[KIND] == SCALAR or not kernel.derived
-            first, second = kernel.address, kernel.second_address if wanted else 0
+            try:
+                first, second = kernel.address, kernel.second_address if wanted else 0
+            except NumbaError as error:
+                raise GraphError(
+                    f"term '{term.name}': Numba cannot compile its function, which gets variables, parameters, and the "
+                    f"rows to write to: {str(error).strip()}", term=term.name,
+                ) from error  # fmt: skip
             if self._differencing is not None and second == 0 and row[PARTS] > 0:
                 row[DIFFERENCING] = self._differencing()
             table, size = kernel.table.ctypes.data, kernel.table.size
