@@ -20,7 +20,8 @@ from benchmarks.report import listing
 from benchmarks.runner import Cell, Study
 from benchmarks.wrong_closures import published
 from problems.closures import adrift, aliased, drive, slipped
-from unifg.pose_graphs import Cluster, PoseGraph, Verdict, best_guess, manhattan, sphere
+from unifg.pose_graphs import PoseGraph, Verdict, best_guess, manhattan, sphere
+from unifg.pose_graphs.verdict import Cluster
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array, IntArray
 

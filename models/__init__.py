@@ -13,7 +13,6 @@ __all__ = [
     "clearances",
     "detours",
     "distance_map",
-    "footprint",
     "inertial",
     "interpolation",
     "keeping",

@@ -21,7 +21,7 @@ from unifg.models.distance_map import DistanceMap, bilinear
 from unifg.models.planar import POSE
 from unifg.typing import Array, BoolArray
 
-__all__ = ["endpoint", "endpoint_loss", "in_world"]
+__all__ = ["endpoint", "endpoint_loss"]
 
 DISCARD_BEYOND = 0.3  # [m] to the nearest surface
 DROP_BEYOND = 10.0  # [m] range

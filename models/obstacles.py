@@ -20,7 +20,7 @@ from unifg.models.planar import POSE
 from unifg.models.profile import of_distance
 from unifg.typing import Array
 
-__all__ = ["clearance_of", "disc_clearance", "shortfall", "wall_distance"]
+__all__ = ["disc_clearance", "shortfall", "wall_distance"]
 
 TAKES = POSE, "m in W", "m"  # units and frames of pose, centres and radii
 

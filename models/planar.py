@@ -26,7 +26,7 @@ from unifg.lie.so2 import wrap
 from unifg.modeling.factors import difference
 from unifg.typing import Array, ArrayLike, BoolArray
 
-__all__ = ["BASES", "Base", "ackermann", "base_of"]
+__all__ = ["Base", "ackermann"]
 
 POSE = "m, m, rad in W_T_B"  # units and frame of a pose
 BASES = ("unicycle", "ackermann", "omnidirectional")

@@ -33,7 +33,7 @@ from unifg.lie.series import c_slope, c_value
 from unifg.modeling.duplicates import doubles
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["BIAS", "ImuNoise", "Preintegrated", "at_rest", "predict", "preintegrate"]
+__all__ = ["BIAS", "ImuNoise", "at_rest", "predict", "preintegrate"]
 
 BIAS = Product(gyro=Rn(3), accelerometer=Rn(3))
 """What the sensors show too much of: rates [rad/s] and specific forces [m/s^2], in the axes of the body."""

@@ -29,7 +29,7 @@ CLOSE = 1e-6  # of a step: how far from a node a stamp still falls on it
 
 
 class Nodes(Protocol):
-    """Nodes of a window, as in :class:`unifg.horizon.History`."""
+    """Nodes of a window, as in :class:`unifg.horizon.history.History`."""
 
     times: Array
 

@@ -139,7 +139,7 @@ class GraduatedNonConvexity(Backend):
 
     The answer is the best found, not the best there is: no local method knows that. CONVERGED says that it is
     stationary. ``solution.verdict`` says which measurements it believes and which other answers were found that cost
-    less, or as much (:class:`unifg.OutlierReport`).
+    less, or as much (:class:`unifg.solution.outlier_report.OutlierReport`).
 
     It is called like a backend. Terms with other losses, or none, take part as they are: measurements that can be
     trusted, such as odometry, are stated without a loss.

@@ -19,6 +19,8 @@ from unifg.solvers.least_squares import DogLeg, GaussNewton, LevenbergMarquardt
 from unifg.solvers.penalty import Penalty
 from unifg.solvers.sqp import SQP
 
+__all__ = ["backend", "backends"]
+
 
 @dataclass(frozen=True)
 class Entry:

@@ -13,9 +13,10 @@ import pytest
 import unifg as fg
 from unifg.errors import BackendError, GraphError
 from unifg.files.g2o import read_g2o
-from unifg.pose_graphs import Edges, PoseGraph, Simulated, best_guess, certify, chordal, judge, manhattan, sphere
+from unifg.pose_graphs import Edges, PoseGraph, best_guess, certify, chordal, judge, manhattan, sphere
 from unifg.pose_graphs.certificate import _Judge, _measured_in
 from unifg.pose_graphs.descent import Descent
+from unifg.pose_graphs.generate import Simulated
 from unifg.pose_graphs.information import bounded_below
 from unifg.pose_graphs.relaxation import Relaxation
 from unifg.solvers import DogLeg, GaussNewton, LevenbergMarquardt

@@ -10,8 +10,9 @@ import pytest
 
 from unifg.errors import GraphError
 from unifg.lie import SE2
-from unifg.pose_graphs import Edges, PoseGraph, Simulated, manhattan, pairwise_consistent, sphere
+from unifg.pose_graphs import Edges, PoseGraph, manhattan, pairwise_consistent, sphere
 from unifg.pose_graphs.consistency import _clique
+from unifg.pose_graphs.generate import Simulated
 from unifg.typing import BoolArray
 
 CITY, GLOBE = manhattan(250, 2, outliers=0.5), sphere(6, 12, seed=2, outliers=0.5)

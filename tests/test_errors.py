@@ -19,6 +19,7 @@ from test_house import LIBRARY, name_of, text_of, tree_of
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.symmetric import Symmetric
 from unifg.files.ros_map import OccupancyMap
+from unifg.modeling.factors import ManifoldResidual
 from unifg.models import quadrotor
 from unifg.models.distance_map import DistanceMap
 from unifg.models.rkmk import integrator
@@ -116,7 +117,7 @@ def test_not_converged_names_nothing_where_nothing_is_violated() -> None:
     assert (caught.value.term, caught.value.index) == (None, None)
 
 
-ON_VECTORS: list[tuple[fg.ManifoldResidual, str]] = [
+ON_VECTORS: list[tuple[ManifoldResidual, str]] = [
     (fg.between, "between needs a Lie group, found S2; use difference"),
     (chart_between, "chart_between needs poses in SE2 or SE3, found"),
     (sighting, "sighting needs poses in SE2 or SE3, found"),
@@ -124,7 +125,7 @@ ON_VECTORS: list[tuple[fg.ManifoldResidual, str]] = [
 
 
 @pytest.mark.parametrize(("function", "message"), ON_VECTORS, ids=[f.name for f, _ in ON_VECTORS])
-def test_a_residual_on_the_wrong_manifold_names_term_and_family(function: fg.ManifoldResidual, message: str) -> None:
+def test_a_residual_on_the_wrong_manifold_names_term_and_family(function: ManifoldResidual, message: str) -> None:
     graph = fg.Graph()
     x = graph.variables("corner", S2 if function is fg.between else fg.Rn(3), 2)
     with pytest.raises(fg.GraphError, match=f"'odometry': {message}.*'corner'") as caught:

@@ -38,7 +38,8 @@ from unifg.models import (
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.models.footprint import Body
 from unifg.models.potential import potential
-from unifg.pose_graphs import bearing, bearing_range, chart_between, distance, sighting
+from unifg.pose_graphs import bearing, bearing_range, distance, sighting
+from unifg.pose_graphs.residuals import chart_between
 from unifg.typing import Array
 
 RNG = np.random.default_rng(7)

@@ -16,7 +16,8 @@ from numpy.random import Generator
 from groups import BATCHES, CASES, PI, Case
 from own_manifolds import Sphere
 from unifg.errors import UnifgError
-from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, ProductGroup, Rn, check_manifold, wrap_angle
+from unifg.lie import SE2, SE3, SO2, SO3, LieGroup, Manifold, Product, Rn, check_manifold, wrap_angle
+from unifg.lie.product import ProductGroup
 
 # -- wrapping --
 

@@ -9,7 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import unifg as fg
-from unifg.horizon import Context, Dynamics, MeshPlan, Robot, Term, plan_on_mesh
+from unifg.horizon import Context, Dynamics, Robot, Term, plan_on_mesh
+from unifg.horizon.mesh import MeshPlan
 from unifg.models import unicycle
 from unifg.models.obstacles import disc_clearance
 from unifg.solvers import InteriorPoint

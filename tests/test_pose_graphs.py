@@ -16,18 +16,9 @@ import unifg as fg
 from unifg.elimination.components import components
 from unifg.errors import GraphError
 from unifg.files.pose_graph import read_pose_graph
-from unifg.pose_graphs import (
-    Edges,
-    PoseGraph,
-    Sightings,
-    chart_between,
-    chordal,
-    lago,
-    manhattan,
-    odometric,
-    sphere,
-)
+from unifg.pose_graphs import Edges, PoseGraph, Sightings, chordal, lago, manhattan, odometric, sphere
 from unifg.pose_graphs.certificate import certify
+from unifg.pose_graphs.residuals import chart_between
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
 

@@ -15,6 +15,7 @@ import pytest
 import unifg as fg
 from fences import PYTHON, documents, fences
 from scripts import run_script
+from unifg.modeling.factors import ManifoldResidual
 
 # Rooms whose modules a user imports by name; all others are organs, but for what a backend of one's own is made of.
 OPEN = (
@@ -104,12 +105,12 @@ def test_a_module_of_models_is_listed_where_it_lists_names() -> None:
 
 
 def test_help_speaks_of_the_residual_and_not_of_its_class() -> None:
-    boilerplate = {inspect.getdoc(fg.Residual), inspect.getdoc(fg.ManifoldResidual)}
+    boilerplate = {inspect.getdoc(fg.Residual), inspect.getdoc(ManifoldResidual)}
     shipped = [importlib.import_module(f"unifg.models.{name}") for name in dir(importlib.import_module("unifg.models"))]
     told = 0
     for module in [fg, importlib.import_module("unifg.pose_graphs"), *shipped]:
         for name, value in vars(module).items():
-            if isinstance(value, (fg.Residual, fg.ManifoldResidual)) and not name.startswith("_"):
+            if isinstance(value, (fg.Residual, ManifoldResidual)) and not name.startswith("_"):
                 assert inspect.getdoc(value) not in boilerplate, (module.__name__, name)
                 told += 1
     assert told > 20

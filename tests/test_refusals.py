@@ -82,8 +82,8 @@ def test_bad_data_and_duals_are_refused() -> None:
         ({"duals": {"bax": np.zeros((4, 2))}}, "which is no constraint"),
         ({"duals": {"box": np.zeros(4)}}, "multipliers of 'box' have shape"),
         ({"duals": {5: np.zeros(4)}}, "multipliers given for '5', which is no constraint"),
-        ({"duals": 5}, "duals must be of the class Mapping or None, found 5"),
-        ({"callback": 5}, "callback must be a function or None, found 5"),
+        ({"duals": 5}, "duals must be of the class Mapping, found 5"),
+        ({"callback": 5}, "callback must be a function, found 5"),
     ]
     for given, message in refused:
         with pytest.raises(fg.UnifgError, match=message):

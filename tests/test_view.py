@@ -24,8 +24,8 @@ from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
-from unifg.view import Part, Scene
-from unifg.view.bodies import BODIES
+from unifg.view import Scene
+from unifg.view.bodies import BODIES, Part
 from unifg.view.shapes import box, column, copies, sphere
 
 pytest.importorskip("meshcat")

@@ -27,7 +27,6 @@ from unifg.errors import (
     ViewError,
 )
 from unifg.factors.autodiff.casadi_function import from_casadi
-from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual, residual
 from unifg.factors.robust import DCS, Cauchy, GemanMcClure, Huber, Loss, Reweighted, TruncatedLeastSquares, Tukey
 from unifg.lie import (
@@ -36,7 +35,6 @@ from unifg.lie import (
     SE23,
     SO2,
     SO3,
-    Axioms,
     LieGroup,
     Manifold,
     ManifoldBase,
@@ -46,15 +44,14 @@ from unifg.lie import (
     elementwise,
     wrap_angle,
 )
-from unifg.modeling.factors import ManifoldResidual, between, difference, prior
+from unifg.modeling.factors import between, difference, prior
 from unifg.modeling.joint_prior import joint_prior
 from unifg.modeling.soft import Soft
 from unifg.modeling.variables import Data, Family, Selection, each, shared
-from unifg.solution.check import Finding, Report
+from unifg.solution.check import Report
 from unifg.solution.graph import Graph
 from unifg.solution.history import Iteration
-from unifg.solution.optimality import Optimality, optimality
-from unifg.solution.outlier_report import OutlierReport
+from unifg.solution.optimality import optimality
 from unifg.solution.solution import AnyGuess as _AnyGuess
 from unifg.solution.solution import Guess, NotConverged, Solution
 from unifg.solution.solver import Callback as _Callback
@@ -79,13 +76,11 @@ __all__ = [
     "SE23",
     "SO2",
     "SO3",
-    "Axioms",
     "BackendError",
     "Cauchy",
     "Data",
     "Family",
     "FileFormatError",
-    "Finding",
     "FixedLag",
     "GemanMcClure",
     "Graph",
@@ -94,16 +89,12 @@ __all__ = [
     "Huber",
     "Incremental",
     "Iteration",
-    "Kernel",
     "LieGroup",
     "Loss",
     "Manifold",
     "ManifoldBase",
-    "ManifoldResidual",
     "ModelError",
     "NotConverged",
-    "Optimality",
-    "OutlierReport",
     "Prepared",
     "Product",
     "Report",

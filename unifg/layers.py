@@ -22,7 +22,7 @@ from unifg.solution.solution import AnyGuess
 from unifg.solution.solver import Prepared
 from unifg.typing import Array, Numbers
 
-__all__ = ["Answers", "Layer"]
+__all__ = ["Layer"]
 
 STEP = 1e-3  # of the differences of x Exp(t), whose error is of its fourth power
 TURN = 2.0 * np.pi

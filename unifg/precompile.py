@@ -45,7 +45,8 @@ from unifg.models.interpolation import cubic
 from unifg.models.lidar import endpoint, endpoint_loss
 from unifg.models.preintegration import BIAS, ImuNoise, predict, preintegrate
 from unifg.models.stamped import StampedMeasurements
-from unifg.pose_graphs import Simulated, manhattan, sphere
+from unifg.pose_graphs import manhattan, sphere
+from unifg.pose_graphs.generate import Simulated
 from unifg.pose_graphs.initialise import starts
 from unifg.smoothing import FixedLag, Incremental
 from unifg.solution.graph import Graph

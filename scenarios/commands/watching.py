@@ -10,7 +10,8 @@ from unifg.scenarios.episode import Progress
 from unifg.scenarios.logs.columns import SoFar, watched
 from unifg.scenarios.scenes.numbers import Number, declare, show
 from unifg.solution.history import Iteration
-from unifg.view import Frame, Live, Scene
+from unifg.view import Live, Scene
+from unifg.view.canvas import Frame
 
 __all__ = ["Announce", "watching_iterates", "watching_ticks"]
 

@@ -9,7 +9,8 @@ from unifg.scenarios.scenes.parts import layout
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.solution.history import Iteration
 from unifg.typing import Array
-from unifg.view import Frame, Scene
+from unifg.view import Scene
+from unifg.view.canvas import Frame
 
 __all__ = ["HEIGHT", "course_iterate", "course_stage", "iterate_scene"]
 

@@ -21,7 +21,9 @@ from unifg.scenarios.logs.metrics import collision_words, health, one_graph
 from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
 from unifg.scenarios.scenes.parts import CLEAR, draw_way, lidar_hits, pillar, standing
 from unifg.typing import Array
-from unifg.view import Frame, Part, Scene, shapes
+from unifg.view import Scene, shapes
+from unifg.view.bodies import Part
+from unifg.view.canvas import Frame
 
 __all__ = ["drive_frame", "drive_scene", "drive_stage", "place_movers"]
 

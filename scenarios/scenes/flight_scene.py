@@ -20,7 +20,9 @@ from unifg.scenarios.scenes.parts import CLEAR, draw_way, layout, pillar, vehicl
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
 from unifg.typing import Array
-from unifg.view import Frame, Part, Scene, shapes
+from unifg.view import Scene, shapes
+from unifg.view.bodies import Part
+from unifg.view.canvas import Frame
 
 __all__ = ["flight_frame", "flight_scene", "flight_stage", "senses"]
 

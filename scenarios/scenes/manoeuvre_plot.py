@@ -14,8 +14,8 @@ from unifg.scenarios.scenes.panels import plot_held, shade_distance
 from unifg.style.colours import INK, css
 from unifg.style.figures import face, ground, headline, new_figure
 from unifg.typing import Array, Axes, Figure
-from unifg.view import Part, Scene
-from unifg.view.bodies import body_of
+from unifg.view import Scene
+from unifg.view.bodies import Part, body_of
 from unifg.view.shapes import merge, ring, wedge
 
 __all__ = ["picture", "plot_control", "plot_iterates", "plot_violation", "shades"]

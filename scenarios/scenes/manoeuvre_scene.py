@@ -7,7 +7,8 @@ import numpy as np
 from unifg.scenarios.manoeuvres import Case, Manoeuvre, ManoeuvreSettings
 from unifg.scenarios.scenes.numbers import Number, declare, show
 from unifg.solution.history import Iteration
-from unifg.view import Frame, Scene
+from unifg.view import Scene
+from unifg.view.canvas import Frame
 
 __all__ = ["manoeuvre_iterate", "manoeuvre_scene", "manoeuvre_stage"]
 

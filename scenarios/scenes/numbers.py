@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from unifg.errors import ViewError
-from unifg.view import Frame, Scene
+from unifg.view import Scene
+from unifg.view.canvas import Frame
 
 __all__ = ["Number", "declare", "filled", "in_words", "metres", "show"]
 

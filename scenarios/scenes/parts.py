@@ -10,7 +10,9 @@ from unifg.lie import SE2
 from unifg.models.footprint import Body
 from unifg.scenarios.simulation.layouts import Layout
 from unifg.typing import Array
-from unifg.view import Frame, Part, Scene, shapes
+from unifg.view import Scene, shapes
+from unifg.view.bodies import Part
+from unifg.view.canvas import Frame
 
 __all__ = ["CLEAR", "draw_way", "floor", "layout", "lidar_hits", "pillar", "standing", "vehicle"]
 

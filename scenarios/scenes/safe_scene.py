@@ -13,8 +13,9 @@ from unifg.scenarios.logs.safe_log import SafeLog
 from unifg.scenarios.scenes.numbers import Number, declare, filled, show
 from unifg.scenarios.scenes.parts import CLEAR, draw_way, floor, pillar, vehicle
 from unifg.typing import Array
-from unifg.view import Frame, Part, Scene, shapes
-from unifg.view.bodies import body_of
+from unifg.view import Scene, shapes
+from unifg.view.bodies import Part, body_of
+from unifg.view.canvas import Frame
 
 __all__ = ["place_bodies", "resting", "safe_frame", "safe_scene", "safe_stage"]
 

@@ -8,8 +8,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from unifg.lie import SE2, SE3
-from unifg.pose_graphs import Edges, PoseGraph, Simulated, manhattan
-from unifg.pose_graphs.generate import simulated
+from unifg.pose_graphs import Edges, PoseGraph, manhattan
+from unifg.pose_graphs.generate import Simulated, simulated
 from unifg.solvers.gating import neighbours
 from unifg.typing import Array, BoolArray, IntArray
 

@@ -24,7 +24,7 @@ from unifg.files.contents import LIMITS, Limits
 from unifg.files.text import TextFile, decimal
 from unifg.typing import Array, IntArray
 
-__all__ = ["CarmenLog", "Odometry", "Scans", "read_carmen"]
+__all__ = ["read_carmen"]
 
 logger = logging.getLogger("unifg")
 

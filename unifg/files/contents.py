@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from unifg.atomic_write import write_atomically
 from unifg.errors import FileFormatError
 
-__all__ = ["LIMITS", "Limits"]
+__all__ = ["LIMITS"]
 
 _GZIP = b"\x1f\x8b"
 _ALLOWED = bytes([9, 10, 13, *range(32, 127), *range(128, 256)])

@@ -16,7 +16,7 @@ from unifg.files.contents import LIMITS, Limits, require_finite, write_rows
 from unifg.files.text import Table, norms
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["Trajectory", "read_tum", "write_tum"]
+__all__ = ["read_tum", "write_tum"]
 
 _FIELDS = "t tx ty tz qx qy qz qw"
 

@@ -10,37 +10,29 @@ loop = RecedingHorizon(robot, 25, terms, solver=InteriorPoint(), window=window, 
 plan = loop.tick(measured={"position": z})
 """
 
-from unifg.horizon.coupling import COUPLINGS, Coupling
-from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
-from unifg.horizon.history import History
-from unifg.horizon.mesh import MeshPlan, plan_on_mesh
+from unifg.horizon.coupling import COUPLINGS
+from unifg.horizon.decision import Decision, LastPlan, LastPlanThenBrake, Plan
+from unifg.horizon.mesh import plan_on_mesh
 from unifg.horizon.multistart import cheapest
-from unifg.horizon.past import Arrival
 from unifg.horizon.receding_horizon import InitialGuesses, RecedingHorizon
 from unifg.horizon.robot import Constant, Robot
-from unifg.horizon.terms import Context, ControlCost, Dynamics, Measurement, Resetting, Term
+from unifg.horizon.terms import Context, ControlCost, Dynamics, Measurement, Term
 from unifg.horizon.tree import Tree, tree_of
 from unifg.horizon.window import Window
 
 __all__ = [
     "COUPLINGS",
-    "AcceptancePolicy",
-    "Arrival",
     "Constant",
     "Context",
     "ControlCost",
-    "Coupling",
     "Decision",
     "Dynamics",
-    "History",
     "InitialGuesses",
     "LastPlan",
     "LastPlanThenBrake",
     "Measurement",
-    "MeshPlan",
     "Plan",
     "RecedingHorizon",
-    "Resetting",
     "Robot",
     "Term",
     "Tree",

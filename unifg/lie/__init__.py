@@ -6,10 +6,10 @@ the class that states them (:func:`elementwise`). A manifold of one's own derive
 from :class:`LieGroup`. Conventions are collected in ``docs/reference/conventions.md``.
 """
 
-from unifg.lie.axioms import Axioms, Breach, check_manifold
+from unifg.lie.axioms import Axioms, check_manifold
 from unifg.lie.elementwise import elementwise
 from unifg.lie.manifold import LieGroup, Manifold, ManifoldBase
-from unifg.lie.product import Component, Product, ProductGroup
+from unifg.lie.product import Product
 from unifg.lie.rn import Rn
 from unifg.lie.se2 import SE2
 from unifg.lie.se3 import SE3
@@ -24,13 +24,10 @@ __all__ = [
     "SO2",
     "SO3",
     "Axioms",
-    "Breach",
-    "Component",
     "LieGroup",
     "Manifold",
     "ManifoldBase",
     "Product",
-    "ProductGroup",
     "Rn",
     "check_manifold",
     "elementwise",

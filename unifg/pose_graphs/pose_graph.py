@@ -181,7 +181,7 @@ class PoseGraph:
         Args:
             robust: loss on the whitened residuals of the loop closures.
             residual: ``"log"`` is Log(Z^-1 Xi^-1 Xj), as in GTSAM; ``"g2o"`` is g2o's chart (see
-                `unifg.pose_graphs.chart_between`). Both take the information matrices as the file has them.
+                `unifg.pose_graphs.residuals.chart_between`). Both take the information matrices as the file has them.
             robust_on: ``"all"`` puts the loss on odometry and sightings too. Where odometry may be wrong, so is a guess
                 made of it: the graph then names chordal poses and, in the plane, LAGO's as further starts.
 

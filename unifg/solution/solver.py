@@ -42,6 +42,8 @@ from unifg.solution.status import Status
 from unifg.solution.warmup_run import rehearse
 from unifg.typing import Array, Numbers
 
+__all__ = ["Backend", "Prepared", "SolveState", "Solver"]
+
 logger = logging.getLogger("unifg")
 
 Callback: TypeAlias = Callable[[Iteration], bool | None]
@@ -306,7 +308,8 @@ class SolveState:
         self, solver: Solver, program: CompiledProblem, values: Values, multipliers: Array, callback: Callback | None
     ):
         """Linearise at the start and test it, unless the backend does."""
-        require_kinds(solver.name, BackendError, {"callback": "Callable | None"}, {"callback": callback})
+        if callback is not None:
+            require_kinds(solver.name, BackendError, {"callback": "Callable"}, {"callback": callback})
         self._solver = solver
         self._callback = callback
         self._started = time.perf_counter()
@@ -920,7 +923,8 @@ class Prepared:
                 self._require_finite("penalties", penalties)
             return program.values_from(flat), self._pressing(multipliers.copy()), penalties
         values = program.values_from(values_of(guess))
-        require_kinds("solve", GraphError, Prepared.read.__annotations__, {"duals": duals}, Mapping)
+        if duals is not None:
+            require_kinds("solve", GraphError, {"duals": "Mapping"}, {"duals": duals}, Mapping)
         carried: Mapping[str, Numbers] = {}
         penalties = program.no_penalties
         if not isinstance(guess, Mapping):

@@ -1,11 +1,9 @@
 """Anything that was solved, looked at: scenes in three dimensions, as pages that need nothing else, or live."""
 
-from unifg.view.bodies import Part
-from unifg.view.canvas import Frame
 from unifg.view.live import Live
 from unifg.view.scene import Scene
 
-__all__ = ["Frame", "Live", "Part", "Scene"]
+__all__ = ["Live", "Scene"]
 
 
 def __dir__() -> list[str]:
