@@ -45,7 +45,7 @@ from unifg.models.interpolation import cubic
 from unifg.models.lidar import endpoint, endpoint_loss
 from unifg.models.preintegration import BIAS, ImuNoise, predict, preintegrate
 from unifg.models.stamped import StampedMeasurements
-from unifg.pose_graphs import manhattan, sphere
+from unifg.pose_graphs import Submaps, manhattan, sphere
 from unifg.pose_graphs.generate import Simulated
 from unifg.pose_graphs.initialise import starts
 from unifg.smoothing import FixedLag, Incremental
@@ -307,6 +307,9 @@ def _pose_graph(simulated: Simulated) -> None:
     with TemporaryDirectory() as folder:
         write_g2o(Path(folder) / "map.g2o", found)
         found = read_g2o(Path(folder) / "map.g2o")
+        submaps = Submaps.split(found, folder, 20)
+        submaps.optimize(max_iterations=1)
+        submaps.covariance(1)
     starts(found)
     found.verdict(effort="full")
 
