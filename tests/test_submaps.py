@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from unifg.elimination.factorization import Factorization
 from unifg.elimination.reduction import Reduction
 from unifg.elimination.symmetric import Symmetric, distinct
 from unifg.errors import GraphError
@@ -220,6 +221,20 @@ def test_reduction_is_the_schur_complement(kept: int, apart: bool) -> None:
     J[:, 2] = 0.0
     A = J.T @ J
     assert not reduction.factor(A[pattern.indices, pattern.columns])
+
+
+@pytest.mark.parametrize("dense", [False, True])
+def test_the_last_node_comes_last(dense: bool) -> None:
+    """Also where another node touches more of them, and where a part of the graph does not touch it."""
+    n = 400
+    first, second = np.arange(n - 3), np.arange(1, n - 2)
+    rows, columns = np.append(first, [0, 200]), np.append(second, [n - 1, n - 1])
+    if dense:
+        rows, columns = np.append(rows, np.arange(n - 2)), np.append(columns, np.full(n - 2, n - 2))
+    factorization = Factorization(Symmetric(n, [(rows, columns)]), np.arange(n), ordering="last")
+    place = np.argsort(factorization.structure.order)
+    assert place[n - 1] > place[: n - 2].max()
+    assert not dense or place[n - 1] > place[n - 2]
 
 
 @pytest.mark.parametrize("numbers", [[], [3], [5, -2, 5, 5, -2, 0], [-(2**63), 2**63 - 1, 0]])

@@ -17,7 +17,7 @@ from unifg.elimination.symbolic import cliques, postordered, predicted_cost
 from unifg.errors import UnifgError
 from unifg.typing import IntArray
 
-Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "metis", "natural"] | IntArray
+Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "metis", "natural", "last"] | IntArray
 SLACK = 16  # numbers the kernels may read beyond the last matrix
 DISSECT = 4e6, 3e3  # predicted nanoseconds, in all and per node, from which nested dissection is tried
 FILL = 1.4  # see :func:`_fits`
@@ -40,12 +40,16 @@ class Graph(NamedTuple):
     pointer: IntArray
     neighbours: IntArray
 
-    def tree(self, order: IntArray | None = None, stage: IntArray | None = None) -> Tree:
-        """Elimination tree of a given order, or of minimum degree within stages; dense nodes come last."""
+    def tree(self, order: IntArray | None = None, stage: IntArray | None = None, last: bool = False) -> Tree:
+        """Elimination tree of a given order, or of minimum degree within stages; dense nodes come last.
+
+        With ``last`` the last node comes after all others.
+        """
         nodes, degree = len(self.weight), np.diff(self.pointer)
         stage = np.zeros(nodes, np.int64) if stage is None else stage
         if order is None:
             stage[degree > 16 + int(10.0 * np.sqrt(nodes))] = stage.max(initial=0) + 1
+            stage[nodes - last :] = stage.max(initial=0) + 1
         first = np.repeat(np.arange(nodes), degree)
         pairs = np.column_stack([first, self.neighbours])[self.neighbours > first]
         given = np.zeros(0, np.int64) if order is None else order
@@ -113,12 +117,14 @@ def analyse(indptr: IntArray, indices: IntArray, blocks: IntArray | None, orderi
         kind, tree = "METIS", graph.tree(metis_order(pointer, neighbours, weight))
     elif ordering == "minimum-degree":
         tree = graph.tree()
+    elif ordering == "last":
+        tree = _before_last(graph)
     elif ordering == "auto":
         kind, tree = _cheapest(graph)
     else:
         raise UnifgError(
-            f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural or "
-            "give a permutation"
+            f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural, last "
+            "or give a permutation"
         )
     order, bounds, parent, passed = tree
     table, scalar_order, rows, relative, runs, slots, part, waiting = lay_out(
@@ -162,6 +168,18 @@ def _cheapest(graph: Graph) -> tuple[str, Tree]:
         if (less := predicted_cost(weight, other[0], other[1], other[3])) < cost:
             kind, tree, cost = name, other, less
     return ("chain", line) if chain and least <= cost else (kind, tree)
+
+
+def _before_last(graph: Graph) -> Tree:
+    """The order of least predicted cost in which the last node, which others may touch in numbers, comes last."""
+    weight, pointer, neighbours = graph
+    last = len(weight) - 1
+    inner = neighbours != last
+    inner[pointer[last] :] = False
+    within = _sums(inner.astype(np.int64))[pointer]
+    dissected = separators(within, neighbours[inner], weight)
+    trees = graph.tree(last=True), graph.tree(stage=dissected, last=True)
+    return min(trees, key=lambda tree: predicted_cost(weight, tree[0], tree[1], tree[3]))
 
 
 def _fits(graph: Graph, line: Tree) -> bool:

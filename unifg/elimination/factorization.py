@@ -86,7 +86,7 @@ class Factorization:
                 other and have the same neighbours are one node.
             ordering: how to order the nodes, or a permutation of them: the nodes in the order of elimination. "auto"
                 takes the cheapest of minimum degree, nested dissection (large graphs; METIS' too, where the extra
-                ``unifg[metis]`` is installed) and a chain of stages.
+                ``unifg[metis]`` is installed) and a chain of stages; "last" those in which the last node comes last.
         """
         self._begin(Symbolic(pattern, blocks, ordering))
 

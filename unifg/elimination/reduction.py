@@ -22,13 +22,10 @@ class Reduction:
     def __init__(self, pattern: Symmetric, kept: int) -> None:
         """Order the first scalars by themselves, and make one node of the last ``kept``."""
         gone = pattern.size - kept
-        within = pattern.columns < gone
-        inner = Symmetric(gone, [(pattern.indices[within], pattern.columns[within])])
-        label = indistinguishable(inner.indptr.astype(np.int64), inner.indices.astype(np.int64))
-        nodes = int(label.max(initial=-1)) + 1
-        order = Factorization(inner, label).structure.order if gone else np.zeros(0, np.int64)
-        whole = np.append(label, np.full(kept, nodes))
-        self._tree = Factorization(pattern, whole, ordering=np.append(order, nodes)[: nodes + (kept > 0)])
+        inner = pattern.indptr[: gone + 1], pattern.indices[: pattern.indptr[gone]]
+        label = indistinguishable(*(array.astype(np.int64) for array in inner))
+        last = np.full(kept, label.max(initial=-1) + 1)
+        self._tree = Factorization(pattern, np.append(label, last), ordering="last" if kept else "auto")
         self._kept, self._added, self._held = slice(gone, pattern.size), np.zeros(pattern.size), np.zeros((0, 0))
 
     def factor(self, data: Array) -> bool:

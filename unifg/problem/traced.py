@@ -16,7 +16,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from unifg.errors import GraphError
-from unifg.factors.autodiff.captured import Captured, captured_by
+from unifg.factors.autodiff.captured import Captured, captured_by, changed_arrays
 from unifg.factors.autodiff.derived import DerivedKernel, derived, in_python
 from unifg.factors.autodiff.rows import Common, Each, Fixed, Given, RowsError, Shared, lengths_for
 from unifg.factors.autodiff.symbols import TraceError
@@ -165,12 +165,12 @@ class Trace:
     @property
     def outdated(self) -> bool:
         """True if something has changed that is compiled in."""
-        return any(reach.changed for reach in (self.reach, *self.given))
+        return self.reach.changed or (bool(self.given) and any(reach.changed for reach in self.given))
 
     @property
     def moved(self) -> bool:
         """True if parameters have changed that are no data."""
-        return _changed(self.free)
+        return changed_arrays(self.free)
 
     def refreshed(self) -> Trace:
         """The same trace with the present content of its parameters."""
@@ -446,10 +446,6 @@ def _moved(manifold: Manifold, point: Array, step: Array) -> Array:
 
 def _contents(arrays: Sequence[Array]) -> Contents:
     return tuple((array, array.tobytes()) for array in arrays)
-
-
-def _changed(contents: Contents) -> bool:
-    return any(array.tobytes() != content for array, content in contents)
 
 
 def reach_of_value(value: Any) -> Any:

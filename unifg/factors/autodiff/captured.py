@@ -56,16 +56,27 @@ class _Watched:
         for names, name, value in self.names:
             if names.get(name, _MISSING) is not value:
                 return True
-        for function, written in self.functions:
-            if any(now is not before for now, before in zip(_written(function), written, strict=True)):
+        for function, (code, defaults, options) in self.functions:  # each tick of a loop comes here
+            if function.__code__ is not code or function.__defaults__ is not defaults:
+                return True
+            if function.__kwdefaults__ is not options:
                 return True
         for container, entries in self.containers:
             present = entries_of(container)
             if len(present) != len(entries) or any(now is not kept for now, kept in zip(present, entries, strict=True)):
                 return True
-        if any(fingerprint_of(interpolator) != content for interpolator, content in self.interpolators):
+        for interpolator, content in self.interpolators:
+            if fingerprint_of(interpolator) != content:
+                return True
+        return changed_arrays(self.arrays)
+
+
+def changed_arrays(contents: Sequence[tuple[Array, bytes]]) -> bool:
+    """Test whether an array holds other numbers than it did."""
+    for array, content in contents:
+        if array.tobytes() != content:
             return True
-        return any(array.tobytes() != content for array, content in self.arrays)
+    return False
 
 
 @dataclass(frozen=True, eq=False)
@@ -315,7 +326,8 @@ class _Walk:
         seen = _scanned(code)
         parts: list[Hashable] = [code]
         if own:
-            self.watched.functions.append((python, _written(python)))
+            written = python.__code__, python.__defaults__, python.__kwdefaults__  # notebooks replace them
+            self.watched.functions.append((python, written))
             if seen.trouble:
                 self.refuse(f"{seen.trouble}")
             self._attributes |= seen.attributes
@@ -409,11 +421,6 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _codes(constant)
-
-
-def _written(function: FunctionType) -> tuple[Any, ...]:
-    """Parts of a function that notebooks replace when a module is loaded again."""
-    return function.__code__, function.__defaults__, function.__kwdefaults__
 
 
 def _inside(cell: CellType) -> Any:
