@@ -3,6 +3,9 @@
 Two levels of nested dissection. Poses are cut by where they lie; the ends of edges across the cuts are the separator.
 A Gauss-Newton step is that of the whole graph: every submap eliminates its inner poses, what is left of all of them is
 solved for the separator, and the steps of the inner poses follow.
+
+It has converged where the relative offset is within the tolerance, of the whole and of the edges of every pose, as
+:mod:`unifg.solution.relative_offset` has it; the second is known once the step is.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import logging
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,7 +40,9 @@ logger = logging.getLogger("unifg")
 
 INDEX, SEPARATOR, INFORMATION = "submaps.json", "separator.npz", "information.npy"
 POSES, NEXT = "poses.npy", "next.npy"
+EDGES = "first", "second", "measured", "information"
 ARMIJO, SHORTEST = 1e-4, 2.0**-10
+ROUNDING = 4.0 * 2.0**-52  # of a residual, relative to the numbers that it is made of
 
 
 class Optimized(NamedTuple):
@@ -61,12 +67,50 @@ class _Pass(NamedTuple):
     Attributes:
         step: (S, d) of the poses of the separator, zero for fixed ones.
         chi2: where it was linearised.
-        fall: of chi2 by the whole step, by the quadratic model.
+        fall: of chi2 by the whole step, by the quadratic model; zero within the rounding of residuals.
+        worst: largest relative offset of a single pose where the step before began.
     """
 
     step: Array
     chi2: float
     fall: float
+    worst: float
+
+    @property
+    def offset(self) -> float:
+        """Relative offset of the whole."""
+        return math.sqrt(self.fall / self.chi2) if self.fall > 0.0 else 0.0
+
+
+class _Edges:
+    """Edges among some poses as a graph.
+
+    Attributes:
+        program: compiled.
+    """
+
+    def __init__(self, group: LieGroup, count: int, edges: Edges) -> None:
+        graph = Graph()
+        self._x = graph.variables("x", group, count)
+        ends = self._x[edges.first], self._x[edges.second]
+        graph.minimize(between, *ends, edges.measured, information=edges.information, name="edges")
+        self.program, self._ends, self._group = CompiledProblem(graph), (edges.first, edges.second), group
+
+    def linearize(self, poses: Array) -> Linearization:
+        """Linearise."""
+        return self.program.linearize(self.program.values_from({self._x: poses}))
+
+    def offsets(self, lin: Linearization, step: Array | None) -> Array:
+        """(3, n) over the edges of each pose: |J d|^2 of a step (n, d), |r|^2, and what is rounding of the first."""
+        costs, count, group = self.program.costs, self._x.count, self._group
+        sizes = np.maximum(np.abs(lin.values[self._x][:, : group.point_dim]).max(axis=1), 1.0)
+        noise = lin.jacobian * (ROUNDING * np.repeat(sizes, group.dim))[costs.columns]
+        moved = np.zeros(costs.count) if step is None else np.bincount(
+            costs.rows, lin.jacobian * step.ravel()[costs.columns], costs.count
+        )  # fmt: skip
+        rows = moved**2, lin.residual**2, np.bincount(costs.rows, noise**2, costs.count)
+        squares = [row.reshape(-1, group.dim).sum(axis=1) for row in rows]
+        return np.array([sum(np.bincount(end, one, count) for end in self._ends) for one in squares])
 
 
 class _Submap:
@@ -75,13 +119,10 @@ class _Submap:
     def __init__(self, file: Path, group: LieGroup) -> None:
         with np.load(file) as known:
             self.inner, self.rim = known["inner"], known["rim"]
-            self.members = np.concatenate([self.inner, self.rim])
-            graph = Graph()
-            x = graph.variables("x", group, len(self.members))
-            ends = x[known["first"]], x[known["second"]]
-            graph.minimize(between, *ends, known["measured"], information=known["information"], name="edges")
-        self._program, self._x = CompiledProblem(graph), x
-        self._tree = Reduction(self._program.normal, len(self.rim) * group.dim)
+            edges = Edges(*(known[name] for name in EDGES))
+        self.members = np.concatenate([self.inner, self.rim])
+        self.edges = _Edges(group, len(self.members), edges)
+        self._tree = Reduction(self.edges.program.normal, len(self.rim) * group.dim)
 
     def linearize(self, poses: Array) -> Linearization:
         """Linearise and eliminate the inner poses.
@@ -89,7 +130,7 @@ class _Submap:
         Raises:
             GraphError: they are not determined.
         """
-        lin = self._program.linearize(self._program.values_from({self._x: poses}))
+        lin = self.edges.linearize(poses)
         if not self._tree.factor(lin.hessian):
             raise GraphError(f"the edges do not determine all poses of the submap that holds pose {self.inner[0]}")
         return lin
@@ -126,7 +167,7 @@ class Submaps:
         self._group: LieGroup = SE2 if storage == SE2.storage else SE3
         with np.load(self.folder / SEPARATOR) as file:
             self._shared, self._fixed = file["shared"], file["fixed"]
-            self._across = Edges(file["first"], file["second"], file["measured"], file["information"])
+            self._across = Edges(*(file[name] for name in EDGES))
         self._rims = [self._places(k) for k in range(self.count)]
         self._optimized = False
 
@@ -213,21 +254,21 @@ class Submaps:
     def _optimize(self, tolerance: float, most: int) -> Optimized:
         now, taken = self._eliminated(), 0
         while True:
-            offset = math.sqrt(max(now.fall, 0.0) / now.chi2) if now.chi2 > 0.0 else 0.0
-            logger.info("submaps: %d steps, chi2 %.9g, offset %.1e", taken, now.chi2, offset)
-            if offset <= tolerance:
-                return Optimized(Status.CONVERGED, now.chi2, taken, offset)
+            logger.info("submaps: %d steps, chi2 %.9g, offset %.1e", taken, now.chi2, now.offset)
             if taken >= most:
-                return Optimized(Status.ITERATION_LIMIT, now.chi2, taken, offset)
+                return Optimized(Status.ITERATION_LIMIT, now.chi2, taken, now.offset)
             length, trial = 1.0, self._eliminated(now.step, 1.0)
-            while not trial.chi2 <= now.chi2 - ARMIJO * length * now.fall:
+            done = now.offset <= tolerance and trial.worst <= tolerance
+            while not trial.chi2 <= now.chi2 * (1.0 + ROUNDING) - ARMIJO * length * now.fall:
                 length *= 0.5
-                if length < SHORTEST:
+                if done or length < SHORTEST:
                     self._eliminated()  # what is left of the submaps belongs to the poses
-                    return Optimized(Status.STALLED, now.chi2, taken, offset)
+                    return Optimized(Status.CONVERGED if done else Status.STALLED, now.chi2, taken, now.offset)
                 trial = self._eliminated(now.step, length)
             os.replace(self.folder / NEXT, self.folder / POSES)
             now, taken = trial, taken + 1
+            if done:
+                return Optimized(Status.CONVERGED, now.chi2, taken, now.offset)
 
     def covariance(self, pose: int) -> Array:
         """(d, d) marginal covariance of a pose, over its tangent space, at the present poses; zero for a fixed one.
@@ -279,27 +320,34 @@ class Submaps:
     def _eliminated(self, step: Array | None = None, length: float = 1.0) -> _Pass:
         """Take a step from the present poses, which writes the next ones, and eliminate all inner poses there."""
         separator, poses, group = self._separator, self.poses, self._group
-        shared, fall = np.array(poses[self._shared]), 0.0
+        shared, fall, worst = np.array(poses[self._shared]), 0.0, 0.0
+        offsets = separator.offsets(shared, step)
         if step is not None:
             following = np.lib.format.open_memmap(self.folder / NEXT, "w+", poses.dtype, poses.shape)
             following[self._shared] = shared = group.retract(shared, length * step)
-        chi2 = separator.begin(shared)
+        chi2, noise = separator.begin(shared), float(offsets[2].sum())
         for k, places in enumerate(self._rims):
             submap = _Submap(self.folder / f"{k}.npz", group)
-            own = np.array(poses[submap.members])
+            own, inner = np.array(poses[submap.members]), len(submap.inner)
             lin = submap.linearize(own)
             if step is not None:
-                own = group.retract(own, length * submap.step(lin.gradient, step[places]))
-                own[len(submap.inner) :] = shared[places]
-                following[submap.inner] = own[: len(submap.inner)]
+                whole = submap.step(lin.gradient, step[places])
+                found = submap.edges.offsets(lin, whole)
+                offsets[:, places] += found[:, inner:]
+                worst = max(worst, _largest(found[:, :inner]))
+                own = group.retract(own, length * whole)
+                own[inner:] = shared[places]
+                following[submap.inner] = own[:inner]
                 lin = submap.linearize(own)
             matrix, gradient, inside = submap.reduced(lin.gradient)
             separator.add(places, matrix, gradient)
             chi2, fall = chi2 + 2.0 * lin.cost, fall + inside
+            noise += float(submap.edges.offsets(lin, None)[2].sum())
         if step is not None:
             following.flush()
         found, outside = separator.solve()
-        return _Pass(found, chi2, fall + outside)
+        fall += outside
+        return _Pass(found, chi2, fall if fall > noise else 0.0, max(worst, _largest(offsets)))
 
     @cached_property
     def _separator(self) -> _Separator:
@@ -324,22 +372,27 @@ class _Separator:
         self._pattern = Symmetric.of_blocks(starts, first[known], second[known])
         self._tree = Factorization(self._pattern, np.repeat(np.arange(len(free)), dim))
         self.information, self._gradient = np.zeros(self._pattern.nnz), np.zeros(self._pattern.size)
-        self._program: CompiledProblem | None = None
+        self._edges: _Edges | None = None
         self._ends = distinct(np.concatenate([edges.first, edges.second]))
         if len(edges):
-            graph = Graph()
-            self._x = graph.variables("x", group, len(self._ends))
-            ends = [self._x[np.searchsorted(self._ends, end)] for end in (edges.first, edges.second)]
-            graph.minimize(between, *ends, edges.measured, information=edges.information, name="edges")
-            self._program = CompiledProblem(graph)
+            first, second = (np.searchsorted(self._ends, end) for end in (edges.first, edges.second))
+            self._edges = _Edges(group, len(self._ends), replace(edges, first=first, second=second))
+
+    def offsets(self, poses: Array, step: Array | None) -> Array:
+        """(3, S) as of :meth:`_Edges.offsets`, of the edges of the separator."""
+        result = np.zeros((3, len(poses)))
+        if self._edges is not None:
+            lin = self._edges.linearize(poses[self._ends])
+            result[:, self._ends] = self._edges.offsets(lin, None if step is None else step[self._ends])
+        return result
 
     def begin(self, poses: Array) -> float:
         """Linearise the edges, of which nothing else is there yet; chi2 of them."""
         self.information[:], self._gradient[:] = 0.0, 0.0
-        if self._program is None:
+        if self._edges is None:
             return 0.0
-        lin = self._program.linearize(self._program.values_from({self._x: poses[self._ends]}))
-        pattern, column = self._program.normal, self._columns[self._ends].ravel()
+        lin = self._edges.linearize(poses[self._ends])
+        pattern, column = self._edges.program.normal, self._columns[self._ends].ravel()
         rows, columns = column[pattern.indices], column[pattern.columns]
         free = (rows >= 0) & (columns >= 0)
         np.add.at(self.information, self._pattern.positions(rows[free], columns[free]), lin.hessian[free])
@@ -380,6 +433,13 @@ class _Separator:
         if len(free):
             result[np.ix_(free, free)] = self._tree.inverse_block(columns[free])
         return result
+
+
+def _largest(offsets: Array) -> float:
+    """Largest relative offset of a pose, of (3, n) as of :meth:`_Edges.offsets`."""
+    moved, squares, noise = offsets
+    told = moved > noise
+    return float(np.sqrt(moved[told] / np.maximum(squares[told], noise[told])).max(initial=0.0))
 
 
 def _cut(places: Array, largest: int) -> IntArray:
