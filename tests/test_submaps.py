@@ -50,10 +50,13 @@ def test_submaps_find_the_map_and_its_covariances(made: PoseGraph, largest: int,
             np.testing.assert_allclose(opened.covariance(pose), expected, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize("largest", [1000, 60])
-def test_a_step_is_that_of_the_whole_graph(largest: int, tmp_path: Path) -> None:
-    """Its offset and what is left of it at half its length, too."""
+@pytest.mark.parametrize(("largest", "moved_away"), [(1000, 0), (60, 0), (60, 37)])
+def test_a_step_is_that_of_the_whole_graph(largest: int, moved_away: int, tmp_path: Path) -> None:
+    """Its offsets, of the whole and of every pose, and what is left of it at half its length, too."""
     made = begun(PLANE)
+    poses = made.poses.copy()
+    poses[moved_away] += np.array([3.0, 2.0, 0.5]) * (moved_away > 0)
+    made = made.with_poses(poses)
     graph, x, guess = made.graph()
     program = graph.compile()
     lin = program.linearize(program.values_from(guess))
@@ -63,7 +66,15 @@ def test_a_step_is_that_of_the_whole_graph(largest: int, tmp_path: Path) -> None
     parted = Submaps.split(made, tmp_path, largest)
     found = parted.optimize(max_iterations=0)
     assert found.offset == pytest.approx(np.sqrt(-gradient @ step / found.chi2), rel=1e-8)
-    parted._eliminated(parted._eliminated().step, 0.5)
+    jacobian = np.zeros((program.costs.count, program.columns.width))
+    jacobian[program.costs.rows, program.costs.columns] = lin.jacobian
+    moved = jacobian[:, program.columns.free] @ step
+    order = np.argsort(~made.edges.odometry, kind="stable")  # of the terms of the graph
+    ends = np.repeat(np.stack([made.edges.first, made.edges.second])[:, order], 3, axis=1).ravel()
+    squares = [np.bincount(ends, np.tile(row**2, 2)) for row in (moved, lin.residual)]
+    ratios = np.sqrt(squares[0] / squares[1])
+    assert (ratios.argmax() in parted._shared) == (moved_away > 0)
+    assert parted._eliminated(parted._eliminated().step, 0.5).worst == pytest.approx(ratios.max(), rel=1e-6)
     expected = program.retract(program.values_from(guess), 0.5 * step)[x]
     np.testing.assert_allclose(np.load(tmp_path / submaps.NEXT), expected, atol=1e-9)
 
