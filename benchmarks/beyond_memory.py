@@ -43,23 +43,23 @@ def city(count: int) -> PoseGraph:
 def whole(count: int) -> list[float]:
     """Steps, chi2, seconds and the peak of memory [GB] of the graph in memory."""
     graph, _, guess = city(count).graph()
-    began = time.perf_counter()
+    began = time.process_time()
     solution = GaussNewton().solve(graph, guess, check=True)
-    return [solution.iterations, 2.0 * solution.cost, time.perf_counter() - began, peak()]
+    return [solution.iterations, 2.0 * solution.cost, time.process_time() - began, peak()]
 
 
 def split(count: int, folder: str, largest: int) -> list[float]:
     """Submaps, poses of the separator, seconds and the peak of memory [GB] of writing them."""
-    made, began = city(count), time.perf_counter()
+    made, began = city(count), time.process_time()
     parted = Submaps.split(made, folder, largest)
-    return [parted.count, len(parted._shared), time.perf_counter() - began, peak()]
+    return [parted.count, len(parted._shared), time.process_time() - began, peak()]
 
 
 def optimized(folder: str) -> list[float]:
     """The same as of :func:`whole` in submaps."""
-    began = time.perf_counter()
+    began = time.process_time()
     found = Submaps(folder).optimize()
-    return [found.iterations, found.chi2, time.perf_counter() - began, peak()]
+    return [found.iterations, found.chi2, time.process_time() - began, peak()]
 
 
 def peak() -> float:
@@ -86,7 +86,7 @@ def tables(rounds: int) -> str:
     head = "poses", "map", "separator", "written in", "steps", "chi2", "seconds", "peak of memory, GB", "on disk, GB"
     notes = (
         f"A city of {WIDTH} streets: half of all poses are measured from the street beside. Poses begin within "
-        "0.3 m and 0.03 rad (standard deviations) of the truth. Wall time of one core, tolerance 1e-6; of writing, the "
+        "0.3 m and 0.03 rad (standard deviations) of the truth. Processor time of one core, tolerance 1e-6; of writing, the "
         "memory holds the arrays of the whole graph."
     )
     return f"{table(head, [measure(*case) for case in CASES], 2)}\n\n{notes}"
