@@ -155,8 +155,8 @@ def test_a_step_that_raises_chi2_is_not_taken(tmp_path: Path, monkeypatch: pytes
     made, step = begun(PLANE), submaps._Separator.solve
 
     def backwards(separator: submaps._Separator) -> tuple[Array, float]:
-        found, fall = step(separator)
-        return -5.0 * found, fall
+        found, decrease = step(separator)
+        return -5.0 * found, decrease
 
     parted = Submaps.split(made, tmp_path, 60)
     parted.optimize(max_iterations=0)
@@ -219,6 +219,8 @@ def test_refusals(tmp_path: Path) -> None:
         with pytest.raises(GraphError, match=words):
             Submaps.split(graph, tmp_path, largest)  # type: ignore[arg-type]
     parted = Submaps.split(made, tmp_path, 60)
+    with pytest.raises(GraphError, match="max_iterations must be a whole number, found 'many'"):
+        parted.optimize(max_iterations="many")  # type: ignore[arg-type]
     for pose, words in ((-1, "pose -1 of 300"), (300, "pose 300 of 300"), ("a", "pose must be a whole number")):
         with pytest.raises(GraphError, match=words):
             parted.covariance(pose)  # type: ignore[arg-type]
@@ -255,9 +257,9 @@ def test_reduction_is_the_schur_complement(kept: int, apart: bool) -> None:
     k = n - kept
     inner = np.linalg.inv(A[:k, :k])
     np.testing.assert_allclose(reduction.matrix, A[k:, k:] - A[k:, :k] @ inner @ A[:k, k:], atol=1e-10)
-    left, fall = reduction.reduce(g)
+    left, decrease = reduction.reduce(g)
     np.testing.assert_allclose(left, g[k:] - A[k:, :k] @ inner @ g[:k], atol=1e-10)
-    assert fall == pytest.approx(g[:k] @ inner @ g[:k])
+    assert decrease == pytest.approx(g[:k] @ inner @ g[:k])
     last = rng.standard_normal(kept)
     step = reduction.step(g, last)
     np.testing.assert_allclose(step[k:], last, atol=1e-9)

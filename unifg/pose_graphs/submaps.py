@@ -14,6 +14,7 @@ import json
 import logging
 import math
 import os
+import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -67,19 +68,19 @@ class _Pass(NamedTuple):
     Attributes:
         step: (S, d) of the poses of the separator, zero for fixed ones.
         chi2: where it was linearised.
-        fall: of chi2 by the whole step, by the quadratic model; zero within the rounding of residuals.
+        decrease: of chi2 by the whole step, by the quadratic model; zero within the rounding of residuals.
         worst: largest relative offset of a single pose where the step before began.
     """
 
     step: Array
     chi2: float
-    fall: float
+    decrease: float
     worst: float
 
     @property
     def offset(self) -> float:
         """Relative offset of the whole."""
-        return math.sqrt(self.fall / self.chi2) if self.fall > 0.0 else 0.0
+        return math.sqrt(self.decrease / self.chi2) if self.decrease > 0.0 else 0.0
 
 
 class _Edges:
@@ -114,15 +115,15 @@ class _Edges:
 
 
 class _Submap:
-    """A submap in memory: edges between inner poses and its rim, the poses of the separator that it touches."""
+    """A submap in memory: edges between inner poses and its boundary, the poses of the separator that it touches."""
 
     def __init__(self, file: Path, group: LieGroup) -> None:
         with np.load(file) as known:
-            self.inner, self.rim = known["inner"], known["rim"]
+            self.inner, self.boundary = known["inner"], known["boundary"]
             edges = Edges(*(known[name] for name in EDGES))
-        self.members = np.concatenate([self.inner, self.rim])
+        self.members = np.concatenate([self.inner, self.boundary])
         self.edges = _Edges(group, len(self.members), edges)
-        self._tree = Reduction(self.edges.program.normal, len(self.rim) * group.dim)
+        self._tree = Reduction(self.edges.program.normal, len(self.boundary) * group.dim)
 
     def linearize(self, poses: Array) -> Linearization:
         """Linearise and eliminate the inner poses.
@@ -136,12 +137,12 @@ class _Submap:
         return lin
 
     def reduced(self, gradient: Array) -> tuple[Array, Array, float]:
-        """Information and gradient that are left to the rim, and the fall of twice the cost by the inner poses."""
+        """Information and gradient left to the boundary, and the decrease of twice the cost by the inner poses."""
         return self._tree.matrix, *self._tree.reduce(gradient)
 
-    def step(self, gradient: Array, rim: Array) -> Array:
-        """(n, d) step of all members, for a given one of the rim."""
-        return self._tree.step(gradient, rim.ravel()).reshape(len(self.members), -1)
+    def step(self, gradient: Array, boundary: Array) -> Array:
+        """(n, d) step of all members, for a given one of the boundary."""
+        return self._tree.step(gradient, boundary.ravel()).reshape(len(self.members), -1)
 
 
 class Submaps:
@@ -168,7 +169,7 @@ class Submaps:
         with np.load(self.folder / SEPARATOR) as file:
             self._shared, self._fixed = file["shared"], file["fixed"]
             self._across = Edges(*(file[name] for name in EDGES))
-        self._rims = [self._places(k) for k in range(self.count)]
+        self._boundaries = [self._places(k) for k in range(self.count)]
         self._optimized = False
 
     @classmethod
@@ -212,11 +213,13 @@ class Submaps:
         members, rows = _groups(part, count), _groups(owner, count)
         for k, (inner, own) in enumerate(zip(members, rows, strict=True), -1):
             ends = np.concatenate([edges.first[own], edges.second[own]])
-            rim = np.zeros(0, np.int64) if k < 0 else distinct(ends[shared[ends]])
-            present = np.concatenate([inner, rim])
+            boundary = np.zeros(0, np.int64) if k < 0 else distinct(ends[shared[ends]])
+            present = np.concatenate([inner, boundary])
             by_name = np.argsort(present)
             at_first, at_second = by_name[np.searchsorted(present[by_name], ends)].reshape(2, -1)
-            names: dict[str, Any] = {"inner": inner, "rim": rim} if k >= 0 else {"shared": inner, "fixed": fixed[inner]}
+            names: dict[str, Any] = (
+                {"inner": inner, "boundary": boundary} if k >= 0 else {"shared": inner, "fixed": fixed[inner]}
+            )
             measured, information = edges.measured[own], edges.information[own]
             with replacing(home / SEPARATOR if k < 0 else home / f"{k}.npz") as file:
                 np.savez(file, first=at_first, second=at_second, measured=measured, information=information, **names)
@@ -243,7 +246,10 @@ class Submaps:
 
         Raises:
             GraphError: the edges do not determine the poses.
+            OSError: the disk is full.
         """
+        options = {"tolerance": tolerance, "max_iterations": max_iterations}
+        require_kinds("optimize", GraphError, Submaps.optimize.__annotations__, options)
         self._optimized = False
         (self.folder / INFORMATION).unlink(missing_ok=True)
         result = self._optimize(tolerance, max_iterations)
@@ -259,7 +265,7 @@ class Submaps:
                 return Optimized(Status.ITERATION_LIMIT, now.chi2, taken, now.offset)
             length, trial = 1.0, self._eliminated(now.step, 1.0)
             done = now.offset <= tolerance and trial.worst <= tolerance
-            while not trial.chi2 <= now.chi2 * (1.0 + ROUNDING) - ARMIJO * length * now.fall:
+            while not trial.chi2 <= now.chi2 * (1.0 + ROUNDING) - ARMIJO * length * now.decrease:
                 length *= 0.5
                 if done or length < SHORTEST:
                     self._eliminated()  # what is left of the submaps belongs to the poses
@@ -289,7 +295,7 @@ class Submaps:
             at = int(np.searchsorted(inner, pose))
             if at < len(inner) and inner[at] == pose:
                 break
-        submap, places = _Submap(self.folder / f"{k}.npz", self._group), self._rims[k]
+        submap, places = _Submap(self.folder / f"{k}.npz", self._group), self._boundaries[k]
         submap.linearize(self.poses[submap.members])
         own, reach = np.empty((dim, dim)), np.empty((dim, len(places) * dim))
         for axis in range(dim):
@@ -312,21 +318,22 @@ class Submaps:
         return self._separator
 
     def _places(self, k: int) -> IntArray:
-        """Rim of a submap, as positions in the separator."""
+        """Boundary of a submap, as positions in the separator."""
         with np.load(self.folder / f"{k}.npz") as file:
-            found: IntArray = np.searchsorted(self._shared, file["rim"])
+            found: IntArray = np.searchsorted(self._shared, file["boundary"])
         return found
 
     def _eliminated(self, step: Array | None = None, length: float = 1.0) -> _Pass:
         """Take a step from the present poses, which writes the next ones, and eliminate all inner poses there."""
         separator, poses, group = self._separator, self.poses, self._group
-        shared, fall, worst = np.array(poses[self._shared]), 0.0, 0.0
+        shared, decrease, worst = np.array(poses[self._shared]), 0.0, 0.0
         offsets = separator.offsets(shared, step)
         if step is not None:
-            following = np.lib.format.open_memmap(self.folder / NEXT, "w+", poses.dtype, poses.shape)
+            shutil.copyfile(self.folder / POSES, self.folder / NEXT)  # a full disk is found here, not in mapped memory
+            following = np.load(self.folder / NEXT, mmap_mode="r+")
             following[self._shared] = shared = group.retract(shared, length * step)
         chi2, noise = separator.begin(shared), float(offsets[2].sum())
-        for k, places in enumerate(self._rims):
+        for k, places in enumerate(self._boundaries):
             submap = _Submap(self.folder / f"{k}.npz", group)
             own, inner = np.array(poses[submap.members]), len(submap.inner)
             lin = submap.linearize(own)
@@ -341,31 +348,31 @@ class Submaps:
                 lin = submap.linearize(own)
             matrix, gradient, inside = submap.reduced(lin.gradient)
             separator.add(places, matrix, gradient)
-            chi2, fall = chi2 + 2.0 * lin.cost, fall + inside
+            chi2, decrease = chi2 + 2.0 * lin.cost, decrease + inside
             noise += float(submap.edges.offsets(lin, None)[2].sum())
         if step is not None:
             following.flush()
         found, outside = separator.solve()
-        fall += outside
-        return _Pass(found, chi2, fall if fall > noise else 0.0, max(worst, _largest(offsets)))
+        decrease += outside
+        return _Pass(found, chi2, decrease if decrease > noise else 0.0, max(worst, _largest(offsets)))
 
     @cached_property
     def _separator(self) -> _Separator:
-        return _Separator(self._group, self._fixed, self._across, self._rims)
+        return _Separator(self._group, self._fixed, self._across, self._boundaries)
 
 
 class _Separator:
     """The poses of the separator: edges between them, and what is left of the submaps."""
 
-    def __init__(self, group: LieGroup, fixed: BoolArray, edges: Edges, rims: Sequence[IntArray]) -> None:
+    def __init__(self, group: LieGroup, fixed: BoolArray, edges: Edges, boundaries: Sequence[IntArray]) -> None:
         """Find the structure."""
         free, dim = np.flatnonzero(~fixed), group.dim
         number = np.full(len(fixed), -1)
         number[free] = np.arange(len(free))
         self._columns = (dim * number[:, None] + np.arange(dim)) * (number >= 0)[:, None] - (number < 0)[:, None]
         pairs = [np.sort(np.stack([number[edges.first], number[edges.second]]), axis=0)]
-        for rim in rims:
-            own = number[rim][number[rim] >= 0]
+        for boundary in boundaries:
+            own = number[boundary][number[boundary] >= 0]
             pairs.append(own[np.stack(np.triu_indices(len(own)))])
         first, second = np.concatenate(pairs, axis=1)
         starts, known = dim * np.arange(len(free) + 1), first >= 0
@@ -399,9 +406,9 @@ class _Separator:
         self._gradient[column[column >= 0]] = lin.gradient[column >= 0]
         return 2.0 * lin.cost
 
-    def add(self, rim: IntArray, matrix: Array, gradient: Array) -> None:
-        """Add what is left of a submap; positions of its rim are sorted."""
-        columns = self._columns[rim].ravel()
+    def add(self, boundary: IntArray, matrix: Array, gradient: Array) -> None:
+        """Add what is left of a submap; positions of its boundary are sorted."""
+        columns = self._columns[boundary].ravel()
         free = np.flatnonzero(columns >= 0)
         columns = columns[free]
         self._gradient[columns] += gradient[free]
@@ -411,7 +418,7 @@ class _Separator:
             self.information[at] += matrix[free[: k + 1], free[k]]
 
     def solve(self) -> tuple[Array, float]:
-        """(S, d) step of all poses, and the fall of chi2.
+        """(S, d) step of all poses, and the decrease of chi2.
 
         Raises:
             GraphError: they are not determined.
@@ -438,8 +445,8 @@ class _Separator:
 def _largest(offsets: Array) -> float:
     """Largest relative offset of a pose, of (3, n) as of :meth:`_Edges.offsets`."""
     moved, squares, noise = offsets
-    told = moved > noise
-    return float(np.sqrt(moved[told] / np.maximum(squares[told], noise[told])).max(initial=0.0))
+    above = moved > noise
+    return float(np.sqrt(moved[above] / np.maximum(squares[above], noise[above])).max(initial=0.0))
 
 
 def _cut(places: Array, largest: int) -> IntArray:
