@@ -21,7 +21,7 @@ from unifg.solvers import GaussNewton
 CASES = ((1_000_000, 0), (1_000_000, 50_000), (10_000_000, 50_000))
 """Poses, and those of a submap at most; 0 for the whole graph in memory."""
 WIDTH = 250
-SIGMA, BEGUN = np.array([0.05, 0.05, 0.01]), np.array([0.3, 0.3, 0.03])
+SIGMA, BEGUN, TOLERANCE = np.array([0.05, 0.05, 0.01]), np.array([0.3, 0.3, 0.01]), 1e-3
 
 
 def city(count: int) -> PoseGraph:
@@ -44,7 +44,7 @@ def whole(count: int) -> list[float]:
     """Steps, chi2, seconds and the peak of memory [GB] of the graph in memory."""
     graph, _, guess = city(count).graph()
     began = time.process_time()
-    solution = GaussNewton().solve(graph, guess, check=True)
+    solution = GaussNewton(tolerance=TOLERANCE).solve(graph, guess, check=True)
     return [solution.iterations, 2.0 * solution.cost, time.process_time() - began, peak()]
 
 
@@ -58,7 +58,7 @@ def split(count: int, folder: str, largest: int) -> list[float]:
 def optimized(folder: str) -> list[float]:
     """The same as of :func:`whole` in submaps."""
     began = time.process_time()
-    found = Submaps(folder).optimize()
+    found = Submaps(folder).optimize(tolerance=TOLERANCE)
     return [found.iterations, found.chi2, time.process_time() - began, peak()]
 
 
@@ -86,7 +86,7 @@ def tables(rounds: int) -> str:
     head = "poses", "map", "separator", "written in", "steps", "chi2", "seconds", "peak of memory, GB", "on disk, GB"
     notes = (
         f"A city of {WIDTH} streets: half of all poses are measured from the street beside. Poses begin within "
-        "0.3 m and 0.03 rad (standard deviations) of the truth. Processor time of one core, tolerance 1e-6; of writing, the "
+        "0.3 m and 0.01 rad (standard deviations) of the truth. Processor time of one core, tolerance 1e-3; of writing, the "
         "memory holds the arrays of the whole graph."
     )
     return f"{table(head, [measure(*case) for case in CASES], 2)}\n\n{notes}"

@@ -43,7 +43,7 @@ INDEX, SEPARATOR, INFORMATION = "submaps.json", "separator.npz", "information.np
 POSES, NEXT = "poses.npy", "next.npy"
 EDGES = "first", "second", "measured", "information"
 ARMIJO, SHORTEST = 1e-4, 2.0**-10
-ROUNDING = 4.0 * 2.0**-52  # of a residual, relative to the numbers that it is made of
+ROUNDING = 4.0 * 2.0**-52  # of a tangent coordinate, relative to the largest position
 
 
 class Optimized(NamedTuple):
@@ -101,16 +101,19 @@ class _Edges:
         """Linearise."""
         return self.program.linearize(self.program.values_from({self._x: poses}))
 
-    def offsets(self, lin: Linearization, step: Array | None) -> Array:
-        """(3, n) over the edges of each pose: |J d|^2 of a step (n, d), |r|^2, and what is rounding of the first."""
-        costs, count, group = self.program.costs, self._x.count, self._group
-        sizes = np.maximum(np.abs(lin.values[self._x][:, : group.point_dim]).max(axis=1), 1.0)
-        noise = lin.jacobian * (ROUNDING * np.repeat(sizes, group.dim))[costs.columns]
-        moved = np.zeros(costs.count) if step is None else np.bincount(
-            costs.rows, lin.jacobian * step.ravel()[costs.columns], costs.count
-        )  # fmt: skip
-        rows = moved**2, lin.residual**2, np.bincount(costs.rows, noise**2, costs.count)
-        squares = [row.reshape(-1, group.dim).sum(axis=1) for row in rows]
+    def offsets(self, lin: Linearization, step: Array | None, rounding: float) -> Array:
+        """(3, n) over the edges of each pose: |J d|^2 of a step (n, d), |r|^2, and what is rounding of the first.
+
+        Args:
+            lin: where.
+            step: none has moved nothing.
+            rounding: of a tangent coordinate.
+        """
+        costs, count = self.program.costs, self._x.count
+        along = 0.0 if step is None else step.ravel()[costs.columns]
+        moved = np.bincount(costs.rows, lin.jacobian * along, costs.count)
+        noise = np.bincount(costs.rows, (rounding * lin.jacobian) ** 2, costs.count)
+        squares = [row.reshape(-1, self._group.dim).sum(axis=1) for row in (moved**2, lin.residual**2, noise)]
         return np.array([sum(np.bincount(end, one, count) for end in self._ends) for one in squares])
 
 
@@ -327,7 +330,8 @@ class Submaps:
         """Take a step from the present poses, which writes the next ones, and eliminate all inner poses there."""
         separator, poses, group = self._separator, self.poses, self._group
         shared, decrease, worst = np.array(poses[self._shared]), 0.0, 0.0
-        offsets = separator.offsets(shared, step)
+        rounding = ROUNDING * max(1.0, float(np.abs(poses[:, : group.point_dim]).max()))
+        offsets = separator.offsets(shared, step, rounding)
         if step is not None:
             shutil.copyfile(self.folder / POSES, self.folder / NEXT)  # a full disk is found here, not in mapped memory
             following = np.load(self.folder / NEXT, mmap_mode="r+")
@@ -339,7 +343,7 @@ class Submaps:
             lin = submap.linearize(own)
             if step is not None:
                 whole = submap.step(lin.gradient, step[places])
-                found = submap.edges.offsets(lin, whole)
+                found = submap.edges.offsets(lin, whole, rounding)
                 offsets[:, places] += found[:, inner:]
                 worst = max(worst, _largest(found[:, :inner]))
                 own = group.retract(own, length * whole)
@@ -349,12 +353,12 @@ class Submaps:
             matrix, gradient, inside = submap.reduced(lin.gradient)
             separator.add(places, matrix, gradient)
             chi2, decrease = chi2 + 2.0 * lin.cost, decrease + inside
-            noise += float(submap.edges.offsets(lin, None)[2].sum())
+            noise += float(submap.edges.offsets(lin, None, rounding)[2].sum())
         if step is not None:
             following.flush()
         found, outside = separator.solve()
         decrease += outside
-        return _Pass(found, chi2, decrease if decrease > noise else 0.0, max(worst, _largest(offsets)))
+        return _Pass(found, chi2, decrease if decrease > noise else 0.0, max(worst, _largest(offsets[:, ~self._fixed])))
 
     @cached_property
     def _separator(self) -> _Separator:
@@ -385,12 +389,12 @@ class _Separator:
             first, second = (np.searchsorted(self._ends, end) for end in (edges.first, edges.second))
             self._edges = _Edges(group, len(self._ends), replace(edges, first=first, second=second))
 
-    def offsets(self, poses: Array, step: Array | None) -> Array:
+    def offsets(self, poses: Array, step: Array | None, rounding: float) -> Array:
         """(3, S) as of :meth:`_Edges.offsets`, of the edges of the separator."""
         result = np.zeros((3, len(poses)))
         if self._edges is not None:
             lin = self._edges.linearize(poses[self._ends])
-            result[:, self._ends] = self._edges.offsets(lin, None if step is None else step[self._ends])
+            result[:, self._ends] = self._edges.offsets(lin, None if step is None else step[self._ends], rounding)
         return result
 
     def begin(self, poses: Array) -> float:

@@ -170,7 +170,7 @@ class Trace:
     @property
     def moved(self) -> bool:
         """True if parameters have changed that are no data."""
-        return changed_arrays(self.free)
+        return bool(self.free) and changed_arrays(self.free)
 
     def refreshed(self) -> Trace:
         """The same trace with the present content of its parameters."""
