@@ -86,8 +86,8 @@ def tables(rounds: int) -> str:
     head = "poses", "map", "separator", "written in", "steps", "chi2", "seconds", "peak of memory, GB", "on disk, GB"
     notes = (
         f"A city of {WIDTH} streets: half of all poses are measured from the street beside. Poses begin within "
-        "0.3 m and 0.01 rad (standard deviations) of the truth. Processor time of one core, tolerance 1e-3; of writing, the "
-        "memory holds the arrays of the whole graph."
+        "0.3 m and 0.01 rad (standard deviations) of the truth. Processor time of one core, tolerance 1e-3; "
+        "while it is written, memory holds the arrays of the whole graph."
     )
     return f"{table(head, [measure(*case) for case in CASES], 2)}\n\n{notes}"
 

@@ -17,7 +17,6 @@ from unifg.errors import ModelError
 from unifg.lie import SE2
 from unifg.typing import Array, ArrayLike
 
-
 EXCESS = 0.03  # [m] by which covering discs may stick out of a polygon
 FINE = 61  # places to a side among which discs are chosen
 INSIDE = 1e-9  # [m]; on the hull is inside

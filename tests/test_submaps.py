@@ -112,6 +112,18 @@ def test_measurements_without_an_error(tmp_path: Path) -> None:
         assert found.status is Status.CONVERGED and found.iterations <= most and found.chi2 < 1e-20
 
 
+@pytest.mark.parametrize("largest", [1000, 60])
+def test_poses_far_from_the_origin_with_loose_ends(largest: int, tmp_path: Path) -> None:
+    """Rounding of the whole map is larger than the residuals of edges that nothing contradicts."""
+    made = begun(PLANE)
+    edges, last = made.edges, len(made.poses) - 1
+    ends = np.isin(edges.first, [0, 1, last]) | np.isin(edges.second, [0, 1, last])
+    made = replace(made, edges=edges[edges.odometry | ~ends], poses=made.poses + np.array([4e4, -3e4, 0.0]))
+    parted = Submaps.split(made, tmp_path, largest)
+    found = parted.optimize(tolerance=1e-7)
+    assert found.status is Status.CONVERGED and found.iterations < 12
+
+
 def test_known_poses_are_kept(tmp_path: Path) -> None:
     made = replace(begun(PLANE), fixed_ids=(0, 140, 299))
     _, poses = whole(made)

@@ -358,7 +358,7 @@ class Submaps:
             following.flush()
         found, outside = separator.solve()
         decrease += outside
-        return _Pass(found, chi2, decrease if decrease > noise else 0.0, max(worst, _largest(offsets[:, ~self._fixed])))
+        return _Pass(found, chi2, decrease if decrease > noise else 0.0, max(worst, _largest(offsets)))
 
     @cached_property
     def _separator(self) -> _Separator:
