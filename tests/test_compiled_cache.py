@@ -299,7 +299,7 @@ def test_a_user_without_a_home_keeps_nothing(
     monkeypatch.delenv(cache_folder.VARIABLE, raising=False)
     monkeypatch.setattr(cache_folder, "_said", Event())
     assert cache_folder.cache_folder.__wrapped__() is None and "there is no home" in caplog.text
-    assert main(["cache"]) == 2 and "there is no home" in capsys.readouterr().err
+    assert main(["cache"]) == 2 and "name one in UNIFG_CACHE_DIR" in capsys.readouterr().err
 
 
 def test_what_cannot_be_deleted_is_said(

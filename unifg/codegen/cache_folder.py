@@ -44,7 +44,7 @@ def place() -> Path:
     except RuntimeError:  # without a home; older ones return "~", a folder of the present one
         folder = Path("~")
     if not folder.is_absolute():
-        raise UnifgError("there is no home for a folder of compiled functions")
+        raise UnifgError(f"there is no home for a folder of compiled functions: name one in {VARIABLE}")
     return folder / version()
 
 
