@@ -282,14 +282,14 @@ def test_reduction_is_the_schur_complement(kept: int, apart: bool) -> None:
 
 
 @pytest.mark.parametrize("dense", [False, True])
-def test_the_last_node_comes_last(dense: bool) -> None:
+def test_a_last_node_comes_last(dense: bool) -> None:
     """Also where another node touches more of them, and where a part of the graph does not touch it."""
     n = 400
     first, second = np.arange(n - 3), np.arange(1, n - 2)
     rows, columns = np.append(first, [0, 200]), np.append(second, [n - 1, n - 1])
     if dense:
         rows, columns = np.append(rows, np.arange(n - 2)), np.append(columns, np.full(n - 2, n - 2))
-    factorization = Factorization(Symmetric(n, [(rows, columns)]), np.arange(n), ordering="last")
+    factorization = Factorization(Symmetric(n, [(rows, columns)]), np.arange(n), last=1)
     place = np.argsort(factorization.structure.order)
     assert place[n - 1] > place[: n - 2].max()
     assert not dense or place[n - 1] > place[n - 2]

@@ -17,7 +17,7 @@ from unifg.elimination.symbolic import cliques, postordered, predicted_cost
 from unifg.errors import UnifgError
 from unifg.typing import IntArray
 
-Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "metis", "natural", "last"] | IntArray
+Ordering: TypeAlias = Literal["auto", "minimum-degree", "nested-dissection", "metis", "natural"] | IntArray
 SLACK = 16  # numbers the kernels may read beyond the last matrix
 DISSECT = 4e6, 3e3  # predicted nanoseconds, in all and per node, from which nested dissection is tried
 FILL = 1.4  # see :func:`_fits`
@@ -40,10 +40,10 @@ class Graph(NamedTuple):
     pointer: IntArray
     neighbours: IntArray
 
-    def tree(self, order: IntArray | None = None, stage: IntArray | None = None, last: bool = False) -> Tree:
+    def tree(self, order: IntArray | None = None, stage: IntArray | None = None, last: int = 0) -> Tree:
         """Elimination tree of a given order, or of minimum degree within stages; dense nodes come last.
 
-        With ``last`` the last node comes after all others.
+        So many of the ``last`` nodes come after all others.
         """
         nodes, degree = len(self.weight), np.diff(self.pointer)
         stage = np.zeros(nodes, np.int64) if stage is None else stage
@@ -93,7 +93,9 @@ class Structure(NamedTuple):
         )
 
 
-def analyse(indptr: IntArray, indices: IntArray, blocks: IntArray | None, ordering: Ordering) -> Structure:
+def analyse(
+    indptr: IntArray, indices: IntArray, blocks: IntArray | None, ordering: Ordering, last: int = 0
+) -> Structure:
     """Analyse a pattern; arguments as for `factorization.Factorization`, the pattern as its two arrays.
 
     Raises:
@@ -117,14 +119,12 @@ def analyse(indptr: IntArray, indices: IntArray, blocks: IntArray | None, orderi
         kind, tree = "METIS", graph.tree(metis_order(pointer, neighbours, weight))
     elif ordering == "minimum-degree":
         tree = graph.tree()
-    elif ordering == "last":
-        tree = _before_last(graph)
     elif ordering == "auto":
-        kind, tree = _cheapest(graph)
+        kind, tree = _cheapest(graph) if last == 0 else _before_last(graph, last)
     else:
         raise UnifgError(
-            f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural, last "
-            "or give a permutation"
+            f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural or "
+            "give a permutation"
         )
     order, bounds, parent, passed = tree
     table, scalar_order, rows, relative, runs, slots, part, waiting = lay_out(
@@ -170,16 +170,16 @@ def _cheapest(graph: Graph) -> tuple[str, Tree]:
     return ("chain", line) if chain and least <= cost else (kind, tree)
 
 
-def _before_last(graph: Graph) -> Tree:
-    """The order of least predicted cost in which the last node, which others may touch in numbers, comes last."""
+def _before_last(graph: Graph, last: int) -> tuple[str, Tree]:
+    """The order of least predicted cost in which so many last nodes come after all others, and its name."""
     weight, pointer, neighbours = graph
-    last = len(weight) - 1
-    inner = neighbours != last
-    inner[pointer[last] :] = False
+    first = len(weight) - last
+    inner = neighbours < first
+    inner[pointer[first] :] = False
     within = _sums(inner.astype(np.int64))[pointer]
-    dissected = separators(within, neighbours[inner], weight)
-    trees = graph.tree(last=True), graph.tree(stage=dissected, last=True)
-    return min(trees, key=lambda tree: predicted_cost(weight, tree[0], tree[1], tree[3]))
+    stage = separators(within, neighbours[inner], weight)
+    trees = {"minimum-degree": graph.tree(last=last), "nested-dissection": graph.tree(stage=stage, last=last)}
+    return min(trees.items(), key=lambda one: predicted_cost(weight, one[1][0], one[1][1], one[1][3]))
 
 
 def _fits(graph: Graph, line: Tree) -> bool:

@@ -42,10 +42,10 @@ class Symbolic:
         indptr, indices: the pattern as compiled code reads it.
     """
 
-    def __init__(self, pattern: Symmetric, blocks: IntArray | None, ordering: Ordering) -> None:
+    def __init__(self, pattern: Symmetric, blocks: IntArray | None, ordering: Ordering, last: int) -> None:
         """Remember what is asked for."""
         self.pattern = pattern
-        self.asked = blocks, ordering
+        self.asked = blocks, ordering, last
         self.indptr = pattern.indptr.astype(np.int64, copy=False)
         self.indices = pattern.indices.astype(np.int64, copy=False)
         self._structure: Structure | None = None
@@ -77,6 +77,7 @@ class Factorization:
         blocks: IntArray | None = None,
         *,
         ordering: Ordering = "auto",
+        last: int = 0,
     ) -> None:
         """Remember the structure.
 
@@ -86,9 +87,10 @@ class Factorization:
                 other and have the same neighbours are one node.
             ordering: how to order the nodes, or a permutation of them: the nodes in the order of elimination. "auto"
                 takes the cheapest of minimum degree, nested dissection (large graphs; METIS' too, where the extra
-                ``unifg[metis]`` is installed) and a chain of stages; "last" those in which the last node comes last.
+                ``unifg[metis]`` is installed) and a chain of stages.
+            last: nodes at the end that are eliminated after all others; with "auto" alone.
         """
-        self._begin(Symbolic(pattern, blocks, ordering))
+        self._begin(Symbolic(pattern, blocks, ordering, last))
 
     def _begin(self, symbolic: Symbolic) -> None:
         self.symbolic, self.pattern = symbolic, symbolic.pattern
@@ -214,22 +216,28 @@ class Factorization:
         result: Array = (self.plan.signs / self.plan.pivots**2)[: self.pattern.size]
         return result
 
-    def root_block(self, scalars: IntArray) -> Array:
-        """(k, k) Schur complement of scalars that are the last of a root, in their order of elimination.
+    def last_block(self, count: int) -> Array:
+        """(k, k) Schur complement of the last ``count`` scalars, which are eliminated after all others.
 
         Raises:
             UnifgError: there is no factorisation.
         """
-        self._demand("root_block")
-        if not len(scalars):
-            return np.zeros((0, 0))
-        chosen = self._position[scalars]
-        first, width, _, panel, stride, *_ = self.plan.fronts[self._owner()[chosen[0]]].tolist()
-        at = int(chosen[0]) - first
-        rows = self.plan.numbers[panel : panel + width * stride].reshape(width, stride)[at:, at:width]
-        upper = np.triu(rows, 1) + np.diag(1.0 / self.plan.pivots[chosen])
-        block: Array = upper.T @ (self.plan.signs[chosen, None] * upper)
-        return block
+        self._demand("last_block")
+        plan, chosen = self.plan, self._position[self.pattern.size - count :]
+        place = np.full(self.pattern.size, -1)
+        place[chosen] = np.arange(count)
+        upper = np.zeros((count, count))
+        for s in np.unique(self._owner()[chosen]).tolist():
+            first, width, rows, panel, stride, *_ = plan.fronts[s].tolist()
+            index = int(plan.fronts[s, INDEX])
+            own = np.arange(first, first + width)
+            block = plan.numbers[panel : panel + width * stride].reshape(width, stride)[:, : width + rows].copy()
+            block[:, :width] = np.triu(block[:, :width], 1) + np.diag(1.0 / plan.pivots[own])
+            here = place[np.append(own, plan.rows[index : index + rows])]
+            mine = here[:width] >= 0  # a front may begin with others
+            upper[np.ix_(here[:width][mine], here[here >= 0])] = block[mine][:, here >= 0]
+        result: Array = upper.T @ (plan.signs[chosen, None] * upper)
+        return result
 
     @property
     def tree(self) -> EliminationTree:
@@ -403,8 +411,8 @@ class Factorization:
             raise UnifgError(f"{what} called before a successful factor: call factor, and look whether it returns True")
 
 
-def _rebuilt(pattern: Symmetric, blocks: IntArray | None, ordering: Ordering) -> Factorization:
-    return Factorization(pattern, blocks, ordering=ordering)
+def _rebuilt(pattern: Symmetric, blocks: IntArray | None, ordering: Ordering, last: int) -> Factorization:
+    return Factorization(pattern, blocks, ordering=ordering, last=last)
 
 
 def _numbers(array: Array, size: int, name: str) -> Array:

@@ -20,12 +20,12 @@ class Reduction:
     """
 
     def __init__(self, pattern: Symmetric, kept: int) -> None:
-        """Order the first scalars by themselves, and make one node of the last ``kept``."""
+        """Order the first scalars before the last ``kept``."""
         gone = pattern.size - kept
-        inner = pattern.indptr[: gone + 1], pattern.indices[: pattern.indptr[gone]]
-        label = indistinguishable(*(array.astype(np.int64) for array in inner))
-        last = np.full(kept, label.max(initial=-1) + 1)
-        self._tree = Factorization(pattern, np.append(label, last), ordering="last" if kept else "auto")
+        label = indistinguishable(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64))
+        label[gone:] += 1  # a node is of the first or of the last
+        last = int(label[-1] - label[gone]) + 1 if kept else 0
+        self._tree = Factorization(pattern, label, last=last)
         self._kept, self._added, self._held = slice(gone, pattern.size), np.zeros(pattern.size), np.zeros((0, 0))
 
     def factor(self, data: Array) -> bool:
@@ -35,7 +35,7 @@ class Reduction:
         done = tree.factor(data, self._added) and tree.definite
         done = done and bool((tree.pivots() > ROUNDING * (diagonal + self._added)[tree.plan.order]).all())
         if done:
-            self._held = self._tree.root_block(np.arange(self._kept.start, self._kept.stop))
+            self._held = tree.last_block(self._kept.stop - self._kept.start)
         return done
 
     @property
