@@ -281,6 +281,21 @@ def test_reduction_is_the_schur_complement(kept: int, apart: bool) -> None:
     assert not reduction.factor(A[pattern.indices, pattern.columns])
 
 
+def test_a_schur_complement_of_a_full_matrix_with_both_signs() -> None:
+    """All scalars have the same neighbours, and yet those that are kept are nodes of their own."""
+    J = np.random.default_rng(1).standard_normal((9, 6))
+    A, rows = J.T @ J, np.triu_indices(6)
+    pattern = Symmetric(6, [rows])
+    reduction = Reduction(pattern, 2)
+    assert reduction.factor(A[pattern.indices, pattern.columns])
+    inner = np.linalg.inv(A[:4, :4])
+    np.testing.assert_allclose(reduction.matrix, A[4:, 4:] - A[4:, :4] @ inner @ A[:4, 4:], atol=1e-12)
+    A[4:, 4:] -= 50.0 * np.eye(2)
+    factorization = Factorization(pattern, np.arange(6), last=2)
+    assert factorization.factor(A[pattern.indices, pattern.columns]) and factorization.inertia == (4, 2, 0)
+    np.testing.assert_allclose(factorization.last_block(2), A[4:, 4:] - A[4:, :4] @ inner @ A[:4, 4:], atol=1e-10)
+
+
 @pytest.mark.parametrize("dense", [False, True])
 def test_a_last_node_comes_last(dense: bool) -> None:
     """Also where another node touches more of them, and where a part of the graph does not touch it."""
