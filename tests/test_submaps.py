@@ -290,6 +290,16 @@ def test_a_schur_complement_of_a_full_matrix_with_both_signs() -> None:
     assert reduction.factor(A[pattern.indices, pattern.columns])
     inner = np.linalg.inv(A[:4, :4])
     np.testing.assert_allclose(reduction.matrix, A[4:, 4:] - A[4:, :4] @ inner @ A[:4, 4:], atol=1e-12)
+    pairs = [(0, 1), (0, 2), (1, 2), *((i, j) for i in (1, 2) for j in range(3, 7)), (4, 5), (4, 6), (5, 6)]
+    alike = np.diag(np.full(7, 20.0))  # scalars 1 and 2, of which one is kept, have the same neighbours
+    alike[tuple(np.transpose(pairs))] = alike.T[tuple(np.transpose(pairs))] = np.arange(1.0, 1.0 + len(pairs)) / 4.0
+    first, second = np.nonzero(np.triu(alike))
+    pattern = Symmetric(7, [(first, second)])
+    reduction = Reduction(pattern, 5)
+    assert reduction.factor(alike[pattern.indices, pattern.columns])
+    expected = alike[2:, 2:] - alike[2:, :2] @ np.linalg.inv(alike[:2, :2]) @ alike[:2, 2:]
+    np.testing.assert_allclose(reduction.matrix, expected, atol=1e-12)
+    pattern = Symmetric(6, [rows])
     A[4:, 4:] -= 50.0 * np.eye(2)
     factorization = Factorization(pattern, np.arange(6), last=2)
     assert factorization.factor(A[pattern.indices, pattern.columns]) and factorization.inertia == (4, 2, 0)
