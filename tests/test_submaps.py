@@ -303,7 +303,7 @@ def test_a_schur_complement_of_a_full_matrix_with_both_signs() -> None:
     A[4:, 4:] -= 50.0 * np.eye(2)
     factorization = Factorization(pattern, np.arange(6), last=2)
     assert factorization.factor(A[pattern.indices, pattern.columns]) and factorization.inertia == (4, 2, 0)
-    np.testing.assert_allclose(factorization.last_block(2), A[4:, 4:] - A[4:, :4] @ inner @ A[:4, 4:], atol=1e-10)
+    np.testing.assert_allclose(factorization.last_block(), A[4:, 4:] - A[4:, :4] @ inner @ A[:4, 4:], atol=1e-10)
 
 
 @pytest.mark.parametrize("dense", [False, True])
@@ -318,6 +318,17 @@ def test_a_last_node_comes_last(dense: bool) -> None:
     place = np.argsort(factorization.structure.order)
     assert place[n - 1] > place[: n - 2].max()
     assert not dense or place[n - 1] > place[n - 2]
+
+
+def test_last_nodes_come_last_where_a_graph_is_dissected() -> None:
+    n = 12
+    k = np.arange(n**3).reshape(n, n, n)
+    first = np.concatenate([k[:, :, :-1].ravel(), k[:, :-1].ravel(), k[:-1].ravel()])
+    second = np.concatenate([k[:, :, 1:].ravel(), k[:, 1:].ravel(), k[1:].ravel()])
+    factorization = Factorization(Symmetric.of_blocks(3 * np.arange(n**3 + 1), first, second), last=3 * n)
+    assert factorization.structure.kind == "nested-dissection"
+    place = np.argsort(factorization.plan.order)
+    assert place[-3 * n :].min() == 3 * (n**3 - n)
 
 
 @pytest.mark.parametrize("numbers", [[], [3], [5, -2, 5, 5, -2, 0], [-(2**63), 2**63 - 1, 0]])

@@ -103,6 +103,9 @@ def analyse(
     """
     size = len(indptr) - 1
     label = indistinguishable(indptr, indices) if blocks is None else _labels(blocks, size)
+    first = size - last
+    if 0 < first < size and label[first] == label[first - 1]:  # a node is of the first or of the last
+        label[first:] += 1
     nodes = int(label[-1]) + 1 if size else 0
     starts = np.searchsorted(label, np.arange(nodes + 1))
     weight = np.diff(starts)
@@ -120,7 +123,7 @@ def analyse(
     elif ordering == "minimum-degree":
         tree = graph.tree()
     elif ordering == "auto":
-        kind, tree = _cheapest(graph) if last == 0 else _before_last(graph, last)
+        kind, tree = _cheapest(graph, nodes - int(label[first]) if last else 0)
     else:
         raise UnifgError(
             f"ordering {ordering!r} is unknown: choose auto, minimum-degree, nested-dissection, metis, natural or "
@@ -150,36 +153,27 @@ def analyse(
     return Structure(plan, panels + waiting + SLACK, starts, order, bounds, parent, kind)
 
 
-def _cheapest(graph: Graph) -> tuple[str, Tree]:
-    """The order of least predicted cost, and its name."""
+def _cheapest(graph: Graph, last: int) -> tuple[str, Tree]:
+    """The order of least predicted cost, and its name; so many nodes come ``last``."""
     weight, pointer, neighbours = graph
     chain, line, least = stages(pointer, neighbours, weight)
+    chain &= last == 0
     if chain and _fits(graph, line):
         return "chain", line
-    kind, tree = "minimum-degree", graph.tree()
+    kind, tree = "minimum-degree", graph.tree(last=last)
     cost = predicted_cost(weight, tree[0], tree[1], tree[3])
     candidates: list[tuple[str, Callable[[], Tree]]] = []
     if cost > max(DISSECT[0], DISSECT[1] * len(weight)):
-        candidates.append(("nested-dissection", lambda: graph.tree(stage=separators(pointer, neighbours, weight))))
-        if installed():
+        candidates.append(
+            ("nested-dissection", lambda: graph.tree(stage=separators(pointer, neighbours, weight), last=last))
+        )
+        if installed() and last == 0:
             candidates.append(("METIS", lambda: graph.tree(metis_order(pointer, neighbours, weight))))
     for name, make in candidates:
         other = make()
         if (less := predicted_cost(weight, other[0], other[1], other[3])) < cost:
             kind, tree, cost = name, other, less
     return ("chain", line) if chain and least <= cost else (kind, tree)
-
-
-def _before_last(graph: Graph, last: int) -> tuple[str, Tree]:
-    """The order of least predicted cost in which so many last nodes come after all others, and its name."""
-    weight, pointer, neighbours = graph
-    first = len(weight) - last
-    inner = neighbours < first
-    inner[pointer[first] :] = False
-    within = _sums(inner.astype(np.int64))[pointer]
-    stage = separators(within, neighbours[inner], weight)
-    trees = {"minimum-degree": graph.tree(last=last), "nested-dissection": graph.tree(stage=stage, last=last)}
-    return min(trees.items(), key=lambda one: predicted_cost(weight, one[1][0], one[1][1], one[1][3]))
 
 
 def _fits(graph: Graph, line: Tree) -> bool:

@@ -16,6 +16,7 @@ from unifg.elimination.off_diagonal_inverse import block_of, blocks_of_pairs, he
 from unifg.elimination.plan import (
     FAILED,
     INDEX,
+    LARGEST,
     NEGATIVE,
     PANELS,
     PIVOTS,
@@ -31,6 +32,7 @@ from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["Factorization", "Ordering"]
 NOTHING = np.zeros(0)
+WEAK = 1e-13  # pivots below this, relative to the diagonal, are rounding errors
 
 
 class Symbolic:
@@ -88,7 +90,7 @@ class Factorization:
             ordering: how to order the nodes, or a permutation of them: the nodes in the order of elimination. "auto"
                 takes the cheapest of minimum degree, nested dissection (large graphs; METIS' too, where the extra
                 ``unifg[metis]`` is installed) and a chain of stages.
-            last: nodes at the end that are eliminated after all others; with "auto" alone.
+            last: scalars at the end that are eliminated after all others, see :meth:`last_block`; with "auto" alone.
         """
         self._begin(Symbolic(pattern, blocks, ordering, last))
 
@@ -96,7 +98,7 @@ class Factorization:
         self.symbolic, self.pattern = symbolic, symbolic.pattern
         self._plan: Plan | None = None
         self._ready = False
-        self._inverse: tuple[Array, IntArray, BoolArray] | None = None  # panels, front of each scalar, fronts filled in
+        self._inverse: tuple[Array, BoolArray] | None = None  # panels, fronts filled in
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the structure asked for, without numbers: a plan holds addresses of this process."""
@@ -201,6 +203,13 @@ class Factorization:
         """True if the last factorisation succeeded with positive pivots only."""
         return self._ready and self.inertia[1] == 0
 
+    def weakest(self, diagonal: Array) -> float:
+        """Smallest pivot relative to the (n,) diagonal of the matrix; 0 where it is not definite."""
+        if not self.definite:
+            return 0.0
+        plan = self.plan
+        return float(fronts.weakest(plan.order, plan.signs, plan.pivots, diagonal, self.pattern.size))
+
     @property
     def failure(self) -> int:
         """Scalar whose pivot vanished or was not finite in the last factorisation, or -1."""
@@ -216,26 +225,27 @@ class Factorization:
         result: Array = (self.plan.signs / self.plan.pivots**2)[: self.pattern.size]
         return result
 
-    def last_block(self, count: int) -> Array:
-        """(k, k) Schur complement of the last ``count`` scalars, which are eliminated after all others.
+    def last_block(self) -> Array:
+        """(k, k) Schur complement of the ``last`` scalars.
 
         Raises:
             UnifgError: there is no factorisation.
         """
         self._demand("last_block")
-        plan, chosen = self.plan, self._position[self.pattern.size - count :]
+        plan, count = self.plan, self.symbolic.asked[2]
+        chosen = self._position[self.pattern.size - count :]
         place = np.full(self.pattern.size, -1)
         place[chosen] = np.arange(count)
         upper = np.zeros((count, count))
-        for s in np.unique(self._owner()[chosen]).tolist():
+        for s in np.unique(self._owner[chosen]).tolist():
             first, width, rows, panel, stride, *_ = plan.fronts[s].tolist()
             index = int(plan.fronts[s, INDEX])
             own = np.arange(first, first + width)
             block = plan.numbers[panel : panel + width * stride].reshape(width, stride)[:, : width + rows].copy()
             block[:, :width] = np.triu(block[:, :width], 1) + np.diag(1.0 / plan.pivots[own])
             here = place[np.append(own, plan.rows[index : index + rows])]
-            mine = here[:width] >= 0  # a front may begin with others
-            upper[np.ix_(here[:width][mine], here[here >= 0])] = block[mine][:, here >= 0]
+            kept = here >= 0  # a front may begin with others
+            upper[np.ix_(here[:width][kept[:width]], here[kept])] = block[np.ix_(kept[:width], kept)]
         result: Array = upper.T @ (plan.signs[chosen, None] * upper)
         return result
 
@@ -275,10 +285,10 @@ class Factorization:
         rows = np.asarray(rows, dtype=np.int64)
         chosen = self._position[rows]
         places = np.zeros((len(rows), len(rows)), np.int64)
-        if locate(self.plan, self._owner(), chosen, places):
+        if locate(self.plan, self._owner, chosen, places):
             block: Array = self._filled(chosen)[places]
             return block
-        found: Array = block_of(self.plan, self._parent, self._owner(), self._heights, chosen, self._clean)
+        found: Array = block_of(self.plan, self._parent, self._owner, self._heights, chosen, self._clean)
         return found
 
     def inverse_blocks(self, first: IntArray, second: IntArray) -> Array:
@@ -296,7 +306,7 @@ class Factorization:
         """
         self._demand("inverse_blocks")
         result: Array = blocks_of_pairs(
-            self.plan, self._parent, self._owner(), self._heights, self._position[np.asarray(first, dtype=np.int64)],
+            self.plan, self._parent, self._owner, self._heights, self._position[np.asarray(first, dtype=np.int64)],
             self._position[np.asarray(second, dtype=np.int64)], self._clean,
         )  # fmt: skip
         return result
@@ -316,7 +326,7 @@ class Factorization:
         """
         self._demand("products")
         result: Array = products(
-            self.plan, self._parent, self._owner(), np.asarray(starts, dtype=np.int64),
+            self.plan, self._parent, self._owner, np.asarray(starts, dtype=np.int64),
             self._position[np.asarray(rows, dtype=np.int64)], np.ascontiguousarray(values, dtype=np.float64),
             self._clean,
         )  # fmt: skip
@@ -331,7 +341,7 @@ class Factorization:
         panels = self._filled(None)
         plan, starts, position = self.plan, self.structure.starts, self._position
         sizes, result = np.diff(starts), [NOTHING] * (len(starts) - 1)
-        front = plan.fronts[self._owner()]  # one row per scalar
+        front = plan.fronts[self._owner]  # one row per scalar
         for size in np.unique(sizes).tolist():
             chosen = np.flatnonzero(sizes == size)
             first = position[starts[chosen]]  # scalars of a node stay together
@@ -365,23 +375,21 @@ class Factorization:
     def _clean(self) -> Array:
         return np.zeros(len(self.plan.work))
 
+    @cached_property
     def _owner(self) -> IntArray:
         """Front that eliminates each scalar, in the order of elimination."""
-        if self._inverse is None:
-            plan = self.plan
-            widths = plan.fronts[:-1, PIVOTS]
-            largest = int(plan.shape[2])
-            panels = np.zeros(int(plan.shape[PANELS]) + 6 * largest * (largest + 4) + SLACK)
-            self._inverse = panels, np.repeat(np.arange(len(widths)), widths), np.zeros(len(widths), dtype=np.bool_)
-        return self._inverse[1]
+        widths = self.plan.fronts[:-1, PIVOTS]
+        return np.repeat(np.arange(len(widths)), widths)
 
     def _filled(self, scalars: IntArray | None) -> Array:
         """Panels of the inverse, filled in for the fronts of some scalars (in elimination order) or for all."""
         self._demand("the inverse")
-        owner = self._owner()
-        assert self._inverse is not None
-        panels, _, done = self._inverse
-        parent = self.structure.parent
+        owner, parent = self._owner, self.structure.parent
+        if self._inverse is None:
+            largest = int(self.plan.shape[LARGEST])
+            size = int(self.plan.shape[PANELS]) + 6 * largest * (largest + 4) + SLACK
+            self._inverse = np.zeros(size), np.zeros(len(parent), dtype=np.bool_)
+        panels, done = self._inverse
         wanted = np.zeros(len(parent), dtype=np.bool_)
         if scalars is None:
             wanted[:] = True
@@ -404,7 +412,7 @@ class Factorization:
     def _forget(self) -> None:
         self._ready = False
         if self._inverse is not None:
-            self._inverse[2][:] = False
+            self._inverse[1][:] = False
 
     def _demand(self, what: str) -> None:
         if not self._ready:

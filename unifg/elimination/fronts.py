@@ -8,6 +8,8 @@ method is then the block tridiagonal recursion, without an index.
 
 from __future__ import annotations
 
+import numpy as np
+
 from unifg.codegen.jit import compiled, inlined
 from unifg.codegen.vectors import Address, address, get, put, splat, store
 from unifg.elimination.assembly import add_row
@@ -206,3 +208,16 @@ def eliminate_part(plan: Plan, part: int, state: IntArray) -> bool:
         if failed >= 0:
             return False
     return True
+
+
+@compiled
+def weakest(order: IntArray, signs: Array, roots: Array, diagonal: Array, size: int) -> float:
+    """Smallest pivot, signs / roots^2, relative to the diagonal; 0 where one is not positive."""
+    least = np.inf
+    for k in range(size):
+        pivot, scale = signs[k], diagonal[order[k]] * roots[k] * roots[k]
+        if not pivot > least * scale:
+            if not pivot > 0.0:
+                return 0.0
+            least = pivot / scale
+    return least

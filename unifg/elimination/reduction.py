@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.elimination.factorization import Factorization
-from unifg.elimination.ordering import indistinguishable
+from unifg.elimination.factorization import WEAK, Factorization
 from unifg.elimination.symmetric import Symmetric
 from unifg.typing import Array
-
-ROUNDING = 1e-13  # pivots that are smaller, of the entry on the diagonal, are made of rounding
 
 
 class Reduction:
@@ -21,21 +18,16 @@ class Reduction:
 
     def __init__(self, pattern: Symmetric, kept: int) -> None:
         """Order the first scalars before the last ``kept``."""
-        gone = pattern.size - kept
-        label = indistinguishable(pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64))
-        label[gone:] += 1  # a node is of the first or of the last
-        last = int(label[-1] - label[gone]) + 1 if kept else 0
-        self._tree = Factorization(pattern, label, last=last)
-        self._kept, self._added, self._held = slice(gone, pattern.size), np.zeros(pattern.size), np.zeros((0, 0))
+        self._tree, self._kept = Factorization(pattern, last=kept), slice(pattern.size - kept, pattern.size)
+        self._added, self._held = np.zeros(pattern.size), np.zeros((kept, kept))
 
     def factor(self, data: Array) -> bool:
         """Factorise, from entries in the order of the pattern; False where the first scalars are not determined."""
         tree, diagonal = self._tree, data[self._tree.pattern.diagonal]
         self._added[self._kept] = np.where(diagonal > 0.0, diagonal, 1.0)[self._kept]
-        done = tree.factor(data, self._added) and tree.definite
-        done = done and bool((tree.pivots() > ROUNDING * (diagonal + self._added)[tree.plan.order]).all())
+        done = tree.factor(data, self._added) and tree.weakest(diagonal + self._added) > WEAK
         if done:
-            self._held = tree.last_block(self._kept.stop - self._kept.start)
+            self._held = tree.last_block()
         return done
 
     @property

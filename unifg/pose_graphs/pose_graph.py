@@ -112,6 +112,11 @@ class Priors(_Measurements):
     information: Array
 
 
+def group_of(poses: Array) -> LieGroup:
+    """SE2 or SE3, whichever (n, storage) poses live in."""
+    return SE2 if poses.shape[1] == SE2.storage else SE3
+
+
 class _Term(NamedTuple):
     """Measurements with their residual, of constants, poses and landmarks, whose positions these are."""
 
@@ -158,7 +163,7 @@ class PoseGraph:
     @property
     def group(self) -> LieGroup:
         """SE2 or SE3, whichever the poses live in."""
-        return SE2 if self.poses.shape[1] == SE2.storage else SE3
+        return group_of(self.poses)
 
     @property
     def closures(self) -> Edges:

@@ -24,16 +24,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from unifg.atomic_write import replacing, write_atomically
+from unifg.codegen.inner import inner
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.reduction import Reduction
-from unifg.elimination.symmetric import Symmetric, distinct
+from unifg.elimination.symmetric import Symmetric, distinct, scatter
 from unifg.errors import GraphError, require_kinds
-from unifg.lie import SE2, SE3, LieGroup
+from unifg.factors.steps import EPSILON
+from unifg.lie import LieGroup
 from unifg.modeling.factors import between
-from unifg.pose_graphs.pose_graph import Edges, PoseGraph
+from unifg.pose_graphs.pose_graph import Edges, PoseGraph, group_of
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.graph import Graph
+from unifg.solution.relative_offset import ROUNDING
 from unifg.solution.status import Status
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -43,7 +46,6 @@ INDEX, SEPARATOR, INFORMATION = "submaps.json", "separator.npz", "information.np
 POSES, NEXT = "poses.npy", "next.npy"
 EDGES = "first", "second", "measured", "information"
 ARMIJO, SHORTEST = 1e-4, 2.0**-10
-ROUNDING = 4.0 * 2.0**-52  # of a tangent coordinate, relative to the largest position
 
 
 class Optimized(NamedTuple):
@@ -101,17 +103,10 @@ class _Edges:
         """Linearise."""
         return self.program.linearize(self.program.values_from({self._x: poses}))
 
-    def offsets(self, lin: Linearization, step: Array | None, rounding: float) -> Array:
-        """(3, n) over the edges of each pose: |J d|^2 of a step (n, d), |r|^2, and what is rounding of the first.
-
-        Args:
-            lin: where.
-            step: none has moved nothing.
-            rounding: of a tangent coordinate.
-        """
+    def offsets(self, lin: Linearization, step: Array, rounding: float) -> Array:
+        """(3, n) over the edges of each pose: |J d|^2 of a step (n, d), |r|^2, and what is rounding of the first."""
         costs, count = self.program.costs, self._x.count
-        along = 0.0 if step is None else step.ravel()[costs.columns]
-        moved = np.bincount(costs.rows, lin.jacobian * along, costs.count)
+        moved = np.bincount(costs.rows, lin.jacobian * step.ravel()[costs.columns], costs.count)
         noise = np.bincount(costs.rows, (rounding * lin.jacobian) ** 2, costs.count)
         squares = [row.reshape(-1, self._group.dim).sum(axis=1) for row in (moved**2, lin.residual**2, noise)]
         return np.array([sum(np.bincount(end, one, count) for end in self._ends) for one in squares])
@@ -165,10 +160,10 @@ class Submaps:
         self.folder = Path(folder)
         try:
             known = json.loads((self.folder / INDEX).read_text(encoding="utf-8"))
-            self.count, storage = int(known["submaps"]), int(known["storage"])
+            self.count = int(known["submaps"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise GraphError(f"{folder}: no submaps here; Submaps.split(pose_graph, folder) writes them") from error
-        self._group: LieGroup = SE2 if storage == SE2.storage else SE3
+        self._group = group_of(self.poses)
         with np.load(self.folder / SEPARATOR) as file:
             self._shared, self._fixed = file["shared"], file["fixed"]
             self._across = Edges(*(file[name] for name in EDGES))
@@ -214,21 +209,21 @@ class Submaps:
         owner = np.maximum(part[edges.first], part[edges.second])  # an edge has inner poses of one submap
         count = int(part.max()) + 1
         members, rows = _groups(part, count), _groups(owner, count)
-        for k, (inner, own) in enumerate(zip(members, rows, strict=True), -1):
+        for k, (interior, own) in enumerate(zip(members, rows, strict=True), -1):
             ends = np.concatenate([edges.first[own], edges.second[own]])
             boundary = np.zeros(0, np.int64) if k < 0 else distinct(ends[shared[ends]])
-            present = np.concatenate([inner, boundary])
+            present = np.concatenate([interior, boundary])
             by_name = np.argsort(present)
             at_first, at_second = by_name[np.searchsorted(present[by_name], ends)].reshape(2, -1)
             names: dict[str, Any] = (
-                {"inner": inner, "boundary": boundary} if k >= 0 else {"shared": inner, "fixed": fixed[inner]}
+                {"inner": interior, "boundary": boundary} if k >= 0 else {"shared": interior, "fixed": fixed[interior]}
             )
             measured, information = edges.measured[own], edges.information[own]
             with replacing(home / SEPARATOR if k < 0 else home / f"{k}.npz") as file:
                 np.savez(file, first=at_first, second=at_second, measured=measured, information=information, **names)
         with replacing(home / POSES) as file:
             np.save(file, poses)
-        write_atomically(home / INDEX, json.dumps({"submaps": count, "storage": int(poses.shape[1])}))
+        write_atomically(home / INDEX, json.dumps({"submaps": count}))
         return cls(home)
 
     @property
@@ -268,7 +263,7 @@ class Submaps:
                 return Optimized(Status.ITERATION_LIMIT, now.chi2, taken, now.offset)
             length, trial = 1.0, self._eliminated(now.step, 1.0)
             done = now.offset <= tolerance and trial.worst <= tolerance
-            while not trial.chi2 <= now.chi2 * (1.0 + ROUNDING) - ARMIJO * length * now.decrease:
+            while not trial.chi2 <= now.chi2 * (1.0 + ROUNDING * EPSILON) - ARMIJO * length * now.decrease:
                 length *= 0.5
                 if done or length < SHORTEST:
                     self._eliminated()  # what is left of the submaps belongs to the poses
@@ -294,9 +289,9 @@ class Submaps:
             return self._known().covariance(np.array([place]))
         for k in range(self.count):
             with np.load(self.folder / f"{k}.npz") as file:
-                inner = file["inner"]
-            at = int(np.searchsorted(inner, pose))
-            if at < len(inner) and inner[at] == pose:
+                interior = file["inner"]
+            at = int(np.searchsorted(interior, pose))
+            if at < len(interior) and interior[at] == pose:
                 break
         submap, places = _Submap(self.folder / f"{k}.npz", self._group), self._boundaries[k]
         submap.linearize(self.poses[submap.members])
@@ -330,35 +325,36 @@ class Submaps:
         """Take a step from the present poses, which writes the next ones, and eliminate all inner poses there."""
         separator, poses, group = self._separator, self.poses, self._group
         shared, decrease, worst = np.array(poses[self._shared]), 0.0, 0.0
-        rounding = ROUNDING * max(1.0, float(np.abs(poses[:, : group.point_dim]).max()))
-        offsets = separator.offsets(shared, step, rounding)
+        rounding = ROUNDING * EPSILON * max(1.0, float(np.abs(poses[:, : group.point_dim]).max()))
         if step is not None:
+            offsets = separator.offsets(shared, step, rounding)
             shutil.copyfile(self.folder / POSES, self.folder / NEXT)  # a full disk is found here, not in mapped memory
             following = np.load(self.folder / NEXT, mmap_mode="r+")
             following[self._shared] = shared = group.retract(shared, length * step)
-        chi2, noise = separator.begin(shared), float(offsets[2].sum())
+        chi2, slopes = separator.begin(shared)
         for k, places in enumerate(self._boundaries):
             submap = _Submap(self.folder / f"{k}.npz", group)
-            own, inner = np.array(poses[submap.members]), len(submap.inner)
+            own, count = np.array(poses[submap.members]), len(submap.inner)
             lin = submap.linearize(own)
             if step is not None:
                 whole = submap.step(lin.gradient, step[places])
                 found = submap.edges.offsets(lin, whole, rounding)
-                offsets[:, places] += found[:, inner:]
-                worst = max(worst, _largest(found[:, :inner]))
+                offsets[:, places] += found[:, count:]
+                worst = max(worst, _largest(found[:, :count]))
                 own = group.retract(own, length * whole)
-                own[inner:] = shared[places]
-                following[submap.inner] = own[:inner]
+                own[count:] = shared[places]
+                following[submap.inner] = own[:count]
                 lin = submap.linearize(own)
             matrix, gradient, inside = submap.reduced(lin.gradient)
             separator.add(places, matrix, gradient)
             chi2, decrease = chi2 + 2.0 * lin.cost, decrease + inside
-            noise += float(submap.edges.offsets(lin, None, rounding)[2].sum())
+            slopes += inner(lin.jacobian, lin.jacobian)
         if step is not None:
             following.flush()
+            worst = max(worst, _largest(offsets))
         found, outside = separator.solve()
         decrease += outside
-        return _Pass(found, chi2, decrease if decrease > noise else 0.0, max(worst, _largest(offsets)))
+        return _Pass(found, chi2, decrease if decrease > 2.0 * rounding**2 * slopes else 0.0, worst)
 
     @cached_property
     def _separator(self) -> _Separator:
@@ -389,26 +385,27 @@ class _Separator:
             first, second = (np.searchsorted(self._ends, end) for end in (edges.first, edges.second))
             self._edges = _Edges(group, len(self._ends), replace(edges, first=first, second=second))
 
-    def offsets(self, poses: Array, step: Array | None, rounding: float) -> Array:
+    def offsets(self, poses: Array, step: Array, rounding: float) -> Array:
         """(3, S) as of :meth:`_Edges.offsets`, of the edges of the separator."""
         result = np.zeros((3, len(poses)))
         if self._edges is not None:
             lin = self._edges.linearize(poses[self._ends])
-            result[:, self._ends] = self._edges.offsets(lin, None if step is None else step[self._ends], rounding)
+            result[:, self._ends] = self._edges.offsets(lin, step[self._ends], rounding)
         return result
 
-    def begin(self, poses: Array) -> float:
-        """Linearise the edges, of which nothing else is there yet; chi2 of them."""
+    def begin(self, poses: Array) -> tuple[float, float]:
+        """Linearise the edges, of which nothing else is there yet; chi2, and the sum of squared slopes."""
         self.information[:], self._gradient[:] = 0.0, 0.0
         if self._edges is None:
-            return 0.0
+            return 0.0, 0.0
         lin = self._edges.linearize(poses[self._ends])
         pattern, column = self._edges.program.normal, self._columns[self._ends].ravel()
         rows, columns = column[pattern.indices], column[pattern.columns]
         free = (rows >= 0) & (columns >= 0)
-        np.add.at(self.information, self._pattern.positions(rows[free], columns[free]), lin.hessian[free])
+        slots = self._pattern.positions(rows[free], columns[free])
+        self.information[:] = scatter(slots, lin.hessian[free], self._pattern.nnz)
         self._gradient[column[column >= 0]] = lin.gradient[column >= 0]
-        return 2.0 * lin.cost
+        return 2.0 * lin.cost, inner(lin.jacobian, lin.jacobian)
 
     def add(self, boundary: IntArray, matrix: Array, gradient: Array) -> None:
         """Add what is left of a submap; positions of its boundary are sorted."""

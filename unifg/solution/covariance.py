@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.elimination.factorization import WEAK
 from unifg.errors import GraphError
 from unifg.locks import ReentrantLock
 from unifg.problem.compiled_problem import CompiledProblem
@@ -17,7 +18,6 @@ from unifg.problem.systems import KktStructure, KktSystem, fill
 from unifg.typing import Array, BoolArray, IntArray
 
 SOLVED = 1e-6  # residual of a column, in the equilibrated system, that belongs to a determined unknown
-WEAK = 1e-13  # pivots below this, relative to the diagonal, are rounding errors
 UNDETERMINED = "the covariance does not exist: some direction is not determined by the costs; run graph.check(guess)"
 
 
@@ -43,10 +43,8 @@ class Covariances:
             self._lin, self._data = lin, np.zeros(0)
             return
         self._factorization = program.systems.normal()
-        if not self._factorization.factor(lin.hessian):
-            raise GraphError(UNDETERMINED)
-        scale = lin.hessian[program.normal.diagonal][self._factorization.plan.order[: program.size]]
-        if (self._factorization.pivots() <= WEAK * np.abs(scale)).any():
+        diagonal = lin.hessian[program.normal.diagonal]
+        if not (self._factorization.factor(lin.hessian) and self._factorization.weakest(diagonal) > WEAK):
             raise GraphError(UNDETERMINED)
 
     def joint(self, columns: IntArray) -> Array:

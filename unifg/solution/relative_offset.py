@@ -40,7 +40,7 @@ import numpy as np
 
 from unifg.codegen.inner import inner
 from unifg.codegen.jit import compiled
-from unifg.elimination.factorization import Factorization
+from unifg.elimination.factorization import WEAK, Factorization
 from unifg.factors.steps import ANGLE, TURN
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
@@ -51,7 +51,6 @@ from unifg.typing import Array, BoolArray, IntArray
 EPS = 2.0**-52
 LARGEST = 1e308
 ROUNDING = 4.0  # roundings in a residual, each of a number as large as the variables
-WEAK = 1e-13  # pivots below this, relative to the diagonal, are rounding errors
 FLAT = 1e-6  # the same of a Hessian whose second derivatives are differences
 STEPS = 4  # conjugate-gradient steps before a new factor is cheaper
 MANY_STEPS = 40  # the same where there is no better factor
@@ -162,9 +161,7 @@ class Structure:
             used = own if lent is None else lent.solver
             weakest = 1.0
             if determined and (lent is None or lent.damping == 0.0) and used.definite:
-                plan = used.plan
-                diagonal = lin.hessian[program.normal.diagonal]
-                weakest = float(_weakest(plan.order, plan.signs, plan.pivots, diagonal, program.size))
+                weakest = used.weakest(lin.hessian[program.normal.diagonal])
         value = math.sqrt(energy) / size if size else 0.0
         value = 0.0 if value <= floor else value
         return Offset(max(value, local.worst) if value <= enough else value, determined, True, weakest)
@@ -243,12 +240,12 @@ def _energy(
     solver = own if lent is None else lent.solver
     if lent is not None:
         lent.damping = 0.0
-    if solver.factor(lin.hessian) and _sound(solver, diagonal, program.size):
+    if solver.factor(lin.hessian) and solver.weakest(diagonal) > WEAK:
         return _promised(solver, gradient, local), True
     idle = _idle(program, diagonal)
     if idle.any():  # what no active factor touches is not asked for
         added = np.where(idle, 1.0, 0.0)
-        if solver.factor(lin.hessian, added) and _sound(solver, diagonal + added, program.size):
+        if solver.factor(lin.hessian, added) and solver.weakest(diagonal + added) > WEAK:
             return _promised(solver, gradient, local), True
     if not len(diagonal):
         return 0.0, False
@@ -284,7 +281,7 @@ def _beside(
         if inner(change, side.residual + lin.residual) < -max(LESS * inner(before, before), local.noise):
             return np.inf, True
     entries = sides[0].hessian
-    regular = solver.factor(entries) and _sound(solver, entries[program.normal.diagonal], program.size)
+    regular = solver.factor(entries) and solver.weakest(entries[program.normal.diagonal]) > WEAK
     return energy, regular
 
 
@@ -300,12 +297,12 @@ def _bent(program: CompiledProblem, lin: Linearization, solver: Factorization) -
     hessian = lagrangian_hessian(program, lin, np.zeros(0))
     diagonal = hessian[program.normal.diagonal]
     regular = bool((diagonal > 0.0).all()) and solver.factor(hessian)
-    return solver if regular and _sound(solver, diagonal, program.size, FLAT) else None
+    return solver if regular and solver.weakest(diagonal) > FLAT else None
 
 
 def _regular(program: CompiledProblem, hessian: Array, diagonal: Array, lent: Factored) -> bool:
     """Test whether a factor near the Hessian shows that every direction is determined."""
-    if not (_sound(lent.solver, diagonal, program.size) and diagonal.all()):
+    if not (lent.solver.weakest(diagonal) > WEAK and diagonal.all()):
         return False
     if lent.damping == 0.0:
         return True
@@ -353,14 +350,6 @@ def _climb(
     return energy, False
 
 
-def _sound(solver: Factorization, diagonal: Array, size: int, weak: float = WEAK) -> bool:
-    """Test whether all pivots stand out from rounding errors."""
-    if not solver.definite:
-        return False
-    plan = solver.plan
-    return bool(_weakest(plan.order, plan.signs, plan.pivots, diagonal, size) > weak)
-
-
 def _counted(program: CompiledProblem) -> BoolArray:
     """(C,) rows that touch an unknown, or nothing when all do."""
     if program.size == program.columns.width:
@@ -394,19 +383,6 @@ def _extents(program: CompiledProblem) -> tuple[IntArray, IntArray, Array]:
     first, last, kinds = (place[program.columns.free] for place in program.columns.extents)
     angles = (kinds == ANGLE) | (kinds == TURN)
     return np.where(angles, 0, first), np.where(angles, 0, last), angles.astype(np.float64)
-
-
-@compiled
-def _weakest(order: IntArray, signs: Array, roots: Array, diagonal: Array, size: int) -> float:
-    """Smallest pivot, signs / roots^2, relative to the diagonal; 0 where one is not positive."""
-    least = np.inf
-    for k in range(size):
-        pivot, scale = signs[k], diagonal[order[k]] * roots[k] * roots[k]
-        if not pivot > least * scale:
-            if not pivot > 0.0:
-                return 0.0
-            least = pivot / scale
-    return least
 
 
 @compiled
