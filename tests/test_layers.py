@@ -175,6 +175,31 @@ def test_frameworks_take_slopes_back(framework: Callable[[], Any], layer: Layer)
         np.testing.assert_allclose(found, right, rtol=1e-6)
 
 
+@pytest.mark.parametrize("framework", [_torch, _jax])
+def test_whole_numbers_are_no_type_of_answers(framework: Callable[[], Any], layer: Layer) -> None:
+    module, _ = framework()
+    whole = pytest.importorskip("torch").tensor if framework is _torch else pytest.importorskip("jax.numpy").array
+    found = module(whole([0, 0, 3]), GOALS[0], 0.5)
+    for values, right in zip(found, layer.solve([0.0, 0.0, 3.0], GOALS[0], 0.5).values, strict=True):
+        np.testing.assert_allclose(values, right, atol=1e-9)
+
+
+def test_second_derivatives_of_torch_raise_and_short_numbers_serve() -> None:
+    torch = pytest.importorskip("torch", reason="the extra 'torch' is not installed")
+    module, _ = _torch()
+    weight = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    loss = module(STARTS[0], GOALS[0], weight)[0].square().sum() + weight**3
+    (slope,) = torch.autograd.grad(loss, weight, create_graph=True)
+    with pytest.raises(fg.GraphError, match="first derivatives only"):
+        torch.autograd.grad(slope, weight)
+    start = torch.tensor(STARTS[1], dtype=torch.bfloat16, requires_grad=True)
+    poses = module(start, GOALS[0], 0.5)[0]
+    poses.sum().backward()
+    assert poses.dtype == start.grad.dtype == torch.bfloat16
+    with pytest.raises(fg.GraphError, match="must be real numbers"):
+        module(torch.tensor(STARTS[0], dtype=torch.complex64), GOALS[0], 0.5)
+
+
 def test_a_training_loop_of_torch_falls() -> None:
     torch = pytest.importorskip("torch", reason="the extra 'torch' is not installed")
     module, _ = _torch()

@@ -25,7 +25,7 @@ def layer(*args: Any, **options: Any) -> Callable[..., Any]:
     """Function from arrays to values of families; arguments and errors as of `unifg.layers.Layer`.
 
     Arrays have the shapes of the data, or (..., shape) for several instances. The result is the array of the output, a
-    tuple of several, of the type of the first input.
+    tuple of several, of the type of the first input; whole numbers count as JAX's default type of real ones.
     """
     inner = Layer(*args, **options)
     known: OrderedDict[bytes, Answers] = OrderedDict()
@@ -62,7 +62,8 @@ def layer(*args: Any, **options: Any) -> Callable[..., Any]:
     solve.defvjp(lambda *given: (solve(*given), given), backward)
 
     def call(*given: Any) -> Any:
-        found = solve(*map(jax.numpy.asarray, given))
+        arrays = [jax.numpy.asarray(one) for one in given]
+        found = solve(*(one.astype(jax.numpy.result_type(one, float)) for one in arrays))
         return found if len(found) > 1 else found[0]
 
     return call
