@@ -96,7 +96,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             with suppress(OSError, AttributeError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if not isinstance(error, BrokenPipeError):  # whose reader has had enough
-            return _refuse(f"{error.filename or 'the output'}: cannot be written ({error.strerror})")
+            what = f"{error.filename}: cannot be read or written" if error.filename else "the output: cannot be written"
+            return _refuse(f"{what} ({error.strerror})")
     return status
 
 

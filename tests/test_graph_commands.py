@@ -50,7 +50,7 @@ def test_what_cannot_be_written_is_refused_before_anything_is(
     assert "it has no measurements" in capsys.readouterr().err
     assert not (tmp_path / "b.g2o").exists()
     assert main(["convert", str(tmp_path / "a.g2o"), str(tmp_path / "none" / "b.g2o")]) == 2
-    assert "none/b.g2o: cannot be written" in capsys.readouterr().err
+    assert "none/b.g2o: cannot be read or written" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("words", "named"), [(["--init", "file"], True), ([], False)])
