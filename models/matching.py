@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.errors import ModelError
 from unifg.lie import wrap_angle
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -34,6 +35,15 @@ class Gates:
 
     match: float = 13.8
     new: float = 50.0
+
+    def __post_init__(self) -> None:
+        """Refuse gates that let nothing through.
+
+        Raises:
+            ModelError: not 0 < match <= new.
+        """
+        if not 0.0 < self.match <= self.new:
+            raise ModelError(f"gates need 0 < match <= new, found {self.match} and {self.new}")
 
 
 def nearest(seen: Array, forecast: Array, innovation: Array, possible: BoolArray, gates: Gates) -> IntArray:

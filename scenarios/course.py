@@ -14,7 +14,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import avoidance, landmarks, quadrotor
-from unifg.scenarios.options import Settings, option
+from unifg.scenarios.options import AtLeastOne, Positive, Settings, option
 from unifg.scenarios.planning.polyline import arc_lengths, at_stations
 from unifg.scenarios.planning.visibility import Ways
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
@@ -86,8 +86,8 @@ class CourseSettings(Settings):
         tolerance: of the KKT test.
     """
 
-    horizon: int = 60
-    dt: float = 0.1
+    horizon: AtLeastOne = 60
+    dt: Positive[float] = 0.1
     solver: str = "sqp"
     hessian: Hessian | None = option(None)
     avoidance: Avoidance = option("potential")
@@ -101,14 +101,14 @@ class CourseSettings(Settings):
     rate: float = 1.0
     thrust: float = 0.1
     near: float = 0.3
-    nearest: float = 0.2
+    nearest: Positive[float] = 0.2
     clearance: float = 0.05
-    rate_limit: float = 4.0
-    thrust_limit: float = 20.0
-    speed_limit: float = 2.0
-    arrival: float = 0.3
+    rate_limit: Positive[float] = 4.0
+    thrust_limit: Positive[float] = 20.0
+    speed_limit: Positive[float] = 2.0
+    arrival: Positive[float] = 0.3
     vehicle: quadrotor.Parameters = field(default_factory=quadrotor.Parameters)
-    tolerance: float = 1e-6
+    tolerance: Positive[float] = 1e-6
 
     @property
     def chosen_hessian(self) -> Hessian:

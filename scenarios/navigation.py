@@ -31,7 +31,7 @@ from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load
 from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.drive_log import Assumed, EpisodeLog
-from unifg.scenarios.options import Settings, count, existing, option, pair, pose, positive
+from unifg.scenarios.options import Positive, Settings, Signed, count, existing, option, pair, pose, positive
 from unifg.scenarios.perception.monte_carlo import MonteCarlo
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.planning.polyline import path_length
@@ -103,14 +103,14 @@ class NavigationSettings(Settings):
     """
 
     map: Path | None = option(None, text=existing("the YAML file of a ROS map"), metavar="F.yaml")
-    start: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
+    start: Signed[tuple[float, float, float]] | None = option(None, text=pose, metavar="X,Y,TH")
     goals: tuple[tuple[float, float, float], ...] | None = option(
         None, text=pose, metavar="X,Y,TH", flag="goal", many=True
     )
     solver: str = "ipm"
     coupling: str = option("sequential", choices=("sequential", "joint"))
     obstacles: int = option(0, text=partial(count, most=200), metavar="K")
-    obstacle_radius: tuple[float, float] = option((0.15, 0.25), text=pair, metavar="LO,HI")
+    obstacle_radius: Positive[tuple[float, float]] = option((0.15, 0.25), text=pair, metavar="LO,HI")
     mover_speed: float = option(0.3, text=positive, metavar="M/S")
     traffic: Traffic = field(default_factory=Traffic)
     seed: int = option(0, metavar="S")
@@ -125,8 +125,8 @@ class NavigationSettings(Settings):
     faults: tuple[Fault, ...] = option(
         (), text=one_of(DRIVE_FAULTS), metavar="KIND[=SIZE]@SECONDS[:DURATION]", flag="fault", many=True
     )
-    believed: tuple[float, float, float] | None = option(None, text=pose, metavar="X,Y,TH")
-    initial_sigma: tuple[float, float, float] = option(INITIAL_SIGMA, text=pose, metavar="X,Y,TH")
+    believed: Signed[tuple[float, float, float]] | None = option(None, text=pose, metavar="X,Y,TH")
+    initial_sigma: Positive[tuple[float, float, float]] = option(INITIAL_SIGMA, text=pose, metavar="X,Y,TH")
     plant: str = option("light", choices=tuple(PLANTS))
     log: Path | None = option(None, text=existing("a log of a laser", folders=True), metavar="LOG")
 

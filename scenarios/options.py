@@ -15,19 +15,22 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import NoneType
-from typing import Any, Literal, NamedTuple, TypeVar, cast, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from unifg.errors import ScenarioError, UnifgError
 from unifg.files.contents import legible
 
 __all__ = [
+    "AtLeastOne",
     "Help",
     "Leaf",
     "Option",
+    "Positive",
     "Settings",
+    "Signed",
     "Text",
     "add_options",
     "checked",
@@ -49,6 +52,7 @@ __all__ = [
 ]
 
 S = TypeVar("S")
+T = TypeVar("T")
 Text = Callable[[str], Any]
 """Makes a value of a word of the command line, or raises ArgumentTypeError."""
 
@@ -95,12 +99,15 @@ class Leaf(NamedTuple):
         owner: class that declares it.
         kind: its annotation.
         declared: the field.
+        within: reader of numbers that it may hold, as its annotation says by `Positive`, `Signed` or `AtLeastOne`; None
+            where that says nothing.
     """
 
     path: tuple[str, ...]
     owner: type
     kind: Any
     declared: dataclasses.Field[Any]
+    within: Text | None
 
     @property
     def option(self) -> Option | None:
@@ -121,37 +128,43 @@ class Leaf(NamedTuple):
 
 def leaves(settings: type, before: tuple[str, ...] = ()) -> Iterator[Leaf]:
     """Fields of a class of settings and of the settings inside."""
-    kinds = get_type_hints(settings)
+    kinds, full = get_type_hints(settings), get_type_hints(settings, include_extras=True)
     for declared in dataclasses.fields(settings):
         kind, path = plain(kinds[declared.name]), (*before, declared.name)
         if isinstance(kind, type) and dataclasses.is_dataclass(kind):
             yield from leaves(kind, path)
         elif declared.init:
-            yield Leaf(path, settings, kinds[declared.name], declared)
+            parts = (full[declared.name], *get_args(full[declared.name]))  # one of which may be None
+            within = next((one for part in parts for one in getattr(part, "__metadata__", ())), None)
+            yield Leaf(path, settings, kinds[declared.name], declared, within)
 
 
 class Settings:
-    """Settings that refuse, wherever they are made, the words and numbers that the command line refuses."""
+    """Settings that refuse, wherever they are made, the words and numbers that the command line refuses.
+
+    Numbers are finite and zero or more, except where the annotation or the option says something else.
+    """
 
     def __post_init__(self) -> None:
-        """Check the options.
+        """Check the fields.
 
         Raises:
             ScenarioError: naming the field.
         """
-        for leaf in _options(cast(type, type(self))):
+        for leaf in _own(cast(type, type(self))):
             name, value = leaf.path[0], getattr(self, leaf.path[0])
-            for one in value if isinstance(value, tuple) and leaf.option.many else (value,):  # type: ignore[union-attr]
+            read_as_one = leaf.option is not None and leaf.option.text is not None and not leaf.option.many
+            for one in value if isinstance(value, tuple) and (leaf.within or not read_as_one) else (value,):
                 if leaf.choices and one is not None and one not in leaf.choices:
                     raise ScenarioError(f"unknown {name} {one!r}: choose {', '.join(leaf.choices)}")
-                if leaf.text is not None and isinstance(one, int | float) and not isinstance(one, bool):
-                    permitted(leaf.text, **{name: one})
+                if isinstance(one, int | float) and not isinstance(one, bool):
+                    permitted(leaf.within or leaf.text or not_negative, **{name: one})
 
 
 @cache
-def _options(settings: type) -> list[Leaf]:
-    """Options of a class of settings itself."""
-    return [leaf for leaf in leaves(settings) if leaf.option is not None and len(leaf.path) == 1]
+def _own(settings: type) -> list[Leaf]:
+    """Fields of a class of settings itself."""
+    return [leaf for leaf in leaves(settings) if len(leaf.path) == 1]
 
 
 def replaced(settings: S, path: Sequence[str], value: Any) -> S:
@@ -306,6 +319,10 @@ def permitted(read: Text, /, **values: float) -> None:
 positive = number("a positive number", lambda value: 0.0 < value < math.inf)
 not_negative = number("a number of zero or more", lambda value: 0.0 <= value < math.inf)
 share = number("a number in [0, 1)", lambda value: 0.0 <= value < 1.0)
+
+Positive: TypeAlias = Annotated[T, positive]
+Signed: TypeAlias = Annotated[T, number("a finite number", math.isfinite)]
+AtLeastOne: TypeAlias = Annotated[int, partial(count, least=1)]
 
 
 def pose(text: str) -> tuple[float, ...]:

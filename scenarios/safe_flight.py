@@ -12,7 +12,7 @@ import itertools
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, get_args
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from unifg.models import quadrotor
 from unifg.scenarios.episode import Progress, run_ticks, silent
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.safe_log import SafeLog
-from unifg.scenarios.options import Settings, count, not_negative, number, option, permitted, positive
+from unifg.scenarios.options import Positive, Settings, count, not_negative, number, option, positive
 from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.quadrotor.cascade import CascadeSettings, Track
 from unifg.scenarios.quadrotor.cbf_mpc import (
@@ -126,9 +126,9 @@ class SafeSettings(Settings):
     seed: int | None = option(None, text=count, metavar="S")
     solver: str = "ipm"
     margin: float = 0.05
-    faster: float = 1.25
+    faster: Positive[float] = 1.25
     patience: float = 2.0
-    dt: float = 0.01
+    dt: Annotated[float, number("a tick in (0, 1] s", lambda value: 0.0 < value <= 1.0)] = 0.01
     books: Airframe = field(default_factory=Airframe)
     truth: quadrotor.Parameters = field(default_factory=lambda: quadrotor.Parameters(1.1, (0.3, 0.3, 0.15)))
     true_loops: Loops = field(default_factory=lambda: Loops(22.0, 0.025, 0.012))
@@ -142,19 +142,6 @@ class SafeSettings(Settings):
     weighing: WeighingSettings = field(default_factory=WeighingSettings)
     seen: tuple[float, float, float] = (1e-3, 3e-3, 1e-2)
     disturbance: DisturbanceModel = field(default_factory=DisturbanceModel)
-
-    def __post_init__(self) -> None:
-        """Refuse ticks that no flight has, speed limits of nothing, and negative distances, times and deviations.
-
-        Raises:
-            ScenarioError: naming the field.
-        """
-        super().__post_init__()
-        permitted(number("a tick in (0, 1] s", lambda value: 0.0 < value <= 1.0), dt=self.dt)
-        permitted(positive, faster=self.faster)
-        permitted(not_negative, margin=self.margin, patience=self.patience)
-        for sigma in self.seen:
-            permitted(not_negative, seen=sigma)
 
 
 class SafeFlight:

@@ -301,7 +301,7 @@ def test_impossible_episodes_are_refused(change: dict[str, Any], message: str) -
 
 @pytest.mark.parametrize("wrong", [{"dt": 0.0}, {"horizon": 0}, {"sigmas": -1.0}, {"wall_clearance": -0.1}], ids=str)
 def test_impossible_settings_of_the_controller_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ScenarioError, match=r"of some length|begin at zero"):
+    with pytest.raises(ScenarioError, match=next(iter(wrong))):
         ControllerSettings(**wrong)
 
 

@@ -336,7 +336,7 @@ def test_what_moves_is_left_out() -> None:
     ("settings", "wrong", "words"),
     [
         (WindowSettings, {"length": 1}, "at least two past states"),
-        (WindowSettings, {"landmarks": 0}, "at least one slot"),
+        (WindowSettings, {"landmarks": 0}, "landmarks: '0' is not a whole number of at least 1"),
         (WindowSettings, {"estimated": ("weight",)}, "'weight' is no parameter"),
         (EstimatorSettings, {"association": "guessed"}, "choose known, unknown"),
     ],

@@ -37,7 +37,7 @@ def test_loops_are_stepped_exactly(loops: Loops) -> None:
 
 @pytest.mark.parametrize("wrong", [{"gain": 0.0}, {"lag": -1.0}, {"link": -0.01}, {"gain": float("nan")}])
 def test_loops_that_are_none_are_refused(wrong: dict[str, float]) -> None:
-    with pytest.raises(ScenarioError, match="loops need"):
+    with pytest.raises(ScenarioError, match="is not a"):
         Loops(**wrong)
 
 

@@ -12,7 +12,7 @@ import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.models.footprint import Body, body_of
 from unifg.models.planar import Base, base_of
-from unifg.scenarios.options import Settings, checked, option, positive
+from unifg.scenarios.options import AtLeastOne, Positive, Settings, checked, option, positive
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -74,17 +74,17 @@ class ControllerSettings(Settings):
 
     base: str = option("unicycle", text=checked(base_of), metavar="BASE")
     body: str = option("", text=checked(body_of), metavar="BODY")
-    horizon: int = 30
-    dt: float = 0.1
+    horizon: AtLeastOne = 30
+    dt: Positive[float] = 0.1
     speed: float = option(1.0, text=positive, metavar="M/S")
-    limits: tuple[float, float] = (1.0, 1.0)
-    accelerations: tuple[float, float] = (2.5, 3.2)
-    pose_sigma: tuple[float, float, float] = (0.3, 0.3, 0.6)
-    terminal_sigma: tuple[float, float, float] = (0.1, 0.1, 0.2)
-    control_sigma: tuple[float, float] = (1.0, 2.0)
-    rate_sigma: tuple[float, float] = (0.5, 1.0)
+    limits: Positive[tuple[float, float]] = (1.0, 1.0)
+    accelerations: Positive[tuple[float, float]] = (2.5, 3.2)
+    pose_sigma: Positive[tuple[float, float, float]] = (0.3, 0.3, 0.6)
+    terminal_sigma: Positive[tuple[float, float, float]] = (0.1, 0.1, 0.2)
+    control_sigma: Positive[tuple[float, float]] = (1.0, 2.0)
+    rate_sigma: Positive[tuple[float, float]] = (0.5, 1.0)
     control_weight: float = option(1.0, text=positive, metavar="W")
-    pull: tuple[float, float, float] = (0.01, 0.01, 0.01)
+    pull: Positive[tuple[float, float, float]] = (0.01, 0.01, 0.01)
     robot_radius: float = option(0.17, text=positive, metavar="M")
     wall_clearance: float = 0.03
     disc_clearance: float = 0.06
@@ -92,27 +92,23 @@ class ControllerSettings(Settings):
     mover_speed: float = 0.3
     mover_unseen: float = 0.1
     mover_margin: float = 0.3
-    approach: float = -math.log(0.88) / 0.1
+    approach: Positive[float] = -math.log(0.88) / 0.1
     avoidance: str = option("clearance", choices=AVOIDANCES)
     futures: str = option("worst", choices=FUTURES)
     tails: int = 2
     shared: int = 5
-    potential_sigma: float = 0.2
+    potential_sigma: Positive[float] = 0.2
     squeeze: float = 0.03
     margin: float = 0.2
-    margin_sigma: float = 0.1
-    discs: int = 3
-    tolerance: float = 1e-4
-    step_tolerance: float = 3e-3
-    feasible: float = 5e-4
+    margin_sigma: Positive[float] = 0.1
+    discs: AtLeastOne = 3
+    tolerance: Positive[float] = 1e-4
+    step_tolerance: Positive[float] = 3e-3
+    feasible: Positive[float] = 5e-4
 
     def __post_init__(self) -> None:
-        """Refuse unknown bases, steps of no length, negative distances, and ways of avoiding things that do not go."""
+        """Refuse unknown bases, and ways of avoiding things that do not go."""
         super().__post_init__()
-        if not (self.horizon >= 1 and self.dt > 0.0):
-            raise ScenarioError(f"a horizon has steps of some length, found horizon {self.horizon}, dt {self.dt:g} s")
-        if min(self.wall_clearance, self.disc_clearance, self.margin, self.sigmas) < 0.0:
-            raise ScenarioError("wall_clearance, disc_clearance, margin and sigmas of the controller begin at zero")
         base_of(self.base)
         if self.body:
             object.__setattr__(self, "robot_radius", self.hull.radius)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.scenarios.options import AtLeastOne, Settings
 from unifg.scenarios.planning.flat_path import Flown
 from unifg.typing import Array
 
@@ -19,7 +20,7 @@ __all__ = ["CascadeSettings", "Track"]
 
 
 @dataclass(frozen=True)
-class CascadeSettings:
+class CascadeSettings(Settings):
     """Division of the work between plan and filter.
 
     Attributes:
@@ -27,7 +28,7 @@ class CascadeSettings:
         barriers: whether the plan keeps barriers as well.
     """
 
-    every: int = 5
+    every: AtLeastOne = 5
     barriers: bool = False
 
 

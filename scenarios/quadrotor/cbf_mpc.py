@@ -21,8 +21,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -41,7 +40,7 @@ from unifg.horizon import (
 from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
-from unifg.scenarios.options import count, permitted, positive
+from unifg.scenarios.options import AtLeastOne, Positive, Settings, number
 from unifg.scenarios.planning.flat_path import Flown
 from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.scenarios.quadrotor.flatness import FlatnessController, Gains, flat_flight
@@ -70,7 +69,7 @@ BRAKING = 6.0  # greatest acceleration along each axis of the world in braking [
 
 
 @dataclass(frozen=True)
-class KeeperSettings:
+class KeeperSettings(Settings):
     """Numbers of the controller. Weights multiply half the square of an error.
 
     Attributes:
@@ -100,10 +99,10 @@ class KeeperSettings:
             too old. A finite one makes a flight depend on the machine.
     """
 
-    horizon: int = 20
-    step: float = 0.05
+    horizon: AtLeastOne = 20
+    step: Positive[float] = 0.05
     slots: int = 5
-    alpha: float = 1.2
+    alpha: Positive[float] = 1.2
     gamma: float = 0.0
     reading: Reading = "decay"
     form: Form = "slack"
@@ -115,24 +114,14 @@ class KeeperSettings:
     thrust: float = 0.05
     rate_change: float = 0.02
     thrust_change: float = 0.01
-    speed: float = 4.0
-    slack: float | None = None
+    speed: Positive[float] = 4.0
+    slack: Positive[float] | None = None
     hinge: float = 1e4
-    tolerance: float = 1e-4
+    tolerance: Positive[float] = 1e-4
     settled: bool = False
-    portion: int | None = 4
-    iterations: int = 20
-    decide_ms: float = np.inf
-
-    def __post_init__(self) -> None:
-        """Refuse a horizon that is none, and less than no obstacle.
-
-        Raises:
-            ScenarioError: naming the field.
-        """
-        permitted(partial(count, least=1), horizon=self.horizon, iterations=self.iterations)
-        permitted(count, slots=self.slots)
-        permitted(positive, step=self.step, speed=self.speed)
+    portion: AtLeastOne | None = 4
+    iterations: AtLeastOne = 20
+    decide_ms: Annotated[float, number("a time above zero", lambda value: value > 0.0)] = np.inf
 
 
 TRACKING = KeeperSettings(

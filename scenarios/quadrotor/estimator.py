@@ -13,7 +13,7 @@ import numpy as np
 
 from unifg.models import quadrotor
 from unifg.models.matching import DOUBTFUL, NEW, Gates, nearest
-from unifg.scenarios.options import Settings, option
+from unifg.scenarios.options import AtLeastOne, Positive, Settings, option
 from unifg.scenarios.perception.association import expected, places
 from unifg.scenarios.perception.atlas import Atlas
 from unifg.scenarios.perception.belief import Belief, Landmarks
@@ -62,18 +62,18 @@ class EstimatorSettings(Settings):
     """
 
     window: WindowSettings = field(default_factory=WindowSettings)
-    position_sigma: float = 0.05
-    attitude_sigma: float = 0.02
-    velocity_sigma: float = 0.05
-    mass_sigma: float = 0.08
-    drag_sigma: float = 0.1
-    wind_sigma: float = 0.5
-    updraft_sigma: float = 0.3
+    position_sigma: Positive[float] = 0.05
+    attitude_sigma: Positive[float] = 0.02
+    velocity_sigma: Positive[float] = 0.05
+    mass_sigma: Positive[float] = 0.08
+    drag_sigma: Positive[float] = 0.1
+    wind_sigma: Positive[float] = 0.5
+    updraft_sigma: Positive[float] = 0.3
     association: str = option("known", choices=ASSOCIATIONS)
     gates: Gates = field(default_factory=Gates)
     confirmation: tuple[int, int] = (1, 1)
-    iterations: int = 2
-    manoeuvre_sigma: float = 3.0
+    iterations: AtLeastOne = 2
+    manoeuvre_sigma: Positive[float] = 3.0
 
     @property
     def state_sigma(self) -> Array:

@@ -19,6 +19,7 @@ import numpy as np
 
 from unifg.lie import SO3
 from unifg.models import quadrotor
+from unifg.scenarios.options import Positive, Settings
 from unifg.scenarios.planning.flat_path import Flown
 from unifg.typing import Array
 
@@ -54,7 +55,7 @@ def flat_flight(flown: Flown, parameters: quadrotor.Parameters) -> tuple[Array, 
 
 
 @dataclass(frozen=True)
-class Gains:
+class Gains(Settings):
     """Of the feedback.
 
     Attributes:
@@ -64,10 +65,10 @@ class Gains:
         heading: of the error of the heading [1/s].
     """
 
-    position: tuple[float, float] = (6.0, 6.0)
-    velocity: tuple[float, float] = (4.0, 4.0)
-    tilt: float = 8.0
-    heading: float = 2.0
+    position: Positive[tuple[float, float]] = (6.0, 6.0)
+    velocity: Positive[tuple[float, float]] = (4.0, 4.0)
+    tilt: Positive[float] = 8.0
+    heading: Positive[float] = 2.0
 
 
 TUNED = Gains((225.0, 644.0), (32.8, 25.6), 65.5, 2.0)

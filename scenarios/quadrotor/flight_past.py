@@ -18,6 +18,7 @@ from unifg.factors.residuals import Residual
 from unifg.horizon import Constant, Context, Measurement, Robot, Term, Window
 from unifg.models import landmarks, quadrotor
 from unifg.models.inertial import specific_force
+from unifg.scenarios.options import AtLeastOne, Positive, Settings
 from unifg.scenarios.quadrotor.arrival import arrival, seen_from_the_vehicle
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -32,7 +33,7 @@ MANIFOLDS = {
 
 
 @dataclass(frozen=True)
-class WindowSettings:
+class WindowSettings(Settings):
     """Sizes and standard deviations.
 
     Attributes:
@@ -53,23 +54,22 @@ class WindowSettings:
     """
 
     length: int = 20
-    landmarks: int = 16
+    landmarks: AtLeastOne = 16
     estimated: tuple[str, ...] = ("mass", "drag", "wind")
-    noise_sigma: tuple[float, ...] = tuple(DisturbanceModel().white_sigma(0.05).tolist())
-    bearing_sigma: float = 0.01
-    range_sigma: float = 0.05
-    height_sigma: float = 0.03
-    tilt_sigma: float = 0.01
-    gyro_sigma: float | None = 0.01
-    force_sigma: float | None = None
-    survey_sigma: float = 0.02
+    noise_sigma: Positive[tuple[float, ...]] = tuple(DisturbanceModel().white_sigma(0.05).tolist())
+    bearing_sigma: Positive[float] = 0.01
+    range_sigma: Positive[float] = 0.05
+    height_sigma: Positive[float] = 0.03
+    tilt_sigma: Positive[float] = 0.01
+    gyro_sigma: Positive[float] | None = 0.01
+    force_sigma: Positive[float] | None = None
+    survey_sigma: Positive[float] = 0.02
 
     def __post_init__(self) -> None:
         """Refuse what cannot be a window."""
+        super().__post_init__()
         if self.length < 2:
             raise fg.ScenarioError(f"a window needs at least two past states, found {self.length}")
-        if self.landmarks < 1:
-            raise fg.ScenarioError(f"a window needs at least one slot for landmarks, found {self.landmarks}")
         for name in self.estimated:
             if name not in PLACES:
                 raise fg.ScenarioError(f"'{name}' is no parameter of a quadrotor: choose from {', '.join(PLACES)}")

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 import unifg as fg
-from unifg.scenarios.options import Settings, count, not_negative, option, permitted, positive
+from unifg.scenarios.options import AtLeastOne, Positive, Settings, Signed, option
 from unifg.scenarios.quadrotor.guide import GuideSettings
 from unifg.solvers import names
 from unifg.typing import Array, ArrayLike
@@ -52,20 +52,20 @@ class ControllerSettings(Settings):
         give: largest violation of a clearance in such a plan [m]; less than the margin.
     """
 
-    horizon: int = 30
-    dt: float = 0.05
-    position_sigma: tuple[float, float, float] = (0.5, 0.5, 0.3)
-    velocity_sigma: tuple[float, float, float] = (0.7, 0.7, 0.7)
+    horizon: AtLeastOne = 30
+    dt: Positive[float] = 0.05
+    position_sigma: Positive[tuple[float, float, float]] = (0.5, 0.5, 0.3)
+    velocity_sigma: Positive[tuple[float, float, float]] = (0.7, 0.7, 0.7)
     terminal_weight: float = 5.0
-    level_sigma: float = 0.3
-    control_sigma: tuple[float, float, float, float] = (1.5, 1.5, 0.7, 3.0)
-    rate_sigma: tuple[float, float, float, float] = (1.0, 1.0, 0.5, 2.0)
-    control_weight: float = 1.0
-    rate_limits: tuple[float, float, float] = (4.0, 4.0, 2.0)
-    thrust_limits: tuple[float, float] = (2.0, 20.0)
-    lean_limit: float = 0.6
-    height_limits: tuple[float, float] = (0.3, 3.0)
-    vehicle_radius: float = 0.25
+    level_sigma: Positive[float] = 0.3
+    control_sigma: Positive[tuple[float, float, float, float]] = (1.5, 1.5, 0.7, 3.0)
+    rate_sigma: Positive[tuple[float, float, float, float]] = (1.0, 1.0, 0.5, 2.0)
+    control_weight: Positive[float] = 1.0
+    rate_limits: Positive[tuple[float, float, float]] = (4.0, 4.0, 2.0)
+    thrust_limits: Positive[tuple[float, float]] = (2.0, 20.0)
+    lean_limit: Positive[float] = 0.6
+    height_limits: Signed[tuple[float, float]] = (0.3, 3.0)
+    vehicle_radius: Positive[float] = 0.25
     margin: float = 0.05
     sigmas: float = 1.0
     margin_limit: float = 0.1
@@ -74,30 +74,21 @@ class ControllerSettings(Settings):
     mover_margin: float = 0.25
     mover_growth: float = 0.25
     avoidance: Avoidance = option("clearance")
-    goal_sigma: float = 1.0
+    goal_sigma: Positive[float] = 1.0
     potential_weight: float = 1.0
     guide: GuideSettings = field(default_factory=GuideSettings)
-    tolerance: float = 1e-3
-    step_tolerance: float = 1e-2
-    feasible: float = 1e-2
+    tolerance: Positive[float] = 1e-3
+    step_tolerance: Positive[float] = 1e-2
+    feasible: Positive[float] = 1e-2
     give: float = 0.04
 
     def __post_init__(self) -> None:
-        """Refuse negative distances and counts, steps of no length, and heights that leave no room.
+        """Refuse heights that leave no room.
 
         Raises:
             ScenarioError: naming the field.
         """
         super().__post_init__()
-        permitted(
-            positive, dt=self.dt, control_weight=self.control_weight, lean_limit=self.lean_limit,
-            vehicle_radius=self.vehicle_radius,
-        )  # fmt: skip
-        permitted(
-            not_negative, margin=self.margin, sigmas=self.sigmas, margin_limit=self.margin_limit,
-            mover_margin=self.mover_margin, mover_growth=self.mover_growth,
-        )  # fmt: skip
-        permitted(count, cylinders=self.cylinders, movers=self.movers)
         low, high = self.height_limits
         if not low < high:
             raise fg.ScenarioError(f"height_limits: the first must be below the second, found {low:g} and {high:g} m")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.scenarios.options import Positive, Settings
 from unifg.scenarios.perception.belief import Landmarks
 from unifg.scenarios.planning.polyline import arc_lengths, at_stations, curvature, nearest_piece, path_length, resample
 from unifg.scenarios.planning.visibility import Ways
@@ -25,7 +26,7 @@ SMOOTHING = 5  # points of a smoothing window
 
 
 @dataclass(frozen=True)
-class GuideSettings:
+class GuideSettings(Settings):
     """Settings of the reference.
 
     Attributes:
@@ -36,11 +37,11 @@ class GuideSettings:
         clearances: of the vehicle's centre from cylinders and walls [m], the one to be preferred first.
     """
 
-    speed: float = 2.0
-    acceleration: float = 2.0
-    lateral: float = 3.0
-    climb: float = 0.8
-    clearances: tuple[float, ...] = (0.6, 0.5, 0.42, 0.36)
+    speed: Positive[float] = 2.0
+    acceleration: Positive[float] = 2.0
+    lateral: Positive[float] = 3.0
+    climb: Positive[float] = 0.8
+    clearances: Positive[tuple[float, ...]] = (0.6, 0.5, 0.42, 0.36)
 
 
 @dataclass(frozen=True)

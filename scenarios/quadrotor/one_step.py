@@ -18,6 +18,7 @@ import qpsolvers
 import scipy.sparse
 
 from unifg.models import quadrotor
+from unifg.scenarios.options import AtLeastOne, Positive, Settings
 from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.typing import Array
 
@@ -25,7 +26,7 @@ __all__ = ["FilterSettings", "filtered"]
 
 
 @dataclass(frozen=True)
-class FilterSettings:
+class FilterSettings(Settings):
     """Numbers of the filter.
 
     Attributes:
@@ -37,12 +38,12 @@ class FilterSettings:
         price: of the squared slack.
     """
 
-    alpha: float = 1.2
-    beta: float = 4.0
-    slots: int = 3
-    level: float = 6.0
-    vertical: float = 4.0
-    price: float = 1e4
+    alpha: Positive[float] = 1.2
+    beta: Positive[float] = 4.0
+    slots: AtLeastOne = 3
+    level: Positive[float] = 6.0
+    vertical: Positive[float] = 4.0
+    price: Positive[float] = 1e4
 
 
 def filtered(

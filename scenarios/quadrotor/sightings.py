@@ -25,6 +25,7 @@ import numpy as np
 
 import unifg as fg
 from unifg.models import quadrotor
+from unifg.scenarios.options import AtLeastOne, Positive, Settings
 from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
@@ -35,7 +36,7 @@ SUREST = 1e-6  # least standard deviation of the vehicle's place [m]
 
 
 @dataclass(frozen=True)
-class SightingSettings:
+class SightingSettings(Settings):
     """Numbers of looks, and of who believes them.
 
     Attributes:
@@ -47,9 +48,9 @@ class SightingSettings:
     """
 
     noise: float = 0.02
-    believed: float = 0.02
-    looks: int = 20
-    fast: float = 3.0
+    believed: Positive[float] = 0.02
+    looks: AtLeastOne = 20
+    fast: Positive[float] = 3.0
     k: float = 3.0
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 
+from unifg.scenarios.options import Positive, Settings
 from unifg.scenarios.planning.flat_path import Flown, Line
 from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.typing import Array
@@ -29,7 +30,7 @@ DEGREE = 3
 
 
 @dataclass(frozen=True)
-class SplineSettings:
+class SplineSettings(Settings):
     """Numbers of the planner.
 
     Attributes:
@@ -42,7 +43,7 @@ class SplineSettings:
     """
 
     margin: float = 0.3
-    knot: float = 0.2
+    knot: Positive[float] = 0.2
     smooth: float = 1.0
     near: float = 50.0
     along: float = 0.02

@@ -17,6 +17,7 @@ import numpy as np
 import unifg as fg
 from unifg.lie import SO3
 from unifg.models import quadrotor
+from unifg.scenarios.options import AtLeastOne, Positive, Settings
 from unifg.solvers import GaussNewton
 from unifg.typing import Array
 
@@ -24,7 +25,7 @@ __all__ = ["Weighing", "WeighingSettings"]
 
 
 @dataclass(frozen=True)
-class WeighingSettings:
+class WeighingSettings(Settings):
     """Numbers of the estimate.
 
     Attributes:
@@ -36,12 +37,12 @@ class WeighingSettings:
         least: least mass that is believed [kg].
     """
 
-    stretch: float = 0.05
-    count: int = 60
-    velocity_sigma: float = 0.01
-    mass_sigma: float = 0.1
-    drag_sigma: float = 0.2
-    least: float = 0.2
+    stretch: Positive[float] = 0.05
+    count: AtLeastOne = 60
+    velocity_sigma: Positive[float] = 0.01
+    mass_sigma: Positive[float] = 0.1
+    drag_sigma: Positive[float] = 0.2
+    least: Positive[float] = 0.2
 
 
 def balance(mass: Array, drag: Array, push: Array, hold: Array, gained: Array) -> Array:

@@ -20,6 +20,7 @@ from unifg.codegen.jit import compiled
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor, quadrotor_dynamics
 from unifg.models.quadrotor_loops import held
+from unifg.scenarios.options import Positive, Settings
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["SUBSTEP", "Airframe", "BodyRatePlant", "Loops"]
@@ -29,7 +30,7 @@ SUBSTEP = 1e-3
 
 
 @dataclass(frozen=True)
-class Loops:
+class Loops(Settings):
     """Response of the vehicle to its commands.
 
     Attributes:
@@ -38,18 +39,9 @@ class Loops:
         link: how late a command arrives after the tick in which it was decided [s].
     """
 
-    gain: float = 25.0
-    lag: float = 0.02
+    gain: Positive[float] = 25.0
+    lag: Positive[float] = 0.02
     link: float = 0.01
-
-    def __post_init__(self) -> None:
-        """Refuse loops that are none.
-
-        Raises:
-            ScenarioError: for a number that is negative, or a gain or a lag of zero.
-        """
-        if not (self.gain > 0.0 and self.lag > 0.0 and self.link >= 0.0):
-            raise ScenarioError(f"loops need a gain and a lag above zero and a link of no negative delay, got {self}")
 
     @property
     def delay(self) -> float:
@@ -58,7 +50,7 @@ class Loops:
 
 
 @dataclass(frozen=True)
-class Airframe:
+class Airframe(Settings):
     """A vehicle.
 
     Attributes:
@@ -71,8 +63,8 @@ class Airframe:
 
     parameters: quadrotor.Parameters = field(default_factory=quadrotor.Parameters)
     loops: Loops = field(default_factory=Loops)
-    radius: float = 0.25
-    rates: tuple[float, float, float] = (6.0, 6.0, 3.0)
+    radius: Positive[float] = 0.25
+    rates: Positive[tuple[float, float, float]] = (6.0, 6.0, 3.0)
     thrust: tuple[float, float] = (2.0, 20.0)
 
     @property

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.errors import ScenarioError
+from unifg.scenarios.options import Positive, Settings
 from unifg.typing import Array
 
 __all__ = ["DisturbanceModel", "Disturbances"]
 
 
 @dataclass(frozen=True)
-class DisturbanceModel:
+class DisturbanceModel(Settings):
     """Statistics of the disturbances; the steady wind is a parameter of the vehicle, not one of them.
 
     Attributes:
@@ -29,19 +29,7 @@ class DisturbanceModel:
     rate_density: float = 0.02 * math.sqrt(0.05)
     acceleration_density: float = 0.05 * math.sqrt(0.05)
     gust: tuple[float, float, float] = (0.1, 0.1, 0.05)
-    gust_time: float = 0.5
-
-    def __post_init__(self) -> None:
-        """Refuse what is not a noise.
-
-        Raises:
-            ScenarioError: if a number is negative or not finite, or the correlation time is not positive.
-        """
-        numbers = (self.rate_density, self.acceleration_density, *self.gust, self.gust_time)
-        if not all(math.isfinite(n) and n >= 0.0 for n in numbers) or self.gust_time == 0.0 or len(self.gust) != 3:
-            raise ScenarioError(
-                f"disturbances need densities and deviations >= 0 and a correlation time > 0, all finite; got {self}"
-            )
+    gust_time: Positive[float] = 0.5
 
     @staticmethod
     def calm() -> DisturbanceModel:

@@ -1,0 +1,63 @@
+"""Numbers of settings: what no scenario can mean is refused where it is stated, by the name of its field."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+
+from unifg.errors import UnifgError
+from unifg.models.matching import Gates
+from unifg.models.vehicle import Vehicle
+from unifg.scenarios.course import CourseSettings
+from unifg.scenarios.flight import FlightSettings
+from unifg.scenarios.navigation import NavigationSettings
+from unifg.scenarios.options import leaves, plain, replaced
+from unifg.scenarios.quadrotor.cbf_mpc import KeeperSettings
+from unifg.scenarios.safe_flight import SafeSettings
+from unifg.scenarios.velocity_tracking import TrackingSettings
+
+SIGNED = {"updraft", "latency", "rolling", "drag", "drag_constant", "drag_linear", "gravity"}  # -1 s: as computed
+
+
+@pytest.mark.parametrize(
+    "settings", [NavigationSettings, FlightSettings, SafeSettings, CourseSettings, TrackingSettings]
+)
+def test_every_number_is_judged(settings: Any) -> None:
+    whole, numbers = settings(), 0
+    for leaf in leaves(settings):
+        if plain(leaf.kind) in (int, float):
+            numbers += 1
+            wrong = [-1] if plain(leaf.kind) is int else [math.nan, -1.0][: 1 if leaf.path[-1] in SIGNED else 2]
+            for value in wrong:
+                if leaf.path[-1] != "seed":
+                    with pytest.raises(UnifgError, match=f"{leaf.path[-1]}|must be finite|positive|match"):
+                        replaced(whole, leaf.path, value)
+    assert numbers > 10
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrong", "message"),
+    [
+        (KeeperSettings, {"slack": 0.0}, "slack: '0.0' is not a positive number"),
+        (KeeperSettings, {"portion": 0}, "portion: '0' is not a whole number of at least 1"),
+        (KeeperSettings, {"decide_ms": 0.0}, "decide_ms: '0.0' is not a time above zero"),
+        (SafeSettings, {"dt": 1.5}, r"dt: '1.5' is not a tick in \(0, 1\] s"),
+        (SafeSettings, {"seen": (1e-3, -1.0, 0.0)}, "seen: '-1.0' is not a number of zero or more"),
+        (SafeSettings, {"speed": (1.0, 0.0)}, "speed: '0.0' is not a positive number"),
+        (NavigationSettings, {"initial_sigma": (0.1, -0.1, 0.1)}, "initial_sigma: '-0.1' is not"),
+        (NavigationSettings, {"start": (0.0, math.nan, 0.0)}, "start: 'nan' is not a finite number"),
+        (Gates, {"match": 60.0}, "0 < match <= new"),
+        (Vehicle, {"equivalent_mass": 0.0}, "positive masses"),
+    ],
+)
+def test_numbers_in_rows_and_of_parts_are_judged(settings: Any, wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(UnifgError, match=message):
+        settings(**wrong)
+
+
+def test_what_a_number_may_be_is_kept() -> None:
+    assert NavigationSettings(start=(-1.0, -2.0, -3.0)).start == (-1.0, -2.0, -3.0)
+    assert KeeperSettings(decide_ms=math.inf, slack=None).slack is None
+    assert replaced(FlightSettings(), ("controller", "height_limits"), (-1.0, 2.0)).controller.height_limits[0] == -1.0
