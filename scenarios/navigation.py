@@ -207,8 +207,6 @@ class Episode:
             people=draw_traffic(settings.traffic, walls, self.path, about),
         )  # fmt: skip
         sigma = np.array(settings.initial_sigma)
-        if not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
-            raise ScenarioError(f"standard deviations of the first belief are positive, got {settings.initial_sigma}")
         believed = self.start + sigma * belief.standard_normal(3)
         if settings.believed is not None:
             believed = _pose(settings.believed, None, "believed")

@@ -18,7 +18,16 @@ from unifg.scenarios.quadrotor.cbf_mpc import KeeperSettings
 from unifg.scenarios.safe_flight import SafeSettings
 from unifg.scenarios.velocity_tracking import TrackingSettings
 
-SIGNED = {"updraft", "latency", "rolling", "drag", "drag_constant", "drag_linear", "gravity"}  # -1 s: as computed
+SIGNED = {
+    "updraft",
+    "latency",
+    "feasible",
+    "rolling",
+    "drag",
+    "drag_constant",
+    "drag_linear",
+    "gravity",
+}  # -1 s: as computed
 
 
 @pytest.mark.parametrize(

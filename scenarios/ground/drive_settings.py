@@ -12,7 +12,7 @@ import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.models.footprint import Body, body_of
 from unifg.models.planar import Base, base_of
-from unifg.scenarios.options import AtLeastOne, Positive, Settings, checked, option, positive
+from unifg.scenarios.options import AtLeastOne, Positive, Settings, Signed, checked, option, positive
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -69,7 +69,7 @@ class ControllerSettings(Settings):
         discs: tracked discs considered at once.
         tolerance: of the KKT test.
         step_tolerance: norm of a step over the whole horizon below which iterating on is of no use to the robot.
-        feasible: largest violation of a plan that may be driven.
+        feasible: largest violation of a plan that may be driven; negative where none may.
     """
 
     base: str = option("unicycle", text=checked(base_of), metavar="BASE")
@@ -103,8 +103,8 @@ class ControllerSettings(Settings):
     margin_sigma: Positive[float] = 0.1
     discs: AtLeastOne = 3
     tolerance: Positive[float] = 1e-4
-    step_tolerance: Positive[float] = 3e-3
-    feasible: Positive[float] = 5e-4
+    step_tolerance: float = 3e-3
+    feasible: Signed[float] = 5e-4
 
     def __post_init__(self) -> None:
         """Refuse unknown bases, and ways of avoiding things that do not go."""

@@ -48,7 +48,7 @@ class ControllerSettings(Settings):
         guide: of the reference.
         tolerance: of the KKT test.
         step_tolerance: norm of a step over the horizon below which iterating on is of no use to the vehicle.
-        feasible: largest defect of the dynamics of a plan that may be flown.
+        feasible: largest defect of the dynamics of a plan that may be flown; negative where none may.
         give: largest violation of a clearance in such a plan [m]; less than the margin.
     """
 
@@ -78,8 +78,8 @@ class ControllerSettings(Settings):
     potential_weight: float = 1.0
     guide: GuideSettings = field(default_factory=GuideSettings)
     tolerance: Positive[float] = 1e-3
-    step_tolerance: Positive[float] = 1e-2
-    feasible: Positive[float] = 1e-2
+    step_tolerance: float = 1e-2
+    feasible: Signed[float] = 1e-2
     give: float = 0.04
 
     def __post_init__(self) -> None:
