@@ -64,6 +64,15 @@ def test_a_cache_that_cannot_be_written_is_no_error(
     assert warmed(done, tmp_path / "kept.nbi") and warmed(done, tmp_path / "kept.nbi")
 
 
+def test_the_command_refuses_to_compile_what_nothing_can_keep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("a file where the folder should be", encoding="utf-8")
+    monkeypatch.setenv("UNIFG_CACHE_DIR", str(tmp_path / "file"))
+    assert command.main(["warmup"]) == 2
+    assert "could not be kept: name a folder in UNIFG_CACHE_DIR" in capsys.readouterr().err
+
+
 def leave(path: Path) -> None:
     """Leave a file with the number of the process."""
     path.write_text(str(os.getpid()), encoding="utf-8")

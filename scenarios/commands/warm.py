@@ -9,6 +9,7 @@ from pathlib import Path
 import numba
 
 from unifg.codegen import precompiled
+from unifg.codegen.cache_folder import VARIABLE, cache_folder
 from unifg.codegen.compile_counter import Tally
 from unifg.errors import ScenarioError
 from unifg.precompile import Job, Progress, jobs, perform
@@ -26,7 +27,13 @@ def missing() -> str:
 
 
 def run(progress: Progress, anew: bool = False, processes: int = 1) -> Tally:
-    """Compile what the library and its scenarios can reach, or find that it is there; no scenarios without extras."""
+    """Compile what the library and its scenarios can reach, or find that it is there; no scenarios without extras.
+
+    Raises:
+        ScenarioError: there is no folder that could keep it.
+    """
+    if cache_folder() is None:  # which logs the reason
+        raise ScenarioError(f"what warmup compiles could not be kept: name a folder in {VARIABLE}")
     if missing():
         return perform("library", lambda: list(jobs()), progress, anew, processes)
     return perform("all", lambda: [*jobs(), *_scenarios()], progress, anew, processes)
