@@ -157,6 +157,26 @@ def test_what_leaves_through_constraints_is_not_lost(solver: fg.Solver) -> None:
     np.testing.assert_allclose(window.state_covariance, whole.covariance(x[-1]), atol=1e-7)
 
 
+@pytest.mark.parametrize("unit", [1e3, 1.0, 1e-3, 1e-6])
+def test_a_covariance_through_exact_dynamics_is_the_same_in_any_unit(unit: float) -> None:
+    """Of a robot that a constant drift moves: softening its motion by 1e-5 km would be a centimetre."""
+    drift = Constant("drift", fg.Rn(1), [0.0], 0.1 * unit)
+    robot = Robot(fg.Rn(1), fg.Rn(1), constants=(drift,), predict=lambda x, u: x + 0.1 * u)
+    motion = Dynamics(lambda x, u, c, y, h: y - x - h * (u + c), 0.1, constants=("drift",))
+    terms: list[Term] = [motion, Measurement("gps", position, (1,), 0.3 * unit)]
+    window = Window(robot, 3, terms, start=[0.0], sigma=0.05 * unit)
+    for k in range(6):
+        if k:
+            window.move([unit])
+        window.record("gps", [0.1 * k * unit])
+        window.estimate()
+    rows = np.stack([np.ones(6), 0.1 * np.arange(6)], axis=1)  # of the start and the drift
+    whole = np.linalg.inv(np.diag([0.05**-2, 0.1**-2]) + rows.T @ rows / 0.3**2)
+    present = np.array([[1.0, 0.5], [0.0, 1.0]])
+    expected, scale = present @ whole @ present.T, np.array([[0.05], [0.1]])
+    np.testing.assert_allclose(window.covariance / unit**2 / (scale * scale.T), expected / (scale * scale.T), atol=1e-3)
+
+
 class Smooth:
     """A cost over three nodes in a row, and a mark seen from them: what leaves ties two nodes and the mark."""
 

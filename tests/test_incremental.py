@@ -247,7 +247,7 @@ def test_what_is_not_determined_is_still_named_so(kind: str) -> None:
             smoother.update({y: np.zeros((adrift + 1, 3)) + np.arange(adrift + 1)[:, None] * [1.0, 0.0, 0.1]})
 
 
-@pytest.mark.parametrize("error", [lambda x: np.log(x - 5.0), lambda x: x * np.nan])
+@pytest.mark.parametrize("error", [lambda x: np.log(x - 5.0), lambda x: x * np.nan, np.sqrt])
 @pytest.mark.parametrize("smoother", [fg.Incremental, lambda: fg.FixedLag(lag=3)])
 def test_a_residual_that_is_not_finite_is_no_estimate(smoother: Any, error: Any) -> None:
     live = smoother()

@@ -246,10 +246,10 @@ def test_what_is_not_estimated_stays() -> None:
 def test_one_structure_serves_a_whole_flight() -> None:
     estimator = begin(1)
     program = estimator.window.run.program
-    factorization = estimator.window.spread._system.factorization.structure
+    structure = program.systems.structure(program.equality)
     beliefs(estimator, flight(1)[:30])
     assert estimator.window.run.program is program
-    assert estimator.window.spread._system.factorization.structure is factorization
+    assert program.systems.structure(program.equality) is structure
 
 
 # ---------------------------------------------------------------- landmarks

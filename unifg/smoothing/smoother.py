@@ -29,7 +29,7 @@ from unifg.smoothing.queries import (
 )
 from unifg.smoothing.state import MADE, PART, PLACE, SLOT, TYPE, State, empty_state
 from unifg.smoothing.tree import give_up
-from unifg.smoothing.undetermined import enough
+from unifg.smoothing.undetermined import enough, sloped
 from unifg.smoothing.update import begin, renew
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers, Records
 
@@ -349,8 +349,8 @@ class Smoother:
         failed, lists, numbers = renew(self._memory, chain, self.relinearize, self.wildfire, self._chronological)
         self._move(lists, numbers)
         if failed >= 0:
-            why = NOT_FINITE if not isfinite(self.cost) else LOST if enough(state, failed) else UNDETERMINED
-            self._fail(failed, why)
+            finite = isfinite(self.cost) and sloped(self._state)
+            self._fail(failed, (LOST if enough(state, failed) else UNDETERMINED) if finite else NOT_FINITE)
         for family in self._by_python:
             move_by_python(self._state, family, self._chronological)
 

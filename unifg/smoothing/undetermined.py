@@ -1,4 +1,4 @@
-"""Causes of a vanished pivot of a smoother: too few factors, or numbers that lose what enough of them say."""
+"""Causes of a vanished pivot of a smoother: too few factors, numbers that are none, or lose what enough of them say."""
 
 from __future__ import annotations
 
@@ -39,3 +39,11 @@ def enough(state: State, variable: int) -> bool:
     spoken = label[count:] == component
     unknowns = int(variables["dim"][:count][alive].sum())
     return bool(np.array(rows)[spoken].sum() >= unknowns and np.array(single)[spoken].any())
+
+
+def sloped(state: State) -> bool:
+    """Test whether the Jacobians of all factors are finite, by the diagonals of J'J that they keep."""
+    kinds, factors = state.types, state.factors[state.factors["used"] == 1]
+    starts, widths = factors["data"] + kinds["numbers"][factors["type"]], kinds["width"][factors["type"]]
+    diagonals = [start + np.arange(width) * (width + 2) for start, width in zip(starts, widths, strict=True)]
+    return bool(np.isfinite(state.numbers[np.concatenate([NOBODY, *diagonals])]).all())
