@@ -26,6 +26,7 @@ from unifg.problem.by_term import ByTerm
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
 from unifg.problem.hessian import require_second
+from unifg.problem.kinks import beside_a_kink
 from unifg.problem.linearization import Linearization, all_finite
 from unifg.problem.units import SMALL_FORCES
 from unifg.solution.batch import SAMPLED, Batch, Outcomes, solve_batch
@@ -52,6 +53,7 @@ UNBOUNDED_COST = -1e20
 KEPT = 4  # workspaces of single solves, for each graph
 EVERY = 100  # solves of a loop after which answers are verified, besides the 1st, 2nd, 4th, ... and new branches
 AT_ONCE, LATER = 4, 256  # verifications of new branches: so many without delay, then one in so many solves
+AT_REST = (Status.CONVERGED, Status.HARDLY_DETERMINED, Status.UNDETERMINED)  # where costs are stationary
 NEARLY, FEW_DIGITS = 100.0, 1e-4  # times the tolerance: KKT numbers, and rounding of unknowns, that may go together
 FEW = 3  # iterations that are asked for as such, one after the other in a control loop
 WITHOUT_SUCCESS = (
@@ -943,6 +945,11 @@ class Prepared:
         program = self.program
         self._solves += 1
         slopes = self._solves.bit_count() == 1
+        if slopes and solution.status in AT_REST:
+            beside = beside_a_kink(program, solution._lin, solution._multipliers)
+            if beside is not None:
+                logger.info("every step from an answer at a kink lowers the cost: the solve goes on beside it")
+                solution = self._continued(solution, beside, began, callback)
         solution.checked = not program.verifications
         if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
             return solution
@@ -960,10 +967,7 @@ class Prepared:
         mistraced: dict[str, str] = {}
         while found := program.mistraced(values, slopes, self._solves):
             mistraced |= found
-            reached = program.columns.values(solution.values), solution._multipliers
-            again = SolveState(self.solver, program, *reached, callback)
-            again._started, again.penalties = began, solution._penalties
-            solution = self._finished(again)
+            solution = self._continued(solution, program.columns.values(solution.values), began, callback)
             if not solution.finite:
                 break
             values = solution._lin.values
@@ -971,6 +975,12 @@ class Prepared:
         solution.checked, solution.mistraced = solution.finite, mistraced
         solution.seconds = time.perf_counter() - began
         return solution
+
+    def _continued(self, before: Solution, values: Values, began: float, callback: Callback | None) -> Solution:
+        """The solution of another solve, from values and the multipliers of one before."""
+        run = SolveState(self.solver, self.program, values, before._multipliers, callback)
+        run._started, run.penalties = began, before._penalties
+        return self._finished(run)
 
     def _broken(self, solution: Solution) -> bool:
         """Test what traced functions assert; the exception of one that fails is passed on as within a solve."""
