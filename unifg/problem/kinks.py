@@ -1,9 +1,9 @@
 """Descent from a kink: stationary by derivatives, though every step lowers the Lagrangian by its length.
 
 The slope of a norm at zero is taken to be zero, so a landmark that is guessed on the pose that measured a distance to
-it seems to be at rest. Rows that have a residual and no slope are suspects, and scalar costs are. Along a random direction
-of their unknowns the Lagrangian is compared ahead and behind: where both are lower, half the step has to lower it by
-about half as much. At a minimum with a kink it rises; at a saddle half the step lowers it by a quarter.
+it seems to be at rest. Rows that have a residual and no slope are suspects, and scalar costs are. Along a random
+direction of their unknowns the Lagrangian is compared ahead and behind: where both are lower, half the step has to
+lower it by about half as much. At a minimum with a kink it rises; at a saddle half the step lowers it by a quarter.
 """
 
 from __future__ import annotations
