@@ -138,7 +138,7 @@ def find_units(
     far = _log_rows(terms, units) > MODEST
     bounded = not sums[TOTAL, 0] < math.inf  # at most
     sloped = _log_curvatures(units, hessian, concavity, gradient)
-    if far or (sloped and not bounded):
+    if far or (sloped and not bounded) or _uneven(sums):
         _forget_small(terms, units)
         for _ in range(SWEEPS):
             _sweep(terms, units)
@@ -287,6 +287,16 @@ def _log_curvatures(units: Units, hessian: Array, concavity: Array, gradient: Ar
         if sums[POWER, k] > 0.0:
             sums[CURVATURE, k] = math.log(sums[CURVATURE, k])
     return sloped
+
+
+@compiled
+def _uneven(sums: Array) -> bool:
+    """Test whether curvatures along coordinates differ by more than units a hundred times apart from their mean."""
+    least, most = math.inf, -math.inf
+    for k in range(sums.shape[1]):
+        if sums[POWER, k] == 2.0:
+            least, most = min(least, sums[CURVATURE, k]), max(most, sums[CURVATURE, k])
+    return most - least > 4.0 * MODEST
 
 
 @compiled
