@@ -161,6 +161,15 @@ class _Remarks:
             stand = "edge repeats another" if len(twice) == 1 else "edges repeat others"
             self.say(f"{len(twice)} {stand} word by word, first in line {lines[k]} ({pair}): each counts")
 
+    def order(self, edges: Edges, ids: Ids) -> None:
+        """Remark poses in an order by which most steps from one identifier to the next count as loop closures."""
+        steps = (np.abs(ids[edges.first] - ids[edges.second]) == 1) & ~edges.odometry
+        if steps.sum() > edges.odometry.sum():
+            self.say(
+                f"poses are not in the order of their identifiers: {counted(int(steps.sum()), 'step')} from one to the "
+                "next count as loop closures, as odometry joins neighbours in the file; sort its vertices"
+            )
+
     def isolated(self, what: str, identifiers: Ids, used: list[IntArray]) -> None:
         """Log which of the vertices (n,) nothing has measured, given the positions of those that are used."""
         lonely = identifiers[np.bincount(np.concatenate(used), minlength=len(identifiers)) == 0]
@@ -209,6 +218,7 @@ def parse(file: TextFile, formats: tuple[Format, Format], repair: Repair | None)
     first, second = (_positions(ids, edges.table, k, "pose") for k in (0, 1))
     joined = Edges(first, second, edges.table.numbers, remarks.weights("edges", edges))
     remarks.pairs(joined, ids, edges.table.lines)
+    remarks.order(joined, ids)
     seen: dict[str, Sightings] = {}
     held: dict[str, Priors] = {}
     for kind, found in measured.items():
