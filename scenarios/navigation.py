@@ -328,8 +328,9 @@ class Episode:
         odometry = None
         if number:
             measured = np.array(self.world.odometry())
-            self._dead_reckoning = self.controller.kind.step(self._dead_reckoning[None], measured[None], dt)[0]
-            self._driven += float(np.hypot(*measured[:2]) if self.controller.kind.slides else abs(measured[0])) * dt
+            moved = np.where(np.isfinite(measured), measured, 0.0)  # the record goes on without a sample of a world
+            self._dead_reckoning = self.controller.kind.step(self._dead_reckoning[None], moved[None], dt)[0]
+            self._driven += float(np.hypot(*moved[:2]) if self.controller.kind.slides else abs(moved[0])) * dt
             odometry = faults.odometry(measured, now)
         true_scan = self.world.scan()
         self.pilot.planless = faults.hold("solver-timeout", now)

@@ -87,6 +87,14 @@ class Odd(Wheels):
         if self.after < 0:
             vars(self).update(self.wrong)
 
+class Unplugged(World):
+    def scan(self):
+        raise TimeoutError("no scan came")
+
+class Unsaid(World):
+    def odometry(self):
+        return [float("nan")] * 2
+
 class Slow(World):
     def step(self, *control, dt):
         super().step(*(0.5 * part for part in control), dt=dt)
@@ -234,6 +242,18 @@ def test_a_localiser_may_answer_in_lists(own: Path) -> None:
         kept=self.kept if odometry is None else self.base.step(self.kept[None], odometry[None], dt)[0]
     )
     np.testing.assert_array_equal(Episode(settings, rehearsal=True).run(stop_after(5)).estimate, usual.estimate)
+
+
+def test_a_world_that_says_nothing_of_its_wheels_leaves_a_record(own: Path) -> None:
+    settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), world="my_planners:Unsaid")
+    log = Episode(settings, rehearsal=True).run(stop_after(5))
+    assert np.isfinite(log.dead_reckoning).all() and log.dropped
+
+
+def test_an_error_of_a_users_part_is_not_one_of_the_output(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=0.8,0,0", "--out", "out"]
+    assert main([*words, "--world", "my_planners:Unplugged"]) == 2
+    assert "error: navigation: TimeoutError: no scan came" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
