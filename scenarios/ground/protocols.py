@@ -98,6 +98,8 @@ class Judged:
         own: the user's object.
         pose: (3,) the last estimate [m, m, rad].
         covariance: (3, 3) of it.
+        iterations: of the last update; 0 where the localiser does not say.
+        refused: why the last scan has not corrected the estimate; "" where the localiser does not say.
     """
 
     def __init__(self, own: Estimator) -> None:
@@ -108,16 +110,6 @@ class Judged:
         """
         self.own = own
         self._take()
-
-    @property
-    def iterations(self) -> int:
-        """Of the last update; 0 where the localiser does not say."""
-        return getattr(self.own, "iterations", 0)
-
-    @property
-    def refused(self) -> str:
-        """Why the last scan has not corrected the estimate; "" where the localiser does not say."""
-        return getattr(self.own, "refused", "")
 
     def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
         """Update the localiser, and take its estimate.
@@ -139,10 +131,7 @@ class Judged:
 
     def _take(self) -> None:
         said = self.own.pose, self.own.covariance
-        try:
-            pose, covariance = (np.array(part, dtype=np.float64) for part in said)
-        except (TypeError, ValueError):
-            pose = covariance = np.zeros(0)
+        pose, covariance = (np.array(part, dtype=np.float64) for part in said)
         right = (pose.shape, covariance.shape) == ((3,), (3, 3)) and np.isfinite([*pose, *covariance.flat]).all()
         if not right or np.linalg.eigvalsh(covariance)[0] <= 0.0:
             what = " and covariance ".join(" ".join(repr(part).split()) for part in said)
@@ -150,6 +139,7 @@ class Judged:
                 f"the localiser says pose {what}: give a finite pose (3,) and a positive definite covariance (3, 3)"
             )
         self.pose, self.covariance = pose, covariance
+        self.iterations, self.refused = getattr(self.own, "iterations", 0), getattr(self.own, "refused", "")
 
 
 @dataclass(frozen=True)
