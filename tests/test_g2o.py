@@ -472,3 +472,7 @@ def test_what_is_wrong_with_a_prior_is_named_with_its_line(tmp_path: Path) -> No
         read_g2o(write(tmp_path, text))
     with pytest.raises(FileFormatError, match="TORO files have no"):
         write_toro(tmp_path / "a.graph", read_g2o(write(tmp_path, PRIORS)))
+    ends = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n" + STEPS.format(0, 1) + "FIX 0\n"
+    write_toro(tmp_path / "a.graph", read_g2o(write(tmp_path, ends)))
+    with pytest.raises(FileFormatError, match="TORO files have no fixed poses; write g2o"):
+        write_toro(tmp_path / "a.graph", read_g2o(write(tmp_path, ends + "FIX 1\n")))

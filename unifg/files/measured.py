@@ -389,9 +389,13 @@ def write(path: str | Path, pose_graph: PoseGraph, formats: tuple[Format, Format
         FileFormatError: a number is not finite, or the format has no tag for what there is.
     """
     path, form = Path(path), formats[pose_graph.group is SE3]
-    if not form.point and (len(pose_graph.landmarks) or pose_graph.priors):
-        found = "landmarks" if len(pose_graph.landmarks) else "priors"
-        raise FileFormatError(f"{path}: {name} files have no {found}; write g2o")
+    counts = {
+        "landmarks": len(pose_graph.landmarks),
+        "priors": len(pose_graph.priors),
+        "fixed poses": len(set(pose_graph.fixed_ids)) - 1,  # one alone says where the map begins
+    }
+    if not form.point and (lost := [what for what, count in counts.items() if count > 0]):
+        raise FileFormatError(f"{path}: {name} files have no {lost[0]}; write g2o")
     ids, edges = pose_graph.ids, pose_graph.edges
     tags = {tag.kind: tag for tag in reversed(form.tags) if tag.weights == "information"}
     lines = _lines(path, form.pose, [ids], form.written(pose_graph.poses))
