@@ -34,7 +34,7 @@ from unifg import __version__
 from unifg.codegen import precompiled
 from unifg.codegen.cache_folder import place
 from unifg.codegen.threads import cores
-from unifg.errors import FileFormatError, UnifgError
+from unifg.errors import FileFormatError, ScenarioError, UnifgError
 from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import FROM_FILES, SCENARIOS
 from unifg.scenarios.commands.extras import absent, remedy
@@ -350,7 +350,10 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
         with _bar(name) as show:
             show(0.0, "preparing")
-            outcome: Outcome = module.run(settings, told(show), **watched)
+            try:
+                outcome: Outcome = module.run(settings, told(show), **watched)
+            except OSError as error:  # of what a run reads, or of a user's part: nothing is written yet
+                raise ScenarioError(f"{name}: {type(error).__name__}: {error}") from error
         if getattr(chosen, "mcap", False):
             outcome.record()
         try:

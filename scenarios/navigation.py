@@ -27,7 +27,7 @@ from unifg.scenarios.ground.drive_parts import bounds
 from unifg.scenarios.ground.drive_pilot import UNSOLVED, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
-from unifg.scenarios.ground.protocols import LocaliserContext, constructed, load_class, name_of
+from unifg.scenarios.ground.protocols import Judged, LocaliserContext, constructed, load_class, name_of
 from unifg.scenarios.ground.route import Blocked, Route
 from unifg.scenarios.logs.columns import Recorder
 from unifg.scenarios.logs.drive_log import Assumed, EpisodeLog
@@ -247,11 +247,7 @@ class Episode:
                 self.occupancy, self.distance_map, pose, sigma, self.world.lidar.beams, self.controller.kind,
                 of_localiser,
             )  # fmt: skip
-            estimator = constructed("localiser", self._localiser, own, ("pose", "covariance"))
-            for name, default in (("iterations", 0), ("refused", "")):
-                if not hasattr(estimator, name):
-                    setattr(estimator, name, default)
-            pilot.estimator = estimator
+            pilot.estimator = Judged(constructed("localiser", self._localiser, own, ("pose", "covariance")))
         pilot.pose = pilot.estimator.pose
         return pilot
 
@@ -330,8 +326,9 @@ class Episode:
         odometry = None
         if number:
             measured = np.array(self.world.odometry())
-            self._dead_reckoning = self.controller.kind.step(self._dead_reckoning[None], measured[None], dt)[0]
-            self._driven += float(np.hypot(*measured[:2]) if self.controller.kind.slides else abs(measured[0])) * dt
+            moved = np.where(np.isfinite(measured), measured, 0.0)  # the record goes on without a sample of a world
+            self._dead_reckoning = self.controller.kind.step(self._dead_reckoning[None], moved[None], dt)[0]
+            self._driven += float(np.hypot(*moved[:2]) if self.controller.kind.slides else abs(moved[0])) * dt
             odometry = faults.odometry(measured, now)
         true_scan = self.world.scan()
         self.pilot.planless = faults.hold("solver-timeout", now)

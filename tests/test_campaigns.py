@@ -24,6 +24,8 @@ from unifg.scenarios.campaigns import campaign as campaigns
 from unifg.scenarios.campaigns import task
 from unifg.scenarios.campaigns.campaign import Campaign, run_campaign
 from unifg.scenarios.campaigns.journal import Journal, lines_of
+from unifg.scenarios.campaigns.replay import episode_of
+from unifg.scenarios.campaigns.sheet import load
 from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Episode, Statement, read, spawned, stated
 from unifg.scenarios.campaigns.task import Task, WrongLibrary, run_task
@@ -435,6 +437,34 @@ def test_a_campaign_goes_on_where_it_stopped(tmp_path: Path) -> None:
     assert len({row["key"] for row in rows(tmp_path)}) == len(rows(tmp_path)) == 9
     assert second.summary == "9 of 9 episodes: 3 ok, 3 failed, 3 error, 0 lost"
     assert run(walks(grid=grid), tmp_path, again=True).ran == 3
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        {"outcome": "fine"},
+        {"outcome": None},
+        {"labels": ["walk"]},
+        {"settings": 3},
+        {"metrics": 3},
+        {"seconds": None},
+        {"scenario": 0},
+        {"key": 1},
+        {"seed": "one"},
+    ],
+)
+def test_a_row_that_is_not_whole_does_not_count(tmp_path: Path, damage: dict[str, Any]) -> None:
+    run(walks(), tmp_path)
+    file = tmp_path / campaigns.EPISODES
+    first, *others = file.read_text().splitlines()
+    file.write_text("\n".join([json.dumps(json.loads(first) | damage), *others, ""]))
+    sheet = load(tmp_path)
+    assert len(sheet.episodes) == 2 and sheet.unreadable == [1]
+    with pytest.raises(ScenarioError, match=r"no episode .* is on file"):
+        episode_of(tmp_path, json.loads(first)["key"])
+    again = run(walks(), tmp_path)
+    assert again.ran == 1 and again.remarks == ["episodes.jsonl: line 1 cannot be read and does not count"]
+    assert again.succeeded and len(load(tmp_path).episodes) == 3
 
 
 def test_changes_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -343,6 +343,15 @@ def test_edges_that_may_not_be_meant_are_remarked(tmp_path: Path) -> None:
     assert "1 edge repeats another word by word, first in line 4 (0 - 1)" in twice
 
 
+def test_vertices_out_of_the_order_of_their_identifiers_are_remarked(tmp_path: Path) -> None:
+    steps = "".join(STEPS.format(k, k + 1) for k in range(5))
+    for names, said in (([0, 1, 2, 3, 4, 5], 0), ([5, 4, 3, 2, 1, 0], 0), ([0, 3, 1, 4, 2, 5], 1)):
+        graph = read_g2o(write(tmp_path, "".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in names) + steps))
+        assert len(graph.remarks) == said and len(graph.closures) == 5 * said
+    assert "5 steps from one to the next count as loop closures" in graph.remarks[0]
+    assert read_g2o(write(tmp_path, steps)).remarks == ()
+
+
 def test_many_tags_and_lines_of_any_form(tmp_path: Path) -> None:
     many = "".join(f"TAG{k} 1\nTAG{k % 7} 2\n" for k in range(90))
     text = f"  # comment\n\n\t{PLANAR.strip()}\n{many}VERTEX_SE2\t99  1e0 +2. -.5e1"
@@ -463,3 +472,7 @@ def test_what_is_wrong_with_a_prior_is_named_with_its_line(tmp_path: Path) -> No
         read_g2o(write(tmp_path, text))
     with pytest.raises(FileFormatError, match="TORO files have no"):
         write_toro(tmp_path / "a.graph", read_g2o(write(tmp_path, PRIORS)))
+    ends = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\n" + STEPS.format(0, 1) + "FIX 0\n"
+    write_toro(tmp_path / "a.graph", read_g2o(write(tmp_path, ends)))
+    with pytest.raises(FileFormatError, match="TORO files have no fixed poses; write g2o"):
+        write_toro(tmp_path / "a.graph", read_g2o(write(tmp_path, ends + "FIX 1\n")))

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from unifg.files.ros_map import save_map
 from unifg.scenarios.command import main
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
+from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.perception.tracks import Tracks
 
@@ -74,6 +76,24 @@ class Wheels:
 class Blank(Wheels):
     def reset(self, pose, sigma):
         self.pose = pose
+
+class Odd(Wheels):
+    after = float("inf")
+    wrong = {"pose": [0.0, 0.0, 0.0]}
+
+    def update(self, scan, odometry, dt):
+        super().update(scan, odometry, dt)
+        self.after -= 1
+        if self.after < 0:
+            vars(self).update(self.wrong)
+
+class Unplugged(World):
+    def scan(self):
+        raise TimeoutError("no scan came")
+
+class Unsaid(World):
+    def odometry(self):
+        return [float("nan")] * 2
 
 class Slow(World):
     def step(self, *control, dt):
@@ -185,6 +205,55 @@ def test_a_localiser_and_a_world_of_ones_own_drive(own: Path) -> None:
     module = sys.modules["my_planners"]
     same = Episode(replace(plain, world=module.Slow), rehearsal=True).run(stop_after(10))
     np.testing.assert_array_equal(same.true_pose, slow.true_pose)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"pose": np.full(3, np.nan)},
+        {"pose": np.zeros((3, 1))},
+        {"covariance": np.zeros((3, 3))},
+        {"covariance": -np.eye(3)},
+        {"covariance": np.full((3, 3), np.nan)},
+        {"covariance": np.ones(3)},
+        {"covariance": None},
+    ],
+)
+def test_a_localiser_that_says_no_estimate_is_not_believed(wrong: dict[str, Any], own: Path) -> None:
+    settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), localiser="my_planners:Odd")
+    episode = Episode(settings, rehearsal=True)
+    odd = cast(Any, sys.modules["my_planners"]).Odd
+    odd.after, odd.wrong = 5, wrong
+    log = episode.run(stop_after(10))
+    assert any("the tick failed: the localiser says pose" in cause for cause in log.cause)
+    assert np.isfinite(log.estimate).all() and episode_metrics(log)["nees"]
+    odd.after, odd.reset = 5, lambda self, pose, sigma: self.__dict__.update({"pose": pose, "covariance": 0.0} | wrong)
+    with pytest.raises(ScenarioError, match=r"give a finite pose \(3,\) and a positive definite covariance"):
+        Episode(settings, rehearsal=True)
+
+
+def test_a_localiser_may_answer_in_lists(own: Path) -> None:
+    settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), localiser="my_planners:Odd")
+    usual = Episode(settings, rehearsal=True).run(stop_after(5))
+    odd = cast(Any, sys.modules["my_planners"]).Odd
+    odd.reset = lambda self, pose, sigma: self.__dict__.update(kept=pose, covariance=np.diag(np.square(sigma)).tolist())
+    odd.pose = property(lambda self: self.kept.tolist())
+    odd.update = lambda self, scan, odometry, dt: self.__dict__.update(
+        kept=self.kept if odometry is None else self.base.step(self.kept[None], odometry[None], dt)[0]
+    )
+    np.testing.assert_array_equal(Episode(settings, rehearsal=True).run(stop_after(5)).estimate, usual.estimate)
+
+
+def test_a_world_that_says_nothing_of_its_wheels_leaves_a_record(own: Path) -> None:
+    settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), world="my_planners:Unsaid")
+    log = Episode(settings, rehearsal=True).run(stop_after(5))
+    assert np.isfinite(log.dead_reckoning).all() and log.dropped
+
+
+def test_an_error_of_a_users_part_is_not_one_of_the_output(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=0.8,0,0", "--out", "out"]
+    assert main([*words, "--world", "my_planners:Unplugged"]) == 2
+    assert "error: navigation: TimeoutError: no scan came" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

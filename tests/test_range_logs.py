@@ -475,6 +475,9 @@ def test_a_recorded_drive_needs_a_map_and_a_localiser(made: Path, capsys: pytest
     assert main(words) == 2 and "give --map" in capsys.readouterr().err
     assert main([*words, "--map", str(made / "map.yaml"), "--localiser", "my:Filter"]) == 2
     assert "choose graph, amcl" in capsys.readouterr().err
+    idle = ["--goal=1,2,3", "--fault", "lidar-blind@3", "--coupling", "joint", "--speed", "2"]
+    assert main([*words, "--map", str(made / "map.yaml"), *idle]) == 2
+    assert "leave out: goals, coupling, controller, faults" in capsys.readouterr().err
 
 
 @pytest.mark.product(1, of="large maps")

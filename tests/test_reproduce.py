@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 
 from unifg.errors import ScenarioError
 from unifg.scenarios import command
+from unifg.scenarios.campaigns.campaign import Campaign
 from unifg.scenarios.campaigns.statement import Statement
 from unifg.scenarios.campaigns.task import FAILED, OK
 from unifg.scenarios.episode import Progress
@@ -184,15 +186,29 @@ def drives(runs: int) -> pd.DataFrame:
 
 
 def test_a_quick_campaign_ends_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def run(part: Statement, folder: Path, workers: int, progress: Progress) -> None:
-        progress(0.1, "first drive")
+    ended = 1
+
+    def run(part: Statement, folder: Path, workers: int, progress: Progress) -> Campaign:
+        found = Campaign(folder, 9, Counter(ok=ended) if ended else Counter())
+        try:
+            progress(0.1, "first drive")
+        except KeyboardInterrupt:
+            found.interrupted = True
+        return found
+
+    def stop(done: float, text: str) -> None:
+        raise KeyboardInterrupt
 
     monkeypatch.setattr(bazzana, "run_campaign", run)
     monkeypatch.setattr(bazzana, "load", lambda folder, failed_too: None)
     monkeypatch.setattr(bazzana, "drives_of", lambda sheet, name: drives(1))
     assert len(bazzana.driven(effort(tmp_path), "department", 2)) == 9
     assert len(bazzana.driven(effort(tmp_path, quick=False), "department", 2, patience=-1.0)) == 9
-    with pytest.raises(KeyboardInterrupt):  # run_campaign takes it for the end
+    assert len(bazzana.driven(effort(tmp_path), "department", 2, patience=-1.0)) == 9
+    with pytest.raises(KeyboardInterrupt):  # of the user, who wants no other base either
+        bazzana.driven(Effort(True, tmp_path, 1, stop), "department", 2)
+    ended = 0
+    with pytest.raises(ScenarioError, match="no drive has ended within -1 s"):
         bazzana.driven(effort(tmp_path), "department", 2, patience=-1.0)
 
 
@@ -224,7 +240,12 @@ def test_a_quick_campaign_is_a_part_of_the_whole_one(
     quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ran: list[Statement] = []
-    monkeypatch.setattr(bazzana, "run_campaign", lambda part, folder, **how: ran.append(part))
+
+    def run(part: Statement, folder: Path, **how: Any) -> Campaign:
+        ran.append(part)
+        return Campaign(folder, 1, Counter(ok=1))
+
+    monkeypatch.setattr(bazzana, "run_campaign", run)
     monkeypatch.setattr(bazzana, "load", lambda folder, failed_too: None)
     monkeypatch.setattr(bazzana, "drives_of", lambda sheet, name: drives(2).iloc[:0].assign(**dict.fromkeys(ERRORS)))
     for function in (bazzana.table_i, bazzana.table_ii, bazzana.figure_6):

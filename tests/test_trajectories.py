@@ -153,6 +153,13 @@ def test_euroc_has_nanoseconds_and_the_scalar_first(tmp_path: Path) -> None:
     assert found.position[1].tolist() == [4.688177, -1.786770, 0.787350]
 
 
+def test_euroc_times_that_run_backwards_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    read_euroc(put(tmp_path, EUROC))
+    assert "backwards" not in caplog.text
+    found = read_euroc(put(tmp_path, "5000000000,0,0,0,1,0,0,0\n4000000000,0,0,0,1,0,0,0\n"))
+    assert found.time.tolist() == [0.0, -1.0] and "time runs backwards, here and 0 times more" in caplog.text
+
+
 def test_evo_reads_what_is_written(tmp_path: Path, rng: np.random.Generator) -> None:
     """It asks for exactly eight, or twelve, fields with one blank between them."""
     evo = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")

@@ -26,11 +26,16 @@ from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.workers import Workers, cluster, died, finished
 
 __all__ = [
-    "EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "manifest_of", "replay_command", "run_campaign",
-    "write_manifest",
+    "EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "episodes_of", "manifest_of", "replay_command",
+    "run_campaign", "write_manifest",
 ]  # fmt: skip
 
 EPISODES, MANIFEST = "episodes.jsonl", "campaign.json"
+_ROW: dict[str, Any] = {
+    "key": str, "labels": dict, "settings": dict, "seed": int | None, "scenario": str, "outcome": str,
+    "seconds": int | float, "cpu_seconds": int | float, "metrics": dict,
+}  # fmt: skip
+_OPTIONAL: dict[str, Any] = {"seconds": 0.0, "cpu_seconds": 0.0, "metrics": {}}  # of episodes without an end
 
 
 @dataclass
@@ -160,6 +165,22 @@ def manifest_of(folder: Path) -> dict[str, Any]:
     raise ScenarioError(f"{folder}: holds no campaign: {why}")
 
 
+def episodes_of(folder: Path, unreadable: list[int] | None = None) -> Iterator[dict[str, Any]]:
+    """Rows of the episodes of a campaign that are on file.
+
+    Args:
+        folder: of the campaign.
+        unreadable: is given the numbers of lines that hold none, or only a part of one.
+    """
+
+    def whole(row: dict[str, Any]) -> bool:
+        told = _OPTIONAL | row
+        fits = all(name in told and isinstance(told[name], kind) for name, kind in _ROW.items())
+        return fits and told["outcome"] in (OK, FAILED, ERROR, LOST)
+
+    return lines_of(folder / EPISODES, unreadable, whole=whole)
+
+
 def replay_command(folder: Path, key: str) -> str:
     """Command that runs an episode again."""
     return f"unifg replay {shlex.quote(str(folder))} {key}"
@@ -171,8 +192,8 @@ def _on_file(found: Campaign, known: set[str], code: str, again: bool, any_code:
     done: dict[str, str] = {}
     others = Counter[str]()
     left: set[str] = set()
-    for row in lines_of(found.folder / EPISODES, unreadable):
-        key, outcome = str(row.get("key")), str(row.get("outcome"))
+    for row in episodes_of(found.folder, unreadable):
+        key, outcome = row["key"], row["outcome"]
         if key not in known:
             left.add(key)
         elif row.get("code") != code and not any_code:

@@ -10,7 +10,7 @@ import json
 import os
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
@@ -103,19 +103,22 @@ class Journal:
         _synced(self._file)
 
 
-def lines_of(path: Path, unreadable: list[int] | None = None) -> Iterator[dict[str, Any]]:
+def lines_of(
+    path: Path, unreadable: list[int] | None = None, *, whole: Callable[[dict[str, Any]], bool] = lambda row: True
+) -> Iterator[dict[str, Any]]:
     """The rows of a file, one after the other; a file that is not there has none.
 
     Args:
         path: of the file.
         unreadable: is given the numbers of lines that hold no row.
+        whole: whether an object has all that a row has.
     """
     if not path.is_file():
         return
     with path.open("rb") as file:
         for number, line in enumerate(file, start=1):
             row = _row(line)
-            if row is not None:
+            if row is not None and whole(row):
                 yield row
             elif unreadable is not None and line.strip():
                 unreadable.append(number)

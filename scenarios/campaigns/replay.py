@@ -7,8 +7,7 @@ from types import ModuleType
 from typing import Any
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.campaigns.campaign import EPISODES, manifest_of
-from unifg.scenarios.campaigns.journal import lines_of
+from unifg.scenarios.campaigns.campaign import episodes_of, manifest_of
 from unifg.scenarios.campaigns.stated_settings import nearest
 from unifg.scenarios.campaigns.statement import built, module_of
 
@@ -26,9 +25,9 @@ def episode_of(folder: Path, key: str) -> tuple[ModuleType, Any]:
         ScenarioError: there is no such episode, or its settings no longer fit.
     """
     base = Path(manifest_of(folder)["base"])
-    rows = {str(row["key"]): row for row in lines_of(folder / EPISODES) if str(row.get("key")).startswith(key)}
+    rows = {row["key"]: row for row in episodes_of(folder) if row["key"].startswith(key)}
     if not rows:
-        known = [str(row.get("key")) for row in lines_of(folder / EPISODES)]
+        known = [row["key"] for row in episodes_of(folder)]
         raise ScenarioError(f"{folder}: no episode {key!r} is on file; {nearest(key, known[:1000])}")
     if len(rows) > 1:
         raise ScenarioError(f"{folder}: {key!r} may mean {' or '.join(sorted(rows)[:5])}")

@@ -12,8 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
-from unifg.scenarios.campaigns.campaign import EPISODES, manifest_of
-from unifg.scenarios.campaigns.journal import lines_of
+from unifg.scenarios.campaigns.campaign import episodes_of, manifest_of
 from unifg.scenarios.campaigns.task import ERROR, FAILED, LOST, OK
 from unifg.typing import Array
 
@@ -109,7 +108,7 @@ def load(folder: Path, any_code: bool = False, failed_too: bool = False) -> Shee
     """
     kept = manifest_of(folder)
     keys, unreadable = set(kept["keys"]), list[int]()
-    rows = [row for row in lines_of(folder / EPISODES, unreadable) if row.get("key") in keys]
+    rows = [row for row in episodes_of(folder, unreadable) if row["key"] in keys]
     mine = [row for row in rows if any_code or row.get("code") == kept["code"]]
     sheet = sheet_of(folder, kept, mine, failed_too)
     sheet.others, sheet.unreadable = len(rows) - len(mine), unreadable

@@ -25,14 +25,17 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
 
     Raises:
         KeyboardInterrupt: when stopped before the first tick.
-        ScenarioError: when start, goals or obstacles do not fit the map, or there is none for the log.
+        ScenarioError: when start, goals or obstacles do not fit the map, or there is none for the log, or something is
+            asked for that a recorded drive has no use for.
     """
     if settings.log is not None:
         if settings.map is None:
             raise ScenarioError("a recorded drive is followed on a map of its place: give --map")
-        replayed = replays.SETTINGS(
-            settings.log, settings.map, settings.start, str(settings.localiser), seed=settings.seed
-        )
+        taken = {name: getattr(settings, name) for name in ("log", "map", "start", "localiser", "seed")}
+        used = navigation.NavigationSettings(**taken, obstacles=settings.obstacles)  # of which commands ask unasked
+        if idle := [name for name, value in vars(used).items() if getattr(settings, name) != value]:
+            raise ScenarioError(f"a recorded drive is not simulated, leave out: {', '.join(idle)}")
+        replayed = replays.SETTINGS(**taken)
         return replays.run(replayed, progress)
     with watching_ticks(announce, drive_stage, drive_frame):
         log = navigation.run_navigation(settings, progress=progress)

@@ -22,7 +22,7 @@ from unifg.scenarios.options import find_modules_in
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["Estimator", "LocaliserContext", "World", "constructed", "load_class", "name_of"]
+__all__ = ["Estimator", "Judged", "LocaliserContext", "World", "constructed", "load_class", "name_of"]
 
 
 class World(Protocol):
@@ -89,6 +89,57 @@ class Estimator(Protocol):
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
+
+
+class Judged:
+    """A user's localiser as the pilot asks it: an answer that is no estimate is refused, and the last one stays.
+
+    Attributes:
+        own: the user's object.
+        pose: (3,) the last estimate [m, m, rad].
+        covariance: (3, 3) of it.
+        iterations: of the last update; 0 where the localiser does not say.
+        refused: why the last scan has not corrected the estimate; "" where the localiser does not say.
+    """
+
+    def __init__(self, own: Estimator) -> None:
+        """Take the first estimate.
+
+        Raises:
+            ScenarioError: it is none.
+        """
+        self.own = own
+        self._take()
+
+    def update(self, scan: Scan | None, odometry: Array | None, dt: float) -> None:
+        """Update the localiser, and take its estimate.
+
+        Raises:
+            ScenarioError: it is none.
+        """
+        self.own.update(scan, odometry, dt)
+        self._take()
+
+    def reset(self, pose: Array, sigma: Array) -> None:
+        """Begin anew, as `Estimator.reset`.
+
+        Raises:
+            ScenarioError: the estimate is none.
+        """
+        self.own.reset(pose, sigma)
+        self._take()
+
+    def _take(self) -> None:
+        said = self.own.pose, self.own.covariance
+        pose, covariance = (np.array(part, dtype=np.float64) for part in said)
+        right = (pose.shape, covariance.shape) == ((3,), (3, 3)) and np.isfinite([*pose, *covariance.flat]).all()
+        if not right or np.linalg.eigvalsh(covariance)[0] <= 0.0:
+            what = " and covariance ".join(" ".join(repr(part).split()) for part in said)
+            raise ScenarioError(
+                f"the localiser says pose {what}: give a finite pose (3,) and a positive definite covariance (3, 3)"
+            )
+        self.pose, self.covariance = pose, covariance
+        self.iterations, self.refused = getattr(self.own, "iterations", 0), getattr(self.own, "refused", "")
 
 
 @dataclass(frozen=True)

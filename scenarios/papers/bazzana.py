@@ -14,6 +14,7 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
+from unifg.errors import ScenarioError
 from unifg.scenarios import manoeuvres
 from unifg.scenarios.campaigns.campaign import run_campaign
 from unifg.scenarios.campaigns.sheet import Sheet, load
@@ -84,6 +85,10 @@ def driven(
         legs: of a quick one; none for all.
         plant: one of `unifg.scenarios.simulation.drivetrain.PLANTS`.
         patience: after which a quick one ends with the drives there are [s].
+
+    Raises:
+        KeyboardInterrupt: the user has stopped it; drives that ended are on file.
+        ScenarioError: no drive has ended by then.
     """
     whole = campaign(name)
     keep = {"coupling": ["sequential"], "leg": legs if effort.quick and legs else list(PAPER[name][LENGTH][0])}
@@ -100,7 +105,11 @@ def driven(
         if time.monotonic() > end:
             raise KeyboardInterrupt  # ends the campaign, what is done stays
 
-    run_campaign(part, folder, workers=effort.workers, progress=progress)
+    found = run_campaign(part, folder, workers=effort.workers, progress=progress)
+    if found.interrupted and time.monotonic() <= end:
+        raise KeyboardInterrupt
+    if not found.outcomes:
+        raise ScenarioError(f"no drive has ended within {patience:g} s: start the same command again, or with --full")
     return drives_of(load(folder, failed_too=True), name)
 
 

@@ -24,7 +24,8 @@ _FIELDS, _COUNT = "t x y z qw qx qy qz", 8
 def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
     """Read a trajectory; empty lines and lines starting with ``#`` are skipped, quaternions are normalised.
 
-    Times become seconds from the first one: nanoseconds since 1970 have more digits than float64.
+    Times become seconds from the first one: nanoseconds since 1970 have more digits than float64. Times that run
+    backwards are named in one warning.
 
     Args:
         path: the file, gzipped or not.
@@ -50,4 +51,5 @@ def read_euroc(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
     stamps, turned = table.integers[:, 0], table.numbers[:, [4, 5, 6, 3]]
     table.refuse(stamps < 0, "the time is below zero")
     time = 1e-9 * (stamps - stamps[:1]).astype(np.float64)
+    replace(table, numbers=time[:, None]).remark_order()
     return Trajectory(time, table.numbers[:, :3], turned / norms(turned, table.place)[:, None])

@@ -161,6 +161,15 @@ class _Remarks:
             stand = "edge repeats another" if len(twice) == 1 else "edges repeat others"
             self.say(f"{len(twice)} {stand} word by word, first in line {lines[k]} ({pair}): each counts")
 
+    def order(self, edges: Edges, ids: Ids) -> None:
+        """Remark poses in an order by which most steps from one identifier to the next count as loop closures."""
+        steps = (np.abs(ids[edges.first] - ids[edges.second]) == 1) & ~edges.odometry
+        if steps.sum() > edges.odometry.sum():
+            self.say(
+                f"poses are not in the order of their identifiers: {counted(int(steps.sum()), 'step')} from one to the "
+                "next count as loop closures, as odometry joins neighbours in the file; sort its vertices"
+            )
+
     def isolated(self, what: str, identifiers: Ids, used: list[IntArray]) -> None:
         """Log which of the vertices (n,) nothing has measured, given the positions of those that are used."""
         lonely = identifiers[np.bincount(np.concatenate(used), minlength=len(identifiers)) == 0]
@@ -209,6 +218,7 @@ def parse(file: TextFile, formats: tuple[Format, Format], repair: Repair | None)
     first, second = (_positions(ids, edges.table, k, "pose") for k in (0, 1))
     joined = Edges(first, second, edges.table.numbers, remarks.weights("edges", edges))
     remarks.pairs(joined, ids, edges.table.lines)
+    remarks.order(joined, ids)
     seen: dict[str, Sightings] = {}
     held: dict[str, Priors] = {}
     for kind, found in measured.items():
@@ -379,9 +389,13 @@ def write(path: str | Path, pose_graph: PoseGraph, formats: tuple[Format, Format
         FileFormatError: a number is not finite, or the format has no tag for what there is.
     """
     path, form = Path(path), formats[pose_graph.group is SE3]
-    if not form.point and (len(pose_graph.landmarks) or pose_graph.priors):
-        found = "landmarks" if len(pose_graph.landmarks) else "priors"
-        raise FileFormatError(f"{path}: {name} files have no {found}; write g2o")
+    counts = {
+        "landmarks": len(pose_graph.landmarks),
+        "priors": len(pose_graph.priors),
+        "fixed poses": len(set(pose_graph.fixed_ids)) - 1,  # one alone says where the map begins
+    }
+    if not form.point and (lost := [what for what, count in counts.items() if count > 0]):
+        raise FileFormatError(f"{path}: {name} files have no {lost[0]}; write g2o")
     ids, edges = pose_graph.ids, pose_graph.edges
     tags = {tag.kind: tag for tag in reversed(form.tags) if tag.weights == "information"}
     lines = _lines(path, form.pose, [ids], form.written(pose_graph.poses))

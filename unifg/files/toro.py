@@ -86,12 +86,12 @@ def write_toro(path: str | Path, pose_graph: PoseGraph) -> Path:
 
     Args:
         path: file to write; an existing one is replaced, and a name that ends in ``.gz`` is gzipped.
-        pose_graph: what to write; TORO knows neither landmarks nor fixed poses.
+        pose_graph: what to write; TORO knows neither landmarks nor fixed poses, of which one is left out.
 
     Returns:
         The path written.
 
     Raises:
-        FileFormatError: the pose graph has landmarks or priors, or a number is not finite.
+        FileFormatError: the pose graph has landmarks, priors or several fixed poses, or a number is not finite.
     """
     return write(path, pose_graph, TORO, "TORO")
