@@ -10,6 +10,8 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems.graphs import graph_with
+from unifg.horizon import Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
+from unifg.models import unicycle
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 from units import COST, OTHER_COST, drive
@@ -85,3 +87,70 @@ def test_the_judge_agrees_on_rows_that_were_scaled() -> None:
     graph, guess = drive(clearance=1e4)
     solution = InteriorPoint(tolerance=1e-7).solve(graph, guess, check=True)
     assert judge(graph, solution).worst() < 1e-4
+
+
+def apart(p: Array, q: Array) -> Array:
+    """(n, 1) distances of poses from points."""
+    lengths: Array = np.linalg.norm(p[:, :2] - q, axis=1, keepdims=True)
+    return lengths
+
+
+class Pillar:
+    """A pillar on the map, uncertain: distances to it are measured, the plan keeps off it and ends at a goal."""
+
+    name = "pillar"
+
+    def __init__(self, metre: float, past: bool) -> None:
+        """Say how long a metre is, and whether this is the past or the plan."""
+        self.metre, self.past = metre, past
+        self.records: dict[str, tuple[int, ...]] = {"distance": (1,)} if past else {}
+
+    def state(self, graph: Any, x: Any, u: Any) -> None:
+        """Add the measurements, or the clearance, the limits and the goal."""
+        pillar, metre = graph.families["pillar"][0], self.metre
+        if self.past:
+            seen = graph.data("distance", np.ones((len(x), 1)), each=True)
+            known = graph.data("known", np.zeros(len(x), dtype=bool), each=True)
+            sigma = 0.05 * metre
+            graph.minimize(lambda p, q, z: apart(p, q) - z, x, pillar, seen, sigma=sigma, active=known, name="pillar")
+        else:
+            graph.constrain(apart, x[1:], pillar, lower=1.1 * metre, name="keep off")
+            graph.bound(u, lower=[-metre, -1.0], upper=[metre, 1.0], name="limits")
+            sigmas = [0.3 * metre, 0.3 * metre, 0.5]
+            graph.minimize(fg.prior, x[-1], [4.0 * metre, metre, 0.3], sigma=sigmas, name="goal")
+
+    def data(self, now: Any) -> dict[str, Any]:
+        """What was measured."""
+        return dict(zip(("distance", "known"), now.past.recorded("distance"), strict=True)) if self.past else {}
+
+
+@pytest.mark.parametrize("metre", [1e-6, 1e-3, 1.0, 1e3, 1e6])
+def test_a_joint_window_takes_a_few_iterations_in_any_unit_of_length(metre: float) -> None:
+    """Curvatures 1e10 apart, and priors of empty places, once made it a thousand in kilometres and in micrometres."""
+    length, sigma = np.array([metre, metre, 1.0]), np.array([0.02, 0.01, 0.02])
+    robot = Robot(
+        fg.SE2, fg.Rn(2), constants=(Constant("pillar", fg.Rn(2), np.array([[1.0, 1.5]]) * metre, 0.5 * metre),),
+        predict=lambda x, u: unicycle.step(x[None], u, 0.2)[0],
+    )  # fmt: skip
+    fix = Measurement("fix", lambda x, z: x[:, :2] - z, (2,), 0.1 * metre)
+    past: list[Any] = [Dynamics(unicycle.dynamics, 0.2, sigma=sigma * length), Pillar(metre, True), fix]
+    plan: list[Any] = [
+        Dynamics(unicycle.dynamics, 0.2),
+        ControlCost([metre, 1.0], change=[0.5 * metre, 0.5]),
+        Pillar(metre, False),
+    ]
+    loop = RecedingHorizon(
+        robot, 8, plan, solver=InteriorPoint(feasibility_tolerance=1e-6 * metre), coupling="joint", pull=np.inf,
+        window=Window(robot, 5, past, start=[0.0, 0.0, 0.0], sigma=0.1 * length),
+    )  # fmt: skip
+    controls = np.random.default_rng(3).normal([0.8, 0.0], [0.1, 0.2], (6, 2))
+    states = unicycle.rollout(np.zeros(3), controls, 0.2)
+    for k, state in enumerate(states):
+        seen = {"distance": np.hypot(*(state[:2] - [1.1, 1.4]))[None] * metre, "fix": state[:2] * metre}
+        loop.tick(
+            None,
+            seen if k % 2 else {"distance": seen["distance"]},
+            applied=None if k == 0 else controls[k - 1] * length[1:],
+        )
+        solution = loop.solution
+        assert solution is not None and solution.converged and solution.iterations <= (8 if k else 30)

@@ -215,7 +215,9 @@ class Past:
         self._resting = graph.data("empty places", left.initial[0])
         self._empty = graph.data("empty", np.zeros(history.length, dtype=bool), each=True)
         if not history.filled:
-            graph.minimize(prior, x[:-1], self._resting, active=self._empty, name="empty places")
+            # Any weight will do; one of other units would set the scale that solvers take curvatures by.
+            resting = x[:-1], self._resting
+            graph.minimize(prior, *resting, information=information, active=self._empty, name="empty places")
             for name, family in self._steps.items():
                 graph.minimize(prior, family, family.manifold.identity(), active=self._empty, name=f"empty {name}")
         self._believed: dict[str, tuple[Data, Data]] = {}

@@ -13,8 +13,8 @@ conditions. Else the median of the units of unknowns is one, and that
 of rows if it may as well be. Without constraints but bounds, unknowns are measured in
 their distances to these.
 
-Where the largest entries of all rows are within a factor of a hundred of each other, as in graphs in usual units, all
-rows have one unit and all unknowns another.
+Where the largest entries of all rows are within a factor of a hundred of each other, and curvatures within 1e8, as in
+graphs in usual units, all rows have one unit and all unknowns another.
 """
 
 from __future__ import annotations
@@ -138,7 +138,8 @@ def find_units(
     far = _log_rows(terms, units) > MODEST
     bounded = not sums[TOTAL, 0] < math.inf  # at most
     sloped = _log_curvatures(units, hessian, concavity, gradient)
-    if far or (sloped and not bounded) or _uneven(sums):
+    far = far or _uneven(sums)
+    if far or (sloped and not bounded):
         _forget_small(terms, units)
         for _ in range(SWEEPS):
             _sweep(terms, units)
