@@ -176,6 +176,9 @@ def test_edges_that_do_not_count_are_not_judged() -> None:
     verdict = replace(right, edges=dirty.edges).verdict(effort="cheap", used=used)
     assert not verdict.of("contradicted") and not verdict.leverage[fault].any()
     assert not any(np.isin(fault, one.edges).any() for one in verdict.clusters)
+    count = int((~used).sum())
+    assert verdict.sentence().startswith(f"{verdict.claim} without the {count} edges left out: chi2 ")
+    assert right.verdict(effort="cheap").sentence().startswith("proven: chi2 ")
     with pytest.raises(GraphError, match="one for each edge"):
         made.pose_graph.verdict(used=used[:-1])
 

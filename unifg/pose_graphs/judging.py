@@ -72,6 +72,7 @@ def _verdict(
         found.weak,
         found.ended,
         seconds,
+        int((~counts).sum()),
     )
 
 

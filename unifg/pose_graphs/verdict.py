@@ -201,6 +201,7 @@ class Verdict:
         weak: names of unknowns of which less than five digits are known.
         ended: False where more may be contradicted than is listed.
         seconds: wall-clock time by part.
+        left_out: number of edges that do not count, such as those that a robust loss has rejected.
     """
 
     effort: Effort
@@ -216,6 +217,7 @@ class Verdict:
     weak: tuple[str, ...]
     ended: bool
     seconds: dict[str, float]
+    left_out: int = 0
 
     @property
     def claim(self) -> str:
@@ -239,7 +241,8 @@ class Verdict:
         """The verdict in one sentence."""
         judged = self.judgement
         bounds = "" if self.interval is None else " in [{:.6g}, {:.6g}]".format(*self.interval)
-        said = [f"{self.claim}: chi2 {judged.chi2:.6g}{bounds} with {judged.freedom} degrees of freedom"]
+        without = f" without the {counted(self.left_out, 'edge')} left out" if self.left_out else ""
+        said = [f"{self.claim}{without}: chi2 {judged.chi2:.6g}{bounds} with {judged.freedom} degrees of freedom"]
         if self.better_chi2 is not None:
             said.append(f"a map of chi2 {self.better_chi2[1]:.6g} was found")
         words: dict[Kind, str] = {
