@@ -325,12 +325,13 @@ class Episode:
         self._swap_maps(now)
         odometry = None
         if number:
-            measured = np.array(self.world.odometry())
+            measured = _told("odometry", self.world.odometry(), (self.controller.kind.size,))
             moved = np.where(np.isfinite(measured), measured, 0.0)  # the record goes on without a sample of a world
             self._dead_reckoning = self.controller.kind.step(self._dead_reckoning[None], moved[None], dt)[0]
             self._driven += float(np.hypot(*moved[:2]) if self.controller.kind.slides else abs(moved[0])) * dt
             odometry = faults.odometry(measured, now)
-        true_scan = self.world.scan()
+        told, beams = self.world.scan(), (len(self.world.lidar.angles),)
+        true_scan = Scan(_told("scan", told.angles, beams), _told("scan", told.ranges, beams), told.time, told.turn)
         self.pilot.planless = faults.hold("solver-timeout", now)
         seen = faults.scan(true_scan, now)
         if not number:
@@ -503,6 +504,14 @@ def _near(pose: Array, goal: Array, distance: float, heading: float) -> bool:
     error = pose - goal
     turn = abs(float(wrap_angle(error[2])))
     return bool(np.hypot(error[0], error[1]) < distance and turn < heading)
+
+
+def _told(what: str, given: object, shape: tuple[int, ...]) -> Array:
+    """An answer of the world, whose class may be a user's own, as an array of its shape."""
+    told = np.array(given, dtype=np.float64)
+    if told.shape != shape:
+        raise ScenarioError(f"the world's {what} has shape {told.shape}, expected {shape}")
+    return told
 
 
 def _pose(given: object, default: tuple[float, float, float] | None, what: str) -> Array:

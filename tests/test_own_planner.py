@@ -95,6 +95,16 @@ class Unsaid(World):
     def odometry(self):
         return [float("nan")] * 2
 
+class Listed(World):
+    short = 0
+
+    def odometry(self):
+        return [*super().odometry(), *[0.0] * self.short]
+
+    def scan(self):
+        scan = super().scan()
+        return type(scan)(scan.angles.tolist(), scan.ranges.tolist()[self.short:], scan.time, scan.turn)
+
 class Slow(World):
     def step(self, *control, dt):
         super().step(*(0.5 * part for part in control), dt=dt)
@@ -248,6 +258,16 @@ def test_a_world_that_says_nothing_of_its_wheels_leaves_a_record(own: Path) -> N
     settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), world="my_planners:Unsaid")
     log = Episode(settings, rehearsal=True).run(stop_after(5))
     assert np.isfinite(log.dead_reckoning).all() and log.dropped
+
+
+def test_a_world_may_answer_in_lists_of_the_right_length(own: Path) -> None:
+    settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),))
+    listed = replace(settings, world="my_planners:Listed")
+    usual, same = (Episode(one, rehearsal=True).run(stop_after(5)) for one in (settings, listed))
+    np.testing.assert_array_equal(usual.estimate, same.estimate)
+    sys.modules["my_planners"].Listed.short = 1
+    with pytest.raises(ScenarioError, match=r"the world's scan has shape \(359,\), expected \(360,\)"):
+        Episode(listed, rehearsal=True).run(stop_after(5))
 
 
 def test_an_error_of_a_users_part_is_not_one_of_the_output(own: Path, capsys: pytest.CaptureFixture[str]) -> None:
