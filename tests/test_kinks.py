@@ -32,13 +32,13 @@ def opaque(p: Array, q: Array) -> Array:
     return np.array([[float(np.sqrt(float(d @ d)))] for d in np.asarray(p) - np.asarray(q)])
 
 
-def survey(measure: Callable[[Array, Array], Array], seen: float) -> tuple[fg.Graph, fg.Family]:
+def survey(measure: Callable[[Array, Array], Array], seen: float, metre: float = 1.0) -> tuple[fg.Graph, fg.Family]:
     """A landmark with a weak prior where the pose is that measured a distance to it, and a guess of zeros."""
     graph = fg.Graph()
     p = graph.variables("p", fg.Rn(2), 2)
-    graph.minimize(fg.prior, p[0], [0.0, 0.0], sigma=0.01, name="pose")
-    graph.minimize(fg.prior, p[1], [0.0, 0.0], sigma=10.0, name="somewhere")
-    graph.minimize(lambda a, b: measure(a, b) - seen, p[0], p[1], sigma=0.1, name="distance")
+    graph.minimize(fg.prior, p[0], [0.0, 0.0], sigma=0.01 * metre, name="pose")
+    graph.minimize(fg.prior, p[1], [0.0, 0.0], sigma=10.0 * metre, name="somewhere")
+    graph.minimize(lambda a, b: measure(a, b) - seen * metre, p[0], p[1], sigma=0.1 * metre, name="distance")
     return graph, p
 
 
@@ -49,6 +49,12 @@ def test_a_landmark_guessed_on_the_pose_is_found(solver: fg.Solver, measure: Cal
     solution = solver.solve(graph, {p: np.zeros((2, 2))}, check=True)
     assert np.linalg.norm(solution[p][1] - solution[p][0]) == pytest.approx(1.0, abs=1e-3)
     assert solution.cost < 0.01 and solution.verify()
+
+
+@pytest.mark.parametrize("metre", [1e-9, 1e-3, 1e3, 1e9])
+def test_the_unit_of_length_does_not_matter(metre: float) -> None:
+    graph, p = survey(distance, 1.0, metre)
+    assert LevenbergMarquardt().solve(graph, {p: np.zeros((2, 2))}, check=True).cost < 0.01
 
 
 def test_the_second_solve_of_a_prepared_graph_is_looked_at_too() -> None:

@@ -20,7 +20,7 @@ from unifg.problem.table import ENTRY, WIDTH
 from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, IntArray
 
-LENGTHS = (1e-4, 1e-6)  # [m, rad]: the longer one for what is rounded, the shorter one beside stiff terms
+LENGTHS = (1e-3, 1e-6, 1e-9, 1e-12)  # of steps: long ones for what is rounded, short ones beside stiff terms
 HALF = 0.4  # share of the fall that half the step must have, at least
 ROUNDINGS = 1e3
 
@@ -46,7 +46,7 @@ def beside_a_kink(program: CompiledProblem, lin: Linearization, multipliers: Arr
         there = program.evaluate(program.retract(lin.values, length * direction))
         return there.cost - lin.cost + inner(multipliers, there.constraints - lin.constraints)
 
-    least = -ROUNDINGS * np.finfo(float).eps * abs(lin.cost)
+    least = -ROUNDINGS * np.finfo(float).eps * (abs(lin.cost) + inner(np.abs(multipliers), np.abs(lin.constraints)))
     with suppress(Exception):  # of functions that are not defined beside the answer
         for length in LENGTHS:
             sides = (length, -length)
