@@ -24,6 +24,7 @@ from unifg.errors import ScenarioError, UnifgError
 from unifg.files.contents import legible
 
 __all__ = [
+    "AboveZero",
     "AtLeastOne",
     "Help",
     "Leaf",
@@ -32,6 +33,7 @@ __all__ = [
     "Settings",
     "Signed",
     "Text",
+    "above_zero",
     "add_options",
     "checked",
     "count",
@@ -320,7 +322,10 @@ positive = number("a positive number", lambda value: 0.0 < value < math.inf)
 not_negative = number("a number of zero or more", lambda value: 0.0 <= value < math.inf)
 share = number("a number in [0, 1)", lambda value: 0.0 <= value < 1.0)
 
+above_zero = number("a number above zero", lambda value: value > 0.0)
+
 Positive: TypeAlias = Annotated[T, positive]
+AboveZero: TypeAlias = Annotated[T, above_zero]  # may be infinite, as limits of an ideal base
 Signed: TypeAlias = Annotated[T, number("a finite number", math.isfinite)]
 AtLeastOne: TypeAlias = Annotated[int, partial(count, least=1)]
 

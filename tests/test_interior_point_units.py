@@ -120,7 +120,7 @@ class Pillar:
             graph.minimize(fg.prior, x[-1], [4.0 * metre, metre, 0.3], sigma=sigmas, name="goal")
 
     def data(self, now: Any) -> dict[str, Any]:
-        """What was measured."""
+        """Measurements of the past."""
         return dict(zip(("distance", "known"), now.past.recorded("distance"), strict=True)) if self.past else {}
 
 

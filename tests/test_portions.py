@@ -142,5 +142,5 @@ def test_a_tick_without_time_for_a_solve_still_estimates() -> None:
 
 
 def test_portions_that_cannot_be_are_refused() -> None:
-    with pytest.raises(fg.GraphError, match="portion=0"):
+    with pytest.raises(fg.ScenarioError, match="portion: '0' is not a whole number of at least 1"):
         keeper(portion=0)

@@ -51,7 +51,7 @@ def test_every_number_is_judged(settings: Any) -> None:
     [
         (KeeperSettings, {"slack": 0.0}, "slack: '0.0' is not a positive number"),
         (KeeperSettings, {"portion": 0}, "portion: '0' is not a whole number of at least 1"),
-        (KeeperSettings, {"decide_ms": 0.0}, "decide_ms: '0.0' is not a time above zero"),
+        (KeeperSettings, {"decide_ms": 0.0}, "decide_ms: '0.0' is not a number above zero"),
         (SafeSettings, {"dt": 1.5}, r"dt: '1.5' is not a tick in \(0, 1\] s"),
         (SafeSettings, {"seen": (1e-3, -1.0, 0.0)}, "seen: '-1.0' is not a number of zero or more"),
         (SafeSettings, {"speed": (1.0, 0.0)}, "speed: '0.0' is not a positive number"),

@@ -16,6 +16,7 @@ from unifg.codegen.compile_counter import tally
 from unifg.files.g2o import write_g2o
 from unifg.pose_graphs import manhattan
 from unifg.scenarios import command
+from unifg.scenarios.commands import warm
 from unifg.scenarios.commands.warm import missing
 
 EXAMPLES = sorted((Path(__file__).resolve().parent.parent / "examples").glob("*.py"))
@@ -67,8 +68,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(
 def test_the_command_refuses_to_compile_what_nothing_can_keep(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "file").write_text("a file where the folder should be", encoding="utf-8")
-    monkeypatch.setenv("UNIFG_CACHE_DIR", str(tmp_path / "file"))
+    monkeypatch.setattr(warm, "cache_folder", lambda: None)
     assert command.main(["warmup"]) == 2
     assert "could not be kept: name a folder in UNIFG_CACHE_DIR" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.models.footprint import Body, body_of
 from unifg.models.planar import Base, base_of
-from unifg.scenarios.options import AtLeastOne, Positive, Settings, Signed, checked, option, positive
+from unifg.scenarios.options import AboveZero, AtLeastOne, Positive, Settings, Signed, checked, option, positive
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -78,7 +78,7 @@ class ControllerSettings(Settings):
     dt: Positive[float] = 0.1
     speed: float = option(1.0, text=positive, metavar="M/S")
     limits: Positive[tuple[float, float]] = (1.0, 1.0)
-    accelerations: Positive[tuple[float, float]] = (2.5, 3.2)
+    accelerations: AboveZero[tuple[float, float]] = (2.5, 3.2)
     pose_sigma: Positive[tuple[float, float, float]] = (0.3, 0.3, 0.6)
     terminal_sigma: Positive[tuple[float, float, float]] = (0.1, 0.1, 0.2)
     control_sigma: Positive[tuple[float, float]] = (1.0, 2.0)

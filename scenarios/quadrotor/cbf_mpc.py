@@ -21,7 +21,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -40,7 +40,7 @@ from unifg.horizon import (
 from unifg.models import quadrotor, quadrotor_loops
 from unifg.models.barriers import Barrier, Flow, accelerated, condition, decay, velocity_extended
 from unifg.models.keeping import Form, Kept, keep
-from unifg.scenarios.options import AtLeastOne, Positive, Settings, number
+from unifg.scenarios.options import AboveZero, AtLeastOne, Positive, Settings
 from unifg.scenarios.planning.flat_path import Flown
 from unifg.scenarios.planning.reference_cost import ReferenceCost
 from unifg.scenarios.quadrotor.flatness import FlatnessController, Gains, flat_flight
@@ -121,7 +121,7 @@ class KeeperSettings(Settings):
     settled: bool = False
     portion: AtLeastOne | None = 4
     iterations: AtLeastOne = 20
-    decide_ms: Annotated[float, number("a time above zero", lambda value: value > 0.0)] = np.inf
+    decide_ms: AboveZero[float] = np.inf
 
 
 TRACKING = KeeperSettings(

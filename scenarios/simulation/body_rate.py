@@ -20,7 +20,7 @@ from unifg.codegen.jit import compiled
 from unifg.errors import ScenarioError
 from unifg.models import quadrotor, quadrotor_dynamics
 from unifg.models.quadrotor_loops import held
-from unifg.scenarios.options import Positive, Settings
+from unifg.scenarios.options import AboveZero, Positive, Settings
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["SUBSTEP", "Airframe", "BodyRatePlant", "Loops"]
@@ -39,7 +39,7 @@ class Loops(Settings):
         link: how late a command arrives after the tick in which it was decided [s].
     """
 
-    gain: Positive[float] = 25.0
+    gain: AboveZero[float] = 25.0
     lag: Positive[float] = 0.02
     link: float = 0.01
 

@@ -17,12 +17,11 @@ import numpy as np
 
 from unifg.models import unicycle
 from unifg.models.planar import Base
-from unifg.scenarios.options import Settings, not_negative, number, option, share
+from unifg.scenarios.options import Settings, above_zero, not_negative, option, share
 from unifg.typing import Array
 
 __all__ = ["COMPUTED", "PLANTS", "Drivetrain", "Wheels", "followed", "plant"]
 
-above_zero = number("a number above zero", lambda value: value > 0.0)  # infinite of an ideal base
 COMPUTED = -1.0  # latency that is the measured time of each tick
 
 

@@ -13,7 +13,7 @@ conditions. Else the median of the units of unknowns is one, and that
 of rows if it may as well be. Without constraints but bounds, unknowns are measured in
 their distances to these.
 
-Where the largest entries of all rows are within a factor of a hundred of each other, and curvatures within 1e8, as in
+Where the largest entries of all rows are within a factor of a hundred of each other, and curvatures within 1e9, as in
 graphs in usual units, all rows have one unit and all unknowns another.
 """
 
@@ -67,6 +67,10 @@ SHARE = 0.01  # of the largest product that a gradient is a sum of
 SWEEPS = 20  # of the minimisation, one variable after the other
 SMALLEST = -14.0  # logarithm of an entry, relative to others, from which on it counts as zero
 MODEST = 4.6  # logarithm of a hundred
+UNEVEN, OVERFLOW = (
+    20.7,
+    200.0,
+)  # logarithms of ratios of curvatures; below 1e9 they may be weights, which mean something
 SMALL_FORCES = 100.0  # times the cost: multipliers from which on it is they that count
 
 
@@ -292,12 +296,12 @@ def _log_curvatures(units: Units, hessian: Array, concavity: Array, gradient: Ar
 
 @compiled
 def _uneven(sums: Array) -> bool:
-    """Test whether curvatures along coordinates differ by more than units a hundred times apart from their mean."""
+    """Test whether curvatures along coordinates differ by more than weights do, and by less than overflow."""
     least, most = math.inf, -math.inf
     for k in range(sums.shape[1]):
         if sums[POWER, k] == 2.0:
             least, most = min(least, sums[CURVATURE, k]), max(most, sums[CURVATURE, k])
-    return most - least > 4.0 * MODEST
+    return UNEVEN < most - least < OVERFLOW
 
 
 @compiled
