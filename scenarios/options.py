@@ -13,9 +13,10 @@ import inspect
 import math
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import MISSING, dataclass, field, replace
 from functools import cache, partial
+from numbers import Real
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, NamedTuple, TypeAlias, TypeVar, cast, get_args, get_origin, get_type_hints
@@ -44,7 +45,6 @@ __all__ = [
     "number",
     "option",
     "pair",
-    "permitted",
     "plain",
     "pose",
     "positive",
@@ -156,11 +156,18 @@ class Settings:
         for leaf in _own(cast(type, type(self))):
             name, value = leaf.path[0], getattr(self, leaf.path[0])
             read_as_one = leaf.option is not None and leaf.option.text is not None and not leaf.option.many
-            for one in value if isinstance(value, tuple) and (leaf.within or not read_as_one) else (value,):
+            row = isinstance(value, Iterable) and not isinstance(value, str) and (leaf.within or not read_as_one)
+            each, size = tuple(value) if row else (value,), get_args(plain(leaf.kind))
+            if row and get_origin(plain(leaf.kind)) is tuple and ... not in size and len(each) != len(size):
+                raise ScenarioError(f"{name}: {len(size)} numbers are expected, found {value!r}")
+            for one in each:
                 if leaf.choices and one is not None and one not in leaf.choices:
                     raise ScenarioError(f"unknown {name} {one!r}: choose {', '.join(leaf.choices)}")
-                if isinstance(one, int | float) and not isinstance(one, bool):
-                    permitted(leaf.within or leaf.text or not_negative, **{name: one})
+                if isinstance(one, Real) and not isinstance(one, bool):
+                    try:
+                        (leaf.within or leaf.text or not_negative)(str(one))
+                    except argparse.ArgumentTypeError as error:
+                        raise ScenarioError(f"{name}: {error}") from None
 
 
 @cache
@@ -299,23 +306,6 @@ def number(what: str, permitted: Callable[[float], bool]) -> Text:
         return value
 
     return read
-
-
-def permitted(read: Text, /, **values: float) -> None:
-    """Refuse numbers that a reader of the command line refuses.
-
-    Args:
-        read: such as :data:`positive`.
-        values: by the name of their field.
-
-    Raises:
-        ScenarioError: naming the field.
-    """
-    for name, value in values.items():
-        try:
-            read(str(value))
-        except argparse.ArgumentTypeError as error:
-            raise ScenarioError(f"{name}: {error}") from None
 
 
 positive = number("a positive number", lambda value: 0.0 < value < math.inf)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import pytest
 
 from unifg.errors import UnifgError
@@ -16,6 +17,7 @@ from unifg.scenarios.navigation import NavigationSettings
 from unifg.scenarios.options import leaves, plain, replaced
 from unifg.scenarios.quadrotor.cbf_mpc import KeeperSettings
 from unifg.scenarios.safe_flight import SafeSettings
+from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.scenarios.velocity_tracking import TrackingSettings
 
 SIGNED = {
@@ -57,6 +59,10 @@ def test_every_number_is_judged(settings: Any) -> None:
         (SafeSettings, {"speed": (1.0, 0.0)}, "speed: '0.0' is not a positive number"),
         (NavigationSettings, {"initial_sigma": (0.1, -0.1, 0.1)}, "initial_sigma: '-0.1' is not"),
         (NavigationSettings, {"start": (0.0, math.nan, 0.0)}, "start: 'nan' is not a finite number"),
+        (DisturbanceModel, {"gust": (0.1, 0.1)}, r"gust: 3 numbers are expected, found \(0.1, 0.1\)"),
+        (DisturbanceModel, {"gust": [0.1, 0.1, -0.1]}, "gust: '-0.1' is not a number of zero or more"),
+        (DisturbanceModel, {"gust": np.array([0.1, 0.1, np.nan])}, "gust: 'nan' is not"),
+        (DisturbanceModel, {"gust_time": np.float32(0.0)}, "gust_time: '0.0' is not a positive number"),
         (Gates, {"match": 60.0}, "0 < match <= new"),
         (Vehicle, {"equivalent_mass": 0.0}, "positive masses"),
     ],

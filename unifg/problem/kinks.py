@@ -49,9 +49,9 @@ def beside_a_kink(program: CompiledProblem, lin: Linearization, multipliers: Arr
     least = -ROUNDINGS * np.finfo(float).eps * (abs(lin.cost) + inner(np.abs(multipliers), np.abs(lin.constraints)))
     with suppress(Exception):  # of functions that are not defined beside the answer
         for length in LENGTHS:
-            sides = (length, -length)
-            if all(change(side) < least and change(0.5 * side) <= HALF * change(side) for side in sides):
-                return program.retract(lin.values, min(sides, key=change) * direction)
+            sides = {side: change(side) for side in (length, -length)}
+            if all(fall < least and change(0.5 * side) <= HALF * fall for side, fall in sides.items()):
+                return program.retract(lin.values, min(sides, key=sides.__getitem__) * direction)
     return None
 
 
