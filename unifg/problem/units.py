@@ -67,10 +67,7 @@ SHARE = 0.01  # of the largest product that a gradient is a sum of
 SWEEPS = 20  # of the minimisation, one variable after the other
 SMALLEST = -14.0  # logarithm of an entry, relative to others, from which on it counts as zero
 MODEST = 4.6  # logarithm of a hundred
-UNEVEN, OVERFLOW = (
-    20.7,
-    200.0,
-)  # logarithms of ratios of curvatures; below 1e9 they may be weights, which mean something
+UNEVEN, OVERFLOW = 20.7, 200.0  # logarithms of ratios of curvatures: below 1e9 they may be weights that are meant
 SMALL_FORCES = 100.0  # times the cost: multipliers from which on it is they that count
 
 
