@@ -104,6 +104,8 @@ class Judge:
         self._free = ~twin.held
         outputs = [twin.cost, self._g, ca.gradient(twin.cost, self._d), ca.jacobian(self._g, self._d)]
         self._derivatives = ca.Function("derivatives", [self._d, self._z], outputs)
+        residual = ca.vertcat(ca.SX(0, 1), *twin.residuals)
+        self._residual = ca.Function("residual", [self._d, self._z], [residual, ca.jacobian(residual, self._d)])
 
     def at(self, values: dict[fg.Family, Array]) -> tuple[float, Array, Array, Any]:
         """Cost, rows, gradient and Jacobian (sparse) along the right perturbation at a point."""
@@ -120,10 +122,14 @@ class Judge:
         limit = np.where(duals > 0.0, self.upper, self.lower)
         distance = np.where(np.isfinite(limit), np.abs(rows - np.where(np.isfinite(limit), limit, 0.0)), 1.0)
         slack = np.where(self.lower == self.upper, 0.0, distance)
-        # Or relative, to a hundredth of the largest of what a gradient is a sum of.
+        # Or relative, to a hundredth of the largest product that gradients along a coordinate are sums of.
+        residual, slopes_of_costs = self._residual(np.zeros(len(pull)), self.twin.stacked(values))
         slopes = np.abs(jacobian.toarray())
-        sizes = np.abs(duals[:, None] * slopes).max(axis=0, initial=0.0)
-        sizes = np.maximum(0.01 * np.maximum(sizes, np.abs(gradient)), scale)
+        products = np.abs(np.array(residual)) * np.abs(np.array(slopes_of_costs))
+        products = np.concatenate([products, np.abs(duals)[:, None] * slopes])
+        along = np.zeros(self.twin.along.max() + 1)
+        np.maximum.at(along, self.twin.along, products.max(axis=0, initial=0.0))
+        sizes = np.maximum(0.01 * along[self.twin.along], scale)
         shares = np.minimum((slopes / sizes).max(axis=1, initial=0.0), 1.0 / scale)
         return Numbers(
             cost,

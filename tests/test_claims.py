@@ -70,6 +70,16 @@ def test_converged_is_true_without_inequalities(kind: str) -> None:
     assert (result.status, result.claim) == ("CONVERGED", "true"), result
 
 
+@pytest.mark.parametrize("name", ["sqp", "kkt"])
+def test_the_judge_measures_what_the_library_measures(name: str) -> None:
+    """Sizes of gradients belong to the coordinate of a family: by unknown, these answers would be false."""
+    twin, judge = stated("pendulum", 4)
+    solution = CONSTRAINED[name].solve(twin.graph, twin.guess)
+    assert solution.status is fg.Status.CONVERGED and solution.stationarity > 1e-7
+    seen = judge.numbers(solution.values, solution.multipliers)
+    assert seen.stationarity == pytest.approx(solution.stationarity, rel=1e-3)
+
+
 def out_of_reach() -> Twin:
     """A mass that shall go 3 m from rest to rest in the time for 2 m."""
     steps, dt = 8, 0.25

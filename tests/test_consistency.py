@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -10,8 +12,8 @@ import pytest
 
 from unifg.errors import GraphError
 from unifg.lie import SE2
-from unifg.pose_graphs import Edges, PoseGraph, manhattan, pairwise_consistent, sphere
-from unifg.pose_graphs.consistency import _clique
+from unifg.pose_graphs import Edges, PoseGraph, consistency, manhattan, pairwise_consistent, sphere
+from unifg.pose_graphs.consistency import _agreements, _certain, _classes, _clique, most_consistent
 from unifg.pose_graphs.generate import Simulated
 from unifg.typing import BoolArray
 
@@ -133,3 +135,107 @@ def test_what_a_closure_is_sure_of_is_carried_to_its_other_end(turned: bool) -> 
     off = np.array([0.0, 0.0, 0.08]) if not turned else -SE2.adjoint(SE2.inverse(measured[-1:]))[0] @ [0.0, 0.0, 0.08]
     measured[-1] = SE2.retract(measured[-1], off)
     assert not pairwise_consistent(replace(graph, edges=replace(graph.edges, measured=measured)))[-1]
+
+
+def judged_at_truth(made: Simulated) -> tuple[PoseGraph, BoolArray]:
+    """The graph at its true poses, and the edges that are right."""
+    return made.pose_graph.with_poses(made.truth), ~made.outliers
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("make", [partial(manhattan, 250), partial(sphere, 6, 12)], ids=["plane", "space"])
+def test_hardly_more_closures_are_consistent_than_are_right(make: Callable[..., Simulated], seed: int) -> None:
+    graph, right = judged_at_truth(make(seed=seed, outliers=0.4))
+    kept = int(right[~graph.edges.odometry].sum())
+    most = most_consistent(graph, right)
+    assert most is not None and kept <= most <= 1.03 * kept
+    assert most_consistent(graph, graph.edges.odometry) == most  # whichever are kept
+
+
+def test_a_bound_is_one_on_every_set_that_is_consistent() -> None:
+    """Closures of which the largest set is known: three groups, each with an error in common, of 5, 4 and 3."""
+    count, groups = 30, [0.0] * 5 + [3.0] * 4 + [-3.0] * 3
+    truth = np.column_stack([np.arange(float(count)), np.zeros((count, 2))])
+    first = np.arange(len(groups))
+    pairs = np.concatenate(
+        [np.stack([np.arange(count - 1), np.arange(1, count)], axis=1), np.stack([first, first + 15], 1)]
+    )
+    measured = SE2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])
+    measured[count - 1 :, 1] += groups
+    information = np.tile(np.diag([1e4, 1e4, 1e6]), (len(pairs), 1, 1))
+    graph = PoseGraph(np.arange(count), truth, Edges(pairs[:, 0], pairs[:, 1], measured, information))
+    used = np.ones(len(pairs), dtype=bool)
+    used[count + 4 :] = False
+    assert most_consistent(graph, used) == 5
+    lost = used.copy()
+    lost[:3] = False  # odometry is no measure where it is left out
+    assert most_consistent(graph, lost) is None
+    used[count + 4] = True  # of another group than the rest: kept closures that seem inconsistent
+    assert most_consistent(graph, used) is None
+    information[-1, 2, 2] = 0.0  # says too little to be compared, and counts
+    blind = replace(graph, edges=replace(graph.edges, information=information))
+    used[count + 4] = False
+    assert most_consistent(blind, used) == 6
+
+
+def test_the_largest_difference_of_two_right_closures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One pair in a hundred differs by more than 11.3 in chi2, of three degrees of freedom."""
+    truth = np.column_stack([np.arange(6.0), np.zeros((6, 2))])
+    pairs = np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 5], [0, 4], [1, 5]])
+    information = np.tile(np.diag([1e12, 1e12, 1e12]), (7, 1, 1))
+    information[5:] = np.diag([100.0, 100.0, 1e12])
+    used = np.arange(7) < 6
+    for chi2, most in ((11.2, 2), (11.5, 1)):
+        measured = SE2.between(truth[pairs[:, 0]], truth[pairs[:, 1]])
+        measured[6, 0] += np.sqrt(chi2 * 0.02)
+        graph = PoseGraph(np.arange(6), truth, Edges(pairs[:, 0], pairs[:, 1], measured, information))
+        assert most_consistent(graph, used) == most
+    monkeypatch.setattr(consistency, "MOST", 1)
+    assert most_consistent(graph, used) is None
+
+
+def test_poses_at_which_drift_is_linearised_matter_little(rng: np.random.Generator) -> None:
+    """Whatever the poses claim, to first order odometry and closures say the same of each other."""
+    made = manhattan(200, seed=3, outliers=0.3)
+    graph = made.pose_graph
+    away = SE2.retract(
+        made.truth, np.column_stack([np.sin(np.arange(200) / 20), np.cos(np.arange(200) / 30), np.zeros(200)])
+    )
+    ((_, at_truth),) = _agreements(graph, *_certain(graph), 0.999, made.truth)
+    ((_, at_others),) = _agreements(graph, *_certain(graph), 0.999, away)
+    assert 0.3 < at_truth.mean() < 0.9 and (at_truth != at_others).mean() < 0.01
+
+
+def test_drift_that_is_far_from_linear_is_linearised_at_the_map() -> None:
+    """Right closures that odometry alone takes for inconsistent, by its heading, are seen to agree at the poses."""
+    made = manhattan(1000, seed=0)
+    graph, right = judged_at_truth(made)
+    closures = int((~graph.edges.odometry).sum())
+    assert most_consistent(graph, right) == closures
+    assert most_consistent(made.pose_graph, right) is None  # at odometry once more, not at the map
+
+
+def test_classes_bound_the_largest_clique(rng: np.random.Generator) -> None:
+    found = []
+    for share in (0.2, 0.5, 0.8):
+        for _ in range(8):
+            agreeing = np.triu(rng.random((12, 12)) < share, 1)
+            agreeing |= agreeing.T
+            most, most_of_all = largest(agreeing), _classes(agreeing)
+            assert most <= most_of_all
+            found.append(most_of_all / most)
+    assert np.mean(found) < 1.2
+    assert _classes(np.zeros((0, 0), dtype=bool)) == 0 and _classes(np.zeros((4, 4), dtype=bool)) == 1
+
+
+def test_a_verdict_on_a_robust_map_bounds_what_could_be_kept() -> None:
+    graph, right = judged_at_truth(CITY)
+    kept = int(right[~graph.edges.odometry].sum())
+    verdict = graph.verdict(used=right)
+    assert verdict.closures is not None and verdict.closures[0] == kept
+    most = verdict.closures[1]
+    bound = f"at most {most} closures are" if most > kept else "no larger set of closures is"
+    assert f"{bound} consistent pair by pair; {kept} are kept" in verdict.sentence()
+    assert graph.verdict(used=right, effort="cheap").closures is None
+    clean = replace(graph, edges=graph.edges[right])
+    assert clean.verdict().closures is None

@@ -171,6 +171,7 @@ def _verdict(verdict: Verdict) -> dict[str, Any]:
         "interval": None if verdict.interval is None else list(verdict.interval),
         "starts": verdict.starts,
         "basins": verdict.basins,
+        "closures": None if verdict.closures is None else dict(zip(("kept", "at_most"), verdict.closures, strict=True)),
         "better_chi2": None if verdict.better_chi2 is None else verdict.better_chi2[1],
         "certificate": None if verdict.certificate is None else _certificate(verdict.certificate),
         "uncertified": verdict.uncertified,

@@ -12,6 +12,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.pose_graphs.certificate import certify, require_one_for_each
 from unifg.pose_graphs.clusters import Partial, Search, optimum, search
+from unifg.pose_graphs.consistency import most_consistent
 from unifg.pose_graphs.initialise import odometric, starts
 from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import JUDGES, PoseGraph, ResidualName
@@ -56,6 +57,10 @@ def _verdict(
             whole = np.ones(len(judged.edges), dtype=np.bool_)
             solved = optimum(judged, whole, residual)[0] if wrong else found.solved
             tried, basins, better = _basins(judged, solved, certificate, residual)
+    most = None
+    if full and not counts.all():
+        with _timed(seconds, "other closures"):
+            most = most_consistent(pose_graph, counts)
     places, leverage = np.flatnonzero(counts), np.zeros(len(counts))
     leverage[places] = found.leverage
     return Verdict(
@@ -73,6 +78,7 @@ def _verdict(
         found.ended,
         seconds,
         int((~counts).sum()),
+        None if most is None else (int(counts[~pose_graph.edges.odometry].sum()), most),
     )
 
 

@@ -202,6 +202,9 @@ class Verdict:
         ended: False where more may be contradicted than is listed.
         seconds: wall-clock time by part.
         left_out: number of edges that do not count, such as those that a robust loss has rejected.
+        closures: number of loop closures that count, and a bound on the number of which every two are consistent with
+            each other and with odometry, see :func:`unifg.pose_graphs.consistency.most_consistent`. None where every
+            edge counts, with little effort, and where there is no bound.
     """
 
     effort: Effort
@@ -218,6 +221,7 @@ class Verdict:
     ended: bool
     seconds: dict[str, float]
     left_out: int = 0
+    closures: tuple[int, int] | None = None
 
     @property
     def claim(self) -> str:
@@ -245,6 +249,10 @@ class Verdict:
         said = [f"{self.claim}{without}: chi2 {judged.chi2:.6g}{bounds} with {judged.freedom} degrees of freedom"]
         if self.better_chi2 is not None:
             said.append(f"a map of chi2 {self.better_chi2[1]:.6g} was found")
+        if self.closures is not None:
+            kept, most = self.closures
+            bound = f"at most {most} closures are" if most > kept else "no larger set of closures is"
+            said.append(f"{bound} consistent pair by pair; {kept} are kept")
         words: dict[Kind, str] = {
             "survey": "all others contradict {}",
             "contradicted": "the rest contradicts {}",

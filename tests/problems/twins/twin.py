@@ -61,7 +61,7 @@ class Twin:
         guess: (n, storage) by family; what is fixed has its value there.
         point, step: casadi symbols z and d, by family, one column per member.
         rows: constraints.
-        cost: casadi expression.
+        residuals: casadi expressions of the whitened residuals; the cost is half the sum of their squares.
     """
 
     def __init__(self, kind: str, seed: int, equalities_only: bool = False) -> None:
@@ -72,11 +72,24 @@ class Twin:
         self.point: dict[fg.Family, Any] = {}
         self.step: dict[fg.Family, Any] = {}
         self.rows: list[Rows] = []
-        self.cost: Any = ca.SX(0.0)
+        self.residuals: list[Any] = []
         self._moved: dict[fg.Family, list[Any]] = {}
         self._first: dict[fg.Family, int] = {}
         self._held: list[IntArray] = []
         self._size = 0
+
+    @property
+    def cost(self) -> Any:
+        """Expression of the cost, a casadi scalar."""
+        return 0.5 * ca.sumsqr(ca.vertcat(ca.SX(0, 1), *self.residuals))
+
+    @property
+    def along(self) -> IntArray:
+        """(n,) number of what a tangent coordinate belongs to: one coordinate of one family."""
+        dims = [family.manifold.dim for family in self.point]
+        first = np.cumsum([0, *dims])
+        spans = zip(first, dims, self.point, strict=False)
+        return np.concatenate([np.tile(begin + np.arange(dim), family.count) for begin, dim, family in spans])
 
     @property
     def name(self) -> str:
@@ -117,7 +130,7 @@ class Twin:
         """Add 1/2 |r / sigma|^2 for each factor."""
         self.graph.minimize(ours, *arguments, sigma=np.asarray(sigma, dtype=np.float64), name=name)
         for column in self._columns(exact, arguments):
-            self.cost += 0.5 * ca.sumsqr(column / ca.DM(np.broadcast_to(sigma, column.shape[0])))
+            self.residuals.append(column / ca.DM(np.broadcast_to(sigma, column.shape[0])))
 
     def require(
         self,
