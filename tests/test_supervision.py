@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import functools
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,8 @@ from unifg.scenarios.ground.drive_pilot import DOUBTFUL, Pilot, make_pilot
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.drive_signals import RAMPS, DriveSignals
 from unifg.scenarios.ground.emergency_stop import EmergencyStop
+from unifg.scenarios.ground.hypotheses import Hypothesis
+from unifg.scenarios.ground.localiser import FITS, Localiser
 from unifg.scenarios.ground.motor_lag import MotorLag
 from unifg.scenarios.ground.relocalise import BELIEVED, PORTION, Found, Relocaliser
 from unifg.scenarios.logs.drive_log import EpisodeLog
@@ -440,6 +442,33 @@ def test_creeping_goes_straight_on_and_turns_to_where_there_is_room() -> None:
     assert not creeping.ended
     creeping.moved(np.array([-30.0, 0.0]))
     assert creeping.ended, "a way that never ends is no way"
+
+
+def test_other_places_are_tried_seldom_once_nothing_fits_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lost robot's tick is spent on the search of the map; a scan that fits brings the hypotheses back."""
+    field, here = maps.field(HALL), np.array([13.0, 3.5, 0.0])
+    localiser = Localiser(field, here, np.full(3, 0.02), BEAMS)
+    tried = list[int]()
+    spread_out = localiser.spread_out
+
+    def counted(scan: Scan, believed: Sequence[Hypothesis] = ()) -> None:
+        tried[-1] += 1
+        spread_out(scan, believed)
+
+    monkeypatch.setattr(localiser, "spread_out", counted)
+
+    def corrects(scan: Scan, count: int) -> list[int]:
+        tried.clear()
+        for _ in range(count):
+            tried.append(0)
+            localiser.correct(scan)
+        return [min(number, 1) for number in tried]
+
+    wrong, right = among_people(World(HALL, (24.0, 7.0, 1.0)).scan()), World(HALL, tuple(here.tolist())).scan()
+    assert explained(field, wrong, here).share < FITS
+    assert corrects(wrong, 31) == [1] * 10 + [1, 0, 0, 0, 0] * 4 + [1]
+    localiser.reset(here, np.full(3, 0.02))
+    assert corrects(wrong, 1) == [1] and corrects(right, 1) == [0] and corrects(wrong, 11) == [1] * 11
 
 
 @pytest.mark.product(1, of="drives and flights")

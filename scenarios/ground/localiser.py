@@ -36,6 +36,7 @@ FITS = 0.6  # share of the beams that the map explains, below which there may be
 FOUND = 0.85  # share that it has to explain at another place
 ASTRAY = np.diag([0.15, 0.15, 0.06]) ** 2  # that a scan which does not fit adds to the covariance [m, m, rad]
 ABOUT = 0.3  # [m] of a match, within which a mean is that of its draws
+OFTEN, SELDOM = 10, 5  # scans in a row that do not fit, after which only every so many is tried at other places
 CERTAIN = 0.98  # share of the belief of a hypothesis that stands alone
 
 
@@ -77,6 +78,7 @@ class Localiser:
         self.covariance = self._held = np.diag(np.asarray(sigma, dtype=np.float64) ** 2)
         self.iterations, self.refused = 0, ""
         self._believed: list[Hypothesis] = []
+        self._misses = 0
         self._sure = sure
         self._rng = np.random.default_rng(0)
         self._map, self._skew = distance_map, np.zeros((3, 3))
@@ -118,7 +120,7 @@ class Localiser:
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew at a pose (3,), believed with ``sigma`` (3,)."""
-        self.pose, self._believed = pose.copy(), []
+        self.pose, self._believed, self._misses = pose.copy(), [], 0
         self.covariance = self._held = np.diag(sigma**2)
 
     def predict(self, u: Array, dt: float) -> None:
@@ -138,18 +140,23 @@ class Localiser:
             self.refused = "too few beams"
             return
         kept = self.pose, self.covariance, self._held
-        if self._believed or not self._is_sure():
+        elsewhere, self._misses = self._misses < OFTEN or not self._misses % SELDOM, self._misses + 1
+        if elsewhere and (self._believed or not self._is_sure()):
             self.spread_out(scan)
             if explained(self._map, scan, self.pose).share >= FITS:
+                self._misses = 0
                 return
             (self.pose, self.covariance, self._held), self._believed = kept, []
         corrected, held = self._solve(scan, self.pose, self._held, lidar.DROP_BEYOND)
         if not float(np.hypot(*(corrected - self.pose)[:2])) <= LARGEST_JUMP:
             self.refused = "it would move the estimate by more than the wheels can be wrong"
             return
-        if explained(self._map, scan, corrected).share < FITS:
+        if explained(self._map, scan, corrected).share >= FITS:
+            self._misses = 0
+        elif elsewhere:
             self.spread_out(scan, [Hypothesis(self.pose, self.covariance + ASTRAY)])
             if explained(self._map, scan, self.pose).share >= FOUND:
+                self._misses = 0
                 return
             self._believed = []  # a map that is wrong fits somewhere a little better, too
         seen = scan_covariance(self._map, scan, corrected) + self._skew
