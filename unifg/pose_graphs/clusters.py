@@ -361,9 +361,11 @@ class Map:
     ) -> tuple[Array, Array, Array, Array]:
         """Statistics of groups of measurements whose residuals an error in common moves by ``shift``."""
         own, held, pull = self.innovations.common(rows, shift, starts)
-        lengths, axes = np.linalg.eigh(own)
+        diagonal = np.einsum("cii->ci", own)
+        by = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))  # so that the unit of length decides nothing
+        lengths, axes = np.linalg.eigh(own * by[:, :, None] * by[:, None, :])
         seen = lengths > UNCHECKED * lengths[:, -1:]
-        unit = np.where(seen, 1.0 / np.sqrt(np.where(seen, lengths, 1.0)), 0.0)[:, None, :] * axes
+        unit = np.where(seen, 1.0 / np.sqrt(np.where(seen, lengths, 1.0)), 0.0)[:, None, :] * axes * by[:, :, None]
         share, inner = np.linalg.eigh(np.swapaxes(unit, 1, 2) @ held @ unit)
         pulled = np.einsum("cia,ci->ca", unit @ inner, pull) ** 2
         free = 1.0 - share > UNCHECKED
