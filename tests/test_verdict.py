@@ -155,6 +155,22 @@ def test_the_unit_of_length_decides_nothing_where_headings_are_sure(unit: float)
     assert again.leverage == pytest.approx(found.leverage, abs=1e-6)
 
 
+def test_nothing_is_claimed_of_clusters_where_an_unknown_is_not_determined() -> None:
+    """One more pose, whose heading nobody has measured, in a map with wrong closures."""
+    made = manhattan(300, 1)
+    dirty, _ = aliased(made.pose_graph, made.truth, 1, 1)
+    last, edges = len(dirty.poses) - 1, dirty.edges
+    seen = Edges(
+        np.array([last]), np.array([last + 1]), np.array([[1.0, 0.0, 0.0]]), np.diag([400.0, 400.0, 0.0])[None]
+    )
+    fields = ("first", "second", "measured", "information")
+    joined = Edges(*(np.concatenate([getattr(one, name) for one in (edges, seen)]) for name in fields))
+    poses = np.concatenate([solved(dirty).poses, made.truth[-1:]])
+    verdict = PoseGraph(np.arange(last + 2), poses, joined).verdict(effort="cheap")
+    assert verdict.weak == (f"poses[{last + 1}]",) and not verdict.clusters and not verdict.ended
+    assert "no cluster" not in verdict.sentence() and "more may be contradicted" in verdict.sentence()
+
+
 def test_effort_decides_what_is_claimed() -> None:
     made = solved(manhattan(300, 1).pose_graph)
     cheap, full = made.verdict(effort="cheap"), made.verdict()

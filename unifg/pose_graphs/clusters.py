@@ -84,7 +84,7 @@ class Search:
             steps of odometry; "unsupported" closures, those first without which the map moves farthest.
         leverage: (m,) of the cluster of each edge; that of odometry is zero.
         weak: names of unknowns of which less than five digits are known.
-        ended: False where more may be contradicted than was taken out.
+        ended: False where more may be contradicted than was taken out, or an unknown is not determined.
     """
 
     solved: PoseGraph
@@ -111,7 +111,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     closures = ~edges.odometry & (edges.first != edges.second)
     now = Map(pose_graph, active, residual)
     solved, weak, maps = now.graph, now.weak(), {active.tobytes(): (now.graph, now.chi2)}
-    ended, clusters = True, list[Suspect]()
+    ended, clusters = now.innovations.determined, list[Suspect]()
     taken: list[list[Suspect]] = []
     while now.innovations.determined:
         clusters = now.suspects(_clusters(edges, closures & active))

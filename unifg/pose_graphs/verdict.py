@@ -199,7 +199,7 @@ class Verdict:
             others were solved again without.
         leverage: (m,) of the cluster of each closure; zero for odometry and edges that do not count.
         weak: names of unknowns of which less than five digits are known.
-        ended: False where more may be contradicted than is listed.
+        ended: False where more may be contradicted than is listed, or an unknown is not determined: then none is.
         seconds: wall-clock time by part.
         left_out: number of edges that do not count, such as those that a robust loss has rejected.
         closures: number of loop closures that count, and a bound on the number of which every two are consistent with
@@ -267,7 +267,7 @@ class Verdict:
             if found:
                 listed = ", ".join([*(one.sentence() for one in named), *([more] if more else [])])
                 said.append(text.format(listed))
-        if not self.clusters:
+        if not self.clusters and self.ended:
             said.append("no cluster of closures is contradicted or without support")
         if not self.ended:
             said.append("more may be contradicted: solve with a robust loss")
