@@ -14,7 +14,7 @@ import unifg as fg
 from problems.closures import aliased
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o, write_g2o
-from unifg.pose_graphs import PoseGraph, Sightings, bearing_range, from_smoother, judge, manhattan, sphere
+from unifg.pose_graphs import PoseGraph, Sightings, bearing_range, from_smoother, judge, manhattan, sighting, sphere
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, BoolArray
 
@@ -130,6 +130,20 @@ def test_landmarks_and_priors_come_along() -> None:
     assert graph.chi2() == pytest.approx(2.0 * smoother.cost, abs=1e-6)
     verdict = graph.verdict(effort="cheap", used=used)
     assert verdict.judgement.freedom == 3 * 5 + 3 * 2 + 2 * 6 - 3 * 6 - 2 and not verdict.clusters
+
+
+def test_the_pose_of_an_only_prior_is_known_and_no_landmark_is(tmp_path: Path) -> None:
+    smoother = fg.Incremental()
+    x, marks = smoother.variables("x", fg.SE2), smoother.variables("marks", fg.Rn(2))
+    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=1e-3)
+    smoother.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.0], sigma=0.1)
+    smoother.minimize(sighting, x[[0, 0, 1, 1]], marks[[0, 1, 0, 1]], [[1, 1], [2, 1], [0, 1.1], [1, 1]], sigma=0.1)
+    smoother.update({x: [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], marks: [[1.0, 1.0], [2.0, 1.0]]}, iterations=3)
+    graph, _ = from_smoother(smoother)
+    assert graph.fixed_ids == (0,) and judge(graph).freedom == 3 + 4 * 2 - 3 - 2 * 2
+    assert [len(held) for held in graph.anchors()] == [1, 0]
+    write_g2o(tmp_path / "map.g2o", graph)
+    assert np.array_equal(read_g2o(tmp_path / "map.g2o").landmarks, graph.landmarks)
 
 
 def own(pose: Array, place: Array) -> Array:

@@ -25,10 +25,10 @@ def from_smoother(smoother: Incremental) -> tuple[PoseGraph, BoolArray]:
     """Pose graph of what a smoother holds, and which of its edges count.
 
     ``graph.verdict(used=used)`` judges the map. Poses and landmarks are those of least squares, to which one or two
-    Gauss-Newton steps lead from the estimates. Identifiers are members, edges are in the order in which they were
-    stated. Edges that revocable decisions leave out do not count; sightings and priors that they leave out are not in
-    the graph. A prior that is the only one says nothing but where the map lies: the graph has a known pose in its
-    place.
+    Gauss-Newton steps lead from the estimates. Identifiers of poses are members, those of landmarks go on after them.
+    Edges are in the order in which they were stated. Those that revocable decisions leave out do not count; sightings
+    and priors that they leave out are not in the graph. A prior that is the only one says nothing but where the map
+    lies: the graph has a known pose in its place.
 
     Args:
         smoother: with one family of poses in SE2 or SE3, at most one of landmarks, and `between` for pairs of poses,
@@ -86,8 +86,8 @@ def from_smoother(smoother: Incremental) -> tuple[PoseGraph, BoolArray]:
             sightings[kind] = Sightings(ends[:, 0], ends[:, 1], measured, information)[kept]
     landmarks = np.zeros((0, points.dim)) if places is None else smoother.estimate(places, best=True)
     graph = PoseGraph(
-        np.arange(x.count), smoother.estimate(x, best=True), edges, np.arange(len(landmarks)), landmarks, sightings,
-        fixed, priors=priors,
+        np.arange(x.count), smoother.estimate(x, best=True), edges, x.count + np.arange(len(landmarks)), landmarks,
+        sightings, fixed, priors=priors,
     )  # fmt: skip
     counting = replace(graph, edges=edges[used])
     stated, poses, guess = counting.graph()
