@@ -13,11 +13,12 @@ import pytest
 import unifg as fg
 from unifg.errors import BackendError, GraphError
 from unifg.files.g2o import read_g2o
-from unifg.pose_graphs import Edges, PoseGraph, best_guess, certify, chordal, judge, manhattan, sphere
+from unifg.pose_graphs import Edges, PoseGraph, Priors, best_guess, certify, chordal, judge, manhattan, sphere, starts
 from unifg.pose_graphs.certificate import _Judge, _measured_in
 from unifg.pose_graphs.descent import Descent
 from unifg.pose_graphs.generate import Simulated
 from unifg.pose_graphs.information import bounded_below
+from unifg.pose_graphs.pose_graph import ResidualName
 from unifg.pose_graphs.relaxation import Relaxation
 from unifg.solvers import DogLeg, GaussNewton, LevenbergMarquardt
 from unifg.typing import Array
@@ -450,6 +451,16 @@ def test_the_start_that_costs_least_is_taken() -> None:
     loss = fg.TruncatedLeastSquares(3.0)
     assert chordal(made.pose_graph) != pytest.approx(made.truth)
     assert best_guess(truth, loss=loss)[0] == "file"  # outliers have no say in what the truth costs
+
+
+@pytest.mark.parametrize("residual", ["log", "g2o"])
+def test_starts_are_compared_by_the_residual_that_was_asked_for(residual: ResidualName) -> None:
+    """Priors of poses have it as well."""
+    made = sphere(4, 6).pose_graph
+    far = Priors(np.array([3, 9]), made.poses[[9, 3]], np.tile(np.eye(6), (2, 1, 1)))
+    held = replace(made, priors={"pose": far})
+    for start in starts(held, residual):
+        assert start.chi2 == pytest.approx(held.with_poses(start.poses).chi2(residual), rel=1e-12)
 
 
 def test_residuals_are_held_against_what_was_stated() -> None:

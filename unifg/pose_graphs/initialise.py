@@ -64,7 +64,7 @@ def starts(pose_graph: PoseGraph, residual: ResidualName = "log", loss: Loss | N
     closures = ~pose_graph.edges.odometry
 
     def start(name: str, moved: PoseGraph) -> Start:
-        squared, seen = moved.squared_errors(residual), moved.seen_chi2()
+        squared, seen = moved.squared_errors(residual), moved.seen_chi2(residual)
         chi2 = float(squared.sum()) + seen
         if loss is None:
             return Start(name, moved.poses, moved.landmarks, chi2, chi2)
