@@ -283,6 +283,8 @@ def looped(x: Array, y: Array) -> Array:
     [
         ({"revocable": 0.0}, "positive and finite; found 0.0"),
         ({"revocable": np.inf}, "positive and finite"),
+        ({"revocable": [3.0, 4.0]}, r"term 'closure': revocable must be a number, found \[3.0, 4.0\]"),
+        ({"revocable": True}, "term 'closure': revocable must be a number, found True"),
         ({"robust": fg.Huber(1.0)}, "leave robust out"),
         ({"function": looped}, "term 'odd': a revocable factor needs a function that can be traced"),
     ],
