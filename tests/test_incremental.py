@@ -255,7 +255,8 @@ def test_a_residual_that_is_not_finite_is_no_estimate(smoother: Any, error: Any)
     live.minimize(fg.prior, y[0], [0.0], sigma=1.0)
     live.update({y: [0.0]})
     live.minimize(error, y[0], sigma=1.0)
-    with pytest.raises(GraphError, match=r"y\[0\] cannot be found: a residual or its Jacobian is not finite"):
-        live.update()
-    with pytest.raises(GraphError, match="the last update failed"):
-        live.covariance(y[0])
+    for _ in range(2):  # it stays so
+        with pytest.raises(GraphError, match=r"y\[0\] cannot be found: a residual or its Jacobian is not finite"):
+            live.update()
+        with pytest.raises(GraphError, match="the last update failed"):
+            live.covariance(y[0])

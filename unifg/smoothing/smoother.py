@@ -229,7 +229,7 @@ class Smoother:
                 have passed on; takes time proportional to the tree above the members, and changes nothing.
 
         Raises:
-            GraphError: when a member has no value, or was marginalised, or the last update failed.
+            GraphError: when a member has no value, or was marginalised; with ``best``, also if the last update failed.
         """
         if not best:
             return self._values(variable, False)
@@ -304,7 +304,8 @@ class Smoother:
             )
             self._move(None, numbers)
             family.grow(out)
-        fresh = [np.zeros(0, dtype=np.int64)]
+        before = self._state.counters["failed"]  # a variable, if the last update failed
+        fresh = [before[before >= 0].astype(np.int64)]
         for item in self._staged:
             touched = _touched(item)
             fresh.append(touched.ravel())
