@@ -120,6 +120,25 @@ def manifolds() -> tuple[Manifold, ...]:
     return fg.Product(p=fg.Rn(3), R=fg.SO3, v=fg.Rn(3)), fg.SE2, fg.Rn(2), fg.SE3, fg.SE23, fg.SO2
 
 
+@pytest.mark.parametrize(
+    ("leaving", "staying", "said"),
+    [
+        ([0, 1], [1, 2], r"x\[1\] is named twice: it leaves, once, or it stays"),
+        ([0, 1, 0], [2], r"x\[0\] is named twice"),
+        ([0, 1], [], "name at least one variable that leaves, and one that stays"),
+        ([], [2], "name at least one variable that leaves, and one that stays"),
+    ],
+)
+def test_a_variable_leaves_or_stays(leaving: list[int], staying: list[int], said: str) -> None:
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(1), 3)
+    graph.minimize(fg.prior, x[0], [0.0], sigma=1.0, name="prior")
+    graph.minimize(fg.between, x[:-1], x[1:], [1.0], sigma=1.0, name="between")
+    solution = GaussNewton().solve(graph, {x: np.zeros((3, 1))})
+    with pytest.raises(fg.GraphError, match=said):
+        solution.marginal_prior(["prior", "between"], [x[k] for k in leaving], [x[k] for k in staying])
+
+
 def test_a_joint_prior_is_priors_side_by_side(rng: np.random.Generator) -> None:
     kinds = manifolds()
     graph = fg.Graph()

@@ -133,9 +133,12 @@ def marginal_prior(
 
     Raises:
         GraphError: when the terms reach other variables, one of them is an inequality, ``remove`` is not determined,
-            or the constraints tie the kept variables to each other exactly.
+            or the constraints tie the kept variables to each other exactly; when nothing leaves or stays, or something
+            leaves twice, or stays as well.
     """
     leaving, staying = _selections(remove), _selections(keep)
+    if not (leaving and staying):
+        raise GraphError("marginal_prior: name at least one variable that leaves, and one that stays")
     terms = [terms] if isinstance(terms, str) else terms  # a name is no list of letters
     removal = _removal(program, tuple(terms), leaving, staying)
     r = lin.residual[removal.costs.rows]
@@ -202,6 +205,9 @@ def _analyse(
     gone = gone[program.columns.unknown[gone] >= 0]
     kept = np.concatenate([program.columns.of(selection).ravel() for selection in staying])
     columns = np.concatenate([gone, kept])
+    if (twice := np.bincount(columns, minlength=1)[gone] > 1).any():
+        family, index = program.columns.name(int(gone[np.argmax(twice)]))
+        raise GraphError(f"{family}[{index}] is named twice: it leaves, once, or it stays", family=family, index=index)
     slices = dict(zip([term.name for term in program.constraint_terms], program.slices, strict=True))
     constrained = np.zeros(program.constraints.count, dtype=bool)
     for name in terms:
