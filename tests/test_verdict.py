@@ -93,6 +93,21 @@ def test_clusters_that_the_rest_contradicts_are_named(count: int, spatial: bool)
     assert not kept.of("contradicted")
 
 
+def test_maps_without_a_cluster_are_those_of_the_others() -> None:
+    """Least squares from a map that wrong closures bend may end in a fold; what was suspected in vain counts again."""
+    made = manhattan(400, 1)
+    dirty, (fault,) = aliased(made.pose_graph, made.truth, 1, 1)
+    found = solved(dirty).verdict(effort="cheap").clusters
+    assert [one.kind for one in found] == ["contradicted", "unsupported"] and np.array_equal(found[0].edges, fault)
+    left = [fault, np.concatenate([fault, found[1].edges])]
+    for one, out in zip(found, left, strict=True):
+        others = np.ones(len(dirty.edges), dtype=bool)
+        others[out] = False
+        _, chi2 = optimum(dirty.with_poses(made.truth), others)
+        assert one.chi2 is not None and one.chi2[0] > one.chi2[1] == pytest.approx(chi2, rel=1e-3)
+    assert found[1].moved is not None and found[1].moved[0] < 1.0 and found[1].moved[1] < 0.1
+
+
 def test_a_cluster_that_nothing_else_reaches_is_unsupported() -> None:
     dirty, (fault,) = adrift(drive(1200, 2), 2)
     assert found(fault, "unsupported", dirty)

@@ -162,6 +162,10 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
                 contradicted.append(replace(first, edges=group, alike=group, fall=innovation))
                 contradicted += [one for one in others if not out[one.edges].any() and one.fall > limit]
         if (active & out).any():
+            contradicted, slipped = (
+                [replace(one, before=one.before[~active[one.before]]) for one in each]
+                for each in (contradicted, slipped)
+            )
             now = Map(now.graph, active, residual)
             maps[active.tobytes()] = now.graph, now.chi2
     named = np.concatenate([np.zeros(0, dtype=np.intp), *(one.edges for one in contradicted)])
@@ -196,7 +200,7 @@ class Partial:
     def __init__(self, pose_graph: PoseGraph, residual: ResidualName) -> None:
         """State it."""
         self.graph = pose_graph
-        self._stated, self._x, self._guess = pose_graph.graph(residual=residual)
+        self._stated, self._x, _ = pose_graph.graph(residual=residual)
         self._counting: list[tuple[Data, BoolArray]] = []
         for name in ("odometry", "closures"):
             chosen = pose_graph.edges.odometry == (name == "odometry")
@@ -205,10 +209,12 @@ class Partial:
                 self._stated.replace(name, active=used)
                 self._counting.append((used, chosen))
 
-    def optimum(self, active: BoolArray) -> tuple[PoseGraph, float]:
-        """Minimum of plain squares of some edges (m,), to within 1e-5 of chi2, and chi2 there."""
+    def optimum(self, active: BoolArray, start: PoseGraph) -> tuple[PoseGraph, float]:
+        """Minimum of plain squares of some edges (m,) near a start, to within 1e-5 of chi2, and chi2 there."""
         data = {used: active[chosen] for used, chosen in self._counting}
-        solution, solved = _solved(self.graph, self._stated, self._x, self._guess, data)
+        places = [start.poses, start.landmarks]
+        guess = dict(zip(self._stated.families.values(), places, strict=False))
+        solution, solved = _solved(self.graph, self._stated, self._x, guess, data)
         return solved, 2.0 * solution.cost
 
 

@@ -88,13 +88,14 @@ def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[
     partial: Partial | None = None
 
     def solved(left_out: IntArray) -> tuple[BoolArray, PoseGraph, float]:
-        """Edges that are left, their map, and its chi2."""
+        """Edges that are left, their map, and its chi2; from a bent map least squares may find another minimum."""
         nonlocal partial
         mask = np.ones(count, dtype=np.bool_)
         mask[left_out] = False
-        if mask.tobytes() not in found.maps:
+        near = min(found.maps.values(), key=lambda one: replace(one[0], edges=one[0].edges[mask]).chi2(residual))
+        if len(left_out) and near is not found.maps.get(mask.tobytes()):
             partial = partial or Partial(found.solved, residual)
-            found.maps[mask.tobytes()] = partial.optimum(mask)
+            found.maps[mask.tobytes()] = partial.optimum(mask, near[0])
         return mask, *found.maps[mask.tobytes()]
 
     clusters: list[Cluster] = []
