@@ -426,6 +426,12 @@ def test_edges_without_information_say_nothing(name: str) -> None:
         chordal(nothing)
 
 
+@pytest.mark.parametrize("tolerance", [-1.0, np.nan])
+def test_a_tolerance_below_zero_is_refused(tolerance: float) -> None:
+    with pytest.raises(GraphError, match=f"the tolerance must not be negative, found {tolerance}"):
+        certify(ring(6, 1), tolerance=tolerance)
+
+
 def test_odd_graphs_are_certified_rightly() -> None:
     loop = solved(ring(20, 1))
     for fixed in ((7,), (0,)):
@@ -481,6 +487,20 @@ def test_residuals_are_held_against_what_was_stated() -> None:
     assert odd.parts == 2 and odd.anchors == (0, 20)
     said = " ".join(odd.sentences())
     assert all(word in said for word in ("20", "place 3", "place 5", "2 parts", "not determined"))
+
+
+def test_poses_that_are_no_numbers_and_edges_of_no_pose_are_named() -> None:
+    graph = ring(6, 1)
+    lost = graph.poses.copy()
+    lost[3] = np.nan
+    far = replace(graph.edges, second=graph.edges.second + np.array([0, 0, 6, 0, 0, 0]))
+    for wrong, said in (
+        (graph.with_poses(lost), "edge 2: r' Omega r is not finite"),
+        (replace(graph, edges=far), "an edge, number 2, names position 9"),
+    ):
+        for judged in (judge, PoseGraph.verdict):
+            with pytest.raises(GraphError, match=said):
+                judged(wrong)
 
 
 def test_worst_edges_are_named() -> None:

@@ -56,9 +56,11 @@ def certify(
         residual: by which a better map is looked for; the interval is that of the logarithm.
 
     Raises:
-        GraphError: the graph has landmarks, several poses of one part are known, or `used` is something else than one
-            truth value for each edge.
+        GraphError: the graph has landmarks, several poses of one part are known, the tolerance is negative, or `used`
+            is something else than one truth value for each edge.
     """
+    if not tolerance >= 0.0:
+        raise GraphError(f"the tolerance must not be negative, found {tolerance}")
     chosen = None if used is None else require_one_for_each(pose_graph, used)
     # Weights of positions and of frames are added up below: the unit of length is the graph's own, not the file's.
     unit = _length(pose_graph, chosen)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from unifg.errors import GraphError
 from unifg.pose_graphs.information import indefinite
 from unifg.pose_graphs.pose_graph import PoseGraph, Priors, ResidualName, Sightings
 from unifg.pose_graphs.verdict import NAMED, Judgement
@@ -26,9 +27,12 @@ def judge(pose_graph: PoseGraph, residual: ResidualName = "log") -> Judgement:
         residual: as for `PoseGraph.graph`.
 
     Raises:
-        GraphError: there is no measurement.
+        GraphError: there is no measurement, one is of a pose that there is not, or chi2 is not finite.
     """
+    parts = pose_graph.parts()
     squared = pose_graph.squared_errors(residual)
+    if not np.isfinite(squared).all():
+        raise GraphError(f"edge {int(np.argmin(np.isfinite(squared)))}: r' Omega r is not finite at these poses")
     order = np.argsort(-squared, kind="stable")[:NAMED]
     order = order[squared[order] > 0.0]
     edges, ids = pose_graph.edges, pose_graph.ids
@@ -51,7 +55,7 @@ def judge(pose_graph: PoseGraph, residual: ResidualName = "log") -> Judgement:
         rows - unknown,
         np.stack([ids[edges.first[order]], ids[edges.second[order]]], axis=1),
         squared[order],
-        int(pose_graph.parts().max(initial=-1)) + 1,
+        int(parts.max(initial=-1)) + 1,
         tuple(added.tolist()),
         tuple(ids[~touched].tolist()),
         np.flatnonzero(greatest == 0.0),
