@@ -145,6 +145,13 @@ def test_what_is_missing_is_named_and_may_be_added_later() -> None:
             lambda s, x, y, v: s.minimize(fg.between, x[[0, 1]], x[[1, 2, 3]], np.zeros(3), sigma=1.0),
             "number of factors is unclear",
         ),
+        (
+            lambda s, x, y, v: s.minimize(fg.prior, x[0], np.zeros(3), sigma=1.0, robust=1.0),
+            "robust= must be a loss such",
+        ),
+        (lambda s, x, y, v: s.minimize(fg.prior, x[0], np.zeros(3), sigma=1.0, robust=fg.Huber), "must be a loss such"),
+        (lambda s, x, y, v: s.update({x: np.zeros(3)}, iterations=0), "iterations must be at least 1, found 0"),
+        (lambda s, x, y, v: s.update({x: np.zeros(3)}, iterations=2.5), "iterations must be a whole number, found 2.5"),
         (lambda s, x, y, v: s.variables("x", fg.SE3), "exists already"),
         (lambda s, x, y, v: s.update({x: [0.0, np.inf, 0.0]}), r"x\[0\].*not on SE2"),
         (lambda s, x, y, v: s.update({x: [0.0, 0.0]}), r"have shape \(2,\)"),

@@ -43,7 +43,7 @@ from unifg.modeling.variables import (
     is_variable,
     undeclared,
 )
-from unifg.modeling.weights import check_limits, check_weights, placed
+from unifg.modeling.weights import check_limits, check_weights, placed, require_loss
 from unifg.typing import Array, ArrayLike, IntArray
 
 AnyResidual: TypeAlias = (
@@ -427,10 +427,7 @@ class Model:
                 raise GraphError(f"term '{name or title(function)}': give sigma or information, not both", term=name)
             parts = self._begun(name, function, arguments, active, replaced)
             unique = parts["name"]
-            if robust is not None and (isinstance(robust, type) or not hasattr(robust, "weight")):
-                raise GraphError(
-                    f"term '{unique}': robust= must be a loss such as fg.Huber(1.345), found {robust!r}", term=unique
-                )
+            require_loss(unique, robust)
             weights = check_weights(unique, sigma, information, parts["count"], parts["size"])
             if isinstance(function, ManifoldResidual) and sigma is not None:  # both in tangent coordinates
                 first = next(argument for argument in parts["arguments"] if isinstance(argument, Selection))

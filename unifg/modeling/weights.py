@@ -53,6 +53,16 @@ def check_weights(
     return sigma, information
 
 
+def require_loss(name: str, robust: object) -> None:
+    """See that a loss is one.
+
+    Raises:
+        GraphError: naming the term, when it is not.
+    """
+    if robust is not None and (isinstance(robust, type) or not hasattr(robust, "weight")):
+        raise GraphError(f"term '{name}': robust= must be a loss such as fg.Huber(1.345), found {robust!r}", term=name)
+
+
 def check_limits(
     name: str, lower: ParameterLike, upper: ParameterLike, count: int, size: int
 ) -> tuple[Parameter, Parameter]:

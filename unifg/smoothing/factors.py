@@ -29,6 +29,7 @@ from unifg.modeling.model import AnyResidual, complete
 from unifg.modeling.probing import rows_of
 from unifg.modeling.terms import Cost, Parameter, prepare_arguments
 from unifg.modeling.variables import Data, Family, ParameterLike, Selection, undeclared
+from unifg.modeling.weights import require_loss
 from unifg.problem.columns import Columns
 from unifg.problem.term import CompiledTerm
 from unifg.problem.traced import Trace, reach_of_value
@@ -174,6 +175,7 @@ class Types:
         name = given or wrapped.name
         if sigma is not None and information is not None:
             raise GraphError(f"term '{name}': give sigma or information, not both", term=name)
+        require_loss(name, robust)
         stated: tuple[Any, Any] = undeclared(name, "sigma", sigma, 2), undeclared(name, "information", information, 3)
         normal, rows, active, count = prepare_arguments(name, arguments, active)
         normal = on_manifolds(name, wrapped, normal, active)

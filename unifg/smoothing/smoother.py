@@ -291,6 +291,10 @@ class Smoother:
     @synchronized
     def _update(self, values: Mapping[GrowingFamily, Numbers] | None, time: float | None, iterations: int) -> None:
         """Take in new members and staged factors, then bring everything up to date."""
+        if type(iterations) is not int or iterations < 1:
+            require_kinds("update", GraphError, {"iterations": "int"}, {"iterations": iterations})
+            if iterations < 1:
+                raise GraphError(f"update: iterations must be at least 1, found {iterations}")
         new = [self._checked(family, value) for family, value in values.items()] if values else []
         if self._staged:
             self._admit({family: len(array) for family, array in new})
