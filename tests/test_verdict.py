@@ -121,6 +121,15 @@ def test_the_only_closure_between_two_drives_is_said_to_hold_the_map_together() 
     assert "(without, the map falls apart, and chi2" in verdict.of("unsupported")[0].sentence()
 
 
+def test_closures_that_are_all_there_is_are_unsupported() -> None:
+    ends, there = np.array([[0, 0], [2, 2]]), np.array([2.0, 0.0, 0.0])
+    edges = Edges(ends[0], ends[1], np.array([there, 1.01 * there]), np.tile(100.0 * np.eye(3), (2, 1, 1)))
+    verdict = solved(PoseGraph(np.arange(3), np.zeros((3, 3)), edges)).verdict(effort="cheap")
+    (found,) = verdict.of("unsupported")
+    assert found.edges.tolist() == [0, 1] and np.isinf(found.deviations) and found.moved is None
+    assert "nothing else supports 2 closures of 0 with 2;" in verdict.sentence()
+
+
 def test_a_slip_is_not_laid_on_closures() -> None:
     made = manhattan(600, 4).pose_graph
     verdict = solved(slipped(made, 200, np.array([2.0, 0.0, 0.1]))).verdict(effort="cheap")

@@ -104,9 +104,10 @@ def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[
             ends = np.sort(np.stack([judged.edges.first, judged.edges.second])[:, suspect.alike], axis=0)
             stretches = judged.ids[np.stack([ends.min(axis=1), ends.max(axis=1)], axis=1)]
             cluster = Cluster(kind, suspect.alike, stretches, suspect.fall, suspect.leverage, suspect.moved)
-            if len(clusters) < NAMED:
+            out = np.concatenate([suspect.before, suspect.edges])
+            if len(clusters) < NAMED and (len(out) < count or judged.sightings or judged.priors):
                 _, here, _ = solved(suspect.before)
-                others, there, chi2 = solved(np.concatenate([suspect.before, suspect.edges]))
+                others, there, chi2 = solved(out)
                 apart = np.linalg.norm(judged.group.local(here.poses, there.poses)[:, dim:], axis=1)
                 away = np.linalg.norm(here.poses[:, :dim] - there.poses[:, :dim], axis=1)
                 moved = float(away.max()), float(apart.max())

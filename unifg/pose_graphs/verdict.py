@@ -148,7 +148,7 @@ class Cluster:
         deviations: standard deviations by which the map moves where their error is free, in its own measure; infinite
             where it falls apart. Steps of odometry have none.
         moved: greatest distance [m] and turn [rad] by which poses move in the map that was solved again without them,
-            and without what is contradicted more than they are; None where that was not done.
+            and without what is contradicted more than they are; None where that was not done, or nothing is left.
         chi2: of the others, with them and without; None likewise.
         sightings: of a survey, their kind and (k,) positions; else None.
     """
