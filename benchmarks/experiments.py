@@ -183,7 +183,7 @@ def together(drives: pd.DataFrame, seconds: float) -> str:
     say = [f"{len(drives)} drives, {many} of each leg and coupling in the tables (the paper: {RUNS} of each leg)."]
     spreads = relative(succeeded(drives)).dropna()
     if len(spreads):
-        section = partial(numbers, "bazzana", "section VII-B")
+        section = partial(numbers, "bazzana", "section VII-C")
         (mean, mean_ros), (mean_s, mean_s_ros) = section("mean_spread_length"), section("mean_spread_duration")
         (top, top_s), (top_ros, top_s_ros) = section("greatest_spread"), section("greatest_spread_ros")
         say.append(
@@ -196,7 +196,7 @@ def together(drives: pd.DataFrame, seconds: float) -> str:
     say.append(
         f"{simulated / 3600.0:.2f} h were driven in {seconds / 3600.0:.2f} h of a processor, "
         f"{simulated / max(seconds, 1e-9):.1f} times real time (the paper: "
-        f"{numbers('bazzana', 'section VII-B', 'hours')[0]:g} h for Table I)."
+        f"{numbers('bazzana', 'section VII-C', 'hours')[0]:g} h for Table I)."
     )
     return " ".join(say)
 

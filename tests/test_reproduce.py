@@ -235,6 +235,17 @@ def test_legs_are_compared_with_their_own_column(tmp_path: Path, monkeypatch: py
     assert found.runs.startswith("Runs of each leg: 4 to 5, 32 of 33 succeeded. Runs of each leg, lagging and slipping")
 
 
+def test_the_mean_deviation_of_the_department_is_no_number_of_the_factory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    factory = drives(4)[lambda found: found["leg"].isin(["AB", "BC", "CD", "DE"])]
+    monkeypatch.setattr(bazzana, "driven", lambda *given: factory)
+    lines = {line.what: line for line in bazzana.table_ii(effort(tmp_path)).lines}
+    for what in ("length", "duration"):
+        line = lines[f"deviation of {what}, mean of legs [%]"]
+        assert line.paper == line.difference == "-" and line.ours != "-"
+
+
 @pytest.mark.parametrize("quick", [True, False])
 def test_a_quick_campaign_is_a_part_of_the_whole_one(
     quick: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
