@@ -17,7 +17,7 @@ from unifg.errors import ViewError
 from unifg.scenarios.commands.drives import summary
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.scenes import drive_plot
-from unifg.scenarios.scenes.drive_plot import overview, plot_localisation
+from unifg.scenarios.scenes.drive_plot import overview, plot_controls, plot_localisation
 from unifg.scenarios.scenes.drive_scene import drive_scene
 from unifg.scenarios.scenes.panels import plot_times
 from unifg.scenarios.scenes.parts import lidar_hits
@@ -275,6 +275,20 @@ def test_times_stand_on_a_logarithmic_axis_and_ticks_that_compiled_are_marked(lo
     (marks,) = [line for line in drawn(marked).get_lines() if line.get_label() == "compiled"]
     np.testing.assert_array_equal(np.asarray(marks.get_xdata()), log.time[[2]])
     np.testing.assert_array_equal(np.asarray(marks.get_ydata()), log.solve_ms[[2]])
+
+
+def test_the_time_per_tick_is_that_of_the_whole_tick(log: EpisodeLog) -> None:
+    slow = replace(log, perceive_ms=log.perceive_ms + 70.0)
+    panel = overview(slow).subfigs[1].axes[-1]
+    assert panel.get_title(loc="left").startswith(f"Time per tick: median {np.median(slow.tick_ms):.1f} ms")
+    assert [line.get_label() for line in panel.get_lines()][:2] == ["all", "localise"]
+
+
+def test_the_speed_sideways_of_a_base_that_slides_is_named(log: EpisodeLog) -> None:
+    control = np.column_stack([log.control[:, 0], log.control])
+    speed, turning = Figure().subplots(2)
+    plot_controls(replace(log, base="omnidirectional", control=control, control_limits=(1.0, 1.0, 1.0)), speed, turning)
+    assert [text.get_text() for text in speed.get_legend().get_texts()] == ["forward", "sideways"]
 
 
 def test_plotted_error_is_the_error(log: EpisodeLog) -> None:

@@ -20,7 +20,7 @@ _DOTS = 200  # along the way of the wheels
 
 
 def overview(log: EpisodeLog) -> Figure:
-    """The map on the left; errors, controls, clearance and solve times over time on the right.
+    """The map on the left; errors, controls, clearance and times of ticks over time on the right.
 
     Raises:
         ViewError: the drive has no tick.
@@ -33,7 +33,7 @@ def overview(log: EpisodeLog) -> Figure:
         plot_localisation(log, panels[0])
         plot_controls(log, panels[1], panels[2])
         plot_clearance(log, panels[3])
-        plot_times(log, log.solve_ms, {"localise": (log.localise_ms, "estimate")}, panels[4])
+        plot_times(log, log.tick_ms, {"localise": (log.localise_ms, "estimate")}, panels[4])
         panels[-1].set_xlabel("time [s]")
         right.align_ylabels(panels)
         headline(figure, _title(log))
@@ -88,10 +88,12 @@ def plot_controls(log: EpisodeLog, speed: Axes, turning: Axes) -> None:
     names = (("v [m/s]", "Forward speed and its limits"), turn)
     style = {"color": css("robot"), "lw": 1.1, "drawstyle": "steps-post"}
     for ax, column, (label, title) in zip((speed, turning), (0, -1), names, strict=True):
-        limit, curves = log.control_limits[column], [(log.control[:, column], style)]
+        limit, curves = log.control_limits[column], [(log.control[:, column], {**style, "label": "forward"})]
         if column == 0 and log.control.shape[1] > 2:
             curves.append((log.control[:, 1], {**style, "color": css("estimate"), "label": "sideways"}))
         over_time(log, ax, title, label, curves, levels=(-limit, limit), bounds=(-1.18 * limit, 1.18 * limit))
+        if len(curves) > 1:
+            ax.legend(loc="upper right", ncols=2, borderpad=0.0)
     shade_trouble(speed, log.dt, log.health, log.cause, "Forward speed")
     if float(log.control[:, :-1].min()) >= 0.0:  # it never reversed: show the half that was used
         speed.set_ylim(bottom=-0.08 * log.control_limits[0])

@@ -153,7 +153,7 @@ def plot_times(log: Any, total: Array, parts: Mapping[str, tuple[Array, str]], a
         parts: names to (T,) [ms] and colour.
         ax: axes to draw into.
     """
-    for name, (values, colour) in {"both": (total, "plan"), **parts}.items():
+    for name, (values, colour) in {"all": (total, "plan"), **parts}.items():
         if (values > 0.0).any():
             spent = np.where(values > 0.0, values, np.nan)
             ax.plot(log.time, spent, ".", color=css(colour), ms=3.6 if values is total else 2.4, label=name)
