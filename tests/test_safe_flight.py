@@ -33,6 +33,7 @@ from unifg.scenarios.quadrotor.situations import SITUATIONS, situation
 from unifg.scenarios.quadrotor.state_filter import StateFilter
 from unifg.scenarios.quadrotor.weighing import Weighing, WeighingSettings
 from unifg.scenarios.safe_flight import SafeFlight, SafeSettings, flights, run_safe_flights
+from unifg.scenarios.scenes.safe_scene import safe_scene
 from unifg.scenarios.simulation.body_rate import Airframe, BodyRatePlant
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.typing import Array
@@ -461,8 +462,8 @@ def judged(near: float, end: float) -> SafeLog:
     states = np.zeros((2, 10))
     states[:, 0] = end
     return SafeLog(
-        label="", settings={"case": "static"}, dt=0.01, hull=0.25, margin=0.05, radii=np.ones(1),
-        upright=np.zeros(1, dtype=bool), end=np.zeros(3), time=np.array([0.0, 0.01]), states=states,
+        label="", settings={"case": "static", "controller": "barrier"}, dt=0.01, hull=0.25, margin=0.05,
+        radii=np.ones(1), upright=np.zeros(1, dtype=bool), end=np.zeros(3), time=np.array([0.0, 0.01]), states=states,
         wanted=np.zeros((2, 6)), controls=np.zeros((2, 4)), plans=np.zeros((2, 1, 3)), bodies=np.zeros((2, 1, 3)),
         near=np.array([[1.0], [near]]), late=zero, slack=zero, mass=zero, drag=np.zeros((2, 3)), decide_ms=zero,
         steps=np.zeros(2, dtype=np.intp), statuses=["none", "none"],
@@ -483,3 +484,10 @@ def test_flights_are_judged(near: float, end: float, touched: bool, violated: bo
     log = judged(near, end)
     assert (log.touched, log.violated, log.succeeded) == (touched, violated, succeeded)
     assert safe_metrics(log)["min_clearance_m"] == pytest.approx(near - 0.25)
+
+
+def test_the_panel_of_a_scene_says_the_error_of_the_metrics() -> None:
+    log = judged(0.35, 0.2)
+    late = replace(log, time=np.array([0.0, 2.5]), wanted=np.array([[0.2, 0.0, 0.0, 0.0, 0.0, 0.0], np.zeros(6)]))
+    assert safe_metrics(late)["tracking_error_m"]["rms"] == pytest.approx(0.2)
+    assert safe_scene(late).facts["from the path"] == "20.0 cm rms"

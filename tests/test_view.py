@@ -452,6 +452,12 @@ def test_numbers_beside_plots_keep_their_zeros() -> None:
     assert found.stdout.split() == list(shown.values())
 
 
+def test_a_long_name_of_a_fact_leaves_its_text_room() -> None:
+    page = (Path(view.__file__).parent / "page.html").read_text(encoding="utf-8")
+    (columns,) = re.findall(r"\bdl \{[^}]*grid-template-columns: ([^;]*);", page)
+    assert columns == "fit-content(60%) 1fr"  # "auto" takes all but a letter of the panel
+
+
 @pytest.mark.parametrize("projection", [None, "3d"])
 def test_a_frame_is_drawn_on_axes_as_a_browser_would_be_sent_it(projection: str | None) -> None:
     from matplotlib.collections import PolyCollection

@@ -106,7 +106,7 @@ class SafeLog:
 
 
 def safe_metrics(log: SafeLog) -> dict[str, Any]:
-    """The numbers of a flight; only ``decide_ms`` depends on the clock."""
+    """The numbers of a flight; only ``decide_ms`` depends on the clock, and errors of tracking are those after 2 s."""
     late = log.error[log.time >= 2.0] if log.time[-1] > 2.0 else log.error
     free = not len(log.radii)
     return {

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from unifg.scenarios.logs.safe_log import SafeLog
+from unifg.scenarios.logs.safe_log import SafeLog, safe_metrics
 from unifg.scenarios.scenes.numbers import Number, declare, filled, show
 from unifg.scenarios.scenes.parts import CLEAR, draw_way, floor, pillar, vehicle
 from unifg.typing import Array
@@ -162,13 +161,13 @@ def _words(scene: Scene, log: SafeLog) -> None:
     words = "kept its distance" if not log.violated else "came TOO NEAR" if not log.touched else "TOUCHED something"
     arrived = "" if log.end is None else ", arrived" if log.arrived else ", did NOT arrive"
     stopped = ", interrupted by the user" if log.interrupted else ""
-    error = np.linalg.norm(log.error, axis=1)
+    error = safe_metrics(log)["tracking_error_m"]
     scene.outcome = (words if len(log.radii) else "nothing in the way") + arrived + stopped
     scene.good = log.succeeded
     scene.facts |= {
         "flight": log.label,
         "controller": str(log.settings["controller"]),
         "least boundary distance": f"{log.boundary.min():.3f} m" if len(log.radii) else "",
-        "from the path": f"{100.0 * math.sqrt(float(np.mean(error**2))):.1f} cm rms",
+        "from the path": f"{100.0 * error['rms']:.1f} cm rms",
         "decided in": f"{np.median(log.decide_ms):.2f} ms median",
     }
