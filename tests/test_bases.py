@@ -359,6 +359,8 @@ def test_help_shows_twelve_options_first_and_all_in_groups(capsys: pytest.Captur
 
 def test_a_flight_says_where_the_speed_asked_for_is_out_of_reach() -> None:
     settings = {"controller": {"guide": {"speed": 8.0, "acceleration": 2.0}}}
-    assert "of 8 asked for" in _short_of({"settings": settings, "max_speed_m_per_s": 5.0})
+    slow = {"settings": settings, "max_speed_m_per_s": 5.0, "reached": True}
+    assert " of 8 asked for: bends" in _short_of(slow)
+    assert _short_of({**slow, "reached": False}) == " of 8 asked for"  # what ended it may have kept it slow
     assert _short_of({"settings": settings, "max_speed_m_per_s": 7.9}) == ""
     assert _short_of({"settings": {}, "max_speed_m_per_s": 1.0}) == ""

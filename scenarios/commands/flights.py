@@ -83,12 +83,13 @@ def summary(log: FlightLog) -> str:
 
 
 def _short_of(m: Mapping[str, Any]) -> str:
-    """Words where the speed asked for was not reached."""
+    """Words where the speed asked for was not reached, with the reason in a flight that was flown to its target."""
     guide = m["settings"].get("controller", {}).get("guide", {})
     asked = guide.get("speed", 0.0)
     if m["max_speed_m_per_s"] >= REACHED * asked:
         return ""
-    return f" of {asked:g} asked for: bends and the way's length allow no more at {guide['acceleration']:g} m/s^2"
+    why = f": bends and the way's length allow no more at {guide['acceleration']:g} m/s^2" if m["reached"] else ""
+    return f" of {asked:g} asked for{why}"
 
 
 def _errors(errors: Mapping[str, float] | None, unit: str) -> str:
