@@ -125,7 +125,8 @@ class AugmentedLagrangian(Solver):
         lowest, since = np.inf, 0  # violation, and steps without a lower one
         while run.status is None:
             violation = run.optimality.violation
-            since = 0 if violation <= max(FALLING * lowest, run.tolerances.violation, KEPT) else since + 1
+            kept = max(run.tolerances.violation, KEPT)  # up to it there is nothing to be fallen below again
+            since = 0 if violation <= max(FALLING * lowest, kept) or 0.0 <= lowest <= kept else since + 1
             lowest = violation if since == 0 else lowest
             if since == STEADY:
                 logger.warning(

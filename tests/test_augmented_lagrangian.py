@@ -293,6 +293,21 @@ def test_a_constant_penalty_that_does_is_not_named_for_rounding(caplog: pytest.L
     assert not [record for record in caplog.records if "constant penalty" in record.getMessage()]
 
 
+def test_a_constant_penalty_that_does_is_not_named_after_a_guess_that_keeps_every_constraint(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """The violation jumps from nothing and falls from then on, here by a fourth a step."""
+    graph, x = graph_with(fg.Rn(1))
+    graph.minimize(fg.prior, x, [0.1])
+    graph.bound(x, lower=1.0)
+    backend = AugmentedLagrangian(schedule="bazzana-damped", penalty=0.3)
+    solution = backend.solve(graph, {x: [[2.0]]})
+    violations = np.array([row.violation for row in solution.history])
+    assert solution.converged and solution.iterations > 25 and violations[0] == 0.0 and np.ptp(violations[1:]) > 0.1
+    assert (np.diff(violations[1:]) < 0.0).all()
+    assert not [record for record in caplog.records if "constant penalty" in record.getMessage()]
+
+
 def test_the_damped_loop_that_cannot_move_says_so() -> None:
     graph, x = graph_with(fg.Rn(1))
     graph.minimize(fg.prior, x, [0.0])
