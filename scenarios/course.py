@@ -65,7 +65,7 @@ class CourseSettings(Settings):
             follows a shortest way around it, the only one that begins outside of obstacles in every layout, so that it
             is the default.
         general: state 1/d as a general cost (`minimize_scalar`) instead of as its least-squares twin. It is the same
-            objective, differentiated numerically; alm does not take it.
+            objective.
         seed: of a random layout; without one, the layout of the documentation.
         goal: weight of the distance to the target at each node [1/m^2].
         end: the same at the last node, in addition.
@@ -109,6 +109,12 @@ class CourseSettings(Settings):
     arrival: Positive[float] = 0.3
     vehicle: quadrotor.Parameters = field(default_factory=quadrotor.Parameters)
     tolerance: Positive[float] = 1e-6
+
+    def __post_init__(self) -> None:
+        """Check the fields; only a potential can be stated as a general cost."""
+        super().__post_init__()
+        if self.general and self.avoidance == "hard":
+            raise fg.ScenarioError("general: a general cost states the potential, and avoidance 'hard' has none")
 
     @property
     def chosen_hessian(self) -> Hessian:

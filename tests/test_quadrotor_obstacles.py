@@ -76,7 +76,7 @@ def test_the_exact_hessian_saves_iterations() -> None:
     assert 2 * exact.solution.iterations <= rough.solution.iterations
 
 
-@pytest.mark.parametrize("solver", ["sqp", "ipm"])
+@pytest.mark.parametrize("solver", ["sqp", "ipm", "alm"])
 def test_a_general_cost_and_its_square_are_the_same_problem(solver: str) -> None:
     general, square = flown(solver=solver, general=True), flown(solver=solver)
     assert general.succeeded
@@ -140,6 +140,7 @@ def test_the_hessian_that_is_asked_for_is_used(solver: str) -> None:
         ({"solver": "newton"}, "unknown backend 'newton'"),
         ({"guess": "luck"}, "unknown guess"),
         ({"solver": "penalty", "general": True}, "Penalty has no option 'hessian'"),
+        ({"avoidance": "hard", "general": True}, "general: a general cost states the potential, and avoidance 'hard'"),
     ],
 )
 def test_what_cannot_be_asked_for(wrong: dict[str, Any], words: str) -> None:
