@@ -94,13 +94,13 @@ class CourseSettings(Settings):
     guess: Start | None = option(None)
     general: bool = option(False)
     seed: int | None = option(None, metavar="S")
-    goal: float = 0.04
-    end: float = 100.0
-    rest: float = 0.5
-    level: float = 1.0
-    rate: float = 1.0
-    thrust: float = 0.1
-    near: float = 0.3
+    goal: Positive[float] = 0.04
+    end: Positive[float] = 100.0
+    rest: Positive[float] = 0.5
+    level: Positive[float] = 1.0
+    rate: Positive[float] = 1.0
+    thrust: Positive[float] = 0.1
+    near: Positive[float] = 0.3
     nearest: Positive[float] = 0.2
     clearance: float = 0.05
     rate_limit: Positive[float] = 4.0

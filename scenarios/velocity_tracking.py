@@ -21,7 +21,7 @@ import unifg as fg
 from unifg.models import vehicle
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios.logs import metrics as numbers
-from unifg.scenarios.options import Settings, count, existing, option, pair, positive
+from unifg.scenarios.options import Positive, Settings, count, existing, option, pair, positive
 from unifg.scenarios.planning.speed_profile import Profile, drive_cycle, read_profile
 from unifg.solution.solver import Callback
 from unifg.solvers import names
@@ -63,9 +63,9 @@ class TrackingSettings(Settings):
     linear: bool = option(False)
     force_bounds: tuple[float, float] | None = option(None, text=pair, metavar="LO,HI")
     start: float = 0.0
-    track: float = 1000.0
-    end: float = 1000.0
-    effort: float = 0.0007
+    track: Positive[float] = 1000.0
+    end: Positive[float] = 1000.0
+    effort: Positive[float] = 0.0007
     vehicle: Vehicle = field(default_factory=Vehicle)
     tolerance: float = option(1e-6, text=positive, metavar="T")
 

@@ -72,6 +72,16 @@ def test_numbers_in_rows_and_of_parts_are_judged(settings: Any, wrong: dict[str,
         settings(**wrong)
 
 
+@pytest.mark.parametrize(
+    ("settings", "weights"),
+    [(CourseSettings, "goal end rest level rate thrust near"), (TrackingSettings, "track end effort")],
+)
+def test_weights_of_costs_are_positive(settings: Any, weights: str) -> None:
+    for name in weights.split():
+        with pytest.raises(UnifgError, match=f"^{name}: '0.0' is not a positive number"):
+            settings(**{name: 0.0})
+
+
 def test_what_a_number_may_be_is_kept() -> None:
     assert NavigationSettings(start=(-1.0, -2.0, -3.0)).start == (-1.0, -2.0, -3.0)
     assert KeeperSettings(decide_ms=math.inf, slack=None).slack is None
