@@ -16,6 +16,7 @@ import pytest
 from episodes import episode
 from test_quadrotor_scene import flight
 from unifg.scenarios.command import main
+from unifg.scenarios.commands import safe_flights
 from unifg.scenarios.logs.columns import columns
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.mcap_log import write_mcap
@@ -199,6 +200,15 @@ def test_a_flight_past_bodies_is_read_back(tmp_path: Path) -> None:
         np.testing.assert_allclose([one["size"]["x"] / 2 for one in solids], radii)
         x = [one["pose"]["position"]["x"] for one in entity["spheres"]]
         np.testing.assert_allclose(x, bodies[~log.upright, 0], atol=1e-12)
+
+
+def test_flights_of_several_speeds_have_names_of_files() -> None:
+    def stop(done: float, text: str) -> None:
+        if done > 1e-3:
+            raise KeyboardInterrupt
+
+    outcome = safe_flights.run(SafeSettings(case="figure8", controller=("flatness",)), stop)
+    assert list(outcome.logs) == ["1-m-per-s"]
 
 
 @pytest.mark.product(1, of="scenes and pictures")

@@ -31,7 +31,7 @@ def run(settings: safe_flight.SafeSettings, progress: Progress, announce: Announ
     if not logs:
         raise KeyboardInterrupt
     succeeded = all(log.succeeded for log in logs)
-    flown = {log.label.replace(" ", "-") or "flight": log for log in logs}
+    flown = {log.label.replace(" ", "-").replace("/", "-per-") or "flight": log for log in logs}
     return Outcome(succeeded, logs[-1].interrupted, summary(logs), safe_numbers(logs), results(logs), flown)
 
 
