@@ -120,8 +120,8 @@ def _served(arguments: list[str]) -> int:
         if said is None:
             raise
         return _refuse(said)
-    except KeyboardInterrupt:
-        print("unifg: interrupted before there was anything to write", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        print(f"unifg: interrupted{str(stop) or ' before there was anything to write'}", file=sys.stderr)
         return INTERRUPTED
 
 
@@ -541,7 +541,7 @@ COMMANDS = {
             "--workers": _WORKERS,
             "--out": {
                 "type": Path, "default": Path("out") / "reproduce", "metavar": "DIR",
-                "help": "folder for runs, which are not repeated (default: %(default)s)",
+                "help": "folder for drives, which are not repeated (default: %(default)s)",
             },
         },
         (("--table", "--figure"), ("--quick", "--full")),

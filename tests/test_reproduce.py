@@ -205,7 +205,8 @@ def test_a_quick_campaign_ends_in_time(tmp_path: Path, monkeypatch: pytest.Monke
     assert len(bazzana.driven(effort(tmp_path), "department", 2)) == 9
     assert len(bazzana.driven(effort(tmp_path, quick=False), "department", 2, patience=-1.0)) == 9
     assert len(bazzana.driven(effort(tmp_path), "department", 2, patience=-1.0)) == 9
-    with pytest.raises(KeyboardInterrupt):  # of the user, who wants no other base either
+    # of the user, who wants no other base either
+    with pytest.raises(KeyboardInterrupt, match=r"; drives in .*bazzana-department-light: 1"):
         bazzana.driven(Effort(True, tmp_path, 1, stop), "department", 2)
     ended = 0
     with pytest.raises(ScenarioError, match="no drive has ended within -1 s"):
@@ -244,6 +245,17 @@ def test_the_mean_deviation_of_the_department_is_no_number_of_the_factory(
     for what in ("length", "duration"):
         line = lines[f"deviation of {what}, mean of legs [%]"]
         assert line.paper == line.difference == "-" and line.ours != "-"
+
+
+def test_an_interrupt_names_the_drives_that_are_on_file(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(_: Effort) -> Comparison:
+        raise KeyboardInterrupt("; drives in here: 3")
+
+    monkeypatch.setattr(catalogue, "found", lambda *_: stop)
+    assert command.main(["reproduce", "bazzana", "--table", "I"]) == 130
+    assert capsys.readouterr().err.endswith("unifg: interrupted; drives in here: 3\n")
 
 
 @pytest.mark.parametrize("quick", [True, False])

@@ -107,7 +107,7 @@ def driven(
 
     found = run_campaign(part, folder, workers=effort.workers, progress=progress)
     if found.interrupted and time.monotonic() <= end:
-        raise KeyboardInterrupt
+        raise KeyboardInterrupt(f"; drives in {folder}: {found.outcomes.total()}")
     if not found.outcomes:
         raise ScenarioError(f"no drive has ended within {patience:g} s: start the same command again, or with --full")
     return drives_of(load(folder, failed_too=True), name)

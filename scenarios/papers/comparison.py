@@ -26,7 +26,7 @@ class Effort:
 
     Attributes:
         quick: a few runs, within five minutes; otherwise as many as on the page of results.
-        folder: for files of runs, which are not repeated.
+        folder: for files of drives, which are not repeated.
         workers: processes of campaigns.
         progress: told the share done and a short text.
     """
