@@ -457,16 +457,19 @@ def test_other_places_are_tried_seldom_once_nothing_fits_for_long(monkeypatch: p
 
     monkeypatch.setattr(localiser, "spread_out", counted)
 
-    def corrects(scan: Scan, count: int) -> list[int]:
+    def corrects(scan: Scan, count: int, least: float = 0.0) -> list[int]:
         tried.clear()
         for _ in range(count):
             tried.append(0)
+            localiser.covariance = localiser.covariance + least * np.eye(3)
             localiser.correct(scan)
         return [min(number, 1) for number in tried]
 
     wrong, right = among_people(World(HALL, (24.0, 7.0, 1.0)).scan()), World(HALL, tuple(here.tolist())).scan()
     assert explained(field, wrong, here).share < FITS
     assert corrects(wrong, 31) == [1] * 10 + [1, 0, 0, 0, 0] * 4 + [1]
+    localiser.reset(here, np.full(3, 0.02))
+    assert corrects(wrong, 16, least=1.0) == [1] * 10 + [1, 0, 0, 0, 0, 1], "unsure or not"
     localiser.reset(here, np.full(3, 0.02))
     assert corrects(wrong, 1) == [1] and corrects(right, 1) == [0] and corrects(wrong, 11) == [1] * 11
 
