@@ -16,12 +16,12 @@ import pandas as pd
 
 from benchmarks.comparison import interval, share
 from benchmarks.kept_rows import ROWS, keep, restore
-from benchmarks.report import OUT, table
+from benchmarks.report import CAMPAIGNS, OUT, table
 from benchmarks.runner import Timing
 from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, replay_command, run_campaign, write_manifest
 from unifg.scenarios.campaigns.report import PAIRED, differences
 from unifg.scenarios.campaigns.sheet import Sheet, load
-from unifg.scenarios.campaigns.statement import Statement, stated
+from unifg.scenarios.campaigns.statement import Statement, read, stated
 from unifg.scenarios.campaigns.task import OK
 from unifg.scenarios.papers.bazzana import (
     CLEARANCE,
@@ -39,9 +39,12 @@ from unifg.scenarios.papers.bazzana import (
 )
 from unifg.scenarios.papers.printed import numbers
 
-OTHERS = "-others"  # ends the name of the campaign of the same legs with other planners
+OTHERS = "-others"  # ends the name of the campaign with other planners
+EARLIER = CAMPAIGNS / "department.toml"  # legs that they drove in the department
+WHERE = "On the legs of Table II, and on legs of Table I between earlier places: AC is 184 m long there, BD 165 m."
 TITLES = {"department": "Table I: eight legs of a department", "factory": "Table II: four legs of a factory"}
 CAMPAIGN_NAMES = (*PAPER, *(name + OTHERS for name in PAPER))
+OURS = "ours, sequential"
 BASELINES = {
     "teb": "elastic_band:ElasticBand", "mppi": "path_integral:PathIntegral", "dwa": "dynamic_window:DynamicWindow",
     "pursuit": "pure_pursuit:PurePursuit",
@@ -50,11 +53,13 @@ BASELINES = {
 
 
 def statement(name: str) -> Statement:
-    """Campaign by name; with other planners the same legs on the same seeds."""
-    whole = campaign(name.removesuffix(OTHERS))
+    """Campaign by name; with other planners on the legs of the factory, and on earlier ones of the department."""
     if not name.endswith(OTHERS):
-        return whole
+        return campaign(name)
+    earlier = name.startswith(EARLIER.stem)
+    whole = read(EARLIER) if earlier else campaign(name.removesuffix(OTHERS))
     others = [{"name": label, "planner": f"benchmarks.baselines.{made}"} for label, made in BASELINES.items()]
+    others = [{"name": OURS}, *others] if earlier else others
     grid = {**whole.given["grid"], "coupling": ["sequential"], "baseline": others}
     title = f"{whole.title}, other planners"
     return stated({**whole.given, "title": title, "grid": grid}, whole.base, name)
@@ -63,15 +68,16 @@ def statement(name: str) -> Statement:
 def rendered(sheets: Mapping[str, Sheet]) -> str:
     """All tables, and sentences about them together."""
     parts = list[str]()
-    drives = pd.concat([drives_of(sheet, name.removesuffix(OTHERS)) for name, sheet in sheets.items()])
-    ours = drives[drives["planner"].str.startswith("ours")]
+    each = {name: drives_of(sheet, name.removesuffix(OTHERS)) for name, sheet in sheets.items()}
+    ours = pd.concat([each[name] for name in sheets if name in PAPER])
     for name in (name for name in sheets if name in PAPER):
         mine = ours[ours["table"] == ROMAN[name]]
         parts += [f"### {TITLES[name]}", reported(mine, PAPER[name], LENGTH), reported(mine, PAPER[name], DURATION)]
         parts += [*_compared(sheets[name]), *_failed(sheets[name])]
     parts.append(together(ours, sum(sheet.cpu_seconds for name, sheet in sheets.items() if name in PAPER)))
-    if len(ours) < len(drives):
-        parts += ["### The same legs with other planners", beside(drives), leg_by_leg(drives)]
+    if set(sheets) - set(PAPER):
+        compared = pd.concat([each[name] for name in sheets if name != EARLIER.stem])
+        parts += ["### Other planners", WHERE, beside(compared), leg_by_leg(compared)]
         parts += [part for name, sheet in sheets.items() if name not in PAPER for part in _failed(sheet)]
     return "\n\n".join(parts)
 
@@ -181,16 +187,16 @@ def together(drives: pd.DataFrame, seconds: float) -> str:
     runs = drives.groupby(["planner", "table", "leg"]).size()
     many = f"{runs.min()} to {runs.max()}" if runs.min() < runs.max() else str(runs.max())
     say = [f"{len(drives)} drives, {many} of each leg and coupling in the tables (the paper: {RUNS} of each leg)."]
-    spreads = relative(succeeded(drives)).dropna()
+    spreads = relative(succeeded(drives[drives["table"] == ROMAN["department"]])).dropna()  # which the paper speaks of
     if len(spreads):
         section = partial(numbers, "bazzana", "section VII-C")
         (mean, mean_ros), (mean_s, mean_s_ros) = section("mean_spread_length"), section("mean_spread_duration")
         (top, top_s), (top_ros, top_s_ros) = section("greatest_spread"), section("greatest_spread_ros")
         say.append(
-            f"The standard deviation is on average {spreads[LENGTH].mean():.2f} % of the path length (paper: "
-            f"{mean:.2f} %; ROS: {mean_ros:.2f} %), at most {spreads[LENGTH].max():.2f} % ({top:.2f} %; {top_ros:.2f} "
-            f"%), and {spreads[DURATION].mean():.2f} % of the duration ({mean_s:.2f} %; {mean_s_ros:.2f} %), at most "
-            f"{spreads[DURATION].max():.2f} % ({top_s:.2f} %; {top_s_ros:.2f} %)."
+            f"In Table I the standard deviation is on average {spreads[LENGTH].mean():.2f} % of the path length "
+            f"(paper: {mean:.2f} %; ROS: {mean_ros:.2f} %), at most {spreads[LENGTH].max():.2f} % ({top:.2f} %; "
+            f"{top_ros:.2f} %), and {spreads[DURATION].mean():.2f} % of the duration ({mean_s:.2f} %; {mean_s_ros:.2f} "
+            f"%), at most {spreads[DURATION].max():.2f} % ({top_s:.2f} %; {top_s_ros:.2f} %)."
         )
     simulated = float(drives[DURATION].sum())
     say.append(

@@ -13,9 +13,11 @@ from unifg.models.matching import Gates
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios.course import CourseSettings
 from unifg.scenarios.flight import FlightSettings
+from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.navigation import NavigationSettings
 from unifg.scenarios.options import leaves, plain, replaced
 from unifg.scenarios.quadrotor.cbf_mpc import KeeperSettings
+from unifg.scenarios.quadrotor.flight_settings import ControllerSettings as FlightControl
 from unifg.scenarios.safe_flight import SafeSettings
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.scenarios.velocity_tracking import TrackingSettings
@@ -57,6 +59,8 @@ def test_every_number_is_judged(settings: Any) -> None:
         (SafeSettings, {"dt": 1.5}, r"dt: '1.5' is not a tick in \(0, 1\] s"),
         (SafeSettings, {"seen": (1e-3, -1.0, 0.0)}, "seen: '-1.0' is not a number of zero or more"),
         (SafeSettings, {"speed": (1.0, 0.0)}, "speed: '0.0' is not a positive number"),
+        (ControllerSettings, {"horizon": 1}, "horizon: '1' is not a whole number of at least 2"),
+        (FlightControl, {"horizon": 1}, "horizon: '1' is not a whole number of at least 2"),
         (NavigationSettings, {"initial_sigma": (0.1, -0.1, 0.1)}, "initial_sigma: '-0.1' is not"),
         (NavigationSettings, {"start": (0.0, math.nan, 0.0)}, "start: 'nan' is not a finite number"),
         (DisturbanceModel, {"gust": (0.1, 0.1)}, r"gust: 3 numbers are expected, found \(0.1, 0.1\)"),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Annotated
 
 import numpy as np
 
@@ -12,7 +13,17 @@ import unifg as fg
 from unifg.errors import ScenarioError
 from unifg.models.footprint import Body, body_of
 from unifg.models.planar import Base, base_of
-from unifg.scenarios.options import AboveZero, AtLeastOne, Positive, Settings, Signed, checked, option, positive
+from unifg.scenarios.options import (
+    AboveZero,
+    AtLeastOne,
+    Positive,
+    Settings,
+    Signed,
+    checked,
+    count,
+    option,
+    positive,
+)
 from unifg.solvers import names
 from unifg.typing import Array
 
@@ -74,7 +85,7 @@ class ControllerSettings(Settings):
 
     base: str = option("unicycle", text=checked(base_of), metavar="BASE")
     body: str = option("", text=checked(body_of), metavar="BODY")
-    horizon: AtLeastOne = 30
+    horizon: Annotated[int, partial(count, least=2)] = 30
     dt: Positive[float] = 0.1
     speed: float = option(1.0, text=positive, metavar="M/S")
     limits: Positive[tuple[float, float]] = (1.0, 1.0)
