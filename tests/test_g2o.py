@@ -427,6 +427,17 @@ def test_a_prior_holds_the_map_where_it_says(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again.priors["pose"].information, graph.priors["pose"].information)
 
 
+def test_headings_alone_hold_no_map(tmp_path: Path) -> None:
+    """Priors of the heading, as of a compass, say nothing of where the map lies: the first pose does."""
+    compass = "".join(f"EDGE_PRIOR_SE2 {k} 0 0 0 0 0 0 0 0 100\n" for k in (0, 1))
+    graph = read_g2o(write(tmp_path, PRIORS.replace("EDGE_PRIOR_SE2 0 5 6 0.5 100 0 0 100 0 100\n", compass)))
+    assert graph.anchors(priors=True)[0].tolist() == [0]
+    problem, x, guess = graph.graph()
+    solution = fg.solve(problem, guess)
+    assert solution.status is fg.Status.CONVERGED
+    np.testing.assert_allclose(solution[x], [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], atol=1e-7)
+
+
 def test_positions_in_the_plane_hold_it_by_two_poses(tmp_path: Path) -> None:
     one = PRIORS.replace("EDGE_PRIOR_SE2 0 5 6 0.5 100 0 0 100 0 100", "EDGE_PRIOR_SE2_XY 0 5 6 1 0 1")
     graph = read_g2o(write(tmp_path, one))

@@ -266,7 +266,7 @@ class PoseGraph:
         A landmark that nothing has measured is held, too, as such a pose is.
 
         Args:
-            priors: whether a part needs no fixed pose that priors determine: one of a whole pose, or those of so many
+            priors: whether a part needs no fixed pose that priors determine: one of a whole pose, or positions of so many
                 poses as a position has coordinates.
         """
         known = np.array(self.fixed_ids, dtype=np.int64)
@@ -276,11 +276,18 @@ class PoseGraph:
         landmarks = np.flatnonzero(np.isin(self.landmark_ids, known) | unseen)
         held = np.concatenate([part[poses], part[count + landmarks]])
         if priors and self.priors:
-            ranks = [np.linalg.matrix_rank(kind.information, hermitian=True) for kind in self.priors.values()]
-            whole = np.concatenate(ranks) == self.group.dim
-            where = np.concatenate([kind.pose for kind in self.priors.values()])
-            counts = np.bincount(part[np.unique(where)])
-            held = np.concatenate([held, part[where[whole]], np.flatnonzero(counts >= self.group.point_dim)])
+            size, where = self.group.point_dim, np.concatenate([kind.pose for kind in self.priors.values()])
+            whole, placed = (  # with information in every direction; about the position, whatever of the heading
+                np.concatenate(
+                    [
+                        np.linalg.matrix_rank(kind.information[:, :k, :k], hermitian=True) == k
+                        for kind in self.priors.values()
+                    ]
+                )
+                for k in (self.group.dim, size)
+            )
+            counts = np.bincount(part[np.unique(where[placed])])
+            held = np.concatenate([held, part[where[whole]], np.flatnonzero(counts >= size)])
         present, firsts = np.unique(part[:count], return_index=True)
         loose = firsts[~np.isin(present, held)]
         return np.sort(np.concatenate([poses, loose])), landmarks
