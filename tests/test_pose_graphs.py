@@ -411,3 +411,20 @@ def test_a_guess_that_is_changed_leaves_the_pose_graph_as_it_is() -> None:
     before = made.poses.copy()
     guess[x][5] = 9.0
     np.testing.assert_array_equal(made.poses, before)
+
+
+def test_measurements_take_any_whole_and_real_numbers() -> None:
+    """Differences of unsigned positions wrap around: the odometry of a drive that is listed backwards was closures."""
+    edges = manhattan(60, seed=1).pose_graph.edges
+    turned = fg.SE2.inverse(edges.measured)
+    back = Edges(edges.second.astype(np.uint16), edges.first.astype(np.uint16), turned, edges.information)
+    np.testing.assert_array_equal(back.odometry, edges.odometry)
+    plain = Edges([0, 1], [1, 2], [[1, 0, 0], [1, 0, 0]], [np.eye(3, dtype=int)] * 2)  # type: ignore[arg-type]
+    assert plain.measured.dtype == plain.information.dtype == np.float64 and plain.odometry.all()
+    for wrong, what in (
+        ({"first": np.array([0.0, 1.5])}, "first must hold whole numbers, found float64"),
+        ({"measured": np.zeros((2, 3), dtype=complex)}, "measured must hold real numbers, found complex128"),
+        ({"second": np.array([1])}, "Edges need as many rows of each array, found first 2, second 1, measured 2"),
+    ):
+        with pytest.raises(fg.GraphError, match=what):
+            replace(plain, **wrong)

@@ -49,6 +49,21 @@ class _Measurements:
     measured: Array
     information: Array
 
+    def __post_init__(self) -> None:
+        """Take positions as signed whole numbers, of which differences are formed, and the rest as real ones.
+
+        Raises:
+            GraphError: naming the array that holds something else, or as many rows as no other one.
+        """
+        for name, value in list(vars(self).items()):
+            rows, whole = np.asarray(value), name not in ("measured", "information")
+            if rows.size and rows.dtype.kind not in ("iu" if whole else "iuf"):
+                raise GraphError(f"{name} must hold {'whole' if whole else 'real'} numbers, found {rows.dtype}")
+            object.__setattr__(self, name, rows.astype(np.intp if whole else np.float64, copy=False))
+        if len({len(rows) for rows in vars(self).values()}) > 1:
+            found = ", ".join(f"{name} {len(rows)}" for name, rows in vars(self).items())
+            raise GraphError(f"{type(self).__name__} need as many rows of each array, found {found}")
+
     def __len__(self) -> int:
         """Number of measurements."""
         return len(self.measured)
@@ -266,8 +281,8 @@ class PoseGraph:
         A landmark that nothing has measured is held, too, as such a pose is.
 
         Args:
-            priors: whether a part needs no fixed pose that priors determine: one of a whole pose, or positions of so many
-                poses as a position has coordinates.
+            priors: whether a part needs no fixed pose that priors determine: one of a whole pose, or positions of so
+                many poses as a position has coordinates.
         """
         known = np.array(self.fixed_ids, dtype=np.int64)
         part, count = self.parts(), len(self.poses)
