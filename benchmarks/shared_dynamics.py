@@ -25,8 +25,8 @@ from unifg.scenarios.episode import silent
 from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics
+from unifg.scenarios.perception.belief import Belief
 from unifg.scenarios.perception.readings import Reading
-from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.quadrotor.estimator import STILL, DeadReckoning, Dynamics, Estimator, EstimatorSettings
 from unifg.scenarios.quadrotor.flight_control import Controller
 from unifg.scenarios.quadrotor.flight_past import WindowSettings
@@ -72,17 +72,25 @@ class Divided(Pilot):
     ) -> None:
         """Join them; the adviser may be the estimator itself."""
         super().__init__(estimator, controller)
-        self.adviser, self._nominal = adviser, nominal
+        self.adviser, self._nominal, self.pushed = adviser, nominal, self._advised
 
-    def tick(self, reading: Reading, control: Array | None, push: Array = STILL) -> Plan:
-        """Decide."""
-        self.alone = self.estimator.update(reading, control, push)
-        parameters = self._nominal
-        if self.adviser is not None:
-            told = self.alone if self.adviser is self.estimator else self.adviser.update(reading, control, push)
-            parameters = told.parameters
-        self.belief = replace(self.alone, parameters=parameters)
-        return self.controller.plan(self.belief, Tracks.none())
+    def recognise(self, reading: Reading, control: Array | None, push: Array = STILL) -> Reading:
+        """Move both pasts on to a reading."""
+        if self.adviser is not None and self.adviser is not self.estimator:
+            self.adviser.predict(reading, control, push)
+        return super().recognise(reading, control, push)
+
+    def decide(self, reading: Reading) -> Plan:
+        """Estimate by both and plan."""
+        if self.adviser is not None and self.adviser is not self.estimator:
+            self.adviser.see(reading)
+        return super().decide(reading)
+
+    def _advised(self, belief: Belief) -> Belief:
+        """The belief with the parameters that the plan takes."""
+        if self.adviser is self.estimator:
+            return belief
+        return replace(belief, parameters=self._nominal if self.adviser is None else self.adviser.estimate().parameters)
 
 
 def prepared(seed: int, past: str, plan: str, accelerometer: bool) -> Flight:

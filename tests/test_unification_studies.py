@@ -17,6 +17,7 @@ from benchmarks import (
     many_landmarks,
     shared_dynamics,
 )
+from unifg.scenarios.episode import silent
 
 
 def row(way: str, seed: int, found: list[tuple[float, float] | None]) -> dict[str, object]:
@@ -114,22 +115,21 @@ def test_ways_are_compared_at_equal_error_and_at_equal_time() -> None:
 
 @pytest.mark.parametrize("past", ["nominal", "unknown"])
 @pytest.mark.parametrize("plan", ["nominal", "estimated"])
-def test_past_and_plan_are_chosen_apart(past: str, plan: str) -> None:
+def test_past_and_plan_are_chosen_apart(past: str, plan: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the flight itself goes: a study whose pilot the flight passed by compared equal plans for days."""
+    monkeypatch.setattr(shared_dynamics, "FLIGHT", 0.3)
     flight = shared_dynamics.prepared(1000, past, plan, accelerometer=plan == "nominal")
-    pilot, nominal, control = cast(Any, flight.pilot), flight.conditions.nominal, None
-    for _ in range(4):
-        control = pilot.tick(flight.world.sense(), control).control
-        flight.world.step(control)
-    own = pilot.estimator.own
+    flight.run(silent)
+    pilot, nominal = cast(Any, flight.pilot), flight.conditions.nominal
+    own, told = pilot.estimator.own, pilot.controller.belief
     assert own.estimated == (("mass", "drag", "wind") if past == "unknown" else ())
     assert (own.noise_sigma[5] > 1.0) == (past == "nominal")
     assert own.force_sigma == (shared_dynamics.FORCE_SIGMA if plan == "nominal" else None)
-    assert pilot.controller.belief is pilot.belief
-    np.testing.assert_array_equal(pilot.belief.state, pilot.estimator.window.present)
-    assert (pilot.belief.parameters == nominal) == (plan == "nominal")
+    np.testing.assert_array_equal(told.state, pilot.alone.state)
+    assert (told.parameters == nominal) == (plan == "nominal")
     if plan == "estimated":
         assert pilot.adviser.own.estimated == ("mass", "drag", "wind")
-        np.testing.assert_array_equal(pilot.belief.parameters.packed[:1], pilot.adviser.parameters[:1])
+        np.testing.assert_array_equal(told.parameters.packed[:1], pilot.adviser.parameters[:1])
         assert (pilot.adviser is pilot.estimator) == (past == "unknown")
 
 
