@@ -41,6 +41,24 @@ def test_inactive_factor_may_be_undefined() -> None:
     np.testing.assert_allclose(solution[x][1], 1.0)
 
 
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_rounding_of_an_inverse_is_symmetric_enough(unit: float) -> None:
+    """An entry next to nothing has no digit left: beside a correlation of one it is symmetric, in any unit."""
+    covariance = np.array([[4.0, 3e-12, 0.0], [3e-12, 0.25, 0.0], [0.0, 0.0, 1e-2]])
+    scale = np.diag([1.0, unit, 1.0])
+    information = np.linalg.inv(scale @ covariance @ scale)
+    information[0, 1] += 1e-15 / unit
+    assert abs(information[0, 1] / information[1, 0] - 1.0) > 1e-6
+    graph = fg.Graph()
+    x = graph.variables("x", fg.Rn(3), 1)
+    graph.minimize(fg.prior, x, [1.0, 2.0, 3.0], information=information)
+    np.testing.assert_allclose(fg.solve(graph, {x: np.zeros((1, 3))})[x], [[1.0, 2.0, 3.0]], atol=1e-9)
+    information[0, 1] += 1e-8 * 2.0 / unit / 0.5
+    with pytest.raises(fg.GraphError, match=r"information must be finite and symmetric, found .* at \(0, 1\)"):
+        graph.minimize(fg.prior, x, [1.0, 2.0, 3.0], information=information)
+        graph.compile()
+
+
 def test_information_and_sigma_agree() -> None:
     rng = np.random.default_rng(1)
     root = rng.normal(size=(3, 3))

@@ -431,14 +431,18 @@ def test_creeping_goes_straight_on_and_turns_to_where_there_is_room() -> None:
     creeping, bound = Creeping(), 0.34
     speed, turn = creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)
     assert speed > 0.0 and abs(turn) < 0.1, "along the aisle"
+    for heading in (-0.35, 0.35):
+        speed, turn = Creeping().control(World(HALL, (13.0, 3.5, heading)).scan(), bound)
+        assert speed > 0.0 and -turn * heading > 0.07, "towards the direction of the aisle, not from wall to wall"
     corner = World(HALL, (25.0, 7.2, 0.0)).scan()  # walls ahead and to the left
     speed, turn = creeping.control(corner, bound)
     assert speed == 0.0 and turn < -0.3
     creeping.moved(np.array([0.0, -1.5]))
     assert creeping.control(World(HALL, (25.0, 7.2, -1.5)).scan(), bound)[0] > 0.0, "turned, it goes on"
-    _, before = creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)
+    assert abs(creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)[1]) < 0.1
     creeping.blocked()
-    assert creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)[1] > before
+    speed, turn = creeping.control(World(HALL, (13.0, 3.5, 0.0)).scan(), bound)
+    assert speed == 0.0 and abs(turn) > 0.3, "back, the way it came"
     assert not creeping.ended
     creeping.moved(np.array([-30.0, 0.0]))
     assert creeping.ended, "a way that never ends is no way"

@@ -52,11 +52,16 @@ class Creeping:
         ranges, aside = agreed(scan), np.abs(wrap_angle(scan.angles - FAN[:, None]))
         free = np.where(aside < HALF, np.minimum(ranges, ROOM), ROOM).min(axis=1)
         free[~(aside < HALF).any(axis=1)] = 0.0
-        if free[int(np.argmin(np.abs(wrap_angle(FAN - self._heading))))] < bound + NEAR:
-            self._heading = float(FAN[int(np.argmax(free - ASIDE * np.abs(FAN)))])
+        away = np.abs(wrap_angle(FAN - self._heading))
+        now = int(np.argmin(away))
+        ended = free[now] < bound + NEAR
+        worth = free - ASIDE * (np.abs(FAN) if ended else away)  # there is more room along an aisle than across
+        best = int(np.argmax(np.where(ended | (away < AHEAD), worth, -np.inf)))
+        if ended or best != now:
+            self._heading = float(FAN[best])
         turn = float(np.clip(2.0 * self._heading, -TURN, TURN))
         return (SPEED if abs(self._heading) < AHEAD else 0.0), turn
 
     def blocked(self) -> None:
-        """Look for another way: something stops the robot that beams ahead do not see."""
-        self._heading += 0.5 * np.pi
+        """Turn back: something stops the robot that beams ahead do not see, and in an aisle there is no other way."""
+        self._heading = float(wrap_angle(self._heading + np.pi))

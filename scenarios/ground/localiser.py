@@ -169,11 +169,12 @@ class Localiser:
 
     def _solve(self, scan: Scan, pose: Array, held: Array, reach: float) -> tuple[Array, Array]:
         """Pose (3,) and covariance (3, 3) that a scan makes of a prediction."""
+        information = np.linalg.inv(held)
         solution = self._run.solve(
             {self._x: pose[None, :]},
             data={
                 self._prior: pose,
-                self._information: np.linalg.inv(held),
+                self._information: 0.5 * (information + information.T),
                 self._beams: lidar.beam_endpoints(scan.ranges, scan.angles, reach),
                 self._seen: lidar.usable(scan.ranges, reach),
             },

@@ -103,9 +103,11 @@ def square_roots(name: str, information: Array, count: int, size: int) -> Array:
     quick = np.empty((len(stack), m * m))
     if quick_roots(stack, quick):
         return quick.reshape(stack.shape)
-    transposed = np.swapaxes(stack, -1, -2)
-    if not np.isfinite(stack).all() or not np.allclose(stack, transposed, rtol=1e-9, atol=0.0):
-        unequal = ~np.isfinite(stack) | ~np.isclose(stack, transposed, rtol=1e-9, atol=0.0)
+    transposed, size_of = np.swapaxes(stack, -1, -2), np.sqrt(np.abs(np.einsum("nii->ni", stack)))
+    # Beside an entry of two rows that depend on each other: rounding leaves no digit of one that is next to nothing.
+    whole = np.maximum(np.abs(transposed), size_of[:, :, None] * size_of[:, None, :])
+    unequal = ~(np.abs(stack - transposed) <= 1e-9 * whole) | ~np.isfinite(stack)
+    if unequal.any():
         index, row, column = (int(k) for k in np.argwhere(unequal)[0])
         raise GraphError(
             f"term '{name}': information must be finite and symmetric, found {stack[index, row, column]!s} at "
@@ -115,6 +117,7 @@ def square_roots(name: str, information: Array, count: int, size: int) -> Array:
             term=name,
             index=index,
         )
+    stack = 0.5 * (stack + transposed)
     try:
         lower = np.linalg.cholesky(stack)
     except np.linalg.LinAlgError:  # singular, or wrong
