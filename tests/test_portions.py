@@ -9,7 +9,7 @@ import pytest
 
 import unifg as fg
 from problems.graphs import graph_with
-from unifg.horizon import ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
+from unifg.horizon import Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.models import quadrotor
 from unifg.scenarios.planning.flat_path import Line
 from unifg.scenarios.quadrotor.cbf_mpc import CbfMpc, Decision, KeeperSettings, Obstacles
@@ -144,3 +144,60 @@ def test_a_tick_without_time_for_a_solve_still_estimates() -> None:
 def test_portions_that_cannot_be_are_refused() -> None:
     with pytest.raises(fg.ScenarioError, match="portion: '0' is not a whole number of at least 1"):
         keeper(portion=0)
+
+
+def boat(steps: int) -> tuple[RecedingHorizon, Robot]:
+    """A boat with drag whose plans take several iterations, of which each tick makes one."""
+
+    def motion(x: Array, u: Array, y: Array, h: Array) -> Array:
+        return y - x - h[:, None] * np.stack([x[:, 1], u[:, 0] - 0.3 * x[:, 1] * np.abs(x[:, 1])], axis=1)
+
+    class Berth:
+        def state(self, graph: fg.Graph, x: fg.Selection, u: fg.Family) -> None:
+            graph.minimize(fg.prior, x[1:], graph.data("berth", np.zeros(2)), sigma=[0.3, 1.0], name="berth")
+            graph.bound(u, lower=-1.0, upper=1.0, name="limits")
+
+        def data(self, now: Context[float]) -> dict[str, list[float]]:
+            return {"berth": [now.given, 0.0]}
+
+    def predict(x: Array, u: Array, seconds: float) -> Array:
+        found: Array = -motion(x[None], u[None], np.zeros((1, 2)), np.full(1, seconds))[0]
+        return found
+
+    robot = Robot(fg.Rn(2), fg.Rn(1), predict=predict, tick=0.5)
+    terms: list[Term] = [Dynamics(motion), Berth(), ControlCost(sigma=2.0)]
+    return RecedingHorizon(robot, steps, terms, solver=InteriorPoint(), portion=1), robot
+
+
+def test_a_plan_that_took_ticks_is_followed_from_where_it_should_be() -> None:
+    loop, robot = boat(6)
+    x = np.zeros(2)
+    for tick in range(8):
+        plan = loop.plan(x, 5.0 if tick < 4 else -3.0)
+        if loop.waited and plan.source == "solved":
+            break
+        x = robot.predicted(x, loop.applied)
+    left = 6 - loop.waited
+    assert plan.source == "solved" and 0 < left < 6
+    np.testing.assert_allclose(robot.rollout(plan.states[0], plan.controls[:left]), plan.states[: left + 1], atol=2e-3)
+
+
+def test_a_plan_that_is_over_before_it_is_found_is_not_applied() -> None:
+    loop, _ = boat(2)
+    found = []
+    for tick in range(12):
+        plan = loop.plan(np.array([0.1 * tick, 0.2]), 5.0)
+        assert plan.controls.shape == (2, 1)
+        found += [plan] if loop.waited >= 2 and not loop.goes_on else []
+    assert found and {plan.source for plan in found} == {"braking"}
+
+
+def test_new_node_times_drop_what_was_begun_on_the_old_ones() -> None:
+    loop, _ = boat(6)
+    for to in (5.0, 5.0, 5.0, 5.0, -3.0):
+        loop.plan(np.zeros(2), to)
+        if loop.goes_on:
+            break
+    assert loop.goes_on
+    loop.set_times([0.0, 0.5, 1.5, 2.5, 3.5, 4.5, 5.5])
+    assert loop.plan(np.zeros(2), 5.0).iterations == 1

@@ -532,10 +532,12 @@ class RecedingHorizon:
             choice = replace(instead, source="late")
         elif choice.source == "solved":
             self._accept(solution, states, controls, choice)
-            if self.waited:
-                left = self.kept.within(self.kept.left())
-                rest = left[-1:].repeat(len(controls) - len(left), 0)
-                choice = replace(choice, controls=np.concatenate([left, rest]))
+            if self.waited and len(self.kept.left()):
+                begun = self.times[self.path]
+                ahead, acting = self.robot.between(begun, states, controls, begun + self.kept.age)
+                choice = replace(choice, controls=self.kept.within(acting), states=ahead)
+            elif self.waited:  # it was over before it was found
+                choice = self._instead(now)
         elif not self.goes_on:
             self.failed = True
             if choice.resumed:
@@ -618,8 +620,8 @@ class RecedingHorizon:
     def set_times(self, times: ArrayLike) -> None:
         """Move the nodes of the future, from the next tick on; nothing is compiled or analysed again.
 
-        The warm start is interpolated; the plan that is kept stays as it was planned. ``Dynamics`` without a step
-        follow; other terms find the times in ``now.times``.
+        The warm start is interpolated; the plan that is kept stays as it was planned; a solve that goes on is dropped.
+        ``Dynamics`` without a step follow; other terms find the times in ``now.times``.
 
         Args:
             times: (N + 1,) from the present on [s], as at the beginning: the first step is as long as a tick.
@@ -634,6 +636,7 @@ class RecedingHorizon:
                 states = self.guess.values[self.x.family][-self.steps - 1 :]
                 self.guess = self._resampled(self.guess, states, self.guess.values[self.u], found)
             self.times, self.kept.times = found, found[self.path]
+            self.goes_on = False  # what a solve that has begun finds is on the old nodes
 
     def _believe(self, solution: Solution | None, choice: Decision, now: Context[Any]) -> None:
         """Take what a joint solve says of the present, or what is known without a solve."""
