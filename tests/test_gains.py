@@ -175,6 +175,22 @@ def test_gains_are_refused_by_name() -> None:
         solved(idle).gains(x, u)
 
 
+def test_gains_at_rest_are_not_those_of_other_weights() -> None:
+    """At the goal neither the cost nor a constraint tells that a weight has been replaced."""
+    graph, x, u = regulator(3, Q, np.zeros(3))
+    price = graph.data("price", R)
+    graph.minimize(fg.prior, u, np.zeros(2), information=price, name="price")
+    run = InteriorPoint().prepare(graph)
+    rest = {x: np.zeros((4, 3)), u: np.zeros((3, 2))}
+    first = run.solve(rest, check=True)
+    gains = first.gains(x, u)
+    run.solve(rest, data={price: 9.0 * R})
+    with pytest.raises(fg.GraphError, match="have been replaced"):
+        first.gains(x, u)
+    run.solve(rest)
+    np.testing.assert_array_equal(first.gains(x, u), gains)
+
+
 def test_a_constraint_that_cannot_be_kept_from_another_state_has_no_gain_there() -> None:
     """A wall for a position that the control reaches two steps later; from farther away it can be kept."""
     graph = fg.Graph()
@@ -206,3 +222,25 @@ def test_a_backend_with_another_way_to_the_solution_has_the_same_gains() -> None
         run = solver.prepare(stated.graph)
         found.append(run.solve(stated.guess, data=data, check=True).gains(stated.x, stated.u))
     np.testing.assert_allclose(found[0], found[1], rtol=0.0, atol=1e-5 * np.abs(found[0]).max())
+
+
+def cart(x: Array, u: Array, y: Array) -> Array:
+    """Defect of a mass that is pushed."""
+    return y - x - 0.5 * np.stack([x[:, 1], u[:, 0]], axis=1)
+
+
+def test_a_soft_limit_that_is_kept_has_the_gains_of_a_hard_one() -> None:
+    """Where the state itself is at the limit, nothing later depends on how far that would have given way."""
+    found = []
+    for soft in (None, 50.0):
+        graph = fg.Graph()
+        x, u = graph.variables("x", fg.Rn(2), 9), graph.variables("u", fg.Rn(1), 8)
+        graph.fix(x[0], [0.0, 0.0])
+        graph.minimize(fg.prior, x[1:], [4.0, 0.0], sigma=[1.0, 2.0])
+        graph.minimize(fg.prior, u, [0.0], sigma=1.0)
+        graph.constrain(cart, x[:-1], u, x[1:], lower=0.0, upper=0.0)
+        graph.constrain(lambda x: x[:, 1:], x[1:], lower=-1.2, upper=1.2, soft=soft, name="speed")
+        solution = solved(graph)
+        assert (np.abs(solution.dual("speed")) > 0.1).sum() > 2
+        found.append(solution.gains(x, u))
+    np.testing.assert_allclose(found[0], found[1], rtol=0.0, atol=1e-7)

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from unifg.errors import GraphError
+from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
@@ -28,7 +29,8 @@ from unifg.solution.covariance import SOLVED
 from unifg.typing import Array, BoolArray, IntArray
 
 REPLACED = "the data of this solution have been replaced since; ask before the next solve"
-SAME = 1e-8  # relative difference of costs and constraints that belong to the same data
+SAME = 1e-8  # relative difference of linearisations that belong to the same data
+LINEARIZED = "cost", "gradient", "hessian", "constraints", "constraint_jacobian"
 
 
 def feedback_gains(
@@ -60,11 +62,15 @@ def feedback_gains(
         return twin.columns.unknown[twin.columns.of(selection)]
 
     state, control = (np.concatenate([numbered(s) for s in part], axis=1) for part in (states, controls))
+    slack = np.zeros(system.pattern.size, dtype=bool)
+    for own in twin.families:
+        if isinstance(own, SlackFamily):
+            slack[numbered(own[:])] = True
     members = [(s.indices + last, numbered(s.family[:])) for part, last in ((states, 1), (controls, 0)) for s in part]
     found = []
     for k in range(len(control)):
         earlier = np.concatenate([rows[: ends[k]].ravel() for ends, rows in members])
-        gain = _gain(twin, system, entries, earlier[earlier >= 0], state[k], control[k])
+        gain = _gain(twin, system, entries, earlier[earlier >= 0], slack, state[k], control[k])
         if gain is None:
             family, index = controls[0].family.name, int(controls[0].indices[k])
             raise GraphError(
@@ -77,6 +83,14 @@ def feedback_gains(
     return np.array(found)
 
 
+def require_data(program: CompiledProblem, lin: Linearization) -> None:
+    """Raise unless the data that are bound make of the values of a solution what it was linearised as."""
+    here = program.linearize(program.columns.values(lin.values))
+    pairs = [(getattr(here, name), getattr(lin, name)) for name in LINEARIZED]
+    if not all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in pairs):
+        raise GraphError(REPLACED)
+
+
 def unfixed(program: CompiledProblem, columns: IntArray, lin: Linearization) -> tuple[CompiledProblem, Linearization]:
     """The problem with the variables unknown that it fixes, found once; and how it is linearised, with the same data.
 
@@ -84,9 +98,6 @@ def unfixed(program: CompiledProblem, columns: IntArray, lin: Linearization) -> 
         program: the compiled graph, with its data bound.
         columns: full tangent columns that are not to be fixed.
         lin: linearisation of a solution.
-
-    Raises:
-        GraphError: the data of the solution have been replaced.
     """
     dropped = frozenset(name for name, part in program.columns.fixed.items() if np.isin(part, columns).any())
     known = program.once(_known)
@@ -96,11 +107,7 @@ def unfixed(program: CompiledProblem, columns: IntArray, lin: Linearization) -> 
         known[dropped] = CompiledProblem(graph)
     twin = known[dropped]
     twin.bind({handle: value for handle, value in program.binding.present.items() if handle in twin.binding.present})
-    here = twin.linearize(twin.columns.values(lin.values))
-    numbers = np.append(here.constraints, here.cost), np.append(lin.constraints, lin.cost)
-    if not np.allclose(*numbers, rtol=SAME, atol=SAME):
-        raise GraphError(REPLACED)
-    return twin, here
+    return twin, twin.linearize(twin.columns.values(lin.values))
 
 
 def _known(_: CompiledProblem) -> dict[frozenset[str], CompiledProblem]:
@@ -109,15 +116,25 @@ def _known(_: CompiledProblem) -> dict[frozenset[str], CompiledProblem]:
 
 
 def _gain(
-    program: CompiledProblem, system: KktSystem, entries: Array, held: IntArray, state: IntArray, control: IntArray
+    program: CompiledProblem,
+    system: KktSystem,
+    entries: Array,
+    held: IntArray,
+    slack: BoolArray,
+    state: IntArray,
+    control: IntArray,
 ) -> Array | None:
     """(m, d) gain of one stage; None where it does not exist."""
     pattern, n = system.pattern, program.size
     out = np.zeros(pattern.size, dtype=bool)
     out[held] = True
-    number = np.full(program.constraints.count, -1)
+    number, later = np.full(program.constraints.count, -1), np.zeros(program.constraints.count, dtype=bool)
     number[system.arrays.rows] = n + np.arange(len(system.arrays.rows))
-    rows, columns = number[program.constraints.free_rows], program.constraints.free_columns
+    own, columns = program.constraints.free_rows, program.constraints.free_columns
+    later[own[~(out | slack)[columns]]] = True
+    out |= slack
+    out[columns[later[own] & slack[columns]]] = False  # slacks of limits of what is held give way with it
+    rows = number[own]
     out[n:] = True
     out[rows[(rows >= 0) & ~out[columns]]] = False  # rows that nothing later is part of say nothing about it
     if not system.saddle.factor(system.without(entries, out)):

@@ -37,12 +37,11 @@ from unifg.problem.parameters import Parameter, datum, fixed_variables, parts_of
 from unifg.problem.systems import KktArrays, KktSystem, fill, leave_out
 from unifg.problem.table import TermArrays
 from unifg.solution.covariance import SOLVED
-from unifg.solution.gains import REPLACED, SAME
+from unifg.solution.gains import REPLACED, SAME, require_data
 from unifg.solution.multipliers import weakest
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
-LINEARIZED = "cost", "gradient", "hessian", "constraints", "constraint_jacobian"
 ENOUGH = 1e-10  # residual of most solves
 AT_ONCE = 64  # right-hand sides in one call
 KEPT = 32  # structures of questions
@@ -209,13 +208,11 @@ class Sensitivities:
 
     def _require_data(self) -> None:
         """Raise unless the present data are those of the solution: their number, or what they make of its values."""
-        program, lin = self._program, self._lin
+        program = self._program
         if self._edition == program.binding.edition:
             return
-        here = program.linearize(program.columns.values(lin.values))
-        pairs = [(getattr(here, name), getattr(lin, name)) for name in LINEARIZED]
-        pairs += zip((program.lower, program.upper), self._limits, strict=True)
-        if not all(np.allclose(a, b, rtol=SAME, atol=SAME) for a, b in pairs):
+        require_data(program, self._lin)
+        if not all(map(partial(np.allclose, rtol=SAME, atol=SAME), (program.lower, program.upper), self._limits)):
             raise GraphError(REPLACED)
         self._edition = program.binding.edition
 

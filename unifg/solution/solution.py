@@ -23,7 +23,7 @@ from unifg.solution.conditioning import Conditioning, cheap, conditioning
 from unifg.solution.covariance import Covariances
 from unifg.solution.explain import disagreeing, holding, slow, violated, weak
 from unifg.solution.fit import Fit, fit_of
-from unifg.solution.gains import feedback_gains
+from unifg.solution.gains import feedback_gains, require_data
 from unifg.solution.history import FactorNorms, History, Iteration, factor_norms
 from unifg.solution.marginal import Variables, information, marginal_prior
 from unifg.solution.multipliers import hold
@@ -364,6 +364,8 @@ class Solution:
             x = [s[:-1] for s in x]
         if len({len(s) for s in (*x, *u)}) > 1:
             raise GraphError(f"gains: {[len(s) for s in x]} states for {[len(s) for s in u]} controls: give as many")
+        if self._edition != self._program.binding.edition:
+            require_data(self._program, self._lin)
         return feedback_gains(self._program, self._lin, self._multipliers, self._equality | self._held(), x, u)
 
     def sensitivity(self, of: Named | Sequence[Named], wrt: Wrt | Sequence[Wrt]) -> Array:
