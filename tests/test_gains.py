@@ -230,7 +230,7 @@ def cart(x: Array, u: Array, y: Array) -> Array:
 
 
 def test_a_soft_limit_that_is_kept_has_the_gains_of_a_hard_one() -> None:
-    """Where the state itself is at the limit, nothing later depends on how far that would have given way."""
+    """At a limit that the state itself is at: nothing later depends on how far that would give way."""
     found = []
     for soft in (None, 50.0):
         graph = fg.Graph()
