@@ -348,6 +348,22 @@ def test_a_first_tick_refuses_what_later_ones_refuse(before: int, wrong: dict[st
     np.testing.assert_array_equal(plan.controls, again.controls)
 
 
+def test_a_quaternion_that_is_none_is_refused_before_anything_moves() -> None:
+    """An attitude sensor that begins with zeros: in the window they would stop every later tick."""
+    robot, still = Robot(fg.SO3, fg.Rn(3)), fg.SO3.identity()
+    turn = Dynamics(lambda x, u, y, h: fg.SO3.local(fg.SO3.compose(x, fg.SO3.exp(h * u)), y), 0.1, sigma=0.1)
+    window = Window(robot, 3, [turn, Measurement("attitude", fg.prior, (4,), 0.1)], start=still, sigma=1.0)
+    loop = RecedingHorizon(robot, 2, [turn, ControlCost(sigma=1.0)], solver=InteriorPoint(), window=window)
+    for attitude in 5 * [still]:
+        loop.tick(measured={"attitude": attitude})
+    with pytest.raises(fg.GraphError, match=r"measurement 'attitude'.*not on SO3"):
+        loop.tick(measured={"attitude": np.zeros(4)})
+    assert window.history.times[-1] == 4.0
+    for attitude in (np.full(4, np.nan), 1.0001 * still):
+        loop.tick(measured={"attitude": attitude})
+    assert window.history.recorded("attitude")[1].tolist() == [True, True, False, True]
+
+
 class Fence:
     """A soft limit whose price changes with every tick."""
 

@@ -11,6 +11,8 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.horizon.robot import Robot, numbers, require_steps
+from unifg.lie import Manifold
+from unifg.modeling.elements import nearest
 from unifg.typing import Array, ArrayLike, BoolArray
 
 
@@ -27,6 +29,7 @@ class History:
         steps: (L, storage) believed unknowns of the steps, by name.
         constants: (count, storage) believed constants, by name.
         initial: (L + 1,) whether a node is the one everything began at.
+        elements: manifolds of those measurements that terms take for elements of one, by name.
     """
 
     def __init__(
@@ -51,7 +54,7 @@ class History:
         """
         require_steps("a window", "length", length)
         present = robot.point(start, "the start")
-        self.length, self.filled = length, filled
+        self.length, self.filled, self.elements = length, filled, dict[str, Manifold]()
         self.states = np.tile(present, (length + 1, 1))
         self.controls = np.zeros((length, robot.control.storage))
         self.times = np.zeros(length + 1)
@@ -143,11 +146,13 @@ class History:
         """A measured value as an array.
 
         Raises:
-            GraphError: when nothing measures that, its shape differs, or it holds no numbers.
+            GraphError: when nothing measures that, its shape differs, it holds no numbers, or is off its manifold.
         """
         if name not in self._values:
             raise GraphError(f"nothing measures '{name}' (there are: {', '.join(self._values) or 'none'})")
-        return numbers(value, self._values[name].shape[1:], f"measurement '{name}'", finite=False)
+        what, kind = f"measurement '{name}'", self.elements.get(name)
+        array = numbers(value, self._values[name].shape[1:], what, finite=False)
+        return array if kind is None or not np.isfinite(array).all() else nearest(what, kind, array, None, name)
 
     def recorded(self, name: str) -> tuple[Array, BoolArray]:
         """(L + 1, ...) what was measured at the nodes, and (L + 1,) whether it was."""

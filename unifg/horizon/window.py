@@ -17,6 +17,7 @@ from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
 from unifg.horizon.terms import Context, Recording, Term, looked_at, reset_all
 from unifg.locks import ReentrantLock, synchronized
+from unifg.modeling.elements import elements_of
 from unifg.modeling.terms import Constraint
 from unifg.modeling.variables import Data, Family, Selection
 from unifg.solution.graph import Graph
@@ -104,6 +105,10 @@ class Window:
         for static in robot.constants:
             static.family(graph)
         self._past = self.past_in(graph, x[:])
+        for stated in graph.terms:
+            for place, kind in elements_of(stated.residual).items():
+                if isinstance(data := stated.arguments[place], Data) and data.name in self._records:
+                    self.history.elements[data.name] = kind
         if solver is None:
             constrained = any(isinstance(term, Constraint) for term in graph.terms)
             solver = InteriorPoint() if constrained else LevenbergMarquardt()
