@@ -24,7 +24,7 @@ from unifg.horizon import (
     Window,
 )
 from unifg.models import unicycle
-from unifg.solvers import InteriorPoint
+from unifg.solvers import SQP, InteriorPoint
 from unifg.typing import Array, ArrayLike
 
 STEP, STEPS = 0.1, 12
@@ -248,3 +248,28 @@ def test_a_joint_graph_and_a_horizon_that_branches_have_margins() -> None:
         states = nodes(loop)
         spare = (states[:, 1] - 2.0 * deviations(states, window.covariance))[1:]
         assert spare.min() > -2e-3
+
+
+class Pace:
+    """Goal, and a limit on how far neighbouring nodes are apart, which no error of the present changes."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.minimize(fg.prior, x[1:], [2.0, 1.0, 0.5], sigma=1.0, name="goal")
+        graph.constrain(lambda a, b: fg.SE2.local(a, b)[:, :1], x[:-1], x[1:], upper=0.08, name="pace")
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        return {}
+
+
+@pytest.mark.parametrize("solver", [InteriorPoint(), SQP()], ids=lambda own: own.name)
+def test_a_limit_that_the_estimate_does_not_move_has_no_margin(solver: fg.Solver) -> None:
+    terms: list[Term] = [Dynamics(unicycle.dynamics, STEP), Pace(), ControlCost(sigma=[3.0, 3.0])]
+    spread = np.array([[0.01, 0.002, 0.0], [0.002, 0.02, 0.001], [0.0, 0.001, 0.005]])
+    found = []
+    for sigmas in (None, 3.0):
+        loop = RecedingHorizon(Robot(fg.SE2, fg.Rn(2)), STEPS, terms, solver=solver, sigmas=sigmas)
+        state = np.array([0.1, 0.2, 0.3])
+        for _ in range(4):
+            state = loop.plan(state, covariance=spread).states[1]
+        found.append(nodes(loop))
+    np.testing.assert_allclose(found[1], found[0], atol=1e-4)

@@ -22,7 +22,7 @@ from unifg.solution.solution import Guess
 from unifg.typing import Array, ArrayLike
 
 WIDEST = 0.45  # of what lies between two limits, so that something is left between them
-ROUNDING = 1e-9  # of a covariance
+ROUNDING = 1e-9  # of a covariance, and of a variance against that without cancellation
 PRICE = 100.0  # of one standard deviation less than wanted, in units of cost: squared standard deviations
 
 
@@ -173,20 +173,24 @@ class Margins:
         return np.broadcast_to(np.eye(kind.dim), (len(nodes), kind.dim, kind.dim))
 
     def _deviation(self, term: CompiledTerm, values: Values, covariance: Array, transport: Array) -> Array:
-        """(n, m) standard deviations of a term's rows."""
-        slopes = np.zeros((term.count, term.size, len(covariance)))
+        """(n, m) standard deviations of a term's rows; zero where that is what they are but for rounding."""
+        slopes, sizes = np.zeros((2, term.count, term.size, len(covariance)))
         first, dim = int(self._x.indices[0]), self._robot.state.dim
         factors, rows = np.arange(term.count)[:, None, None], np.arange(term.size)[:, None]
         for gather, block in zip(term.gathers, term.jacobians(values), strict=True):
             chosen = gather.selection
             members = np.broadcast_to(chosen.indices, (term.count,))
             if chosen.family is self._x.family:
-                slopes[:, :, :dim] += block @ transport[members - first][:, chosen.tangent]
+                moved = block @ transport[members - first][:, chosen.tangent]
+                slopes[:, :, :dim] += moved
+                sizes[:, :, :dim] += np.abs(moved)
             elif chosen.family.name in self._columns:
                 own = self._columns[chosen.family.name][members][:, chosen.tangent]
                 slopes[factors, rows, own[:, None]] += block
+                sizes[factors, rows, own[:, None]] += np.abs(block)
         variances: Array = np.einsum("nmi,ij,nmj->nm", slopes, covariance, slopes)
-        return np.sqrt(np.maximum(variances, 0.0))
+        greatest = (sizes @ np.sqrt(np.maximum(covariance.diagonal(), 0.0))) ** 2
+        return np.sqrt(np.where(variances > ROUNDING * greatest, variances, 0.0))
 
 
 def as_rows(limit: Parameter, handle: Data, given: Mapping[Data, ArrayLike]) -> Array:
