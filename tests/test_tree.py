@@ -283,6 +283,7 @@ def scalar(x: Array) -> Array:
     [
         (lambda g, x, u: g.minimize(fg.prior, x[:-1], TARGET), r"'x' is not selected by slice\(None, -1, None\)"),
         (lambda g, x, u: g.minimize(fg.prior, x[-1], TARGET), "'x' is not selected by -1"),
+        (lambda g, x, u: g.minimize(fg.prior, x[np.int64(-1)], TARGET), "'x' is not selected by -1"),
         (lambda g, x, u: g.minimize(fg.difference, u[:-1], u[1:]), "'u' is not selected by"),
         (lambda g, x, u: g.minimize_scalar(scalar, x, name="odd"), "'odd' cannot be weighted by the probability"),
         (lambda g, x, u: g.minimize(fg.prior, x, TARGET, robust=fg.Huber(1.0), name="odd"), "'odd' cannot be"),

@@ -161,7 +161,7 @@ class BranchedSelection(Selection):
         if isinstance(index, slice):
             ambiguous = index not in (slice(None), slice(1, None))
         else:
-            ambiguous = isinstance(index, int) and index < 0
+            ambiguous = isinstance(index, int | np.integer) and index < 0
         if ambiguous:
             raise GraphError(
                 f"this horizon branches, so '{self.family.name}' is not selected by {index}: tree = tree_of(x) names "
