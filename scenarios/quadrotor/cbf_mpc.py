@@ -354,7 +354,7 @@ class CbfMpc:
         assert solution is not None
         status, slack, p = "last plan" if plan.source == "kept" else plan.source, 0.0, self.believed
         mass, drag, places = p.mass, np.array(p.drag), plan.states[:, :3]
-        if plan.source == "kept":
+        if plan.source in ("kept", "solved"):
             places = self.loop.kept.states[:, :3]
         if not plan.emergency:
             status, mass, drag = plan.status.name.lower(), float(solution["mass"][0, 0]), solution["drag"][0]
