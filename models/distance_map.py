@@ -49,17 +49,17 @@ class DistanceMap:
             origin: (x, y, yaw) [m, m, rad].
 
         Raises:
-            ModelError: values are not a finite (H, W) grid, or the resolution is not positive.
+            ModelError: values are not a finite (H, W) grid, the resolution is not positive, or the origin no pose.
         """
         self.values: Array = np.asarray(values, dtype=np.float64)
         self.resolution = float(resolution)
         pose = np.asarray(origin, dtype=np.float64).ravel()
-        if self.values.ndim != 2 or self.values.size == 0 or not np.all(np.isfinite(self.values)):
-            raise ModelError(f"distance map: values {self.values.shape} must be a finite (H, W) grid")
-        if not self.resolution > 0.0 or pose.shape != (3,):
+        if not self.resolution > 0.0 or pose.shape != (3,) or not np.isfinite(pose).all():
             raise ModelError(
                 f"distance map: resolution {resolution!r} must be positive; origin {origin!r}: (x, y, yaw)"
             )
+        if self.values.ndim != 2 or self.values.size == 0 or not np.all(np.isfinite(self.values)):
+            raise ModelError(f"distance map: values {self.values.shape} must be a finite (H, W) grid")
         self.origin: tuple[float, float, float] = (float(pose[0]), float(pose[1]), float(pose[2]))
 
         height, width = self.values.shape
@@ -95,7 +95,7 @@ class DistanceMap:
         if mask.ndim != 2 or mask.size == 0:
             raise ModelError(f"distance map: occupied of shape {mask.shape} must be a (H, W) grid")
         limit = resolution * math.hypot(*mask.shape) if cap is None else float(cap)
-        if not limit > 0.0:
+        if cap is not None and not limit > 0.0:
             raise ModelError(f"distance map: cap {cap!r} must be positive [m]")
         if mask.all() or not mask.any():
             return cls(np.full(mask.shape, -limit if mask.all() else limit), resolution, origin)
@@ -200,6 +200,8 @@ def sampler(look_up: Callable[..., tuple[float, float, float]]) -> Callable[[Arr
 
     def sample(table: Array, points: Array) -> tuple[Array, Array]:
         points = np.ascontiguousarray(points, dtype=np.float64)
+        if points.shape[-1] != 2:
+            raise ModelError(f"distance map: points are (..., 2) arrays, found shape {points.shape}")
         shape = points.shape[:-1]
         value, gradient = np.empty(math.prod(shape)), np.empty((math.prod(shape), 2))
         loop(table, points.reshape(-1, 2), value, gradient)

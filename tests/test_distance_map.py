@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from unifg.errors import ModelError
-from unifg.models.distance_map import DistanceMap
+from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.typing import Array
 
 ORIGIN = (1.5, -2.0, 0.6)
@@ -121,10 +121,23 @@ def test_bad_grids_are_refused() -> None:
         DistanceMap(np.array([[math.nan]]), 0.1, (0.0, 0.0, 0.0))
     with pytest.raises(ModelError, match="resolution"):
         DistanceMap(np.zeros((2, 2)), -0.1, (0.0, 0.0, 0.0))
+    for resolution in (-0.1, math.nan):  # which is no matter of the cap
+        with pytest.raises(ModelError, match="resolution .* must be positive"):
+            DistanceMap.from_occupancy(np.eye(3, dtype=bool), resolution, (0, 0, 0))
+    with pytest.raises(ModelError, match="origin"):
+        DistanceMap(np.zeros((2, 2)), 0.1, (0.0, math.nan, 0.0))
     with pytest.raises(ModelError, match="cap"):
         DistanceMap.from_occupancy(np.eye(3, dtype=bool), 0.1, (0, 0, 0), cap=-1.0)
     with pytest.raises(ModelError, match="grid"):
         DistanceMap.from_occupancy(np.zeros(3, dtype=bool), 0.1, (0, 0, 0))
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (4, 1), (3,)])
+def test_poses_are_no_points(shape: tuple[int, ...]) -> None:
+    """Four poses are as many numbers as six points: the look-up would write past the end of its results."""
+    for field in (blocks(), SmoothField(blocks())):
+        with pytest.raises(ModelError, match=r"points are \(\.\.\., 2\) arrays, found shape"):
+            field.distance(np.zeros(shape))
 
 
 def test_a_scan_is_cheap() -> None:
