@@ -21,7 +21,8 @@ from unifg.typing import Array, IntArray
 
 __all__ = ["BundleAdjustment", "project", "reprojection", "triangulate"]
 
-UNDISTORTED = 10  # rounds of taking the distortion out of a pixel
+UNDISTORTED = 20  # steps of Newton's method that take the distortion out of a pixel
+HELD = 1e-6  # of the distance of two cameras: how firmly it is kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,7 @@ class BundleAdjustment:
         points = graph.variables("points", Rn(3), len(self.points))
         graph.fix(poses[0], self.poses[0], name="first camera")
         graph.minimize(
-            _apart, poses[other], centres[0], far[other], sigma=1e-3 * float(far[other]), name="scale of the map"
+            _apart, poses[other], centres[0], far[other], sigma=HELD * float(far[other]), name="scale of the map"
         )
         graph.minimize(
             reprojection, poses[self.camera], intrinsics[self.camera], points[self.point], self.pixels, sigma=sigma,
@@ -107,10 +108,13 @@ def triangulate(problem: BundleAdjustment) -> Array:
     A point that is observed once, or along one ray only, keeps its value.
     """
     focal, first, second = problem.intrinsics[problem.camera].T[:, :, None]
-    flat = target = problem.pixels / focal
+    target = problem.pixels / focal
+    radius = size = np.linalg.norm(target, axis=1, keepdims=True)
     for _ in range(UNDISTORTED):
-        squared = np.sum(flat**2, axis=1, keepdims=True)
-        flat = target / (1.0 + squared * (first + second * squared))
+        squared = radius**2
+        off = radius * (1.0 + squared * (first + second * squared)) - size
+        radius = radius - off / (1.0 + squared * (3.0 * first + 5.0 * second * squared))
+    flat = target / (1.0 + radius**2 * (first + second * radius**2))
     matrices = SE3.to_matrix(problem.poses)[problem.camera]
     rows = matrices[:, :2, :3] + flat[:, :, None] * matrices[:, 2:3, :3]  # P_xy + flat P_z = 0
     right = -(matrices[:, :2, 3] + flat * matrices[:, 2:3, 3])

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
 
 import unifg as fg
 from judge import judge
 from unifg.files.bal import read_bal, write_bal
 from unifg.models.bundle_adjustment import BundleAdjustment, project, triangulate
 from unifg.solvers import LevenbergMarquardt
+from unifg.typing import Array
 
 
 def scene(cameras: int = 8, size: int = 60, noise: float = 0.5, seed: int = 0) -> BundleAdjustment:
@@ -77,6 +79,15 @@ def test_exact_pixels_are_triangulated_exactly_and_what_is_seen_once_stays() -> 
     np.testing.assert_array_equal(found[3], problem.points[3] + 1.0)
 
 
+@pytest.mark.parametrize("distortion", [(-0.2, 0.02), (-0.1, 0.0), (0.3, 0.1), (0.0, 1.0)])
+def test_wide_and_strongly_distorted_pixels_are_triangulated_exactly(distortion: tuple[float, float]) -> None:
+    problem = scene(noise=0.0)
+    near = replace(problem, intrinsics=problem.intrinsics * [1.0, 0.0, 0.0] + [0.0, *distortion])
+    near.poses[:, 2] += 5.0  # points up to some 45 degrees beside the axis
+    pixels = project(near.poses[near.camera], near.intrinsics[near.camera], near.points[near.point])
+    np.testing.assert_allclose(triangulate(replace(near, pixels=pixels)), near.points, atol=1e-7)
+
+
 @pytest.mark.parametrize("calibrated", [False, True])
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_a_map_is_found_up_to_place_and_scale(unit: float, calibrated: bool) -> None:
@@ -93,6 +104,32 @@ def test_a_map_is_found_up_to_place_and_scale(unit: float, calibrated: bool) -> 
     np.testing.assert_allclose(apart[0] / apart[0].mean(), apart[1] / apart[1].mean(), atol=0.02)
     if unit == 1.0:
         assert judge(graph, solution).worst() < 1e-3  # by slopes found apart from the library's
+
+
+def test_an_uncertain_scale_is_no_part_of_the_covariance() -> None:
+    """Against least squares in which two cameras keep their distance exactly, by a step that is left out."""
+    problem = scene(size=15, seed=2)
+    graph, guess = problem.graph(sigma=0.5, calibrated=True)
+    solution = LevenbergMarquardt().solve(graph, guess, check=True)
+    poses, points, turned = solution["poses"], solution["points"], 6 * (len(problem.poses) - 1)
+    centres = fg.SE3.inverse(poses)[:, :3]
+    begun = fg.SE3.inverse(problem.poses)[:, :3]
+    other = int(np.linalg.norm(begun - begun[0], axis=1).argmax())
+
+    def seen(step: Array) -> Array:
+        moved = fg.SE3.retract(poses, np.concatenate([np.zeros((1, 6)), step[:turned].reshape(-1, 6)]))
+        marks = points + step[turned:].reshape(-1, 3)
+        return project(moved[problem.camera], problem.intrinsics[problem.camera], marks[problem.point]).ravel() / 0.5
+
+    h = 1e-6 * np.eye(turned + points.size)
+    slopes = np.stack([(seen(row) - seen(-row)) / 2e-6 for row in h], axis=1)
+    away = np.zeros(turned + points.size)
+    apart = centres[other] - centres[0]
+    away[6 * (other - 1) : 6 * other] = np.concatenate([apart, np.cross(centres[other], apart)])
+    free = null_space(away[None])
+    expected = free @ np.linalg.inv(free.T @ slopes.T @ slopes @ free) @ free.T
+    found = solution.covariance(graph.families["points"][7])
+    np.testing.assert_allclose(found, expected[turned + 21 : turned + 24, turned + 21 : turned + 24], rtol=1e-3)
 
 
 def test_what_pixels_do_not_tell_is_refused_or_held() -> None:

@@ -122,7 +122,7 @@ def test_bad_grids_are_refused() -> None:
     with pytest.raises(ModelError, match="resolution"):
         DistanceMap(np.zeros((2, 2)), -0.1, (0.0, 0.0, 0.0))
     for resolution in (-0.1, math.nan):  # which is no matter of the cap
-        with pytest.raises(ModelError, match="resolution .* must be positive"):
+        with pytest.raises(ModelError, match=r"resolution .* must be positive"):
             DistanceMap.from_occupancy(np.eye(3, dtype=bool), resolution, (0, 0, 0))
     with pytest.raises(ModelError, match="origin"):
         DistanceMap(np.zeros((2, 2)), 0.1, (0.0, math.nan, 0.0))
