@@ -27,6 +27,7 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual, residual
 from unifg.lie import SE23, SO3, Manifold, Product
 from unifg.locks import ReentrantLock
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.factors import difference
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data, Selection, Variable, as_selection
@@ -253,8 +254,10 @@ class InertialMeasurements:
 
         Raises:
             ModelError: on another shape.
+            GraphError: on masked arrays, dates, and what is no real number.
         """
-        t, w, a = (np.asarray(part, dtype=np.float64) for part in (stamp, gyro, accelerometer))
+        parts = {"stamps": stamp, "rates": gyro, "forces": accelerometer}
+        t, w, a = (doubles(f"'{self.name}': {what}", part) for what, part in parts.items())
         if t.ndim > 1 or w.shape != (*t.shape, 3) or a.shape != w.shape:
             raise ModelError(
                 f"'{self.name}': stamps {t.shape} need rates and forces {(*t.shape, 3)}, found {w.shape}, {a.shape}"

@@ -18,6 +18,7 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Function, Residual
 from unifg.factors.robust import Loss
 from unifg.locks import ReentrantLock
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data, Family, Variable, as_selection
 from unifg.models.interpolation import Interpolation, geodesic
@@ -185,8 +186,10 @@ class StampedMeasurements:
 
         Raises:
             ModelError: on another shape.
+            GraphError: on masked arrays, dates, and what is no real number.
         """
-        stamps, values = np.array(stamp, dtype=np.float64), np.array(value, dtype=np.float64)
+        stamps = np.array(doubles(f"'{self.name}': stamps", stamp))
+        values = np.array(doubles(f"'{self.name}': values", value))
         wanted = (*stamps.shape, self.size)
         if stamps.ndim > 1 or (values.shape != wanted and not (self.size == 1 and values.shape == stamps.shape)):
             raise ModelError(f"'{self.name}': stamps {stamps.shape} need values {wanted}, found {values.shape}")

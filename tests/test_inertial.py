@@ -503,6 +503,12 @@ def test_misuse_of_the_bookkeeping_is_named() -> None:
         imu.at(graph, [0.0, 1.0], NONE)
     with pytest.raises(ModelError, match=r"need rates and forces \(2, 3\)"):
         imu.add([0.0, 1.0], np.zeros((2, 3)), np.zeros(3))
+    for wrong, words in (
+        (np.ma.masked_array(np.zeros(3), [True] * 3), "rates is a masked"),
+        (1j * np.ones(3), "complex"),
+    ):
+        with pytest.raises(fg.GraphError, match=words):
+            imu.add(0.0, wrong, np.zeros(3))
     for gap in (0.0, np.nan):
         with pytest.raises(ModelError, match="must be positive"):
             InertialMeasurements(NOISE, gap=gap)

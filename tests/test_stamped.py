@@ -271,6 +271,19 @@ def test_shapes_and_times_are_checked() -> None:
         fixes.add(0.1, np.zeros(3))
     with pytest.raises(ModelError, match=r"need values \(3, 2\), found \(2, 2\)"):
         fixes.add(np.zeros(3), np.zeros((2, 2)))
+    masked = np.ma.masked_array(np.zeros((3, 2)), [[False] * 2, [True] * 2, [False] * 2])
+    for stamps, values, words in (
+        (np.zeros(3), masked, "'fixes': values is a masked array"),
+        (
+            np.array(["2026-01-01"], dtype="M8[D]"),
+            np.zeros((1, 2)),
+            "'fixes': stamps must be real numbers, found dates",
+        ),
+        ([0.1], [["1", "2"]], "'fixes': values must be real numbers, found text"),
+    ):
+        with pytest.raises(fg.GraphError, match=words):
+            fixes.add(stamps, values)
+    assert fixes.counts == Counts()
     for times in (TIMES[:4], TIMES[::-1], np.zeros(5), [0.0, 0.1, np.nan, 0.3, 0.4]):
         with pytest.raises(ModelError, match="5 finite, increasing numbers"):
             fixes.at(graph, times)
