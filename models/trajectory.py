@@ -107,7 +107,7 @@ class CubicTrajectory:
         """
         if not isfinite(end):
             raise ModelError(f"trajectory: the end {end!r} must be finite")
-        return ORDER + max(int(np.ceil((end - self.start) / self.spacing - 1e-9)) - 1, 0)
+        return ORDER + max(int(np.ceil((end - self.start) / self.spacing - self._slack(end))) - 1, 0)
 
     def knots(self, count: int) -> Array:
         """(count,) moments that the control poses belong to [s]; the first and the last lie outside.
@@ -127,15 +127,20 @@ class CubicTrajectory:
             raise ModelError(f"trajectory: {count} control poses hold no moment, {ORDER} the first interval")
         since = (times - self.start) / self.spacing
         last = count - ORDER
-        outside = ~((since >= -1e-9) & (since <= last + 1 + 1e-9))
+        slack = self._slack(times)
+        outside = ~((since >= -slack) & (since <= last + 1 + slack))
         if outside.any():
             index = int(np.argmax(outside))
             raise ModelError(
-                f"trajectory: moment {times[index]!r} s (number {index}) is outside of {self.start:g} .. "
-                f"{self.start + (last + 1) * self.spacing:g} s, which {count} control poses hold"
+                f"trajectory: moment {times[index]:.12g} s (number {index}) is outside of {self.start:.12g} .. "
+                f"{self.start + (last + 1) * self.spacing:.12g} s, which {count} control poses hold"
             )
         first = np.clip(np.floor(since), 0, last).astype(np.int64)
         return Places(first, np.clip(since - first, 0.0, 1.0))
+
+    def _slack(self, times: Any) -> Any:
+        """By how many spacings rounding may put moments outside: those since 1970 have steps of 0.2 us."""
+        return 1e-9 + 2.0 * np.spacing(np.maximum(np.abs(times), abs(self.start))) / self.spacing
 
     def at(self, controls: ArrayLike, times: ArrayLike) -> Array:
         """(n, storage) poses at (n,) moments [s], of (N, storage) control poses; as :meth:`places` raises."""

@@ -89,6 +89,19 @@ def test_brackets_of_rotations_are_cross_products(rng: np.random.Generator) -> N
         assert np.abs(total).max() == 0.0
 
 
+@pytest.mark.parametrize("start", [0.0, 1.7e9, 1690000000.123])
+@pytest.mark.parametrize("spacing", [0.01, 0.1, 0.3])
+def test_whole_numbers_of_spacings_need_no_pose_more(start: float, spacing: float) -> None:
+    """One more would be held by nothing, as seconds since 1970 are rounded to 0.2 us."""
+    curve = CubicTrajectory(fg.SE2, start, spacing)
+    for count in range(1, 200):
+        end = start + count * spacing
+        assert curve.controls(end) == count + 3
+        assert curve.places([start, end], count + 3).first.tolist() == [0, count - 1]
+    with pytest.raises(ModelError, match=f"is outside of {start:.12g} .. {start + spacing:.12g} s"):
+        curve.places([start + 1.01 * spacing], 4)
+
+
 def test_moments_outside_are_refused() -> None:
     curve = CubicTrajectory(fg.SE2, start=5.0, spacing=0.5)
     assert (
