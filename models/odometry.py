@@ -100,15 +100,15 @@ def held(time: ArrayLike, velocity: ArrayLike, at: ArrayLike) -> Array:
         (m, 3) poses x, y, heading [m, m, rad]; the heading is not wrapped.
 
     Raises:
-        ModelError: shapes do not fit, or times fall.
+        ModelError: shapes do not fit, or times fall or are no numbers.
     """
     since, speed, when = (np.asarray(part, dtype=np.float64) for part in (time, velocity, at))
     if since.ndim != 1 or speed.shape != (len(since), 2) or when.ndim != 1:
         raise ModelError(
             f"time {since.shape}, velocity {speed.shape} and at {when.shape} must be (n,), (n, 2) and (m,)"
         )
-    if (np.diff(since) < 0.0).any() or (np.diff(when) < 0.0).any():
-        raise ModelError("times of velocities, and those to look at, must not fall")
+    if not ((np.diff(since) >= 0.0).all() and (np.diff(when) >= 0.0).all()):
+        raise ModelError("times of velocities, and those to look at, must be numbers and not fall")
     if not len(when):
         return np.zeros((0, 3))
     inside = since[(since > when[0]) & (since < when[-1])]

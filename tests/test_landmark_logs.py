@@ -192,8 +192,9 @@ def test_velocities_hold_until_the_next() -> None:
     [
         (lambda: driven(np.zeros((3, 3))), r"steps have shape \(3, 3\), expected \(n, 2\)"),
         (lambda: held([0.0], np.zeros((2, 2)), [0.0]), r"velocity \(2, 2\)"),
-        (lambda: held([1.0, 0.0], np.zeros((2, 2)), [0.0]), "must not fall"),
-        (lambda: held([0.0], np.zeros((1, 2)), [1.0, 0.0]), "must not fall"),
+        (lambda: held([1.0, 0.0], np.zeros((2, 2)), [0.0]), "not fall"),
+        (lambda: held([0.0, np.nan, 2.0], np.zeros((3, 2)), [0.0]), "must be numbers and not fall"),
+        (lambda: held([0.0], np.zeros((1, 2)), [1.0, 0.0]), "not fall"),
     ],
 )
 def test_odometry_that_does_not_fit(call: object, message: str) -> None:
