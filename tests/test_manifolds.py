@@ -101,6 +101,23 @@ def test_product_is_componentwise(rng: Generator) -> None:
     np.testing.assert_array_equal(loose, [1, 0, PI / 2])
 
 
+def test_numbers_of_another_length_are_refused(rng: Generator) -> None:
+    """A step of seven numbers would move x by its first six, and spread the seventh over the three of v."""
+    product = Product(p=Rn(3), R=SO3, v=Rn(3))
+    x, d = product.random(rng, (4,)), np.zeros((4, 9))
+    for call, said in (
+        (lambda: product.retract(x, d[:, :7]), r"\(\.\.\., 9\) arrays, for its dim; got shape \(4, 7\)"),
+        (lambda: product.retract(x, x), r"got shape \(4, 10\)"),
+        (lambda: product.local(x, d), r"\(\.\.\., 10\) arrays, for its storage; got shape \(4, 9\)"),
+        (lambda: product.log(d), "its storage; got"),
+        (lambda: product.exp(x), "its dim; got"),
+        (lambda: product.compose(x, 1.0), r"got shape \(\)"),
+        (lambda: product.unpack(d), "its storage; got"),
+    ):
+        with pytest.raises(UnifgError, match=said):
+            call()
+
+
 def test_pack_and_unpack(rng: Generator) -> None:
     state = Product(p=Rn(2), T=SE2)
     pose = SE2.random(rng, (4,))

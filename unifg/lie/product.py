@@ -110,7 +110,7 @@ class Product:
 
     def unpack(self, x: ArrayLike, /) -> dict[str, Array]:
         """Split (..., storage) into views, one per component."""
-        x = np.asarray(x, dtype=np.float64)
+        x = self._sized(STORAGE, x)
         return {name: x[..., part.storage] for name, part in self.components.items()}
 
     def identity(self) -> Array:
@@ -119,12 +119,12 @@ class Product:
 
     def retract(self, x: ArrayLike, d: ArrayLike, /) -> Array:
         """Move each component by its own retraction, (..., storage)."""
-        x, d = np.asarray(x, dtype=np.float64), np.asarray(d, dtype=np.float64)
+        x, d = self._sized(STORAGE, x), self._sized(DIM, d)
         return self._join(lambda c: c.manifold.retract(x[..., c.storage], d[..., c.tangent]))
 
     def local(self, x: ArrayLike, y: ArrayLike, /) -> Array:
         """Return the step of each component, (..., dim)."""
-        x, y = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
+        x, y = self._sized(STORAGE, x), self._sized(STORAGE, y)
         return self._join(lambda c: c.manifold.local(x[..., c.storage], y[..., c.storage]))
 
     def random(self, rng: np.random.Generator, /, shape: tuple[int, ...] = ()) -> Array:
@@ -136,6 +136,13 @@ class Product:
         x = np.asarray(x, dtype=np.float64)
         verdicts = [part.manifold.is_valid(x[..., part.storage]) for part in self.components.values()]
         return np.asarray(np.logical_and.reduce(verdicts))
+
+    def _sized(self, size: str, x: ArrayLike) -> Array:
+        """(..., n) numbers: slices of what is longer or shorter would be elements of something else."""
+        array, length = np.asarray(x, dtype=np.float64), getattr(self, size)
+        if array.shape[-1:] != (length,):
+            raise UnifgError(f"{self.name} takes (..., {length}) arrays, for its {size}; got shape {array.shape}")
+        return array
 
     def _join(self, of: Callable[[Component], Array]) -> Array:
         """Put the components' results side by side."""
@@ -163,10 +170,10 @@ class Product:
 
 def _componentwise(name: str) -> Callable[..., Array]:
     """Make the method of a product that does the same to every component."""
-    square = len(LAYOUTS[name][1]) == 2
+    sizes, square = LAYOUTS[name][0], len(LAYOUTS[name][1]) == 2
 
     def each(self: Any, *arguments: ArrayLike) -> Array:
-        arrays = [np.asarray(argument, dtype=np.float64) for argument in arguments]
+        arrays = [self._sized(size, x) for size, x in zip(sizes, arguments, strict=True)]
         found = [of(*(x[..., at] for x, at in zip(arrays, parts, strict=True))) for of, *parts in self._of(name)]
         return self._diagonal(name, found) if square else np.concatenate(found, axis=-1)
 
