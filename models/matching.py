@@ -57,7 +57,7 @@ def nearest(seen: Array, forecast: Array, innovation: Array, possible: BoolArray
         gates: how near is near.
 
     Returns:
-        (M,) index of a landmark, ``NEW`` or ``DOUBTFUL``.
+        (M,) index of a landmark, ``NEW`` or ``DOUBTFUL``, as for a sighting that is no number.
     """
     found = np.full(len(seen), NEW, dtype=np.intp)
     if not len(seen) or not len(forecast):
@@ -66,7 +66,8 @@ def nearest(seen: Array, forecast: Array, innovation: Array, possible: BoolArray
     difference[..., 0] = wrap_angle(difference[..., 0])
     distance = np.einsum("mka,kab,mkb->mk", difference, np.linalg.inv(innovation), difference)
     distance[~possible] = np.inf
-    found[distance.min(axis=1) < gates.new] = DOUBTFUL
+    found[~(distance.min(axis=1) >= gates.new)] = DOUBTFUL
+    distance[np.isnan(distance)] = np.inf
     while True:
         m, k = np.unravel_index(int(np.argmin(distance)), distance.shape)
         if not distance[m, k] <= gates.match:

@@ -286,6 +286,8 @@ def test_gates() -> None:
     possible[4, 0] = False
     assert nearest(seen, forecast, innovation, possible, Gates()).tolist() == [0, DOUBTFUL, NEW, 2, NEW]
     assert nearest(seen, forecast[:0], innovation[:0], possible[:, :0], Gates()).tolist() == [NEW] * 5
+    seen[2, 1] = np.nan  # one sensor that fails makes no new landmarks of what the others see
+    assert nearest(seen, forecast, innovation, possible, Gates()).tolist() == [0, DOUBTFUL, DOUBTFUL, 2, NEW]
 
 
 def test_landmarks_come_with_the_covariance_of_their_sighting() -> None:
