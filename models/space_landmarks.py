@@ -71,9 +71,15 @@ def observe_3d(
         landmarks: (M, 3) places [m].
         state: of x.
         body_T_sensor: (7,) place of the sensor on the body.
+
+    Raises:
+        ModelError: for another manifold, on another shape, or a place that is none.
     """
     p, R = pose_parts(state, "observe_3d")
-    at, places = np.asarray(x, dtype=np.float64)[None], np.asarray(landmarks, dtype=np.float64).reshape(-1, 3)
+    at, places = np.asarray(x, dtype=np.float64)[None], np.asarray(landmarks, dtype=np.float64)
+    if at.shape != (1, state.storage) or (places.size and places.shape[-1] != 3):
+        raise ModelError(f"observe_3d: a state ({state.storage},), places (M, 3); found {at.shape[1:]}, {places.shape}")
+    places = places.reshape(-1, 3)
     seen = _sensor(at[:, p], at[:, R], places, _mounted(body_T_sensor))
     distance = np.linalg.norm(seen, axis=1, keepdims=True)
     return np.concatenate([seen / distance, distance], axis=1)

@@ -107,6 +107,9 @@ def test_what_is_no_pose_is_refused() -> None:
     for place in (np.zeros(7), np.zeros(6), [np.nan] * 7):
         with pytest.raises(ModelError, match="must be an element of SE3"):
             bearing_3d(SE3, place)
+    for x, marks in ((SE3.identity(), np.zeros((3, 2))), (SE3.identity()[None], np.zeros((3, 3)))):
+        with pytest.raises(ModelError, match=r"observe_3d: a state \(7,\), places \(M, 3\); found"):
+            observe_3d(x, marks)  # three places in the plane are no two in space
     assert bearing_3d().kernel is bearing_3d().kernel  # derived once
 
 
