@@ -116,13 +116,16 @@ class Base:
 
         Returns:
             (n, 3) next poses.
+
+        Raises:
+            ModelError: on another shape.
         """
         moved = np.empty((max(len(x), len(u)), 3))
         self._advance(_rows(x, moved, 3), u, dt, moved)
         return moved
 
     def rollout(self, start: Array, u: Array, dt: ArrayLike) -> Array:
-        """States reached from ``start`` (3,) under controls (n, m): (n + 1, 3)."""
+        """States reached from ``start`` (3,) under controls (n, m): (n + 1, 3); as :meth:`step` raises."""
         states = np.empty((len(u) + 1, 3))
         states[0] = start
         self._advance(states[:-1], u, dt, states[1:])
@@ -191,7 +194,10 @@ def ramp(last: Array, u: Array) -> Array:
 
 def _rows(part: ArrayLike, moved: Array, size: int) -> Array:
     """One contiguous row per result."""
-    return np.array(np.broadcast_to(np.asarray(part, dtype=np.float64), (len(moved), size)), order="C")
+    array = np.asarray(part, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != size:
+        raise ModelError(f"poses and controls of a base are (n, 3) and (n, m), here (n, {size}); got {array.shape}")
+    return np.array(np.broadcast_to(array, (len(moved), size)), order="C")
 
 
 def ackermann(wheelbase: float = 0.3, steering: float = 0.6, rate: float = 2.0) -> Base:

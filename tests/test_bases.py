@@ -118,6 +118,11 @@ def test_a_step_keeps_the_dynamics_and_goes_along_the_arc(name: str) -> None:
     tangent[:, : body.shape[1] - 1], tangent[:, 2] = body[:, :-1], body[:, -1]
     exact = fg.SE2.retract(x, DT * tangent)
     assert np.abs(fg.SE2.local(exact, base.step(x, u, DT))).max() < 1e-5
+    for pose, control in ((x[0], u), (x, u[0]), (x[:1], u[0]), (x, u[:, :1])):  # one control is no row for each number
+        with pytest.raises(ModelError, match="poses and controls of a base are"):
+            base.step(pose, control, DT)
+    with pytest.raises(ModelError, match="poses and controls of a base are"):
+        base.rollout(x[0], u[0], DT)
 
 
 def test_a_car_turns_about_its_radius_and_not_on_the_spot() -> None:
