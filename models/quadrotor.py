@@ -210,12 +210,12 @@ def fly(
         (10,) state.
 
     Raises:
-        ModelError: on another shape, or no substep.
+        ModelError: on another shape, or no whole number of substeps.
     """
     state, u = _single(state, 10, "state"), _single(u, 4, "control")
     disturbance = np.zeros(6) if noise is None else _single(noise, 6, "noise")
-    if substeps < 1:
-        raise ModelError(f"fly needs at least one substep, found {substeps}")
+    if substeps < 1 or substeps % 1:
+        raise ModelError(f"fly needs at least one substep, a whole number, found {substeps}")
     reached = state.copy()
     quadrotor_dynamics.integrate(reached, u, disturbance, parameters.packed, float(dt) / substeps, substeps)
     return reached

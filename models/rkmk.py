@@ -231,9 +231,11 @@ def rollout(
 
     Raises:
         UnifgError: when Newton's method does not converge in a step of an implicit method.
-        ModelError: on an unknown method.
+        ModelError: on an unknown method, or no whole number of substeps.
     """
     tableau = _tableau(method)
+    if substeps < 1 or substeps % 1:
+        raise ModelError(f"rollout takes a whole number of substeps, 1 or more; found {substeps!r}")
     parts = [np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in inputs]
     count = max([len(part) for part in parts], default=1) if count is None else count
     parts = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
