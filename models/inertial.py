@@ -238,7 +238,7 @@ class InertialMeasurements:
 
     def _named(self, found: Preintegrated) -> dict[str, Array]:
         """Values of the data, by name, in the order in which they are stated."""
-        known = found.held <= self.gap
+        known = found.held <= self.gap + CLOSE
         return {
             f"{self.name}: increment": found.increment,
             f"{self.name}: by bias": found.by_bias,
@@ -303,8 +303,8 @@ class InertialMeasurements:
         """
         term: Any = graph.term(self.name)
         needed, at = term.count + 1, np.asarray(times, dtype=np.float64)
-        if at.shape != (needed,):
-            raise ModelError(f"'{self.name}': {needed} times are needed, found {at.shape}")
+        if at.shape != (needed,) or not (np.isfinite(at).all() and (np.diff(at) > 0.0).all()):
+            raise ModelError(f"'{self.name}': {needed} times are needed, finite and increasing, found {at}")
         walking = [f"{self.name}: biases"] if f"{self.name}: biases" in (term.name for term in graph.terms) else []
         return by_handle(graph, (self.name, *walking), self._given(at, 0, bias))
 
@@ -317,8 +317,9 @@ class InertialMeasurements:
             begin = float(self._samples[0, 0]) if len(self._samples) else np.inf
             if since < begin - CLOSE and self._left >= since - self.gap:
                 raise ModelError(
-                    f"'{self.name}': nodes from {since:g} s on are asked for, but the samples before {begin:g} s have "
-                    "been forgotten: give every window a sensor of its own, and call reset() where time begins anew"
+                    f"'{self.name}': nodes from {since:.12g} s on are asked for, but the samples before {begin:.12g} s "
+                    "have been forgotten: give every window a sensor of its own, and call reset() where time begins "
+                    "anew"
                 )
             old = int(np.searchsorted(self._samples[:, 0], since, side="right")) - 1
             if old > 0:
@@ -327,7 +328,7 @@ class InertialMeasurements:
             samples = self._samples
         found = self._integrated(samples, times, bias)
         found.held[:first] = np.inf
-        unknown = int((found.held[first:] > self.gap).sum())
+        unknown = int((found.held[first:] > self.gap + CLOSE).sum())
         with self._lock:
             self.counts = replace(self.counts, kept=len(samples), unknown=unknown)
         still = slice(empty, first)  # steps of no duration, in which nothing moves

@@ -261,8 +261,9 @@ class StampedMeasurements:
         slack = CLOSE * float(np.diff(at).min()) + 4.0 * float(np.spacing(np.abs(at).max()))
         if at[0] < self._since - slack and self._left + offset >= at[0] - slack:
             raise ModelError(
-                f"'{self.name}': nodes from {at[0]:g} s on are asked for, but what was measured before {self._since:g} "
-                "s has left: give every window a sensor of its own, and call reset() where time begins anew"
+                f"'{self.name}': nodes from {at[0]:.12g} s on are asked for, but what was measured before "
+                f"{self._since:.12g} s has left: give every window a sensor of its own, and call reset() where time "
+                "begins anew"
             )
         late, ahead = taken < at[0] - slack, taken > at[-1] + slack
         inside = np.flatnonzero(~late & ~ahead)

@@ -515,6 +515,20 @@ def test_misuse_of_the_bookkeeping_is_named() -> None:
     assert imu.counts == SampleCounts()
 
 
+def test_refused_times_cost_no_sample_and_seconds_since_1970_are_named_in_full() -> None:
+    graph, _, _, imu, _ = estimator(3)
+    times = 1.7e9 + np.arange(3.0)
+    imu.add(1.7e9 + np.arange(0.0, 5.0, 0.1), np.zeros((50, 3)), np.zeros((50, 3)))
+    for wrong in (times[::-1], np.array([np.nan, *times[1:]])):
+        with pytest.raises(ModelError, match="3 times are needed, finite and increasing, found"):
+            imu.at(graph, wrong, NONE)
+    imu.at(graph, times, NONE)
+    assert imu.counts.unknown == 0 and imu.counts.kept == 50  # tenths of a second, rounded, are no longer than the gap
+    imu.at(graph, times + 2.0, NONE)
+    with pytest.raises(ModelError, match=r"nodes from 1700000000 s on are .* before 1700000002 s have been forgotten"):
+        imu.at(graph, times, NONE)
+
+
 def test_the_walk_of_biases_grows_with_the_root_of_time() -> None:
     sigma = NOISE.walk([0.25, 4.0])
     assert sigma.shape == (2, 6)

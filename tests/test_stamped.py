@@ -265,6 +265,14 @@ def test_rounding_of_node_times_keeps_measurements_on_the_ends(epoch: float) -> 
     assert fixes.counts == Counts(placed=2)
 
 
+def test_nodes_whose_measurements_have_left_are_named_in_full() -> None:
+    graph, _, fixes = window()
+    fixes.add(1.7e9 + 0.15, np.zeros(2))
+    fixes.at(graph, 1.7e9 + 0.25 + TIMES)
+    with pytest.raises(ModelError, match=r"nodes from 1700000000 s on are .* before 1700000000\.25 s has left"):
+        fixes.at(graph, 1.7e9 + TIMES)
+
+
 def test_shapes_and_times_are_checked() -> None:
     graph, x, fixes = window()
     with pytest.raises(ModelError, match=r"need values \(2,\), found \(3,\)"):
