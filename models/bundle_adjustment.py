@@ -123,7 +123,7 @@ def triangulate(problem: BundleAdjustment) -> Array:
     np.add.at(normal, problem.point, np.einsum("nra,nrb->nab", rows, rows))
     np.add.at(moment, problem.point, np.einsum("nra,nr->na", rows, right))
     sound = np.linalg.cond(normal + 1e-300) < 1e12
-    found = problem.points.copy()
+    found = np.array(problem.points, dtype=np.float64)
     found[sound] = np.linalg.solve(normal[sound], moment[sound][:, :, None])[:, :, 0]
     return found
 

@@ -77,6 +77,8 @@ def test_exact_pixels_are_triangulated_exactly_and_what_is_seen_once_stays() -> 
     others = np.arange(len(found)) != 3
     np.testing.assert_allclose(found[others], problem.points[others], atol=1e-7)
     np.testing.assert_array_equal(found[3], problem.points[3] + 1.0)
+    whole = triangulate(replace(lone, points=np.zeros(problem.points.shape, dtype=int)))  # no guess, and no fractions
+    np.testing.assert_array_equal(whole[others], found[others])
 
 
 @pytest.mark.parametrize("distortion", [(-0.2, 0.02), (-0.1, 0.0), (0.3, 0.1), (0.0, 1.0)])
