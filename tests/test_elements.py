@@ -143,6 +143,14 @@ def test_data_are_checked_at_statement_and_at_every_binding() -> None:
     np.testing.assert_allclose(fg.SE3.local(POSE, solver.solve(guess)[x][0]), 0.0, atol=1e-9)
 
 
+@pytest.mark.parametrize(("group", "maker"), [(fg.SO3, "SO3"), (fg.SE3, "SE3"), (fg.lie.SE23, "SO3")])
+def test_the_constructor_that_is_named_exists(group: Any, maker: str) -> None:
+    graph, x = graph_with(group, 1)
+    with pytest.raises(fg.GraphError, match=f"norm 1: {maker}.from_quaternion converts others"):
+        graph.minimize(fg.prior, x, 1.1 * group.identity())
+    assert hasattr(getattr(fg.lie, maker), "from_quaternion")
+
+
 def test_a_fix_by_data_is_named_as_what_fixes() -> None:
     graph = fg.Graph()
     x, start = graph.variables("x", fg.SE3, 2), graph.data("start", fg.SE3.identity())

@@ -109,7 +109,8 @@ def nearest(what: str, manifold: Manifold, given: Array, active: BoolArray | Non
             k, finite = int(wrong[bad[0]]), np.isfinite(here[bad[0]]).all()
             said = f"is not on {leaf.name}" if finite else "is not finite"
             shown = ", ".join(f"{number:.6g}" for number in here[bad[0]].tolist())
-            hint = f"; its quaternion is to be w first, norm 1: {leaf.name}.from_quaternion converts others"
+            maker = "SO3" if isinstance(leaf, ExtendedPoses) else leaf.name
+            hint = f"; its quaternion is to be w first, norm 1: {maker}.from_quaternion converts others"
             raise GraphError(
                 f"{what}, row {k}, {said}: [{shown}]{hint if isinstance(leaf, QUATERNIONS) else ''}",
                 term=term,
