@@ -139,7 +139,7 @@ class CubicTrajectory:
         return Places(first, np.clip(since - first, 0.0, 1.0))
 
     def _slack(self, times: Any) -> Any:
-        """By how many spacings rounding may put moments outside: those since 1970 have steps of 0.2 us."""
+        """Spacings by which rounding may put moments outside: those since 1970 have steps of 0.2 us."""
         return 1e-9 + 2.0 * np.spacing(np.maximum(np.abs(times), abs(self.start))) / self.spacing
 
     def at(self, controls: ArrayLike, times: ArrayLike) -> Array:
