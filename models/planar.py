@@ -110,8 +110,8 @@ class Base:
         """Advance by one sample with the heading at mid-step.
 
         Args:
-            x: (n, 3) poses [m, m, rad].
-            u: (n, m) controls.
+            x: (n, 3) poses [m, m, rad], or one for all controls.
+            u: (n, m) controls, or one for all poses.
             dt: sampling time [s], one or (n,).
 
         Returns:
@@ -120,6 +120,7 @@ class Base:
         Raises:
             ModelError: on another shape.
         """
+        x, u = np.atleast_2d(x), np.atleast_2d(u)
         moved = np.empty((max(len(x), len(u)), 3))
         self._advance(_rows(x, moved, 3), u, dt, moved)
         return moved

@@ -118,9 +118,12 @@ def test_a_step_keeps_the_dynamics_and_goes_along_the_arc(name: str) -> None:
     tangent[:, : body.shape[1] - 1], tangent[:, 2] = body[:, :-1], body[:, -1]
     exact = fg.SE2.retract(x, DT * tangent)
     assert np.abs(fg.SE2.local(exact, base.step(x, u, DT))).max() < 1e-5
-    for pose, control in ((x[0], u), (x, u[0]), (x[:1], u[0]), (x, u[:, :1])):  # one control is no row for each number
-        with pytest.raises(ModelError, match="poses and controls of a base are"):
-            base.step(pose, control, DT)
+    for pose, control in ((x[0], u), (x, u[0]), (x[:1], u[0]), (x[0], u[0])):  # one control is no row for each number
+        count = max(np.atleast_2d(pose).shape[0], np.atleast_2d(control).shape[0])
+        rows, every = np.broadcast_to(pose, (count, 3)), np.broadcast_to(control, (count, u.shape[1]))
+        np.testing.assert_array_equal(base.step(pose, control, DT), base.step(rows, every, DT))
+    with pytest.raises(ModelError, match="poses and controls of a base are"):
+        base.step(x, u[:, :1], DT)
     with pytest.raises(ModelError, match="poses and controls of a base are"):
         base.rollout(x[0], u[0], DT)
 

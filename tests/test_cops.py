@@ -64,7 +64,7 @@ def test_units_follow_what_a_graph_is_written_in(name: str) -> None:
         program = graph.compile()
         lin = program.linearize(program.values_from(guess))
         memory = program.unit_memory()
-        derivatives = lin.hessian, lin.concavity, lin.gradient, lin.constraints, lin.constraint_jacobian
+        derivatives = lin.hessian, lin.concavity, lin.gradient, lin.jacobian, lin.constraints, lin.constraint_jacobian
         measures.find_units(program.arrays, memory, units.rows, *derivatives)
         return memory
 

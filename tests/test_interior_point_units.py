@@ -154,3 +154,21 @@ def test_a_joint_window_takes_a_few_iterations_in_any_unit_of_length(metre: floa
         )
         solution = loop.solution
         assert solution is not None and solution.converged and solution.iterations <= (8 if k else 30)
+
+
+@pytest.mark.parametrize("heading", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3])
+def test_a_heading_next_to_nothing_gives_the_way_ahead_no_unit(heading: float) -> None:
+    """A lateral error sees the way ahead by the heading alone: its curvature there is no unit of another kind."""
+    graph = fg.Graph()
+    x, u = graph.variables("x", fg.SE2, 16), graph.variables("u", fg.Rn(2), 15)
+    graph.fix(x[0], [0.0, 0.0, 0.0])
+    graph.minimize(fg.prior, u, [1.0, 0.0], sigma=0.5, name="cruise")
+    graph.minimize(lambda x: x[:, 1:2], x[1:], sigma=0.5, name="lane")
+    graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.2, lower=0.0, upper=0.0, name="motion")
+    graph.bound(u, lower=[0.0, -1.0], upper=[1.0, 1.0], name="limits")
+    graph.constrain(fg.difference, u[:-1], u[1:], lower=-0.15, upper=0.15, name="changes")
+    graph.constrain(lambda x: 1.0 - x[:, :1], x[4:], lower=0.0, name="stop")
+    states = unicycle.rollout(np.array([0.0, 0.0, heading]), np.tile([0.3, 0.0], (15, 1)), 0.2)
+    states[0, 2] = 0.0
+    solution = InteriorPoint().solve(graph, {x: states, u: np.tile([0.3, 0.0], (15, 1))})
+    assert solution.converged and solution.iterations <= 25, (solution.status, solution.iterations)

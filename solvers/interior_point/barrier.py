@@ -213,7 +213,7 @@ def begin(address: int) -> None:
     """Find the sides; choose mu, slacks and multipliers of a start that has been linearised."""
     concavity, constraint_jacobian, constraints = parts(address, "concavity constraint_jacobian constraints")
     free, gradient, heights, hessian = parts(address, "free gradient heights hessian")
-    links, measures = parts(address, "links measures")
+    jacobian, links, measures = parts(address, "jacobian links measures")
     multipliers, pairs, penalties, row_units = parts(address, "multipliers pairs penalties row_units")
     rows, scalars, sides, terms, units = parts(address, "rows scalars sides terms units")
     now = scalars[0]
@@ -229,7 +229,8 @@ def begin(address: int) -> None:
                     count += 1
     now.sides, now.elastic = count, 0 if len(rows) else 1
     if now.scaling == 1:
-        find_units(terms, measures, now.violation_unit, hessian, concavity, gradient, constraints, constraint_jacobian)
+        derivatives = hessian, concavity, gradient, jacobian, constraints, constraint_jacobian
+        find_units(terms, measures, now.violation_unit, *derivatives)
     size = cost_unit(measures, hessian, concavity, gradient)
     now.cost_unit = 1.0
     if now.scaling == 1:

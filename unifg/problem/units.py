@@ -115,6 +115,7 @@ def find_units(
     hessian: Array,
     concavity: Array,
     gradient: Array,
+    slopes: Array,
     constraints: Array,
     jacobian: Array,
 ) -> None:
@@ -127,6 +128,7 @@ def find_units(
         hessian: of the cost, as for :func:`cost_unit`.
         concavity: the same.
         gradient: the same.
+        slopes: entries of the Jacobian of the costs that are squares.
         constraints: (M,) values.
         jacobian: entries of their Jacobian.
     """
@@ -139,7 +141,7 @@ def find_units(
     far = _log_rows(terms, units) > MODEST
     bounded = not sums[TOTAL, 0] < math.inf  # at most
     sloped = _log_curvatures(units, hessian, concavity, gradient)
-    far = far or _uneven(sums)
+    far = far or _uneven(terms, units, slopes)
     if far or (sloped and not bounded):
         _forget_small(terms, units)
         for _ in range(SWEEPS):
@@ -292,13 +294,36 @@ def _log_curvatures(units: Units, hessian: Array, concavity: Array, gradient: Ar
 
 
 @compiled
-def _uneven(sums: Array) -> bool:
-    """Test whether curvatures along coordinates differ by more than weights do, and by less than overflow."""
-    least, most = math.inf, -math.inf
+def _uneven(terms: TermArrays, units: Units, jacobian: Array) -> bool:
+    """Test whether curvatures along coordinates differ by more than weights do, and by less than overflow.
+
+    A coordinate whose entries are all next to nothing beside others of their rows has a curvature by accident: a
+    heading of 1e-9 lets an error across see the way ahead.
+    """
+    fields, columns, sums = terms.fields, terms.columns, units.sums
+    share = math.exp(-0.5 * UNEVEN)
     for k in range(sums.shape[1]):
-        if sums[POWER, k] == 2.0:
-            least, most = min(least, sums[CURVATURE, k]), max(most, sums[CURVATURE, k])
-    return UNEVEN < most - least < OVERFLOW
+        sums[WEIGHT, k] = -1.0
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] != COST:
+            continue
+        m, width, entry, column = term[ROWS], term[WIDTH], term[ENTRY], term[COLUMN]
+        for _ in range(term[COUNT]):
+            for first in range(entry, entry + m * width, width):
+                most = 0.0
+                for d in range(width):
+                    most = max(most, abs(jacobian[first + d]))
+                for d in range(width):
+                    at = units.coordinates[columns[column + d]]
+                    sums[WEIGHT, at] = max(sums[WEIGHT, at], 1.0 if abs(jacobian[first + d]) > share * most else 0.0)
+            entry += m * width
+            column += width
+    least, greatest = math.inf, -math.inf
+    for k in range(sums.shape[1]):
+        if sums[POWER, k] == 2.0 and sums[WEIGHT, k] != 0.0:
+            least, greatest = min(least, sums[CURVATURE, k]), max(greatest, sums[CURVATURE, k])
+    return UNEVEN < greatest - least < OVERFLOW
 
 
 @compiled
