@@ -287,9 +287,9 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 33_722, "scenarios": 13_071, "benchmarks": 4_887, "tests": 37_939,
-    "docs examples": 1_984, "unifg/factors": 4_320, "unifg/problem": 3_485, "models": 2_269,
-    "unifg/elimination": 2_215, "solvers": 5_142, "unifg/solution": 3_237, "unifg/smoothing": 1_930,
+    "unifg solvers models": 33_743, "scenarios": 13_071, "benchmarks": 4_887, "tests": 37_956,
+    "docs examples": 1_984, "unifg/factors": 4_320, "unifg/problem": 3_504, "models": 2_270,
+    "unifg/elimination": 2_215, "solvers": 5_143, "unifg/solution": 3_237, "unifg/smoothing": 1_930,
     "unifg/lie": 1_400, "unifg/view": 1_518, "unifg/files": 1_254, "unifg/pose_graphs": 1_960,
     "unifg/horizon": 1_536, "unifg/modeling": 1_193, "unifg/codegen": 1_338, "unifg/plots": 415,
     "scenarios/scenes": 1_325, "scenarios/simulation": 1_378, "scenarios/campaigns": 929,
