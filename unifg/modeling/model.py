@@ -427,7 +427,8 @@ class Model:
                 raise GraphError(f"term '{name or title(function)}': give sigma or information, not both", term=name)
             parts = self._begun(name, function, arguments, active, replaced)
             unique = parts["name"]
-            require_loss(unique, robust)
+            if robust is not None:
+                require_loss(unique, robust)
             weights = check_weights(unique, sigma, information, parts["count"], parts["size"])
             if isinstance(function, ManifoldResidual) and sigma is not None:  # both in tangent coordinates
                 first = next(argument for argument in parts["arguments"] if isinstance(argument, Selection))

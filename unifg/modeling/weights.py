@@ -59,7 +59,7 @@ def require_loss(name: str, robust: object) -> None:
     Raises:
         GraphError: naming the term, when it is not.
     """
-    if robust is not None and (isinstance(robust, type) or not hasattr(robust, "weight")):
+    if isinstance(robust, type) or not hasattr(robust, "weight"):
         raise GraphError(f"term '{name}': robust= must be a loss such as fg.Huber(1.345), found {robust!r}", term=name)
 
 

@@ -175,7 +175,8 @@ class Types:
         name = given or wrapped.name
         if sigma is not None and information is not None:
             raise GraphError(f"term '{name}': give sigma or information, not both", term=name)
-        require_loss(name, robust)
+        if robust is not None:
+            require_loss(name, robust)
         stated: tuple[Any, Any] = undeclared(name, "sigma", sigma, 2), undeclared(name, "information", information, 3)
         normal, rows, active, count = prepare_arguments(name, arguments, active)
         normal = on_manifolds(name, wrapped, normal, active)
