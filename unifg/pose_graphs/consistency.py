@@ -164,9 +164,10 @@ def _drift(pose_graph: PoseGraph, certain: BoolArray, at: Array | None) -> tuple
     moved = np.where(forward[:, None], edges.measured[step], group.inverse(edges.measured[step]))
     back = group.adjoint(edges.measured[step])
     noise = np.where(forward[:, None, None], noise, back @ noise @ np.swapaxes(back, 1, 2))
-    poses = np.tile(group.identity(), (count, 1)) if at is None else at
-    for k in range(1, count if at is None else 1):
-        if step[k] >= 0:
+    poses = at
+    if poses is None:
+        poses = np.tile(group.identity(), (count, 1))
+        for k in np.flatnonzero(step >= 0):
             poses[k] = group.compose(poses[k - 1], moved[k])
     ends = group.compose(poses[np.arange(count) - 1], moved)
     seen = group.adjoint(ends)
