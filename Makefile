@@ -7,7 +7,7 @@
 #   make processes    graphs and solutions in other processes, however these begin, with joblib and dask (a minute)
 #   make fuzz     mutated files for every reader, a minute each
 #   make lint     check style (ruff) and types (mypy; what users write with pyright, too)
-#   make performance  time what the library does against the record of the checkout; fails for a loss of 15 % (half a minute)
+#   make performance  time what the library does beside the last accepted commit; fails for a loss of 15 % (a minute)
 #   make bench    measure everything again and rewrite the tables in docs/ (long)
 #   make sample   repeat two figures of a page, drawn by the date: counts, not times
 #   make results PAGE=control    measure one page of docs/results again; without PAGE, list them
@@ -110,7 +110,7 @@ kernels: $(VENV)/ready
 	NUMBA_CPU_NAME=generic UNIFG_CACHE_DIR=$(CURDIR)/out/kernels $(ONE_THREAD) $(BIN)/unifg warmup --ship
 
 performance: $(VENV)/ready
-	$(ONE_THREAD) $(BIN)/unifg bench --quick --strict
+	$(ONE_THREAD) $(BIN)/python -m tools.performance
 
 mutants: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/python -m tools.mutants $(FILES)
