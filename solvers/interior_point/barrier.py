@@ -44,7 +44,7 @@ from unifg.codegen.function_pointers import linked, parts, run
 from unifg.codegen.jit import compiled
 from unifg.problem.evaluation import transposed_times
 from unifg.problem.table import TermArrays
-from unifg.problem.units import SMALL_FORCES, cost_unit, find_units
+from unifg.problem.units import cost_unit, find_units, mean_force
 from unifg.solvers.interior_point.state import (
     CONVERGED,
     LIMIT_REACHED,
@@ -152,14 +152,13 @@ def measure(address: int) -> None:
     for k in range(len(full)):
         full[k] = gradient[k]
     transposed_times(terms, False, constraint_jacobian, multipliers, full)
-    stationarity = violation = paid = complementarity = excess = push = 0.0
+    stationarity = violation = paid = complementarity = excess = 0.0
     for column in free:
         force = abs(full[column]) * units[column]
         if not force <= stationarity:  # NaN stays
             stationarity = force
     for row in range(len(constraints)):
         value, multiplier = constraints[row], multipliers[row]
-        push += abs(multiplier) * row_units[row]
         outside = max(value - upper[row], lower[row] - value)
         if not outside <= violation:
             violation = outside
@@ -178,7 +177,7 @@ def measure(address: int) -> None:
             least, most = min(least, min(pz, nz)), max(most, max(pz, nz))
             gap = max(gap, abs(constraints[row] - lower[row] - p + n) / row_units[row])
     now.size = cost_unit(measures, hessian, concavity, gradient)
-    now.forces = max(now.size, push / max(len(constraints), 1) / SMALL_FORCES)
+    now.forces = max(now.size, mean_force(terms, multipliers, row_units))
     now.stationarity, now.complementarity = stationarity / now.forces, complementarity / now.forces
     # Rows in small units count, too, where a large tolerance says nothing of them.
     now.violation, now.excess = violation, excess

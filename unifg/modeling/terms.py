@@ -11,7 +11,7 @@ from unifg.errors import GraphError
 from unifg.factors.residuals import Residual
 from unifg.factors.robust import Loss
 from unifg.modeling.duplicates import doubles
-from unifg.modeling.soft import Slack, Soft
+from unifg.modeling.soft import Slack, SlackFamily, Soft
 from unifg.modeling.variables import Data, Declared, Family, Selection
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -122,6 +122,11 @@ class Constraint(Term):
     def soft(self) -> Soft | None:
         """Price of violation; None for a hard constraint."""
         return None if self.slack is None else self.slack.soft
+
+    @property
+    def limits_slacks(self) -> bool:
+        """Test whether it keeps the slacks of a soft constraint from being negative."""
+        return self.is_bound and isinstance(self.selections[0].family, SlackFamily)
 
     @property
     def kind(self) -> str:

@@ -13,12 +13,12 @@ from contextlib import suppress
 import numpy as np
 
 from unifg.codegen.inner import inner
+from unifg.codegen.jit import compiled
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
-from unifg.problem.table import ENTRY, WIDTH
-from unifg.problem.term import CompiledTerm
-from unifg.typing import Array, IntArray
+from unifg.problem.table import COLUMN, COST, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.typing import Array, BoolArray
 
 LENGTHS = (1e-3, 1e-6, 1e-9, 1e-12)  # of steps: long ones for what is rounded, short ones beside stiff terms
 HALF = 0.4  # share of the fall that half the step must have, at least
@@ -33,14 +33,11 @@ def beside_a_kink(program: CompiledProblem, lin: Linearization, multipliers: Arr
         lin: linearisation at an answer.
         multipliers: (M,) of its constraints.
     """
-    suspects = [_still(program, lin, term) for term in program.cost_terms]
-    suspects += [np.concatenate(term.columns, axis=1).ravel() for term in program.scalar_terms]
-    unknown = program.table.arrays.unknown[np.concatenate([np.zeros(0, dtype=np.int64), *suspects])]
-    unknown = unknown[unknown >= 0]
-    if not len(unknown):
+    suspect = np.zeros(program.size, dtype=np.bool_)
+    if not _mark(program.arrays, lin.residual, lin.jacobian, suspect):
         return None
     direction = np.zeros(program.size)
-    direction[unknown] = np.random.default_rng(0).uniform(-1.0, 1.0, len(unknown))
+    direction[suspect] = np.random.default_rng(0).uniform(-1.0, 1.0, np.count_nonzero(suspect))
 
     def change(length: float) -> float:
         there = program.evaluate(program.retract(lin.values, length * direction))
@@ -55,10 +52,39 @@ def beside_a_kink(program: CompiledProblem, lin: Linearization, multipliers: Arr
     return None
 
 
-def _still(program: CompiledProblem, lin: Linearization, term: CompiledTerm) -> IntArray:
-    """Columns of the factors of a term of which a row has a residual and no slope."""
-    start, width = int(term.place[ENTRY]), int(term.place[WIDTH])
-    entries = lin.jacobian[start : start + term.count * term.size * width].reshape(term.count, term.size, width)
-    still = (~entries.any(axis=2) & (program.rows_of(term, lin.residual, lin.constraints) != 0.0)).any(axis=1)
-    columns: IntArray = np.concatenate(term.columns, axis=1)[still].ravel()
-    return columns
+@compiled
+def _mark(terms: TermArrays, residual: Array, jacobian: Array, suspect: BoolArray) -> bool:
+    """Mark the unknowns of suspects; test whether there is one."""
+    fields, scalars, found = terms.fields, terms.scalars, False
+    for t in range(len(fields)):
+        term = fields[t]
+        if term[KIND] != COST:
+            continue
+        m, width, row, entry, column = term[ROWS], term[WIDTH], term[ROW], term[ENTRY], term[COLUMN]
+        for _ in range(term[COUNT]):
+            still = False
+            for a in range(m):
+                flat = residual[row + a] != 0.0
+                for d in range(entry + a * width, entry + (a + 1) * width):
+                    flat = flat and jacobian[d] == 0.0
+                still = still or flat
+            found = (still and _mark_factor(terms, column, width, suspect)) or found
+            row += m
+            entry += m * width
+            column += width
+    for t in range(len(scalars)):
+        for i in range(scalars[t, COUNT]):
+            column = scalars[t, COLUMN] + i * scalars[t, WIDTH]
+            found = _mark_factor(terms, column, scalars[t, WIDTH], suspect) or found
+    return found
+
+
+@compiled
+def _mark_factor(terms: TermArrays, column: int, width: int, suspect: BoolArray) -> bool:
+    """Mark the unknowns of a factor; test whether it has any."""
+    found = False
+    for d in range(column, column + width):
+        unknown = terms.unknown[terms.columns[d]]
+        if unknown >= 0:
+            suspect[unknown] = found = True
+    return found

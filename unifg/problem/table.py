@@ -62,8 +62,9 @@ from unifg.typing import Array, IntArray
     DIFFERENCED,  # whether the Jacobian is made of differences
     LOSS,  # which robust loss, or one of the words below
     LOSS_AT,  # where its two parameters stand in TermArrays.parameters
+    SLACKS,  # whether it limits the slacks of a soft constraint
     FIELDS,
-) = range(35)
+) = range(36)
 
 COST, CONSTRAINT, BOUND, SCALAR = range(4)
 PYTHON, HELD = -1, -2  # losses whose formulas are Python; HELD: line searches keep the weights of a linearisation
@@ -194,6 +195,7 @@ class TermTable:
             else:
                 assert isinstance(term.term, Constraint)
                 row[KIND] = BOUND if term.is_bound else CONSTRAINT
+                row[SLACKS] = term.term.limits_slacks
                 row[ROW], row[ENTRY] = self.constraints, self.constraint_entries
                 self.constraints += count * m
                 self.constraint_entries += entries

@@ -26,7 +26,20 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.problem.columns import Columns
-from unifg.problem.table import BOUND, COLUMN, CONSTRAINT, COST, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.problem.table import (
+    BOUND,
+    COLUMN,
+    CONSTRAINT,
+    COST,
+    COUNT,
+    ENTRY,
+    KIND,
+    ROW,
+    ROWS,
+    SLACKS,
+    WIDTH,
+    TermArrays,
+)
 from unifg.typing import Array, IntArray
 
 
@@ -392,6 +405,22 @@ def _bounded(terms: TermArrays, values: Array, coordinates: IntArray, sums: Arra
                 total += math.sqrt(math.sqrt(distance * math.exp(-unit)))
                 count += 1
     return 4.0 * math.log(total / count) - math.log(10.0) if total > 0.0 else 0.0
+
+
+@compiled
+def mean_force(terms: TermArrays, multipliers: Array, units: Array) -> float:
+    """Mean magnitude of the multipliers of constraints, each times a unit, in :data:`SMALL_FORCES`.
+
+    Limits of slacks do not count: the price of a soft constraint presses on each, violated or not.
+    """
+    fields, total, count = terms.fields, 0.0, 0
+    for t in range(len(fields)):
+        if fields[t, KIND] == COST or fields[t, SLACKS] != 0:
+            continue
+        for row in range(fields[t, ROW], fields[t, ROW] + fields[t, COUNT] * fields[t, ROWS]):
+            total += abs(multipliers[row]) * units[row]
+            count += 1
+    return total / max(count, 1) / SMALL_FORCES
 
 
 @compiled

@@ -9,9 +9,9 @@ For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipli
 
 Stationarity and complementarity are divided by max(1, mean|lambda| / 100), or they are relative, whichever is less: the
 gradient to s, the size of what it is a sum of along the coordinate of a family (`find_sizes` of
-:mod:`unifg.problem.units`), and lambda_i to what makes its force as large. Where numbers are large, relative ones alone
-can be met: they do not depend on the units of cost, rows and unknowns. The violation is in the graph's units, with a
-tolerance of its own, which tells the unit of rows.
+:mod:`unifg.problem.units`), and lambda_i to what makes its force as large. Limits of slacks do not count in the mean
+(`mean_force` there). Where numbers are large, relative ones alone can be met: they do not depend on the units of cost,
+rows and unknowns. The violation is in the graph's units, with a tolerance of its own, which tells the unit of rows.
 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
@@ -45,7 +45,7 @@ from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
-from unifg.problem.units import SMALL_FORCES, find_sizes
+from unifg.problem.units import find_sizes, mean_force
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
@@ -147,8 +147,8 @@ def optimality(
         return measured
     rounding = 0.0
     if program.differenced:
-        uncertain, total = gradient_rounding(program, lin, multipliers), float(np.abs(multipliers).sum())
-        scale = max(1.0, total / max(len(multipliers), 1) / SMALL_FORCES)
+        uncertain = gradient_rounding(program, lin, multipliers)
+        scale = max(1.0, mean_force(program.arrays, multipliers, np.ones(len(multipliers))))
         own = np.maximum(sizes[columns.coordinates[columns.free]], np.finfo(float).tiny)
         with np.errstate(over="ignore"):
             relative = float((uncertain / own).max(initial=0.0))
@@ -304,7 +304,7 @@ def kkt_numbers(
         gradient: (width,) memory, for the gradient of the Lagrangian.
         found: (6,) result.
     """
-    stationarity, violation, complementarity, total = 0.0, 0.0, 0.0, 0.0
+    stationarity, violation, complementarity = 0.0, 0.0, 0.0
     worst, count, finite = -1, len(constraints), True
     lower, upper = terms.lower, terms.upper
     copy_to(slope, gradient)
@@ -321,12 +321,11 @@ def kkt_numbers(
         outside = max(max(value - upper[row], lower[row] - value), 0.0)
         if worst < 0 or outside > violation:
             worst, violation = row, outside
-        total += abs(multiplier)
         if lower[row] != upper[row]:
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
-    scale = max(1.0, total / max(count, 1) / SMALL_FORCES)
+    scale = max(1.0, mean_force(terms, multipliers, np.ones(count)))
     stationarity, complementarity, least = stationarity / scale, complementarity / scale, scale
     if not max(stationarity, complementarity) <= enough and finite:
         find_sizes(terms, coordinates, residual, jacobian, multipliers, entries, sizes)

@@ -134,6 +134,8 @@ class Conditions:
         none = np.zeros(0)
         self.g = np.concatenate([none, *(t.rows.ravel() for t in self._own)])
         self.lower, self.upper = (np.concatenate([none, *(pair[k].ravel() for pair in limits)]) for k in (0, 1))
+        of_slacks = [np.full(t.rows.size, isinstance(t.term, Constraint) and t.term.limits_slacks) for t in self._own]
+        self._counted = ~np.concatenate([np.zeros(0, dtype=np.bool_), *of_slacks])
         outside = np.maximum(np.maximum(self.g - self.upper, self.lower - self.g), 0.0)
         self.violation, self.worst = float(outside.max(initial=0.0)), int(outside.argmax()) if len(outside) else -1
 
@@ -162,16 +164,18 @@ class Conditions:
             at += term.rows.size
         self._jacobian = Entries.of(parts)
 
-    def numbers(self, multipliers: Array) -> Numbers:
+    def numbers(self, multipliers: Array, tolerance: float) -> Numbers:
         """KKT numbers with these multipliers (M,)."""
         A, size = self._jacobian, self.program.size
         slope = self.gradient + np.bincount(A.columns, A.numbers * multipliers[A.rows], size)
         doubt = self._doubt + np.bincount(A.columns, A.errors * np.abs(multipliers[A.rows]), size)
-        scale = max(1.0, float(np.abs(multipliers).mean()) / 100.0) if len(multipliers) else 1.0
+        counted = np.abs(multipliers[self._counted])
+        scale = max(1.0, float(counted.mean()) / 100.0) if len(counted) else 1.0
         sizes = self._sizes(multipliers)
-        stationarity, bound = min(
+        either = [
             tuple(float(np.abs(part / size).max(initial=0.0)) for part in (slope, doubt)) for size in (scale, sizes)
-        )
+        ]
+        stationarity, bound = min(either, key=lambda pair: (max(pair) > tolerance, pair))  # one of them suffices
         if self.program.least_squares and len(slope):
             stationarity, bound = self._offset(slope, doubt)
         limit = np.where(multipliers > 0.0, self.upper, self.lower)
@@ -304,7 +308,7 @@ def verified(
         with np.errstate(all="ignore"):
             here.differentiate()
             made = here.multipliers()
-            claimed, least = here.numbers(multipliers), here.numbers(made)
+            claimed, least = here.numbers(multipliers, tolerance), here.numbers(made, tolerance)
     except Exception as error:  # a function may raise beside an answer, and SciPy at a singular matrix
         return Verified("undecided", f"slopes cannot be found: {type(error).__name__}: {error}", **measured)
     measured |= {"claimed": claimed, "least": least, "multipliers": dict(program.by_term(made))}
