@@ -51,6 +51,19 @@ def test_a_landmark_guessed_on_the_pose_is_found(solver: fg.Solver, measure: Cal
     assert solution.cost < 0.01 and solution.verify()
 
 
+@pytest.mark.parametrize("wrong", [0, 1, 2])
+def test_a_row_among_others_of_a_factor_among_others_is_found(wrong: int) -> None:
+    """One of three landmarks is guessed where its distance is measured from; the others fit without a residual."""
+    graph = fg.Graph()
+    p = graph.variables("p", fg.Rn(2), 3)
+    guess = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
+    guess[wrong] = 0.0
+    graph.minimize(fg.prior, p, guess, sigma=10.0, name="somewhere")
+    graph.minimize(lambda v: np.concatenate([1e-6 * v[:, 1:], distance(v, 0.0 * v) - 1.0], axis=1), p, sigma=0.1)
+    found = LevenbergMarquardt().solve(graph, {p: guess}, check=True)
+    np.testing.assert_allclose(np.linalg.norm(found[p], axis=1), 1.0, atol=1e-3)
+
+
 @pytest.mark.parametrize("metre", [1e-9, 1e-3, 1e3, 1e9])
 def test_the_unit_of_length_does_not_matter(metre: float) -> None:
     graph, p = survey(distance, 1.0, metre)
