@@ -78,7 +78,7 @@ class SolveSettings(Settings):
             out, or keep what is left without them. By default such a file is refused.
         max_iterations: before giving up.
         threads: that share the work of a large graph; no more than there are free cores.
-        no_scene: leave out the scene and the picture, which take longer than the solve.
+        scene: draw a picture and a scene, too, which takes longer than the solve.
         effort: spent on the verdict: none, cheap (a bound on what another map could gain, closures that the others
             contradict or do not support), or full (a better map is looked for as well, and taken).
         keep_map: keep the map of the first solve although a better one was found; that is a failure.
@@ -94,7 +94,7 @@ class SolveSettings(Settings):
     repair_information: Repair | None = option(None, choices=REPAIRS)
     max_iterations: int = option(100, metavar="N")
     threads: int = option(1, text=partial(count, least=1), metavar="N")
-    no_scene: bool = option(False)
+    scene: bool = option(False)
     effort: Literal["none", "cheap", "full"] = option("cheap")
     keep_map: bool = option(False)
 
@@ -265,7 +265,7 @@ class _Solve:
             self.progress(0.95 * (1.0 - 0.95 * 0.9**number), f"iteration {number}{stage}, cost {row.cost:.6g}")
 
         tolerance = {"tolerance": MAP} if settings.tolerance == "map" else {}
-        limit, watched = settings.max_iterations, not settings.no_scene
+        limit, watched = settings.max_iterations, settings.scene
         backend = names.backend(settings.solver, keep_values=watched, max_iterations=limit, **tolerance)
         solver = GraduatedNonConvexity(solver=backend) if isinstance(loss, TruncatedLeastSquares) else backend
         clock.start()

@@ -58,6 +58,6 @@ def test_a_solve_from_a_stated_guess_that_ends_early_names_another(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], named: bool
 ) -> None:
     write_g2o(tmp_path / "a.g2o", sphere(rings=4, per_ring=8).pose_graph)
-    options = ["--max-iterations", "1", "--no-scene", "--effort", "none", "--out", str(tmp_path / "out")]
+    options = ["--max-iterations", "1", "--effort", "none", "--out", str(tmp_path / "out")]
     assert main(["solve", str(tmp_path / "a.g2o"), *words, *options]) != 0
     assert ("--init auto instead of --init file" in capsys.readouterr().out) == named

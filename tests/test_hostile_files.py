@@ -162,7 +162,7 @@ def test_what_may_be_meant_is_warned_about_by_name(tmp_path: Path, caplog: pytes
 
 def test_a_map_is_solved_beside_what_nothing_has_measured(tmp_path: Path) -> None:
     path = put(tmp_path, "alone.g2o", PLANAR + b"VERTEX_SE2 9 0 0 0\nVERTEX_XY 10 1 1\n")
-    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--no-scene"]) == 0
+    assert main(["solve", str(path), "--out", str(tmp_path / "out")]) == 0
     np.testing.assert_array_equal(read_g2o(tmp_path / "out" / "graph.g2o").landmarks[-1], [1.0, 1.0])
 
 
@@ -172,7 +172,7 @@ def test_names_that_are_no_text_are_spelled(tmp_path: Path, capsys: pytest.Captu
     assert main(["solve", path, "--out", str(tmp_path)]) == 2
     assert "\\xff.g2o: no such file" in capsys.readouterr().err
     Path(path).write_bytes(PLANAR)
-    assert main(["solve", path, "--out", str(tmp_path / "out"), "--no-scene"]) == 0
+    assert main(["solve", path, "--out", str(tmp_path / "out")]) == 0
     assert "\\xff.g2o" in capsys.readouterr().out
 
 
@@ -180,7 +180,7 @@ def test_streams_that_are_closed_or_lack_characters_take_what_is_said(tmp_path: 
     put(tmp_path, "g.g2o", PLANAR)
     script = (
         "import sys; sys.stderr = None; from unifg.scenarios.command import main; "
-        "sys.exit(main(['solve', 'g.g2o', '--out', '\xfc', '--no-scene']))"
+        "sys.exit(main(['solve', 'g.g2o', '--out', '\xfc']))"
     )
     said = run_script(script, cwd=tmp_path, variables={"PYTHONIOENCODING": "ascii"}).stdout
     assert "\\xfc/graph.g2o" in said and (tmp_path / "\xfc" / "graph.g2o").is_file()
@@ -255,7 +255,7 @@ def test_a_full_disk_leaves_the_last_results(
         write_g2o(tmp_path / "graph.g2o", graph)
     assert (tmp_path / "graph.g2o").read_bytes() == before
     assert sorted(path.name for path in tmp_path.iterdir()) == ["g.g2o", "graph.g2o"]
-    assert main(["solve", str(tmp_path / "g.g2o"), "--out", str(tmp_path), "--no-scene"]) == 2
+    assert main(["solve", str(tmp_path / "g.g2o"), "--out", str(tmp_path)]) == 2
     assert "cannot write the results" in capsys.readouterr().err
 
 
@@ -290,7 +290,7 @@ def test_sigterm_ends_with_the_results_so_far(
 
     monkeypatch.setattr(pose_graph._Solve, "__init__", stopping)
     path = put(tmp_path, "g.g2o", PLANAR)
-    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--no-scene"]) == 130
+    assert main(["solve", str(path), "--out", str(tmp_path / "out")]) == 130
     numbers = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert numbers["interrupted"] and numbers["status"] == "INTERRUPTED" and numbers["iterations"] == 1
     assert (tmp_path / "out" / "graph.g2o").is_file() and signal.getsignal(signal.SIGTERM) is before
@@ -304,7 +304,7 @@ def test_an_end_asked_for_after_the_solve_keeps_it(tmp_path: Path, monkeypatch: 
     edges = ("0 1 1 0 0", "1 2 1 0 1.57", "2 0 0.1 2 -1.57")
     text = "\n".join(f"EDGE_SE2 {edge} 1 0 0 1 0 1" for edge in edges)
     path = put(tmp_path, "g.g2o", ("".join(f"VERTEX_SE2 {k} {k} 0 0\n" for k in range(3)) + text).encode())
-    assert main(["solve", str(path), "--out", str(tmp_path / "out"), "--no-scene"]) == 130
+    assert main(["solve", str(path), "--out", str(tmp_path / "out")]) == 130
     numbers = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert numbers["interrupted"] and numbers["converged"] and numbers["verdict"] is None
 
@@ -322,7 +322,7 @@ sys.exit(main(sys.argv[1:]))
 @pytest.mark.product(2, of="processes of their own")
 def test_numbers_need_nothing_but_the_library(tmp_path: Path) -> None:
     path = put(tmp_path, "g.g2o", PLANAR)
-    run = run_script(WITHOUT, "solve", path, "--out", tmp_path / "out")
+    run = run_script(WITHOUT, "solve", path, "--scene", "--out", tmp_path / "out")
     written = sorted(p.name for p in (tmp_path / "out").iterdir())
     assert written == ["graph.g2o", "metrics.json", "trajectory.tum"]
     assert "pip install 'unifg[view]'" in run.stderr and "Traceback" not in run.stderr

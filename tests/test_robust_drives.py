@@ -160,7 +160,7 @@ def test_the_command_doubts_odometry_when_told(tmp_path: Path, capsys: pytest.Ca
     clean, _ = drive(0, CALM)
     graph, _ = slipped(clean, 100)
     file, out = write_g2o(tmp_path / "drive.g2o", graph), tmp_path / "out"
-    options = ["--robust", "gnc", "--robust-on", "all", "--no-scene", "--out", str(out)]
+    options = ["--robust", "gnc", "--robust-on", "all", "--out", str(out)]
     assert command.main(["solve", str(file), *options]) == 0
     found = json.loads((out / "metrics.json").read_text())
     assert found["robust_on"] == "all" and found["outliers"] == 3
@@ -196,7 +196,7 @@ def test_the_command_names_groups(tmp_path: Path) -> None:
     clean, truth = drive(4, replace(CALM, closures=20))
     graph, wrong = aliased(clean, truth, 4, (20.0, 5.0, 0.1))
     file, out = write_g2o(tmp_path / "drive.g2o", graph), tmp_path / "out"
-    assert command.main(["solve", str(file), "--robust", "gnc", "--no-scene", "--out", str(out)]) == 0
+    assert command.main(["solve", str(file), "--robust", "gnc", "--out", str(out)]) == 0
     (group,) = (one for one in json.loads((out / "metrics.json").read_text())["groups"] if len(one["factors"]) == 15)
     assert group["kept"] and group["term"] == "closures" and group["cost"] > 80.0
     assert group["factors"] == np.flatnonzero(wrong[~graph.edges.odometry]).tolist()

@@ -164,7 +164,7 @@ finally:
 COMMAND = """
 import sys
 from unifg.scenarios.command import main
-main(["solve", "map.g2o", "--effort", "full", "--out", "."])
+main(["solve", "map.g2o", "--effort", "full", "--scene", "--out", "."])
 """
 
 

@@ -38,9 +38,9 @@ def run(settings: pose_graph.SolveSettings, progress: Progress) -> Outcome:
 
 
 def results(solved: SolvedGraph) -> dict[str, Writer]:
-    """Results of a solve: graph, trajectory (the positions in the file as times), numbers, a picture and a scene.
+    """Results of a solve: graph, trajectory (the positions in the file as times), numbers.
 
-    The last two are left out where they are not wanted, or what draws them is not installed.
+    A picture and a scene, too, where they are asked for and what draws them is installed.
     """
     poses = solved.after.poses
     files: dict[str, Writer] = {
@@ -48,7 +48,7 @@ def results(solved: SolvedGraph) -> dict[str, Writer]:
         "trajectory.tum": lambda path: write_tum(path, np.arange(len(poses), dtype=np.float64), poses),
         "graph.g2o": lambda path: write_g2o(path, solved.after),
     }
-    if solved.settings.no_scene:
+    if not solved.settings.scene:
         return files
     if lacking := absent("view"):  # numbers need nothing but the library
         logger.warning("no picture and no scene: %s", remedy(lacking))
