@@ -86,17 +86,28 @@ def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[
     """Clusters with the names of their stretches, the first of them solved again without."""
     dim, count = judged.group.point_dim, len(judged.edges)
     partial: Partial | None = None
+    errors: dict[bytes, tuple[Array, float]] = {}
 
-    def solved(left_out: IntArray) -> tuple[BoolArray, PoseGraph, float]:
-        """Edges that are left, their map, and its chi2; from a bent map least squares may find another minimum."""
+    def chi2_of(known: bytes, mask: BoolArray) -> float:
+        """Sum of squares of some edges on a known map, whose errors are found once."""
+        graph = found.maps[known][0]
+        if known not in errors:
+            errors[known] = graph.squared_errors(residual), graph.seen_chi2(residual)
+        each, seen = errors[known]
+        return float(each[mask].sum()) + seen
+
+    def solved(left_out: IntArray) -> tuple[BoolArray, bytes]:
+        """Edges that are left, and the name of their map; from a bent map least squares may find another minimum."""
         nonlocal partial
         mask = np.ones(count, dtype=np.bool_)
         mask[left_out] = False
-        near = min(found.maps.values(), key=lambda one: replace(one[0], edges=one[0].edges[mask]).chi2(residual))
-        if len(left_out) and near is not found.maps.get(mask.tobytes()):
+        name = mask.tobytes()
+        near = min(found.maps, key=lambda known: chi2_of(known, mask))
+        if len(left_out) and near != name:
             partial = partial or Partial(found.solved, residual)
-            found.maps[mask.tobytes()] = partial.optimum(mask, near[0])
-        return mask, *found.maps[mask.tobytes()]
+            found.maps[name] = partial.optimum(mask, found.maps[near][0])
+            errors.pop(name, None)
+        return mask, name
 
     clusters: list[Cluster] = []
     for kind, suspects in found.by_kind.items():
@@ -106,13 +117,13 @@ def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[
             cluster = Cluster(kind, suspect.alike, stretches, suspect.fall, suspect.leverage, suspect.moved)
             out = np.concatenate([suspect.before, suspect.edges])
             if len(clusters) < NAMED and (len(out) < count or judged.sightings or judged.priors):
-                _, here, _ = solved(suspect.before)
-                others, there, chi2 = solved(out)
+                _, name = solved(suspect.before)
+                others, without = solved(out)
+                here, (there, chi2) = found.maps[name][0], found.maps[without]
                 apart = np.linalg.norm(judged.group.local(here.poses, there.poses)[:, dim:], axis=1)
                 away = np.linalg.norm(here.poses[:, :dim] - there.poses[:, :dim], axis=1)
                 moved = float(away.max()), float(apart.max())
-                rest = replace(here, edges=here.edges[others])
-                cluster = replace(cluster, moved=moved, chi2=(rest.chi2(residual), chi2))
+                cluster = replace(cluster, moved=moved, chi2=(chi2_of(name, others), chi2))
             clusters.append(cluster)
     return clusters
 
