@@ -415,3 +415,24 @@ def test_scalar_costs_are_refused_still() -> None:
     graph.minimize_scalar(lambda x: x[:, 0] - x[:, 1], x, name="linear")
     with pytest.raises(fg.BackendError, match="Penalty cannot take the scalar cost 'linear'"):
         Penalty().solve(graph, {x: np.full((N, 2), 0.5)})
+
+
+@pytest.mark.parametrize("price", [10.0, 1e3, 1e5, 1e7])
+@pytest.mark.parametrize("both", [False, True])
+@pytest.mark.parametrize("solver", SOLVERS[:-1], ids=named)
+@pytest.mark.product(12)
+def test_what_is_converged_costs_what_is_written(solver: fg.Solver, both: bool, price: float) -> None:
+    """A violation of 1e-8 costs the price of one: it passes as one of a hard limit does, and is none to be believed."""
+    graph, x = graph_with(fg.Rn(2), N)
+    wanted = np.array([[1.0, 0.2], [0.8, -0.3], [1.5, 0.1], [0.2, 0.1]])
+
+    def height(v: Array) -> Array:
+        return np.sin(v[:, :1]) + 0.5 * v[:, 1:] ** 2
+
+    graph.minimize(fg.prior, x, wanted, name="wanted")
+    graph.constrain(height, x, upper=0.5, lower=0.0 if both else -np.inf, soft=price, name="low")
+    found = solver.solve(graph, {x: np.zeros((N, 2))}, check=True)
+    above = np.maximum(height(found[x]) - 0.5, 0.0)
+    written = 0.5 * float(((found[x] - wanted) ** 2).sum()) + price * float(above.sum())
+    assert written == pytest.approx(0.649380, abs=1e-5)
+    assert found.verify().verdict != "fails"

@@ -5,7 +5,8 @@ For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipli
 - stationarity: max |grad f + A' lambda| over the unknowns (tangent coordinates, right perturbation);
 - violation: max distance of g outside [l, u];
 - complementarity: max |lambda_i| times the distance of g_i to the limit its sign points at; a multiplier pointing at a
-  limit that does not exist has the wrong sign, and the distance is one.
+  limit that does not exist has the wrong sign, and the distance is one. The slack of a soft constraint has to be what
+  its limit is violated by: what it does not pay for adds to its own distance, which counts as one of that row.
 
 Stationarity and complementarity are divided by max(1, mean|lambda| / 100), or they are relative, whichever is less: the
 gradient to s, the size of what it is a sum of along the coordinate of a family (`find_sizes` of
@@ -44,7 +45,7 @@ from unifg.factors.steps import EPSILON, FIRST, step_for
 from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
-from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, ENTRY, KIND, ROW, ROWS, SLACKS, WIDTH, TermArrays
 from unifg.problem.units import find_sizes, mean_force
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
@@ -236,6 +237,19 @@ def _add_rounding(
 
 
 @compiled
+def unpaid(terms: TermArrays, t: int, k: int, constraints: Array) -> float:
+    """Violation of a soft constraint that its k-th slack, limited by term t, does not pay for; zero for other rows."""
+    fields = terms.fields
+    if fields[t, SLACKS] == 0:
+        return 0.0
+    count, m = fields[t - 1, COUNT], fields[t - 1, ROWS]
+    each = fields[t, COUNT] * fields[t, ROWS] // max(count, 1)
+    row = fields[t - 1, ROW] + k // each * m + k % each % m
+    outside: float = max(max(constraints[row] - terms.upper[row], terms.lower[row] - constraints[row]), 0.0)
+    return outside
+
+
+@compiled
 def _complementarity(
     terms: TermArrays,
     shares: tuple[IntArray, Array, float, float],
@@ -250,22 +264,25 @@ def _complementarity(
         term = fields[t]
         if term[KIND] == COST:
             continue
-        m, width, entry, row, column = term[ROWS], term[WIDTH], term[ENTRY], term[ROW], term[COLUMN]
-        for _ in range(term[COUNT]):
-            for at in range(row, row + m):
-                if lower[at] != upper[at] and multipliers[at] != 0.0:
-                    share = 0.0  # of the force of the row in the gradients
-                    for d in range(width):
-                        size = sizes[coordinates[columns[column + d]]]
-                        if size > 0.0:
-                            share = max(share, abs(entries[entry + d]) / size)
-                    limit = upper[at] if multipliers[at] > 0.0 else lower[at]
-                    slack = abs(constraints[at] - limit) if math.isfinite(limit) else unit
-                    share = min(share / unit, 1.0 / scale) if share > 0.0 else 1.0 / scale
-                    result = max(result, abs(multipliers[at]) * slack * share)
-                entry += width
-            row += m
-            column += width
+        count = term[COUNT] * term[ROWS]
+        own = fields[t - 1 if term[SLACKS] != 0 else t]  # what slacks are limited by tells what their row is worth
+        m, width = own[ROWS], own[WIDTH]
+        each = count // max(own[COUNT], 1)  # rows of a factor, with slacks of one side or both
+        for k in range(count):
+            at = term[ROW] + k
+            if lower[at] == upper[at] or multipliers[at] == 0.0:
+                continue
+            column = own[COLUMN] + k // each * width
+            entry = own[ENTRY] + (k // each * m + k % each % m) * width
+            share = 0.0  # of the force of the row in the gradients
+            for d in range(width):
+                size = sizes[coordinates[columns[column + d]]]
+                if size > 0.0:
+                    share = max(share, abs(entries[entry + d]) / size)
+            limit = upper[at] if multipliers[at] > 0.0 else lower[at]
+            slack = abs(constraints[at] - limit) + unpaid(terms, t, k, constraints) if math.isfinite(limit) else unit
+            share = min(share / unit, 1.0 / scale) if share > 0.0 else 1.0 / scale
+            result = max(result, abs(multipliers[at]) * slack * share)
     return result
 
 
@@ -325,6 +342,11 @@ def kkt_numbers(
             limit = upper[row] if multiplier > 0.0 else lower[row]
             slack = abs(value - limit) if math.isfinite(limit) else 1.0
             complementarity = max(complementarity, abs(multiplier) * slack)
+    for t in range(len(terms.fields)):
+        if terms.fields[t, SLACKS] != 0:
+            for k in range(terms.fields[t, COUNT] * terms.fields[t, ROWS]):
+                force = abs(multipliers[terms.fields[t, ROW] + k])
+                complementarity = max(complementarity, force * unpaid(terms, t, k, constraints))
     scale = max(1.0, mean_force(terms, multipliers, np.ones(count)))
     stationarity, complementarity, least = stationarity / scale, complementarity / scale, scale
     if not max(stationarity, complementarity) <= enough and finite:

@@ -134,10 +134,18 @@ class Conditions:
         none = np.zeros(0)
         self.g = np.concatenate([none, *(t.rows.ravel() for t in self._own)])
         self.lower, self.upper = (np.concatenate([none, *(pair[k].ravel() for pair in limits)]) for k in (0, 1))
-        of_slacks = [np.full(t.rows.size, isinstance(t.term, Constraint) and t.term.limits_slacks) for t in self._own]
-        self._counted = ~np.concatenate([np.zeros(0, dtype=np.bool_), *of_slacks])
+        self._worth = np.arange(len(self.g))  # row that tells how much another matters: of slacks, the one they are in
+        at = 0
+        for before, t in zip([None, *self._own], self._own, strict=False):
+            if before is not None and isinstance(t.term, Constraint) and t.term.limits_slacks:
+                (count, m), k = before.rows.shape, np.arange(t.rows.size)
+                each = t.rows.size // max(count, 1)
+                self._worth[at : at + len(k)] = at - count * m + k // each * m + k % each % m
+            at += t.rows.size
+        self._counted = self._worth == np.arange(len(self.g))
         outside = np.maximum(np.maximum(self.g - self.upper, self.lower - self.g), 0.0)
         self.violation, self.worst = float(outside.max(initial=0.0)), int(outside.argmax()) if len(outside) else -1
+        self._unpaid = np.where(self._counted, 0.0, outside[self._worth])  # by slacks: it costs the price of one, too
 
     def differentiate(self) -> None:
         """Find gradient, Jacobian of the constraints and, of least squares, the Gauss-Newton matrix."""
@@ -180,9 +188,10 @@ class Conditions:
             stationarity, bound = self._offset(slope, doubt)
         limit = np.where(multipliers > 0.0, self.upper, self.lower)
         slack = np.where(np.isfinite(limit), np.abs(self.g - np.where(np.isfinite(limit), limit, 0.0)), 1.0)
+        slack += self._unpaid
         shares = np.zeros(len(multipliers))
         np.maximum.at(shares, A.rows, np.abs(A.numbers) / sizes[A.columns])
-        shares = np.where(shares > 0.0, np.minimum(shares, 1.0 / scale), 1.0 / scale)
+        shares = np.where(shares > 0.0, np.minimum(shares, 1.0 / scale), 1.0 / scale)[self._worth]
         wrong = np.where(self.lower != self.upper, np.abs(multipliers) * slack * shares, 0.0)
         columns = self.program.columns
         at = columns.name(int(columns.free[np.abs(slope).argmax()])) if len(slope) else None
