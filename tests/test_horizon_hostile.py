@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,9 @@ from unifg.horizon import (
     ControlCost,
     Dynamics,
     InitialGuesses,
+    LastPlanThenBrake,
     Measurement,
+    Plan,
     RecedingHorizon,
     Robot,
     Term,
@@ -396,6 +398,28 @@ NO_NUMBERS: dict[str, tuple[Any, str]] = {
     "clock": (lambda: loop_of(clock=3), "clock must be a function, found 3"),
     "probabilities": (lambda: loop_of(probabilities=[1.0]), r"probabilities must be a function or None, found \[1.0\]"),
     "patience": (lambda: loop_of(patience=None), "patience must be a whole number"),
+    "no patience": (lambda: loop_of(patience=-1), "patience=-1: one tick or more"),
+    "no times": (
+        lambda: RecedingHorizon(POINT, 2, [Wish(), Dynamics(moved)], solver=SQP()),
+        "term 'dynamics' has no step, and the horizon no node times: give Dynamics its step",
+    ),
+    "a model without seconds": (
+        lambda: replace(POINT, tick=H),
+        r"predict is called as predict\(x, u, seconds\), .* too many positional",
+    ),
+    "a model with seconds": (
+        lambda: replace(POINT, predict=lambda x, u, h: x),
+        r"predict is called as predict\(x, u\), .*'h'",
+    ),
+    "a model": (lambda: replace(POINT, predict=3), "Robot: predict must be a function or None, found 3"),  # type: ignore[arg-type]
+    "tick": (lambda: replace(POINT, tick=0.0), "tick must be a positive number of seconds, got 0.0"),
+    "brake": (lambda: LastPlanThenBrake(POINT, brake=3), "brake must be a function or None, found 3"),  # type: ignore[arg-type]
+    "braking of another shape": (
+        lambda: braking([1.0, 2.0]),
+        r"the controls that brake gives has shape \(2,\), expected \(4, 1\)",
+    ),
+    "braking by what is not finite": (lambda: braking(np.nan), "the controls that brake gives must be finite"),
+    "braking by words": (lambda: braking("hard"), "the controls that brake gives must be real numbers, found 'hard'"),
     "starts": (lambda: loop_of(starts=lambda now: ()), "starts must be of the class InitialGuesses or None"),
     "terms": (lambda: RecedingHorizon(POINT, 2, Wish(), solver=SQP()), "terms are a list"),  # type: ignore[arg-type]
     "tree": (lambda: Tree("ab"), "a tree is made of whole numbers.*found 'ab'"),  # type: ignore[arg-type]
@@ -416,6 +440,39 @@ NO_NUMBERS: dict[str, tuple[Any, str]] = {
 
 def guessing(guess: Any) -> None:
     loop_of(starts=InitialGuesses(cold=lambda now: guess)).plan([0.0, 0.0])
+
+
+def braking(brake: Any) -> Plan:
+    return loop_of(judge=LastPlanThenBrake(POINT, feasible=-1.0, brake=lambda now: brake)).plan([0.0, 0.0])
+
+
+def test_a_loop_brakes_by_one_control_or_by_all() -> None:
+    for brake in (0.5, [0.5], np.full((4, 1), 0.5)):
+        plan = braking(brake)
+        assert plan.source == "braking" and (plan.controls == 0.5).all()
+
+
+class Log:
+    """A cost that is finite on one side of where the caller says."""
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        side = graph.data("side", np.zeros(1))
+        graph.minimize(lambda x, s: np.log(x[:, :1] - s), x, side, name="log")
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        return {"side": [now.given]}
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_a_warm_start_where_a_term_is_not_finite_gives_way_to_a_fresh_guess() -> None:
+    loop = loop_of(Log(), ControlCost([1.0]))
+    loop.plan([2.0, 0.0], 0.0)
+    warm = loop.guess
+    with pytest.raises(fg.GraphError, match="not finite at the guess"):
+        loop.plan([2.0, 0.0], 5.0)  # no guess from there is
+    assert loop.guess is warm and warm is not None
+    fresh = loop_of(Log(), ControlCost([1.0]))
+    np.testing.assert_array_equal(loop.plan([7.0, 0.0], 5.0).states, fresh.plan([7.0, 0.0], 5.0).states)
 
 
 @pytest.mark.parametrize(("make", "message"), NO_NUMBERS.values(), ids=NO_NUMBERS)

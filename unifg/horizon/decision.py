@@ -8,8 +8,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from unifg.horizon.robot import Robot
+from unifg.errors import GraphError, require_kinds
+from unifg.horizon.robot import Robot, numbers
 from unifg.horizon.terms import Context
+from unifg.modeling.duplicates import doubles
 from unifg.solution.solution import Solution
 from unifg.solution.status import Status
 from unifg.typing import Array
@@ -149,12 +151,19 @@ class LastPlanThenBrake:
         keep: greatest age of an old plan that may be applied, in seconds, or in ticks of a horizon without node times;
             None for 8 ticks.
         brake: ``brake(now)`` gives controls (N, m), or (m,) for all steps, that bring the robot to rest; None: zero.
+
+    Raises:
+        GraphError: for parts of another kind, and where it brakes by what are no controls.
     """
 
     robot: Robot
     feasible: float = 1e-3
     keep: float | None = None
     brake: Callable[[Context[Any]], Array] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse parts of another kind before they are needed."""
+        require_kinds("LastPlanThenBrake", GraphError, LastPlanThenBrake.__annotations__, vars(self), Robot)
 
     def __call__(
         self, solution: Solution, states: Array, controls: Array, now: Context[Any], kept: LastPlan
@@ -169,7 +178,9 @@ class LastPlanThenBrake:
         count = len(kept.controls)
         braking = kept.within(np.tile(np.zeros(kept.controls.shape[1]), (count, 1)))
         if self.brake is not None:
-            braking = kept.within(np.broadcast_to(np.asarray(self.brake(now), dtype=np.float64), kept.controls.shape))
+            given, shape = doubles("the controls that brake gives", self.brake(now)), kept.controls.shape
+            given = np.broadcast_to(given, shape) if given.shape in ((), shape[1:]) else given
+            braking = kept.within(numbers(given, shape, "the controls that brake gives"))
         left = kept.within(kept.left())
         tick = float(kept.times[1])
         keep = 8 * tick if self.keep is None else self.keep

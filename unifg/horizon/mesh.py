@@ -93,7 +93,7 @@ def plan_on_mesh(
     if not (defect > 0.0 and violation > 0.0 and substeps > 1 and rounds > 0):
         raise GraphError(f"plan_on_mesh: takes positive numbers, and at least two substeps, found {options}")
     nodes, start, made = doubles("the times of the nodes", times).copy(), cold, list[int]()
-    if nodes.ndim != 1 or len(nodes) < 2:
+    if nodes.ndim != 1 or len(nodes) < 2 or not 0.0 < nodes[1] < np.inf:
         raise GraphError(f"the times must be growing numbers from 0 on, at least two of them; got {times!r}")
     while True:
         made.append(len(nodes) - 1)

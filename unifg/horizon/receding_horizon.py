@@ -19,7 +19,7 @@ from unifg.horizon.history import instant
 from unifg.horizon.margins import Margins
 from unifg.horizon.multistart import LEAST_TIME, Jumps, cheapest
 from unifg.horizon.robot import Robot, control_limits, numbers, require_steps
-from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
+from unifg.horizon.terms import Context, Dynamics, Guessing, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.tree import BranchedSelection, ExpectedCost, Tree
 from unifg.horizon.window import Window
 from unifg.locks import ReentrantLock
@@ -166,13 +166,15 @@ class RecedingHorizon:
 
         Raises:
             GraphError: for options of another kind, an unknown coupling, a joint one without a window, sizes and limits
-                that do not fit, a term that cannot be stated, times that do not grow or begin with another step than a
-                tick, or a delay of a joint coupling or of a robot without a model; portions of what begins anew with
-                every tick.
+                that do not fit, a term that cannot be stated, dynamics without a step where nodes have no times, times
+                that do not grow or begin with another step than a tick, or a delay of a joint coupling or of a robot
+                without a model; portions of what begins anew with every tick.
         """
         given = dict(locals())
         stated = RecedingHorizon.__init__.__annotations__ | {"judge": "Callable | None"}
         require_kinds("RecedingHorizon", GraphError, stated, given, Robot, Solver, Window, InitialGuesses)
+        if patience < 1:
+            raise GraphError(f"patience={patience}: one tick or more, after which a solve begins anew")
         if portion is not None and (portion < 1 or coupling == "joint" or delay):
             raise GraphError(f"portion={portion}: one iteration or more, of a plan that acts at once and is not joint")
         if coupling not in COUPLINGS:
@@ -194,6 +196,13 @@ class RecedingHorizon:
         self.tree, self.path = tree, tree.paths[-1]
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, len(tree), coupling, window, delay
         self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
+        stepless = [term.name for term in self._terms if isinstance(term, Dynamics) and term.step is None]
+        if stepless and times is None and robot.tick is None:
+            raise GraphError(
+                f"term '{stepless[0]}' has no step, and the horizon no node times: give Dynamics its step [s], the "
+                "horizon times=, or the robot its tick",
+                term=stepless[0],
+            )
         between = control_limits((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
         graph = Graph()
         self.tie: PresentCoupling = self._tied(graph, pull)
@@ -401,7 +410,17 @@ class RecedingHorizon:
         if np.isfinite(self._deadline) and self._portion is None:
             limit = self._limits[0 if run is self.warm else 1]
             run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
-        first, rescued = self._timed(lambda: run.solve(start, data=data)), False
+        try:
+            first, rescued = self._timed(lambda: run.solve(start, data=data)), False
+        except GraphError:  # as where a term is not finite at a warm start that data have moved away from
+            warm, self.guess = self.guess, None
+            if warm is None:
+                raise
+            try:
+                return self._plan(present, begin, covariance)
+            except GraphError:
+                self.guess = warm
+                raise
         solution = self._search(first, now, data, begin)
         if self.second is not None and self._refuses(solution, now):
             solution, rescued = self._ask(self.second, solution, now, data, begin)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from inspect import signature
 
 import numpy as np
 
-from unifg.errors import GraphError
+from unifg.errors import GraphError, require_kinds
 from unifg.lie import Manifold
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.model import Model
@@ -95,6 +97,9 @@ class Robot:
             next node, and the states that kept plans and braking lead to. None: it stays where it is.
         tick: length of a tick [s]; with it ``predict(x, u, seconds)`` is given the length of a step, as horizons with
             node times of any spacing need. None: all steps are of one length, which ``predict`` has.
+
+    Raises:
+        GraphError: for parts of another kind, a tick that is not positive, or where ``predict`` takes other arguments.
     """
 
     state: Manifold
@@ -103,6 +108,20 @@ class Robot:
     steps: Mapping[str, Manifold] = field(default_factory=dict)
     predict: Callable[..., Array] | None = None
     tick: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse a model that could not be called, and a tick that is none, before a loop needs them."""
+        require_kinds("Robot", GraphError, Robot.__annotations__, vars(self))
+        if self.tick is not None and not 0.0 < self.tick < np.inf:
+            raise GraphError(f"the robot's tick must be a positive number of seconds, got {self.tick}")
+        given = "x, u" if self.tick is None else "x, u, seconds"
+        try:
+            with suppress(ValueError):  # of a builtin that tells nothing about its arguments
+                signature(self.predict or self.predicted).bind(*given.split(", "))
+        except TypeError as error:
+            raise GraphError(
+                f"the robot's predict is called as predict({given}), with a tick as predict(x, u, seconds): {error}"
+            ) from error
 
     def places(self, size: str) -> dict[str, IntArray]:
         """(count, k) places of the members of each constant among all of them, counted in "dim" or in "storage"."""

@@ -171,7 +171,7 @@ class Dynamics:
     Attributes:
         residual: ``residual(x, u, x_next, h)`` or, with constants, ``residual(x, u, s_1, ..., x_next, h)``: (n, m).
         step: h [s], for all steps or (N,) for each; None in a horizon for those between its node times, which may then
-            change from tick to tick.
+            change from tick to tick, or for the robot's tick.
         sigma: (m,) standard deviations of the process noise; None where the model holds exactly.
         constants: names of families of one member that the residual takes, too.
         name: of the term, and with "past" added where the controls are those that were applied.
