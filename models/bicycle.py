@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from unifg.errors import ModelError, require_kinds
 from unifg.factors.residuals import Residual
 from unifg.lie import SE2, Product, Rn
 from unifg.models import rkmk
@@ -30,10 +31,20 @@ CONTROL = Rn(2)
 
 @dataclass(frozen=True)
 class Bicycle:
-    """Positions of the axles: distances from the centre of gravity to the front and to the rear one [m]."""
+    """Positions of the axles: distances from the centre of gravity to the front and to the rear one [m].
+
+    Raises:
+        ModelError: unless the rear axle lies behind the centre of gravity, and the front axle not behind it.
+    """
 
     front: float = 1.2
     rear: float = 1.4
+
+    def __post_init__(self) -> None:
+        """Refuse axles that no path divides by."""
+        require_kinds("Bicycle", ModelError, Bicycle.__annotations__, vars(self))
+        if not (0.0 <= self.front < np.inf and 0.0 < self.rear < np.inf):
+            raise ModelError(f"Bicycle: takes front >= 0 and rear > 0 [m], found front={self.front}, rear={self.rear}")
 
 
 def field(car: Bicycle) -> Field:

@@ -32,7 +32,7 @@ from unifg.factors.residuals import residual
 from unifg.lie import SO3, Product, Rn
 from unifg.models import quadrotor_dynamics
 from unifg.models.quadrotor_dynamics import GRAVITY
-from unifg.models.rkmk import alike
+from unifg.models.rkmk import alike, require_substeps
 from unifg.typing import Array, ArrayLike
 
 __all__ = [
@@ -214,8 +214,7 @@ def fly(
     """
     state, u = _single(state, 10, "state"), _single(u, 4, "control")
     disturbance = np.zeros(6) if noise is None else _single(noise, 6, "noise")
-    if substeps < 1 or substeps % 1:
-        raise ModelError(f"fly needs at least one substep, a whole number, found {substeps}")
+    require_substeps("fly", substeps)
     reached = state.copy()
     quadrotor_dynamics.integrate(reached, u, disturbance, parameters.packed, float(dt) / substeps, substeps)
     return reached

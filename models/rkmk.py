@@ -234,8 +234,7 @@ def rollout(
         ModelError: on an unknown method, or no whole number of substeps.
     """
     tableau = _tableau(method)
-    if substeps < 1 or substeps % 1:
-        raise ModelError(f"rollout takes a whole number of substeps, 1 or more; found {substeps!r}")
+    require_substeps("rollout", substeps)
     parts = [np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in inputs]
     count = max([len(part) for part in parts], default=1) if count is None else count
     parts = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
@@ -254,6 +253,12 @@ def rollout(
             x = _advance(group, field, tableau, x, held, h / substeps)
         states[n + 1] = x[0]
     return states
+
+
+def require_substeps(who: str, count: object) -> None:
+    """Refuse a number of substeps that is not whole, or below one."""
+    if not isinstance(count, int | np.integer) or count < 1:
+        raise ModelError(f"{who} takes a whole number of substeps, 1 or more; found {count!r}")
 
 
 def _stepping(

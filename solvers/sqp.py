@@ -86,6 +86,11 @@ class SQP(Solver):
             raise BackendError(
                 f"{self.name}: hessian must be 'auto', 'exact' or 'gauss-newton', found '{self.hessian}'"
             )
+        for name in (self.qp, self.fallback or "piqp"):
+            if name not in ("osqp", "graph", "elimination", "piqp"):
+                from unifg.solvers.quadratic_programs.qpsolvers_route import require_known
+
+                require_known(name)
 
     def require(self, program: CompiledProblem) -> None:
         """Refuse inequalities where the linear algebra knows equalities only."""

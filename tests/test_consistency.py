@@ -80,6 +80,10 @@ def test_edges_that_cannot_be_tested_stay() -> None:
     for options in ({"probability": 1.0}, {"tries": 0}):
         with pytest.raises(GraphError, match="must be"):
             pairwise_consistent(graph, **options)
+    with pytest.raises(GraphError, match="probability must be a number, found 'a'"):
+        pairwise_consistent(graph, probability="a")  # type: ignore[arg-type]
+    with pytest.raises(GraphError, match="pose_graph must be of the class PoseGraph, found Simulated"):
+        pairwise_consistent(CITY)  # type: ignore[arg-type]
 
 
 def test_cliques_are_cliques_and_mostly_the_largest(rng: np.random.Generator) -> None:

@@ -66,3 +66,9 @@ def test_contradictions_are_left_to_the_elastic_problem(name: str) -> None:
     graph.bound(x, lower=-2.0, upper=2.0)
     solution = SQP(qp=name).solve(graph, {x: np.array([[0.01, 0.02]])}, check=True)
     assert "elastic" in {row.details["qp"] for row in solution.history[1:]}
+
+
+@pytest.mark.parametrize("options", [{"qp": "nope"}, {"fallback": "nope"}])
+def test_names_of_no_solver_are_refused_before_there_is_a_graph(options: dict[str, str]) -> None:
+    with pytest.raises(fg.BackendError, match=r"QP solver .nope. is not installed .there are: .*graph"):
+        SQP(**options)  # type: ignore[arg-type]

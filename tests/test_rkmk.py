@@ -10,7 +10,7 @@ import pytest
 
 import unifg as fg
 from unifg.factors.differences import jacobian
-from unifg.models import rkmk, unicycle
+from unifg.models import quadrotor, rkmk, unicycle
 from unifg.models.rkmk import Method
 from unifg.solvers import SQP
 from unifg.typing import Array
@@ -144,12 +144,14 @@ def test_long_simulations_are_those_of_numpy() -> None:
     np.testing.assert_allclose(quick, slow, rtol=1e-13, atol=1e-9)
 
 
-@pytest.mark.parametrize("substeps", [0, -1, 1.5])
+@pytest.mark.parametrize("substeps", [0, -1, 1.5, "two"])
 def test_a_simulation_without_whole_substeps_is_refused(substeps: Any) -> None:
     """None would stay where it is, one and a half would go two thirds of the way."""
     for steps in (2, 2 * rkmk.FEW):
         with pytest.raises(fg.ModelError, match="a whole number of substeps, 1 or more; found"):
             rkmk.rollout(fg.SE2, turning, np.zeros(3), np.ones((steps, 1)), h=0.1, substeps=substeps)
+    with pytest.raises(fg.ModelError, match="fly takes a whole number of substeps"):
+        quadrotor.fly(quadrotor.STATE.identity(), np.zeros(4), 0.1, quadrotor.Parameters(), substeps=substeps)
 
 
 def test_a_field_that_writes_outside_itself_is_run_step_by_step() -> None:

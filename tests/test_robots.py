@@ -113,6 +113,12 @@ def frequencies(field: Any, rest: Sequence[float], driven: int) -> Array:
     return np.sort(-np.linalg.eigvals((ahead - behind).T / 2e-5).real)
 
 
+@pytest.mark.parametrize("axles", [{"rear": 0.0}, {"rear": -1.0}, {"front": -1.0}, {"front": np.nan}, {"rear": np.inf}])
+def test_axles_that_make_no_car_are_refused(axles: dict[str, float]) -> None:
+    with pytest.raises(fg.ModelError, match="Bicycle: takes front >= 0 and rear > 0"):
+        Bicycle(**axles)
+
+
 def test_wheels_do_not_slip() -> None:
     car = Bicycle(front=1.1, rear=1.7)
     rng = np.random.default_rng(0)

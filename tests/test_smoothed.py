@@ -181,3 +181,5 @@ def test_families_that_are_no_map_are_refused() -> None:
     smoother.variables("y", fg.SE3)
     with pytest.raises(GraphError, match=r"found families \['x', 'y'\], expected one of poses in SE2 or SE3"):
         from_smoother(smoother)
+    with pytest.raises(GraphError, match=r"smoother must be of the class Incremental, found .*FixedLag"):
+        from_smoother(fg.FixedLag(5))  # type: ignore[arg-type]

@@ -21,6 +21,19 @@ SETTINGS: dict[str, dict[str, Any]] = {
 }
 
 
+def require_known(name: str) -> None:
+    """Refuse a solver that qpsolvers does not know, or that is not installed.
+
+    Raises:
+        BackendError: naming the installed ones.
+    """
+    import qpsolvers  # and with it every solver it knows: not for those who ask for none of them
+
+    if name not in qpsolvers.available_solvers:
+        known = ", ".join(sorted({"elimination", "graph", *qpsolvers.available_solvers}))
+        raise BackendError(f"QP solver '{name}' is not installed (there are: {known}); pip install 'qpsolvers[{name}]'")
+
+
 class QpsolversRoute:
     """Solves through ``qpsolvers.solve_problem``; the workspace is rebuilt each time.
 
@@ -29,18 +42,9 @@ class QpsolversRoute:
     """
 
     def __init__(self, program: CompiledProblem, name: str) -> None:
-        """Check that the solver is installed.
+        """Take the solver of a name that :func:`require_known` has let pass."""
+        import qpsolvers
 
-        Raises:
-            BackendError: naming the installed ones.
-        """
-        import qpsolvers  # and with it every solver it knows: not for those who ask for none of them
-
-        if name not in qpsolvers.available_solvers:
-            known = ", ".join(sorted(qpsolvers.available_solvers)) or "none"
-            raise BackendError(
-                f"QP solver '{name}' is not installed (installed: {known}); pip install 'qpsolvers[{name}]'"
-            )
         self.program = program
         self.name = name
         self._dense = name in qpsolvers.dense_solvers and name not in qpsolvers.sparse_solvers

@@ -16,7 +16,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from unifg.errors import GraphError
+from unifg.errors import GraphError, require_kinds
 from unifg.factors.whitening import quick_roots
 from unifg.pose_graphs.pose_graph import PoseGraph
 from unifg.typing import Array, BoolArray, IntArray
@@ -46,8 +46,10 @@ def pairwise_consistent(pose_graph: PoseGraph, probability: float = 0.9999, trie
         (m,) True for the edges to be kept.
 
     Raises:
-        GraphError: for a probability outside (0, 1), or no tries.
+        GraphError: for a probability outside (0, 1), no tries, or arguments of another kind.
     """
+    given = {"pose_graph": pose_graph, "probability": probability, "tries": tries}
+    require_kinds("pairwise_consistent", GraphError, pairwise_consistent.__annotations__, given, PoseGraph)
     if not 0.0 < probability < 1.0 or tries < 1:
         raise GraphError(f"probability {probability} must be in (0, 1) and tries {tries} at least 1")
     certain, closures = _certain(pose_graph)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from unifg.errors import GraphError
+from unifg.errors import GraphError, require_kinds
 from unifg.lie import SE2, SE3, Rn
 from unifg.modeling.factors import ManifoldResidual, between, prior
 from unifg.pose_graphs.pose_graph import SEEN, Edges, PoseGraph, Priors, Sightings
@@ -38,8 +38,10 @@ def from_smoother(smoother: Incremental) -> tuple[PoseGraph, BoolArray]:
         The graph, and (m,) True for edges that count.
 
     Raises:
-        GraphError: naming the factor or family that has no place in a pose graph; an update failed.
+        GraphError: naming the factor or family that has no place in a pose graph; an update failed; the smoother is
+            another one, as one that forgets.
     """
+    require_kinds("from_smoother", GraphError, from_smoother.__annotations__, {"smoother": smoother}, Incremental)
     x = _family(smoother, "poses in SE2 or SE3", (SE2, SE3))
     if x is None:
         raise GraphError("from_smoother: the smoother has no family of poses in SE2 or SE3")

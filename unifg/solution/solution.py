@@ -557,6 +557,7 @@ class Solution:
 
         Raises:
             GraphError: as of :meth:`verify`.
+            UnifgError: the path is none.
             OSError: the file cannot be written.
         """
         write_answer(path, *self._claims("save"))
