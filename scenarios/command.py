@@ -39,7 +39,7 @@ from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import FROM_FILES, SCENARIOS
 from unifg.scenarios.commands.extras import absent, remedy
 from unifg.scenarios.commands.outcome import Outcome, Progress
-from unifg.scenarios.options import Help, count, settings_of
+from unifg.scenarios.options import Help, count, existing, settings_of
 
 __all__ = ["main"]
 
@@ -203,7 +203,9 @@ def _mcap(chosen: argparse.Namespace) -> int:
     stored: Path = chosen.folder
     if stored.is_dir():
         logs = [file for name in ("drive.npz", "flight.npz") if (file := stored / name).is_file()]
-        stored = max(logs, key=lambda file: file.stat().st_mtime, default=stored / "drive.npz")
+        if not logs:
+            return _refuse(f"{legible(stored)}: holds neither drive.npz nor flight.npz; give {_LOG}")
+        stored = max(logs, key=lambda file: file.stat().st_mtime)
     out: Path = chosen.out or stored.with_suffix(".mcap")
     kinds: list[type[EpisodeLog | FlightLog]] = [EpisodeLog, FlightLog]
     first, other = reversed(kinds) if stored.name == "flight.npz" else kinds  # a log may have been renamed
@@ -346,6 +348,7 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
         return _refuse(f"--out {folder}: cannot make this folder ({error.strerror})")
     if not os.access(folder, os.W_OK | os.X_OK):
         return _refuse(f"--out {folder}: cannot write to this folder")
+    reused = (folder / "metrics.json").is_file()
     with _interrupts() as told:
         watched = {"announce": _announce} if getattr(chosen, "live", False) else {}
         with _bar(name) as show:
@@ -369,6 +372,10 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
     print()
     for file in files:
         print(legible(file))
+    others = sorted(legible(file.name) for file in {*folder.iterdir()} - {*files} if file.is_file())
+    if reused and others:
+        named = f"{legible(folder)} holds files that this run has not written: {', '.join(others)}"
+        print(f"unifg: note: {named}", file=sys.stderr)
     if outcome.interrupted:
         return INTERRUPTED
     return SUCCEEDED if outcome.succeeded else FAILED
@@ -478,6 +485,7 @@ _ANY_CODE = {"action": "store_true", "help": "episodes that other states of the 
 _WORKERS = {
     "type": partial(count, least=1), "default": 1, "metavar": "N", "help": "processes, one thread each (default: 1)",
 }  # fmt: skip
+_LOG = "the results of unifg run navigation or quadrotor-mpc, or a log of theirs"
 _LIVE = {"action": "store_true", "help": "show it in a browser while it runs; says where"}
 
 COMMANDS = {
@@ -590,7 +598,10 @@ COMMANDS = {
         _mcap, "export a drive or a flight",
         "Write a log, drive.npz or flight.npz, as messages that Foxglove, PlotJuggler and mcap's tools play.",
         {
-            "folder": {"type": Path, "metavar": "DIR", "help": "results of unifg run, its latest log, or a log itself"},
+            "folder": {
+                "type": existing(_LOG, folders=True), "metavar": "DIR",
+                "help": "results of unifg run, its latest log, or a log itself",
+            },
             "--out": {"type": Path, "metavar": "FILE", "help": "to write (default: beside the log)"},
         },
     ),

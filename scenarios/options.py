@@ -34,6 +34,7 @@ __all__ = [
     "Settings",
     "Signed",
     "Text",
+    "Unasked",
     "above_zero",
     "add_options",
     "checked",
@@ -57,6 +58,10 @@ S = TypeVar("S")
 T = TypeVar("T")
 Text = Callable[[str], Any]
 """Makes a value of a word of the command line, or raises ArgumentTypeError."""
+
+
+class Unasked(int):
+    """A whole number that nobody has asked for: the default of a command where settings have another."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.follow import PathFollower
 from unifg.scenarios.planning.grid import SPACING
 from unifg.scenarios.planning.lattice import plan_poses
-from unifg.scenarios.simulation.drivetrain import Drivetrain
+from unifg.scenarios.simulation.drivetrain import COMPUTED, Drivetrain
 from unifg.scenarios.simulation.plane import LidarModel, OdometryModel, World
 from unifg.typing import Array
 
@@ -345,11 +345,17 @@ def test_speed_plant_and_belief_are_those_asked_for() -> None:
 
 def test_any_setting_is_stated_by_its_name(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     stated = Fields(NavigationSettings, tmp_path).restated(
-        NavigationSettings(), ["controller.margin=0.3", "base=ackermann", "controller.pull=[0.1, 0.1, 0.2]"]
+        NavigationSettings(),
+        ["controller.margin=0.3", "base=ackermann", "controller.pull=[0.1, 0.1, 0.2]", "latency=auto"],
     )
     assert stated.controller.margin == 0.3 and stated.controller.kind.name.startswith("ackermann")
-    assert stated.controller.pull == (0.1, 0.1, 0.2)
-    for word, why in (("controller.margins=1", "did you mean"), ("controller.margin=wide", "does not fit"), ("x", "=")):
+    assert stated.controller.pull == (0.1, 0.1, 0.2) and stated.drivetrain.latency == COMPUTED
+    for word, why in (
+        ("controller.margins=1", "did you mean"),
+        ("controller.margin=wide", "does not fit"),
+        ("x", "="),
+        ("latency=soon", "does not fit"),
+    ):
         assert main(["run", "navigation", "--set", word, "--out", str(tmp_path)]) == 2
         assert why in capsys.readouterr().err
 

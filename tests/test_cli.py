@@ -93,6 +93,20 @@ def test_writes_every_file_and_names_it(
     np.testing.assert_allclose(estimate, navigation.log.estimate, atol=1e-8)
 
 
+@pytest.mark.usefixtures("navigation", "no_files")
+def test_a_folder_used_again_is_told_what_is_not_of_this_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").touch()
+    assert run(tmp_path) == 0
+    assert "note" not in capsys.readouterr().err  # nothing of an earlier run is there
+    (tmp_path / "out" / "flight.npz").touch()
+    assert run(tmp_path) == 0
+    assert "out holds files that this run has not written: flight.npz, thesis.tex\n" in capsys.readouterr().err
+    assert (tmp_path / "out" / "thesis.tex").exists()
+
+
 @pytest.mark.usefixtures("no_files")
 def test_bars_are_drawn_on_a_terminal(
     navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import os
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -115,7 +116,10 @@ def test_the_command_takes_a_folder_or_a_log(tmp_path: Path, capsys: pytest.Capt
     assert main(["mcap", str(tmp_path), "--out", str(tmp_path / "no" / "x.mcap")]) == 2
     said = capsys.readouterr()
     assert "drive.mcap" in said.out
-    assert "nowhere is no unifg drive log" in said.err
+    assert re.search(r"DIR: .*nowhere: no such file; give the results of unifg run", said.err)
+    (tmp_path / "empty").mkdir()
+    assert main(["mcap", str(tmp_path / "empty")]) == 2
+    assert "empty: holds neither drive.npz nor flight.npz; give the results" in capsys.readouterr().err
 
 
 def test_the_command_takes_the_latest_log_under_any_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -45,8 +45,10 @@ def test_known_numbers() -> None:
     chords = 39 * 2 * 2.4 * np.sin((log.true_pose[1, 2] - log.true_pose[0, 2]) / 2)
     assert metrics["path_length_m"] == pytest.approx(chords)
     assert metrics["planned_length_m"] == pytest.approx(chords)
-    assert metrics["duration_s"] == 4.0
-    assert metrics["mean_speed_m_per_s"] == pytest.approx(chords / 4.0)
+    assert metrics["duration_s"] == 3.9  # nothing is driven after the last tick
+    assert metrics["mean_speed_m_per_s"] == pytest.approx(chords / 3.9)
+    alone = episode_metrics(episode(ticks=1))
+    assert alone["duration_s"] == alone["mean_speed_m_per_s"] == 0.0
     assert metrics["min_clearance_m"] == log.clearance[-1]
     assert metrics["solver_failures"] == metrics["emergency_ticks"] == 1
     assert metrics["plan_status"] == {"converged": 39, "stalled": 1}

@@ -478,6 +478,9 @@ def test_a_recorded_drive_needs_a_map_and_a_localiser(made: Path, capsys: pytest
     idle = ["--goal=1,2,3", "--fault", "lidar-blind@3", "--coupling", "joint", "--speed", "2"]
     assert main([*words, "--map", str(made / "map.yaml"), *idle]) == 2
     assert "leave out: goals, coupling, controller, faults" in capsys.readouterr().err
+    for obstacles in (["--obstacles", "3"], ["--set", "obstacles=3"]):  # as many as are placed unasked
+        assert main([*words, "--map", str(made / "map.yaml"), *obstacles]) == 2
+        assert "leave out: obstacles" in capsys.readouterr().err
 
 
 @pytest.mark.product(1, of="large maps")

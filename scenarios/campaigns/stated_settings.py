@@ -11,6 +11,7 @@ import hashlib
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
@@ -120,6 +121,9 @@ class Fields:
                 raise wrong
             return tuple(self._fitting(plain(k), one, where, text) for k, one in zip(arguments, given, strict=True))
         if kind is float:
+            if text is not None and isinstance(given, str):  # a word for a number, as "auto" for a latency
+                with suppress(argparse.ArgumentTypeError):
+                    given = text(given)
             if isinstance(given, bool) or not isinstance(given, int | float) or math.isnan(given):
                 raise wrong
             return float(given)

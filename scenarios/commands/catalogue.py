@@ -13,7 +13,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from unifg.scenarios.options import add_options
+from unifg.scenarios.options import Unasked, add_options
 
 __all__ = ["FROM_FILES", "SCENARIOS", "Scenario"]
 
@@ -72,7 +72,7 @@ SCENARIOS = {
     "navigation": Scenario(
         "drives",
         "A robot localises itself by lidar and drives through a building under MPC.",
-        defaults={"obstacles": 3},
+        defaults={"obstacles": Unasked(3)},
         first=(
             "--map",
             "--start",

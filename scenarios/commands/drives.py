@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from unifg.errors import ScenarioError
 from unifg.files.tum import write_tum
 from unifg.scenarios import navigation
@@ -11,6 +13,7 @@ from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.metrics import health, one_graph, table, write_metrics
+from unifg.scenarios.options import Unasked
 from unifg.scenarios.scenes.drive_plot import overview
 from unifg.scenarios.scenes.drive_scene import drive_frame, drive_scene, drive_stage
 from unifg.style.figures import write_figure
@@ -32,7 +35,9 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
         if settings.map is None:
             raise ScenarioError("a recorded drive is followed on a map of its place: give --map")
         taken = {name: getattr(settings, name) for name in ("log", "map", "start", "localiser", "seed")}
-        used = navigation.NavigationSettings(**taken, obstacles=settings.obstacles)  # of which commands ask unasked
+        used = navigation.NavigationSettings(**taken)
+        if isinstance(settings.obstacles, Unasked):
+            used = replace(used, obstacles=settings.obstacles)
         if idle := [name for name, value in vars(used).items() if getattr(settings, name) != value]:
             raise ScenarioError(f"a recorded drive is not simulated, leave out: {', '.join(idle)}")
         replayed = replays.SETTINGS(**taken)

@@ -27,7 +27,8 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
 
     Returns:
         The metrics, of plain Python numbers; the key says the unit. ``path_length_m`` is the way the robot really
-        drove, ``planned_length_m`` that of the planned path; ``solver_failures`` counts ticks without a
+        drove, ``duration_s`` the time from the first tick to the last, at which arrival shows, ``planned_length_m`` the
+        length of the planned path; ``solver_failures`` counts ticks without a
         plan, in which the robot braked (``emergency_ticks``, the same ticks), ``rescued_ticks`` those for which the
         second backend had one and the first had not, and ``plan_status`` counts the status words of all ticks.
         ``odometry_error_m`` is the error of dead reckoning. ``outcomes`` says what became of every goal, ``health``
@@ -43,7 +44,7 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
     """
     if log.ticks == 0:
         raise ScenarioError("the episode has no tick: there is nothing to measure")
-    duration = round(log.ticks * log.dt, 9)
+    duration = round(float(log.time[-1]), 9)
     length = path_length(log.true_pose)
     position, heading = pose_errors(log.estimate, log.true_pose)
     odometry_position, odometry_heading = pose_errors(log.dead_reckoning, log.true_pose)
@@ -68,10 +69,10 @@ def episode_metrics(log: EpisodeLog) -> dict[str, Any]:
         "broken_assumptions": judgement.ticks,
         "beyond_sigma": judgement.beyond_sigma,
         "steps": log.ticks,
-        "duration_s": float(duration),
+        "duration_s": duration,
         "path_length_m": length,
         "planned_length_m": path_length(log.path),
-        "mean_speed_m_per_s": length / duration,
+        "mean_speed_m_per_s": length / duration if duration else 0.0,
         "min_clearance_m": float(np.min(log.clearance)),
         "localisation_error_m": spread(position),
         "nees": consistency(log),
