@@ -217,7 +217,7 @@ def _solve_file(settings: SolveSettings, progress: Progress) -> SolvedGraph:
                 clock.split("verdict")
                 if verdict.better is None:
                     break
-                again = solve(before.with_poses(verdict.better))
+                again = solve(before.with_poses(verdict.better, verdict.better_landmarks))
                 # Compared as stated, losses included.
                 if not again[0].cost < (1.0 - _JUDGED[settings.tolerance]) * solution.cost:
                     break

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import unifg as fg
 from problems.closures import adrift, aliased, drive, slipped
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
-from unifg.pose_graphs import Edges, PoseGraph, best_guess, manhattan, sphere
+from unifg.pose_graphs import Edges, PoseGraph, Sightings, best_guess, manhattan, sphere
 from unifg.pose_graphs.clusters import Map, _clusters, optimum
 from unifg.solvers import GaussNewton, LevenbergMarquardt
 from unifg.typing import IntArray
@@ -220,6 +221,24 @@ def test_a_better_map_is_handed_over() -> None:
     verdict = here.verdict()
     assert verdict.better is not None and verdict.claim == "better one known"
     assert made.with_poses(verdict.better).chi2() == pytest.approx(best.chi2(), rel=1e-4)
+
+
+def test_a_better_map_is_handed_over_with_its_landmarks() -> None:
+    simulated = manhattan(60, 0)
+    made, truth, pose = simulated.pose_graph, simulated.truth, np.arange(60)
+    marks = truth[5::10, :2] + 1.0
+    nearest = np.argmin(np.linalg.norm(truth[:, None, :2] - marks, axis=2), axis=1)
+    measured = fg.SE2.act(fg.SE2.inverse(truth), marks[nearest])
+    seen = {"point": Sightings(pose, nearest, measured, np.tile(100.0 * np.eye(2), (60, 1, 1)))}
+    made = replace(made, landmark_ids=60 + np.arange(len(marks)), landmarks=marks, sightings=seen)
+    turned = made.poses.copy()
+    turned[:, 2] += np.linspace(0.0, 4.0 * np.pi, len(turned))
+    here, _ = optimum(made.with_poses(turned), np.ones(len(made.edges), dtype=bool))
+    verdict = here.verdict()
+    assert verdict.better is not None and verdict.better_chi2 is not None
+    better = here.with_poses(verdict.better, verdict.better_landmarks)
+    assert better.chi2() == pytest.approx(verdict.better_chi2[1], rel=1e-6)
+    assert here.with_poses(verdict.better).chi2() > 2.0 * better.chi2()  # the old landmarks belong to another map
 
 
 def test_edges_that_do_not_count_are_not_judged() -> None:

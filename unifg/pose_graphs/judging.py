@@ -18,7 +18,7 @@ from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import JUDGES, PoseGraph, ResidualName
 from unifg.pose_graphs.surveys import surveys
 from unifg.pose_graphs.verdict import NAMED, Certificate, Cluster, Effort, Verdict
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import BoolArray, IntArray
 
 __all__: list[str] = []
 
@@ -70,7 +70,7 @@ def _verdict(
         uncertified,
         tried,
         basins,
-        None if better is None else better[0],
+        None if better is None else better[0].poses,
         None if better is None else (judgement.chi2, better[1]),
         tuple(replace(one, edges=places[one.edges]) for one in clusters),
         leverage,
@@ -79,6 +79,7 @@ def _verdict(
         seconds,
         int((~counts).sum()),
         None if most is None else (int(counts[~pose_graph.edges.odometry].sum()), most),
+        None if better is None else better[0].landmarks,
     )
 
 
@@ -130,18 +131,17 @@ def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[
 
 def _basins(
     judged: PoseGraph, solved: PoseGraph, certificate: Certificate | None, residual: ResidualName
-) -> tuple[int, int, tuple[Array, float] | None]:
+) -> tuple[int, int, tuple[PoseGraph, float] | None]:
     """Number of further starts, of different minima, and a better map than the given one with its chi2."""
-    minima = [(solved.poses, solved.chi2(residual))]
+    minima = [(solved, solved.chi2(residual))]
     if certificate is not None and certificate.better is not None:
-        minima.append((certificate.better, judged.with_poses(certificate.better).chi2(residual)))
+        found = judged.with_poses(certificate.better)
+        minima.append((found, found.chi2(residual)))
     every = np.ones(len(judged.edges), dtype=np.bool_)
-    others = [start.poses for start in starts(judged, residual)[1:]]
+    others = [judged.with_poses(start.poses, start.landmarks) for start in starts(judged, residual)[1:]]
     with suppress(GraphError):
-        others.append(odometric(judged))
-    for poses in others:
-        reached, chi2 = optimum(judged.with_poses(poses), every, residual)
-        minima.append((reached.poses, chi2))
+        others.append(judged.with_poses(odometric(judged)))
+    minima += [optimum(start, every, residual) for start in others]
     values = np.sort([chi2 for _, chi2 in minima])
     best = min(minima, key=lambda one: one[1])
     basins = 1 + int((np.diff(values) > SAME * values[1:]).sum())

@@ -205,6 +205,7 @@ class Verdict:
         closures: number of loop closures that count, and a bound on the number of which every two are consistent with
             each other and with odometry, see :func:`unifg.pose_graphs.consistency.most_consistent`. None where every
             edge counts, with little effort, and where there is no bound.
+        better_landmarks: (k, p) landmarks of the map `better`; None without it.
     """
 
     effort: Effort
@@ -222,6 +223,7 @@ class Verdict:
     seconds: dict[str, float]
     left_out: int = 0
     closures: tuple[int, int] | None = None
+    better_landmarks: Array | None = None
 
     @property
     def claim(self) -> str:
