@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.errors import ModelError, require_kinds
 from unifg.factors.residuals import Residual
 from unifg.lie import SE2, Product, Rn
 from unifg.models import rkmk
@@ -42,9 +41,7 @@ class Bicycle:
 
     def __post_init__(self) -> None:
         """Refuse axles that no path divides by."""
-        require_kinds("Bicycle", ModelError, Bicycle.__annotations__, vars(self))
-        if not (0.0 <= self.front < np.inf and 0.0 < self.rear < np.inf):
-            raise ModelError(f"Bicycle: takes front >= 0 and rear > 0 [m], found front={self.front}, rear={self.rear}")
+        rkmk.require_constants(self, ("rear",), ("front",))
 
 
 def field(car: Bicycle) -> Field:

@@ -29,12 +29,20 @@ FORCE = Rn(1)
 
 @dataclass(frozen=True)
 class CartPole:
-    """Masses of cart and pole [kg], length of the rod [m], gravity [m/s^2]; defaults as in the paper."""
+    """Masses of cart and pole [kg], length of the rod [m], gravity [m/s^2]; defaults as in the paper.
+
+    Raises:
+        ModelError: for a cart without mass, a rod without length, a negative mass, or what is not finite.
+    """
 
     cart: float = 1.0
     pole: float = 0.3
     length: float = 0.5
     gravity: float = 9.81
+
+    def __post_init__(self) -> None:
+        """Refuse what nothing can push."""
+        rkmk.require_constants(self, ("cart", "length"), ("pole",))
 
 
 def field(robot: CartPole) -> Field:

@@ -30,13 +30,21 @@ TORQUES = Rn(2)
 
 @dataclass(frozen=True)
 class Arm:
-    """Of both links: masses m [kg], lengths l [m], centres r [m] from the joint, inertias I [kg m^2]; g [m/s^2]."""
+    """Of both links: masses m [kg], lengths l [m], centres r [m] from the joint, inertias I [kg m^2]; g [m/s^2].
+
+    Raises:
+        ModelError: for a link without mass or length, a negative inertia, or what is not finite.
+    """
 
     masses: tuple[float, float] = (1.0, 1.0)
     lengths: tuple[float, float] = (0.5, 0.5)
     centres: tuple[float, float] = (0.25, 0.25)
     inertias: tuple[float, float] = (1 / 48, 1 / 48)
     gravity: float = 9.81
+
+    def __post_init__(self) -> None:
+        """Refuse links that are none."""
+        rkmk.require_constants(self, ("masses", "lengths"), ("inertias",))
 
 
 def field(arm: Arm) -> Field:

@@ -100,15 +100,19 @@ class Parameters:
 
     def __post_init__(self) -> None:
         """Refuse what cannot fly."""
-        drag, wind = tuple(float(d) for d in self.drag), tuple(float(a) for a in self.wind)
+        try:
+            drag, wind = tuple(float(d) for d in self.drag), tuple(float(a) for a in self.wind)
+            mass, updraft = float(self.mass), float(self.updraft)
+        except (TypeError, ValueError) as error:
+            raise ModelError(f"a quadrotor's parameters are numbers, of drag 3, of wind 2: {error}") from error
         if len(drag) != 3 or len(wind) != 2:
             raise ModelError(
                 f"a quadrotor has 3 drag coefficients and 2 of the wind, found {len(drag)} and {len(wind)}"
             )
-        object.__setattr__(self, "mass", float(self.mass))
+        object.__setattr__(self, "mass", mass)
         object.__setattr__(self, "drag", drag)
         object.__setattr__(self, "wind", wind)
-        object.__setattr__(self, "updraft", float(self.updraft))
+        object.__setattr__(self, "updraft", updraft)
         if not np.isfinite(self.packed).all():
             raise ModelError(f"a quadrotor's parameters must be finite, found {self}")
         if self.mass <= 0.0:

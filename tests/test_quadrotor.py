@@ -198,8 +198,8 @@ def test_wrong_shapes_are_refused() -> None:
         r"controls have shape \(n, 4\)": lambda: quadrotor.rollout(x[0], u[:, :3], 0.1, CALM),
         r"state has shape \(10,\)": lambda: quadrotor.fly(x, u[0], 0.1, CALM),
         r"noise has shape \(6,\)": lambda: quadrotor.fly(x[0], u[0], 0.1, CALM, np.zeros(3)),
-        "at least one substep": lambda: quadrotor.fly(x[0], u[0], 0.1, CALM, substeps=0),
-        "a whole number, found 1.5": lambda: quadrotor.fly(x[0], u[0], 0.1, CALM, substeps=1.5),  # type: ignore[arg-type]
+        "a whole number of substeps, 1 or more; found 0": lambda: quadrotor.fly(x[0], u[0], 0.1, CALM, substeps=0),
+        "1 or more; found 1.5": lambda: quadrotor.fly(x[0], u[0], 0.1, CALM, substeps=1.5),  # type: ignore[arg-type]
         r"7 parameters, found shape \(6,\)": lambda: Parameters.unpacked(np.ones(6)),
         "carries the vehicle": lambda: quadrotor.hover_attitude(Parameters(updraft=10.0)),
         "argument 3 has shape": lambda: quadrotor.dynamics(x, u, x, np.ones(6), 0.1),

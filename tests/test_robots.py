@@ -8,7 +8,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from unifg.models import bicycle, cart_pole, manipulator, rkmk
+from unifg.models import bicycle, cart_pole, manipulator, quadrotor, rkmk
 from unifg.models.bicycle import Bicycle
 from unifg.models.cart_pole import CartPole
 from unifg.models.manipulator import Arm
@@ -115,8 +115,27 @@ def frequencies(field: Any, rest: Sequence[float], driven: int) -> Array:
 
 @pytest.mark.parametrize("axles", [{"rear": 0.0}, {"rear": -1.0}, {"front": -1.0}, {"front": np.nan}, {"rear": np.inf}])
 def test_axles_that_make_no_car_are_refused(axles: dict[str, float]) -> None:
-    with pytest.raises(fg.ModelError, match="Bicycle: takes front >= 0 and rear > 0"):
+    with pytest.raises(fg.ModelError, match=r"Bicycle: \w+ must be a finite number (above 0|from 0 on), found"):
         Bicycle(**axles)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: CartPole(cart=0.0), "CartPole: cart must be a finite number above 0, found 0.0"),
+        (lambda: CartPole(pole=-1.0), "CartPole: pole must be a finite number from 0 on, found -1.0"),
+        (lambda: CartPole(length="long"), "CartPole: length must be a finite number above 0, found 'long'"),  # type: ignore[arg-type]
+        (lambda: CartPole(gravity=-np.inf), "CartPole: gravity must be a finite number, found -inf"),
+        (lambda: Arm(masses=(1.0,)), r"Arm: masses must be 2 finite numbers above 0, found \(1.0,\)"),  # type: ignore[arg-type]
+        (lambda: Arm(lengths=(0.5, 0.0)), r"Arm: lengths must be 2 finite numbers above 0"),
+        (lambda: Arm(inertias=(0.5, -0.1)), r"Arm: inertias must be 2 finite numbers from 0 on"),
+        (lambda: quadrotor.Parameters(drag=1.0), "a quadrotor's parameters are numbers, of drag 3"),  # type: ignore[arg-type]
+        (lambda: quadrotor.Parameters(mass="light"), "a quadrotor's parameters are numbers"),  # type: ignore[arg-type]
+    ],
+)
+def test_constants_of_no_robot_are_refused(make: Callable[[], object], said: str) -> None:
+    with pytest.raises(fg.ModelError, match=said):
+        make()
 
 
 def test_wheels_do_not_slip() -> None:

@@ -172,5 +172,5 @@ def test_an_answer_whose_data_are_gone_is_not_saved(script: Path) -> None:
     with pytest.raises(GraphError, match="save: the data of this solution were replaced; save what the solve returned"):
         copied.save("copied.npz")
     assert not Path("copied.npz").exists()
-    with pytest.raises(fg.UnifgError, match="the path of a file to write is expected, found 3"):
+    with pytest.raises(GraphError, match="save: the path of a file is expected, found 3"):
         solution.save(3)  # type: ignore[arg-type]

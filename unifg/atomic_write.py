@@ -11,8 +11,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import get_ident
 
-from unifg.errors import UnifgError
-
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
@@ -20,12 +18,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     The name ends as that of ``path`` does, for writers that look at it. Links are followed; what is no file, such as
     ``/dev/stdout``, is written to directly. Errors name ``path``.
-
-    Raises:
-        UnifgError: it is no path.
     """
-    if not isinstance(path, str | os.PathLike):
-        raise UnifgError(f"the path of a file to write is expected, found {f'{path!r}'[:80]}")
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         yield target

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from unifg.atomic_write import replacing
-from unifg.errors import FileFormatError
+from unifg.errors import FileFormatError, GraphError
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data, Family
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
@@ -32,7 +32,13 @@ def write_answer(
     cost: float,
     data: Mapping[Data, Array],
 ) -> None:
-    """Write an answer; arguments as of :func:`unifg.solution.verify.verified`."""
+    """Write an answer; arguments as of :func:`unifg.solution.verify.verified`.
+
+    Raises:
+        GraphError: the path is none.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise GraphError(f"save: the path of a file is expected, found {f'{path!r}'[:80]}")
     arrays: dict[str, Any] = {COST: np.array(cost)}
     arrays |= {VALUES + family.name: own for family, own in values.items()}
     arrays |= {MULTIPLIERS + name: own for name, own in program.by_term(multipliers).items()}

@@ -93,7 +93,8 @@ class Solution:
 
     Attributes:
         status: why the solve ended.
-        cost: objective, with its 1/2.
+        cost: objective, with its 1/2. Soft constraints count by the slacks of the iterate, which without convergence
+            are not yet those of :meth:`slack`: the difference is in the violation.
         stationarity, violation, complementarity: KKT numbers, see :mod:`unifg.solution.optimality`. The stationarity of
             pure least squares is its relative offset, free of the unit of cost; above the tolerance, at least this.
         rounding: by how much numerical differentiation may be wrong about the stationarity.
@@ -556,8 +557,7 @@ class Solution:
         ``unifg check SCRIPT.py:GRAPH FILE`` checks it; :mod:`unifg.solution.saved` names the arrays.
 
         Raises:
-            GraphError: as of :meth:`verify`.
-            UnifgError: the path is none.
+            GraphError: as of :meth:`verify`, and for a path that is none.
             OSError: the file cannot be written.
         """
         write_answer(path, *self._claims("save"))
