@@ -413,6 +413,19 @@ NO_NUMBERS: dict[str, tuple[Any, str]] = {
     ),
     "a model": (lambda: replace(POINT, predict=3), "Robot: predict must be a function or None, found 3"),  # type: ignore[arg-type]
     "tick": (lambda: replace(POINT, tick=0.0), "tick must be a positive number of seconds, got 0.0"),
+    "constants": (lambda: replace(POINT, constants={"a": 1}), "the robot's constants are a tuple"),  # type: ignore[arg-type]
+    "a step back": (lambda: Dynamics(moved, -H), "term 'dynamics': its step must be positive .s., found -0.5"),
+    "a step of words": (lambda: Dynamics(moved, "long"), "step must be real numbers, found 'long'"),
+    "node": (lambda: window_of().record("p", [1.0], node=1.5), "'p' of node 1.5: a whole number"),  # type: ignore[arg-type]
+    "measured": (lambda: loop_of().tick(measured=[1.0]), r"measured: values by name are expected, found \[1.0\]"),  # type: ignore[arg-type]
+    "data of a term": (lambda: giving(None), "Giving.data must return values by name, found None"),
+    "a function of a guess": (lambda: InitialGuesses(cold=3), "cold must be a function or None, found 3"),  # type: ignore[arg-type]
+    "half a guess": (lambda: guessing((np.zeros((5, 2)),)), "an initial guess is two arrays, states and controls"),
+    "a carried guess": (lambda: carrying(None), "a guess is .family: array"),
+    "judge": (
+        lambda: loop_of(judge=lambda *given: None).plan([0.0, 0.0]),
+        "judge: must return a Decision, found None",
+    ),
     "brake": (lambda: LastPlanThenBrake(POINT, brake=3), "brake must be a function or None, found 3"),  # type: ignore[arg-type]
     "braking of another shape": (
         lambda: braking([1.0, 2.0]),
@@ -440,6 +453,29 @@ NO_NUMBERS: dict[str, tuple[Any, str]] = {
 
 def guessing(guess: Any) -> None:
     loop_of(starts=InitialGuesses(cold=lambda now: guess)).plan([0.0, 0.0])
+
+
+def carrying(guess: Any) -> None:
+    loop = loop_of(starts=InitialGuesses(carry=lambda shifted, now: guess))
+    loop.plan([0.0, 0.0])
+    loop.plan([0.0, 0.0])
+
+
+@dataclass
+class Giving:
+    """A term with something for data."""
+
+    given: Any
+
+    def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
+        graph.minimize(fg.prior, x, [0.0, 0.0], name="rest")
+
+    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
+        return self.given  # type: ignore[no-any-return]
+
+
+def giving(given: Any) -> None:
+    loop_of(Giving(given)).plan([0.0, 0.0])
 
 
 def braking(brake: Any) -> Plan:

@@ -82,6 +82,10 @@ class GraphError(UnifgError):
     """The graph, its guess or its data cannot be solved as given."""
 
 
+class NotFiniteError(GraphError):
+    """A term, or a Jacobian, is not finite where a solve begins."""
+
+
 class ModelError(UnifgError):
     """A model, a map or a method was given numbers or functions it cannot be made of, or cannot be evaluated with."""
 

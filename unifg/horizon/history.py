@@ -136,6 +136,8 @@ class History:
             GraphError: when nothing measures that, its shape differs, or the node has not entered or has left.
         """
         array = self.readable(name, value)
+        if not isinstance(node, int | np.integer):
+            raise GraphError(f"measurement '{name}' of node {node!r}: a whole number is expected")
         place = node if node >= 0 else self.length + 1 + node
         if not self.empty <= place <= self.length:
             raise GraphError(f"measurement '{name}' of node {node}: the window holds nodes {self.empty}..{self.length}")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import BackendError, GraphError, require_kinds
+from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds
 from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
@@ -56,6 +56,10 @@ class InitialGuesses:
     after_failure: Callable[[Context[Any]], tuple[Array, Array]] | None = None
     carry: Callable[[Guess, Context[Any]], Guess] | None = None
     others: Callable[[Context[Any]], Iterable[tuple[Array, Array]]] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no function before it is called."""
+        require_kinds("InitialGuesses", GraphError, InitialGuesses.__annotations__, vars(self))
 
 
 class RecedingHorizon:
@@ -295,6 +299,8 @@ class RecedingHorizon:
         time: float | None,
     ) -> Plan:
         begin = self._clock()
+        if not isinstance(measured, Mapping | None):
+            raise GraphError(f"measured: values by name are expected, found {f'{measured!r}'[:80]}")
         seen = {name: value for name, value in (measured or {}).items() if value is not None}
         for name, value in seen.items():
             window.history.readable(name, value)
@@ -412,13 +418,13 @@ class RecedingHorizon:
             run.solver.time_limit = max(LEAST_TIME, min(limit, self._deadline - (self._clock() - begin)))
         try:
             first, rescued = self._timed(lambda: run.solve(start, data=data)), False
-        except GraphError:  # as where a term is not finite at a warm start that data have moved away from
+        except NotFiniteError:  # at a warm start that data have moved away from
             warm, self.guess = self.guess, None
             if warm is None:
                 raise
             try:
                 return self._plan(present, begin, covariance)
-            except GraphError:
+            except NotFiniteError:
                 self.guess = warm
                 raise
         solution = self._search(first, now, data, begin)
@@ -502,15 +508,22 @@ class RecedingHorizon:
 
     def _untried(self, starts: Iterable[tuple[Array, Array]], now: Context[Any]) -> Iterator[Guess]:
         """Starts of a search that have not been tried yet."""
-        for states, controls in islice(starts, self._tried, None):
+        for start in islice(starts, self._tried, None):
             self._tried = (self._tried or 0) + 1
             self.more_starts += 1
-            yield self.tie.begin(self.guess_of(states, controls, now), now)
+            yield self.tie.begin(self._guess_from(start, now), now)
         self._tried = None
 
     def _refuses(self, solution: Solution, now: Context[Any]) -> bool:
         """Test whether the judge would have something else applied than the plan."""
-        return self.judge(solution, *self._planned(solution), now, self.kept).source != "solved"
+        return self._judged(solution, *self._planned(solution), now).source != "solved"
+
+    def _judged(self, solution: Solution, states: Array, controls: Array, now: Context[Any]) -> Decision:
+        """Decision of the judge."""
+        choice = self.judge(solution, states, controls, now, self.kept)
+        if not isinstance(choice, Decision):
+            raise GraphError(f"judge: must return a Decision, found {f'{choice!r}'[:80]}")
+        return choice
 
     def _planned(self, solution: Solution) -> tuple[Array, Array]:
         """States (K + 1, storage) and controls (K, m) of the path that is applied."""
@@ -527,7 +540,7 @@ class RecedingHorizon:
         if np.isfinite(left):
             other.solver.time_limit = min(self._limits[2], left)
         start = self.starts.after_failure or self.starts.cold or self._stay
-        found = other.solve(self.tie.begin(self.guess_of(*start(now), now), now), data=data)
+        found = other.solve(self.tie.begin(self._guess_from(start(now), now), now), data=data)
         if self._refuses(found, now):
             return first, False
         self.rescues += 1
@@ -543,7 +556,7 @@ class RecedingHorizon:
         """
         states, controls = self._planned(solution)
         self.kept.age += float(self.times[1])
-        choice = self.judge(solution, states, controls, now, self.kept)
+        choice = self._judged(solution, states, controls, now)
         self.goes_on = choice.source != "solved" and self._portion is not None and self.warm.unfinished
         if late and choice.source == "solved":
             instead = self._instead(now)
@@ -578,8 +591,14 @@ class RecedingHorizon:
             carry = self.starts.carry
             return self.warm, self.guess if carry is None else carry(self.guess, now)
         if self.failed and self.starts.after_failure is not None:
-            return self.warm, self.guess_of(*self.starts.after_failure(now), now)
-        return self.cold, self.guess_of(*(self.starts.cold or self._stay)(now), now)
+            return self.warm, self._guess_from(self.starts.after_failure(now), now)
+        return self.cold, self._guess_from((self.starts.cold or self._stay)(now), now)
+
+    def _guess_from(self, start: tuple[Array, Array], now: Context[Any]) -> Guess:
+        """A guess of what a function of :class:`InitialGuesses` gives."""
+        if not (isinstance(start, tuple | list) and len(start) == 2):
+            raise GraphError(f"an initial guess is two arrays, states and controls, found {f'{start!r}'[:80]}")
+        return self.guess_of(*start, now)
 
     def _stay(self, now: Context[Any]) -> tuple[Array, Array]:
         """States and controls of staying with the control zero."""

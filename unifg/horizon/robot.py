@@ -112,6 +112,8 @@ class Robot:
     def __post_init__(self) -> None:
         """Refuse a model that could not be called, and a tick that is none, before a loop needs them."""
         require_kinds("Robot", GraphError, Robot.__annotations__, vars(self))
+        if not (isinstance(self.constants, tuple | list) and all(isinstance(one, Constant) for one in self.constants)):
+            raise GraphError(f"the robot's constants are a tuple, as (Constant(...),), found {self.constants!r}")
         if self.tick is not None and not 0.0 < self.tick < np.inf:
             raise GraphError(f"the robot's tick must be a positive number of seconds, got {self.tick}")
         given = "x, u" if self.tick is None else "x, u, seconds"

@@ -18,6 +18,7 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.horizon.history import History
 from unifg.horizon.tree import Tree, tree_of
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.factors import difference, prior
 from unifg.modeling.model import AnyResidual
 from unifg.modeling.variables import Data, Family, Selection
@@ -183,6 +184,12 @@ class Dynamics:
     constants: tuple[str, ...] = ()
     name: str = "dynamics"
 
+    def __post_init__(self) -> None:
+        """Refuse steps that lead nowhere, or back."""
+        steps = None if self.step is None or isinstance(self.step, Data) else doubles("step", self.step, term=self.name)
+        if steps is not None and not ((steps > 0.0) & (steps < np.inf)).all():
+            raise GraphError(f"term '{self.name}': its step must be positive [s], found {self.step}", term=self.name)
+
     def state(self, graph: Graph, x: Selection, u: Any) -> None:
         """Add a cost or an equality for every step."""
         shared = _shared(graph, self.constants, self.name)
@@ -247,7 +254,10 @@ def values_of(terms: Sequence[Term], now: Context[Any], handles: Mapping[str, Da
     """
     found: dict[Data, ArrayLike] = {}
     for term in terms:
-        for name, value in term.data(now).items():
+        given = term.data(now)
+        if not isinstance(given, Mapping):
+            raise GraphError(f"{type(term).__name__}.data must return values by name, found {f'{given!r}'[:80]}")
+        for name, value in given.items():
             if name not in handles:
                 known = ", ".join(handles) or "none"
                 raise GraphError(f"{type(term).__name__} gives data '{name}', which its graph does not read ({known})")

@@ -16,7 +16,7 @@ from weakref import ReferenceType, ref
 import numpy as np
 
 from unifg.codegen.inner import inner
-from unifg.errors import BackendError, GraphError, require_kinds
+from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds
 from unifg.factors.steps import EPSILON
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
@@ -1115,7 +1115,7 @@ class Prepared:
             if bad.any():
                 index = int(np.flatnonzero(bad)[0])
                 selection = term.gathers[0].selection
-                raise GraphError(
+                raise NotFiniteError(
                     f"term '{term.name}': the residual of factor {index} is not finite at the guess "
                     f"(its first variable is {selection.family.name}[{selection.indices[index % len(selection)]}]); "
                     + term.remedy(index),
@@ -1123,7 +1123,7 @@ class Prepared:
                     family=selection.family.name,
                     index=index,
                 )
-        raise GraphError("a Jacobian is not finite at the guess: run graph.check(guess) to find the term")
+        raise NotFiniteError("a Jacobian is not finite at the guess: run graph.check(guess) to find the term")
 
 
 def _same(options: Mapping[str, Any], others: Mapping[str, Any]) -> bool:
