@@ -79,8 +79,13 @@ def headed(path: ArrayLike, heading: float, backwards: bool = False) -> Array:
         path: positions [m].
         heading: where it does not move [rad].
         backwards: True for one that drives in reverse.
+
+    Raises:
+        ModelError: for less than two positions.
     """
     positions = np.asarray(path, dtype=np.float64)
+    if positions.ndim != 2 or positions.shape[1] != 2 or len(positions) < 2:
+        raise ModelError(f"headed: two positions or more are expected, (N + 1, 2), found {positions.shape}")
     step = np.gradient(positions, axis=0)
     along = np.arctan2(step[:, 1], step[:, 0]) + (np.pi if backwards else 0.0)
     return np.column_stack([positions, np.where(np.hypot(*step.T) > 1e-9, along, heading)])

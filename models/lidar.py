@@ -13,6 +13,7 @@ import math
 import numpy as np
 
 from unifg.codegen.jit import compiled
+from unifg.errors import ModelError
 from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual, residual
 from unifg.factors.robust import Reweighted
@@ -70,7 +71,13 @@ class _Rule:
 
 
 def endpoint_loss(sigma: float, resolution: float) -> Reweighted:
-    """Weights of section VII-A for beams of standard deviation ``sigma`` [m] on cells of ``resolution`` [m]."""
+    """Weights of section VII-A for beams of standard deviation ``sigma`` [m] on cells of ``resolution`` [m].
+
+    Raises:
+        ModelError: unless both are positive.
+    """
+    if not (sigma > 0.0 and resolution > 0.0):
+        raise ModelError(f"end-points need a positive sigma and resolution [m], found {sigma} and {resolution}")
     return Reweighted(_Rule(sigma, resolution))
 
 

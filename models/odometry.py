@@ -11,6 +11,7 @@ from unifg.errors import ModelError
 from unifg.lie import SE2
 from unifg.models import unicycle
 from unifg.models.planar import Base
+from unifg.models.rkmk import require_constants
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["OdometryNoise", "driven", "held", "predict"]
@@ -25,12 +26,19 @@ class OdometryNoise:
         rotation: per radian turned [rad/rad].
         drift: per metre travelled, of the heading [rad/m].
         floor: of a step without motion, (x, y, theta) [m, m, rad]: slip, and the time between readings.
+
+    Raises:
+        ModelError: for one that is negative or not finite.
     """
 
     translation: float = 0.07
     rotation: float = 0.07
     drift: float = 0.02
     floor: tuple[float, float, float] = (0.002, 0.002, 0.002)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no standard deviation."""
+        require_constants(self, (), ("translation", "rotation", "drift", "floor"))
 
     def covariance(self, u: Array, dt: float) -> Array:
         """(3, 3) covariance of one step with body velocities (k,) in the frame of its end [m^2, rad^2]."""

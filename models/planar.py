@@ -127,6 +127,8 @@ class Base:
 
     def rollout(self, start: Array, u: Array, dt: ArrayLike) -> Array:
         """States reached from ``start`` (3,) under controls (n, m): (n + 1, 3); as :meth:`step` raises."""
+        if np.size(start) != 3:
+            raise ModelError(f"a rollout starts at a pose (3,), got {np.shape(start)}")
         states = np.empty((len(u) + 1, 3))
         states[0] = start
         self._advance(states[:-1], u, dt, states[1:])

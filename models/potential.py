@@ -105,11 +105,12 @@ def potential(
             the side of the body on which the obstacle is not, to the left of one dead ahead.
 
     Raises:
-        ModelError: when the thresholds are not 0 < near < far, the sense is unknown or its weight negative, or the
-            distance has no Jacobian.
+        ModelError: when the thresholds are not 0 < near < far or the scale not positive, the sense is unknown or its
+            weight negative, or the distance has no Jacobian.
     """
-    if not 0.0 < near < far:
-        raise ModelError(f"potential: thresholds must be 0 < near < far, found near = {near}, far = {far}")
+    if not (0.0 < near < far and scale > 0.0):
+        found = f"near = {near}, far = {far} and scale = {scale}"
+        raise ModelError(f"potential: the scale must be positive and 0 < near < far, found {found}")
     if distance.jacobian is None:
         raise ModelError(f"potential: '{distance.name}' has no attached Jacobian: use fg.residual(function, jacobian)")
     if sense not in ("circulate", "aside") or (sense == "aside" and vortex < 0.0):

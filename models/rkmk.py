@@ -233,12 +233,15 @@ def rollout(
 
     Raises:
         UnifgError: when Newton's method does not converge in a step of an implicit method.
-        ModelError: on an unknown method, or no whole number of substeps.
+        ModelError: on an unknown method, no whole number of substeps, or shapes that do not fit.
     """
     tableau = _tableau(method)
     require_substeps("rollout", substeps)
     parts = [np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in inputs]
     count = max([len(part) for part in parts], default=1) if count is None else count
+    if np.size(start) != group.storage or any(len(part) not in (1, count) for part in parts):
+        found = ", ".join(str(np.shape(part)) for part in (start, *parts))
+        raise ModelError(f"rollout takes a start ({group.storage},) and inputs ({count}, k) or (k,), found {found}")
     parts = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
     states = np.empty((count + 1, group.storage))
     states[0] = start

@@ -9,15 +9,15 @@ the model means nothing for v < 0. Time is discretised by one step of Euler's me
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
-from unifg.errors import ModelError
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual, residual
 from unifg.lie import Rn
+from unifg.models import rkmk
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["Vehicle", "dynamics"]
@@ -54,8 +54,7 @@ class Vehicle:
         Raises:
             ModelError: a number is not finite; a mass is not positive.
         """
-        if not np.isfinite(astuple(self)).all() or min(self.equivalent_mass, self.mass) <= 0.0:
-            raise ModelError(f"a vehicle has positive masses and finite parameters, found {self}")
+        rkmk.require_constants(self, ("equivalent_mass", "mass"))
 
     def linearised(self, constant: float = 0.0, linear: float = 20.0) -> Vehicle:
         """The same vehicle with drag p1 + p2 v in place of c_a v^2 [N], [N s/m]."""

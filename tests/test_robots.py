@@ -8,10 +8,16 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from unifg.models import bicycle, cart_pole, manipulator, quadrotor, rkmk
+from unifg.models import bicycle, cart_pole, manipulator, quadrotor, rkmk, unicycle
 from unifg.models.bicycle import Bicycle
 from unifg.models.cart_pole import CartPole
+from unifg.models.detours import headed
+from unifg.models.lidar import endpoint_loss
 from unifg.models.manipulator import Arm
+from unifg.models.obstacles import disc_clearance
+from unifg.models.odometry import OdometryNoise
+from unifg.models.potential import potential
+from unifg.models.vehicle import Vehicle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
 
@@ -119,6 +125,10 @@ def test_axles_that_make_no_car_are_refused(axles: dict[str, float]) -> None:
         Bicycle(**axles)
 
 
+def drive(start: Array, u: Array, **options: Any) -> Array:
+    return rkmk.rollout(fg.SE2, rkmk.unicycle_field, start, u, h=0.1, **options)
+
+
 @pytest.mark.parametrize(
     ("make", "said"),
     [
@@ -129,11 +139,24 @@ def test_axles_that_make_no_car_are_refused(axles: dict[str, float]) -> None:
         (lambda: Arm(masses=(1.0,)), r"Arm: masses must be 2 finite numbers above 0, found \(1.0,\)"),  # type: ignore[arg-type]
         (lambda: Arm(lengths=(0.5, 0.0)), r"Arm: lengths must be 2 finite numbers above 0"),
         (lambda: Arm(inertias=(0.5, -0.1)), r"Arm: inertias must be 2 finite numbers from 0 on"),
+        (lambda: Vehicle(mass=0.0), "Vehicle: mass must be a finite number above 0, found 0.0"),
+        (lambda: Vehicle(drag=np.nan), "Vehicle: drag must be a finite number, found nan"),
+        (lambda: OdometryNoise(translation=-1.0), "OdometryNoise: translation must be a finite number from 0 on"),
+        (lambda: OdometryNoise(floor=0.1), "OdometryNoise: floor must be 3 finite numbers from 0 on, found 0.1"),  # type: ignore[arg-type]
+        (lambda: endpoint_loss(0.0, 0.1), "end-points need a positive sigma and resolution .m., found 0.0 and 0.1"),
+        (lambda: potential(disc_clearance, scale=0.0), "the scale must be positive and .* and scale = 0.0"),
+        (lambda: headed([[0.0, 0.0]], 0.0), r"headed: two positions or more are expected, .*found \(1, 2\)"),
+        (lambda: unicycle.rollout(np.zeros(2), np.zeros((3, 2)), 0.1), r"starts at a pose \(3,\), got \(2,\)"),
+        (
+            lambda: drive(np.zeros(2), np.zeros((3, 2))),
+            r"start \(3,\) and inputs \(3, k\).*, found \(2,\), \(3, 2\)",
+        ),
+        (lambda: drive(np.zeros(3), np.zeros((3, 2)), count=5), r"inputs \(5, k\) or \(k,\), found \(3,\), \(3, 2\)"),
         (lambda: quadrotor.Parameters(drag=1.0), "a quadrotor's parameters are numbers, of drag 3"),  # type: ignore[arg-type]
         (lambda: quadrotor.Parameters(mass="light"), "a quadrotor's parameters are numbers"),  # type: ignore[arg-type]
     ],
 )
-def test_constants_of_no_robot_are_refused(make: Callable[[], object], said: str) -> None:
+def test_what_makes_no_robot_is_refused_by_name(make: Callable[[], object], said: str) -> None:
     with pytest.raises(fg.ModelError, match=said):
         make()
 
