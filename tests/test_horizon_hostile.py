@@ -387,6 +387,9 @@ def test_prices_of_soft_constraints_are_data_of_terms() -> None:
 NO_NUMBERS: dict[str, tuple[Any, str]] = {
     "a masked measurement": (lambda: window_of().record("p", np.ma.array([1.0], mask=[True])), "'p'.*masked"),
     "a date measured": (lambda: window_of().record("p", np.array(["2020"], "M8[D]")), "'p'.*dates"),
+    "solver of a window": (lambda: window_of(solver=3), "Window: solver must be of the class Solver or None, found 3"),
+    "robot of a window": (lambda: window_of(robot=3), "Window: robot must be of the class Robot, found 3"),  # type: ignore[arg-type]
+    "sigma of a window": (lambda: window_of(sigma="x"), "the standard deviations at the start must be real numbers"),
     "rounds": (lambda: window_of(rounds=0), "one round"),
     "length": (lambda: window_of(length=2.5), "length=2.5"),  # type: ignore[arg-type]
     "prediction": (lambda: window_of(robot=Robot(fg.Rn(2), fg.Rn(1), predict=lambda x, u: "x")).move([0.0]), "predict"),  # type: ignore[arg-type,return-value]

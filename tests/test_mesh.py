@@ -117,6 +117,11 @@ def test_the_dynamics_hold_between_nodes_to_the_tolerance() -> None:
     np.testing.assert_allclose(missed, found.defects, atol=0.05e-3)
 
 
+def test_clearances_of_nothing_are_not_violated() -> None:
+    for free in (lambda x: np.zeros((len(x), 0)), lambda x: np.full(len(x), np.inf)):
+        assert not drive(between=free).violations.any()
+
+
 def test_a_plan_that_is_refused_ends_the_search() -> None:
     found = drive(present=np.array([0.75, 0.0, 0.0]), solver=InteriorPoint(max_iterations=0))
     assert not found.met and found.steps == (8,) and found.plan.source != "solved"
@@ -133,6 +138,9 @@ def test_a_plan_that_is_refused_ends_the_search() -> None:
         ({"substeps": 1}, "at least two substeps"),
         ({"substeps": 2.5}, "substeps must be a whole number, found 2.5"),
         ({"defect": "small"}, "defect must be a number, found 'small'"),
+        ({"between": 3}, "between must be a function or None, found 3"),
+        ({"between": lambda x: np.full(len(x), np.nan)}, "between must give numbers, found"),
+        ({"between": lambda x: None}, "what between gives must be real numbers, found None"),
         ({"times": [0.0]}, "at least two of them"),
         ({"times": 4.0}, "at least two of them"),
         ({"times": "soon"}, "the times of the nodes must be real numbers, found 'soon'"),

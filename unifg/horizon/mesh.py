@@ -86,10 +86,11 @@ def plan_on_mesh(
         GraphError: for a robot without a model, options that no plan could meet, and as
             :class:`unifg.horizon.RecedingHorizon`.
     """
+    options = {"defect": defect, "violation": violation, "substeps": substeps, "rounds": rounds}
+    given = {"robot": robot, "between": between, **options}
+    require_kinds("plan_on_mesh", GraphError, plan_on_mesh.__annotations__, given, Robot)
     if robot.predict is None:
         raise GraphError("a mesh needs a robot that predicts: its model says what happens between nodes")
-    options = {"defect": defect, "violation": violation, "substeps": substeps, "rounds": rounds}
-    require_kinds("plan_on_mesh", GraphError, plan_on_mesh.__annotations__, options)
     if not (defect > 0.0 and violation > 0.0 and substeps > 1 and rounds > 0):
         raise GraphError(f"plan_on_mesh: takes positive numbers, and at least two substeps, found {options}")
     nodes, start, made = doubles("the times of the nodes", times).copy(), cold, list[int]()
@@ -127,5 +128,8 @@ def _looked_at(
         way = robot.rollout(plan.states[k], np.tile(control, (substeps, 1)), shares)
         defects[k] = np.abs(robot.state.local(plan.states[k + 1], way[-1])).max()
         if between is not None:
-            violations[k] = max(-float(np.min(between(way[1:-1]))), 0.0)
+            room = doubles("what between gives", between(way[1:-1]))
+            if np.isnan(room).any():
+                raise GraphError(f"between must give numbers, found {room} at the states {way[1:-1]}")
+            violations[k] = max(-float(room.min(initial=np.inf)), 0.0)
     return defects, violations

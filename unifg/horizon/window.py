@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import GraphError, UnifgError
+from unifg.errors import GraphError, UnifgError, require_kinds
 from unifg.horizon.history import History
 from unifg.horizon.past import Arrival, MarginalPrior, Past, Place, Tangent
 from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
 from unifg.horizon.terms import Context, Recording, Term, looked_at, reset_all
 from unifg.locks import ReentrantLock, synchronized
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.elements import elements_of
 from unifg.modeling.terms import Constraint
 from unifg.modeling.variables import Data, Family, Selection
@@ -87,6 +88,8 @@ class Window:
         Raises:
             GraphError: when sizes do not fit, or a term cannot stand in a window.
         """
+        given = {"robot": robot, "solver": solver, "rounds": rounds, "steady": steady}
+        require_kinds("Window", GraphError, Window.__init__.__annotations__, given, Robot, Solver)
         if rounds < 1:
             raise GraphError(f"an estimate takes one round or more, found rounds={rounds}")
         self._lock = ReentrantLock()
@@ -363,7 +366,7 @@ class Window:
 
 def _covariance(sigma: ArrayLike, dim: int) -> Array:
     """(d, d) covariance of standard deviations (d,), or as it is."""
-    array = np.array(sigma, dtype=np.float64)
+    array = doubles("the standard deviations at the start", sigma).copy()
     positive = bool(np.isfinite(array).all())
     if array.ndim < 2:
         positive = positive and array.shape in ((), (1,), (dim,)) and bool(np.all(array > 0.0))
