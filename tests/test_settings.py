@@ -68,7 +68,7 @@ def test_every_number_is_judged(settings: Any) -> None:
         (DisturbanceModel, {"gust": np.array([0.1, 0.1, np.nan])}, "gust: 'nan' is not"),
         (DisturbanceModel, {"gust_time": np.float32(0.0)}, "gust_time: '0.0' is not a positive number"),
         (Gates, {"match": 60.0}, "0 < match <= new"),
-        (Vehicle, {"equivalent_mass": 0.0}, "positive masses"),
+        (Vehicle, {"equivalent_mass": 0.0}, "mass must be a finite number above 0"),
     ],
 )
 def test_numbers_in_rows_and_of_parts_are_judged(settings: Any, wrong: dict[str, Any], message: str) -> None:
