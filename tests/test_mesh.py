@@ -146,7 +146,7 @@ def test_a_plan_that_is_refused_ends_the_search() -> None:
         ({"times": "soon"}, "the times of the nodes must be real numbers, found 'soon'"),
         ({"times": [0.0, np.nan]}, "growing numbers from 0 on"),
     ],
-    ids=str,
+    ids=lambda part: part if isinstance(part, str) else "-".join(part),
 )
 def test_what_no_mesh_can_meet_is_refused(options: dict[str, Any], said: str) -> None:
     """No round would have ended the search, or none of its numbers could be found."""
