@@ -18,7 +18,7 @@ from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import JUDGES, PoseGraph, ResidualName
 from unifg.pose_graphs.surveys import surveys
 from unifg.pose_graphs.verdict import NAMED, Certificate, Cluster, Effort, Verdict
-from unifg.typing import BoolArray, IntArray
+from unifg.typing import Array, BoolArray, IntArray
 
 __all__: list[str] = []
 
