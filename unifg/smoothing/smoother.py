@@ -35,7 +35,7 @@ from unifg.typing import Array, ArrayLike, BoolArray, IntArray, Numbers, Records
 
 FIRST_MADE = PLACE[MADE[0]]
 VARIABLE_END, FACTOR_END, CLIQUE_END = PLACE["variable_end"], PLACE["factor_end"], PLACE["clique_end"]
-UPDATES, SCRATCH = PLACE["updates"], PLACE["scratch"]
+UPDATES, SCRATCH, FAILED = PLACE["updates"], PLACE["scratch"], PLACE["failed"]
 LOST = (
     "is determined by its factors, but lost to rounding: the problem is too ill-conditioned where it is linear now, as "
     "after first guesses that are radians off, or with weights many orders apart. Begin again with better guesses, or "
@@ -308,11 +308,11 @@ class Smoother:
             )
             self._move(None, numbers)
             family.grow(out)
-        before = self._state.counters["failed"]  # a variable, if the last update failed
-        fresh = [before[before >= 0].astype(np.int64)]
+        failed = int(self._counts[FAILED])  # a variable, if the last update failed
+        fresh = [np.array([[failed]])] if failed >= 0 else []
         for item in self._staged:
             touched = _touched(item)
-            fresh.append(touched.ravel())
+            fresh.append(touched)
             number = self._batches.add(_batch(item, touched)) if item.term is not None else 0
             lists, numbers = add_factors(self._memory, item.kind, touched, item.data, number, item.items)
             self._move(lists, numbers)
@@ -321,7 +321,7 @@ class Smoother:
         self._staged.clear()
         for _ in range(iterations):
             self._solve()
-        self._require_finite(np.concatenate(fresh))
+        self._require_finite(fresh)
 
     def _effort(self) -> Effort:
         return Effort(*self._counts[FIRST_MADE : FIRST_MADE + len(MADE)].tolist())
@@ -359,13 +359,16 @@ class Smoother:
         for family in self._by_python:
             move_by_python(self._state, family, self._chronological)
 
-    def _require_finite(self, rows: IntArray) -> None:
+    def _require_finite(self, fresh: list[IntArray]) -> None:
         """Fail where the steps of variables with new factors are not finite."""
-        variables = self._state.variables
-        finite = np.isfinite(self._state.numbers[variables["value"][rows] + variables["storage"][rows]])
-        if not finite.all():
-            give_up(self._memory, int(rows[finite.argmin()]))
-            self._fail(int(rows[finite.argmin()]), NOT_FINITE)
+        variables, numbers = self._state.variables, self._state.numbers
+        value, storage = variables["value"], variables["storage"]
+        for rows in fresh:
+            steps = numbers[value[rows] + storage[rows]]
+            if not isfinite(steps.sum()):  # NumPy takes longer to look at each of a few
+                lost = int(rows.ravel()[np.isfinite(steps).argmin()])
+                give_up(self._memory, lost)
+                self._fail(lost, NOT_FINITE)
 
     def _fail(self, variable: int, why: str) -> NoReturn:
         """Refuse an update, by the name of a variable."""
