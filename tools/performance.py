@@ -101,6 +101,7 @@ def _git(*words: str) -> str:
 
 def unpacked(commit: str, folder: Path) -> Path:
     """The files of a commit in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
     file = folder / "commit.tar"
     _git("archive", "--format=tar", f"--output={file}", commit)
     with tarfile.open(file) as archive:
