@@ -237,8 +237,9 @@ def test_nobody_imports_side_folders_by_bare_name() -> None:
 # Tests of the measurements themselves; all others take their problems from tests/problems.
 OF_MEASUREMENTS = {
     "test_baselines.py", "test_benchmarks.py", "test_compiled_peers.py", "test_experiments.py", "test_golden.py",
-    "test_large_maps.py", "test_mutants.py", "test_peers.py", "test_planner.py", "test_printed.py",
-    "test_quadrotor_flights.py", "test_quadrotor_joint.py", "test_quadrotor_obstacles.py", "test_robust.py",
+    "test_large_maps.py", "test_mutants.py", "test_peers.py", "test_performance.py", "test_planner.py",
+    "test_printed.py", "test_quadrotor_flights.py", "test_quadrotor_joint.py", "test_quadrotor_obstacles.py",
+    "test_robust.py",
     "test_unification_studies.py", "test_walks.py",
 }  # fmt: skip
 
