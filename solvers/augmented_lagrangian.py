@@ -25,7 +25,6 @@ import numpy as np
 
 from unifg.codegen.jit import compiled
 from unifg.errors import BackendError
-from unifg.modeling.terms import Constraint
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.solver import Solver, SolveState
@@ -113,7 +112,7 @@ class AugmentedLagrangian(Solver):
         """Alternate primal and dual steps."""
         rho, weights = self._first_penalties(run, workspace)
         if not run.multipliers.any():
-            run.multipliers = _prices(run.program, run.lin)
+            run.multipliers = workspace.prices(run.lin)
         alternate = self._tightening if self.schedule == "bcl" else self._literal
         return alternate(run, workspace, rho, weights)
 
@@ -255,7 +254,7 @@ class AugmentedLagrangian(Solver):
                     creeping, stuck, last, least_yet, recent = 0, 0, np.inf, np.inf, []
                     first *= self.penalty_growth**2
                     rho, damping = min(first, heaviest), Damping(self.damping)
-                    multipliers = expected = _prices(run.program, run.lin)
+                    multipliers = expected = primal.prices(run.lin)
                     gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
                 elif rho < heaviest:
                     rho = min(rho * self.penalty_growth, heaviest)
@@ -317,15 +316,6 @@ class AugmentedLagrangian(Solver):
 
     def _stop_rule(self, run: SolveState, step_norm: float) -> bool:
         return step_norm < self.step_tolerance and run.optimality.violation < self.violation_tolerance
-
-
-def _prices(program: CompiledProblem, lin: Linearization) -> Array:
-    """(M,) first multipliers: prices hold the slacks of soft constraints where they are, or the first step is lost."""
-    multipliers = np.zeros(program.constraints.count)
-    for term, rows in zip(program.constraint_terms, program.slices, strict=True):
-        if isinstance(term.term, Constraint) and term.term.limits_slacks:
-            multipliers[rows] = -lin.gradient[np.concatenate(term.columns, axis=1).ravel()]
-    return multipliers
 
 
 @compiled

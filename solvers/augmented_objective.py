@@ -18,6 +18,7 @@ from unifg.codegen.function_pointers import Memory, all_of, linked_to
 from unifg.codegen.inner import inner
 from unifg.codegen.jit import compiled, inlined
 from unifg.elimination.plan import Plan
+from unifg.modeling.terms import Constraint
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.evaluation import times, transposed_times
@@ -71,6 +72,14 @@ class Primal:
         self.hopeful = False
         self.reached: Linearization | None = None
         self._held: tuple[object, ...] = (None,)  # nothing is that, so that the first call describes
+
+    def prices(self, lin: Linearization) -> Array:
+        """(M,) multipliers by which slacks of soft constraints stay where they are: without, a first step is lost."""
+        multipliers = np.zeros(self.program.constraints.count)
+        for term, rows in zip(self.program.constraint_terms, self.program.slices, strict=True):
+            if isinstance(term.term, Constraint) and term.term.limits_slacks:
+                multipliers[rows] = -lin.gradient[np.concatenate(term.columns, axis=1).ravel()]
+        return multipliers
 
     @property
     def address(self) -> int:

@@ -31,8 +31,9 @@ ROUNDING = 1e-15  # relative decrease of the objective that is noise
 class Penalty(Solver):
     """Equalities and inequalities as quadratic penalties with a schedule of growing weights.
 
-    The multipliers returned are the estimates rho times violation; those of the guess are not used. When the last
-    weight leaves the problem's own KKT conditions unmet, the status is STOP_RULE.
+    The multipliers returned are the estimates rho times violation; those of the guess are not used, and the prices of
+    soft constraints hold their slacks. When the last weight leaves the problem's own KKT conditions unmet, the status
+    is STOP_RULE.
 
     Attributes:
         max_iterations: steps over all weights.
@@ -69,17 +70,17 @@ class Penalty(Solver):
 
     def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """A step at the first weight and the initial damping."""
-        none = np.zeros(len(run.multipliers))
-        found = model_step(workspace, lin, none, np.full(len(none), self.penalty), self.damping)
+        held = workspace.prices(lin)
+        found = model_step(workspace, lin, held, np.full(len(held), self.penalty), self.damping)
         return None if found is None else found[0]
 
     def iterate(self, run: SolveState, workspace: Primal) -> Status | None:
         """Minimise for one weight after the other."""
-        none = np.zeros(len(run.multipliers))
+        held = workspace.prices(run.lin)
         rho = self.penalty
         last = max(self.largest_penalty, rho)
         while True:
-            stalled = self._minimize(run, workspace, none, rho)
+            stalled = self._minimize(run, workspace, held, rho)
             if run.status is not None:
                 return None
             if not self._violated(run):  # a heavier weight would not help
@@ -90,27 +91,27 @@ class Penalty(Solver):
                 return settle(run, Status.STALLED if stalled else Status.STOP_RULE)
             rho = min(rho * self.penalty_growth, last)
 
-    def _minimize(self, run: SolveState, primal: Primal, none: Array, rho: float) -> bool:
+    def _minimize(self, run: SolveState, primal: Primal, held: Array, rho: float) -> bool:
         """Minimise for one weight; returns whether no step helped any more."""
-        penalty = np.full(len(none), rho)
+        penalty = np.full(len(held), rho)
         damping = Damping(self.damping)
         for _ in range(self.inner_iterations):
-            gradient = float(np.abs(primal.gradient(run.lin, none, penalty)).max(initial=0.0))
+            gradient = float(np.abs(primal.gradient(run.lin, held, penalty)).max(initial=0.0))
             if self._violated(run) and gradient <= max(min(1.0, 1.0 / rho), run.enough):
                 return False
-            taken = damped_step(primal, run.lin, none, penalty, damping)
+            taken = damped_step(primal, run.lin, held, penalty, damping)
             if taken is None:
                 return True
             values, step, rejected = taken
-            before = primal.merit(run.lin, none, penalty)
+            before = primal.merit(run.lin, held, penalty)
             # rho times the violation of the new iterate would be mostly rounding errors once rho is large; the linear
             # model's balance the gradient of the cost to the accuracy of the linear solve.
-            estimate = primal.expected_multipliers(run.lin, step, none, penalty, run.lin.constraints)
+            estimate = primal.expected_multipliers(run.lin, step, held, penalty, run.lin.constraints)
             lin = run.program.linearize(values)
             run.accept(lin, estimate, norm(step), 1.0, penalty=rho, damping=damping.value, rejected=rejected)
             if run.status is not None:
                 return False
-            gained = before - primal.merit(lin, none, penalty)
+            gained = before - primal.merit(lin, held, penalty)
             # Beside a gross cost of least squares, the progress of all others is rounding.
             if not run.program.least_squares and gained <= ROUNDING * max(1.0, abs(before)):
                 return True
