@@ -52,7 +52,7 @@ demo: $(VENV)/installed
 
 test: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/unifg warmup
-	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup $(PYTEST)
+	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(PYTEST)
 
 test-all: $(VENV)/ready
 	$(MAKE) test PYTEST="--all $(PYTEST)"
@@ -60,7 +60,7 @@ test-all: $(VENV)/ready
 # What is old calls what is new in ways that have since been deprecated.
 test-lowest: $(VENV)-lowest/ready
 	$(ONE_THREAD) $(VENV)-lowest/bin/unifg warmup
-	$(ONE_THREAD) $(VENV)-lowest/bin/python -m pytest -n $(WORKERS) --dist loadgroup -W ignore::DeprecationWarning $(PYTEST)
+	$(ONE_THREAD) $(VENV)-lowest/bin/python -m pytest -n $(WORKERS) --dist loadfile -W ignore::DeprecationWarning $(PYTEST)
 
 fuzz: $(VENV)/ready
 	$(BIN)/python -m benchmarks.fuzz

@@ -59,7 +59,6 @@ def plain(source: str) -> list[str]:
     return list(walk(tree_of(source), "", ""))
 
 
-@pytest.mark.xdist_group("house")
 def test_no_plain_exception_is_raised() -> None:
     own = re.compile(rf"\braise ({'|'.join(EXCEPTIONS)})\b")
     raised = {name_of(path): plain(text_of(path)) for _, path in LIBRARY if own.search(text_of(path))}

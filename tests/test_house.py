@@ -11,8 +11,6 @@ import pytest
 
 from scripts import CHECKOUT, files_in_git
 
-pytestmark = pytest.mark.xdist_group("house")  # what one process has parsed
-
 # Import name of each package -> its folder in the checkout.
 FOLDERS = {
     "unifg": CHECKOUT / "unifg",
@@ -301,14 +299,21 @@ BUDGETS = {
 DENSITY = {"unifg solvers models": 10.0, "scenarios": 10.6, "benchmarks": 11.9, "tests": 12.3}
 
 
+@cache
+def size_of(path: Path) -> tuple[int, int]:
+    """Statements of a file, without imports and docstrings, and nodes of syntax."""
+    statements = nodes = 0
+    for node in nodes_in(path):
+        text = isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str)
+        statements += isinstance(node, ast.stmt) and not text and not isinstance(node, ast.Import | ast.ImportFrom)
+        nodes += isinstance(node, ast.stmt | ast.expr)
+    return statements, nodes
+
+
 def sized(folders: str) -> tuple[int, float]:
     """Statements below folders, without imports and docstrings, and nodes of syntax a statement."""
-    statements = nodes = 0
-    for path in (path for folder in folders.split() for path in sources(CHECKOUT / folder)):
-        for node in nodes_in(path):
-            text = isinstance(node, ast.Expr) and isinstance(getattr(node.value, "value", None), str)
-            statements += isinstance(node, ast.stmt) and not text and not isinstance(node, ast.Import | ast.ImportFrom)
-            nodes += isinstance(node, ast.stmt | ast.expr)
+    found = [size_of(path) for folder in folders.split() for path in sources(CHECKOUT / folder)]
+    statements, nodes = map(sum, zip(*found, strict=True))
     return statements, nodes / statements
 
 
