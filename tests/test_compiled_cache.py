@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import importlib.util
 import os
 import subprocess
 import sys
@@ -19,7 +18,7 @@ import numpy as np
 import platformdirs
 import pytest
 
-from scripts import run_script
+from scripts import loaded, run_script
 from unifg.codegen import cache_folder, jit
 from unifg.codegen.artifact import Artifact
 from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON, UseDispatcher
@@ -39,11 +38,7 @@ def twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[float], 
     monkeypatch.setattr(jit, "cache_folder", cache_folder.cache_folder.__wrapped__)
     path = tmp_path / "doubling.py"
     path.write_text(SOURCE, encoding="utf-8")
-    spec = importlib.util.spec_from_file_location("doubling", path)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    function: Callable[[float], float] = module.twice
+    function: Callable[[float], float] = loaded(path).twice
     return function
 
 

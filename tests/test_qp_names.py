@@ -58,14 +58,16 @@ def test_one_subproblem_is_what_the_engine_finds(name: str) -> None:
     np.testing.assert_allclose(theirs.multipliers, mine.multipliers, atol=1e-3)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", ["osqp", *NAMES])
 def test_contradictions_are_left_to_the_elastic_problem(name: str) -> None:
+    """Near the origin the linearised circle asks for an impossible step within the box."""
     graph, x = graph_with(fg.Rn(2))
     graph.minimize(fg.prior, x, [1.0, 1.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
     graph.bound(x, lower=-2.0, upper=2.0)
     solution = SQP(qp=name).solve(graph, {x: np.array([[0.01, 0.02]])}, check=True)
     assert "elastic" in {row.details["qp"] for row in solution.history[1:]}
+    np.testing.assert_allclose(solution[x], 0.5**0.5, atol=1e-6)
 
 
 @pytest.mark.parametrize("options", [{"qp": "nope"}, {"fallback": "nope"}])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
 import re
 from pathlib import Path
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fences import PYTHON, fences
-from scripts import CHECKOUT
+from scripts import CHECKOUT, loaded
 
 README = CHECKOUT / "README.md"
 PICTURES = re.compile(r"docs/images/[\w/-]+\.(?:gif|png)")
@@ -48,11 +47,7 @@ def test_the_film_is_small_and_moves() -> None:
 
 def described(repository: str | None) -> str:
     """README.md as a package index gets it."""
-    spec = importlib.util.spec_from_file_location("setup_of_unifg", CHECKOUT / "setup.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    text: str = module.described(README.read_text(encoding="utf-8"), repository, "1.2.3")
+    text: str = loaded(CHECKOUT / "setup.py").described(README.read_text(encoding="utf-8"), repository, "1.2.3")
     return text
 
 

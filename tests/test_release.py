@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import sys
 import tarfile
@@ -11,17 +10,13 @@ from types import ModuleType
 
 import pytest
 
-from scripts import CHECKOUT
+from scripts import CHECKOUT, loaded
 
 
 @pytest.fixture(scope="module")
 def release() -> ModuleType:
     """The script of `make release-check`."""
-    spec = importlib.util.spec_from_file_location("check_release", CHECKOUT / "docs" / "check_release.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded(CHECKOUT / "docs" / "check_release.py")
 
 
 def packed(names: list[str], when: int, who: str, mode: int) -> bytes:

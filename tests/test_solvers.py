@@ -148,17 +148,6 @@ def test_sqp_history_names_the_route() -> None:
     assert "piqp" in routes, "one iteration is too few for OSQP here, so the fallback must appear"
 
 
-def test_sqp_is_elastic_when_the_linearisation_is_infeasible() -> None:
-    """At the origin the linearised circle asks for an impossible step within the box."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 1.0])
-    graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
-    graph.bound(x, lower=-2.0, upper=2.0)
-    solution = SQP().solve(graph, {x: np.array([[0.01, 0.02]])}, check=True)
-    assert any("elastic" in str(row.details.get("qp")) for row in solution.history)
-    np.testing.assert_allclose(solution[x], 0.5**0.5, atol=1e-6)
-
-
 def test_moving_within_bounds_spends_no_iteration() -> None:
     graph, guess = short_drive()
     u = graph.families["u"]

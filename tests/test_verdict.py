@@ -165,19 +165,22 @@ def test_measurements_without_sense_are_judged() -> None:
     assert verdict.of("slipped")
 
 
-@pytest.mark.parametrize("unit", [1e-3, 1e3])
-def test_the_unit_of_length_decides_nothing_where_headings_are_sure(unit: float) -> None:
+def test_the_unit_of_length_decides_nothing_where_headings_are_sure() -> None:
     made = manhattan(400, 3)
     dirty, _ = aliased(made.pose_graph, made.truth, 1, 3)
-    edges, by = dirty.edges, np.array([unit, unit, 1.0])
+    edges = dirty.edges
     sure = solved(replace(dirty, edges=replace(edges, information=edges.information * np.array([1.0, 1.0, 1e3]))))
-    information = sure.edges.information / by / by[:, None]
-    other = replace(sure, edges=replace(edges, measured=edges.measured * by, information=information))
-    found, again = (one.verdict(effort="cheap") for one in (sure, other.with_poses(sure.poses * by)))
-    assert found.of("contradicted") and [one.kind for one in again.clusters] == [one.kind for one in found.clusters]
-    for one, same in zip(found.clusters, again.clusters, strict=True):
-        assert np.array_equal(same.edges, one.edges) and same.squared == pytest.approx(one.squared, rel=1e-4)
-    assert again.leverage == pytest.approx(found.leverage, abs=1e-6)
+    found = sure.verdict(effort="cheap")
+    assert found.of("contradicted")
+    for unit in (1e-3, 1e3):
+        by = np.array([unit, unit, 1.0])
+        information = sure.edges.information / by / by[:, None]
+        other = replace(sure, edges=replace(edges, measured=edges.measured * by, information=information))
+        again = other.with_poses(sure.poses * by).verdict(effort="cheap")
+        assert [one.kind for one in again.clusters] == [one.kind for one in found.clusters]
+        for one, same in zip(found.clusters, again.clusters, strict=True):
+            assert np.array_equal(same.edges, one.edges) and same.squared == pytest.approx(one.squared, rel=1e-4)
+        assert again.leverage == pytest.approx(found.leverage, abs=1e-6)
 
 
 def test_nothing_is_claimed_of_clusters_where_an_unknown_is_not_determined() -> None:
