@@ -353,6 +353,31 @@ def test_weakly_active_rows_are_refused_by_name(limit: float) -> None:
     refused(point(state), r"'wall', factor 0, row 0, is weakly active.*both below 1.0e-03")
 
 
+@pytest.mark.parametrize("limits", [(-math.inf, 1.0), (-5.0, 1.0), (1.0, 1.0)], ids=str)
+@pytest.mark.parametrize("price", [(1e8, 0.0), (0.0, 3.0), (0.0, 1e8), (0.1, 1e8)], ids=str)
+def test_prices_make_no_row_weakly_active(price: tuple[float, float], limits: tuple[float, float]) -> None:
+    """Neither large ones the multipliers beside them, nor squares the limits of slacks that nothing pulls at."""
+
+    def state(graph: fg.Graph, x: fg.Family) -> None:
+        graph.minimize(fg.prior, x, graph.data("p", [1.3, 0.5]))
+        lower, upper = limits
+        graph.constrain(lambda x: x, x, lower=[lower, -5.0], upper=[upper, 5.0], soft=fg.Soft(*price), name="wall")
+
+    solution = point(state)
+    gives = 1.0 / (1.0 + price[1]) if price[1] else 0.0  # of x - p + w + q (x - 1) = 0
+    expected = [[gives, 0.0], [0.0, 1.0], [1.0 - gives, 0.0], [0.0, 0.0]]
+    np.testing.assert_allclose(solution.sensitivity(["x", "wall"], "p"), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("price", [0.3, fg.Soft(0.3, 3.0)], ids=["linear", "both"])
+def test_a_row_that_is_about_to_give_way_is_weakly_active(price: Any) -> None:
+    def state(graph: fg.Graph, x: fg.Family) -> None:
+        graph.minimize(fg.prior, x, graph.data("p", [1.3, 0.5]))
+        graph.constrain(lambda x: x, x, upper=[1.0, 5.0], soft=price, name="wall")
+
+    refused(point(state), "'wall: slack', factor 0, row 0, is weakly active")
+
+
 def test_a_refused_question_leaves_no_factor_behind() -> None:
     graph = fg.Graph()
     x, p = graph.variables("x", fg.Rn(2), 1), graph.data("p", [3.0, 2.0])
