@@ -15,6 +15,8 @@ from unifg.modeling.variables import Data
 from unifg.models import unicycle
 from unifg.solution import as_written
 from unifg.solution.as_written import WrittenTerm
+from unifg.solution.optimality import Tolerances, optimality
+from unifg.solution.verify import verified
 from unifg.solvers import (
     KKT,
     SQP,
@@ -402,3 +404,23 @@ def test_a_large_term_is_moved_call_by_call(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(as_written, "LONGEST", 60)
     term.slopes()
     assert lengths == [10] * 5 + [60]
+
+
+@pytest.mark.parametrize(("limit", "price", "beside"), [(1.0, 10.0, 1e-7), (500.0, 1e9, 0.0)], ids=["sum", "ulp"])
+def test_what_slacks_do_not_pay_for_is_judged_as_by_the_solver(limit: float, price: float, beside: float) -> None:
+    """Neither twice, with the length of the slack, nor where it is the last digit of the row."""
+    graph, x = graph_with(fg.Rn(1))
+    graph.minimize(fg.prior, x, [limit + 2.0])
+    graph.constrain(lambda x: x, x, upper=limit, soft=price, name="wall")
+    program, multipliers = graph.compile(), np.array([2.0, 2.0 - price])
+
+    def claimed(at: float) -> tuple[Any, ...]:
+        here = program.values_from({x: [[at]]})
+        here[program.soft["wall"].family][:] = beside
+        lin = program.linearize(here)
+        if beside and at < limit + 1e-6:
+            assert optimality(program, lin, multipliers, 1e-6).passes(Tolerances(1e-6, 1e-6))
+        return program, {family: here[family] for family in here}, multipliers, lin.cost, {}, 1e-6
+
+    assert verified(*claimed(np.nextafter(limit, np.inf) + 2.0 * beside)).verdict != "fails"
+    assert verified(*claimed(limit + 1e-6)).verdict == "fails"

@@ -31,6 +31,7 @@ FLAT = 1e-11  # curvature, relative to the diagonal, of a direction of which dif
 FITS = 100.0  # times the rounding of the variables: residuals that are nothing else
 SYMMETRIC = "MMD_AT_PLUS_A"  # ordering
 COST = 1e-8  # relative difference of costs
+LAST = 4 * np.finfo(float).eps  # of the value of a row: what prices do not multiply
 SHARE = 0.01  # of the largest product that a gradient is a sum of: what its size is
 
 
@@ -145,7 +146,8 @@ class Conditions:
         self._counted = self._worth == np.arange(len(self.g))
         outside = np.maximum(np.maximum(self.g - self.upper, self.lower - self.g), 0.0)
         self.violation, self.worst = float(outside.max(initial=0.0)), int(outside.argmax()) if len(outside) else -1
-        self._unpaid = np.where(self._counted, 0.0, outside[self._worth])  # by slacks: it costs the price of one, too
+        seen = np.where(outside > LAST * np.abs(self.g), outside, 0.0)
+        self._unpaid = np.where(self._counted, 0.0, seen[self._worth])  # by slacks: it costs the price of one, too
 
     def differentiate(self) -> None:
         """Find gradient, Jacobian of the constraints and, of least squares, the Gauss-Newton matrix."""
@@ -188,7 +190,7 @@ class Conditions:
             stationarity, bound = self._offset(slope, doubt)
         limit = np.where(multipliers > 0.0, self.upper, self.lower)
         slack = np.where(np.isfinite(limit), np.abs(self.g - np.where(np.isfinite(limit), limit, 0.0)), 1.0)
-        slack += self._unpaid
+        slack = np.maximum(slack, self._unpaid)
         shares = np.zeros(len(multipliers))
         np.maximum.at(shares, A.rows, np.abs(A.numbers) / sizes[A.columns])
         shares = np.where(shares > 0.0, np.minimum(shares, 1.0 / scale), 1.0 / scale)[self._worth]
