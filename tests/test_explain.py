@@ -126,6 +126,15 @@ def test_a_soft_constraint_that_gives_way_is_named() -> None:
     assert "gives way in" in said and "in factor 5" in said
 
 
+@pytest.mark.parametrize("price", [1e2, 1e9])
+def test_a_price_hides_nothing_that_holds_the_solution(price: float) -> None:
+    graph, guess = chain(0.2)
+    graph.constrain(lambda x: x, graph.families["x"], upper=9.0, soft=price, name="far")
+    solution = InteriorPoint().solve(graph, guess, check=True)
+    assert "holds the solution in 1 row, most in factor 3" in sentence(solution, "'limits'")
+    assert "'far'" not in solution.explain()
+
+
 def test_notebooks_show_solutions_and_histories() -> None:
     solution = InteriorPoint().solve(*chain(), check=True)
     assert solution.table() == str(solution.history)

@@ -57,10 +57,12 @@ def holding(program: CompiledProblem, multipliers: Array, equality: BoolArray, h
     """
     found = []
     sizes = np.where(held, np.abs(multipliers), 0.0)
+    for name, rows, _ in program.places:
+        sizes[rows] *= not name.endswith(SLACK)
     least = SMALL * max(1.0, float(sizes.max(initial=0.0)))
     for name, rows, (_, size) in program.places:
         row = rows.start + int(sizes[rows].argmax())
-        if sizes[row] > least and not name.endswith(SLACK):
+        if sizes[row] > least:
             found.append(
                 (float(sizes[row]), row, name, divmod(row - rows.start, size), int((sizes[rows] > least).sum()))
             )
