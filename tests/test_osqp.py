@@ -105,3 +105,17 @@ def test_contradictions_and_crossed_limits_are_told() -> None:
     assert answer.infeasible and not np.isfinite(answer.error)
     beyond = replace(qp, lower=np.full(2, 1e21), upper=np.full(2, np.inf))
     assert not np.isfinite(OsqpRoute(program, 100).solve(beyond, np.zeros(2), 1e-6).error)
+
+
+def test_limits_that_cross_only_where_rows_are_scaled_print_nothing(capfd: pytest.CaptureFixture[str]) -> None:
+    """An equality of a row that its weights have left next to nothing of."""
+    graph, x = graph_with(fg.Rn(1))
+    graph.minimize(fg.prior, x, [0.0], sigma=1e-9)
+    graph.constrain(lambda p: 1e-9 * p - 45.0, x, lower=0.0, upper=0.0, name="far")
+    program = graph.compile()
+    qp = subproblem(program, program.linearize(program.values_from({x: [[0.5]]})), 0.0)
+    faint = replace(qp, jacobian=1e-9 * qp.jacobian)
+    for sign in (1.0, -1.0):
+        there = replace(faint, lower=sign * faint.lower, upper=sign * faint.upper)
+        assert not np.isfinite(OsqpRoute(program, 100).solve(there, np.zeros(1), 1e-6).error)
+    assert capfd.readouterr() == ("", "")

@@ -80,9 +80,9 @@ class OsqpRoute:
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve to ``accuracy``, polish, and measure."""
         nothing = QPAnswer(np.zeros(self.program.size), multipliers, self.name, 0, np.inf)
-        if (qp.lower >= INFINITY).any() or (qp.upper <= -INFINITY).any():
-            return nothing  # OSQP would print that the limits cross
         packed = Packed.of(qp, EQUALITIES, INFINITY)
+        if (packed.lower >= INFINITY).any() or (packed.upper <= -INFINITY).any():
+            return nothing  # OSQP would print that the limits cross
         try:
             self._update(qp, packed)
             return self._refine(qp, packed, multipliers, max(FINER * accuracy, TIGHTEST), nothing)
