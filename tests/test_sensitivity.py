@@ -378,6 +378,23 @@ def test_a_row_that_is_about_to_give_way_is_weakly_active(price: Any) -> None:
     refused(point(state), "'wall: slack', factor 0, row 0, is weakly active")
 
 
+@pytest.mark.parametrize("equal", [False, True])
+@pytest.mark.parametrize("each", [False, True])
+def test_square_prices_next_to_nothing_have_derivatives(equal: bool, each: bool) -> None:
+    """They enter by their root, which has a slope at zero only beside what it is multiplied by."""
+    prices, graph = np.array([[0.0, 1e-7], [1e3, 2.0]] if each else [0.0, 2.0]), fg.Graph()
+    x, price = graph.variables("x", fg.Rn(2), 2), graph.data("q", prices)
+    graph.minimize(fg.prior, x, [3.0, 3.0])
+    lower, soft = 1.0 if equal else -math.inf, fg.Soft(0.5, price)
+    graph.constrain(lambda x: x, x, lower=lower, upper=1.0, soft=soft, name="wall")
+    solution = InteriorPoint(tolerance=1e-10).solve(graph, {x: np.zeros((2, 2))}, check=True)
+    gives = 1.5 / (1.0 + np.broadcast_to(prices, (2, 2)))  # of x - 3 + 0.5 + q (x - 1) = 0
+    slopes, heights = -gives / (1.0 + np.broadcast_to(prices, (2, 2))), 0.5 * gives**2
+    expected = np.diag(slopes.ravel()) if each else np.vstack([np.diag(row) for row in slopes])
+    np.testing.assert_allclose(solution.sensitivity(x, price), expected, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(solution.gradient("cost", price), heights if each else heights.sum(axis=0), rtol=1e-6)
+
+
 def test_a_refused_question_leaves_no_factor_behind() -> None:
     graph = fg.Graph()
     x, p = graph.variables("x", fg.Rn(2), 1), graph.data("p", [3.0, 2.0])

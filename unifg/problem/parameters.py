@@ -25,6 +25,7 @@ from unifg.factors.robust import bend_of, form_of
 from unifg.lie import Manifold, Rn
 from unifg.modeling.elements import elements_of
 from unifg.modeling.probing import blocks_of
+from unifg.modeling.soft import Slack
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Selection
 from unifg.problem.columns import Values
@@ -137,13 +138,25 @@ def parts_of(
         forces = np.ones((term.count, 1)) if own is None else multipliers[own].reshape(term.count, term.size)
         for place, argument in enumerate(term.term.arguments):
             if argument is wrt.handle and place in term._inputs:
-                yield number, _moved(term, values, forces, place, wrt)
+                family, squares = term.term.selections[0].family, isinstance(term.term, Cost)
+                slack = next((s for s in program.soft.values() if squares and s.family is family), None)
+                priced = _squared(term, values, slack, handle) if slack and handle else None
+                yield number, priced or _moved(term, values, forces, place, wrt)
         if handle is None or handle not in term.term.shaping:
             continue
         if isinstance(term.term, Cost):
             yield number, _weighed(term, values, handle)
         elif own is not None:
             yield number, _limited(term, forces, program.equality[own].reshape(forces.shape), handle)
+
+
+def _squared(term: CompiledTerm, values: Values, slack: Slack, handle: Data) -> Part:
+    """The part of square prices of slacks: they enter by their root, which has no slope at zero."""
+    given = values[slack.family]
+    n, m = slack.signed(given).shape
+    numbers = np.broadcast_to(np.arange(handle.value.size).reshape(handle.value.shape), (n, m))
+    slopes = given[:, :, None] * (np.arange(given.shape[1])[:, None] % m == np.arange(m))
+    return _part(term, numbers, slopes, np.zeros((n, 0, m)), 0.5 * (slopes * given[:, :, None]).sum(axis=1))
 
 
 def _moved(term: CompiledTerm, values: Values, forces: Array, place: int, wrt: Parameter) -> Part:
