@@ -6,7 +6,7 @@ For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipli
 - violation: max distance of g outside [l, u];
 - complementarity: max |lambda_i| times the distance of g_i to the limit its sign points at; a multiplier pointing at a
   limit that does not exist has the wrong sign, and the distance is one. The slack of a soft constraint has to be what
-  its limit is violated by: what it does not pay for adds to its own distance, which counts as one of that row.
+  its limit is violated by: what it does not pay for is a distance of its own, if larger, and counts as one of that row.
 
 Stationarity and complementarity are divided by max(1, mean|lambda| / 100), or they are relative, whichever is less: the
 gradient to s, the size of what it is a sum of along the coordinate of a family (`find_sizes` of
@@ -51,6 +51,7 @@ from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
 
+LAST = 4 * EPSILON  # of the value of a row: what prices do not multiply
 NUMBERS = 6  # that :func:`kkt_numbers` writes
 
 
@@ -245,8 +246,8 @@ def unpaid(terms: TermArrays, t: int, k: int, constraints: Array) -> float:
     count, m = fields[t - 1, COUNT], fields[t - 1, ROWS]
     each = fields[t, COUNT] * fields[t, ROWS] // max(count, 1)
     row = fields[t - 1, ROW] + k // each * m + k % each % m
-    outside: float = max(max(constraints[row] - terms.upper[row], terms.lower[row] - constraints[row]), 0.0)
-    return outside
+    outside: float = max(constraints[row] - terms.upper[row], terms.lower[row] - constraints[row])
+    return outside if outside > LAST * abs(constraints[row]) else 0.0
 
 
 @compiled
@@ -280,7 +281,8 @@ def _complementarity(
                 if size > 0.0:
                     share = max(share, abs(entries[entry + d]) / size)
             limit = upper[at] if multipliers[at] > 0.0 else lower[at]
-            slack = abs(constraints[at] - limit) + unpaid(terms, t, k, constraints) if math.isfinite(limit) else unit
+            slack = max(abs(constraints[at] - limit), unpaid(terms, t, k, constraints))
+            slack = slack if math.isfinite(limit) else unit
             share = min(share / unit, 1.0 / scale) if share > 0.0 else 1.0 / scale
             result = max(result, abs(multipliers[at]) * slack * share)
     return result

@@ -20,6 +20,7 @@ from unifg.modeling.terms import Constraint
 from unifg.modeling.variables import Data, Family
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution.as_written import WrittenTerm, moved_fix, off_manifold
+from unifg.solution.optimality import LAST
 from unifg.typing import Array, IntArray
 
 ROUNDS = 30  # of pivoting
@@ -31,7 +32,6 @@ FLAT = 1e-11  # curvature, relative to the diagonal, of a direction of which dif
 FITS = 100.0  # times the rounding of the variables: residuals that are nothing else
 SYMMETRIC = "MMD_AT_PLUS_A"  # ordering
 COST = 1e-8  # relative difference of costs
-LAST = 4 * np.finfo(float).eps  # of the value of a row: what prices do not multiply
 SHARE = 0.01  # of the largest product that a gradient is a sum of: what its size is
 
 
