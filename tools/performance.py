@@ -3,9 +3,9 @@
     python -m tools.performance [--base COMMIT] [--rounds N]
 
 The cases of ``unifg bench`` run in two processes, one with the code of the checkout and one with that of the commit,
-in turn and in random order; only one of them works at a time. Another machine slows both, so nothing is compared
-with times that were measured elsewhere. A case that seems slower is timed again, longer, and the second time counts:
-exit status 1 where the 95 % bootstrap interval of the ratio of its medians lies above `SLOWER`.
+in turn and in random order, on one core; only one of them works at a time. Another machine slows both, so nothing is
+compared with times that were measured elsewhere. A case that seems slower is timed again, longer, and the second time
+counts: exit status 1 where the 95 % bootstrap interval of the ratio of its medians lies above `SLOWER`.
 
 The accepted commit is the last one that changed the record of times that ships: whoever records anew
 (``unifg bench --record scenarios/commands/performance.jsonl``) accepts the speed as it is. A checkout without that
@@ -36,7 +36,9 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 RECORD = "scenarios/commands/performance.jsonl"
 AGAIN = 4  # times as many rounds where a case seems slower
 WORKER = """\
-import sys, time
+import os, sys, time
+if hasattr(os, "sched_setaffinity"):  # cores of a shared machine differ by a quarter: both sides have the same one
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 from unifg.scenarios.commands.performance import cases
 found = cases()
 print(*found, sep="\\t", flush=True)
