@@ -13,9 +13,10 @@ import unifg as fg
 from problems.graphs import graph_with
 from unifg.modeling.variables import Data
 from unifg.models import unicycle
+from unifg.problem.table import SLACKS
 from unifg.solution import as_written
 from unifg.solution.as_written import WrittenTerm
-from unifg.solution.optimality import Tolerances, optimality
+from unifg.solution.optimality import Tolerances, optimality, unpaid
 from unifg.solution.verify import verified
 from unifg.solvers import (
     KKT,
@@ -418,9 +419,25 @@ def test_what_slacks_do_not_pay_for_is_judged_as_by_the_solver(limit: float, pri
         here = program.values_from({x: [[at]]})
         here[program.soft["wall"].family][:] = beside
         lin = program.linearize(here)
-        if beside and at < limit + 1e-6:
+        if at < limit + 1e-6:
             assert optimality(program, lin, multipliers, 1e-6).passes(Tolerances(1e-6, 1e-6))
         return program, {family: here[family] for family in here}, multipliers, lin.cost, {}, 1e-6
 
     assert verified(*claimed(np.nextafter(limit, np.inf) + 2.0 * beside)).verdict != "fails"
     assert verified(*claimed(limit + 1e-6)).verdict == "fails"
+
+
+@pytest.mark.parametrize("lower", [-np.inf, -1.0])
+def test_every_slack_is_judged_by_its_own_row(lower: float) -> None:
+    graph, x = graph_with(fg.Rn(2), 3)
+    graph.constrain(lambda x: x, x, lower=lower, upper=1.0, soft=5.0, name="wall")
+    program = graph.compile()
+    here = program.values_from({x: [[1.5, 0.0], [-2.0, 3.0], [1.0, -1.25]]})
+    here[program.soft["wall"].family][:] = 0.0
+    outside = np.array([[0.5, 0.0], [1.0, 2.0], [0.0, 0.25]])
+    if lower == -np.inf:
+        outside[here[x] < 0.0] = 0.0
+    constraints, term = program.evaluate(here).constraints, int(np.flatnonzero(program.arrays.fields[:, SLACKS])[0])
+    expected = outside if lower == -np.inf else np.tile(outside, (1, 2))  # slacks above, then those below
+    found = [unpaid(program.arrays, term, k, constraints) for k in range(expected.size)]
+    np.testing.assert_array_equal(found, expected.ravel())
