@@ -19,6 +19,7 @@ import numpy as np
 from unifg.factors.residuals import Residual
 from unifg.lie import SE2, Product, Rn
 from unifg.models import rkmk
+from unifg.models.constants import require_constants
 from unifg.models.rkmk import Field
 from unifg.typing import Array
 
@@ -41,7 +42,7 @@ class Bicycle:
 
     def __post_init__(self) -> None:
         """Refuse axles that no path divides by."""
-        rkmk.require_constants(self, ("rear",), ("front",))
+        require_constants(self, ("rear",), ("front",))
 
 
 def field(car: Bicycle) -> Field:

@@ -17,6 +17,7 @@ import numpy as np
 from unifg.factors.residuals import Residual
 from unifg.lie import SO2, Product, Rn
 from unifg.models import rkmk
+from unifg.models.constants import require_constants
 from unifg.models.rkmk import Field
 from unifg.typing import Array
 
@@ -42,7 +43,7 @@ class CartPole:
 
     def __post_init__(self) -> None:
         """Refuse what nothing can push."""
-        rkmk.require_constants(self, ("cart", "length"), ("pole",))
+        require_constants(self, ("cart", "length"), ("pole",))
 
 
 def field(robot: CartPole) -> Field:

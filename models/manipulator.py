@@ -18,6 +18,7 @@ import numpy as np
 from unifg.factors.residuals import Residual
 from unifg.lie import SO2, Product, Rn
 from unifg.models import rkmk
+from unifg.models.constants import require_constants
 from unifg.models.rkmk import Field
 from unifg.typing import Array
 
@@ -44,7 +45,7 @@ class Arm:
 
     def __post_init__(self) -> None:
         """Refuse links that are none."""
-        rkmk.require_constants(self, ("masses", "lengths"), ("inertias",))
+        require_constants(self, ("masses", "lengths"), ("inertias",))
 
 
 def field(arm: Arm) -> Field:

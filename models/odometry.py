@@ -10,8 +10,8 @@ import numpy as np
 from unifg.errors import ModelError
 from unifg.lie import SE2
 from unifg.models import unicycle
+from unifg.models.constants import require_constants
 from unifg.models.planar import Base
-from unifg.models.rkmk import require_constants
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["OdometryNoise", "driven", "held", "predict"]

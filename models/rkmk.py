@@ -28,7 +28,6 @@ trapezoid's own error: both are of second order. All methods are exact where F d
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields
 from functools import partial
 from typing import Any, Literal, TypeAlias
 
@@ -36,7 +35,7 @@ import numpy as np
 
 from unifg.codegen.calls import RETRACTION, address, call_residual, call_retraction, vector
 from unifg.codegen.jit import compiled
-from unifg.errors import GraphError, ModelError, UnifgError
+from unifg.errors import ModelError, UnifgError
 from unifg.factors.autodiff.captured import captured_by
 from unifg.factors.autodiff.derived import DerivedKernel, derived
 from unifg.factors.autodiff.rows import Each
@@ -45,7 +44,6 @@ from unifg.factors.differences import jacobian
 from unifg.factors.residuals import Residual, residual
 from unifg.lie import LieGroup
 from unifg.lie.functions import functions_of
-from unifg.modeling.duplicates import doubles
 from unifg.models.tableau import METHODS, Tableau
 from unifg.typing import Array, ArrayLike
 
@@ -258,31 +256,6 @@ def rollout(
             x = _advance(group, field, tableau, x, held, h / substeps)
         states[n + 1] = x[0]
     return states
-
-
-def require_constants(model: Any, positive: Sequence[str], from_zero: Sequence[str] = ()) -> None:
-    """Refuse physical constants that are not finite, not as many as by default, or without the sign they have to have.
-
-    Args:
-        model: a dataclass of numbers and tuples of numbers with defaults.
-        positive: fields.
-        from_zero: likewise, that may also be zero.
-
-    Raises:
-        ModelError: naming the field.
-    """
-    for constant in fields(model):
-        name, given, default = constant.name, getattr(model, constant.name), np.array(constant.default)
-        try:
-            values = doubles(name, given)
-        except GraphError:
-            values = np.full(default.shape, np.nan)
-        low = 0.0 if name in positive or name in from_zero else -np.inf
-        right = values.shape == default.shape and (values >= low).all() and (values < np.inf).all()
-        if not right or (name in positive and not values.all()) or (values == -np.inf).any():
-            count = f"{default.size} finite numbers" if default.ndim else "a finite number"
-            which = " above 0" if name in positive else " from 0 on" if name in from_zero else ""
-            raise ModelError(f"{type(model).__name__}: {name} must be {count}{which}, found {given!r}")
 
 
 def require_substeps(who: str, count: object) -> None:

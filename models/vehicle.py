@@ -17,7 +17,7 @@ import numpy as np
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual, residual
 from unifg.lie import Rn
-from unifg.models import rkmk
+from unifg.models.constants import require_constants
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["Vehicle", "dynamics"]
@@ -54,7 +54,7 @@ class Vehicle:
         Raises:
             ModelError: a number is not finite; a mass is not positive.
         """
-        rkmk.require_constants(self, ("equivalent_mass", "mass"))
+        require_constants(self, ("equivalent_mass", "mass"))
 
     def linearised(self, constant: float = 0.0, linear: float = 20.0) -> Vehicle:
         """The same vehicle with drag p1 + p2 v in place of c_a v^2 [N], [N s/m]."""
