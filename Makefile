@@ -1,7 +1,7 @@
 # Everything needs only make and Python >= 3.11: the first target you call builds a virtual environment in .venv.
 #
 #   make demo     one graph that estimates and plans drives a robot through a building; writes out/demo/scene.html
-#   make test     run the tests; of large tables of cases a draw, another one for each commit
+#   make test     run the tests; of large tables and long scenes a draw, another one for each commit
 #   make test-all run the tests with all cases
 #   make test-lowest    the same with the lowest versions of all packages that pyproject.toml allows, in .venv-lowest
 #   make processes    graphs and solutions in other processes, however these begin, with joblib and dask (a minute)

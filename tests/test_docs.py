@@ -60,7 +60,7 @@ def python_blocks(page: Path) -> list[Fence]:
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if python_blocks(page)], ids=relative)
-@pytest.mark.product(4)
+@pytest.mark.product(2)
 def test_python_blocks_run(page: Path, scratch: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     blocks = python_blocks(page)
     for peer in ("casadi", "gtsam"):  # extras that the tests do not ask for

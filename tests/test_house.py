@@ -286,7 +286,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 33_956, "scenarios": 13_085, "benchmarks": 4_887, "tests": 38_190,
+    "unifg solvers models": 33_956, "scenarios": 13_085, "benchmarks": 4_887, "tests": 38_189,
     "docs examples": 1_984, "unifg/factors": 4_320, "unifg/problem": 3_544, "models": 2_303,
     "unifg/elimination": 2_215, "solvers": 5_154, "unifg/solution": 3_289, "unifg/smoothing": 1_934,
     "unifg/lie": 1_400, "unifg/view": 1_518, "unifg/files": 1_254, "unifg/pose_graphs": 1_973,
