@@ -68,8 +68,8 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spare tests that look at other things the drawing of pictures, which takes a second each."""
-    drawn = "matplotlib.figure.Figure.savefig"
-    monkeypatch.setattr(drawn, lambda figure, path, **options: Path(path).write_text("png"))
+    drawn = "matplotlib.backends.backend_agg.FigureCanvasAgg.print_png"
+    monkeypatch.setattr(drawn, lambda canvas, path, **options: Path(path).write_text("png"))
 
 
 @cache

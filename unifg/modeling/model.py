@@ -165,9 +165,8 @@ class Model:
         _require_name("data", name)
         if name in self._data:
             raise GraphError(f"data '{name}' exists already: choose another name")
-        handle = Data(name, value, each, quantity(f"data '{name}'", units, frame))
-        self._data[name] = handle
-        return handle
+        self._data[name] = Data(name, value, each, quantity(f"data '{name}'", units, frame))
+        return self._data[name]
 
     def minimize(
         self,

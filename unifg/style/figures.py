@@ -137,7 +137,10 @@ def word(ax: Axes, at: Array, text: str, offset: tuple[int, int], **style: Any) 
 
 def write_figure(path: str | Path, figure: Figure, dpi: int) -> Path:
     """Write a figure as a PNG and return its path; the same log gives the same bytes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     path = Path(path)
-    with replacing(path) as own:
-        figure.savefig(own, dpi=dpi, format="png", metadata={"Software": None})  # no version, no date
+    figure.set_dpi(dpi)
+    with replacing(path) as own:  # `savefig` would draw everything twice; no version, no date
+        FigureCanvasAgg(figure).print_png(own, metadata={"Software": None})  # type: ignore[no-untyped-call]
     return path
