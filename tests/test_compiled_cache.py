@@ -379,8 +379,8 @@ numba.__version__ = "99.0.0"
 _helperlib.c_helpers["numba_of_tomorrow"] = 0
 if "renamed" in sys.argv:
     import numba.core.runtime
-    from numba.core.compiler import CompileResult
-    del CompileResult._rebuild, numba.core.runtime._nrt_python
+    from numba.core.codegen import CodeLibrary
+    del CodeLibrary._set_compiled_object, numba.core.runtime._nrt_python
     sys.modules["numba.core.runtime._nrt_python"] = None
 import numpy as np
 import unifg as fg

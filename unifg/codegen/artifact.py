@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import binding as llvm
 from numba import types
+from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
 from numba.core.funcdesc import FunctionDescriptor
 from numba.core.lowering import Environment
@@ -63,6 +64,23 @@ class Artifact(NamedTuple):
         return cls(found, content[first + header : first + header + code], content[first + header + code :])
 
 
+class _Kept(JITCodeLibrary):  # type: ignore[misc]
+    """Machine code from a file; what a caller links is parsed when one is compiled, which seldom happens."""
+
+    def __init__(self, codegen: Any, artifact: Artifact, symbols: tuple[str, ...]) -> None:
+        """Hand the code to the engine; `symbols` are those it has."""
+        super().__init__(codegen, artifact.header["symbol"])
+        self._linkable = artifact.linkable
+        self.enable_object_caching()
+        self._set_compiled_object(artifact.code)
+        self._finalize_final_module()
+        codegen._engine._defined_symbols.update(symbols)
+
+    def _get_module_for_linking(self) -> Any:
+        self._shared_module: Any = self._shared_module or llvm.parse_bitcode(self._linkable)
+        return self._shared_module
+
+
 def header_of(result: Any, use: int) -> dict[str, Any] | None:
     """Header of what Numba has compiled; None where its types or its environment have no plain form."""
     described, environment = result.fndesc, result.environment
@@ -95,12 +113,18 @@ def rebuilt(target: Any, artifact: Artifact, function: FunctionType, arguments: 
     described, environment = _described_function(artifact.header, function, arguments)
     if not environment.consts:
         environment.consts.extend(_dtype(held) for held in artifact.header["held"])
-    library: tuple[Any, ...] = artifact.header["symbol"], "object", (artifact.code, artifact.linkable)
-    if artifact.header["use"] == LINKED:
+    use = artifact.header["use"]
+    if use == LINKED:
         target = target.subtarget(codegen=linked_code)
-        library = artifact.header["symbol"], "bitcode", artifact.linkable
-    signature = described.restype(*arguments)
-    return CompileResult._rebuild(target, library, described, environment, signature, False, (), "", (), ())
+    symbols = (artifact.header["symbol"], described.llvm_cpython_wrapper_name)[:use]
+    library = _Kept(target.codegen(), artifact, symbols)
+    parts = {
+        "target_context": target, "typing_context": target.typing_context, "library": library,
+        "environment": environment, "entry_point": target.get_executable(library, described, environment),
+        "fndesc": described, "type_annotation": "", "signature": described.restype(*arguments), "objectmode": False,
+        "lifted": (), "reload_init": (), "referenced_envs": (),
+    }  # fmt: skip
+    return CompileResult(*map(parts.get, CompileResult._fields))
 
 
 def finished(

@@ -251,7 +251,7 @@ class _Cache:
 def _say_unknown(error: AttributeError) -> None:
     """Log, once in a process, that this Numba has no way to keep functions that is known here."""
     owner = error.obj if isinstance(error.obj, type) else type(error.obj)
-    if owner.__module__.partition(".")[0] not in ("numba", "llvmlite"):
+    if not any(base.__module__.partition(".")[0] in ("numba", "llvmlite") for base in owner.__mro__):
         raise error
     say_not_kept(f"Numba {numba.__version__} is newer than unifg knows ({error})")
 
