@@ -5,6 +5,7 @@ The command ``unifg solve`` is this and `unifg.scenarios.commands.graphs`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -27,6 +28,7 @@ from unifg.pose_graphs.verdict import Judgement, Verdict
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import Settings, count, existing, option
 from unifg.scenarios.stopwatch import Stopwatch
+from unifg.solution.chi_squared import exceeded
 from unifg.solution.history import Iteration
 from unifg.solution.solution import Solution
 from unifg.solution.status import Status
@@ -309,9 +311,7 @@ def robust_loss(text: str | None, dim: int) -> Loss | None:
 
 def threshold(dim: int) -> float:
     """The length of a whitened residual that a share of right measurements stays below."""
-    from scipy.special import chdtri  # slow to load, and seldom asked
-
-    return float(np.sqrt(chdtri(dim, 1.0 - _INLIERS)))
+    return math.sqrt(exceeded(dim, 1.0 - _INLIERS))
 
 
 def _chosen(kept: dict[int, Array]) -> tuple[list[int], Array]:

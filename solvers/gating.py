@@ -25,6 +25,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import ENTRY, ROW, WIDTH
 from unifg.problem.term import CompiledTerm
+from unifg.solution.chi_squared import exceeded
 from unifg.typing import Array, BoolArray, IntArray
 
 NEAR = 10  # members of a family between two measurements of one group, at most
@@ -53,11 +54,9 @@ class VarianceFactor:
 
         It is about one where information matrices are right, and one where too few measurements tell.
         """
-        if self.freedom < 1.0 or self.squared <= 0.0:
+        if not 1.0 <= self.freedom < np.inf or self.squared <= 0.0:
             return 1.0
-        from scipy.special import chdtri  # slow to load
-
-        return min(1.0, self.squared / float(chdtri(self.freedom, 1.0 - CHANCE)))
+        return min(1.0, self.squared / exceeded(self.freedom, 1.0 - CHANCE))
 
     def rejects(self, innovation: Array, size: int, count: int) -> BoolArray:
         """Test whether measurements scatter more than the others, at a false-alarm rate of ``CHANCE`` in ``count``.
@@ -68,15 +67,13 @@ class VarianceFactor:
             count: how many are looked at.
         """
         if np.isinf(self.freedom):
-            from scipy.special import chdtri
-
-            known: BoolArray = innovation > float(chdtri(size, CHANCE / max(count, 1)))
+            known: BoolArray = innovation > exceeded(size, CHANCE / max(count, 1))
             return known
         rest = self.freedom - size
         if rest < 1.0:
             return np.zeros(len(innovation), dtype=np.bool_)
         without = np.maximum(self.squared - innovation, np.finfo(np.float64).eps * self.squared) / rest
-        from scipy.special import fdtri
+        from scipy.special import fdtri  # slow to load
 
         limit = float(fdtri(size, rest, 1.0 - CHANCE / max(count, 1)))
         return innovation > size * limit * without

@@ -19,6 +19,7 @@ import numpy as np
 from unifg.errors import GraphError, require_kinds
 from unifg.factors.whitening import quick_roots
 from unifg.pose_graphs.pose_graph import PoseGraph
+from unifg.solution.chi_squared import exceeded
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["most_consistent", "pairwise_consistent"]
@@ -112,8 +113,6 @@ def _agreements(
         probability: that the loop of two right closures passes.
         at: (n, storage) poses at which drift is linearised; without them, those of odometry.
     """
-    from scipy.special import chdtri  # slow to load
-
     if not len(closures):
         return
     group, edges, dim = pose_graph.group, pose_graph.edges, pose_graph.group.dim
@@ -133,7 +132,7 @@ def _agreements(
     covariance = across @ covariance @ np.swapaxes(across, 1, 2)
     moved = gone[second] - gone[first]
     pairs = part[first] * (int(part.max(initial=0)) + 1) + part[second]
-    bound = float(chdtri(dim, 1.0 - probability))
+    bound = exceeded(dim, 1.0 - probability)
     for one in np.unique(pairs):
         own = np.flatnonzero(pairs == one)
         agreeing = np.zeros((len(own), len(own)), dtype=np.bool_)
