@@ -423,6 +423,11 @@ NO_NUMBERS: dict[str, tuple[Any, str]] = {
     "measured": (lambda: loop_of().tick(measured=[1.0]), r"measured: values by name are expected, found \[1.0\]"),  # type: ignore[arg-type]
     "data of a term": (lambda: giving(None), "Giving.data must return values by name, found None"),
     "a function of a guess": (lambda: InitialGuesses(cold=3), "cold must be a function or None, found 3"),  # type: ignore[arg-type]
+    "no more guesses": (
+        lambda: loop_of(starts=InitialGuesses(others=lambda now: None)).plan([0.0, 0.0]),  # type: ignore[arg-type,return-value]
+        r"InitialGuesses: others\(now\) must be of the class Iterable, found None",
+    ),
+    "sigmas without a limit": (lambda: loop_of(sigmas="a"), "sigmas of all limits must be real numbers, found 'a'"),
     "half a guess": (lambda: guessing((np.zeros((5, 2)),)), "an initial guess is two arrays, states and controls"),
     "a carried guess": (lambda: carrying(None), "a guess is .family: array"),
     "judge": (

@@ -167,12 +167,23 @@ def test_a_joint_graph_moves_its_past_by_nodes_and_its_future_by_seconds() -> No
         ([0.0, 0.1, 0.2, 0.4, 0.7, 1.1, np.inf], CART, "growing"),
         (TIMES, STEADY, r"predict\(x, u, seconds\)"),
         (TIMES, replace(CART, tick=0.2), r"as long as a tick of the robot \(0.2 s\), got 0.1 s"),
+        (TICK * np.arange(7.0), CART, "'dynamics': its step is .* s, but the nodes .* leave step= out"),
+        (None, CART, "'dynamics': its step is .* s, but the nodes"),
     ],
 )
 def test_times_that_do_not_fit_are_refused(times: ArrayLike, robot: Robot, why: str) -> None:
     terms: list[Term] = [Dynamics(motion, np.diff(TIMES)), Goal()]
     with pytest.raises(fg.GraphError, match=why):
         RecedingHorizon(robot, 6, terms, times=times, solver=InteriorPoint())
+
+
+def test_dynamics_of_one_step_are_refused_beside_other_times() -> None:
+    with pytest.raises(fg.GraphError, match=r"'dynamics': its step is 0.1 s, but the nodes of the horizon are \[0.1"):
+        RecedingHorizon(CART, 6, [Dynamics(motion, TICK), Goal()], times=TIMES, solver=InteriorPoint())
+    loop = loop_of(TICK * np.arange(7.0))
+    with pytest.raises(fg.GraphError, match="leave step= out"):
+        loop.set_times(TIMES)
+    assert loop.times[-1] == pytest.approx(6 * TICK)
 
 
 def moving(**options: Any) -> RecedingHorizon:

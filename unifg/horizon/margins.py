@@ -81,13 +81,14 @@ class Margins:
         self._columns = {name: robot.state.dim + places for name, places in robot.places("dim").items()}
         self._size = robot.state.dim + sum(columns.size for columns in self._columns.values())
         own = {term.name: term for term in terms if isinstance(term, Constraint) and self._limits_state(term)}
+        known = ", ".join(f"'{name}'" for name in own)
         given = dict(sigmas) if isinstance(sigmas, Mapping) else dict.fromkeys(own, 0.0 if sigmas is None else sigmas)
+        numbers(0.0 if isinstance(sigmas, Mapping | None) else sigmas, (), f"sigmas of {known or 'all limits'}")
         chosen = {name: float(numbers(count, (), f"sigmas of '{name}'")) for name, count in given.items()}
         for name, count in chosen.items():
             if name not in own:
-                known = ", ".join(f"'{other}'" for other in own) or "none"
                 raise GraphError(
-                    f"sigmas: '{name}' is no inequality constraint on states (there are: {known})", term=name
+                    f"sigmas: '{name}' is no inequality constraint on states (there are: {known or 'none'})", term=name
                 )
             if count < 0.0:
                 raise GraphError(f"sigmas: {count} standard deviations for '{name}': a number from 0 on", term=name)

@@ -170,9 +170,9 @@ class RecedingHorizon:
 
         Raises:
             GraphError: for options of another kind, an unknown coupling, a joint one without a window, sizes and limits
-                that do not fit, a term that cannot be stated, dynamics without a step where nodes have no times, times
-                that do not grow or begin with another step than a tick, or a delay of a joint coupling or of a robot
-                without a model; portions of what begins anew with every tick.
+                that do not fit, a term that cannot be stated, dynamics without a step where nodes have no times, or
+                with another step than between them, times that do not grow or begin with another step than a tick, or a
+                delay of a joint coupling or of a robot without a model; portions of what begins anew with every tick.
         """
         given = dict(locals())
         stated = RecedingHorizon.__init__.__annotations__ | {"judge": "Callable | None"}
@@ -196,17 +196,10 @@ class RecedingHorizon:
                 "'joint', where the future begins at the present"
             )
         self._lock = ReentrantLock()
-        self.times = _node_times(times, tree, robot)
-        self.tree, self.path = tree, tree.paths[-1]
+        self._terms, self.tree, self.path = looked_at(terms), tree, tree.paths[-1]
+        self.times = _node_times(times, tree, robot, self._terms)
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, len(tree), coupling, window, delay
-        self._terms, self._deadline, self._clock, self._patience = looked_at(terms), deadline, clock, patience
-        stepless = [term.name for term in self._terms if isinstance(term, Dynamics) and term.step is None]
-        if stepless and times is None and robot.tick is None:
-            raise GraphError(
-                f"term '{stepless[0]}' has no step, and the horizon no node times: give Dynamics its step [s], the "
-                "horizon times=, or the robot its tick",
-                term=stepless[0],
-            )
+        self._deadline, self._clock, self._patience = deadline, clock, patience
         between = control_limits((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
         graph = Graph()
         self.tie: PresentCoupling = self._tied(graph, pull)
@@ -503,7 +496,9 @@ class RecedingHorizon:
         if self._tried is None or left <= 0.0:
             return first
         self.cold.solver.time_limit = self._limits[1]
-        starts = self._untried(chain([(self.starts.cold or self._stay)(now)], others(now)), now)
+        more = others(now)
+        require_kinds("InitialGuesses", GraphError, {"others(now)": "Iterable"}, {"others(now)": more}, Iterable)
+        starts = self._untried(chain([(self.starts.cold or self._stay)(now)], more), now)
         return cheapest(self.cold, starts, data=data, seconds=left, incumbent=first, clock=self._clock)
 
     def _untried(self, starts: Iterable[tuple[Array, Array]], now: Context[Any]) -> Iterator[Guess]:
@@ -669,7 +664,7 @@ class RecedingHorizon:
             BackendError: while another thread plans.
         """
         with self._alone():
-            found = _node_times(times, self.tree, self.robot)
+            found = _node_times(times, self.tree, self.robot, self._terms)
             if self.guess is not None:
                 states = self.guess.values[self.x.family][-self.steps - 1 :]
                 self.guess = self._resampled(self.guess, states, self.guess.values[self.u], found)
@@ -732,18 +727,21 @@ class RecedingHorizon:
         self.constants, self.believed = {static.name: static.values for static in self.robot.constants}, False
 
 
-def _node_times(times: ArrayLike | None, tree: Tree, robot: Robot) -> Array:
-    """(N + 1,) times of the nodes."""
-    if times is None:
-        return tree.depths.astype(np.float64) * (robot.tick or 1.0)
-    nodes, count = doubles("the times of the nodes", times).copy(), len(tree) + 1
+def _node_times(times: ArrayLike | None, tree: Tree, robot: Robot, terms: Sequence[Term]) -> Array:
+    """(N + 1,) times of the nodes, with which the steps of dynamics agree."""
+    given = tree.depths * (robot.tick or 1.0) if times is None else times
+    nodes, count = doubles("the times of the nodes", given).copy(), len(tree) + 1
     growing = nodes.shape == (count,) and nodes[0] == 0.0 and np.isfinite(nodes).all()
     if not (growing and (nodes[1:] > nodes[tree.begins]).all()):
-        raise GraphError(f"the times must be {count} growing numbers from 0 on, one for each node; got {times}")
-    if robot.predict is not None and robot.tick is None:
+        raise GraphError(f"the times must be {count} growing numbers from 0 on, one for each node; got {nodes}")
+    if times is not None and robot.predict is not None and robot.tick is None:
         raise GraphError("node times need the robot's tick: its predict(x, u, seconds) is given the length of a step")
     if robot.tick is not None and not np.isclose(robot.tick, nodes[1], rtol=1e-9, atol=0.0):
         raise GraphError(f"the first step must be as long as a tick of the robot ({robot.tick} s), got {nodes[1]} s")
+    lengths = None if times is None and robot.tick is None else nodes[1:] - nodes[tree.begins]
+    for term in terms:
+        if isinstance(term, Dynamics):
+            term.require_step(lengths)
     return nodes
 
 

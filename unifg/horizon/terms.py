@@ -190,6 +190,23 @@ class Dynamics:
         if steps is not None and not ((steps > 0.0) & (steps < np.inf)).all():
             raise GraphError(f"term '{self.name}': its step must be positive [s], found {self.step}", term=self.name)
 
+    def require_step(self, lengths: Array | None) -> None:
+        """Refuse a step that contradicts the lengths (N,) of a horizon's steps [s], and none where there are none."""
+        step: Any = lengths if self.step is None or isinstance(self.step, Data) else self.step
+        if self.step is None and lengths is None:
+            raise GraphError(
+                f"term '{self.name}' has no step, and the horizon no node times: give Dynamics its step [s], the "
+                "horizon times=, or the robot its tick",
+                term=self.name,
+            )
+        alike = lengths is None or np.size(step) not in (1, len(lengths))  # the graph refuses other shapes
+        if not (alike or np.allclose(np.ravel(step), lengths, rtol=1e-9, atol=0.0)):
+            raise GraphError(
+                f"term '{self.name}': its step is {self.step} s, but the nodes of the horizon are {lengths} s apart: "
+                "leave step= out to follow them",
+                term=self.name,
+            )
+
     def state(self, graph: Graph, x: Selection, u: Any) -> None:
         """Add a cost or an equality for every step."""
         shared = _shared(graph, self.constants, self.name)
