@@ -19,7 +19,8 @@ import numpy as np
 from scipy import ndimage
 
 from unifg.codegen.jit import compiled
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
+from unifg.modeling.duplicates import doubles
 from unifg.typing import Array, ArrayLike, BoolArray
 
 __all__ = ["DistanceMap", "SmoothField"]
@@ -51,20 +52,11 @@ class DistanceMap:
         Raises:
             ModelError: values are not a finite (H, W) grid, the resolution is not positive, or the origin no pose.
         """
-        self.values: Array = np.asarray(values, dtype=np.float64)
-        self.resolution = float(resolution)
-        pose = np.asarray(origin, dtype=np.float64).ravel()
-        if not self.resolution > 0.0 or pose.shape != (3,) or not np.isfinite(pose).all():
-            raise ModelError(
-                f"distance map: resolution {resolution!r} must be positive; origin {origin!r}: (x, y, yaw)"
-            )
-        if self.values.ndim != 2 or self.values.size == 0 or not np.all(np.isfinite(self.values)):
-            raise ModelError(f"distance map: values {self.values.shape} must be a finite (H, W) grid")
-        self.origin: tuple[float, float, float] = (float(pose[0]), float(pose[1]), float(pose[2]))
-
-        height, width = self.values.shape
-        cosine, sine = math.cos(pose[2]) / self.resolution, math.sin(pose[2]) / self.resolution
-        offset = [-cosine * pose[0] - sine * pose[1], sine * pose[0] - cosine * pose[1]]
+        self.values: Array
+        self.values, self.resolution, self.origin = grid_of("distance map", values, resolution, origin)
+        (height, width), (x, y, yaw) = self.values.shape, self.origin
+        cosine, sine = math.cos(yaw) / self.resolution, math.sin(yaw) / self.resolution
+        offset = [-cosine * x - sine * y, sine * x - cosine * y]
         header = [cosine, sine, offset[0], -sine, cosine, offset[1], width, height]
         # Repeated border values make the field constant across the border: clamping needs no masks.
         self.table: Array = np.empty(HEADER + (height + 2 * RING) * (width + 2 * RING))
@@ -90,10 +82,15 @@ class DistanceMap:
             origin: (x, y, yaw) [m, m, rad].
             cap: largest magnitude kept [m]; by default the diagonal of the grid, which only a map without
                 surfaces reaches.
+
+        Raises:
+            ModelError: occupied is no grid of booleans, or a number is not as it should be.
         """
-        mask = np.asarray(occupied, dtype=bool)
-        if mask.ndim != 2 or mask.size == 0:
-            raise ModelError(f"distance map: occupied of shape {mask.shape} must be a (H, W) grid")
+        numbers = {"resolution": resolution, "cap": cap}
+        require_kinds("distance map", ModelError, DistanceMap.from_occupancy.__annotations__, numbers)
+        mask = np.asarray(occupied)
+        if mask.ndim != 2 or mask.size == 0 or mask.dtype != bool:
+            raise ModelError(f"distance map: occupied, {mask.dtype} of shape {mask.shape}, must be a (H, W) bool grid")
         limit = resolution * math.hypot(*mask.shape) if cap is None else float(cap)
         if cap is not None and not limit > 0.0:
             raise ModelError(f"distance map: cap {cap!r} must be positive [m]")
@@ -125,6 +122,24 @@ class DistanceMap:
             has a kink, the derivative is that of the side with larger coordinates.
         """
         return _bilinear(self.table, points)
+
+
+def grid_of(
+    who: str, values: ArrayLike, resolution: float, origin: ArrayLike
+) -> tuple[Array, float, tuple[float, float, float]]:
+    """Grid (H, W), side of a cell [m] and origin (x, y, yaw); the arguments as those of :class:`DistanceMap`.
+
+    Raises:
+        ModelError: values are not a finite (H, W) grid, the resolution is not positive, or the origin no pose.
+    """
+    require_kinds(who, ModelError, grid_of.__annotations__, {"resolution": resolution})
+    pose, grid = (doubles(f"{who}: {w}", v, error=ModelError) for w, v in (("origin", origin), ("values", values)))
+    if not 0.0 < resolution < math.inf or pose.size != 3 or not np.isfinite(pose).all():
+        raise ModelError(f"{who}: resolution {resolution!r} must be positive; origin {origin!r}: (x, y, yaw)")
+    if grid.ndim != 2 or grid.size == 0 or not np.isfinite(grid).all():
+        raise ModelError(f"{who}: values {grid.shape} must be a finite (H, W) grid")
+    x, y, yaw = pose.ravel().tolist()
+    return grid, float(resolution), (x, y, yaw)
 
 
 def _signed_cells(mask: BoolArray) -> Array:

@@ -15,6 +15,7 @@ import numpy as np
 
 from unifg.errors import ModelError
 from unifg.lie import SE2
+from unifg.modeling.duplicates import doubles
 from unifg.typing import Array, ArrayLike
 
 EXCESS = 0.03  # [m] by which covering discs may stick out of a polygon
@@ -40,14 +41,14 @@ class Body:
         Raises:
             ModelError: no disc, a number that is not finite, a radius that is not positive.
         """
-        table = np.array(self.discs, dtype=np.float64)
+        table = doubles("the discs of a body", self.discs, error=ModelError)
         if table.ndim != 2 or table.shape[1:] != (3,) or not np.isfinite(table).all() or not (table[:, 2] > 0.0).all():
             raise ModelError(f"a body is made of discs x, y, radius > 0 [m], got {self.discs}")
 
     @staticmethod
     def disc(radius: float) -> Body:
         """A disc about the robot's axis."""
-        return Body(((0.0, 0.0, float(radius)),))
+        return Body(((0.0, 0.0, radius),))
 
     @staticmethod
     def polygon(corners: ArrayLike) -> Body:
@@ -56,7 +57,7 @@ class Body:
         Raises:
             ModelError: fewer than three corners, or a polygon that is not convex.
         """
-        points = np.array(corners, dtype=np.float64)
+        points = doubles("the corners of a polygon", corners, error=ModelError)
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
             raise ModelError(f"a polygon has at least three corners x, y [m], got shape {points.shape}")
         edges = np.roll(points, -1, axis=0) - points
@@ -180,10 +181,12 @@ def body_of(text: str) -> Body:
     try:
         if not colon:
             length, width = (0.5 * float(word) for word in kind.split("x"))
+            if min(length, width) <= 0.0:
+                raise ModelError("length and width must be positive [m]")
             return Body.polygon([(length, -width), (length, width), (-length, width), (-length, -width)])
         rows = [[float(word) for word in row.split(",")] for row in numbers.split(";")]
         if kind == "disc":
-            return Body.disc(rows[0][0])
+            return Body.disc(float(numbers))
         if kind == "polygon":
             return Body.polygon(rows)
         if kind == "discs":

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
 from unifg.lie import wrap_angle
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -42,6 +42,7 @@ class Gates:
         Raises:
             ModelError: not 0 < match <= new.
         """
+        require_kinds("gates", ModelError, Gates.__annotations__, vars(self))
         if not 0.0 < self.match <= self.new:
             raise ModelError(f"gates need 0 < match <= new, found {self.match} and {self.new}")
 

@@ -18,7 +18,7 @@ import numpy as np
 from unifg.codegen.calls import call_residual, vector
 from unifg.codegen.jit import compiled
 from unifg.codegen.loops import copy_to
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual, residual
 from unifg.lie import SE2, Rn, wrap_angle
@@ -214,6 +214,7 @@ def ackermann(wheelbase: float = 0.3, steering: float = 0.6, rate: float = 2.0) 
     Raises:
         ModelError: a number that no car has.
     """
+    require_kinds("a bicycle", ModelError, ackermann.__annotations__, locals())
     if not (0.0 < wheelbase < math.inf and 0.0 < steering < 0.5 * math.pi and rate > 0.0):
         raise ModelError(
             f"a bicycle needs a wheelbase above 0 m, a steering angle in (0, pi/2) and a rate above 0, got "

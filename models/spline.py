@@ -23,9 +23,10 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_banded
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
 from unifg.factors.autodiff.lookup import Lookup
-from unifg.models.distance_map import DistanceMap
+from unifg.modeling.duplicates import doubles
+from unifg.models.distance_map import DistanceMap, grid_of
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["SplineCurve", "SplineField"]
@@ -50,12 +51,14 @@ class SplineCurve(Lookup):
         Raises:
             ModelError: fewer than four values, values that are not finite, or a spacing that is not positive.
         """
-        self.values: Array = np.array(values, dtype=np.float64)
+        numbers = {"start": start, "spacing": spacing}
+        require_kinds("spline", ModelError, SplineCurve.__init__.__annotations__, numbers)
+        self.values: Array = np.array(doubles("spline: values", values, error=ModelError))
         self.start, self.spacing = float(start), float(spacing)
         if self.values.ndim != 1 or len(self.values) < 4 or not np.isfinite(self.values).all():
             raise ModelError(f"spline: values of shape {self.values.shape} must be four or more finite numbers")
-        if not (self.spacing > 0.0 and math.isfinite(self.start)):
-            raise ModelError(f"spline: spacing {spacing!r} must be positive and start {start!r} finite")
+        if not (0.0 < self.spacing < math.inf and math.isfinite(self.start)):
+            raise ModelError(f"spline: spacing {spacing!r} must be positive and finite, and start {start!r} finite")
         super().__init__(np.pad(coefficients(self.values), PAD, mode="edge"))
 
     def __call__(self, s: Any) -> Any:
@@ -80,14 +83,10 @@ class SplineField(Lookup):
             ModelError: values are not a finite grid of four by four or more, the resolution is not positive, or the
                 origin no pose.
         """
-        self.values: Array = np.array(values, dtype=np.float64)
-        self.resolution = float(resolution)
-        pose = np.asarray(origin, dtype=np.float64).ravel()
-        if self.values.ndim != 2 or min(self.values.shape) < 4 or not np.isfinite(self.values).all():
-            raise ModelError(f"spline: values of shape {self.values.shape} must be a finite grid, 4 by 4 or more")
-        if not self.resolution > 0.0 or pose.shape != (3,) or not np.isfinite(pose).all():
-            raise ModelError(f"spline: resolution {resolution!r} must be positive; origin {origin!r}: (x, y, yaw)")
-        self.origin: tuple[float, float, float] = (float(pose[0]), float(pose[1]), float(pose[2]))
+        grid, self.resolution, self.origin = grid_of("spline", values, resolution, origin)
+        self.values: Array = grid.copy()
+        if min(grid.shape) < 4:
+            raise ModelError(f"spline: values of shape {grid.shape} must be a grid of 4 by 4 or more")
         super().__init__(np.pad(coefficients(coefficients(self.values).T).T, PAD, mode="edge"))
 
     @classmethod

@@ -13,12 +13,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Function, Residual
 from unifg.factors.robust import Loss
 from unifg.locks import ReentrantLock
-from unifg.modeling.duplicates import doubles
+from unifg.modeling.duplicates import doubles, kept
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data, Family, Variable, as_selection
 from unifg.models.interpolation import Interpolation, geodesic
@@ -120,13 +120,16 @@ class StampedMeasurements:
             name: of the term.
 
         Raises:
-            ModelError: when there is no slot or nothing measured, or ``error`` is no batched function.
+            ModelError: when there is no slot or nothing measured, ``error`` is no batched function, or another argument
+                is not what it should be.
         """
+        kinds = StampedMeasurements.__init__.__annotations__ | {"error": "Callable", "between": "Callable | None"}
+        require_kinds(f"'{name}'", ModelError, kinds, dict(locals()), str, Sequence)
         if size < 1 or capacity < 1:
             raise ModelError(f"'{name}': size {size} and capacity {capacity} must be at least 1")
         self.name, self.size, self.capacity = name, size, capacity
         self.constants, self.offset, self.component = tuple(constants), offset, component
-        self._error, self._sigma, self._between, self._robust = _batched(error, name), sigma, between, robust
+        self._error, self._sigma, self._between, self._robust = _batched(error, name), kept(sigma), between, robust
         self._lock = ReentrantLock()
         self.reset()
 
@@ -226,7 +229,7 @@ class StampedMeasurements:
         """
         term: Any = graph.term(self.name)
         nodes = term.count // self.capacity + 1
-        at = np.asarray(times, dtype=np.float64)
+        at = doubles(f"'{self.name}': times", times, error=ModelError)
         good = at.shape == (nodes,) and np.isfinite(at).all() and (np.diff(at) > 0.0).all()
         if not (good and np.isfinite(offset)):
             raise ModelError(f"'{self.name}': times must be {nodes} finite, increasing numbers, found {at}")

@@ -31,8 +31,9 @@ from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
 from unifg.lie import LieGroup
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Family
 from unifg.typing import Array, ArrayLike, IntArray
 
@@ -87,6 +88,8 @@ class CubicTrajectory:
 
     def __post_init__(self) -> None:
         """Look at the knots."""
+        stated = {"group": self.group, "start": self.start, "spacing": self.spacing}
+        require_kinds("trajectory", ModelError, CubicTrajectory.__annotations__, stated, LieGroup)
         if not (isfinite(self.start) and isfinite(self.spacing) and self.spacing > 0.0):
             raise ModelError(
                 f"trajectory: spacing {self.spacing!r} must be positive and finite, start {self.start!r} finite"
@@ -105,6 +108,7 @@ class CubicTrajectory:
         Raises:
             ModelError: the end is not finite.
         """
+        require_kinds("trajectory", ModelError, CubicTrajectory.controls.__annotations__, {"end": end})
         if not isfinite(end):
             raise ModelError(f"trajectory: the end {end!r} must be finite")
         return ORDER + max(int(np.ceil((end - self.start) / self.spacing - self._slack(end))) - 1, 0)
@@ -122,7 +126,7 @@ class CubicTrajectory:
         Raises:
             ModelError: naming a moment before the start, after the end or not finite, or too few control poses.
         """
-        times = np.atleast_1d(np.asarray(times, dtype=np.float64))
+        times = np.atleast_1d(doubles("trajectory: moments", times, error=ModelError))
         if count < ORDER:
             raise ModelError(f"trajectory: {count} control poses hold no moment, {ORDER} the first interval")
         since = (times - self.start) / self.spacing
@@ -155,7 +159,9 @@ class CubicTrajectory:
         return self.acceleration(*self._held(controls, times))
 
     def _held(self, controls: ArrayLike, times: ArrayLike) -> tuple[Array, Array, Array, Array, Array]:
-        array = np.asarray(controls, dtype=np.float64)
+        array = doubles("trajectory: control poses", controls, error=ModelError)
+        if array.ndim != 2 or array.shape[1] != self.group.storage:
+            raise ModelError(f"trajectory: control poses are (N, {self.group.storage}), found {array.shape}")
         first, fraction = self.places(times, len(array))
         return array[first], array[first + 1], array[first + 2], array[first + 3], fraction
 

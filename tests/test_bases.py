@@ -77,7 +77,22 @@ def test_the_rim_of_a_body_is_where_a_ray_leaves_it() -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["0.6", "disc:0", "disc:x", "polygon:0,0;1,0", "polygon:0,0;1,0;0.2,0.2;0,1", "discs:0,0", "ball:1", "axb"],
+    [
+        "0.6",
+        "disc:0",
+        "disc:x",
+        "polygon:0,0;1,0",
+        "polygon:0,0;1,0;0.2,0.2;0,1",
+        "discs:0,0",
+        "ball:1",
+        "axb",
+        "-1x1",
+        "1x-1",
+        "-1x-1",
+        "disc:1,2",
+        "disc:1;2",
+        "polygon:a,0;1,0;0,1",
+    ],
 )
 def test_what_is_no_body_is_refused(text: str) -> None:
     with pytest.raises(ModelError):

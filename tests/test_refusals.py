@@ -11,6 +11,13 @@ import pytest
 import unifg as fg
 from problems.graphs import graph_with
 from problems.known import line, short_drive
+from unifg.models.distance_map import DistanceMap
+from unifg.models.footprint import Body
+from unifg.models.matching import Gates
+from unifg.models.planar import ackermann
+from unifg.models.spline import SplineCurve, SplineField
+from unifg.models.stamped import StampedMeasurements
+from unifg.models.trajectory import CubicTrajectory
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton
 from unifg.typing import Array
 
@@ -204,7 +211,42 @@ OPTIONS: list[tuple[Callable[[fg.Graph, fg.Family, Any], object], Any, str]] = [
     (lambda g, x, bad: GaussNewton().solve(bad, guess_of(x)), {}, "takes a graph, as fg.Graph"),
     (lambda g, x, bad: fg.solve(bad, guess_of(x)), fg.Graph, "takes a graph, as fg.Graph"),
     (lambda g, x, bad: fg.best_guess(g, guess_of(x), along=bad), "x", "along= is a family"),
+    (lambda g, x, bad: Gates(match=bad), "a", "gates: match must be a number, found 'a'"),
+    (lambda g, x, bad: Gates(new=bad), None, "gates: new must be a number, found None"),
+    (lambda g, x, bad: ackermann(bad), "a", "a bicycle: wheelbase must be a number, found 'a'"),
+    (lambda g, x, bad: ackermann(rate=bad), None, "a bicycle: rate must be a number, found None"),
+    (lambda g, x, bad: SplineCurve(bad), "a", "spline: values must be real numbers, found 'a'"),
+    (lambda g, x, bad: SplineCurve(np.zeros(5), start=bad), None, "spline: start must be a number, found None"),
+    (lambda g, x, bad: SplineCurve(np.zeros(5), spacing=bad), np.inf, "spline: spacing inf must be positive and fin"),
+    (lambda g, x, bad: SplineField(bad, 1.0), [["a"] * 4] * 4, "spline: values must be real numbers, found text"),
+    (lambda g, x, bad: SplineField(bad, 1.0), [], "spline: values .0,. must be a finite .H, W. grid"),
+    (lambda g, x, bad: SplineField(np.zeros((5, 5)), bad), "a", "spline: resolution must be a number, found 'a'"),
+    (lambda g, x, bad: DistanceMap(bad, 1.0, [0.0] * 3), None, "distance map: values must be real numbers, found None"),
+    (lambda g, x, bad: DistanceMap(np.zeros((2, 2)), 1.0, bad), "a", "distance map: origin must be real numbers"),
+    (lambda g, x, bad: DistanceMap(np.zeros((2, 2)), bad, [0.0] * 3), np.inf, "distance map: resolution inf must be"),
+    (lambda g, x, bad: grown(bad), np.array([[-1.0, 100.0]]), "distance map: occupied, float64 .* bool grid"),
+    (lambda g, x, bad: grown(resolution=bad), "a", "distance map: resolution must be a number, found 'a'"),
+    (lambda g, x, bad: grown(cap=bad), "a", "distance map: cap must be a number or None, found 'a'"),
+    (lambda g, x, bad: CubicTrajectory(bad), "SE2", "trajectory: group must be of the class LieGroup, found 'SE2'"),
+    (lambda g, x, bad: CubicTrajectory(fg.SE2, spacing=bad), "a", "trajectory: spacing must be a number, found 'a'"),
+    (lambda g, x, bad: CubicTrajectory(fg.SE2).controls(bad), None, "trajectory: end must be a number, found None"),
+    (lambda g, x, bad: CubicTrajectory(fg.SE2).places(bad, 4), "a", "trajectory: moments must be real numbers"),
+    (lambda g, x, bad: CubicTrajectory(fg.SE2).at(bad, 0.5), np.zeros((4, 2)), "poses are .N, 3., found .4, 2."),
+    (lambda g, x, bad: seen(size=bad), "a", "'stamped': size must be a whole number"),
+    (lambda g, x, bad: seen(error=bad), None, "'stamped': error must be a function"),
+    (lambda g, x, bad: seen(between=bad), 3, "'stamped': between must be a function or None, found 3"),
+    (lambda g, x, bad: seen(constants=bad), 3, "'stamped': constants must be of the class Sequence, found 3"),
+    (lambda g, x, bad: seen(offset=bad), 0.1, "'stamped': offset must be of the class str or None, found 0.1"),
+    (lambda g, x, bad: Body.disc(bad), "a", "discs of a body must be real numbers"),
 ]
+
+
+def grown(occupied: Any = ((True, False),), resolution: Any = 1.0, cap: Any = None) -> DistanceMap:
+    return DistanceMap.from_occupancy(occupied, resolution, [0.0, 0.0, 0.0], cap)
+
+
+def seen(error: Any = lambda x, z: x - z, size: int = 1, **options: Any) -> StampedMeasurements:
+    return StampedMeasurements(error, size, capacity=1, sigma=1.0, **options)
 
 
 def guess_of(x: fg.Family) -> dict[fg.Family, Array]:
