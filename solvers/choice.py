@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from unifg.errors import GraphError, require_kinds
+from unifg.errors import GraphError, NotFiniteError, require_kinds
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
@@ -111,13 +112,11 @@ def solve(
         raise GraphError(f"solve: starts must be 1, the guess alone, or more, found {starts}")
     choice = choose(graph, data, tolerance=tolerance, time_limit=time_limit, verbose=verbose)
     logger.info("picked %s for %s", choice.first.name, choice.reason)
-    others: tuple[Found, ...] = ()
-    if starts > 1:
-        guess, others = _best_start(choice.first, graph, guess, data or {}, starts)
     solution = choice.first.solve(graph, guess, data=data, callback=callback)
-    solution.others = others
-    solution.picked = f"picked for {choice.reason}"
     left = time_limit - solution.seconds
+    if starts > 1:
+        solution, left = _best_start(choice.first, graph, guess, data or {}, callback, starts, solution, left)
+    others, solution.picked = solution.others, f"picked for {choice.reason}"
     if solution.status in ELSEWHERE and left > 0.0:
         how = solution.status.name.lower().replace("_", " ")
         logger.info("picked %s: %s ended as %s", choice.second.name, choice.first.name, how)
@@ -133,20 +132,32 @@ def solve(
 
 
 def _best_start(
-    solver: Solver, graph: Model, guess: AnyGuess, data: Mapping[Data, Numbers], count: int
-) -> tuple[AnyGuess, tuple[Found, ...]]:
-    """The start whose answer is the cheapest, the guess where none has one; and the answers of all others."""
-    prepared = solver.prepare(graph)
-    program = prepared.program
-    with program.lock:
-        program.bind(data)
-        starts = spread(program, prepared.read(guess), count)
-    each = {handle: np.broadcast_to(value, (count, *np.shape(value))) for handle, value in data.items()}
-    batch = prepared.solve_many(starts, data=each)
-    costs = np.where([status.converged for status in batch.statuses], batch.cost, np.inf)
-    best = int(np.argmin(costs))
-    found = [
-        Found(status, float(batch.cost[k]), float(batch.violation[k]), {f.name: batch[f][k] for f in program.families})
-        for k, status in enumerate(batch.statuses)
-    ]
-    return starts[best], (*found[:best], *found[best + 1 :])
+    solver: Solver,
+    graph: Model,
+    guess: AnyGuess,
+    data: Mapping[Data, Numbers],
+    callback: Callback | None,
+    count: int,
+    best: Solution,
+    left: float,
+) -> tuple[Solution, float]:
+    """The cheapest answer from the guess, ``best``, and from other starts, and what is ``left`` of the time [s].
+
+    Starts at which a term is not finite are left out.
+    """
+    prepared, others, last = solver.bound(graph), list[Found](), best
+    with prepared.program.lock:
+        prepared.program.bind(data)
+        starts = spread(prepared.program, prepared.read(guess), count)[1:]
+    for start in starts:
+        if left <= 0.0 or last.status is Status.INTERRUPTED:
+            break
+        with suppress(NotFiniteError):
+            last = replace(solver, time_limit=left).solve(graph, start, data=data, callback=callback)
+            left -= last.seconds
+            cheaper = last.converged and not (best.converged and best.cost <= last.cost)
+            best, worse = (last, best) if cheaper else (best, last)
+            values = {family.name: array.copy() for family, array in worse.values.items()}
+            others.append(Found(worse.status, worse.cost, worse.violation, values))
+    best.others = tuple(others)
+    return best, left

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 import unifg as fg
 from problems.graphs import graph_with
 from unifg.models import obstacles, unicycle
+from unifg.solution.solver import Prepared, Solver
 
 
 def waves() -> tuple[fg.Graph, fg.Family]:
@@ -62,3 +65,48 @@ def test_the_guess_is_kept_where_no_start_has_an_answer() -> None:
     solution = fg.solve(graph, {x: [[-5.0]]}, starts=3)
     assert solution.status is fg.Status.LOCALLY_INFEASIBLE
     assert not any(found.status.converged for found in solution.others)
+
+
+def test_every_start_is_solved_once_and_the_best_keeps_its_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x = waves()
+    begun: list[float] = []
+    solve = Prepared.solve
+
+    def counted(self: Prepared, *given: Any, **options: Any) -> fg.Solution:
+        begun.append(self.solver.time_limit)
+        return solve(self, *given, **options)
+
+    monkeypatch.setattr(Prepared, "solve", counted)
+    solution = fg.solve(graph, {x: [[-5.0]]}, starts=7)
+    assert len(begun) == 7 and len(solution.others) == 6 and solution.checked
+    assert solution.iterations == len(solution.history) - 1
+
+
+def test_the_time_limit_is_of_all_starts_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x = waves()
+    left: list[float] = []
+    solve = Solver.solve
+
+    def timed(self: Solver, *given: Any, **options: Any) -> fg.Solution:
+        left.append(self.time_limit)
+        solution = solve(self, *given, **options)
+        solution.seconds = 0.5
+        return solution
+
+    monkeypatch.setattr(Solver, "solve", timed)
+    solution = fg.solve(graph, {x: [[-5.0]]}, starts=20, time_limit=2.0)
+    assert left == [2.0, 1.5, 1.0, 0.5] and len(solution.others) == 3
+
+
+def test_a_callback_ends_all_starts() -> None:
+    graph, x = waves()
+    solution = fg.solve(graph, {x: [[-5.0]]}, starts=9, callback=lambda row: row.number > 0)
+    assert not solution.others and solution.status is fg.Status.INTERRUPTED
+
+
+def test_starts_where_a_term_is_not_finite_are_left_out() -> None:
+    graph, x = graph_with(fg.Rn(1))
+    graph.minimize(lambda x: np.log(x), x, name="log")
+    with np.errstate(invalid="ignore"):
+        solution = fg.solve(graph, {x: [[0.5]]}, starts=9)
+    assert solution.converged and 0 < len(solution.others) < 8

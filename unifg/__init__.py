@@ -157,12 +157,13 @@ def solve(
         guess: values per family, ``{x: array, ...}``, or a guess or solution that carries multipliers too.
         data: values of data for this solve; others keep their defaults.
         check: raise instead of returning a solution that did not converge.
-        callback: called with every row of the history; returning True ends the solve.
+        callback: called with every row of the history, from every start; returning True ends the solve.
         tolerance: of the KKT test.
-        time_limit: seconds for both together.
+        time_limit: seconds for all of it: both backends, and all starts.
         verbose: log one line per iteration, or print it where logging is not configured.
         starts: solve from so many starts, the guess and others around it, and keep the cheapest answer; what the others
-            found stands in ``solution.others``.
+            found stands in ``solution.others``. Those that the time limit leaves no time for are not tried, nor those
+            at which a term is not finite.
 
     Raises:
         GraphError: when the graph, guess or data is malformed.
