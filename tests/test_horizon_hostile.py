@@ -561,7 +561,8 @@ class Speed:
 
 def test_a_term_that_divides_by_durations_is_told_of_those_that_are_none() -> None:
     with pytest.raises(fg.GraphError, match=r"filled=False"):
-        window_of(Speed(), filled=True).estimate()
+        place: list[Term] = [Measurement("p", position, (1,), 0.3), Speed()]
+        Window(POINT, 3, place, start=[0.0, 0.0], sigma=1.0, solver=GaussNewton(), filled=True).estimate()
     window = window_of(Speed())
     for k in range(6):
         if k:

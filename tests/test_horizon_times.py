@@ -252,3 +252,9 @@ def test_new_times_interpolate_the_warm_start_and_leave_the_kept_plan() -> None:
 def test_a_past_needs_a_step_of_its_own() -> None:
     with pytest.raises(GraphError, match="the past needs the step of 'dynamics'"):
         Window(CART, 3, [Dynamics(motion)], start=np.zeros(2), sigma=1.0)
+
+
+def test_steps_of_one_length_do_not_fill_a_window() -> None:
+    """They would move its start and add their noise before anything has moved."""
+    with pytest.raises(GraphError, match=r"'dynamics' has a step of 0.1 s, but a filled window begins with steps"):
+        Window(CART, 3, [Dynamics(motion, TICK, sigma=[0.01, 0.02])], start=[0.0, 1.0], sigma=1.0, filled=True)

@@ -8,6 +8,7 @@ from numpy.random import Generator
 
 import unifg as fg
 from problems.graphs import graph_with
+from test_horizon import Timed
 from unifg.horizon import Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.lie import SE23, SO3
 from unifg.models.inertial import InertialMeasurements
@@ -33,6 +34,7 @@ def step(x: Array, u: Array) -> Array:
 
 
 POINT = Robot(fg.Rn(2), fg.Rn(2), predict=step)
+TIMED = Robot(fg.Rn(2), fg.Rn(1), steps={"noise": fg.Rn(1)}, predict=lambda x, u: x)
 
 
 def walk(rng: Generator, count: int) -> tuple[Array, Array, list[tuple[float, float, Array]]]:
@@ -249,13 +251,12 @@ def test_sensors_stand_in_a_window_that_is_full_at_once() -> None:
     answers = []
     for filled in (False, True):
         sensor = fixes_of()
-        move = Dynamics(drift, H, sigma=0.01)
-        window = Window(POINT, 4, [move, sensor], start=np.zeros(2), sigma=0.2, filled=filled)
+        window = Window(TIMED, 4, [Timed(), sensor], start=np.zeros(2), sigma=0.2, filled=filled)
         sensor.add([0.0, np.nextafter(0.0, -1.0)], [[0.1, 0.0], [0.2, 0.0]])
         window.estimate()
         assert sensor.counts == Counts()
         for k in range(1, 8):
-            window.move(np.zeros(2), H * k)
+            window.move(np.zeros(1), H * k)
             sensor.add(H * (k - 0.5), [0.1, 0.0])
             assert window.estimate().converged
         assert sensor.counts.late == 0

@@ -15,7 +15,7 @@ from unifg.horizon.history import History
 from unifg.horizon.past import Arrival, MarginalPrior, Past, Place, Tangent
 from unifg.horizon.robot import Robot, information_of
 from unifg.horizon.spread import JointCovariance
-from unifg.horizon.terms import Context, Recording, Term, looked_at, reset_all
+from unifg.horizon.terms import Context, Dynamics, Recording, Term, looked_at, reset_all
 from unifg.locks import ReentrantLock, synchronized
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.elements import elements_of
@@ -86,7 +86,7 @@ class Window:
             steady: a round that moves the present state by less, in every coordinate of its tangent space, is the last.
 
         Raises:
-            GraphError: when sizes do not fit, or a term cannot stand in a window.
+            GraphError: when sizes do not fit, or a term cannot stand in a window, as Dynamics in one that is filled.
         """
         given = {"robot": robot, "solver": solver, "rounds": rounds, "steady": steady}
         require_kinds("Window", GraphError, Window.__init__.__annotations__, given, Robot, Solver)
@@ -94,6 +94,13 @@ class Window:
             raise GraphError(f"an estimate takes one round or more, found rounds={rounds}")
         self._lock = ReentrantLock()
         self.robot, self.terms, self.length = robot, looked_at(terms), length
+        fixed = [term for term in self.terms if filled and isinstance(term, Dynamics)]
+        if fixed:
+            raise GraphError(
+                f"term '{fixed[0].name}' has a step of {fixed[0].step} s, but a filled window begins with steps of no "
+                "duration: take durations from now.past.times, as an exact motion, or give filled=False",
+                term=fixed[0].name,
+            )
         self._arrival = arrival or Tangent()
         self._records: dict[str, tuple[int, ...]] = {}
         for term in self.terms:
