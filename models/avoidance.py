@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import GraphError, ModelError
+from unifg.errors import GraphError, ModelError, require_positive
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual, residual
 from unifg.lie import Rn
@@ -139,8 +139,7 @@ def inverse_distance_root(clearance: Residual, nearest: float = 0.1) -> Residual
     Raises:
         ModelError: when ``nearest`` is not positive, or the clearance is compiled by hand.
     """
-    if not nearest > 0.0:
-        raise ModelError(f"1/d needs a positive distance where its parabola takes over, found nearest={nearest}")
+    require_positive("1/d", ModelError, nearest=nearest)
     made = plain(clearance, partial(_root, nearest), f"root of 1/{clearance.name}")
     if made is None:
         raise ModelError(f"1/d needs a clearance that is a plain function, found '{clearance.name}'")

@@ -25,7 +25,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds, require_positive
 from unifg.factors.autodiff.rates import rate
 from unifg.factors.residuals import Residual
 from unifg.lie import Manifold
@@ -166,8 +166,7 @@ def inverse(h: Barrier, safe: float) -> Barrier:
     Raises:
         ModelError: when it is not positive: a point is at distance zero from itself, and 1/0 no number.
     """
-    if not (safe > 0.0 and math.isfinite(safe)):
-        raise ModelError(f"1/d_safe - 1/d needs a positive d_safe, found {safe!r}: use the distance itself")
+    require_positive("1/d_safe - 1/d (for points use the distance itself)", ModelError, safe=safe)
 
     def of_inverse(x: Array, t: Any, *obstacle: Any) -> Array:
         return 1.0 / safe - 1.0 / (safe + h(x, t, *obstacle))
@@ -313,5 +312,6 @@ def condition(
 
 
 def _not_negative(name: str, value: float) -> None:
+    require_kinds("a barrier", ModelError, {name: "float"}, {name: value})
     if not (value >= 0.0 and math.isfinite(value)):
         raise ModelError(f"{name} of a barrier must be a finite number, zero or more, found {value!r}")

@@ -11,7 +11,8 @@ from itertools import product
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds, require_positive
+from unifg.modeling.duplicates import doubles
 from unifg.typing import Array, ArrayLike
 
 __all__ = ["detours", "headed"]
@@ -43,16 +44,20 @@ def detours(
         most: number of paths.
 
     Raises:
-        ModelError: for arrays that do not fit, or a stride that is not positive.
+        ModelError: for arrays that do not fit, radii below zero, no step, or a stride that is not positive.
     """
-    ends = np.array([start, goal], dtype=np.float64)
-    middle = np.asarray(centres, dtype=np.float64).reshape(-1, 2)
-    if ends.shape != (2, 2) or np.ndim(radii) > 1 or np.size(radii) not in (1, len(middle)) or not stride > 0.0:
+    require_kinds("detours", ModelError, detours.__annotations__, {"steps": steps, "most": most})
+    require_positive("detours", ModelError, stride=stride, steps=steps)
+    given = {"start and goal": [start, goal], "centres": centres, "radii": radii}
+    ends, middle, radius = (doubles(f"detours: {what}", part, error=ModelError) for what, part in given.items())
+    middle = middle.reshape(-1, 2) if middle.size == 0 else middle
+    fits = middle.ndim == 2 and middle.shape[1] == 2 and radius.ndim < 2 and radius.size in (1, len(middle))
+    if ends.shape != (2, 2) or not (fits and (radius >= 0.0).all() and np.isfinite(radius).all()):
         raise ModelError(
-            f"detours: start and goal must be (2,), radii (M,) for centres (M, 2), and stride positive; got "
-            f"{ends.shape}, {np.shape(radii)}, {middle.shape} and {stride}"
+            "detours: start and goal must be (2,), and radii (M,), finite and not negative, for centres (M, 2); got "
+            f"{ends.shape}, {radii!r} and {middle.shape}"
         )
-    radius = np.broadcast_to(np.asarray(radii, dtype=np.float64), len(middle))
+    radius = np.broadcast_to(radius, len(middle))
     length = max(float(np.hypot(*(ends[1] - ends[0]))), 1e-12)
     ahead = (ends[1] - ends[0]) / length
     aside = np.array([-ahead[1], ahead[0]])
@@ -83,7 +88,8 @@ def headed(path: ArrayLike, heading: float, backwards: bool = False) -> Array:
     Raises:
         ModelError: for less than two positions.
     """
-    positions = np.asarray(path, dtype=np.float64)
+    require_kinds("headed", ModelError, headed.__annotations__, {"heading": heading})
+    positions = doubles("headed: the path", path, error=ModelError)
     if positions.ndim != 2 or positions.shape[1] != 2 or len(positions) < 2:
         raise ModelError(f"headed: two positions or more are expected, (N + 1, 2), found {positions.shape}")
     step = np.gradient(positions, axis=0)

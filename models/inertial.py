@@ -22,7 +22,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds, require_positive
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import Residual, residual
 from unifg.lie import SE23, SO3, Manifold, Product
@@ -164,10 +164,11 @@ class InertialMeasurements:
             name: of the terms.
 
         Raises:
-            ModelError: when the gap is not positive.
+            ModelError: when the gap is not positive, or an argument of another kind.
         """
-        if not gap > 0.0:
-            raise ModelError(f"'{name}': gap {gap} must be positive")
+        stated = InertialMeasurements.__init__.__annotations__
+        require_kinds(f"'{name}'", ModelError, stated, dict(locals()), ImuNoise, str)
+        require_positive(f"'{name}'", ModelError, gap=gap)
         self.noise, self.gap, self.name = noise, gap, name
         self._body, self._bias, self._gravity = body, bias, gravity
         self._walk = f"{name}: walk"

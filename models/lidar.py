@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_positive
 from unifg.factors.kernel import Kernel
 from unifg.factors.residuals import Residual, residual
 from unifg.factors.robust import Reweighted
@@ -76,8 +76,7 @@ def endpoint_loss(sigma: float, resolution: float) -> Reweighted:
     Raises:
         ModelError: unless both are positive.
     """
-    if not (sigma > 0.0 and resolution > 0.0):
-        raise ModelError(f"end-points need a positive sigma and resolution [m], found {sigma} and {resolution}")
+    require_positive("end-points", ModelError, sigma=sigma, resolution=resolution)
     return Reweighted(_Rule(sigma, resolution))
 
 

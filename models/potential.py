@@ -28,7 +28,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
 from unifg.factors.residuals import Residual
 from unifg.models.profile import of_distance
 from unifg.typing import Array
@@ -108,9 +108,10 @@ def potential(
         ModelError: when the thresholds are not 0 < near < far or the scale not positive, the sense is unknown or its
             weight negative, or the distance has no Jacobian.
     """
-    if not (0.0 < near < far and scale > 0.0):
-        found = f"near = {near}, far = {far} and scale = {scale}"
-        raise ModelError(f"potential: the scale must be positive and 0 < near < far, found {found}")
+    require_kinds("potential", ModelError, potential.__annotations__, locals(), Residual)
+    if not (0.0 < near < far and scale > 0.0 and np.isfinite(vortex)):
+        found = f"near = {near}, far = {far}, scale = {scale} and vortex = {vortex}"
+        raise ModelError(f"potential: the scale must be positive, the vortex finite and 0 < near < far, found {found}")
     if distance.jacobian is None:
         raise ModelError(f"potential: '{distance.name}' has no attached Jacobian: use fg.residual(function, jacobian)")
     if sense not in ("circulate", "aside") or (sense == "aside" and vortex < 0.0):

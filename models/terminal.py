@@ -17,13 +17,12 @@ It is larger than the first. Both are for obstacles that rest: from one that com
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_positive
 from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import residual
 from unifg.lie import SO3
@@ -59,8 +58,7 @@ def brakeable(h: Barrier, alpha: float, deceleration: float, *, p: slice = P, v:
     Raises:
         ModelError: on an alpha or a deceleration that is not positive.
     """
-    if not (alpha > 0.0 and deceleration > 0.0 and math.isfinite(alpha + deceleration)):
-        raise ModelError(f"brakeable: alpha and deceleration must be positive, found {alpha!r} and {deceleration!r}")
+    require_positive("brakeable", ModelError, alpha=alpha, deceleration=deceleration)
 
     def left(x: Array, t: Any, *obstacle: Any) -> Array:
         fast = np.linalg.norm(x[:, v], axis=1, keepdims=True)

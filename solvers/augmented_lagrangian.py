@@ -24,7 +24,7 @@ from typing import Literal
 import numpy as np
 
 from unifg.codegen.jit import compiled
-from unifg.errors import BackendError
+from unifg.errors import BackendError, require_positive
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.solver import Solver, SolveState
@@ -94,8 +94,7 @@ class AugmentedLagrangian(Solver):
             raise BackendError(f"{self.name}: schedule must be {words}, found '{self.schedule}'")
         if self.hessian not in ("exact", "gauss-newton"):
             raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
-        if self.penalty is not None and not self.penalty > 0.0:
-            raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
+        require_positive(self.name, BackendError, penalty=1.0 if self.penalty is None else self.penalty)
 
     def workspace(self, program: CompiledProblem) -> Primal:
         """The factorisation of the primal step."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.errors import BackendError
+from unifg.errors import BackendError, require_positive
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.solver import Solver, SolveState
@@ -59,8 +59,7 @@ class Penalty(Solver):
     def __post_init__(self) -> None:
         """Refuse schedules that do not grow."""
         super().__post_init__()
-        if not self.penalty > 0.0:
-            raise BackendError(f"{self.name}: penalty must be positive, found {self.penalty}")
+        require_positive(self.name, BackendError, penalty=self.penalty)
         if not self.penalty_growth > 1.0:
             raise BackendError(f"{self.name}: penalty_growth must be above 1, found {self.penalty_growth}")
 

@@ -177,9 +177,9 @@ def test_potentials_are_traced_in_graphs() -> None:
 
 
 def test_what_the_potential_needs() -> None:
-    with pytest.raises(fg.ModelError, match="positive distance"):
+    with pytest.raises(fg.ModelError, match="1/d: nearest must be positive"):
         avoidance.inverse_distance_root(avoidance.cylinder_clearance, 0.0)
-    with pytest.raises(fg.ModelError, match="positive distance"):
+    with pytest.raises(fg.ModelError, match="1/d: nearest must be positive"):
         avoidance.inverse_distance(avoidance.cylinder_clearance, np.nan)
     attached: Residual = residual(lambda p: p[:, :1], lambda p: [np.ones((len(p), 1, 3))], "attached")
     with pytest.raises(fg.ModelError, match="plain function, found 'attached'"):

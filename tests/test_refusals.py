@@ -11,12 +11,21 @@ import pytest
 import unifg as fg
 from problems.graphs import graph_with
 from problems.known import line, short_drive
+from unifg.models import barriers
+from unifg.models.avoidance import inverse_distance_root, sphere_clearance
+from unifg.models.detours import detours, headed
 from unifg.models.distance_map import DistanceMap
 from unifg.models.footprint import Body
+from unifg.models.inertial import InertialMeasurements
+from unifg.models.lidar import endpoint_loss
 from unifg.models.matching import Gates
+from unifg.models.obstacles import disc_clearance
 from unifg.models.planar import ackermann
+from unifg.models.potential import potential
+from unifg.models.preintegration import ImuNoise
 from unifg.models.spline import SplineCurve, SplineField
 from unifg.models.stamped import StampedMeasurements
+from unifg.models.terminal import brakeable
 from unifg.models.trajectory import CubicTrajectory
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton
 from unifg.typing import Array
@@ -238,7 +247,27 @@ OPTIONS: list[tuple[Callable[[fg.Graph, fg.Family, Any], object], Any, str]] = [
     (lambda g, x, bad: seen(constants=bad), 3, "'stamped': constants must be of the class Sequence, found 3"),
     (lambda g, x, bad: seen(offset=bad), 0.1, "'stamped': offset must be of the class str or None, found 0.1"),
     (lambda g, x, bad: Body.disc(bad), "a", "discs of a body must be real numbers"),
+    (lambda g, x, bad: GaussNewton(tolerance=bad), np.inf, "GaussNewton: tolerance must be positive and finite"),
+    (lambda g, x, bad: inverse_distance_root(sphere_clearance, bad), "a", "1/d: nearest must be a number, found 'a'"),
+    (lambda g, x, bad: barriers.inverse(lambda x, t: x, bad), None, "safe must be a number, found None"),
+    (lambda g, x, bad: barriers.decay(lambda x, t: x, bad), "a", "a barrier: alpha must be a number, found 'a'"),
+    (lambda g, x, bad: brakeable(lambda x, t: x, 1.0, bad), "a", "brakeable: deceleration must be a number"),
+    (lambda g, x, bad: endpoint_loss(0.1, bad), "a", "end-points: resolution must be a number, found 'a'"),
+    (lambda g, x, bad: potential(bad), None, "potential: distance must be of the class Residual, found None"),
+    (lambda g, x, bad: potential(disc_clearance, vortex=bad), np.nan, "the vortex finite .* vortex = nan"),
+    (lambda g, x, bad: InertialMeasurements(bad), 0.1, "'imu': noise must be of the class ImuNoise, found 0.1"),
+    (lambda g, x, bad: InertialMeasurements(ImuNoise(), gap=bad), "a", "'imu': gap must be a number, found 'a'"),
+    (lambda g, x, bad: InertialMeasurements(ImuNoise(), body=bad), 3, "'imu': body must be of the class str or None"),
+    (lambda g, x, bad: passing(radii=bad), -0.5, "radii .M,., finite and not negative.* -0.5"),
+    (lambda g, x, bad: passing(radii=bad), np.nan, "radii .M,., finite and not negative.* nan"),
+    (lambda g, x, bad: passing(start=bad), "a", "detours: start and goal"),
+    (lambda g, x, bad: passing(steps=bad), -1, "detours: steps must be positive, found -1"),
+    (lambda g, x, bad: headed([[0.0, 0.0], [1.0, 0.0]], bad), "a", "headed: heading must be a number, found 'a'"),
 ]
+
+
+def passing(start: Any = (0.0, 0.0), radii: Any = 0.5, steps: Any = 4) -> list[Array]:
+    return detours(start, [3.0, 0.0], [[1.5, 0.0]], radii, steps, 0.5)
 
 
 def grown(occupied: Any = ((True, False),), resolution: Any = 1.0, cap: Any = None) -> DistanceMap:

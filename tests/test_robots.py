@@ -143,8 +143,8 @@ def drive(start: Array, u: Array, **options: Any) -> Array:
         (lambda: Vehicle(drag=np.nan), "Vehicle: drag must be a finite number, found nan"),
         (lambda: OdometryNoise(translation=-1.0), "OdometryNoise: translation must be a finite number from 0 on"),
         (lambda: OdometryNoise(floor=0.1), "OdometryNoise: floor must be 3 finite numbers from 0 on, found 0.1"),  # type: ignore[arg-type]
-        (lambda: endpoint_loss(0.0, 0.1), "end-points need a positive sigma and resolution .m., found 0.0 and 0.1"),
-        (lambda: potential(disc_clearance, scale=0.0), "the scale must be positive and .* and scale = 0.0"),
+        (lambda: endpoint_loss(0.0, 0.1), "end-points: sigma must be positive, found 0.0"),
+        (lambda: potential(disc_clearance, scale=0.0), "the scale must be positive, .* scale = 0.0"),
         (lambda: headed([[0.0, 0.0]], 0.0), r"headed: two positions or more are expected, .*found \(1, 2\)"),
         (lambda: unicycle.rollout(np.zeros(2), np.zeros((3, 2)), 0.1), r"starts at a pose \(3,\), got \(2,\)"),
         (

@@ -8,6 +8,7 @@ what Python itself asks for: ``AttributeError`` from ``__getattr__`` (``hasattr`
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from math import inf
 from numbers import Integral, Real
 from typing import Any
 
@@ -61,6 +62,14 @@ def require_kinds(
         if isinstance(found, bool) or not isinstance(found, wanted):
             how = f", a class: give an object of it, as {found.__name__}(...)" if isinstance(found, type) else ""
             raise error(f"{who}: {name} must be {words}{' or None' if rest else ''}, found {f'{value!r}'[:80]}{how}")
+
+
+def require_positive(who: str, error: type[UnifgError], **numbers: Any) -> None:
+    """Refuse what is no number, not finite, or not above zero; arguments as for :func:`require_kinds`."""
+    require_kinds(who, error, dict.fromkeys(numbers, "float"), numbers)
+    for name, value in numbers.items():
+        if not 0.0 < value < inf:
+            raise error(f"{who}: {name} must be positive{' and finite' if value == inf else ''}, found {value}")
 
 
 def name_term(error: Exception, term: str) -> None:

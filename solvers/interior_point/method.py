@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from unifg.codegen.clock import clock
 from unifg.codegen.function_pointers import ADDRESS, NOTHING, link, memory
 from unifg.codegen.standalone import Entry
-from unifg.errors import BackendError
+from unifg.errors import BackendError, require_positive
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian, require_second
@@ -95,9 +95,7 @@ class InteriorPoint(Solver):
         super().__post_init__()
         if self.hessian not in ("exact", "gauss-newton"):
             raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
-        for name, value in (("barrier", self.barrier), ("penalty", self.penalty)):
-            if not value > 0.0:
-                raise BackendError(f"{self.name}: {name} must be positive, found {value}")
+        require_positive(self.name, BackendError, barrier=self.barrier, penalty=self.penalty)
 
     def runs_alone(self, program: CompiledProblem) -> bool:
         """Test whether the loop may make the whole solve; that of least squares is tested outside, at every step."""

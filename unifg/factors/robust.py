@@ -18,7 +18,7 @@ from typing import Protocol, TypeAlias, runtime_checkable
 import numpy as np
 
 from unifg.codegen.jit import in_order
-from unifg.errors import GraphError, require_kinds
+from unifg.errors import GraphError, require_positive
 from unifg.typing import Array
 
 QUADRATIC, HUBER, CAUCHY, TUKEY, SCALED, GEMAN_MCCLURE, TRUNCATED = range(7)
@@ -255,9 +255,7 @@ class Reweighted:
 
 def positive(value: float, name: str) -> None:
     """Raise unless a loss parameter is positive and finite."""
-    require_kinds(name, GraphError, positive.__annotations__, {"value": value})
-    if not (np.isfinite(value) and value > 0.0):
-        raise GraphError(f"{name}: its parameter must be positive and finite, found {value}")
+    require_positive(name, GraphError, **{"its parameter": value})
 
 
 def form_of(loss: Loss | None) -> Form | None:

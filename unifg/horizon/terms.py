@@ -199,7 +199,7 @@ class Dynamics:
                 "horizon times=, or the robot its tick",
                 term=self.name,
             )
-        fits = np.size(step) in (1, np.size(lengths))  # the graph refuses other shapes
+        fits = lengths is not None and np.size(step) in (1, len(lengths))  # the graph refuses other shapes
         if lengths is not None and fits and not np.allclose(np.ravel(step), lengths, rtol=1e-9, atol=0.0):
             raise GraphError(
                 f"term '{self.name}': its step is {self.step} s, but the nodes of the horizon are {lengths} s apart: "

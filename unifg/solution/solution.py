@@ -289,7 +289,9 @@ class Solution:
     def covariance(self, *variables: Variable | str) -> Array:
         """(k, k) joint covariance of the selected variables, in their tangent spaces, in the order given.
 
-        What is fixed is known: its rows and columns are zero, as are directions that an active constraint forbids.
+        What is fixed is known: its rows and columns are zero, as are directions that an active constraint forbids. The
+        slope of a norm at zero is taken to be zero: a distance of zero that was measured, as that of a landmark where
+        the pose is, adds nothing here. Measure the offset, whose norm it is, instead.
 
         Raises:
             GraphError: when the system is singular, or nothing is selected.

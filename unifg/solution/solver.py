@@ -16,7 +16,7 @@ from weakref import ReferenceType, ref
 import numpy as np
 
 from unifg.codegen.inner import inner
-from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds
+from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds, require_positive
 from unifg.factors.steps import EPSILON
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
@@ -166,8 +166,7 @@ class Solver(Backend):
         """Refuse options no solve could honour."""
         kinds = {field.name: field.type for field in fields(self)} | {"tolerance": "float"}
         require_kinds(self.name, BackendError, kinds, vars(self))
-        if not self.tolerance > 0.0:
-            raise BackendError(f"{self.name}: tolerance must be positive, found {self.tolerance}")
+        require_positive(self.name, BackendError, tolerance=self.tolerance)
         if self.feasibility_tolerance is not None and not self.feasibility_tolerance > 0.0:
             found = self.feasibility_tolerance
             raise BackendError(f"{self.name}: feasibility_tolerance must be positive or None, found {found}")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unifg.errors import ViewError
+from unifg.errors import ViewError, require_positive
 from unifg.view.shapes import Mesh, box, column, copies, merge, ring, sphere, tube, wedge
 
 __all__ = ["BODIES", "Part", "beams", "body_of"]
@@ -117,6 +117,5 @@ def body_of(kind: str, size: float, colour: str) -> list[Part]:
     """
     if kind not in BODIES:
         raise ViewError(f"there is no body {kind!r}: take one of {', '.join(BODIES)}")
-    if not (np.isfinite(size) and size > 0.0):
-        raise ViewError(f"a body of size {size!r}: it must be positive [m]")
+    require_positive("a body", ViewError, size=size)
     return BODIES[kind](size, colour)

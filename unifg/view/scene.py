@@ -7,7 +7,6 @@ every frame.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from unifg.atomic_write import write_atomically
-from unifg.errors import ViewError
+from unifg.errors import ViewError, require_positive
 from unifg.modeling.variables import Family, Variable
 from unifg.solution.solution import Solution
 from unifg.style.colours import rgb
@@ -65,8 +64,7 @@ class Scene(Content, Canvas):
         Raises:
             ViewError: dt or keep is not positive.
         """
-        if dt is not None and not (math.isfinite(dt) and dt > 0.0):
-            raise ViewError(f"dt={dt!r}: the time between two frames must be positive [s]")
+        require_positive("the time between two frames", ViewError, dt=1.0 if dt is None else dt)
         if keep is not None and keep < 1:
             raise ViewError(f"keep={keep!r}: at least one frame must be kept")
         Content.__init__(self, title, dt, counts)
