@@ -86,8 +86,7 @@ class DistanceMap:
         Raises:
             ModelError: occupied is no grid of booleans, or a number is not as it should be.
         """
-        numbers = {"resolution": resolution, "cap": cap}
-        require_kinds("distance map", ModelError, DistanceMap.from_occupancy.__annotations__, numbers)
+        require_kinds("distance map", ModelError, DistanceMap.from_occupancy.__annotations__, locals())
         mask = np.asarray(occupied)
         if mask.ndim != 2 or mask.size == 0 or mask.dtype != bool:
             raise ModelError(f"distance map: occupied, {mask.dtype} of shape {mask.shape}, must be a (H, W) bool grid")

@@ -13,7 +13,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_positive
 from unifg.lie import SE2
 from unifg.modeling.duplicates import doubles
 from unifg.typing import Array, ArrayLike
@@ -181,8 +181,7 @@ def body_of(text: str) -> Body:
     try:
         if not colon:
             length, width = (0.5 * float(word) for word in kind.split("x"))
-            if min(length, width) <= 0.0:
-                raise ModelError("length and width must be positive [m]")
+            require_positive("a rectangle", ModelError, length=length, width=width)
             return Body.polygon([(length, -width), (length, width), (-length, width), (-length, -width)])
         rows = [[float(word) for word in row.split(",")] for row in numbers.split(";")]
         if kind == "disc":

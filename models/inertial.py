@@ -166,8 +166,7 @@ class InertialMeasurements:
         Raises:
             ModelError: when the gap is not positive, or an argument of another kind.
         """
-        stated = InertialMeasurements.__init__.__annotations__
-        require_kinds(f"'{name}'", ModelError, stated, dict(locals()), ImuNoise, str)
+        require_kinds(f"'{name}'", ModelError, type(self).__init__.__annotations__, locals(), ImuNoise, str)
         require_positive(f"'{name}'", ModelError, gap=gap)
         self.noise, self.gap, self.name = noise, gap, name
         self._body, self._bias, self._gravity = body, bias, gravity

@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_positive
 from unifg.factors.residuals import Residual
 from unifg.lie import Rn
 from unifg.modeling.factors import prior
@@ -125,8 +125,7 @@ def keep(
         raise ModelError(f"'{name}' is held by 'hinge', 'hard', 'slack' or 'exact slack', found {form!r}")
     if not names:
         raise ModelError(f"'{name}' has no obstacle")
-    if not (price > 0.0 and np.isfinite(price)):
-        raise ModelError(f"'{name}': the weight of a slack or a hinge must be positive, found {price!r}")
+    require_positive(f"'{name}'", ModelError, weight=price)
     normal, _, _, count = prepare_arguments(name, arguments, active)
     rows = rows_of(name, complete(barrier, normal), normal, count)
     if rows != len(names):

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import solve_banded
 
-from unifg.errors import ModelError, require_kinds
+from unifg.errors import ModelError, require_kinds, require_positive
 from unifg.factors.autodiff.lookup import Lookup
 from unifg.modeling.duplicates import doubles
 from unifg.models.distance_map import DistanceMap, grid_of
@@ -51,14 +51,12 @@ class SplineCurve(Lookup):
         Raises:
             ModelError: fewer than four values, values that are not finite, or a spacing that is not positive.
         """
-        numbers = {"start": start, "spacing": spacing}
-        require_kinds("spline", ModelError, SplineCurve.__init__.__annotations__, numbers)
+        require_kinds("spline", ModelError, SplineCurve.__init__.__annotations__, {"start": start})
+        require_positive("spline", ModelError, spacing=spacing)
         self.values: Array = np.array(doubles("spline: values", values, error=ModelError))
         self.start, self.spacing = float(start), float(spacing)
-        if self.values.ndim != 1 or len(self.values) < 4 or not np.isfinite(self.values).all():
-            raise ModelError(f"spline: values of shape {self.values.shape} must be four or more finite numbers")
-        if not (0.0 < self.spacing < math.inf and math.isfinite(self.start)):
-            raise ModelError(f"spline: spacing {spacing!r} must be positive and finite, and start {start!r} finite")
+        if self.values.ndim != 1 or len(self.values) < 4 or not np.isfinite([*self.values, start]).all():
+            raise ModelError(f"spline: start {start!r} and values {self.values.shape}: four or more finite numbers")
         super().__init__(np.pad(coefficients(self.values), PAD, mode="edge"))
 
     def __call__(self, s: Any) -> Any:

@@ -123,8 +123,8 @@ class StampedMeasurements:
             ModelError: when there is no slot or nothing measured, ``error`` is no batched function, or another argument
                 is not what it should be.
         """
-        kinds = StampedMeasurements.__init__.__annotations__ | {"error": "Callable", "between": "Callable | None"}
-        require_kinds(f"'{name}'", ModelError, kinds, dict(locals()), str, Sequence)
+        stated = {**StampedMeasurements.__init__.__annotations__, "error": "Callable", "between": "Callable | None"}
+        require_kinds(f"'{name}'", ModelError, stated, locals(), str, Sequence)
         if size < 1 or capacity < 1:
             raise ModelError(f"'{name}': size {size} and capacity {capacity} must be at least 1")
         self.name, self.size, self.capacity = name, size, capacity

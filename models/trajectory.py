@@ -31,7 +31,7 @@ from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from unifg.errors import ModelError, require_kinds
+from unifg.errors import ModelError, require_kinds, require_positive
 from unifg.lie import LieGroup
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Family
@@ -88,12 +88,10 @@ class CubicTrajectory:
 
     def __post_init__(self) -> None:
         """Look at the knots."""
-        stated = {"group": self.group, "start": self.start, "spacing": self.spacing}
-        require_kinds("trajectory", ModelError, CubicTrajectory.__annotations__, stated, LieGroup)
-        if not (isfinite(self.start) and isfinite(self.spacing) and self.spacing > 0.0):
-            raise ModelError(
-                f"trajectory: spacing {self.spacing!r} must be positive and finite, start {self.start!r} finite"
-            )
+        require_kinds("trajectory", ModelError, CubicTrajectory.__annotations__, vars(self), LieGroup)
+        require_positive("trajectory", ModelError, spacing=self.spacing)
+        if not isfinite(self.start):
+            raise ModelError(f"trajectory: start {self.start!r} must be finite")
         functions = _functions(cast(Hashable, self.group), float(self.spacing))
         for name, function in zip(("pose", "velocity", "acceleration"), functions, strict=True):
             object.__setattr__(self, name, function)

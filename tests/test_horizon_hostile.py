@@ -415,7 +415,7 @@ NO_NUMBERS: dict[str, tuple[Any, str]] = {
         r"predict is called as predict\(x, u\), .*'h'",
     ),
     "a model": (lambda: replace(POINT, predict=3), "Robot: predict must be a function or None, found 3"),  # type: ignore[arg-type]
-    "tick": (lambda: replace(POINT, tick=0.0), "tick must be a positive number of seconds, got 0.0"),
+    "tick": (lambda: replace(POINT, tick=0.0), "Robot: tick must be positive, found 0.0"),
     "constants": (lambda: replace(POINT, constants={"a": 1}), "the robot's constants are a tuple"),  # type: ignore[arg-type]
     "a step back": (lambda: Dynamics(moved, -H), "term 'dynamics': its step must be positive .s., found -0.5"),
     "a step of words": (lambda: Dynamics(moved, "long"), "step must be real numbers, found 'long'"),

@@ -226,7 +226,7 @@ OPTIONS: list[tuple[Callable[[fg.Graph, fg.Family, Any], object], Any, str]] = [
     (lambda g, x, bad: ackermann(rate=bad), None, "a bicycle: rate must be a number, found None"),
     (lambda g, x, bad: SplineCurve(bad), "a", "spline: values must be real numbers, found 'a'"),
     (lambda g, x, bad: SplineCurve(np.zeros(5), start=bad), None, "spline: start must be a number, found None"),
-    (lambda g, x, bad: SplineCurve(np.zeros(5), spacing=bad), np.inf, "spline: spacing inf must be positive and fin"),
+    (lambda g, x, bad: SplineCurve(np.zeros(5), spacing=bad), np.inf, "spline: spacing must be positive and finite"),
     (lambda g, x, bad: SplineField(bad, 1.0), [["a"] * 4] * 4, "spline: values must be real numbers, found text"),
     (lambda g, x, bad: SplineField(bad, 1.0), [], "spline: values .0,. must be a finite .H, W. grid"),
     (lambda g, x, bad: SplineField(np.zeros((5, 5)), bad), "a", "spline: resolution must be a number, found 'a'"),

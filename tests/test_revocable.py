@@ -281,7 +281,7 @@ def looped(x: Array, y: Array) -> Array:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ({"revocable": 0.0}, "positive and finite; found 0.0"),
+        ({"revocable": 0.0}, "revocable must be positive, found 0.0"),
         ({"revocable": np.inf}, "positive and finite"),
         ({"revocable": [3.0, 4.0]}, r"term 'closure': revocable must be a number, found \[3.0, 4.0\]"),
         ({"revocable": True}, "term 'closure': revocable must be a number, found True"),

@@ -10,7 +10,7 @@ import pytest
 import unifg as fg
 from problems.graphs import graph_with
 from unifg.models import obstacles, unicycle
-from unifg.solution.solver import Prepared, Solver
+from unifg.solution.solver import Solver
 
 
 def waves() -> tuple[fg.Graph, fg.Family]:
@@ -67,35 +67,25 @@ def test_the_guess_is_kept_where_no_start_has_an_answer() -> None:
     assert not any(found.status.converged for found in solution.others)
 
 
-def test_every_start_is_solved_once_and_the_best_keeps_its_solve(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("starts", "limit", "left"), [(7, np.inf, [np.inf] * 7), (20, 2.0, [2.0, 1.5, 1.0, 0.5])], ids=["all", "in time"]
+)
+def test_every_start_is_solved_once_in_what_is_left_of_the_time(
+    starts: int, limit: float, left: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
     graph, x = waves()
-    begun: list[float] = []
-    solve = Prepared.solve
-
-    def counted(self: Prepared, *given: Any, **options: Any) -> fg.Solution:
-        begun.append(self.solver.time_limit)
-        return solve(self, *given, **options)
-
-    monkeypatch.setattr(Prepared, "solve", counted)
-    solution = fg.solve(graph, {x: [[-5.0]]}, starts=7)
-    assert len(begun) == 7 and len(solution.others) == 6 and solution.checked
-    assert solution.iterations == len(solution.history) - 1
-
-
-def test_the_time_limit_is_of_all_starts_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph, x = waves()
-    left: list[float] = []
+    given: list[float] = []
     solve = Solver.solve
 
-    def timed(self: Solver, *given: Any, **options: Any) -> fg.Solution:
-        left.append(self.time_limit)
-        solution = solve(self, *given, **options)
+    def timed(self: Solver, *arguments: Any, **options: Any) -> fg.Solution:
+        given.append(self.time_limit)
+        solution = solve(self, *arguments, **options)
         solution.seconds = 0.5
         return solution
 
     monkeypatch.setattr(Solver, "solve", timed)
-    solution = fg.solve(graph, {x: [[-5.0]]}, starts=20, time_limit=2.0)
-    assert left == [2.0, 1.5, 1.0, 0.5] and len(solution.others) == 3
+    solution = fg.solve(graph, {x: [[-5.0]]}, starts=starts, time_limit=limit)
+    assert given == left and len(solution.others) == len(left) - 1 and solution.checked
 
 
 def test_a_callback_ends_all_starts() -> None:

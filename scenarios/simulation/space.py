@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 import pymunk
 
-from unifg.errors import ScenarioError
+from unifg.errors import ScenarioError, require_positive
 from unifg.models.footprint import Body
 from unifg.typing import Array
 
@@ -160,8 +160,7 @@ class Space:
         Raises:
             ScenarioError: if the duration is not usable.
         """
-        if not (math.isfinite(dt) and dt > 0.0):
-            raise ScenarioError(f"the duration of a step must be positive and finite, got {dt}")
+        require_positive("a step", ScenarioError, duration=dt)
         count, begin = max(1, math.ceil(dt / _SUBSTEP - 1e-9)), self.time
         for k in range(count):
             self.time = begin + (k + 1) * (dt / count)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds
+from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds, require_positive
 from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
@@ -188,8 +188,7 @@ class RecedingHorizon:
         tree = steps if isinstance(steps, Tree) else Tree(tuple(range(steps)))
         if not deadline > 0.0:
             raise GraphError(f"the deadline must be positive, got {deadline} s")
-        if not (control_weight > 0.0 and np.isfinite(control_weight)):
-            raise GraphError(f"control_weight must be positive and finite, got {control_weight}")
+        require_positive("RecedingHorizon", GraphError, control_weight=control_weight)
         if delay < 0 or (delay and (coupling == "joint" or robot.predict is None)):
             raise GraphError(
                 f"delay={delay}: a plan acts now or later; later takes a robot that predicts, and not the coupling "

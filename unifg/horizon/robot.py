@@ -9,7 +9,7 @@ from inspect import signature
 
 import numpy as np
 
-from unifg.errors import GraphError, require_kinds
+from unifg.errors import GraphError, require_kinds, require_positive
 from unifg.lie import Manifold
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.model import Model
@@ -114,8 +114,7 @@ class Robot:
         require_kinds("Robot", GraphError, Robot.__annotations__, vars(self))
         if not (isinstance(self.constants, tuple | list) and all(isinstance(one, Constant) for one in self.constants)):
             raise GraphError(f"the robot's constants are a tuple, as (Constant(...),), found {self.constants!r}")
-        if self.tick is not None and not 0.0 < self.tick < np.inf:
-            raise GraphError(f"the robot's tick must be a positive number of seconds, got {self.tick}")
+        require_positive("Robot", GraphError, tick=1.0 if self.tick is None else self.tick)
         given = "x, u" if self.tick is None else "x, u, seconds"
         try:
             with suppress(ValueError):  # of a builtin that tells nothing about its arguments

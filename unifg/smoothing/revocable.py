@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from unifg.errors import GraphError, require_kinds
+from unifg.errors import GraphError, require_positive
 from unifg.smoothing.factors import Staged
 from unifg.smoothing.queries import covariance_root, factor_rows, squared_errors
 from unifg.smoothing.smoother import Smoother
@@ -267,7 +267,5 @@ def limit_of(threshold: float, term: str) -> float:
     Raises:
         GraphError: the threshold is not a positive and finite number.
     """
-    require_kinds(f"term '{term}'", GraphError, {"revocable": "float"}, {"revocable": threshold})
-    if not 0.0 < threshold < np.inf:
-        raise GraphError(f"term '{term}': revocable is a threshold of |W r|, positive and finite; found {threshold}")
+    require_positive(f"term '{term}'", GraphError, revocable=threshold)
     return float(threshold) ** 2
