@@ -43,6 +43,7 @@ from benchmarks.report import END, begin, put_results
 from benchmarks.runner import PAGES, RESULTS, Study, Timing
 from benchmarks.section import goal, met
 from benchmarks.timing import interleave, number, ratio, shown, spread
+from benchmarks.yielding import Yielding
 from maps import walled
 from problems.collection import BACKENDS, CASES, attempt
 from unifg.errors import ScenarioError
@@ -411,3 +412,14 @@ def test_the_search_finds_the_least_fault_that_harms(monkeypatch: pytest.MonkeyP
     assert fault_search.least([], "m") == "none"
     page = fault_search.render([row, *({**row, "kind": kind} for kind in fault_search.SPANS if kind != "range-bias")])
     assert f"{12 * len(fault_search.SPANS)} evaluations" in page
+
+
+def test_discs_of_the_yielding_world_stop_before_a_robot() -> None:
+    disc = Obstacle(np.array([8.0, 6.05]), 0.2, np.array([1.0, 6.05]), 1.0)
+    here = Yielding(walled(12.0, 12.0), (3.0, 6.0, 0.0), [disc], np.random.default_rng(0))
+    for _ in range(60):
+        here.step(0.0, 0.0)
+    assert here.discs()[0, 0] == pytest.approx(3.0 + 0.17 + 0.2 + 0.5, abs=0.02) and here.collisions == 0
+    for _ in range(40):
+        here.step(-0.3, 0.0)
+    assert here.discs()[0, 0] < 3.0, "it goes on where the robot makes way"
