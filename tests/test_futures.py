@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from maps import field, walled
-from test_movers import DT, RADIUS, clock, seen, walk
+from test_movers import AFAR, DT, RADIUS, clock, seen, walk
 from unifg.errors import ScenarioError
 from unifg.horizon import Tree
 from unifg.scenarios.ground.drive_control import Controller
@@ -26,12 +26,12 @@ POSE = np.array([2.0, 1.0, 0.0])
 WAVE = np.array([4.0, 0.4, 4.0, 1.6, 0.3, 0.8])
 
 
-def movers(*weights: tuple[float, float, float]) -> Tracks:
+def movers(*weights: tuple[float, ...]) -> Tracks:
     """Movers that go along y, which may go to and fro."""
     count = len(weights)
     place = np.column_stack([4.0 + np.arange(count), np.full(count, 0.7)])
     found = Tracks.of_movers(place, np.tile([0.0, 0.8], (count, 1)), np.full(count, RADIUS))
-    return replace(found, wave=np.tile(WAVE, (count, 1)), weights=np.array(weights))
+    return replace(found, wave=np.tile(WAVE, (count, 1)), weights=np.array([[*row, 0.0][:4] for row in weights]))
 
 
 # ------------------------------------------------------------------ hypotheses
@@ -40,10 +40,10 @@ def movers(*weights: tuple[float, float, float]) -> Tracks:
 def test_weights_tell_going_on_from_standing() -> None:
     on, still = MotionModel(), MotionModel()
     for time in clock(0.0, 3.0):
-        goes = on.update(seen(np.array([0.8 * time, 1.0]), np.array([0.8, 0.0])), DT)
-        stands = still.update(seen(np.array([1.0, 1.0]), np.array([0.5, 0.0])), DT)
+        goes = on.update(seen(np.array([0.8 * time, 1.0]), np.array([0.8, 0.0])), DT, AFAR)
+        stands = still.update(seen(np.array([1.0, 1.0]), np.array([0.5, 0.0])), DT, AFAR)
         if time < 0.5:
-            assert np.array_equal(goes.weights[0], [0.0, 1.0, 0.0]), "nothing is known yet"
+            assert np.array_equal(goes.weights[0], [0.0, 1.0, 0.0, 0.0]), "nothing is known yet"
     assert goes.weights[0, 1] > 0.98 and stands.weights[0, 2] > 0.98
     assert np.isnan(goes.wave).all()
 
@@ -52,7 +52,7 @@ def test_a_round_trip_is_a_hypothesis_before_it_is_known() -> None:
     """From the second turn on a wave is fitted; its weight grows until the others are unlikely."""
     tracks = walk(MotionModel(), clock(0.3, 6.0), 1.0)
     fitted = [each for each in tracks if np.isfinite(each.wave[0, 5])]
-    assert fitted and np.allclose([each.weights.sum() for each in tracks], 1.0)
+    assert fitted and np.allclose([each.weights[0, :3].sum() for each in tracks], 1.0)
     for each in fitted:
         assert each.sweeps[0] == (each.weights[0, 0] >= 0.98)
         if each.sweeps[0]:
@@ -69,6 +69,14 @@ def test_joint_hypotheses_come_by_their_probability() -> None:
     assert np.allclose(second.swept(times)[1], [[4.0, 1.5], [5.0, 0.7]])
     several = futures(replace(TREE, tails=5), tracks)
     assert len(several.tracks) == 4 and several.probabilities[-1] == pytest.approx(REST / (1.0 + REST))
+
+
+def test_no_tail_counts_on_a_mover_that_yields() -> None:
+    """Its tails, and their clearances, are those of one that does not."""
+    found, other = (futures(TREE, movers((0.0, 0.7, 0.3, yields))) for yields in (0.9, 0.0))
+    assert np.array_equal(found.probabilities, other.probabilities)
+    for tail, same in zip(found.tracks, other.tracks, strict=True):
+        assert np.array_equal(tail.sweep, same.sweep)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from unifg.scenarios.ground.drive_parts import disc_limits, predicted
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.route import BETWEEN, PERIODS, TICK, Route
 from unifg.scenarios.ground.waiting import EARLY, LOOK, occupancy, timed, waiting
-from unifg.scenarios.perception.motion_model import GONE, MEMORY, MotionModel
+from unifg.scenarios.perception.motion_model import GONE, MEMORY, SELDOM, UNLIKELY, MotionModel
 from unifg.scenarios.perception.tracks import Tracks, nearest, to_and_fro
 from unifg.scenarios.planning.grid import SPACING
 from unifg.scenarios.planning.space_time import CELL, Future, quickest
@@ -22,6 +22,7 @@ from unifg.typing import Array
 
 DT, RADIUS = 0.1, 0.2
 SETTINGS = ControllerSettings()
+AFAR = np.array([-50.0, 0.0])  # the robot
 ENDS = np.array([[3.0, 2.0], [4.2, 2.9]])  # 1.5 m apart
 
 
@@ -43,7 +44,7 @@ def walk(
             for t in (time, time - DT)
         )
         place = ENDS[0] + now * direction + sigma * rng.standard_normal(2)
-        found.append(model.update(seen(place, (now - before) / DT * direction, name), DT))
+        found.append(model.update(seen(place, (now - before) / DT * direction, name), DT, AFAR))
     return found
 
 
@@ -78,10 +79,10 @@ def test_one_who_does_something_else_is_not_known_any_more() -> None:
 def test_one_who_walks_on_or_bends_is_not_known() -> None:
     straight, bent = MotionModel(), MotionModel()
     for time in clock(0.0, 12.0):
-        on = straight.update(seen(np.array([0.8 * time, 1.0]), np.array([0.8, 0.0])), DT)
+        on = straight.update(seen(np.array([0.8 * time, 1.0]), np.array([0.8, 0.0])), DT, AFAR)
         angle = time / 0.8
         circle = np.array([np.cos(angle), np.sin(angle)])
-        round_ = bent.update(seen(circle, np.array([-circle[1], circle[0]]) / 0.8), DT)
+        round_ = bent.update(seen(circle, np.array([-circle[1], circle[0]]) / 0.8), DT, AFAR)
         assert not on.sweeps[0] and not round_.sweeps[0]
     assert np.hypot(*(on.sweep[0, :2] - on.sweep[0, 2:4])) == pytest.approx(0.8 * 1.9), "where it was lately"
 
@@ -89,19 +90,76 @@ def test_one_who_walks_on_or_bends_is_not_known() -> None:
 def test_what_is_hidden_is_foretold_and_what_comes_back_is_known() -> None:
     model = MotionModel()
     walk(model, clock(0.0, 6.0), 0.8)
-    begun = MotionModel().update(seen(np.array([9.0, 9.0]), np.zeros(2), unseen=0.1), DT)
+    begun = MotionModel().update(seen(np.array([9.0, 9.0]), np.zeros(2), unseen=0.1), DT, AFAR)
     assert np.allclose(begun.sweep[0, :4], 9.0), "a past may begin out of sight"
-    hidden = model.update(seen(np.array([9.0, 9.0]), np.zeros(2), unseen=0.1), DT)
+    hidden = model.update(seen(np.array([9.0, 9.0]), np.zeros(2), unseen=0.1), DT, AFAR)
     assert np.hypot(*(hidden.centre[0] - hidden.swept(np.zeros(1))[0, 0])) < 1e-9
     for _ in range(10):
-        model.update(Tracks.none(), DT)
+        model.update(Tracks.none(), DT, AFAR)
     assert walk(model, clock(7.1, 7.5), 0.8, name=5)[-1].sweeps[0], "another number on the line of the lost one"
-    other = model.update(seen(np.array([3.0, 4.0]), np.zeros(2), name=9), DT)
+    other = model.update(seen(np.array([3.0, 4.0]), np.zeros(2), name=9), DT, AFAR)
     assert not other.sweeps[0]
     for _ in range(round(GONE / DT) + 2):
-        model.update(Tracks.none(), DT)
+        model.update(Tracks.none(), DT, AFAR)
     assert not model._pasts
     assert len(walk(model, clock(0.0, 20.0), 0.8)) > MEMORY and len(model._pasts[0].times) == MEMORY
+
+
+# ------------------------------------------------------------------ who yields
+
+
+def met(end: float, robots: dict[float, float], until: float = 99.0, length: float = 99.0) -> list[Tracks]:
+    """Tracks of a mover at 1 m/s to and fro on a way; robots stand there for 4 s each, by the times they come at.
+
+    Until a time the mover brakes at 1 m/s^2 before a robot, later it passes through.
+    """
+    model, rng, found = MotionModel(), np.random.default_rng(5), []
+    made, speed, felt = 0.0, 1.0, 1.0
+    for time in clock(0.0, end):
+        robot = np.array([next((x for t, x in robots.items() if t <= time < t + 4.0), -50.0), 0.1])
+        sense = 1.0 if made % (2.0 * length) < length else -1.0
+        ahead = sense * (robot[0] - float(to_and_fro(0.0, length, made, 0.0, np.array(0.0))))
+        stops = time < until and 0.0 < ahead < 0.9 + 0.5 * speed**2
+        speed = min(max(speed - DT if stops else speed + DT, 0.0), 1.0)
+        made, felt = made + DT * speed, 0.5 * (felt + sense * speed)
+        at = np.array([float(to_and_fro(0.0, length, made, 0.0, np.array(0.0))), 0.0])
+        found.append(model.update(seen(at + 0.02 * rng.standard_normal(2), np.array([felt, 0.0])), DT, robot))
+    return found
+
+
+def yielding(tracks: list[Tracks]) -> Array:
+    """Weights (n,) of yielding."""
+    return np.array([each.weights[0, 3] for each in tracks])
+
+
+ROBOTS = {2.0: 4.0, 9.0: 7.5, 16.0: 11.0}
+
+
+def test_weight_rises_with_every_robot_that_a_mover_yields_to() -> None:
+    weights = yielding(met(22.0, ROBOTS))
+    first, second, third = (weights[round(begin / DT) :][:40].max() for begin in ROBOTS)
+    assert weights[: round(2.0 / DT)].max() <= SELDOM, "it has met no robot"
+    assert UNLIKELY < first < second < third and third > 0.5
+
+
+def test_weight_stays_for_a_mover_that_does_not_yield() -> None:
+    assert yielding(met(22.0, ROBOTS, until=0.0)).max() <= SELDOM
+    assert yielding(met(22.0, {})).max() <= SELDOM, "it met nobody"
+
+
+def test_weight_falls_for_a_mover_that_does_not_yield_any_more() -> None:
+    weights = yielding(met(22.0, ROBOTS, until=15.0))
+    assert weights[round(15.0 / DT)] > 0.5 and weights[-1] < UNLIKELY
+
+
+def test_a_mover_that_yields_is_not_known_to_go_to_and_fro() -> None:
+    """One that turns round before robots is known; one that would, but stops for them, is not."""
+    robots = {k: 2.9 for k in (2.0, 9.0, 16.0, 23.0)}
+    turns, stops = met(26.0, robots, 0.0, 2.5), met(26.0, robots, 99.0, 2.5)
+    known, likely = (np.array([each.sweeps[0] for each in found]) for found in (turns, stops))
+    assert known[-100:].all() and not likely.any()
+    last = stops[-1].sweep[0]
+    assert np.isfinite(last[:4]).all() and np.isnan(last[4:]).all() and np.isfinite(stops[-1].wave).all(), "ends stay"
 
 
 # ------------------------------------------------------------------ what is made of it

@@ -115,7 +115,7 @@ class DiscTracker:
             identity = self._next_identity + np.arange(len(fresh), dtype=np.intp)
             self._next_identity += len(fresh)
             self._rows = self._rows.followed_by(_Filters.of(fresh, identity))
-        return self._motion.update(self.tracks(), dt)
+        return self._motion.update(self.tracks(), dt, place[:2])
 
     def tracks(self) -> Tracks:
         """The confirmed tracks as they stand."""

@@ -2,7 +2,9 @@
 
 Each hypothesis foretells where a disc will be; its weight follows from how far off that was over the last seconds. To
 and fro is a triangular wave along a line, fitted to the track by Gauss-Newton, once it was seen to turn round twice.
-Going on is the hypothesis of a track that nothing else explains: such a mover may stop or turn at any time.
+Going on is the hypothesis of a track that nothing else explains: such a mover may stop or turn at any time. Whichever
+it does, a mover may yield: it stops before a robot in its way, and is told apart by what it does there alone. Once that
+is likely enough its motion is no longer taken as known, for it depends on what the robot does.
 """
 
 from __future__ import annotations
@@ -29,30 +31,36 @@ ADOPTED = 0.4  # [m] from the line of a lost track at which a new one goes on wi
 BOTH = 3  # scans before and after a turn that show it
 STARTS = 40  # places on the round trip from which the fit may begin
 STEPS = 4  # of Gauss-Newton
-GOES_ON = np.array([0.0, 1.0, 0.0])
+GOES_ON = np.array([0.0, 1.0, 0.0, 0.0])
+BRAKING = 1.0  # [m/s^2] of a mover that yields
+BEFORE = 1.0  # [m] from the robot's centre at which it stops
+BESIDE = 0.65  # [m] from the line ahead of a mover to the centre of a robot that is in its way
+SELDOM = 0.01  # probability that a mover yields, before it has met the robot
 
 
 @dataclass
 class Past:
-    """Places (n, 2) and velocities (n, 2) of a track at times (n,), the last of which are kept."""
+    """Places (n, 2) and velocities (n, 2) of a track at times (n,), and of the robot; the last ones are kept."""
 
     times: Array
     places: Array
     velocities: Array
+    robots: Array
     wave: Array | None = None  # (4,) first and last place along the line, round trip made now [m], speed [m/s]
     axis: Array | None = None  # (2, 2) middle of the line, and its direction
-    weights: Array = field(default_factory=lambda: GOES_ON)  # of going to and fro, going on, standing
+    weights: Array = field(default_factory=lambda: GOES_ON)  # row of `Tracks.weights`
 
     @classmethod
     def none(cls) -> Past:
         """Nothing has been seen."""
-        return cls(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2)))
+        return cls(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2)))
 
-    def add(self, time: float, place: Array, velocity: Array) -> None:
-        """Take in where the track is now, and judge the hypotheses again."""
+    def add(self, time: float, place: Array, velocity: Array, robot: Array) -> None:
+        """Take in where the track and the robot are now, and judge the hypotheses again."""
         self.times = np.append(self.times, time)[-MEMORY:]
         self.places = np.vstack([self.places, place])[-MEMORY:]
         self.velocities = np.vstack([self.velocities, velocity])[-MEMORY:]
+        self.robots = np.vstack([self.robots, robot])[-MEMORY:]
         self._fit()
         self._judge()
 
@@ -96,15 +104,16 @@ class Past:
         return wave
 
     def _judge(self) -> None:
-        """Weights of going to and fro, going on and standing, by the errors of what they foretell."""
+        """Weights of the hypotheses, by the errors of what they foretell."""
         self.weights = GOES_ON
         if len(self.times) <= AHEAD:
             return
         lag = (self.times[AHEAD:] - self.times[:-AHEAD])[:, None]
-        before = self.places[:-AHEAD]
-        errors = np.full((3, len(before)), np.inf)
-        for row, place in zip(errors[1:], (before + lag * self.velocities[:-AHEAD], before), strict=True):
-            row[:] = np.hypot(*(place - self.places[AHEAD:]).T)
+        before, velocity = self.places[:-AHEAD], self.velocities[:-AHEAD]
+        errors = np.full((5, len(before)), np.inf)
+        ways = lag * velocity, np.zeros((1, 2)), _yielding(before, velocity, self.robots[:-AHEAD], lag)
+        for row, way in zip(errors[1:4], ways, strict=True):
+            row[:] = np.hypot(*(before + way - self.places[AHEAD:]).T)
         if self.wave is not None and self.axis is not None:
             middle, direction = self.axis
             low, high, made, speed = self.wave.tolist()
@@ -112,9 +121,12 @@ class Past:
             off = np.hypot(*(middle + along[:, None] * direction - self.places).T)
             if off[-2:].max() <= WORST * SIGMA / 2.0:  # else it has just done something else
                 errors[0] = off[AHEAD:]
+        errors[4] = np.minimum(errors[0], errors[1])  # it does not yield
+        errors[3] = np.where(np.isnan(errors[3]), errors[4], errors[3])
         costs = (np.minimum(errors / SIGMA, WORST) ** 2).sum(axis=1) / (2.0 * AHEAD)
-        weights = np.where(np.isfinite(errors[:, -1]), np.exp(costs.min() - costs), 0.0)
-        self.weights = weights / weights.sum()
+        yields = SELDOM / (SELDOM + (1.0 - SELDOM) * np.exp(costs[3] - costs[4]))
+        weights = np.where(np.isfinite(errors[:3, -1]), np.exp(costs[:3].min() - costs[:3]), 0.0)
+        self.weights = np.append(weights / weights.sum(), yields)
 
     @property
     def round_trip(self) -> Array:
@@ -128,11 +140,26 @@ class Past:
     @property
     def sweep(self) -> Array:
         """(6,) row of `Tracks.sweep`: where another hypothesis is likely enough, only the ends of its last places."""
-        if self.weights[0] >= 1.0 - UNLIKELY:
+        if self.weights[0] >= 1.0 - UNLIKELY and self.weights[3] <= UNLIKELY:
             return self.round_trip
         last = self.places[-LATELY:]
         far = int(np.argmax(np.hypot(*(last - last[-1]).T)))
         return np.concatenate([last[far], last[-1], [np.nan, np.nan]])
+
+
+def _yielding(place: Array, velocity: Array, robot: Array, time: Array) -> Array:
+    """Ways (n, 2) in times (n, 1) [s] of movers at places (n, 2) that stop before a robot (n, 2) in their way [m].
+
+    Not a number where it is not in their way.
+    """
+    speed = np.maximum(np.hypot(*velocity.T), 1e-9)[:, None]
+    heading, offset = velocity / speed, robot - place
+    ahead = (offset * heading).sum(axis=1, keepdims=True)
+    aside = np.hypot(*(offset - ahead * heading).T)[:, None]
+    braking = np.minimum(time, speed / BRAKING)
+    stopped = np.maximum(ahead - BEFORE, (speed - 0.5 * BRAKING * braking) * braking)
+    way: Array = np.where((ahead > 0.0) & (aside < BESIDE), np.minimum(speed * time, stopped), np.nan) * heading
+    return way
 
 
 class MotionModel:
@@ -143,12 +170,13 @@ class MotionModel:
         self._now = 0.0
         self._pasts: dict[int, Past] = {}
 
-    def update(self, tracks: Tracks, dt: float) -> Tracks:
+    def update(self, tracks: Tracks, dt: float, robot: Array) -> Tracks:
         """The tracks, with the sweeps of movers that go to and fro.
 
         Args:
             tracks: as they are now.
             dt: time since the last update [s].
+            robot: (2,) its place now [m].
         """
         self._now += dt
         self._pasts = {name: past for name, past in self._pasts.items() if self._now - past.times[-1] < GONE}
@@ -159,7 +187,7 @@ class MotionModel:
                 self._pasts[name] = self._adopted(tracks.centre[k], tracks.identity)
             past = self._pasts[name]
             if not (tracks.unseen[k] and len(past.times)):
-                past.add(self._now, tracks.centre[k], tracks.velocity[k])
+                past.add(self._now, tracks.centre[k], tracks.velocity[k], robot)
             sweep[k], wave[k], weights[k] = past.sweep, past.round_trip, past.weights
             for row in (sweep[k], wave[k]):
                 row[4] += row[5] * (self._now - past.times[-1])

@@ -29,7 +29,7 @@ class Tracks(Rows):
         sweep: (m, 6) of a mover both ends of where it was lately [m], and if it is known to go to and fro between them
             the way it has made of a round trip from the first [m], and its speed [m/s]; else not a number.
         wave: (m, 6) the same of one that may go to and fro; not a number where nothing like that was seen.
-        weights: (m, 3) of a mover: that it goes to and fro, goes on, stands.
+        weights: (m, 4) of a mover: that it goes to and fro, goes on, stands; and that it yields, whichever it does.
     """
 
     centre: Array
@@ -40,12 +40,12 @@ class Tracks(Rows):
     mover: BoolArray
     sweep: Array = field(default_factory=lambda: np.zeros((0, 6)))
     wave: Array = field(default_factory=lambda: np.zeros((0, 6)))
-    weights: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    weights: Array = field(default_factory=lambda: np.zeros((0, 4)))
 
     def __post_init__(self) -> None:
         """Know no motion but going on unless it is given."""
         unknown = np.full(6, np.nan)
-        for name, row in (("sweep", unknown), ("wave", unknown), ("weights", np.array([0.0, 1.0, 0.0]))):
+        for name, row in (("sweep", unknown), ("wave", unknown), ("weights", np.array([0.0, 1.0, 0.0, 0.0]))):
             if len(getattr(self, name)) < len(self.radius):
                 object.__setattr__(self, name, np.tile(row, (len(self.radius), 1)))
 
