@@ -19,7 +19,7 @@ import unifg as fg
 from benchmarks.comparison import Row
 from benchmarks.covariance_plans import by_setting, counted, mean, plans_of
 from benchmarks.report import table
-from benchmarks.runner import Cell, Study
+from benchmarks.runner import Study, every
 from problems import belief_plans
 from problems.belief_plans import SENSOR, Guess, Layout, Plan, Planner
 
@@ -151,9 +151,4 @@ def render(rows: Sequence[Row]) -> str:
     )
 
 
-def cells(seeds: Sequence[int]) -> list[Cell]:
-    """Every layout, planned in every way."""
-    return [{"seed": seed, "way": way} for seed in seeds for way in WAYS]
-
-
-STUDY = Study(cells, attempt, render, range(100, 110))
+STUDY = Study(every(way=WAYS), attempt, render, range(100, 110))

@@ -18,7 +18,7 @@ import pandas as pd
 import unifg as fg
 from benchmarks.comparison import Row, difference, interval, where
 from benchmarks.report import table
-from benchmarks.runner import Cell, Study
+from benchmarks.runner import Study, every
 from benchmarks.timing import clocked
 from problems import belief_plans
 from problems.belief_plans import Guess, Plan
@@ -130,7 +130,8 @@ def render(rows: Sequence[Row]) -> str:
             "### The best setting of each layout, chosen afterwards",
             table(["collisions at most", "way", "layouts kept", "difference to the margin [s]"], each, 2),
             "Processor time of a plan from one guess, mean: "
-            + ", ".join(f"{way} {1e3 * took:.0f} ms" for way, took in seconds.items()) + ".",
+            + ", ".join(f"{way} {1e3 * took:.0f} ms" for way, took in seconds.items())
+            + ".",
         ]
     )
 
@@ -148,9 +149,4 @@ def hindsight(plans: pd.DataFrame, target: float) -> dict[str, pd.Series[float]]
     return {str(way): found.droplevel("way") for way, found in times.groupby("way")}
 
 
-def cells(seeds: Sequence[int]) -> list[Cell]:
-    """Every layout, planned in every way."""
-    return [{"seed": seed, "way": way} for seed in seeds for way in WAYS]
-
-
-STUDY = Study(cells, attempt, render, range(12))
+STUDY = Study(every(way=WAYS), attempt, render, range(12))

@@ -16,7 +16,7 @@ import unifg as fg
 from benchmarks import impossible_states
 from benchmarks.comparison import Row, bracketed, where
 from benchmarks.report import table
-from benchmarks.runner import Cell, Study
+from benchmarks.runner import Study, every
 from unifg.lie import SE2
 from unifg.models import landmarks, obstacles
 from unifg.solvers import GaussNewton, InteriorPoint
@@ -281,10 +281,4 @@ def render(rows: list[Row]) -> str:
     return "\n\n".join(parts)
 
 
-def cells(seeds: Sequence[int]) -> list[Cell]:
-    """Every layout under every condition."""
-    studies = *CONDITIONS, *impossible_states.STUDIES
-    return [{"seed": seed, "study": study} for seed in seeds for study in studies]
-
-
-STUDY = Study(cells, attempt, render, range(12))
+STUDY = Study(every(study=(*CONDITIONS, *impossible_states.STUDIES)), attempt, render, range(12))

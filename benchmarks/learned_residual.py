@@ -7,7 +7,7 @@ weights are constants of the robot like mass and drag: unknowns of the window of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 import unifg as fg
 from benchmarks.comparison import Row, against, where
 from benchmarks.report import listing
-from benchmarks.runner import Cell, Study
+from benchmarks.runner import Study, every
 from unifg.horizon import Constant, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.models import quadrotor
 from unifg.solvers import InteriorPoint
@@ -178,9 +178,4 @@ def tables(rows: list[Row]) -> str:
     return f"{listing(['estimated'], groups, heads)}\n\n{notes}"
 
 
-def cells(seeds: Sequence[int]) -> list[Cell]:
-    """Both models on every seed."""
-    return [{"seed": seed, "model": model} for seed in seeds for model in MODELS]
-
-
-STUDY = Study(cells, measure, tables, range(10))
+STUDY = Study(every(model=MODELS), measure, tables, range(10))

@@ -9,7 +9,7 @@ and the past stays. This is the outlook of Ta et al. (2014, section VI).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 import unifg as fg
 from benchmarks.comparison import Row, interval, where
 from benchmarks.report import listing
-from benchmarks.runner import Cell, Study
+from benchmarks.runner import Study, every
 from benchmarks.timing import clocked
 from unifg.models import quadrotor
 from unifg.models.avoidance import landmark_clearance
@@ -216,9 +216,4 @@ def _mean(rows: list[Row], name: str) -> str:
     return f"{np.mean([row[name] for row in rows]):.3g}" if rows and name in rows[0] else "-"
 
 
-def cells(seeds: Sequence[int]) -> list[Cell]:
-    """All numbers of cylinders on every seed."""
-    return [{"seed": seed, "count": count} for seed in seeds for count in COUNTS]
-
-
-STUDY = Study(cells, measure, tables, range(5), alone=lambda cell: True)
+STUDY = Study(every(count=COUNTS), measure, tables, range(5), alone=lambda cell: True)

@@ -7,7 +7,7 @@ beside it stand the warm start alone, the cold start alone, and twenty starts in
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,7 @@ from benchmarks.casadi_peer import available
 from benchmarks.comparison import Row
 from benchmarks.obstacle_fields import Field
 from benchmarks.report import table
-from benchmarks.runner import Cell, Study
+from benchmarks.runner import Study, every
 from unifg.horizon import Context, ControlCost, Dynamics, InitialGuesses, RecedingHorizon, Robot, Term, cheapest
 from unifg.models import obstacles, unicycle
 from unifg.models.detours import detours, headed
@@ -203,9 +203,4 @@ def tables(rows: list[Row]) -> str:
     return f"{table(head, lines)}\n\n{notes}"
 
 
-def cells(seeds: Sequence[int]) -> list[Cell]:
-    """One for each field."""
-    return [{"seed": seed} for seed in seeds]
-
-
-STUDY = Study(cells, measure, tables, range(100, 119))
+STUDY = Study(every(), measure, tables, range(100, 119))

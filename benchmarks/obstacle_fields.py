@@ -9,10 +9,8 @@ weight 1e-9).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -20,7 +18,7 @@ import pandas as pd
 import unifg as fg
 from benchmarks.comparison import Row
 from benchmarks.report import table
-from benchmarks.runner import Cell, Study
+from benchmarks.runner import Study, every
 from benchmarks.timing import clocked
 from problems.control import Stated, Unicycle
 from unifg.models import obstacles
@@ -179,10 +177,4 @@ def tables(rows: list[Row]) -> str:
     return "\n\n".join(parts)
 
 
-def cells(seeds: Sequence[int]) -> list[Cell]:
-    """Every method with both backends on every field."""
-    variants = product(seeds, range(len(METHODS)), BACKENDS)
-    return [{"seed": seed, "method": method, "backend": backend} for seed, method, backend in variants]
-
-
-STUDY = Study(cells, measure, tables, range(100))
+STUDY = Study(every(method=range(len(METHODS)), backend=BACKENDS), measure, tables, range(100))

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from itertools import product
 from typing import Any, TypeAlias
 
 from tqdm import tqdm
@@ -27,6 +28,14 @@ RESULTS = CHECKOUT / "docs" / "results"
 
 Cell: TypeAlias = Mapping[str, Any]
 """Arguments of a measurement by name, strings and numbers: a problem, a contestant and a seed."""
+
+
+def every(**choices: Iterable[Any]) -> Callable[[Sequence[int]], list[Cell]]:
+    """Cells of every combination of choices on every seed, which comes first."""
+    of = {name: tuple(choice) for name, choice in choices.items()}
+    return lambda seeds: [
+        {"seed": seed, **dict(zip(of, chosen, strict=True))} for seed in seeds for chosen in product(*of.values())
+    ]
 
 
 class Unavailable(Exception):
