@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.solvers import (
     SQP,
     GaussNewton,
@@ -23,8 +23,7 @@ from unifg.typing import Array
 
 def pair() -> tuple[fg.Graph, fg.Family, fg.Family]:
     """Two past states, hard and soft ties to the present, all linear."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(2), 2), graph.variables("y", fg.Rn(2), 1)
+    graph, x, y = graph_of(("x", fg.Rn(2), 2), ("y", fg.Rn(2), 1))
     graph.minimize(fg.prior, x, np.array([0.3, -0.4]), sigma=[0.5, 2.0], name="prior")
     graph.minimize(lambda a, b: b - a - 1.0, x[0], x[1], sigma=0.7, name="step")
     graph.minimize(lambda a, b: 2.0 * b - a, x[1], y, sigma=0.3, name="now")
@@ -67,8 +66,7 @@ def test_a_prior_does_not_depend_on_where_a_linear_graph_was_left(iterations: in
 
 def test_a_factor_may_hold_a_variable_twice() -> None:
     """Its derivatives along both arguments add up."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     graph.minimize(lambda a, b, c: 2.0 * a + b - c, x[0], x[0], y[0], sigma=0.5, name="twice")
     graph.minimize(fg.prior, x, np.zeros(1), sigma=1.0, name="prior")
     graph.minimize(fg.prior, y, np.zeros(1), sigma=1.0, name="rest")
@@ -104,8 +102,7 @@ def test_a_solution_remembers_which_constraints_were_equalities() -> None:
 
 
 def test_one_inequality_among_equalities_is_refused_and_named() -> None:
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 2), graph.variables("y", fg.Rn(1), 2)
+    graph, x, y = graph_of(("x", fg.Rn(1), 2), ("y", fg.Rn(1), 2))
     graph.minimize(fg.prior, x, np.zeros(1), name="prior")
     graph.minimize(fg.prior, y, np.zeros(1), name="rest")
     limit = np.array([[0.0], [1.0]])
@@ -146,8 +143,7 @@ def test_a_fixed_member_has_no_variance_and_the_others_have_theirs() -> None:
 
 def test_one_direction_that_nothing_determines_is_enough_to_refuse() -> None:
     """Three of four numbers are known well; their sum with the fourth is not."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(3), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(3), 1), ("y", fg.Rn(1), 1))
     graph.minimize(fg.prior, x, np.zeros(3), name="prior")
     graph.minimize(lambda a: a[:, :1] * 0.0, y, name="nothing")
     solution = GaussNewton(max_iterations=0).solve(graph, {x: np.ones((1, 3)), y: np.ones((1, 1))})
@@ -218,8 +214,7 @@ def test_reactions_balance_the_gradient() -> None:
 
 
 def test_a_shift_moves_values_and_multipliers_and_repeats_the_end() -> None:
-    graph = fg.Graph()
-    x, p = graph.variables("x", fg.Rn(1), 5), graph.variables("p", fg.Rn(1), 1)
+    graph, x, p = graph_of(("x", fg.Rn(1), 5), ("p", fg.Rn(1), 1))
     graph.minimize(fg.prior, x, np.array([3.0]), name="wish")
     graph.minimize(fg.prior, p, np.array([7.0]), name="parameter")
     limits = np.arange(5.0)[:, None] / 4.0
@@ -257,8 +252,7 @@ def test_the_worst_row_is_named_where_something_is_violated() -> None:
 
 def test_check_names_the_place_of_every_mistake() -> None:
     """Wrong Jacobians by factor, argument and number; unknowns that hang together; equalities that say the same."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(2), 3), graph.variables("y", fg.Rn(2), 3)
+    graph, x, y = graph_of(("x", fg.Rn(2), 3), ("y", fg.Rn(2), 3))
 
     def jacobian(a: Array, b: Array) -> list[Array]:
         blocks = [np.tile(-np.eye(2), (3, 1, 1)), np.tile(np.eye(2), (3, 1, 1))]
@@ -317,8 +311,7 @@ def test_a_prior_of_what_leaves_is_the_same_in_every_unit(sigma: float) -> None:
 
 
 def test_a_report_gives_the_number_that_decided() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [2.0])
+    graph, x = drawn_to([2.0])
     text = GaussNewton().solve(graph, {x: np.zeros((1, 1))}).report()
     assert "relative offset" in text and "violation" not in text
     graph.constrain(lambda a: a, x, upper=1.0, name="limit")
@@ -327,8 +320,7 @@ def test_a_report_gives_the_number_that_decided() -> None:
 
 
 def test_no_iteration_is_a_limit_like_any_other() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [2.0])
+    graph, x = drawn_to([2.0])
     solution = GaussNewton(max_iterations=0).solve(graph, {x: np.ones((1, 1))})
     assert solution.status is fg.Status.ITERATION_LIMIT and solution[x] == 1.0
 

@@ -15,7 +15,7 @@ from judge import judge
 from out_of_reach import goal_too_far
 from problems.control import Driver, Unicycle
 from problems.cylinders import flight
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.known import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, short_drive
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
@@ -71,8 +71,7 @@ def test_penalties_follow_the_scale_of_their_rows() -> None:
 
 
 def test_rows_without_slope_at_the_start_are_left_alone() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [2.0])
+    graph, x = drawn_to([2.0])
     graph.constrain(lambda a: a**2, x, lower=1.0, upper=1.0, name="square")
     solution = AugmentedLagrangian(max_iterations=1).solve(graph, {x: np.zeros((1, 1))})
     assert np.isfinite(solution.penalties["square"]).all()
@@ -173,8 +172,7 @@ def test_flights_among_cylinders() -> None:
 def past_discs(offset: float) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """A unicycle past three discs, ``offset`` metres east and north of the origin."""
     count, dt, origin = 30, 0.2, np.array([offset, offset])
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     start, goal = np.array([*origin, 0.0]), np.array([offset + 4.5, offset + 0.3, 0.2])
     graph.fix(x[0], start)
     graph.minimize(unicycle.tracking, x[-1], goal, sigma=0.1)
@@ -284,8 +282,7 @@ def test_a_constant_penalty_that_does_not_do_is_named_once(
 
 def test_a_constant_penalty_that_does_is_not_named_for_rounding(caplog: pytest.LogCaptureFixture) -> None:
     """A guess that keeps the constraint is no lower violation to be reached again: what is left then is rounding."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.1])
+    graph, x = drawn_to([0.1])
     graph.constrain(lambda x: x**2 - 2.0, x, lower=0.0, upper=0.0)
     backend = AugmentedLagrangian(schedule="bazzana", penalty=1e3, tolerance=1e-300, max_iterations=100)
     solution = backend.solve(graph, {x: [[np.sqrt(2.0)]]})
@@ -297,8 +294,7 @@ def test_a_constant_penalty_that_does_is_not_named_after_a_guess_that_keeps_ever
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """The violation jumps from nothing and falls from then on, here by a fourth a step."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.1])
+    graph, x = drawn_to([0.1])
     graph.bound(x, lower=1.0)
     backend = AugmentedLagrangian(schedule="bazzana-damped", penalty=0.3)
     solution = backend.solve(graph, {x: [[2.0]]})
@@ -309,8 +305,7 @@ def test_a_constant_penalty_that_does_is_not_named_after_a_guess_that_keeps_ever
 
 
 def test_the_damped_loop_that_cannot_move_says_so() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.0])
+    graph, x = drawn_to([0.0])
     graph.constrain(fg.prior, x, [1.0], lower=0.0, upper=0.0, name="one")
     graph.constrain(fg.prior, x, [2.0], lower=0.0, upper=0.0, name="two")
     backend = AugmentedLagrangian(schedule="bazzana-damped", penalty=10.0, keep_values=True)

@@ -12,7 +12,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from problems.guarded_flight import NAMES, SPHERES, START, GuardedFlight
 from unifg.errors import GraphError, ModelError
 from unifg.factors.autodiff.operations import Op
@@ -97,8 +97,7 @@ def test_a_rate_of_what_is_known_is_refused_in_a_trace() -> None:
 
 def test_residuals_may_be_called_in_a_trace() -> None:
     """Stated as plain functions or compiled by hand, on one row for each factor or on several."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 4), graph.variables("u", fg.Rn(2), 3)
+    graph, x, u = graph_of(("x", fg.SE2, 4), ("u", fg.Rn(2), 3))
     shifted = fg.residual(lambda p: avoidance.sphere_clearance(p + 1.0, CENTRE, RADIUS))
     p = graph.variables("p", fg.Rn(3), 2)
     half = 0.5
@@ -171,8 +170,7 @@ def test_every_clearance_has_a_barrier_with_exact_derivatives(name: str) -> None
     clearance, manifold, obstacle = CLEARANCES[name]
     x = manifold.random(RNG, (5,))
     h = barriers.still(clearance)
-    graph = fg.Graph()
-    family, along = graph.variables("x", manifold, 5), graph.variables("u", fg.Rn(manifold.dim), 4)
+    graph, family, along = graph_of(("x", manifold, 5), ("u", fg.Rn(manifold.dim), 4))
     graph.minimize(fg.prior, family, x)
     graph.minimize(fg.prior, along, np.zeros(manifold.dim))
     graph.constrain(barriers.decay(h, 0.7), family[:-1], family[1:], 0.0, 0.1, *obstacle, lower=-1e3, name="decay")
@@ -810,8 +808,7 @@ def closed_loop(
     centre, radius = rng.uniform([1.0, -0.6, -0.6], [4.0, 0.6, 0.6], (3, 3)), rng.uniform(0.2, 0.5, 3)
     centre, radius = centre + np.array([3.0 * size - 3.0, 0.0, 0.0]), size * radius  # larger and further away
     dt, n, push = 0.1, 4, 3.0
-    graph = fg.Graph()
-    x, u = graph.variables("x", POINT, n + 1), graph.variables("u", fg.Rn(3), n)
+    graph, x, u = graph_of(("x", POINT, n + 1), ("u", fg.Rn(3), n))
     start = graph.data("start", np.zeros(6))
     graph.fix(x[0], start)
     graph.constrain(lambda x, u, y: y - advance(x, u, dt), x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")

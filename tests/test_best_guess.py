@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.files.g2o import read_g2o
 from unifg.lie import Product
 from unifg.models.odometry import driven, held
@@ -113,8 +113,7 @@ def ranges(seed: int) -> tuple[fg.Graph, dict[fg.Family, Array], int]:
     path = driven(moves + rng.normal(0.0, 0.03, moves.shape))[1:]
     which = rng.integers(0, 6, count)
     z = np.linalg.norm(truth[:, :2] - beacons[which], axis=1, keepdims=True) + rng.normal(0.0, 0.3, (count, 1))
-    graph = fg.Graph()
-    x, b = graph.variables("x", fg.SE2, count), graph.variables("b", fg.Rn(2), 6)
+    graph, x, b = graph_of(("x", fg.SE2, count), ("b", fg.Rn(2), 6))
     graph.fix(x[0], path[0])
     graph.minimize(fg.between, x[:-1], x[1:], fg.SE2.between(path[:-1], path[1:]), sigma=[0.05, 0.02, 0.03])
     graph.minimize(lambda x, p, z: np.linalg.norm(x[:, :2] - p, axis=1, keepdims=True) - z, x, b[which], z, sigma=0.3)
@@ -147,9 +146,7 @@ def test_points_in_space_velocities_and_constraints() -> None:
         noisy.append(np.ravel(fg.SE3.retract(noisy[-1], step)))
     node, mark = np.nonzero(rng.random((count, 20)) < 0.2)
     z = fg.SE3.act(fg.SE3.inverse(truth[node]), points[mark]) + rng.normal(0.0, 0.02, (len(node), 3))
-    graph = fg.Graph()
-    x, m = graph.variables("x", fg.SE3, count), graph.variables("m", fg.Rn(3), 20)
-    v = graph.variables("v", state, 2)
+    graph, x, m, v = graph_of(("x", fg.SE3, count), ("m", fg.Rn(3), 20), ("v", state, 2))
     graph.fix(x[0], truth[0])
     graph.minimize(fg.prior, v, state.identity(), sigma=1.0, name="rest")
     odometry = fg.SE3.between(np.array(noisy)[:-1], np.array(noisy)[1:])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import drawn_to
 from problems.known import PROBLEMS, Problem, line, short_drive
 from unifg.solvers import AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt, choice
 from unifg.solvers.choice import choose
@@ -18,16 +19,14 @@ from unifg.typing import Array
 
 def circled(upper: float = 2.0) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """The point of the unit circle nearest to (1, 1), in a box that may exclude it."""
-    graph, x = line(1)
-    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph, x = drawn_to([1.0, 1.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
     graph.bound(x, lower=0.0, upper=upper, name="box")
     return graph, {x: np.array([[0.1, 0.2]])}
 
 
 def test_what_is_stated_decides() -> None:
-    graph, x = line()
-    graph.minimize(fg.prior, x, [1.0, 0.0])
+    graph, x = drawn_to([1.0, 0.0], 4)
     assert isinstance(choose(graph).first, LevenbergMarquardt)
     assert choose(graph).reason == "least squares without constraints"
     where = graph.data("where", 0.5)
@@ -46,8 +45,7 @@ def test_what_is_stated_decides() -> None:
 
 
 def test_limits_that_are_none_now_are_no_equality() -> None:
-    graph, x = line(1)
-    graph.minimize(fg.prior, x, [1.0, 0.0])
+    graph, x = drawn_to([1.0, 0.0])
     graph.bound(x, upper=graph.data("most", np.inf), name="box")
     assert choose(graph).reason == "the constraint 'box', without limits now"
 

@@ -8,7 +8,7 @@ import pytest
 import unifg as fg
 from problems.control import Unicycle
 from problems.cops import PROBLEMS, electrons
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.scaled import Units, scaled
 from unifg.problem import units as measures
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
@@ -120,8 +120,7 @@ def test_a_cost_of_rounding_at_the_start_is_no_measure() -> None:
     """A guess on the reference costs nothing, or what rounding leaves."""
     counts = []
     for offset in (0.0, 1e-14):
-        graph = fg.Graph()
-        x, u = graph.variables("x", fg.Rn(2), 21), graph.variables("u", fg.Rn(2), 20)
+        graph, x, u = graph_of(("x", fg.Rn(2), 21), ("u", fg.Rn(2), 20))
         graph.minimize(fg.prior, u, np.full(2, 0.5 + offset), name="effort")
         graph.constrain(lambda a, u, b: b - a - 0.1 * u, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")
         graph.constrain(lambda a: ((a - [0.5, 0.55]) ** 2).sum(axis=1, keepdims=True), x[1:], lower=0.04, name="disc")
@@ -144,8 +143,7 @@ def test_augmented_lagrangian_begins_where_nothing_is_curved() -> None:
 
 @pytest.mark.parametrize("function", [np.exp, lambda x: x**3])
 def test_interior_point_names_an_equality_that_loses_its_slope(function: Any) -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [-1.0])
+    graph, x = drawn_to([-1.0])
     graph.constrain(function, x, lower=0.0, upper=0.0, name="flat")
     assert InteriorPoint().solve(graph, {x: [[1.0]]}).status is fg.Status.DEGENERATE
 
@@ -163,8 +161,7 @@ def test_hessian_of_an_answer_is_that_of_gauss_newton() -> None:
 
 def test_steps_of_restoration_are_counted() -> None:
     """Two rows that contradict each other: the descent on the violation is no secret of the solver's."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [0.0, 0.0], sigma=1.0)
+    graph, x = drawn_to([0.0, 0.0], sigma=1.0)
     graph.constrain(lambda x: (x**2).sum(axis=1, keepdims=True), x, upper=1.0, name="near")
     graph.constrain(lambda x: np.exp(x[:, :1]) - x[:, 1:], x, upper=-3.0, name="far")
     for solver in (InteriorPoint(), SQP()):

@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from test_kkt import chain
 from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.typing import Array
@@ -67,8 +67,7 @@ def test_what_nothing_determines_is_refused_in_any_unit(unit: float) -> None:
 
 def test_solutions_of_one_graph_keep_their_own_covariances() -> None:
     """They share the structure of the elimination, not its numbers."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     sigma, slope = graph.data("sigma", 1.0), graph.data("slope", np.ones(1))
     graph.minimize(fg.prior, x, [0.0], sigma=sigma)
     graph.minimize(fg.prior, y, [0.0], sigma=1e3)

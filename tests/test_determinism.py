@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from problems.known import Guess, short_drive
 from unifg.solvers import (
     KKT,
@@ -69,8 +69,7 @@ def open_drive() -> tuple[fg.Graph, Guess, Guess]:
     """A drive with nothing but dynamics."""
     from unifg.models import unicycle
 
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 9), graph.variables("u", fg.Rn(2), 8)
+    graph, x, u = graph_of(("x", fg.SE2, 9), ("u", fg.Rn(2), 8))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(unicycle.tracking, x[-1], [1.2, 0.6, 0.4], sigma=0.1)
     graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)

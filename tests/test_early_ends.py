@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from unifg.models import obstacles, unicycle
 from unifg.problem.linearization import Linearization
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
@@ -200,8 +200,7 @@ class Flies(fg.Solver):
 
 
 def test_where_the_last_iterate_is_not_finite_another_stands_in() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [1.0], name="wish")
+    graph, x = drawn_to([1.0], name="wish")
     graph.minimize(fg.prior, x, [3.2], name="other wish")
     solution = Flies().solve(graph, {x: [[0.0]]})
     assert solution.status is fg.Status.NOT_FINITE
@@ -296,8 +295,7 @@ ENDINGS = [
 
 def wall(most: float) -> tuple[fg.Graph, fg.Family]:
     """Minimise 1/2 (x - 5)^2 where x is at most ``most``."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [5.0])
+    graph, x = drawn_to([5.0])
     graph.constrain(lambda p: p, x, upper=most)
     return graph, x
 

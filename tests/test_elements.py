@@ -12,7 +12,7 @@ import pytest
 
 import unifg as fg
 from own_manifolds import S2, XYZW
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.solvers import GaussNewton
 from unifg.typing import Array, ArrayLike
 
@@ -78,8 +78,7 @@ def test_a_constant_pose_in_the_place_of_a_variable_is_an_element() -> None:
 
 
 def test_the_reference_of_a_joint_prior_is_checked_part_by_part() -> None:
-    graph = fg.Graph()
-    x, b = graph.variables("x", fg.SE3, 1), graph.variables("b", fg.Rn(1), 1)
+    graph, x, b = graph_of(("x", fg.SE3, 1), ("b", fg.Rn(1), 1))
     joint = fg.joint_prior(fg.SE3, fg.Rn(1), offset=True)
     with pytest.raises(fg.GraphError, match=r"argument 2.*norm 1"):
         graph.minimize(joint, x, b, [*scaled(POSE, 0.9), 5.0, *np.zeros(7)])
@@ -98,8 +97,7 @@ def test_numbers_that_are_not_finite_are_refused(manifold: fg.Manifold, wrong: f
 def test_measurements_of_other_kernels_are_finite_too() -> None:
     from unifg.models import landmarks
 
-    graph = fg.Graph()
-    x, spot = graph.variables("x", fg.SE2, 1), graph.variables("spot", fg.Rn(2), 1)
+    graph, x, spot = graph_of(("x", fg.SE2, 1), ("spot", fg.Rn(2), 1))
     with pytest.raises(fg.GraphError, match=r"argument 2.*row 0.*not finite"):
         graph.minimize(landmarks.bearing_range, x, spot, [0.1, np.nan], sigma=[0.1, 0.1])
 
@@ -216,8 +214,7 @@ MASKED = np.ma.MaskedArray([1.0, 2.0], mask=[False, True])
     ],
 )
 def test_masked_arrays_are_refused(state: Callable[[fg.Graph, fg.Family], object]) -> None:
-    graph, x = graph_with(fg.Rn(2), 2)
-    graph.minimize(fg.prior, x, [0.0, 0.0], name="origin")
+    graph, x = drawn_to([0.0, 0.0], 2, name="origin")
     with pytest.raises(fg.GraphError, match="masked"):
         state(graph, x)
 
@@ -241,8 +238,7 @@ def test_a_prior_with_headings_beyond_a_turn_names_degrees(value: list[Any], cap
 
 
 def test_a_prior_with_headings_of_a_turn_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.SE2, 1), graph.variables("y", fg.SE2, 1)
+    graph, x, y = graph_of(("x", fg.SE2, 1), ("y", fg.SE2, 1))
     with caplog.at_level(logging.WARNING, "unifg"):
         graph.minimize(fg.prior, x, [100.0, -200.0, 2.0 * math.pi])
         graph.minimize(fg.between, x, y, [0.0, 0.0, 7.0])

@@ -125,8 +125,7 @@ ON_VECTORS: list[tuple[ManifoldResidual, str]] = [
 
 @pytest.mark.parametrize(("function", "message"), ON_VECTORS, ids=[f.name for f, _ in ON_VECTORS])
 def test_a_residual_on_the_wrong_manifold_names_term_and_family(function: ManifoldResidual, message: str) -> None:
-    graph = fg.Graph()
-    x = graph.variables("corner", S2 if function is fg.between else fg.Rn(3), 2)
+    graph, x = graph_with(S2 if function is fg.between else fg.Rn(3), 2, "corner")
     with pytest.raises(fg.GraphError, match=f"'odometry': {message}.*'corner'") as caught:
         graph.minimize(function, x[0], x[1], np.zeros(3), name="odometry")
     assert (caught.value.term, caught.value.family) == ("odometry", "corner")

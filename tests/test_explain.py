@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array
 
@@ -20,8 +20,7 @@ def sentence(solution: fg.Solution, start: str) -> str:
 
 def chain(limit: float = 0.8) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """A cart that is pushed towards 4, with limits on the pushes."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(1), 6), graph.variables("u", fg.Rn(1), 5)
+    graph, x, u = graph_of(("x", fg.Rn(1), 6), ("u", fg.Rn(1), 5))
     graph.fix(x[0], [0.0])
     graph.minimize(fg.prior, x[-1], [4.0], sigma=0.5, name="goal")
     graph.minimize(fg.prior, u, [0.0], name="effort")
@@ -49,8 +48,7 @@ def test_the_constraint_that_holds_is_named_with_its_gain() -> None:
 
 def test_the_measurement_that_disagrees_is_named() -> None:
     rng = np.random.default_rng(3)
-    graph = fg.Graph()
-    x, tree = graph.variables("x", fg.SE2, 12), graph.variables("tree", fg.Rn(2), 1)
+    graph, x, tree = graph_of(("x", fg.SE2, 12), ("tree", fg.Rn(2), 1))
     poses = np.stack([0.3 * np.arange(12), np.zeros(12), np.zeros(12)], axis=1)
     seen = np.array([2.0, 1.0]) - poses[:, :2] + 0.05 * rng.normal(size=(12, 2))
     seen[7] += [0.0, 0.6]
@@ -67,8 +65,7 @@ def test_the_measurement_that_disagrees_is_named() -> None:
 
 
 def test_the_variable_that_is_hardly_determined_is_named() -> None:
-    graph = fg.Graph()
-    x, tree = graph.variables("x", fg.Rn(2), 3), graph.variables("tree", fg.Rn(2), 2)
+    graph, x, tree = graph_of(("x", fg.Rn(2), 3), ("tree", fg.Rn(2), 2))
     poses = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
     graph.minimize(fg.prior, x, poses, sigma=0.01, name="gps")
 
@@ -92,8 +89,7 @@ def test_the_slow_term_is_named_with_the_way_to_write_it() -> None:
     def looped(x: Array) -> Array:
         return np.array([[sum(float(f"{v:.17g}") for v in row for _ in range(20))] for row in x])
 
-    graph, x = graph_with(fg.Rn(2), 30)
-    graph.minimize(fg.prior, x, [1.0, 2.0], name="near")
+    graph, x = drawn_to([1.0, 2.0], 30, name="near")
     graph.minimize(looped, x, sigma=10.0, name="looped")
     loop = GaussNewton().prepare(graph)
     loop.solve({x: np.zeros((30, 2))})

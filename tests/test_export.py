@@ -20,7 +20,7 @@ from asserting import below
 from fences import fences
 from problems.around_a_disc import around_a_disc
 from problems.control import Quadrotor, Stated, Unicycle
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from scripts import CHECKOUT
 from unifg.codegen import standalone
 from unifg.errors import BackendError
@@ -91,8 +91,7 @@ def assert_same(prepared: Prepared, folder: Path, guess: Any, each: Sequence[Map
 
 def with_losses() -> tuple[fg.Graph, dict[fg.Family, Array], fg.Data]:
     """A cost that is no square, a robust one, comparisons, a table, and a constraint between quaternions."""
-    graph = fg.Graph()
-    q, p = graph.variables("q", fg.SO3, 3), graph.variables("p", fg.Rn(2), 3)
+    graph, q, p = graph_of(("q", fg.SO3, 3), ("p", fg.Rn(2), 3))
     place, levels = graph.data("place", [1.0, 2.0]), np.array([0.0, 0.5, 0.2, 0.9])
     turned = graph.data("turned", fg.SO3.exp([0.3, 0.1, -0.2]))
     graph.minimize(fg.prior, q, turned, sigma=0.1, name="turn")
@@ -322,8 +321,7 @@ def test_backends_whose_loop_is_python_are_refused() -> None:
 
 def test_parts_of_python_are_refused_by_name() -> None:
     def graph() -> tuple[fg.Graph, fg.Family, dict[fg.Family, Array]]:
-        made, x = graph_with(fg.Rn(2), 2)
-        made.minimize(fg.prior, x, [1.0, 2.0], name="there")
+        made, x = drawn_to([1.0, 2.0], 2, name="there")
         return made, x, {x: np.zeros((2, 2))}
 
     made, x, guess = graph()

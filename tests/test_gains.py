@@ -10,6 +10,7 @@ from scipy.linalg import solve_discrete_are
 
 import unifg as fg
 from problems.control import Problem, Quadrotor, Stated, Unicycle
+from problems.graphs import graph_of
 from unifg.horizon import ControlCost, Dynamics, RecedingHorizon, Robot, Term
 from unifg.solvers import SQP, InteriorPoint
 from unifg.typing import Array
@@ -27,8 +28,7 @@ def motion(x: Array, u: Array, y: Array) -> Array:
 
 def regulator(steps: int, end: Array, start: Any = (1.0, 1.0, 1.0)) -> tuple[fg.Graph, fg.Family, fg.Family]:
     """Linear system with quadratic costs."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(3), steps + 1), graph.variables("u", fg.Rn(2), steps)
+    graph, x, u = graph_of(("x", fg.Rn(3), steps + 1), ("u", fg.Rn(2), steps))
     graph.fix(x[0], start, name="start")
     graph.minimize(fg.prior, x[:-1], np.zeros(3), information=Q, name="stages")
     graph.minimize(fg.prior, x[-1], np.zeros(3), information=end, name="end")
@@ -166,8 +166,7 @@ def test_gains_are_refused_by_name() -> None:
         with pytest.raises(fg.GraphError, match="expected a family of variables"):
             good.gains(x, wrong)  # type: ignore[arg-type]
     np.testing.assert_array_equal(good.gains(x[1:3], u[1:3]), good.gains(x, u)[1:])
-    idle = fg.Graph()
-    x, u = idle.variables("x", fg.Rn(1), 3), idle.variables("u", fg.Rn(2), 2)
+    idle, x, u = graph_of(("x", fg.Rn(1), 3), ("u", fg.Rn(2), 2))
     idle.fix(x[0], [1.0])
     idle.minimize(fg.prior, x[1:], [0.0], sigma=1.0)
     idle.constrain(lambda x, u, y: y - x - u[:, :1] - u[:, 1:], x[:-1], u, x[1:], lower=0.0, upper=0.0, name="step")
@@ -193,8 +192,7 @@ def test_gains_at_rest_are_not_those_of_other_weights() -> None:
 
 def test_a_constraint_that_cannot_be_kept_from_another_state_has_no_gain_there() -> None:
     """A wall for a position that the control reaches two steps later; from farther away it can be kept."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(2), 6), graph.variables("u", fg.Rn(1), 5)
+    graph, x, u = graph_of(("x", fg.Rn(2), 6), ("u", fg.Rn(1), 5))
     graph.fix(x[0], [0.0, 0.5])
     graph.minimize(fg.prior, x[1:], [2.0, 0.0], sigma=0.1, name="goal")
     graph.minimize(fg.prior, u, [0.0], sigma=1.0, name="effort")
@@ -233,8 +231,7 @@ def test_a_soft_limit_that_is_kept_has_the_gains_of_a_hard_one() -> None:
     """At a limit that the state itself is at: nothing later depends on how far that would give way."""
     found = []
     for soft in (None, 50.0):
-        graph = fg.Graph()
-        x, u = graph.variables("x", fg.Rn(2), 9), graph.variables("u", fg.Rn(1), 8)
+        graph, x, u = graph_of(("x", fg.Rn(2), 9), ("u", fg.Rn(1), 8))
         graph.fix(x[0], [0.0, 0.0])
         graph.minimize(fg.prior, x[1:], [4.0, 0.0], sigma=[1.0, 2.0])
         graph.minimize(fg.prior, u, [0.0], sigma=1.0)

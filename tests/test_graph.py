@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from problems.known import line, short_drive
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, LevenbergMarquardt
 
@@ -32,8 +32,7 @@ def test_inactive_factors_keep_their_place_and_cost_nothing(solver: fg.Solver) -
 
 
 def test_inactive_factor_may_be_undefined() -> None:
-    graph, x = line(2)
-    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph, x = drawn_to([1.0, 1.0], 2)
     with np.errstate(all="ignore"):
         graph.minimize(lambda p: np.log(p), x, active=np.array([True, False]))
         solution = LevenbergMarquardt().solve(graph, {x: np.array([[2.0, 2.0], [-1.0, -1.0]])})
@@ -49,9 +48,7 @@ def test_rounding_of_an_inverse_is_symmetric_enough(unit: float) -> None:
     information = np.linalg.inv(scale @ covariance @ scale)
     information[0, 1] += 1e-15 / unit
     assert abs(information[0, 1] / information[1, 0] - 1.0) > 1e-6
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(3), 1)
-    graph.minimize(fg.prior, x, [1.0, 2.0, 3.0], information=information)
+    graph, x = drawn_to([1.0, 2.0, 3.0], information=information)
     np.testing.assert_allclose(fg.solve(graph, {x: np.zeros((1, 3))})[x], [[1.0, 2.0, 3.0]], atol=1e-9)
     information[0, 1] += 1e-8 * 2.0 / unit / 0.5
     with pytest.raises(fg.GraphError, match=r"information must be finite and symmetric, found .* at \(0, 1\)"):
@@ -99,8 +96,7 @@ def test_shift_keeps_rank_within_a_stage() -> None:
 
 def test_reweighted_loss_holds_its_weights_during_the_line_search() -> None:
     """A quarter below one: the trial cost is judged with the weight of the linearisation."""
-    graph, x = line(1)
-    graph.minimize(fg.prior, x, [0.0, 0.0], robust=fg.Reweighted(lambda s: np.where(s < 1.0, 0.25, 1.0)), name="beam")
+    graph, x = drawn_to([0.0, 0.0], robust=fg.Reweighted(lambda s: np.where(s < 1.0, 0.25, 1.0)), name="beam")
     program = graph.compile()
     lin = program.linearize({x: np.array([[2.0, 0.0]])})
     assert lin.cost == pytest.approx(2.0)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.codegen.compile_counter import counting
 from unifg.horizon import (
     COUPLINGS,
@@ -143,8 +143,7 @@ def test_what_leaves_through_constraints_is_not_lost(solver: fg.Solver) -> None:
     window: Window = Window(robot, 4, terms, start=START, sigma=0.8, solver=solver)
     for k in range(15):
         carry_on(window, drive, k)
-    graph = fg.Graph()
-    x, w = graph.variables("x", fg.Rn(2), 15), graph.variables("w", fg.Rn(1), 14)
+    graph, x, w = graph_of(("x", fg.Rn(2), 15), ("w", fg.Rn(1), 14))
     graph.minimize(fg.prior, x[0], START, sigma=0.8)
     graph.minimize(fg.prior, w, [0.0], sigma=0.4)
     each = graph.data("u", drive.controls, each=True)
@@ -200,8 +199,7 @@ def test_factors_over_several_nodes_leave_whole() -> None:
     exact = GaussNewton(tolerance=1e-12)
     window: Window = Window(robot, 3, terms, start=START, sigma=0.8, solver=exact)
     drive, ticks = Drive(12, seed=3), 12
-    graph = fg.Graph()
-    x, m = graph.variables("x", fg.Rn(2), ticks + 1), graph.variables("m", fg.Rn(1), 2)
+    graph, x, m = graph_of(("x", fg.Rn(2), ticks + 1), ("m", fg.Rn(1), 2))
     graph.minimize(fg.prior, x[0], START, sigma=0.8)
     graph.minimize(fg.prior, m, [[0.0], [7.0]], sigma=[[2.0], [0.1]])
     graph.minimize(lambda a, b, c: a - 2.0 * b + c, x[:-2], x[1:-1], x[2:], sigma=0.3)
@@ -317,8 +315,7 @@ def test_a_slot_that_gets_another_landmark_forgets_the_first() -> None:
             assert window.history.constants["mark"][0, 0] == 1.0
         window.record("gaps", np.column_stack([gaps[k], seen[k]]))
         window.estimate(None)
-    graph = fg.Graph()
-    x, m = graph.variables("x", fg.Rn(2), ticks + 1), graph.variables("m", fg.Rn(1), 3)
+    graph, x, m = graph_of(("x", fg.Rn(2), ticks + 1), ("m", fg.Rn(1), 3))
     graph.minimize(fg.prior, x[0], START, sigma=0.8)
     graph.minimize(fg.prior, m, [[0.0], [0.0], [1.0]], sigma=1e3)
     still = graph.data("u", np.zeros((ticks, 1)), each=True)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.codegen.compile_counter import counting
 from unifg.errors import ModelError
 from unifg.lie import SE23, SO3
@@ -404,8 +404,7 @@ def flight(seconds: float, rng: Generator, bias: Array, rate: float = 200.0) -> 
 def estimator(
     nodes: int, manifold: fg.Manifold = SE23
 ) -> tuple[fg.Graph, fg.Family, fg.Family, InertialMeasurements, fg.Data]:
-    graph = fg.Graph()
-    x, bias = graph.variables("x", manifold, nodes), graph.variables("bias", BIAS, nodes)
+    graph, x, bias = graph_of(("x", manifold, nodes), ("bias", BIAS, nodes))
     imu = InertialMeasurements(NOISE)
     imu.state(graph, x)
     fixes = graph.data("places", np.zeros((nodes, 3)), each=True)

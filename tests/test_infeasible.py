@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.models import obstacles, unicycle
 from unifg.solution.optimality import infeasible_stationary
 from unifg.solvers import SQP, AugmentedLagrangian
@@ -25,8 +25,7 @@ Problem = tuple[fg.Graph, dict[fg.Family, Array]]
 
 def two_values(weight: float) -> Problem:
     """x = 0 and weight (x - 1) = 0."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [5.0])
+    graph, x = drawn_to([5.0])
     graph.constrain(fg.prior, x, [0.0], lower=0.0, upper=0.0, name="zero")
     graph.constrain(lambda v: weight * (v - 1.0), x, lower=0.0, upper=0.0, name="one")
     return graph, {x: np.array([[3.0]])}
@@ -69,8 +68,7 @@ def test_one_impossible_row_among_others_is_named(name: str) -> None:
 
 def saddle(away: float = 0.0) -> Problem:
     """1 + x^2 = y^2: at the origin the violation is stationary, yet along y it falls."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [0.0, 0.5])
+    graph, x = drawn_to([0.0, 0.5])
     graph.constrain(lambda p: 1.0 + p[:, :1] ** 2 - p[:, 1:] ** 2, x, lower=0.0, upper=0.0, name="hyperbola")
     return graph, {x: np.array([[away, 0.0]])}
 
@@ -99,8 +97,7 @@ def test_least_violation_is_stationary_or_none(build: Callable[[], Problem]) -> 
 
 def bay() -> Problem:
     """x^3 - 3 x + 3 = 0 has its root at -2.1; at 1, where the cost pulls, it is 1 and no nearer root is in sight."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [1.0], sigma=0.01)
+    graph, x = drawn_to([1.0], sigma=0.01)
     graph.constrain(lambda p: p**3 - 3.0 * p + 3.0, x, lower=0.0, upper=0.0, name="cubic")
     return graph, {x: np.array([[np.roots([1.0, 0.0, -3.0, 3.0])[0].real]])}
 
@@ -138,8 +135,7 @@ def test_the_unit_of_an_unknown_does_not_decide_what_is_infeasible(unit: float) 
 def corridor(length: float) -> Problem:
     """A unicycle, a goal behind two discs that close a corridor, and a straight guess through them."""
     count, dt = 20, 0.2
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
     graph.constrain(fg.prior, x[-1], [length, 0.0, 0.0], lower=0.0, upper=0.0, name="goal")
@@ -166,8 +162,7 @@ def shelves(seed: int) -> Problem:
     """A robot at rest among shelves, which is a plan that violates nothing, and a goal behind some of them."""
     count, dt = 20, 0.2
     rng = np.random.default_rng(seed)
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     start = np.array([0.0, 0.0, rng.uniform(-3.0, 3.0)])
     heading = rng.uniform(-np.pi, np.pi)
     goal = np.array([3.0 * np.cos(heading), 3.0 * np.sin(heading), heading])

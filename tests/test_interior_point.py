@@ -15,7 +15,7 @@ import pytest
 import unifg as fg
 from own_manifolds import S2, SphereManifold
 from problems.control import Quadrotor, Unicycle
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.codegen.clock import clock
 from unifg.factors.robust import Loss
 from unifg.models import avoidance, quadrotor
@@ -116,8 +116,7 @@ def test_a_stopped_loop_hands_back_what_kept_the_constraints(
 
 def test_the_same_variable_twice_in_an_equality() -> None:
     """Both columns of a factor mean one entry of the KKT matrix."""
-    graph, x = graph_with(fg.Rn(1), 2)
-    graph.minimize(fg.prior, x, [3.0])
+    graph, x = drawn_to([3.0], 2)
     graph.constrain(fg.difference, x[[0, 0]], x[[0, 1]], lower=0.0, upper=0.0, name="equal")
     graph.bound(x, upper=2.0)
     solution = InteriorPoint().solve(graph, {x: np.array([[0.0], [5.0]])}, check=True)
@@ -291,8 +290,7 @@ class Plain(SphereManifold):
 def test_a_manifold_without_a_compiled_retraction_and_a_fixed_member(sphere: SphereManifold) -> None:
     """Its part of a step is taken in Python; what is fixed stays to the last bit."""
     rng = np.random.default_rng(2)
-    graph = fg.Graph()
-    g, q = graph.variables("g", sphere, 2), graph.variables("q", fg.SO3, 2)
+    graph, g, q = graph_of(("g", sphere, 2), ("q", fg.SO3, 2))
     kept = fg.SO3.random(rng) * (1.0 + 3e-13)
     graph.fix(q[0], kept)
     seen = S2.random(rng, (12,))
@@ -361,8 +359,7 @@ def test_orders_of_elimination_lose_no_digits(scalar: bool, aside: float) -> Non
     """
     count, dt = 40, 0.1
     vehicle = quadrotor.Parameters(mass=1.2, drag=(0.2, 0.2, 0.3), wind=(0.0, 0.5))
-    graph = fg.Graph()
-    x, u = graph.variables("x", quadrotor.STATE, count + 1), graph.variables("u", quadrotor.CONTROL, count)
+    graph, x, u = graph_of(("x", quadrotor.STATE, count + 1), ("u", quadrotor.CONTROL, count))
     start, target = np.array([0.0, 0.0, 1.0]), np.array([5.0, 0.0, 1.5])
     tree, trunk = np.array([[2.5, 0.1]]), np.array([0.75])
     still, hover = np.concatenate([start, quadrotor.hover_attitude(vehicle), np.zeros(3)]), quadrotor.hover(vehicle)

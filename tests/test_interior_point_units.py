@@ -9,7 +9,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.horizon import Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Window
 from unifg.models import unicycle
 from unifg.solvers import InteriorPoint
@@ -159,8 +159,7 @@ def test_a_joint_window_takes_a_few_iterations_in_any_unit_of_length(metre: floa
 @pytest.mark.parametrize("heading", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3])
 def test_a_heading_next_to_nothing_gives_the_way_ahead_no_unit(heading: float) -> None:
     """A lateral error sees the way ahead by the heading alone: its curvature there is no unit of another kind."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 16), graph.variables("u", fg.Rn(2), 15)
+    graph, x, u = graph_of(("x", fg.SE2, 16), ("u", fg.Rn(2), 15))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, u, [1.0, 0.0], sigma=0.5, name="cruise")
     graph.minimize(lambda x: x[:, 1:2], x[1:], sigma=0.5, name="lane")

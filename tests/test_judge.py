@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.solution.multipliers import Slopes, estimated
 from unifg.solution.optimality import optimality
 from unifg.solution.solver import Solver, SolveState
@@ -61,8 +61,7 @@ class Liar(Solver):
 
 def limited() -> tuple[fg.Graph, fg.Family]:
     """Minimise 1/2 (x - 3)^2 with x <= 1: x = 1, multiplier 2."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [3.0])
+    graph, x = drawn_to([3.0])
     graph.constrain(lambda p: p, x, upper=1.0, name="limit")
     return graph, x
 
@@ -82,14 +81,12 @@ def test_a_backend_is_not_believed(point: float, multiplier: float, believed: bo
 @pytest.mark.parametrize("solver", [InteriorPoint(max_iterations=300), SQP(max_iterations=300)], ids=lambda s: s.name)
 def test_no_minimum_is_found_where_there_is_none(solver: Solver) -> None:
     """Far out an absolute step is lost, and every difference looks like zero."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     graph.minimize_scalar(lambda a, b: -(a + b)[:, 0], x, y)
     graph.constrain(lambda a, b: a - b, x, y, lower=0.0, upper=0.0)
     assert not solver.solve(graph, {x: [[1.0]], y: [[2.0]]}).converged
 
-    saddle = fg.Graph()
-    x, y = saddle.variables("x", fg.Rn(1), 1), saddle.variables("y", fg.Rn(1), 1)
+    saddle, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     saddle.minimize_scalar(lambda a, b: (b**2 - a**2)[:, 0], x, y)
     saddle.bound(y, lower=-1.0, upper=1.0)
     assert not solver.solve(saddle, {x: [[1.0]], y: [[0.5]]}).converged
@@ -98,8 +95,7 @@ def test_no_minimum_is_found_where_there_is_none(solver: Solver) -> None:
 @pytest.mark.parametrize("size", [7e10, 1e15, 1e27])
 def test_derivatives_do_not_vanish_far_out(size: float) -> None:
     """The point itself is judged, whatever a backend would do there."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     graph.minimize_scalar(lambda a, b: -(a + b)[:, 0], x, y)
     graph.minimize(lambda a, b: 1e-3 * (a - b), x, y)
     lin = graph.compile().linearize({x: np.array([[size]]), y: np.array([[size]])})
@@ -223,8 +219,7 @@ def test_a_compiled_residual_that_leaves_rows_out_is_named() -> None:
 
 
 def test_information_of_zero_is_not_silent(caplog: pytest.LogCaptureFixture) -> None:
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 1.0], information=np.zeros((2, 2)), name="nothing")
+    graph, x = drawn_to([1.0, 1.0], information=np.zeros((2, 2)), name="nothing")
     run = LevenbergMarquardt().prepare(graph)
     for _ in range(3):
         assert run.solve({x: np.ones((1, 2))}).status is fg.Status.UNDETERMINED
@@ -329,8 +324,7 @@ def test_the_second_backend_is_asked_where_the_first_ends_degenerate(monkeypatch
 def test_long_chains_of_constraints_are_not_degenerate(solver: Solver) -> None:
     """Their multipliers add up over the length."""
     count = 4000
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(2), count), graph.variables("u", fg.Rn(1), count - 1)
+    graph, x, u = graph_of(("x", fg.Rn(2), count), ("u", fg.Rn(1), count - 1))
 
     def pendulum(a: Array, b: Array, u: Array) -> Array:
         return np.concatenate(
@@ -349,8 +343,7 @@ def test_long_chains_of_constraints_are_not_degenerate(solver: Solver) -> None:
 
 def test_an_exact_optimum_is_found_out_where_the_linear_system_was_singular() -> None:
     """From the centre of a circle its row has no slope: the first step reaches the optimum with a multiplier of 1e9."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 0.0])
+    graph, x = drawn_to([1.0, 0.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
     solution = InteriorPoint().solve(graph, {x: np.zeros((1, 2))}, check=True)
     assert solution.dual("circle").item() == pytest.approx(0.0, abs=1e-9)
@@ -383,8 +376,7 @@ def test_multipliers_of_a_stalled_solve_are_estimated_from_the_gradients(
 def test_estimated_multipliers_have_the_sign_of_their_limits() -> None:
     """Pulled away from its limit, a row has none; between limits that meet it may have either."""
     for goal, lower, expected in ((3.0, -np.inf, 2.0), (0.0, -np.inf, 0.0), (3.0, 1.0, 2.0), (0.0, 1.0, -1.0)):
-        graph, x = graph_with(fg.Rn(1))
-        graph.minimize(fg.prior, x, [goal])
+        graph, x = drawn_to([goal])
         graph.constrain(lambda p: p, x, lower=lower, upper=1.0)
         program = graph.compile()
         multipliers = estimated(program, program.linearize({x: np.ones((1, 1))}), 1e-6)
@@ -429,8 +421,7 @@ def test_check_names_violated_rows_between_fixed_variables() -> None:
 
 def on_a_circle(size: float) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """The nearest point of a circle, whose row is in other units."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [3.0, 4.0])
+    graph, x = drawn_to([3.0, 4.0])
     graph.constrain(lambda p: size * ((p**2).sum(axis=1, keepdims=True) - 1.0), x, lower=0.0, upper=0.0, name="circle")
     return graph, {x: np.array([[2.0, -1.0]])}
 
@@ -451,8 +442,7 @@ def test_a_tolerance_of_nothing_is_refused() -> None:
 @pytest.mark.parametrize("size", [1e-6, 1e6])
 def test_large_numbers_are_judged_by_what_they_are_sums_of(size: float) -> None:
     """A gradient of 1e6 times a millionth is a sum that cancels; of one, it is none."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [1.0], sigma=1.0 / np.sqrt(size))
+    graph, x = drawn_to([1.0], sigma=1.0 / np.sqrt(size))
     graph.constrain(lambda p: p, x, lower=0.0, upper=0.0, name="zero")
     program = graph.compile()
     lin = program.linearize(program.values_from({x: np.zeros((1, 1))}))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import drawn_to, graph_with
 from unifg.solvers import (
     SQP,
     AugmentedLagrangian,
@@ -34,8 +35,7 @@ def opaque(p: Array, q: Array) -> Array:
 
 def survey(measure: Callable[[Array, Array], Array], seen: float, metre: float = 1.0) -> tuple[fg.Graph, fg.Family]:
     """A landmark with a weak prior where the pose is that measured a distance to it, and a guess of zeros."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(2), 2)
+    graph, p = graph_with(fg.Rn(2), 2, "p")
     graph.minimize(fg.prior, p[0], [0.0, 0.0], sigma=0.01 * metre, name="pose")
     graph.minimize(fg.prior, p[1], [0.0, 0.0], sigma=10.0 * metre, name="somewhere")
     graph.minimize(lambda a, b: measure(a, b) - seen * metre, p[0], p[1], sigma=0.1 * metre, name="distance")
@@ -54,8 +54,7 @@ def test_a_landmark_guessed_on_the_pose_is_found(solver: fg.Solver, measure: Cal
 @pytest.mark.parametrize("wrong", [0, 1, 2])
 def test_a_row_among_others_of_a_factor_among_others_is_found(wrong: int) -> None:
     """One of three landmarks is guessed where its distance is measured from; the others fit without a residual."""
-    graph = fg.Graph()
-    p = graph.variables("p", fg.Rn(2), 3)
+    graph, p = graph_with(fg.Rn(2), 3, "p")
     guess = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0]])
     guess[wrong] = 0.0
     graph.minimize(fg.prior, p, guess, sigma=10.0, name="somewhere")
@@ -84,27 +83,21 @@ def test_a_minimum_at_a_kink_stays(solver: fg.Solver) -> None:
 
 
 def test_what_is_flat_on_both_sides_stays_and_limits_count() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 2)
-    graph.minimize(fg.prior, x, [2.0], name="prior")
+    graph, x = drawn_to([2.0], 2, name="prior")
     graph.minimize(lambda v: np.minimum(v, 1.0) - 3.0, x[0], name="saturated")
     graph.minimize(lambda v: np.abs(v - 2.0) + 1.0, x[1], name="held down")
     solution = fg.solve(graph, {x: [[2.0], [2.0]]}, check=True)
     np.testing.assert_allclose(solution[x], 2.0)
-    ridge = fg.Graph()
-    y = ridge.variables("y", fg.Rn(1), 1)
+    ridge, y = graph_with(fg.Rn(1), 1, "y")
     ridge.minimize(lambda v: 2.0 - np.abs(v), y, name="ridge")
     ridge.bound(y, lower=-1.0, upper=1.0, name="limits")
     assert abs(InteriorPoint().solve(ridge, {y: [[0.0]]}, check=True)[y][0, 0]) == pytest.approx(1.0, abs=1e-5)
 
 
 def test_scalar_costs_and_saddles() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
-    graph.minimize(fg.prior, x, [0.0, 0.0], name="prior")
+    graph, x = drawn_to([0.0, 0.0], name="prior")
     graph.minimize_scalar(lambda v: -3.0 * np.linalg.norm(v, axis=1), x, name="away")
     assert np.linalg.norm(fg.solve(graph, {x: [[0.0, 0.0]]}, check=True)[x]) == pytest.approx(3.0, abs=1e-4)
-    saddle = fg.Graph()
-    y = saddle.variables("y", fg.Rn(1), 1)
+    saddle, y = graph_with(fg.Rn(1), 1, "y")
     saddle.minimize(lambda v: v**2 - 1.0, y, name="well")  # a maximum at zero, smooth: derivatives say all there is
     assert GaussNewton().solve(saddle, {y: [[0.0]]})[y][0, 0] == 0.0

@@ -11,7 +11,7 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems.control import Unicycle
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.known import STARTS, ecg2o, pose_chain, three_variable_qp
 from unifg.models import unicycle
 from unifg.problem.compiled_problem import CompiledProblem
@@ -36,8 +36,7 @@ def circle(
 
 def drive(goal: tuple[float, float, float], count: int = 12) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """A unicycle without limits."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(unicycle.tracking, x[-1], list(goal), sigma=0.1)
     graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
@@ -197,9 +196,7 @@ def chain(
     n, steps, unit = len(units), 20, np.array(units)
     transition = np.outer(unit, 1.0 / unit) * (np.eye(n) + 0.1 * np.diag(np.ones(n - 1), 1))
     rng = np.random.default_rng(0)
-    graph = fg.Graph()
-    x, w = graph.variables("x", fg.Rn(n), steps + 1), graph.variables("w", fg.Rn(1), steps)
-    b = graph.variables("b", fg.Rn(1), 1)
+    graph, x, w, b = graph_of(("x", fg.Rn(n), steps + 1), ("w", fg.Rn(1), steps), ("b", fg.Rn(1), 1))
     graph.minimize(fg.prior, x[0], np.zeros(n), sigma=unit * arrival, name="arrival")
     graph.minimize(fg.prior, b, [0.0], sigma=1.0, name="bias")
     graph.minimize(fg.prior, w, [0.0], sigma=noise, name="noise")
@@ -242,8 +239,7 @@ def test_hard_priors_that_hold_already_are_no_obstacle(
 
 def mover(steps: int, dt: float, dimension: int, seen: int | None) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """Places that only speeds and their changes pay for: every place has rows of exact ones and no curvature."""
-    graph = fg.Graph()
-    p, v = graph.variables("p", fg.Rn(dimension), steps + 1), graph.variables("v", fg.Rn(dimension), steps)
+    graph, p, v = graph_of(("p", fg.Rn(dimension), steps + 1), ("v", fg.Rn(dimension), steps))
     graph.fix(p[0], np.zeros(dimension))
     graph.minimize(lambda v: v, v, sigma=1.5, name="effort")
     graph.minimize(lambda a, b: b - a, v[:-1], v[1:], sigma=0.5, name="smooth")
@@ -307,8 +303,7 @@ def test_words_that_make_no_sense_are_refused() -> None:
 def test_a_full_step_that_will_probably_be_taken_is_linearised_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is not evaluated before, unless steps have been shortened of late."""
     stated = Unicycle("straight", False, 20).formulation()
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 21), graph.variables("u", fg.Rn(2), 20)
+    graph, x, u = graph_of(("x", fg.SE2, 21), ("u", fg.Rn(2), 20))
     graph.fix(x[0], [0.0, 0.5, -0.4])
     reference, cruise = stated.problem.reference()
     graph.minimize(unicycle.tracking, x, reference, sigma=1.0)
@@ -337,8 +332,7 @@ def test_chains_with_a_hard_end_are_solved(globalization: Literal["line-search",
 
 def corner(upper: float) -> tuple[fg.Graph, fg.Family]:
     """A point that is drawn to (1, 2), below a line and a parabola that meet at (1, 1)."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 2.0])
+    graph, x = drawn_to([1.0, 2.0])
     graph.constrain(lambda x: x[:, :1] + x[:, 1:], x, upper=upper, name="line")
     graph.constrain(lambda x: x[:, 1:] - x[:, :1] ** 2, x, upper=0.0, name="parabola")
     graph.bound(x, lower=-5.0, upper=5.0, name="box")

@@ -14,6 +14,7 @@ from scipy.io import loadmat
 
 import unifg as fg
 from hostile import MRCLAM, PLAZA
+from problems.graphs import graph_of
 from unifg.errors import FileFormatError, ModelError
 from unifg.files.contents import Limits
 from unifg.files.mrclam import NOBODY, MrclamLog, read_mrclam, write_mrclam
@@ -216,9 +217,7 @@ def test_the_log_of_a_mower_without_a_map(shared_data: Path) -> None:
     def ranged(x: Array, b: Array, long: Array, z: Array) -> Array:
         return np.asarray(long[:, :1] * np.linalg.norm(x[:, :2] - b, axis=1, keepdims=True) + long[:, 1:] - z)
 
-    graph = fg.Graph()
-    x, b = graph.variables("x", fg.SE2, len(path)), graph.variables("b", fg.Rn(2), 4)
-    long = graph.variables("long", fg.Rn(2), 1)
+    graph, x, b, long = graph_of(("x", fg.SE2, len(path)), ("b", fg.Rn(2), 4), ("long", fg.Rn(2), 1))
     graph.fix(x[0], path[0])
     spread = np.sqrt(np.maximum(np.diff(place), 1))[:, None] * [0.03, 0.03, 0.01]
     graph.minimize(fg.between, x[:-1], x[1:], fg.SE2.between(path[:-1], path[1:]), sigma=spread)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_of
 from unifg.layers import Layer
 from unifg.models import unicycle
 from unifg.solvers import InteriorPoint
@@ -27,8 +28,7 @@ def layer() -> Layer:
 
 
 def arguments(limit: float = 4.0) -> tuple[Any, ...]:
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, N + 1), graph.variables("u", fg.Rn(2), N)
+    graph, x, u = graph_of(("x", fg.SE2, N + 1), ("u", fg.Rn(2), N))
     start, goal, weight = graph.data("start", STARTS[0]), graph.data("goal", GOALS[0]), graph.data("weight", 0.5)
     graph.fix(x[0], start, name="start")
     graph.minimize(lambda pose, to: pose[:, :2] - to, x[-1], goal, sigma=weight, name="arrive")

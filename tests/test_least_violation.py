@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.models import unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.typing import Array
@@ -26,8 +26,7 @@ BACKENDS = {
 
 def pushed(lower: float, upper: float) -> Expected:
     """A point moved by u <= 1 that is to be 1.25 away: the motion and the goal share what is missing."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(1), 1), graph.variables("u", fg.Rn(1), 1)
+    graph, x, u = graph_of(("x", fg.Rn(1), 1), ("u", fg.Rn(1), 1))
     graph.minimize(fg.prior, u, [0.0])
     graph.constrain(lambda x, u: x - u, x, u, lower=0.0, upper=0.0, name="motion")
     graph.constrain(lambda x: x - 1.25, x, lower=0.0, upper=0.0, name="goal")
@@ -37,8 +36,7 @@ def pushed(lower: float, upper: float) -> Expected:
 
 def heavy_rows() -> Expected:
     """2 x + y >= 6 and 3 y <= 3 beside x <= 1: y is where (4 - y)^2 + (3 y - 3)^2 is least."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     graph.minimize(fg.prior, x, [5.0])
     graph.minimize(fg.prior, y, [-3.0])
     graph.constrain(lambda x, y: 2.0 * x + y, x, y, lower=6.0, name="far")
@@ -90,8 +88,7 @@ BEHIND = [InteriorPoint(), SQP(), SQP(hessian="exact"), AugmentedLagrangian()]
 @pytest.mark.parametrize("count", [15, 20, 25])
 def test_a_hard_goal_past_a_disc_dead_ahead_is_reached(solver: fg.Solver, count: int) -> None:
     """Steps all go through the disc by symmetry, to a saddle of the violation, which is none of its minima."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, u, [0.0, 0.0])
     graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 4.0 / count, lower=0.0, upper=0.0, name="motion")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.known import PROBLEMS, Guess, ecg2o, ecg2o_inequality, three_variable_qp
 from test_sqp_exact import two_rotations
 from unifg.models import unicycle
@@ -27,8 +27,7 @@ DAMPING = 1e-6
 def drive_to_a_pose() -> tuple[fg.Graph, Guess]:
     """Eight steps of a unicycle from one pose to another, both given; kernels, fixed variables, a robust cost."""
     count = 8
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, u, [0.5, 0.0], sigma=[0.4, 0.7], name="effort")
     graph.minimize(unicycle.rate, u[:-1], u[1:], sigma=0.3, name="rate")
@@ -41,8 +40,7 @@ def drive_to_a_pose() -> tuple[fg.Graph, Guess]:
 
 def repulsion() -> tuple[fg.Graph, Guess]:
     """Ta's obstacle cost 1/d, on a line."""
-    graph, x = graph_with(fg.Rn(2), 2)
-    graph.minimize(fg.prior, x, [1.0, 0.0], sigma=0.4, name="goal")
+    graph, x = drawn_to([1.0, 0.0], 2, sigma=0.4, name="goal")
     graph.minimize_scalar(lambda p: 1.0 / np.hypot(p[:, 0], p[:, 1] - 0.1), x, name="push")
     graph.constrain(lambda p, q: p[:, :1] * q[:, 1:] - 0.1, x[0], x[1], lower=0.0, upper=0.0, name="product")
     return graph, {x: np.array([[0.9, 0.4], [1.1, 0.3]])}
@@ -298,8 +296,7 @@ def test_damping_is_a_factor_of_its_own() -> None:
 
 
 def test_switched_off_factors_are_left_out() -> None:
-    graph, x = graph_with(fg.Rn(2), 3)
-    graph.minimize(fg.prior, x, [1.0, 2.0], name="prior")
+    graph, x = drawn_to([1.0, 2.0], 3, name="prior")
     graph.minimize(fg.prior, x, [5.0, 5.0], active=np.array([True, False, False]), name="some")
     graph.constrain(lambda p: p[:, :1], x, lower=0.0, upper=0.0, active=np.array([False, True, False]), name="wall")
     both = LinearGraphs.at(graph, {x: np.zeros((3, 2))})

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 
 import unifg as fg
 from problems.control import Unicycle
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.factors.robust import Formula, Loss, bend_of, form_of
 from unifg.modeling.terms import Cost
 from unifg.problem.compiled_problem import CompiledProblem
@@ -90,8 +90,7 @@ def objective(program: CompiledProblem, values: dict[fg.Family, Array], loss: Lo
 def poses(loss: Loss, compiled: bool) -> tuple[fg.Graph, dict[fg.Family, Array], Array]:
     """Poses and a shared offset; a pose twice in one factor, a fixed one, one factor switched off."""
     rng = np.random.default_rng(4)
-    graph = fg.Graph()
-    x, shared = graph.variables("x", fg.SE2, 5), graph.variables("shared", fg.Rn(2), 1)
+    graph, x, shared = graph_of(("x", fg.SE2, 5), ("shared", fg.Rn(2), 1))
     graph.fix(x[0], [0.1, 0.2, 0.3])
     first, second = np.array([0, 1, 2, 3, 2, 4]), np.array([1, 2, 3, 4, 2, 0])
     active: Array = np.array([True, True, False, True, True, True])
@@ -171,8 +170,7 @@ def beacons(loss: Loss, constrained: bool, equal: bool) -> tuple[fg.Graph, dict[
     measured = np.linalg.norm(truth - RANGES_FROM, axis=1)[:, None] + 0.2
     measured += 0.05 * np.array([[1.0], [-1.0], [0.5], [0.3], [-0.8], [0.4]])
     measured[3] += 2.0
-    graph = fg.Graph()
-    place, bias = graph.variables("place", fg.Rn(2), 1), graph.variables("bias", fg.Rn(1), 1)
+    graph, place, bias = graph_of(("place", fg.Rn(2), 1), ("bias", fg.Rn(1), 1))
     graph.minimize(
         lambda p, b, z: ranges_to(p, b) - z, place, bias, graph.data("z", measured, each=True), sigma=0.1, robust=loss
     )

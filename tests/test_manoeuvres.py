@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import drawn_to
 from scenes import check_offline, commands_of, data_of, tracks_of
 from unifg.models import unicycle
 from unifg.scenarios import command
@@ -148,8 +148,7 @@ def test_iterates_begin_with_the_guess_and_end_with_the_answer(name: str, solver
 
 
 def test_kept_values_are_copies() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [3.0])
+    graph, x = drawn_to([3.0])
     graph.bound(x, upper=1.0)
     solution = SQP(keep_values=True).solve(graph, {x: np.zeros((1, 1))})
     first, last = solution.history[0].values, solution.history[-1].values

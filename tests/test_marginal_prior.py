@@ -9,7 +9,7 @@ import pytest
 
 import unifg as fg
 from own_manifolds import Sphere
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.errors import GraphError
 from unifg.lie import Manifold
 from unifg.pose_graphs import manhattan
@@ -130,8 +130,7 @@ def manifolds() -> tuple[Manifold, ...]:
     ],
 )
 def test_a_variable_leaves_or_stays(leaving: list[int], staying: list[int], said: str) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(1), 3)
+    graph, x = graph_with(fg.Rn(1), 3)
     graph.minimize(fg.prior, x[0], [0.0], sigma=1.0, name="prior")
     graph.minimize(fg.between, x[:-1], x[1:], [1.0], sigma=1.0, name="between")
     solution = GaussNewton().solve(graph, {x: np.zeros((3, 1))})
@@ -162,8 +161,7 @@ def test_a_joint_prior_is_priors_side_by_side(rng: np.random.Generator) -> None:
 @pytest.mark.parametrize("kind", [Sphere, lambda: fg.Product(a=Sphere(), b=fg.Rn(1))], ids=["own", "product"])
 def test_a_joint_prior_takes_manifolds_of_the_user(kind: Callable[[], Manifold], rng: np.random.Generator) -> None:
     one, other = kind(), fg.SE2
-    graph = fg.Graph()
-    x, y = graph.variables("x", one, 1), graph.variables("y", other, 1)
+    graph, x, y = graph_of(("x", one, 1), ("y", other, 1))
     reference = np.concatenate([one.random(rng), other.random(rng)])
     information = np.eye(one.dim + 3) + 0.3
     graph.minimize(fg.joint_prior(one, other), x, y, reference, information=information)
@@ -189,8 +187,7 @@ def test_an_offset_moves_a_joint_prior_along_the_tangents(rng: np.random.Generat
 
 def test_a_marginal_prior_with_an_offset_is_the_same_model(rng: np.random.Generator) -> None:
     """Its lowest point is where the step leads, and its information is as symmetric as it is asked to be."""
-    graph = fg.Graph()
-    x, b = graph.variables("x", fg.SE2, 2), graph.variables("b", fg.Rn(3), 1)
+    graph, x, b = graph_of(("x", fg.SE2, 2), ("b", fg.Rn(3), 1))
     graph.minimize(fg.prior, x[0], fg.SE2.random(rng), sigma=0.3, name="prior")
     graph.minimize(lambda p, q, c: fg.SE2.between(p, q) + 1e-4 * c, x[0], x[1], b[0], sigma=0.2, name="step")
     guess = {x: np.stack([fg.SE2.random(rng) for _ in range(2)]), b: rng.normal(size=(1, 3))}

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from scripts import CHECKOUT
 from unifg import solvers
 from unifg.scenarios import command as shell
@@ -30,8 +30,7 @@ def test_lists_follow_from_the_classes() -> None:
 def test_a_class_takes_what_it_says(name: str) -> None:
     solver = names.backend(name)
     for limits, taken in (((0.0, 0.0), solver.constraints != "none"), ((-1.0, 1.0), solver.constraints == "all")):
-        graph, x = graph_with(fg.Rn(1))
-        graph.minimize(fg.prior, x, [1.0])
+        graph, x = drawn_to([1.0])
         graph.constrain(lambda x: x, x, lower=limits[0], upper=limits[1], name="limits")
         if taken:
             solver.prepare(graph)

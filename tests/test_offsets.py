@@ -11,6 +11,7 @@ import pytest
 
 import unifg as fg
 from problems import offsets
+from problems.graphs import graph_of
 from unifg.codegen.jit import compiled
 from unifg.factors.differences import directions_of, jacobian, one_by_one, scalar_slopes
 from unifg.lie.rn import minus
@@ -82,8 +83,7 @@ def derivatives_at(
 ) -> Callable[[float], tuple[Array, Array]]:
     """Jacobian, and Hessian of the Lagrangian, of one constraint with its world moved so far."""
     rng = np.random.default_rng(4)
-    graph = fg.Graph()
-    x, y = graph.variables("x", manifold, 2), graph.variables("y", manifold, 2)
+    graph, x, y = graph_of(("x", manifold, 2), ("y", manifold, 2))
     u, centre = graph.variables("u", fg.Rn(2), 2), graph.data("centre", CENTRE)
     points = {family: manifold.random(rng, (2,)) for family in (x, y)}
     for values in points.values():
@@ -127,8 +127,7 @@ def test_a_wide_step_is_not_believed_where_the_function_bends(how: str) -> None:
         r[1] = x[0] - centre[0]
         r[2] = r[3] = 0.0
 
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(2), 1), graph.variables("u", fg.Rn(1), 1)
+    graph, x, u = graph_of(("x", fg.Rn(2), 1), ("u", fg.Rn(1), 1))
     graph.minimize(fg.residual(fine, rows=4) if how == "njit" else batched(fine), x, u, CENTRE)
     lin = graph.compile().linearize({x: np.full((1, 2), 5e6), u: np.array([[1e-3]])})
     np.testing.assert_allclose(lin.jacobian.reshape(4, 3)[0], [0.0, 0.0, 1e3 * np.cos(1.0)], rtol=1e-4)

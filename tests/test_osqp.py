@@ -12,7 +12,7 @@ import pytest
 import unifg as fg
 from counts import Count, counting
 from problems.control import problems
-from problems.graphs import graph_with
+from problems.graphs import drawn_to
 from problems.known import active_bounds, short_drive
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solvers import SQP
@@ -89,14 +89,12 @@ def test_the_limit_is_counted_on_the_graph() -> None:
     assert abs(counted_iterations(short) - counted_iterations(longer)) <= 20
     assert 30 <= counted_iterations(short) <= 300
     assert OsqpRoute(short, 17).max_iterations == 17
-    empty, x = graph_with(fg.Rn(1))
-    empty.minimize(fg.prior, x, [0.0])
+    empty, _ = drawn_to([0.0])
     assert counted_iterations(empty.compile()) > 0
 
 
 def test_contradictions_and_crossed_limits_are_told() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.0])
+    graph, x = drawn_to([0.0])
     graph.constrain(lambda p: p, x, lower=1.0, upper=1.0, name="one")
     graph.constrain(lambda p: p, x, upper=0.0, name="none")
     program = graph.compile()
@@ -109,8 +107,7 @@ def test_contradictions_and_crossed_limits_are_told() -> None:
 
 def test_limits_that_cross_only_where_rows_are_scaled_print_nothing(capfd: pytest.CaptureFixture[str]) -> None:
     """An equality of a row that its weights have left next to nothing of."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.0], sigma=1e-9)
+    graph, x = drawn_to([0.0], sigma=1e-9)
     graph.constrain(lambda p: 1e-9 * p - 45.0, x, lower=0.0, upper=0.0, name="far")
     program = graph.compile()
     qp = subproblem(program, program.linearize(program.values_from({x: [[0.5]]})), 0.0)

@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from problems.known import STARTS, active_bounds, ecg2o, ecg2o_inequality, inactive_inequality, short_drive
 from unifg.solvers import Penalty
 
@@ -58,8 +58,7 @@ def test_a_light_last_weight_ends_without_the_claim() -> None:
 
 
 def test_infeasible_problem_is_named() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.0])
+    graph, x = drawn_to([0.0])
     graph.bound(x, lower=2.0, name="above")
     graph.constrain(lambda p: p, x, upper=1.0, name="below")
     solution = Penalty().solve(graph, {x: np.zeros((1, 1))})

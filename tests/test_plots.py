@@ -15,7 +15,7 @@ from matplotlib.quiver import Quiver
 
 import unifg as fg
 from own_manifolds import S2
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.known import line, short_drive
 from scripts import run_script
 from unifg.plots import factor_graph, shown
@@ -52,8 +52,7 @@ def test_matplotlib_is_imported_when_something_is_drawn_and_pyplot_never(tmp_pat
 
 
 def test_without_matplotlib_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    graph, x = line(1)
-    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph, _ = drawn_to([0.0, 0.0])
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r'pip install "unifg\[view\]"'):
         graph.draw()
@@ -162,8 +161,7 @@ def test_places_are_set_apart_about_their_middle(wanted: list[float]) -> None:
 
 
 def test_large_graphs_are_drawn_family_by_family() -> None:
-    graph = fg.Graph()
-    x, seen = graph.variables("x", fg.SE2, 2000), graph.variables("landmarks of the building", fg.Rn(2), 40)
+    graph, x, seen = graph_of(("x", fg.SE2, 2000), ("landmarks of the building", fg.Rn(2), 40))
     graph.minimize(fg.between, x[:-1], x[1:], np.zeros(3), name="odometry")
     graph.fix(x[0], np.zeros(3))
     for k in range(60):
@@ -230,8 +228,7 @@ def test_a_drive_is_a_path_and_controls_with_their_limits() -> None:
 
 @pytest.mark.parametrize("different", [False, True])
 def test_limits_are_shaded_or_dashed(different: bool) -> None:
-    graph, x = line(5)
-    graph.minimize(fg.prior, x, [3.0, -3.0])
+    graph, x = drawn_to([3.0, -3.0], 5)
     graph.bound(x, upper=[1.0, 2.0] if different else 1.0)
     graph.bound(x[1:3], lower=-2.0)
     graph.bound(x[2], lower=-1.0, upper=4.0)
@@ -256,8 +253,7 @@ def test_ellipses_and_bands_are_two_standard_deviations() -> None:
         turn = np.array([[np.cos(pose[2]), -np.sin(pose[2])], [np.sin(pose[2]), np.cos(pose[2])]])
         away = (np.asarray(path.vertices)[:-1] - pose[:2]) @ turn
         np.testing.assert_allclose((away[:, 0] / 0.3) ** 2 + (away[:, 1] / 0.1) ** 2, 4.0, rtol=1e-6)
-    graph, y = line(4)
-    graph.minimize(fg.prior, y, [0.0, 0.0], sigma=[0.5, 2.0])
+    graph, y = drawn_to([0.0, 0.0], 4, sigma=[0.5, 2.0])
     solution = GaussNewton().solve(graph, {y: np.ones((4, 2))})
     ax = titled(solution.plot(marginals=True))["x"]
     spans = [c.get_paths()[0].get_extents() for c in ax.collections]
@@ -363,8 +359,7 @@ def test_the_history_is_plotted_row_by_row() -> None:
 
 
 def test_histories_of_every_kind_are_plotted() -> None:
-    graph, x = line(1)
-    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph, x = drawn_to([1.0, 1.0])
     free = GaussNewton().solve(graph, {x: np.zeros((1, 2))})
     assert "violation" not in labelled(free.history.plot().axes[1])
     done = GaussNewton().solve(graph, {x: np.ones((1, 2))})
@@ -383,8 +378,7 @@ def test_marginals_are_the_blocks_of_the_joint_covariance() -> None:
     """Of every member and component, fixed and held ones too, with constraints and without."""
     state = fg.Product(pose=fg.SE2, steer=fg.Rn(1))
     for constrained in (False, True):
-        graph = fg.Graph()
-        s, u = graph.variables("s", state, 6), graph.variables("u", fg.Rn(2), 5)
+        graph, s, u = graph_of(("s", state, 6), ("u", fg.Rn(2), 5))
         graph.fix(s[0].pose, np.zeros(3))
         graph.minimize(fg.between, s[:-1].pose, s[1:].pose, [1.0, 0.0, 0.2], sigma=[0.1, 0.2, 0.05])
         graph.minimize(lambda a, b, c: b - a - c[:, :1], s[:-1].steer, s[1:].steer, u, sigma=0.3)

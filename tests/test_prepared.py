@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to
 from scripts import run_script
 from unifg.solvers import GaussNewton
 
@@ -144,8 +143,7 @@ class Particular(GaussNewton):
 
 
 def test_a_rehearsal_that_fails_fails_nothing() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [2.0], sigma=1.0)
+    graph, x = drawn_to([2.0], sigma=1.0)
     solution = Particular().prepare(graph).solve({x: [[0.0]]})
     assert solution.converged and solution[x][0, 0] == pytest.approx(2.0)
 

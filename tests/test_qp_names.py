@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import drawn_to
 from problems.known import PROBLEMS, Problem, active_bounds, short_drive
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
@@ -61,8 +61,7 @@ def test_one_subproblem_is_what_the_engine_finds(name: str) -> None:
 @pytest.mark.parametrize("name", ["osqp", *NAMES])
 def test_contradictions_are_left_to_the_elastic_problem(name: str) -> None:
     """Near the origin the linearised circle asks for an impossible step within the box."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph, x = drawn_to([1.0, 1.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
     graph.bound(x, lower=-2.0, upper=2.0)
     solution = SQP(qp=name).solve(graph, {x: np.array([[0.01, 0.02]])}, check=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from problems.known import line, short_drive
 from unifg.models import barriers
 from unifg.models.avoidance import inverse_distance_root, sphere_clearance
@@ -75,8 +75,7 @@ GUESSES: list[tuple[str, Callable[[fg.Family], dict[fg.Family, Array]], str]] = 
 def test_bad_guess_is_refused(
     solver: fg.Solver, guess: Callable[[fg.Family], dict[fg.Family, Array]], message: str
 ) -> None:
-    graph, x = line()
-    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph, x = drawn_to([0.0, 0.0], 4)
     with pytest.raises(fg.GraphError, match=message) as caught:
         solver.solve(graph, guess(x))
     assert caught.value.family in ("x", None)
@@ -113,8 +112,7 @@ def test_bad_data_and_duals_are_refused() -> None:
 
 
 def test_not_finite_at_the_guess_names_the_factor() -> None:
-    graph, x = line()
-    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph, x = drawn_to([1.0, 1.0], 4)
     graph.minimize(lambda p: np.log(p), x, name="logarithm")
     guess = np.ones((4, 2))
     guess[2, 1] = -1.0
@@ -156,8 +154,7 @@ def test_check_finds_what_nothing_determines() -> None:
 
 
 def test_check_finds_dependent_constraints_and_bad_residuals() -> None:
-    graph, x = line(2)
-    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph, x = drawn_to([0.0, 0.0], 2)
     graph.constrain(lambda p: p[:, :1], x[0], lower=1.0, upper=1.0, name="once")
     graph.constrain(lambda p: 2.0 * p[:, :1], x[0], lower=2.0, upper=2.0, name="twice")
     found = graph.check({x: np.zeros((2, 2))}).findings
@@ -182,8 +179,7 @@ def test_a_constant_that_is_not_finite_is_named_and_not_the_guess() -> None:
 
 
 def test_names_do_not_take_the_place_of_families() -> None:
-    graph, x = line()
-    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph, x = drawn_to([0.0, 0.0], 4)
     guess = np.zeros((len(x), 2))
     with pytest.raises(fg.GraphError, match="contains 'x', which is no family of this graph: take the family itself"):
         GaussNewton().solve(graph, {"x": guess})  # type: ignore[dict-item]
@@ -200,8 +196,7 @@ def test_names_do_not_take_the_place_of_families() -> None:
 
 
 def test_a_limit_may_be_infinite_if_it_is_given() -> None:
-    graph, x = line()
-    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph, x = drawn_to([0.0, 0.0], 4)
     graph.bound(x, lower=-np.inf, upper=np.inf)
     assert AugmentedLagrangian().solve(graph, {x: np.ones((len(x), 2))}).converged
 
@@ -284,8 +279,7 @@ def guess_of(x: fg.Family) -> dict[fg.Family, Array]:
 
 @pytest.mark.parametrize(("make", "bad", "message"), OPTIONS, ids=[message for *_, message in OPTIONS])
 def test_options_of_another_kind_are_refused(make: Any, bad: Any, message: str) -> None:
-    graph, x = line()
-    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph, x = drawn_to([0.0, 0.0], 4)
     with pytest.raises(fg.UnifgError, match=message):
         make(graph, x, bad)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.elimination.factorization import Factorization
 from unifg.files.g2o import read_g2o
 from unifg.lie import LieGroup
@@ -287,8 +287,7 @@ def test_an_exact_answer_of_zero_takes_few_steps() -> None:
 
 def test_scalar_costs_keep_the_gradient_and_constraints_the_kkt_test() -> None:
     """A cost that is not a square has no zero point: its stationarity is the gradient, in the user's units."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [2.0], sigma=1e-3)
+    graph, x = drawn_to([2.0], sigma=1e-3)
     graph.minimize_scalar(lambda a: 5.0 + 0.0 * a[:, 0], x, name="constant")
     lin = graph.compile().linearize({x: np.array([[2.0 + 1e-9]])})
     assert fg.optimality(graph.compile(), lin, np.zeros(0)).stationarity == pytest.approx(1e-3, rel=1e-3)
@@ -333,8 +332,7 @@ def test_published_optima_in_other_units(shared_data: Path, name: str, chi2: flo
 
 def beside(size: float, linked: bool) -> tuple[fg.Graph, dict[fg.Family, Array], fg.Family]:
     """One nonlinear unknown, and priors that contradict each other by ``size`` sigma, linked to it or not."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     graph.minimize(fg.prior, x, [0.0], sigma=1.0, name="here")
     graph.minimize(fg.prior, x, [size], sigma=1.0, name="there")
     graph.minimize(lambda y: np.concatenate([y**2 - 9.0, 0.3 * (y - 4.0), np.exp(0.3 * y) - 2.7], axis=1), y)
@@ -395,8 +393,7 @@ def test_a_solve_ends_when_every_variable_has_converged(solver: type[fg.Solver])
 def test_soft_modes_beside_gross_errors_converge() -> None:
     """The long bends of a chain have gradients of a thousandth of their error."""
     rng = np.random.default_rng(2)
-    graph = fg.Graph()
-    x, z = graph.variables("x", fg.SE2, 1000), graph.variables("z", fg.Rn(1), 1)
+    graph, x, z = graph_of(("x", fg.SE2, 1000), ("z", fg.Rn(1), 1))
     steps = np.tile([1.0, 0.0, 0.0], (999, 1)) + 0.02 * rng.standard_normal((999, 3))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.between, x[:-1], x[1:], steps, sigma=0.02)
@@ -446,8 +443,7 @@ def edged(height: float, far: float) -> Callable[[float], Made]:
     """The distance from 2, above or below ``height``, beside priors that contradict each other by ``far`` sigma."""
 
     def make(start: float) -> Made:
-        graph = fg.Graph()
-        y, z = graph.variables("y", fg.Rn(1), 1), graph.variables("z", fg.Rn(1), 1)
+        graph, y, z = graph_of(("y", fg.Rn(1), 1), ("z", fg.Rn(1), 1))
         graph.minimize(lambda y: np.abs(y - 2.0) + height, y)
         graph.minimize(fg.prior, z, [0.0], name="here")
         graph.minimize(fg.prior, z, [far], name="there")
@@ -468,8 +464,7 @@ def test_a_kink_is_not_undetermined(solver: fg.Solver, far: float) -> None:
 @pytest.mark.parametrize("far", [0.0, 2e8])
 @pytest.mark.parametrize("solver", BACKENDS, ids=lambda s: s.name)
 def test_a_maximum_is_not_undetermined(solver: fg.Solver, far: float) -> None:
-    graph = fg.Graph()
-    y, z = graph.variables("y", fg.Rn(1), 1), graph.variables("z", fg.Rn(1), 1)
+    graph, y, z = graph_of(("y", fg.Rn(1), 1), ("z", fg.Rn(1), 1))
     graph.minimize(lambda y: y**2 - 4.0, y)
     graph.minimize(fg.prior, z, [far])
     graph.minimize(fg.prior, z, [0.0], name="other")

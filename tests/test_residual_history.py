@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from problems.known import short_drive
 from unifg.scenarios.scenes.residual_plot import ResidualMonitor, residual_picture
 from unifg.solution.history import factor_norms
@@ -31,8 +31,7 @@ from unifg.typing import Array
 
 def everything(scalar: bool) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """A graph with a term of every kind, some of it inactive."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(2), 4), graph.variables("y", fg.Rn(1), 3)
+    graph, x, y = graph_of(("x", fg.Rn(2), 4), ("y", fg.Rn(1), 3))
     graph.minimize(fg.prior, x, np.array([1.0, 2.0]), sigma=[0.5, 2.0], name="prior")
     seen = np.array([True, False, True])
     information = np.array([[2.0, 0.5], [0.5, 1.0]])

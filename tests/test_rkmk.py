@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_of
 from unifg.factors.differences import jacobian
 from unifg.models import quadrotor, rkmk, unicycle
 from unifg.models.rkmk import Method
@@ -76,8 +77,7 @@ def test_sign_inside_the_residual() -> None:
 def test_drives_as_a_hard_constraint(form: Method) -> None:
     """A vehicle in a current reaches a goal with hard trapezoid dynamics; the defect is met everywhere."""
     count, h = 10, 0.2
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, x[-1], [1.5, 0.5, 0.4], sigma=0.1)
     graph.minimize(fg.prior, u, [0.5, 0.0])
@@ -122,8 +122,7 @@ def test_steps_are_traced_and_differenced_where_f_cannot_be(field: Any, route: s
     rng = np.random.default_rng(3)
     x, u = fg.SE2.random(rng, (5,)), rng.normal(size=(4, 1))
     x[1] = x[0]  # where the logarithm is zero
-    graph = fg.Graph()
-    poses, controls = graph.variables("x", fg.SE2, 5), graph.variables("u", fg.Rn(1), 4)
+    graph, poses, controls = graph_of(("x", fg.SE2, 5), ("u", fg.Rn(1), 4))
     defect = rkmk.integrator(fg.SE2, field, "hermite-simpson")
     graph.minimize(defect, poses[:-1], controls, poses[1:], 0.3)
     program = graph.compile()

@@ -8,6 +8,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
+from problems.graphs import graph_of
 from unifg.models import bicycle, cart_pole, manipulator, quadrotor, rkmk, unicycle
 from unifg.models.bicycle import Bicycle
 from unifg.models.cart_pole import CartPole
@@ -190,8 +191,7 @@ def test_a_car_with_its_wheels_held_drives_a_circle(method: Any) -> None:
 def parked() -> tuple[fg.Graph, dict[Any, Array]]:
     """A car changes lanes past a disc and stops."""
     n, h = 16, 0.3
-    graph = fg.Graph()
-    x, u = graph.variables("x", bicycle.STATE, n + 1), graph.variables("u", bicycle.CONTROL, n)
+    graph, x, u = graph_of(("x", bicycle.STATE, n + 1), ("u", bicycle.CONTROL, n))
     graph.fix(x[0], bicycle.STATE.pack(pose=[0.0, 0.0, 0.0], speed=[3.0]))
     graph.fix(x[-1], bicycle.STATE.pack(pose=[12.0, 1.5, 0.0], speed=[0.0]))
     graph.minimize(fg.prior, u, np.zeros(2), sigma=[1.0, 0.2])
@@ -210,8 +210,7 @@ def clear_of_a_post(x: Array) -> Array:
 def swung_up() -> tuple[fg.Graph, dict[Any, Array]]:
     """Kelly's swing-up: one metre in two seconds, with at most 20 N."""
     n, h = 24, 2.0 / 24
-    graph = fg.Graph()
-    x, f = graph.variables("x", cart_pole.STATE, n + 1), graph.variables("f", cart_pole.FORCE, n)
+    graph, x, f = graph_of(("x", cart_pole.STATE, n + 1), ("f", cart_pole.FORCE, n))
     graph.fix(x[0], np.zeros(4))
     graph.fix(x[-1], [1.0, np.pi - 1e-12, 0.0, 0.0])
     graph.minimize(fg.prior, f, np.zeros(1), sigma=10.0)
@@ -223,8 +222,7 @@ def swung_up() -> tuple[fg.Graph, dict[Any, Array]]:
 def lifted() -> tuple[fg.Graph, dict[Any, Array]]:
     """An arm that hangs is lifted to hold its forearm level, by an elbow that is at its limit on the way."""
     n, h = 16, 0.04
-    graph = fg.Graph()
-    x, tau = graph.variables("x", manipulator.STATE, n + 1), graph.variables("tau", manipulator.TORQUES, n)
+    graph, x, tau = graph_of(("x", manipulator.STATE, n + 1), ("tau", manipulator.TORQUES, n))
     graph.fix(x[0], [-np.pi / 2, 0.0, 0.0, 0.0])
     graph.fix(x[-1], [-np.pi / 4, np.pi / 4, 0.0, 0.0])
     graph.minimize(fg.prior, tau, np.zeros(2), sigma=5.0)

@@ -15,7 +15,7 @@ import unifg as fg
 from benchmarks import gtsam_peer
 from benchmarks.wrong_closures import COLUMNS, METHODS, aligned_error, attempt
 from problems.closures import Claim, with_wrong_closures
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from unifg.errors import BackendError, GraphError
 from unifg.factors.robust import Graduated, Loss
 from unifg.files.g2o import read_g2o
@@ -147,8 +147,7 @@ def test_data_and_interruptions_reach_the_stages() -> None:
 
 
 def test_graduation_wants_a_loss_it_can_graduate() -> None:
-    graph, line = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, line, [1.0], robust=fg.Huber())
+    graph, line = drawn_to([1.0], robust=fg.Huber())
     with pytest.raises(BackendError, match="no term has a loss with surrogates"):
         GraduatedNonConvexity().solve(graph, {line: [[0.0]]})
     for bad in ({"growth": 1.0}, {"stage_iterations": 0}):

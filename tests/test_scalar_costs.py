@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_of
 from unifg.factors.differences import convexified
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.scalars import positive_part
@@ -63,8 +64,7 @@ def saddle(pose: Array, shared: Array) -> Array:
 def repelled(derivatives: Derivatives) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """Poses pushed by marks that come and go; a fixed pose, a shared number, a variable twice in one factor."""
     rng = np.random.default_rng(3)
-    graph = fg.Graph()
-    p, x, s = graph.variables("p", fg.Rn(3), 4), graph.variables("x", fg.SE2, 3), graph.variables("s", fg.Rn(1), 1)
+    graph, p, x, s = graph_of(("p", fg.Rn(3), 4), ("x", fg.SE2, 3), ("s", fg.Rn(1), 1))
     graph.fix(x[1], [0.3, -0.4, 0.5])
     graph.minimize(fg.prior, p, rng.standard_normal((4, 3)), sigma=0.7, name="goal")
     graph.minimize(fg.prior, x, np.zeros(3), sigma=0.5, name="pose")

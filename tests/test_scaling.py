@@ -10,7 +10,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from unifg.solvers import SQP
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
 from unifg.solvers.quadratic_programs.scaling import MODEST, Scaling
@@ -100,8 +100,7 @@ def test_a_scaled_subproblem_is_the_same_subproblem() -> None:
 
 def beside_disc(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
     """A point in a disc of radius one and beyond a wall ``gap`` outside of it."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [2.0, 0.5])
+    graph, x = drawn_to([2.0, 0.5])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="disc")
     graph.constrain(lambda p: p[:, :1], x, lower=1.0 + gap, name="wall")
     return graph, {x: np.array([[0.3, 0.2]])}
@@ -109,8 +108,7 @@ def beside_disc(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
 
 def between_lines(gap: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
     """Two half planes that miss each other by ``gap``."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [2.0, 0.5])
+    graph, x = drawn_to([2.0, 0.5])
     graph.constrain(lambda p: p.sum(axis=1, keepdims=True), x, upper=1.0, name="below")
     graph.constrain(lambda p: p.sum(axis=1, keepdims=True), x, lower=1.0 + gap, name="above")
     return graph, {x: np.array([[0.3, 0.2]])}

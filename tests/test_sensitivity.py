@@ -13,7 +13,7 @@ import pytest
 
 import unifg as fg
 from problems.control import Problem, Unicycle, problems, sixteen
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.models import unicycle
 from unifg.pose_graphs import manhattan, sphere
 from unifg.problem.fixed_columns import FixedColumns
@@ -279,9 +279,7 @@ def test_graduated_non_convexity_keeps_what_it_believes() -> None:
 def past_and_future() -> tuple[fg.Graph, fg.Family, fg.Family, dict[fg.Family, Array]]:
     """A unicycle that has measured its places, whose wheel radius is shared with what it is about to do."""
     rng = np.random.default_rng(4)
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 21), graph.variables("u", fg.Rn(2), 10)
-    slip = graph.variables("slip", fg.Rn(1), 1)
+    graph, x, u, slip = graph_of(("x", fg.SE2, 21), ("u", fg.Rn(2), 10), ("slip", fg.Rn(1), 1))
     driven = np.tile([1.0, 0.3], (10, 1))
     path = [np.zeros(3)]
     for control in driven:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.modeling.soft import SlackFamily
 from unifg.models.obstacles import disc_clearance
 from unifg.models.unicycle import dynamics
@@ -48,8 +48,7 @@ def ring(soft: Any, lower: Any = 1.0, upper: Any = None, **options: Any) -> tupl
 
 def by_hand(linear: float, quadratic: float, lower: float, upper: float) -> tuple[fg.Graph, dict[fg.Family, Any]]:
     """The same with slack variables of one's own."""
-    graph = fg.Graph()
-    x, s, t = graph.variables("x", fg.Rn(2), N), graph.variables("s", fg.Rn(1), N), graph.variables("t", fg.Rn(1), N)
+    graph, x, s, t = graph_of(("x", fg.Rn(2), N), ("s", fg.Rn(1), N), ("t", fg.Rn(1), N))
     graph.minimize(fg.prior, x, FAR, sigma=1.0, name="pull")
     graph.constrain(lambda x, s, t: length(x) + s - t, x, s, t, lower=lower, upper=upper, name="ring")
     graph.bound(s, lower=0.0)
@@ -103,8 +102,7 @@ STEPS = 12
 
 def drive(soft: Any, radius: float = 0.4) -> tuple[fg.Graph, dict[fg.Family, Array], fg.Family]:
     """A vehicle past a disc, by the functions that ship."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, STEPS + 1), graph.variables("u", fg.Rn(2), STEPS)
+    graph, x, u = graph_of(("x", fg.SE2, STEPS + 1), ("u", fg.Rn(2), STEPS))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.constrain(dynamics, x[:-1], u, x[1:], 0.3, lower=0.0, upper=0.0, name="dynamics")
     graph.minimize(fg.prior, x, [3.0, 0.2, 0.0], sigma=1.0, name="goal")
@@ -160,8 +158,7 @@ def test_a_drive_past_a_disc(solver: fg.Solver) -> None:
 @pytest.mark.parametrize("solver", [InteriorPoint(), SQP(), AugmentedLagrangian()], ids=named)
 def test_limits_that_exclude_each_other_give_way(solver: fg.Solver) -> None:
     def stated(soft: Any) -> tuple[fg.Graph, fg.Family]:
-        graph, x = graph_with(fg.Rn(1), 2)
-        graph.minimize(fg.prior, x, [0.0], sigma=1.0)
+        graph, x = drawn_to([0.0], 2, sigma=1.0)
         graph.bound(x, lower=2.0, name="least")
         graph.constrain(lambda x: x, x, upper=1.0, soft=soft, name="most")
         return graph, x
@@ -192,8 +189,7 @@ def stretch(x: Array) -> Array:
 def test_weights_of_rows_and_of_stages(each: bool, as_data: bool) -> None:
     """Row 0 pulls x down by w0 above 1, row 1 by 2 w1 above 1 / 2."""
     weights = np.array([[0.6, 0.25], [0.2, 0.1], [0.1, 0.9]]) if each else np.array([0.6, 0.25])
-    graph, x = graph_with(fg.Rn(1), 3)
-    graph.minimize(fg.prior, x, [3.0], sigma=1.0)
+    graph, x = drawn_to([3.0], 3, sigma=1.0)
     price: Any = graph.data("price", weights) if as_data else weights
     graph.constrain(stretch, x, upper=1.0, soft=price, name="both")
     run = InteriorPoint().prepare(graph)

@@ -9,7 +9,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.known import PROBLEMS, Problem, ecg2o, inactive_inequality, short_drive
 from unifg.solvers import (
     KKT,
@@ -130,8 +130,7 @@ def test_bazzana_stop_rule_does_not_claim_convergence() -> None:
 
 @pytest.mark.parametrize("solver", [AugmentedLagrangian(), SQP()], ids=["alm", "sqp"])
 def test_infeasible_problem_is_named(solver: fg.Solver) -> None:
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph, x = drawn_to([0.0, 0.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="inside")
     graph.bound(x, lower=[2.0, -9.0], upper=[9.0, 9.0], name="outside")
     solution = solver.solve(graph, {x: np.array([[0.5, 0.0]])})
@@ -216,8 +215,7 @@ def test_backends_are_silent(capfd: pytest.CaptureFixture[str]) -> None:
 
 def test_alm_leaves_a_subproblem_whose_steps_are_too_short_to_be_of_use() -> None:
     """At a kink the gradient never vanishes; what violation remains is for the multipliers, not for more steps."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     graph.minimize(lambda a: np.hstack([1.0 + np.abs(a), 30.0 * a]), x, name="kink")
     graph.minimize(fg.prior, y, [0.0], name="rest")
     graph.constrain(lambda b: b, y, lower=1.0, upper=1.0, name="hold")

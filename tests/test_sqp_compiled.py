@@ -9,9 +9,8 @@ from unittest.mock import PropertyMock, patch
 import numpy as np
 import pytest
 
-import unifg as fg
 from problems.control import Quadrotor, Unicycle
-from problems.graphs import graph_with
+from problems.graphs import drawn_to
 from problems.hock_schittkowski import SMALL
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution.solution import values_of
@@ -78,8 +77,7 @@ def test_completing_repairs_a_rough_answer() -> None:
 @pytest.mark.parametrize(("limit", "contradicts"), [(1.0 - 1e-4, True), (1.0 + 1e-4, False)])
 def test_contradicting_rows_are_proved_and_no_others(limit: float, contradicts: bool) -> None:
     """A sum that has to reach one beside limits that let it almost, or just."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [0.3, -5.0])
+    graph, x = drawn_to([0.3, -5.0])
     graph.constrain(lambda p: p[:, :1] + p[:, 1:], x, lower=1.0, name="sum")
     graph.bound(x, lower=[-np.inf, -np.inf], upper=[0.5, limit - 0.5])
     program = graph.compile()

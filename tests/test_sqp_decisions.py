@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to
 from problems.known import short_drive
 from unifg.solvers import SQP
 from unifg.solvers.globalize.feasibility_restoration import FALLING, PATIENCE, RestorationTrigger
@@ -48,8 +48,7 @@ def test_falling_by_little_at_a_time_is_not_falling() -> None:
 
 def line(limit: float = -1.0) -> tuple[fg.Graph, fg.Family]:
     """One number, to be at most ``limit``."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [3.0])
+    graph, x = drawn_to([3.0])
     graph.constrain(lambda p: p, x, upper=limit, name="limit")
     return graph, x
 

@@ -11,7 +11,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from problems.hock_schittkowski import SMALL
 from problems.known import PROBLEMS, Guess, Problem, ecg2o, ecg2o_inequality, hs6, pose_beside_disc, short_drive
 from unifg.problem.compiled_problem import CompiledProblem
@@ -198,8 +198,7 @@ def test_an_inequality_that_lets_go_is_noticed() -> None:
 
 def test_wrong_inertia_takes_gauss_newton_and_right_inertia_does_not() -> None:
     """On the circle H = (1 + 2 lambda) I: negative along the tangent for lambda < -1/2."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 0.0])
+    graph, x = drawn_to([1.0, 0.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
     program = graph.compile()
     program.bind({})

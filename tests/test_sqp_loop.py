@@ -11,7 +11,7 @@ import pytest
 
 import unifg as fg
 from problems.control import Quadrotor, Unicycle
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from problems.hock_schittkowski import SMALL
 from unifg.errors import GraphError
 from unifg.solution.solver import SolveState
@@ -77,8 +77,7 @@ def beyond() -> Stated:
 
 def apart() -> Stated:
     """Two circles that do not meet."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 0.3])
+    graph, x = drawn_to([1.0, 0.3])
     for k, place in enumerate((0.0, 3.0)):
         graph.constrain(lambda p, c: ((p - c) ** 2).sum(axis=1, keepdims=True), x, [place, 0.0], upper=1.0, name=f"{k}")
     return graph, {x: np.array([[0.5, 4.0]])}
@@ -86,8 +85,7 @@ def apart() -> Stated:
 
 def missed() -> Stated:
     """A square that is to be negative by a little: every linearisation can be met."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.3])
+    graph, x = drawn_to([0.3])
     graph.constrain(lambda p: p**2, x, upper=-1e-3, name="square")
     return graph, {x: np.ones((1, 1))}
 
@@ -110,8 +108,7 @@ def endless() -> Stated:
 
 def units() -> Stated:
     """A length in units of a micrometre beside one in kilometres."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1e6, 2e-3], sigma=[1e5, 1e-4])
+    graph, x = drawn_to([1e6, 2e-3], sigma=[1e5, 1e-4])
     graph.constrain(lambda p: p[:, :1] * 1e-6 + p[:, 1:] * 1e3, x, upper=2.0, name="sum")
     return graph, {x: np.zeros((1, 2))}
 
@@ -279,8 +276,7 @@ def test_a_violated_row_of_fixed_variables_is_found_before_the_first_step() -> N
 
 
 def test_a_start_that_cannot_be_evaluated_is_refused_by_name() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [5.0])
+    graph, x = drawn_to([5.0])
     graph.constrain(lambda p: np.log(p), x, lower=-3.0, name="log")
     with pytest.raises(GraphError, match="log"):
         SQP(qp="graph").solve(graph, {x: np.full((1, 1), -1.0)})

@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from problems.control import Unicycle
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.hock_schittkowski import SMALL
 from unifg.solution.optimality import Tolerances
 from unifg.solvers import SQP
@@ -54,8 +54,7 @@ def test_curvature_that_gauss_newton_lacks_is_seen_along_the_step(name: str, mos
 
 def test_missing_curvature_by_hand() -> None:
     """On the rim of a circle the Lagrangian's curvature is 1 + 2 lambda; Gauss-Newton knows the one."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 0.0])
+    graph, x = drawn_to([1.0, 0.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, upper=1.0, name="circle")
     program = graph.compile()
     before = program.linearize(program.values_from({x: np.array([[0.6, 0.8]])}))
@@ -90,8 +89,7 @@ def test_subproblems_on_the_graph_begin_from_the_last_multipliers() -> None:
 @pytest.mark.parametrize("correction", [True, False])
 def test_a_point_that_cannot_be_evaluated_is_not_taken(correction: bool) -> None:
     """The first step leads to where there is no logarithm."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [-5.0])
+    graph, x = drawn_to([-5.0])
     graph.constrain(lambda p: np.log(p), x, lower=-3.0, name="log")
     solution = SQP(qp="graph", second_order_correction=correction).solve(graph, {x: np.ones((1, 1))}, check=True)
     assert solution[x][0, 0] == pytest.approx(np.exp(-3.0), rel=1e-4)
@@ -108,8 +106,7 @@ def test_positions_in_small_units_beside_headings_are_scaled() -> None:
         gap: Array = b - a - 0.2 * along
         return gap
 
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(3), 9), graph.variables("u", fg.Rn(2), 8)
+    graph, x, u = graph_of(("x", fg.Rn(3), 9), ("u", fg.Rn(2), 8))
     graph.fix(x[0], np.zeros(3))
     graph.minimize(fg.prior, x[-1], np.array([1.0, 0.5, 0.3]) / unit, sigma=0.1 / unit)
     graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
@@ -150,8 +150,7 @@ def test_functions_that_know_their_batch(which: str, derivatives: Any) -> None:
         if which == "shared by chance":  # as long as the batch, and no row for each factor
             weight = np.tile(ROWS.sum(axis=0), (N, 1))
             function = lambda x, u, after, own: bent(x, u, after) + own.sum(axis=0) * x**2  # noqa: E731
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(STATES), N + 1), graph.variables("u", fg.Rn(CONTROLS), N)
+    graph, x, u = graph_of(("x", fg.Rn(STATES), N + 1), ("u", fg.Rn(CONTROLS), N))
     if which == "given each":
         more = (graph.data("rows", ROWS, each=True),)
     stated = fg.residual(function, derivatives=derivatives)
@@ -228,8 +227,7 @@ def test_solves_do_not_depend_on_how_a_function_is_called(solver: fg.Solver) -> 
 
     found = []
     for function in (long, short):
-        graph = fg.Graph()
-        x, u = graph.variables("x", fg.Rn(3), 11), graph.variables("u", fg.Rn(2), 10)
+        graph, x, u = graph_of(("x", fg.Rn(3), 11), ("u", fg.Rn(2), 10))
         graph.fix(x[0], np.zeros(3))
         graph.minimize(lambda u: u, u, name="effort")
         graph.constrain(function, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")

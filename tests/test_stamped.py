@@ -17,7 +17,7 @@ from numpy.random import Generator
 from scipy.io import loadmat
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.codegen.compile_counter import counting
 from unifg.codegen.jit import compiled
 from unifg.errors import ModelError
@@ -83,8 +83,7 @@ def test_interpolation_is_traced_with_exact_derivatives(name: str, rng: Generato
     def error(a: Array, b: Array, s: Array, h: Array, here: Array) -> Array:
         return manifold.local(here, between(a, b, s, h))
 
-    graph = fg.Graph()
-    a, b = graph.variables("a", manifold, count), graph.variables("b", manifold, count)
+    graph, a, b = graph_of(("a", manifold, count), ("b", manifold, count))
     given = [graph.data(str(k), part, each=True) for k, part in enumerate((s, h, here))]
     graph.minimize(fg.residual(error, derivatives="trace"), a, b, *given)
     lin = graph.compile().linearize({a: x, b: y})
@@ -420,8 +419,7 @@ def test_the_offset_of_a_clock_is_estimated(between: Interpolation | None, rng: 
     truth = np.array([drive(t) for t in step * np.arange(count)])
     if between:
         truth = np.concatenate([truth, np.tile([1.0, 0.0, 0.6], (count, 1))], axis=1)
-    graph = fg.Graph()
-    x, late = graph.variables("x", manifold, count), graph.variables("late", fg.Rn(1), 1)
+    graph, x, late = graph_of(("x", manifold, count), ("late", fg.Rn(1), 1))
     fixes = StampedMeasurements(place, 2, capacity=2, sigma=0.01, between=between, offset="late", name="fixes")
     fixes.state(graph, x)
     graph.minimize(fg.prior, x, truth, sigma=0.01, name="own clock")
@@ -447,8 +445,7 @@ def test_an_offset_that_is_known_moves_the_stamps() -> None:
 
 def test_errors_may_be_shipped_residuals_with_landmarks(rng: Generator) -> None:
     """The bearing and range of a landmark, itself unknown, seen between two nodes of a quadrotor."""
-    graph = fg.Graph()
-    x, mark = graph.variables("x", STATE, 4), graph.variables("mark", fg.Rn(2), 1)
+    graph, x, mark = graph_of(("x", STATE, 4), ("mark", fg.Rn(2), 1))
     seen = StampedMeasurements(
         landmarks.bearing_range,
         2,
@@ -587,8 +584,7 @@ def test_ranges_of_a_lawn_mower_between_sparse_nodes(shared_data: Path) -> None:
         distance = np.linalg.norm(x[:, :2] - z[:, :2], axis=1, keepdims=True)
         return np.asarray(distance * (1.0 + long[:, 1:]) + long[:, :1] - z[:, 2:])
 
-    graph = fg.Graph()
-    x, long = graph.variables("x", fg.SE2, count + 1), graph.variables("long", fg.Rn(2), 1)
+    graph, x, long = graph_of(("x", fg.SE2, count + 1), ("long", fg.Rn(2), 1))
     graph.minimize(fg.between, x[:-1], x[1:], moved, sigma=np.sqrt(every) * np.array([0.03, 0.03, 0.01]))
     graph.minimize(fg.prior, x[0], truth[0], sigma=[1.0, 1.0, 0.3])
     graph.minimize(fg.prior, long, [0.0, 0.0], sigma=[5.0, 0.2])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.models import obstacles, unicycle
 from unifg.solution.solver import Solver
 
@@ -38,8 +38,7 @@ def test_more_starts_find_the_lowest_of_many_minima() -> None:
 def test_starts_pass_an_obstacle_on_both_sides() -> None:
     """The guess goes straight through a disc that lies to one side: from there it is passed on the longer side."""
     count = 20
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     centre = graph.data("centre", [[1.0, 0.12]])
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.fix(x[-1], [2.0, 0.0, 0.0])

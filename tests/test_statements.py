@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.known import line, short_drive
 from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, GaussNewton, InteriorPoint, LevenbergMarquardt
@@ -22,8 +23,7 @@ States = Callable[[Any, Any, Any], object]  # mistakes that a type checker would
 
 def stage() -> tuple[fg.Graph, fg.Family, fg.Family]:
     """Four poses and three controls with a term and a datum, so that there is something to spoil."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 4), graph.variables("u", fg.Rn(2), 3)
+    graph, x, u = graph_of(("x", fg.SE2, 4), ("u", fg.Rn(2), 3))
     graph.data("dt", 0.1)
     graph.minimize(fg.prior, x, [0.0, 0.0, 0.0], sigma=0.1, name="kept")
     graph.minimize(fg.prior, u, [0.0, 0.0])
@@ -287,8 +287,7 @@ def test_numbers_that_lose_nothing_are_taken() -> None:
     ],
 )  # fmt: skip
 def test_a_component_that_is_not_there_names_those_that_are(asks: Callable[[Any], object], message: str) -> None:
-    graph = fg.Graph()
-    s = graph.variables("s", STATE, 3)
+    graph, s = graph_with(STATE, 3, "s")
     with pytest.raises(AttributeError, match=message):
         asks(s)
     assert not hasattr(s, "nothing") and s.steer.manifold == fg.Rn(1)
@@ -298,8 +297,7 @@ def test_a_component_that_is_not_there_names_those_that_are(asks: Callable[[Any]
 
 @pytest.mark.parametrize("index", ["steer", "stear", (0, 3), (slice(None), 3), 0.5, [[0], [1]], None, 3, [True]])
 def test_a_wrong_index_says_how_members_and_components_are_selected(index: Any) -> None:
-    graph = fg.Graph()
-    s = graph.variables("s", STATE, 3)
+    _, s = graph_with(STATE, 3, "s")
     for selected in (s, s[:], s.pose):
         with pytest.raises(fg.GraphError, match="family 's'") as caught:
             selected[index]
@@ -332,8 +330,7 @@ def test_a_graph_prints_as_a_table() -> None:
 
 
 def test_many_terms_that_are_alike_share_a_line() -> None:
-    graph = fg.Graph()
-    x, landmarks = graph.variables("x", fg.SE2, 200), graph.variables("l", fg.Rn(2), 5)
+    graph, x, landmarks = graph_of(("x", fg.SE2, 200), ("l", fg.Rn(2), 5))
     for k in range(199):
         graph.minimize(fg.between, x[k], x[k + 1], [1.0, 0.0, 0.0], name=f"step {k}")
     for k in range(50):
@@ -470,8 +467,7 @@ def test_prepared_solvers_and_solutions_keep_to_the_graph_that_they_were_made_of
 
 
 def test_stating_a_graph_again_and_again_leaves_nothing_behind() -> None:
-    graph, x = line(2)
-    graph.minimize(fg.prior, x, [0.0, 0.0])
+    graph, x = drawn_to([0.0, 0.0], 2)
     for k in range(5):
         goal = graph.data("goal", [float(k), 0.0])
         graph.minimize(fg.prior, x, goal, name="pull")
@@ -505,8 +501,7 @@ def test_zeros_and_ones_stand_for_booleans_in_data(given: object) -> None:
 
 
 def test_numbers_that_differ_by_rounding_are_told_as_they_are() -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.Rn(2), 1)
+    graph, x = graph_with(fg.Rn(2))
     with pytest.raises(fg.GraphError, match=r"0\.30000000000000004 > 0\.3"):
         graph.bound(x, lower=0.1 + 0.2, upper=0.3)
     information = np.array([[1e7, 3e6 + 1.0], [3e6, 1e7]])
@@ -532,8 +527,7 @@ def test_weights_and_limits_are_declared_to_have_a_row_for_each_factor(state: St
     full = row if row.dtype == bool else np.tile(row, (3,) + (1,) * row.ndim)
 
     def solved(declare: Callable[[fg.Graph, Array], Any], numbers: Array) -> Array:
-        graph = fg.Graph()
-        x = graph.variables("x", fg.Rn(3), 3)
+        graph, x = graph_with(fg.Rn(3), 3)
         graph.minimize(fg.prior, x, 4.0 * np.ones(3))
         state(graph, x, declare(graph, numbers))
         return InteriorPoint(tolerance=1e-9).solve(graph, {x: np.full((3, 3), 4.5)})[x]

@@ -17,7 +17,7 @@ from scipy.interpolate import (
 )
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from test_derive import curved, evaluated
 from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.operations import Op
@@ -313,8 +313,7 @@ def test_a_drive_over_tables_is_traced_and_answers_as_python_does(
 ) -> None:
     found, iterations = [], []
     for derivatives in (None, "differences"):
-        graph = fg.Graph()
-        x, u = graph.variables("x", fg.Rn(2), STEPS + 1), graph.variables("u", fg.Rn(1), STEPS)
+        graph, x, u = graph_of(("x", fg.Rn(2), STEPS + 1), ("u", fg.Rn(1), STEPS))
         own = drive if derivatives is None else fg.residual(drive, derivatives="differences")
         graph.constrain(own, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="drive")
         graph.fix(x[0], [0.0, 1.0])

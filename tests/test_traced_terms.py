@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.errors import GraphError
 from unifg.factors.autodiff.captured import captured_by
 from unifg.factors.autodiff.derived import derived
@@ -424,8 +424,7 @@ def test_rows_that_depend_on_other_factors_are_an_error(function: Function) -> N
 
 
 def test_the_first_row_of_a_shared_variable_is_everybody_s() -> None:
-    graph = fg.Graph()
-    x, centre = graph.variables("x", fg.Rn(2), N), graph.variables("c", fg.Rn(2), 1)
+    graph, x, centre = graph_of(("x", fg.Rn(2), N), ("c", fg.Rn(2), 1))
     graph.minimize(lambda x, c: x - c[0] - TARGETS[0, :2], x, centre)
     graph.minimize(lambda c: c - 1.0, centre)
     solution = GaussNewton().solve(graph, {x: np.zeros((N, 2)), centre: np.zeros((1, 2))})

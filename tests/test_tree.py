@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_of
 from test_horizon import LINE, Drive, line_window, step
 from test_horizon_times import CART, TARGET, TICK, TIMES, Refusing, loop_of, motion
 from unifg.codegen.compile_counter import counting
@@ -54,8 +55,7 @@ def horizon(tree: Tree = FORK, ends: Ends | None = None, **options: Any) -> Rece
 
 def by_hand(walls: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
     """States and controls of both paths of ``FORK``, the shared part and each tail as families of their own."""
-    graph = fg.Graph()
-    x, u = graph.variables("trunk", fg.Rn(2), 3), graph.variables("controls", fg.Rn(1), 2)
+    graph, x, u = graph_of(("trunk", fg.Rn(2), 3), ("controls", fg.Rn(1), 2))
     graph.fix(x[0], PRESENT)
     parts: list[tuple[Any, Any, float, float]] = [(x, u, float(np.min(walls)), 1.0)]
     for k, (wall, weight) in enumerate(zip(np.asarray(walls), np.asarray(weights), strict=True)):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.factors.autodiff.intervals import bounds
 from unifg.factors.autodiff.rows import traced
 from unifg.models import obstacles, unicycle
@@ -49,8 +49,7 @@ def test_no_value_lies_outside_of_the_bounds(name: str) -> None:
 
 
 def plan(radius: float) -> tuple[fg.Solution, fg.Family]:
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 6), graph.variables("u", fg.Rn(2), 5)
+    graph, x, u = graph_of(("x", fg.SE2, 6), ("u", fg.Rn(2), 5))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, x[-1], [2.0, 0.0, 0.0], sigma=0.1, name="goal")
     graph.minimize(fg.prior, u, [0.0, 0.0], sigma=1.0, name="effort")

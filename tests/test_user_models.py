@@ -10,6 +10,7 @@ import pytest
 
 import unifg as fg
 from moving import Carried
+from problems.graphs import graph_of
 from unifg.models import rkmk
 from unifg.models.rkmk import Method
 from unifg.models.tableau import METHODS, Tableau
@@ -100,9 +101,7 @@ def test_a_boat_finds_the_current_and_plans_with_it(method: Method) -> None:
     truth = np.array([0.4, -0.3])
     drive = np.stack([np.full(past, 1.0), 0.8 * np.sin(np.arange(past))], axis=1)
     sailed = rkmk.rollout(BOAT, boat, np.zeros(6), drive, truth, h=h, method=method)
-    graph = fg.Graph()
-    x, u = graph.variables("x", BOAT, count + 1), graph.variables("u", fg.Rn(2), count)
-    current = graph.variables("current", fg.Rn(2), 1)
+    graph, x, u, current = graph_of(("x", BOAT, count + 1), ("u", fg.Rn(2), count), ("current", fg.Rn(2), 1))
     dynamics = rkmk.integrator(BOAT, boat, method)
     graph.constrain(dynamics, x[:-1], u, current, x[1:], h, lower=0.0, upper=0.0, name="dynamics")
     graph.fix(u[:past], drive)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_with
 from scripts import run_script
 from unifg.solvers import SQP, GaussNewton
 
@@ -37,8 +37,7 @@ def test_verbose_prints_although_logging_is_not_configured(configure: str) -> No
 def test_verbose_logs_where_logging_is_configured(
     caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 2.0])
+    graph, x = drawn_to([1.0, 2.0])
     with caplog.at_level(logging.INFO, "unifg"):
         GaussNewton(verbose=True).solve(graph, {x: np.zeros((1, 2))})
     assert "iter " in caplog.text

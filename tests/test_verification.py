@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.factors.autodiff import symbols
 from unifg.factors.autodiff.calculus import jacobian
 from unifg.factors.autodiff.operations import Op
@@ -168,8 +168,7 @@ def test_a_solve_without_time_left_is_verified_after_the_next() -> None:
 
 
 def test_where_nothing_is_traced_nothing_is_left_unchecked() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [1.0])
+    graph, x = drawn_to([1.0])
     prepared = GaussNewton().prepare(graph)
     assert all(prepared.solve({x: np.zeros((1, 1))}).checked for _ in range(4))
 
@@ -273,8 +272,7 @@ def test_fields_of_discs_and_costs_with_kinks_raise_no_alarm(seed: int) -> None:
         rate = np.stack([u[:, 0] * np.cos(heading), u[:, 0] * np.sin(heading), u[:, 1]], axis=1)
         return np.asarray(after - x - 0.3 * rate)
 
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(3), steps + 1), graph.variables("u", fg.Rn(2), steps)
+    graph, x, u = graph_of(("x", fg.Rn(3), steps + 1), ("u", fg.Rn(2), steps))
     graph.fix(x[0], np.zeros(3))
     graph.constrain(moved, x[:-1], u, x[1:], lower=0.0, upper=0.0)
     gap: Function = lambda x: np.linalg.norm(x[:, None, :2] - centre, axis=2) - radius  # noqa: E731

@@ -10,7 +10,7 @@ import pytest
 from numba import njit
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.modeling.variables import Data
 from unifg.models import unicycle
 from unifg.problem.table import SLACKS
@@ -55,8 +55,7 @@ def _in_python(pose: Array) -> Array:
 
 def control() -> tuple[fg.Graph, dict[Any, Any], Data]:
     """A unicycle's plan: kernels, a NumPy function, bounds, a scalar cost, a soft and a fixed part, data."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 21), graph.variables("u", fg.Rn(2), 20)
+    graph, x, u = graph_of(("x", fg.SE2, 21), ("u", fg.Rn(2), 20))
     goal = graph.data("goal", [1.5, 0.6, 0.0])
     graph.fix(x[0], [0.0, 0.0, 0.0], name="start")
     graph.minimize(_missed, x[-1], goal, sigma=0.1, name="goal")
@@ -71,8 +70,7 @@ def control() -> tuple[fg.Graph, dict[Any, Any], Data]:
 def estimate() -> tuple[fg.Graph, dict[Any, Any]]:
     """A walk past trees: quaternions, a compiled function of one factor, robust losses, weights of all kinds."""
     rng = np.random.default_rng(1)
-    graph = fg.Graph()
-    x, trees = graph.variables("x", fg.SE3, 6), graph.variables("trees", fg.Rn(2), 2)
+    graph, x, trees = graph_of(("x", fg.SE3, 6), ("trees", fg.Rn(2), 2))
     active = np.array([True, True, False, True, True])
     information = np.diag([100.0, 100.0, 50.0, 400.0, 300.0, 400.0])
     information[0, 1] = information[1, 0] = 20.0
@@ -91,8 +89,7 @@ def estimate() -> tuple[fg.Graph, dict[Any, Any]]:
 
 def test_large_forces_are_judged_relative_to_their_size() -> None:
     """Regression test: a solution that passed by the relative numbers of the KKT test failed by absolute ones."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 500)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 500))
     graph.minimize(fg.prior, x, [1.0], sigma=0.01)
     graph.minimize(fg.prior, y, [0.0])
     graph.bound(x, upper=0.0, name="wall")
@@ -144,8 +141,7 @@ def test_a_perfect_fit_passes() -> None:
 
 def test_a_perfect_fit_at_zero_passes() -> None:
     """Variables that are zero have no size that rounding could be measured by."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(1), 1), graph.variables("y", fg.Rn(1), 1)
+    graph, x, y = graph_of(("x", fg.Rn(1), 1), ("y", fg.Rn(1), 1))
     graph.minimize(lambda a, b: 3.0 * a - b, x, y, sigma=0.5)
     graph.minimize(fg.prior, x, [0.0])
     graph.minimize(fg.prior, y, [0.0])
@@ -163,8 +159,7 @@ def _turned(x: Array, matrix: Array, r: Array) -> None:
 
 @pytest.mark.parametrize("count", [3, 2])
 def test_a_function_of_one_factor_takes_matrices_that_all_share(count: int) -> None:
-    graph, x = graph_with(fg.Rn(2), count)
-    graph.minimize(fg.prior, x, [1.0, 2.0])
+    graph, x = drawn_to([1.0, 2.0], count)
     matrix = np.array([[0.0, -1.0], [1.0, 0.0]])
     graph.constrain(fg.residual(_turned, rows=2), x, fg.shared(matrix), lower=-1.0, upper=0.5, name="turned")
     found = InteriorPoint().solve(graph, {x: np.zeros((count, 2))}, check=True).verify()
@@ -311,8 +306,7 @@ def test_a_solution_whose_data_are_gone_is_refused() -> None:
 
 
 def test_slopes_that_differences_cannot_tell_are_undecided() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [1.0])
+    graph, x = drawn_to([1.0])
     graph.constrain(lambda x: np.sin(6e4 * (x - 1.0)), x, upper=0.0, name="steep")
     solution = SQP().solve(graph, {x: [[1.0]]}, check=True)
     solution._multipliers[:] = 1e-11  # times slopes of 6e4, of which steps of 6e-5 see less
@@ -325,8 +319,7 @@ def test_slopes_that_differences_cannot_tell_are_undecided() -> None:
 @pytest.mark.parametrize("beside", [0.0, 1e-5, 2e-5, 3e-5, 5e-5])
 def test_a_kink_is_undecided(beside: float) -> None:
     """At a kink there is no slope, and beside it steps reach across: the bound tells, wherever it lies."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [2.0])
+    graph, x = drawn_to([2.0])
     graph.constrain(lambda x: np.maximum(x, 3.0 * x - 2.0), x, upper=1.0 - beside, name="bent")
     solution = InteriorPoint(tolerance=1e-9).solve(graph, {x: [[0.5]]})
     solution._lin.values.flat[:] = 1.0 - beside
@@ -366,8 +359,7 @@ def test_slopes_take_few_calls_where_the_function_allows_that(kind: str) -> None
         calls.append(len(x))
         return np.asarray(function(x, y, each, shared))
 
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.Rn(2), 5), graph.variables("y", fg.Rn(2), 5)
+    graph, x, y = graph_of(("x", fg.Rn(2), 5), ("y", fg.Rn(2), 5))
     active = np.array([True, True, False, True, True])
     given = fg.each(np.arange(1.0, 6.0)[:, None]), fg.shared([0.5, 0.7])
     graph.minimize(counted, x, y, *given, active=active, name="term")
@@ -410,8 +402,7 @@ def test_a_large_term_is_moved_call_by_call(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.parametrize(("limit", "price", "beside"), [(1.0, 10.0, 1e-7), (500.0, 1e9, 0.0)], ids=["sum", "ulp"])
 def test_what_slacks_do_not_pay_for_is_judged_as_by_the_solver(limit: float, price: float, beside: float) -> None:
     """Neither twice, with the length of the slack, nor where it is the last digit of the row."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [limit + 2.0])
+    graph, x = drawn_to([limit + 2.0])
     graph.constrain(lambda x: x, x, upper=limit, soft=price, name="wall")
     program, multipliers = graph.compile(), np.array([2.0, 2.0 - price])
 

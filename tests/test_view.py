@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from scripts import CHECKOUT, run_script
 from unifg import view
@@ -39,8 +39,7 @@ def offset_error(pose: Array, tree: Array, far: Array) -> Array:
 
 def chain(count: int = 5, group: Any = fg.SE2, offset: float = 0.0) -> tuple[fg.Solution, fg.Family, fg.Family]:
     """A way of poses a metre apart, and two trees seen from the first of them."""
-    graph = fg.Graph()
-    x, trees = graph.variables("x", group, count), graph.variables("trees", fg.Rn(group.point_dim), 2)
+    graph, x, trees = graph_of(("x", group, count), ("trees", fg.Rn(group.point_dim), 2))
     start = np.array(group.identity())
     start[0] += offset
     step = np.zeros(group.dim)
@@ -303,8 +302,7 @@ def test_rounding_is_not_refused() -> None:
 
 
 def test_what_has_no_place_is_refused_with_what_to_do() -> None:
-    graph = fg.Graph()
-    q, s = graph.variables("q", fg.Rn(7), 2), graph.variables("s", STATE, 3)
+    graph, q, s = graph_of(("q", fg.Rn(7), 2), ("s", STATE, 3))
     graph.minimize(fg.prior, q, np.zeros(7), sigma=1.0)
     graph.minimize(fg.prior, s, np.zeros(4), sigma=1.0)
     solution = GaussNewton().solve(graph, {q: np.zeros((2, 7)), s: np.zeros((3, 4))})

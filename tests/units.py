@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import unifg as fg
+from problems.graphs import graph_of
 from problems.known import Guess
 from unifg.typing import Array
 
@@ -68,8 +69,7 @@ def drive(
         slope[:, 0, :2] = 2.0 * clearance * position * (a[:, :2] * position - CENTRE)
         return [slope]
 
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(3), count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.Rn(3), count + 1), ("u", fg.Rn(2), count))
     graph.fix(x[0], np.zeros(3))
     pull, effort, change = cost * np.diag(state / SIGMA), cost * np.diag(input_ / 2.0), cost * np.diag(input_)
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 import unifg as fg
+from problems.graphs import graph_of
 from unifg.models import unicycle
 from unifg.typing import Array
 
 
 def around_a_disc() -> tuple[fg.Graph, dict[fg.Family, Array], fg.Data]:
     """Graph, guess and start."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, 21), graph.variables("u", fg.Rn(2), 20)
+    graph, x, u = graph_of(("x", fg.SE2, 21), ("u", fg.Rn(2), 20))
     start = graph.data("start", [0.0, 0.0, 0.0])
     graph.fix(x[0], start)
     graph.minimize(fg.prior, x[-1], [2, 1, 0], sigma=0.01, name="goal")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy import cos, exp, sin, sqrt
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Family, Selection
 from unifg.typing import Array, IntArray
@@ -105,8 +105,7 @@ def electrons(count: int) -> Stated:
 
 def chain(steps: int) -> Stated:
     """Potential energy of a chain of length 4 between (0, 1) and (1, 3)."""
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.Rn(3), steps + 1), graph.variables("slope", fg.Rn(1), steps + 1)
+    graph, x, u = graph_of(("x", fg.Rn(3), steps + 1), ("slope", fg.Rn(1), steps + 1))
 
     def rate(x: Any, u: Any) -> Any:
         length = sqrt(1.0 + u[:, 0] ** 2)

@@ -1,11 +1,35 @@
-"""The graph that most tests begin with: one family, and nothing stated of it yet."""
+"""The graphs that most tests begin with: their families, and nothing or one wish stated of them yet."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any, overload
+
 import unifg as fg
+
+Members = tuple[str, fg.Manifold, int]
 
 
 def graph_with(manifold: fg.Manifold, count: int = 1, name: str = "x") -> tuple[fg.Graph, fg.Family]:
     """An empty graph and its one family of variables."""
     graph = fg.Graph()
     return graph, graph.variables(name, manifold, count)
+
+
+@overload
+def graph_of(first: Members, second: Members, /) -> tuple[fg.Graph, fg.Family, fg.Family]: ...
+@overload
+def graph_of(
+    first: Members, second: Members, third: Members, /
+) -> tuple[fg.Graph, fg.Family, fg.Family, fg.Family]: ...
+def graph_of(*families: Members) -> tuple[Any, ...]:
+    """An empty graph and its families of variables: of each the name, the manifold and how many there are."""
+    graph = fg.Graph()
+    return graph, *(graph.variables(*members) for members in families)
+
+
+def drawn_to(target: Sequence[float], count: int = 1, **options: Any) -> tuple[fg.Graph, fg.Family]:
+    """A graph of points that each wants to be at a target, and the points; options are those of the wish."""
+    graph, x = graph_with(fg.Rn(len(target)), count)
+    graph.minimize(fg.prior, x, target, **options)
+    return graph, x

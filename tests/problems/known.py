@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.papers import ecg2o as study
 from unifg.typing import Array
@@ -49,8 +49,7 @@ def line(count: int = 4) -> tuple[fg.Graph, fg.Family]:
 
 def ecg2o_inequality() -> tuple[fg.Graph, Guess]:
     """A circle cut by an ellipse."""
-    graph, x = graph_with(fg.Rn(2))
-    graph.minimize(fg.prior, x, [1.0, 1.0])
+    graph, x = drawn_to([1.0, 1.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
     graph.constrain(lambda p: p**2 @ np.array([[4.0], [0.25]]), x, upper=1.0, name="ellipse")
     return graph, {x: np.array([[-1.0, 2.0]])}
@@ -69,16 +68,14 @@ def three_variable_qp() -> tuple[fg.Graph, Guess]:
 
 def inactive_inequality() -> tuple[fg.Graph, Guess]:
     """Read literally, Bazzana's eq. 19 answers 0.867 here."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.2], sigma=0.5**0.5)
+    graph, x = drawn_to([0.2], sigma=0.5**0.5)
     graph.bound(x, upper=1.0, name="limit")
     return graph, {x: np.array([[5.0]])}
 
 
 def active_bounds() -> tuple[fg.Graph, Guess]:
     """One bound active above, one below, one not: the signs of the multipliers."""
-    graph, x = graph_with(fg.Rn(3))
-    graph.minimize(fg.prior, x, [3.0, -3.0, 0.5])
+    graph, x = drawn_to([3.0, -3.0, 0.5])
     graph.bound(x, lower=-1.0, upper=1.0, name="box")
     return graph, {x: np.zeros((1, 3))}
 
@@ -172,8 +169,7 @@ def product_state() -> tuple[fg.Graph, Guess]:
 def short_drive(disc: bool = True) -> tuple[fg.Graph, Guess]:
     """Twelve steps of a unicycle, past a disc if wanted, with hard dynamics and limits."""
     count, dt = 12, 0.2
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(unicycle.tracking, x[-1], [2.0, 0.1, 0.0], sigma=0.1)
     graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
@@ -229,8 +225,7 @@ def anchored_square() -> tuple[fg.Graph, Guess]:
 def rolled_out_drive() -> tuple[fg.Graph, Guess]:
     """A drive whose guess keeps its dynamics, its start, stated as a constraint, and its limits."""
     count, dt = 12, 0.2
-    graph = fg.Graph()
-    x, u = graph.variables("x", fg.SE2, count + 1), graph.variables("u", fg.Rn(2), count)
+    graph, x, u = graph_of(("x", fg.SE2, count + 1), ("u", fg.Rn(2), count))
     graph.constrain(fg.prior, x[0], [0.0, 0.0, 0.0], lower=0.0, upper=0.0, name="start")
     graph.minimize(unicycle.tracking, x[-1], [1.5, 0.6, 0.4], sigma=0.1)
     graph.minimize(fg.prior, u, [0.0, 0.0], sigma=2.0)
@@ -244,8 +239,7 @@ def rolled_out_drive() -> tuple[fg.Graph, Guess]:
 
 def inverse_distance() -> tuple[fg.Graph, Guess]:
     """A scalar cost 1/d that pushes away from the origin against a quadratic pull: d^3 = 1 by hand."""
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, [0.0])
+    graph, x = drawn_to([0.0])
     graph.minimize_scalar(lambda p: 1.0 / p[:, 0], x, name="push")
     graph.bound(x, lower=0.1, name="positive")
     return graph, {x: np.array([[3.0]])}

@@ -10,7 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.typing import Array, ArrayLike
 
 Built: TypeAlias = tuple[fg.Graph, dict[fg.Family, Array]]
@@ -159,8 +159,7 @@ def mean_with_limit() -> Built:
 
 def slew(steps: int = 6) -> Built:
     """Rest to rest turn of least effort: the rate is constant and about one axis."""
-    graph = fg.Graph()
-    r, rate = graph.variables("r", fg.SO3, steps + 1), graph.variables("rate", fg.Rn(3), steps)
+    graph, r, rate = graph_of(("r", fg.SO3, steps + 1), ("rate", fg.Rn(3), steps))
     graph.fix(r[0], turned(UP, 0.0)[0])
     graph.fix(r[-1], turned(np.array([0.0, 0.6, 0.8]), 2.1)[0])
     graph.minimize(fg.prior, rate, np.zeros(3), name="effort")
@@ -273,8 +272,7 @@ SCREW = np.concatenate([0.4 * AXIS, 0.3 * AXIS])  # translation along the axis o
 
 def rigid_link() -> Built:
     """Two poses measured 3 m apart that are held 2 m apart by a rigid link: each gives half."""
-    graph = fg.Graph()
-    x, y = graph.variables("x", fg.SE3, 1), graph.variables("y", fg.SE3, 1)
+    graph, x, y = graph_of(("x", fg.SE3, 1), ("y", fg.SE3, 1))
     graph.minimize(fg.prior, x, posed([0.0, 0.0, 0.0], UP, 0.0)[0], name="first")
     graph.minimize(fg.prior, y, posed([3.0, 0.0, 0.0], UP, 0.0)[0], name="second")
     link = posed([2.0, 0.0, 0.0], UP, 0.0)
