@@ -12,6 +12,7 @@ from benchmarks.report import listing, words
 from benchmarks.section import Result, goal
 from benchmarks.timing import interleave, milliseconds, shown, timed
 from problems.control import Unicycle
+from problems.graphs import graph_of
 from unifg.models import unicycle
 from unifg.solvers import AugmentedLagrangian, GaussNewton
 
@@ -31,9 +32,7 @@ def chain(kind: str, horizon: int) -> tuple[fg.Solver, fg.Graph, fg.Guess]:
     problem = Unicycle("straight", False, horizon)
     weights = np.vstack([np.tile(problem.stage, (horizon, 1)), problem.terminal])
     reference, cruise = problem.reference()
-    graph = fg.Graph()
-    x = graph.variables("pose", fg.SE2, horizon + 1)
-    u = graph.variables("control", fg.Rn(2), horizon)
+    graph, x, u = graph_of(("pose", fg.SE2, horizon + 1), ("control", fg.Rn(2), horizon))
     graph.fix(x[0], problem.start)
     graph.minimize(unicycle.tracking, x, reference, sigma=weights**-0.5, name="tracking")
     graph.minimize(fg.prior, u, cruise, sigma=problem.effort**-0.5, name="effort")

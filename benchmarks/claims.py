@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from benchmarks.comparison import Row
+from benchmarks.comparison import Row, middle
 from benchmarks.report import listing
 from benchmarks.runner import Cell, Study
 from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
@@ -80,7 +80,7 @@ def summary(cases: list[Case], names: Iterable[str]) -> str:
         "lost to IPOPT": lambda mine: str(sum(case.ipopt.solved and a.status != "CONVERGED" for case, a in mine)),
         "IPOPT lost": lambda mine: str(sum(not case.ipopt.solved for case, _ in solved(mine))),
         "cost below / at / above IPOPT's": beside,
-        "iterations": lambda mine: f"{np.median([a.iterations for _, a in solved(mine)]):.0f}" if solved(mine) else "-",
+        "iterations": lambda mine: middle([a.iterations for _, a in solved(mine)]),
         "CPU [s]": lambda mine: f"{np.median([a.seconds for _, a in mine]):.2f}",
     }
     groups = {(name,): [(case, case.answers[name]) for case in cases if name in case.answers] for name in names}

@@ -52,6 +52,22 @@ def bracketed(differences: Array) -> str:
     return f"({digits(low, '+')} .. {digits(high, '+')})"
 
 
+def mean(name: str, scale: float = 1.0) -> Callable[[Sequence[Row]], str]:
+    """Mean of a measure of rows."""
+    return lambda rows: f"{scale * np.mean([row[name] for row in rows]):.1f}"
+
+
+def middle(values: Sequence[float], places: int = 0) -> str:
+    """Median with so many places; a dash where there is nothing."""
+    return f"{np.median(values):.{places}f}" if values else "-"
+
+
+def portion(some: int, of: int) -> str:
+    """95 % interval of a share [%]."""
+    low, high = share(some, of)
+    return f"{100 * low:.0f} .. {100 * high:.0f} %"
+
+
 def difference(values: Array, scale: float = 1.0) -> str:
     """Mean of paired differences and, in brackets, its interval; differences that are not finite are left out."""
     known = scale * np.asarray(values, dtype=np.float64)

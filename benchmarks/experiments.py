@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from benchmarks.comparison import interval, share
+from benchmarks.comparison import interval, portion
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.report import CAMPAIGNS, OUT, table
 from benchmarks.runner import Timing
@@ -93,12 +93,11 @@ def beside(drives: pd.DataFrame) -> str:
     base = succeeded(drives[drives["planner"] == first]).set_index(pair)[DURATION]
     for planner, mine in drives.groupby("planner", sort=False):
         good = succeeded(mine)
-        low, high = share(len(good), len(mine))
         extra = (good.set_index(pair)[DURATION] - base).dropna().to_numpy()
         spreads = relative(good)
         rows.append((
             str(planner), str(mine.groupby(["table", "leg"]).ngroups), str(len(mine)), str(len(good)),
-            f"{100 * low:.0f} .. {100 * high:.0f} %", f"{mine[CONTACTS].sum():.0f}",
+            portion(len(good), len(mine)), f"{mine[CONTACTS].sum():.0f}",
             f"{1e3 * mine[CLEARANCE].min():.0f}", f"{1e3 * mine[CLEARANCE].mean():.0f}",
             *(f"{spreads[measure].mean():.2f} %" for measure in (LENGTH, DURATION)),
             "-" if planner == first or len(extra) < 2 else

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from benchmarks.comparison import digits, interval
+from benchmarks.comparison import difference
 from benchmarks.report import table
 from benchmarks.runner import Timing
 from unifg.scenarios.quadrotor.cascade import CascadeSettings
@@ -102,9 +102,8 @@ def paired(flown: Sequence[Flown], others: Sequence[Flown], part: Literal["error
     """Mean of the differences, seed by seed [mm], and the bootstrap's 95 % interval; of two or fewer the span."""
     if flown is others:
         return "-"
-    apart = 1e3 * np.array([getattr(one, part) - getattr(two, part) for one, two in zip(flown, others, strict=True)])
-    low, high = interval(apart) if len(apart) > 2 else (apart.min(), apart.max())
-    return f"{digits(apart.mean(), '+')} ({digits(low, '+')} .. {digits(high, '+')})"
+    apart = [getattr(one, part) - getattr(two, part) for one, two in zip(flown, others, strict=True)]
+    return difference(np.array(apart), 1e3)
 
 
 def summed_up(name: str, alpha: float, flown: Sequence[Flown], without: Sequence[Flown]) -> list[str]:

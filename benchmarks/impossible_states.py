@@ -10,6 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 import unifg as fg
+from problems.graphs import graph_of, graph_with
 from unifg.lie import SE2
 from unifg.modeling.variables import Data
 from unifg.solvers import GaussNewton, InteriorPoint
@@ -30,8 +31,7 @@ def along_a_wall(seed: int, drives: int) -> dict[str, list[float]]:
     moved = SE2.compose(SE2.inverse(truth[:-1]), truth[1:])
 
     def stated(wall: bool, contact: bool) -> tuple[fg.Graph, fg.Family, Data, Data]:
-        graph = fg.Graph()
-        x = graph.variables("x", SE2, POSES)
+        graph, x = graph_with(SE2, POSES)
         fixes = graph.data("fixes", truth[:, :2], each=True)
         steps = graph.data("steps", moved, each=True)
         graph.minimize(fg.prior, x[0], truth[0], sigma=[FIX, FIX, 0.1], name="begin")
@@ -74,8 +74,7 @@ def rolling(seed: int, drives: int) -> dict[str, list[float]]:
         return after - v * np.exp(-d * H)
 
     def stated(known: bool) -> tuple[fg.Graph, fg.Family, fg.Family, Data]:
-        graph = fg.Graph()
-        v, d = graph.variables("v", fg.Rn(1), SPEEDS), graph.variables("d", fg.Rn(1), 1)
+        graph, v, d = graph_of(("v", fg.Rn(1), SPEEDS), ("d", fg.Rn(1), 1))
         measured = graph.data("measured", speeds[:, None], each=True)
         graph.minimize(fg.prior, v, measured, sigma=METER, name="meter")
         graph.minimize(slower, v[:-1], d, v[1:], sigma=0.02, name="rolling")

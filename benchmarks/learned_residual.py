@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import unifg as fg
-from benchmarks.comparison import Row, against, where
+from benchmarks.comparison import Row, against, mean, where
 from benchmarks.report import listing
 from benchmarks.runner import Study, every
 from unifg.horizon import Constant, Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
@@ -44,6 +44,11 @@ def flow(x: Array) -> Array:
     return fg.SO3.act(fg.SO3.inverse(x[:, 3:7]), x[:, 7:10])
 
 
+def falling(x: Array, body: Array) -> Array:
+    """(n, 3) acceleration in the world by what pushes in the body, and by gravity [m/s^2]."""
+    return np.asarray(fg.SO3.act(x[:, 3:7], body) - [0.0, 0.0, quadrotor.GRAVITY])
+
+
 def network(air: Array, weights: Array) -> Array:
     """(n, 3) acceleration in the body [m/s^2] by the velocity ``air`` (n, 3) there."""
     first = weights[:, :FIRST].reshape(-1, HIDDEN, 4)
@@ -63,8 +68,7 @@ def modelled(x: Array, u: Array, mass: Array, drag: Array, weights: Array) -> Ar
     """(n, 3) acceleration by the model [m/s^2]."""
     air = flow(x)
     body = u[:, 3:] * [0.0, 0.0, 1.0] / mass - drag * air / mass + network(air, weights)
-    pull: Array = fg.SO3.act(x[:, 3:7], body) - [0.0, 0.0, quadrotor.GRAVITY]
-    return pull
+    return falling(x, body)
 
 
 def motion(x: Array, u: Array, mass: Array, drag: Array, weights: Array, after: Array, step: Any) -> Array:
@@ -84,8 +88,7 @@ def true(x: Array, u: Array) -> Array:
     speed = np.linalg.norm(air, axis=1, keepdims=True)
     lift = LIFT * np.square(air[:, :2]).sum(axis=1, keepdims=True)
     body = (u[:, 3:] / MASS + lift) * [0.0, 0.0, 1.0] - DRAG * speed * air
-    pull: Array = fg.SO3.act(x[:, 3:7], body) - [0.0, 0.0, quadrotor.GRAVITY]
-    return pull
+    return falling(x, body)
 
 
 def flown(state: Array, control: Array, parts: int = 10) -> Array:
@@ -167,9 +170,6 @@ def tables(rows: list[Row]) -> str:
 
     def beside(name: str) -> Callable[[list[Row]], str]:
         return lambda own: against(own, base, lambda row: row[name])
-
-    def mean(name: str) -> Callable[[list[Row]], str]:
-        return lambda own: f"{np.mean([row[name] for row in own]):.1f}"
 
     heads = {f"lap {lap + 1} [mm rms]": beside(f"lap {lap + 1}") for lap in range(LAPS)}
     heads["error of the acceleration, lap 3 [m/s^2 rms]"] = beside("missing")

@@ -18,7 +18,7 @@ from unittest import mock
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.comparison import Row, difference, where
+from benchmarks.comparison import Row, difference, mean, middle, where
 from benchmarks.report import listing, shared
 from benchmarks.routes import drawn
 from benchmarks.runner import Cell, Study
@@ -232,20 +232,15 @@ def render(rows: Sequence[Row]) -> str:
         tuple(key.split("|")): [row["results"][key] for row in where(rows) if key in row["results"]] for key in keys
     }
 
-    def mean(name: str, scale: float = 1e3) -> Callable[[list[Row]], str]:
-        return lambda some: f"{scale * np.mean([r[name] for r in some]):.1f}"
-
     columns: dict[str, Callable[[list[Row]], str]] = {
         "drives": lambda some: str(len(some)),
-        "mean [mm]": mean("m"),
-        "std [mm]": mean("m_std"),
+        "mean [mm]": mean("m", 1e3),
+        "std [mm]": mean("m_std", 1e3),
         "worst [mm]": lambda some: f"{1e3 * max(r['m_max'] for r in some):.0f}",
-        "mean [mrad]": mean("rad"),
-        "std [mrad]": mean("rad_std"),
+        "mean [mrad]": mean("rad", 1e3),
+        "std [mrad]": mean("rad_std", 1e3),
         "knows at the end": lambda some: f"{sum(r['found'] for r in some)} of {len(some)}",
-        "since [s]": lambda some: (
-            f"{np.median(times):.1f}" if (times := [r["since"] for r in some if r["found"]]) else "-"
-        ),
+        "since [s]": lambda some: middle([r["since"] for r in some if r["found"]], 1),
     }
     parts = [
         listing(["condition", "localiser"], groups, columns),

@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 
-from benchmarks.comparison import Row, difference, share, where
+from benchmarks.comparison import Row, difference, portion, where
 from benchmarks.report import table
 from benchmarks.routes import drawn
 from benchmarks.runner import Cell, Study
@@ -107,10 +107,9 @@ def render(rows: list[Row]) -> str:
     good, lines = counted[counted["reached"] & (counted["touched"] == "")], []
     for (speed, base, futures), mine in counted.groupby(["speed", "base", "futures"], sort=False):
         touched, ours = mine["touched"].value_counts(), good.loc[good.index.intersection(mine.index)]
-        low, high = share(len(ours), len(mine))
         regret = (ours["time"] / ours["arrival"]).median()
         found = (
-            speed, base, futures, len(mine), len(ours), f"{100 * low:.0f} .. {100 * high:.0f} %",
+            speed, base, futures, len(mine), len(ours), portion(len(ours), len(mine)),
             touched.get("moving", 0), touched.get("at rest", 0), (~mine["reached"]).sum(), f"{regret:.2f}",
             f"{100 * mine['reverse'].mean():.0f} %", f"{mine['tick'].median():.1f}",
         )  # fmt: skip

@@ -15,7 +15,7 @@ from operator import itemgetter
 
 import numpy as np
 
-from benchmarks.comparison import Row, difference, paired, share, where
+from benchmarks.comparison import Row, difference, paired, portion, where
 from benchmarks.report import table
 from benchmarks.routes import drawn
 from benchmarks.runner import Cell, Study, Unavailable
@@ -97,9 +97,8 @@ def render(rows: list[Row]) -> str:
         for world in worlds:
             mine = where(rows, robot=robot, world=world)
             reached = [row for row in mine if row["outcome"] == "reached"]
-            low, high = share(len(reached), len(mine))
             lines.append((
-                robot, world, str(len(mine)), str(len(reached)), f"{100 * low:.0f} .. {100 * high:.0f} %",
+                robot, world, str(len(mine)), str(len(reached)), portion(len(reached), len(mine)),
                 str(sum(row["contacts"] for row in mine)), str(sum(row["emergency"] for row in mine)),
                 *(_spread([row[name] for row in mine]) for name in MEASURES),
             ))  # fmt: skip

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks.comparison import Row, share, where
+from benchmarks.comparison import Row, middle, share, where
 from benchmarks.report import listing, table
 from benchmarks.runner import Cell, Study
 from unifg.scenarios.course import AVOIDANCES, HESSIANS, Avoidance, Start
@@ -84,8 +84,8 @@ def rates(results: Results) -> str:
         "cheapest found": lambda some: str(
             sum(o.minimum and b is not None and o.cost <= b.cost * (1.0 + SAME) for o, b in some)
         ),
-        "iterations": lambda some: _middle([o.iterations for o, _ in some]),
-        "ms": lambda some: _middle([o.milliseconds for o, _ in some]),
+        "iterations": lambda some: middle([o.iterations for o, _ in some]),
+        "ms": lambda some: middle([o.milliseconds for o, _ in some]),
     }
     return listing(("avoidance", "guess", "backend"), groups, columns)
 
@@ -108,7 +108,7 @@ def hessians(results: Results) -> str:
         return [(e, g) for e, g in pairs if e.minimum and g.minimum and abs(e.cost - g.cost) <= SAME * abs(e.cost)]
 
     def middles(pairs: Pairs, name: str) -> str:
-        return " : ".join(_middle([getattr(pair[k], name) for pair in same(pairs)]) for k in range(2))
+        return " : ".join(middle([getattr(pair[k], name) for pair in same(pairs)]) for k in range(2))
 
     groups: dict[tuple[str, str], Pairs] = {}
     for avoidance, solver in product(AVOIDANCES, ("sqp", "ipm")):
@@ -192,10 +192,6 @@ def render(results: Results, layouts: Sequence[Layout]) -> str:
             "Iterations and times are medians, times are the processor's.",
         )
     )
-
-
-def _middle(values: Sequence[float]) -> str:
-    return f"{np.median(values):.0f}" if values else "-"
 
 
 def cells(seeds: Sequence[int]) -> list[Cell]:

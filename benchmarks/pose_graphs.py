@@ -15,6 +15,7 @@ from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import listing, shared, words
 from benchmarks.section import Result, goal
 from benchmarks.timing import clock, interleave, milliseconds, ratio, shown, timed
+from problems.graphs import graph_with
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.lie import SE3
 from unifg.pose_graphs import PoseGraph, manhattan, sphere
@@ -157,12 +158,17 @@ def measure_file(case: Case, rounds: int) -> Result:
         "chi2": ends["ours"][1], "ratio": None, "target": case.whole,
     }  # fmt: skip
     if available():
-        best = min(ORDERINGS, key=lambda ordering: float(np.median(times[ordering])))
+        best = fastest(times)
         result |= {
             "gtsam": milliseconds(times[best]), "best": best, "gtsam_iterations": ends[best][0],
             "gtsam_chi2": ends[best][1], "ratio": ratio(times[best], times["ours"]),
         }  # fmt: skip
     return result
+
+
+def fastest(times: Mapping[str, Array]) -> str:
+    """The ordering of GTSAM's that takes the least time."""
+    return min(ORDERINGS, key=lambda ordering: float(np.median(times[ordering])))
 
 
 def _whole(peer: Peer, ordering: str, ends: list[tuple[int, float]]) -> float:
@@ -173,7 +179,7 @@ def _whole(peer: Peer, ordering: str, ends: list[tuple[int, float]]) -> float:
 
 def _compared(times: Mapping[str, Array], best_whole: str, iterations: int, chi2: float) -> Result:
     """Ratios to the faster of GTSAM's orderings."""
-    best = min(ORDERINGS, key=lambda ordering: float(np.median(times[ordering])))
+    best = fastest(times)
     return {
         "gtsam": {ordering: milliseconds(times[ordering]) for ordering in ORDERINGS},
         "best": best,
@@ -253,8 +259,7 @@ def render(result: Result) -> str:
 def posed(pose_graph: PoseGraph, sigma: float) -> tuple[fg.Graph, fg.Family]:
     """The same measurements with a prior on the first pose where `PoseGraph.graph` fixes it."""
     edges = pose_graph.edges
-    graph = fg.Graph()
-    x = graph.variables("poses", pose_graph.group, len(pose_graph.poses))
+    graph, x = graph_with(pose_graph.group, len(pose_graph.poses), "poses")
     graph.minimize(fg.between, x[edges.first], x[edges.second], edges.measured, information=edges.information)
     graph.minimize(fg.prior, x[0], pose_graph.poses[0], sigma=sigma)
     return graph, x

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from benchmarks.comparison import Read, Row, comparison, share, where
+from benchmarks.comparison import Read, Row, comparison, middle, share, where
 from benchmarks.report import listing, table
 from unifg.typing import Array
 
@@ -85,8 +85,8 @@ SUCCESS: dict[str, Callable[[list[Row]], str]] = {
     "95 % [%]": lambda flights: " .. ".join(f"{100 * end:.0f}" for end in share(_good(flights), len(flights))),
     "collided": lambda flights: str(sum(m["collisions"] > 0 for m in flights)),
     "not there": lambda flights: str(sum(not m["reached"] for m in flights)),
-    "time [s]": lambda flights: _middle([m["time_to_goal_s"] for m in flights if m["time_to_goal_s"] is not None], 1),
-    "clearance [m]": lambda flights: _middle([m["min_clearance_m"] for m in flights], 2),
+    "time [s]": lambda flights: middle([m["time_to_goal_s"] for m in flights if m["time_to_goal_s"] is not None], 1),
+    "clearance [m]": lambda flights: middle([m["min_clearance_m"] for m in flights], 2),
 }
 
 
@@ -98,10 +98,6 @@ def success(rows: Sequence[Row]) -> str:
 
 def _good(flights: list[Row]) -> int:
     return sum(bool(m["succeeded"]) for m in flights)
-
-
-def _middle(values: list[float], places: int) -> str:
-    return f"{np.median(values):.{places}f}" if values else "-"
 
 
 def failures(rows: Sequence[Row]) -> str:

@@ -32,10 +32,8 @@ Cell: TypeAlias = Mapping[str, Any]
 
 def every(**choices: Iterable[Any]) -> Callable[[Sequence[int]], list[Cell]]:
     """Cells of every combination of choices on every seed, which comes first."""
-    of = {name: tuple(choice) for name, choice in choices.items()}
-    return lambda seeds: [
-        {"seed": seed, **dict(zip(of, chosen, strict=True))} for seed in seeds for chosen in product(*of.values())
-    ]
+    names = "seed", *choices
+    return lambda seeds: [dict(zip(names, one, strict=True)) for one in product(seeds, *choices.values())]
 
 
 class Unavailable(Exception):

@@ -7,17 +7,14 @@ changes one function at a time. Processor times [s] of the next run; of a run th
 from __future__ import annotations
 
 import ast
-import os
-import resource
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
-from unifg.codegen.cache_folder import VARIABLE
+from benchmarks.first_use import spent
+from benchmarks.report import CHECKOUT
 
-CHECKOUT = Path(__file__).resolve().parent.parent
 CENTRAL = (
     ("unifg/lie/so2.py", "wrap"),
     ("unifg/lie/so3.py", "exp"),
@@ -47,15 +44,6 @@ def changed(path: Path, function: str, line: str) -> str:
     return "\n".join(lines)
 
 
-def spent(checkout: Path, cache: Path, example: str) -> float:
-    """Processor time of the example in a new process [s]."""
-    environment = {**os.environ, "PYTHONPATH": str(checkout), VARIABLE: str(cache)}
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([sys.executable, "-c", example], cwd=checkout, env=environment, capture_output=True, check=True)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-
-
 def main() -> None:
     """Measure and print."""
     example = (CHECKOUT / "README.md").read_text(encoding="utf-8").split("```python")[1].split("```")[0]
@@ -64,7 +52,7 @@ def main() -> None:
         left_out = shutil.ignore_patterns(".*", "out", "build", "dist", "*.egg-info", "__pycache__")
         shutil.copytree(CHECKOUT, checkout, symlinks=True, ignore=left_out)
         for _ in range(2):
-            still = spent(checkout, cache, example)
+            still = spent(sys.executable, example, cache, PYTHONPATH=str(checkout))
         print(f"{'nothing':<54} {still:6.2f}")
         for name, function in CENTRAL:
             path = checkout / name
@@ -72,9 +60,9 @@ def main() -> None:
             times = []
             for line in ("# a comment", "changed = 1.0"):
                 path.write_text(changed(path, function, line), encoding="utf-8")
-                times.append(spent(checkout, cache, example))
+                times.append(spent(sys.executable, example, cache, PYTHONPATH=str(checkout)))
                 path.write_text(kept, encoding="utf-8")
-            spent(checkout, cache, example)
+            spent(sys.executable, example, cache, PYTHONPATH=str(checkout))
             print(f"{name + ' ' + function:<54} comment {times[0]:6.2f}  formula {times[1]:6.2f}", flush=True)
 
 
