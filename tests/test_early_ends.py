@@ -175,7 +175,7 @@ def test_the_manoeuvre_behind_in_the_paper_s_form() -> None:
     assert solution.cost == solution.history[-1].cost
 
 
-@pytest.mark.parametrize("solver", [SQP(max_iterations=2000), InteriorPoint(max_iterations=2000)])
+@pytest.mark.parametrize("solver", [SQP(max_iterations=500), InteriorPoint(max_iterations=2000)])
 def test_an_unbounded_solve_returns_its_last_finite_iterate(solver: fg.Solver) -> None:
     graph, x = graph_with(fg.Rn(1))
     graph.minimize_scalar(lambda p: -(p[:, 0] ** 3), x)

@@ -163,7 +163,7 @@ def test_a_common_factor_changes_no_plan(loss: Any) -> None:
 
 
 @dataclass
-class Rail:
+class Rail(Term):
     """A limit of the state that gives way."""
 
     price: Any
@@ -171,9 +171,6 @@ class Rail:
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         price = graph.data("price", 1.0) if self.price is None else self.price
         graph.bound(x, lower=[-0.2, -0.1], upper=[1.5, 0.4], soft=price, name="rail")
-
-    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        return {}
 
 
 @pytest.mark.parametrize("price", [0.3, fg.Soft(linear=[0.3, 0.1], quadratic=2.0)])

@@ -212,21 +212,31 @@ def test_a_window_gives_its_own_covariance() -> None:
         loop.plan((0.0, 0.3, 0.0), covariance=np.eye(2))
 
 
-def test_errors_name_what_was_given() -> None:
-    with pytest.raises(GraphError, match=r"'walls' is no inequality constraint on states \(there are: 'wall'\)"):
-        loop_of(Wall(), sigmas={"walls": 2.0})
-    with pytest.raises(GraphError, match="'limits' is no inequality"):
-        loop_of(Wall(), sigmas={"limits": 2.0})
-    with pytest.raises(GraphError, match=r"-1\.0 standard deviations for 'wall'"):
-        loop_of(Wall(), sigmas=-1.0)
-    with pytest.raises(GraphError, match=r"sigmas of 'wall' has shape \(2,\), expected \(\)"):
-        loop_of(Wall(), sigmas=np.array([1.0, 2.0]))
-    with pytest.raises(GraphError, match="sigmas of 'wall' must be finite"):
-        loop_of(Wall(), sigmas=np.inf)
-    with pytest.raises(GraphError, match="negative variances"):
-        loop_of(Wall(), sigmas=1.0).plan((0.0, 0.4, 0.0), covariance=-np.eye(3))
-    with pytest.raises(GraphError, match=r"need the covariance of state and constants, \(3, 3\), or a window"):
-        loop_of(Wall(), sigmas=1.0).plan((0.0, 0.4, 0.0))
+@pytest.mark.parametrize(
+    ("sigmas", "message"),
+    [
+        ({"walls": 2.0}, r"'walls' is no inequality constraint on states \(there are: 'wall'\)"),
+        ({"limits": 2.0}, "'limits' is no inequality"),
+        (-1.0, r"-1\.0 standard deviations for 'wall'"),
+        (np.array([1.0, 2.0]), r"sigmas of 'wall' has shape \(2,\), expected \(\)"),
+        (np.inf, "sigmas of 'wall' must be finite"),
+    ],
+)
+def test_errors_name_the_sigmas_that_were_given(sigmas: Any, message: str) -> None:
+    with pytest.raises(GraphError, match=message):
+        loop_of(Wall(), sigmas=sigmas)
+
+
+@pytest.mark.parametrize(
+    ("covariance", "message"),
+    [
+        (-np.eye(3), "negative variances"),
+        (None, r"need the covariance of state and constants, \(3, 3\), or a window"),
+    ],
+)
+def test_errors_name_the_covariance_that_was_given(covariance: Any, message: str) -> None:
+    with pytest.raises(GraphError, match=message):
+        loop_of(Wall(), sigmas=1.0).plan((0.0, 0.4, 0.0), covariance=covariance)
 
 
 def test_a_joint_graph_and_a_horizon_that_branches_have_margins() -> None:
@@ -250,15 +260,12 @@ def test_a_joint_graph_and_a_horizon_that_branches_have_margins() -> None:
         assert spare.min() > -2e-3
 
 
-class Pace:
+class Pace(Term):
     """Goal, and a limit on how far neighbouring nodes are apart, which no error of the present changes."""
 
     def state(self, graph: fg.Graph, x: fg.Selection, u: Any) -> None:
         graph.minimize(fg.prior, x[1:], [2.0, 1.0, 0.5], sigma=1.0, name="goal")
         graph.constrain(lambda a, b: fg.SE2.local(a, b)[:, :1], x[:-1], x[1:], upper=0.08, name="pace")
-
-    def data(self, now: Context[Any]) -> Mapping[str, ArrayLike]:
-        return {}
 
 
 @pytest.mark.parametrize("solver", [InteriorPoint(), SQP()], ids=lambda own: own.name)
