@@ -46,6 +46,4 @@ def __getattr__(name: str) -> _ModuleType:
     raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
 
 
-def __dir__() -> list[str]:
-    """List what is public."""
-    return list(__all__)
+__dir__ = __all__.copy

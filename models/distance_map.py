@@ -19,7 +19,7 @@ import numpy as np
 from scipy import ndimage
 
 from unifg.codegen.jit import compiled
-from unifg.errors import ModelError, require_kinds
+from unifg.errors import ModelError, require_kinds, require_positive
 from unifg.modeling.duplicates import doubles
 from unifg.typing import Array, ArrayLike, BoolArray
 
@@ -91,8 +91,7 @@ class DistanceMap:
         if mask.ndim != 2 or mask.size == 0 or mask.dtype != bool:
             raise ModelError(f"distance map: occupied, {mask.dtype} of shape {mask.shape}, must be a (H, W) bool grid")
         limit = resolution * math.hypot(*mask.shape) if cap is None else float(cap)
-        if cap is not None and not limit > 0.0:
-            raise ModelError(f"distance map: cap {cap!r} must be positive [m]")
+        require_positive("distance map", ModelError, finite=False, **{"cap [m]": 1.0 if cap is None else cap})
         if mask.all() or not mask.any():
             return cls(np.full(mask.shape, -limit if mask.all() else limit), resolution, origin)
         values = _signed_cells(mask)

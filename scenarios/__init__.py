@@ -51,6 +51,4 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def __dir__() -> list[str]:
-    """List what is public."""
-    return list(__all__)
+__dir__ = __all__.copy

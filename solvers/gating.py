@@ -67,8 +67,7 @@ class VarianceFactor:
             count: how many are looked at.
         """
         if np.isinf(self.freedom):
-            known: BoolArray = innovation > exceeded(size, CHANCE / max(count, 1))
-            return known
+            return innovation > exceeded(size, CHANCE / max(count, 1))
         rest = self.freedom - size
         if rest < 1.0:
             return np.zeros(len(innovation), dtype=np.bool_)

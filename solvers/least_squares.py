@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from unifg.codegen.inner import inner
-from unifg.errors import BackendError
+from unifg.errors import BackendError, require_positive
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.solver import Solver, SolveState
@@ -158,8 +158,7 @@ class DogLeg(LeastSquares):
     def __post_init__(self) -> None:
         """Refuse a radius that is not positive."""
         super().__post_init__()
-        if not self.radius > 0.0:
-            raise BackendError(f"{self.name}: radius must be positive, found {self.radius}")
+        require_positive(self.name, BackendError, finite=False, radius=self.radius)
 
     def search_step(self, run: SolveState, workspace: Primal, lin: Linearization) -> Array | None:
         """The step within the first radius."""

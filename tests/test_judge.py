@@ -435,7 +435,7 @@ def test_the_violation_has_a_tolerance_of_its_own(solver: Solver) -> None:
 
 
 def test_a_tolerance_of_nothing_is_refused() -> None:
-    with pytest.raises(fg.BackendError, match="feasibility_tolerance must be positive or None, found 0"):
+    with pytest.raises(fg.BackendError, match="feasibility_tolerance must be positive, found 0"):
         SQP(feasibility_tolerance=0.0)
 
 

@@ -62,7 +62,7 @@ def test_no_outlier_needs_no_surrogate() -> None:
 @pytest.mark.parametrize("make", [fg.DCS, fg.GemanMcClure, fg.TruncatedLeastSquares])
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan")])
 def test_parameters_must_be_positive(make: type, bad: float) -> None:
-    with pytest.raises(GraphError, match=f"{make.__name__}: its parameter must be positive"):
+    with pytest.raises(GraphError, match=f"{make.__name__}: [a-z]+ must be positive"):
         make(bad)
 
 

@@ -64,11 +64,11 @@ def require_kinds(
             raise error(f"{who}: {name} must be {words}{' or None' if rest else ''}, found {f'{value!r}'[:80]}{how}")
 
 
-def require_positive(who: str, error: type[UnifgError], **numbers: Any) -> None:
-    """Refuse what is no number, not finite, or not above zero; arguments as for :func:`require_kinds`."""
+def require_positive(who: str, error: type[UnifgError], *, finite: bool = True, **numbers: Any) -> None:
+    """Refuse what is no number, not above zero, or infinite if it must be ``finite``; else as :func:`require_kinds`."""
     require_kinds(who, error, dict.fromkeys(numbers, "float"), numbers)
     for name, value in numbers.items():
-        if not 0.0 < value < inf:
+        if not 0.0 < value or (finite and value == inf):
             raise error(f"{who}: {name} must be positive{' and finite' if value == inf else ''}, found {value}")
 
 

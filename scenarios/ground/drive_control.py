@@ -240,8 +240,7 @@ class Controller:
 
 def wanted_controls(now: Context[Drive]) -> Array:
     """(N, m) controls that would follow the reference, those of a stage for all nodes of the stage."""
-    wanted: Array = now.given.wanted if now.tree is None else now.given.wanted[now.tree.depths[1:] - 1]
-    return wanted
+    return now.given.wanted if now.tree is None else now.given.wanted[now.tree.depths[1:] - 1]
 
 
 def is_behind(states: Array, reference: Array) -> bool:

@@ -196,15 +196,13 @@ def along(spread: Array, directions: Array) -> Array:
 
 def wall_distances(hull: Body, field: SmoothField, states: Array) -> Array:
     """(N, K) distances to walls as their rows count them, of the discs of a body at states (N, 3) [m]."""
-    found: Array = field.distance(hull.places(states)) + hull.smaller
-    return found
+    return field.distance(hull.places(states)) + hull.smaller
 
 
 def disc_distances(hull: Body, states: Array, centres: Array) -> Array:
     """(N, K, M) the same from centres (N, M, 2)."""
     offset = hull.places(states)[:, :, None] - centres[:, None]
-    found: Array = np.hypot(offset[..., 0], offset[..., 1]) + hull.smaller[:, None]
-    return found
+    return np.hypot(offset[..., 0], offset[..., 1]) + hull.smaller[:, None]
 
 
 def wall_limits(s: ControllerSettings, field: SmoothField, evasive: Array, reference: Array, spread: Array) -> Array:

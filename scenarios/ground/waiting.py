@@ -74,5 +74,4 @@ def occupancy(s: ControllerSettings, pose: Array, places: Array, movers: Tracks)
 
 def _distances(first: Array, second: Array) -> Array:
     offset = first - second
-    found: Array = np.hypot(offset[..., 0], offset[..., 1])
-    return found
+    return np.hypot(offset[..., 0], offset[..., 1])

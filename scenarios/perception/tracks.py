@@ -86,15 +86,13 @@ class Tracks(Rows):
         first, way = self.sweep[:, :2], self.sweep[:, 2:4] - self.sweep[:, :2]
         length = np.maximum((way**2).sum(axis=1), 1e-12)
         share = np.clip(((place[..., None, :] - first) * way).sum(axis=-1) / length, 0.0, 1.0)
-        places: Array = np.where(np.isnan(self.sweep[:, :1]), self.centre, first + share[..., None] * way)
-        return places
+        return np.where(np.isnan(self.sweep[:, :1]), self.centre, first + share[..., None] * way)
 
 
 def to_and_fro(first: Number, last: Number, made: Number, speed: Number, times: Number) -> Array:
     """Places on a line at times from now [s] of what goes to and fro there, ``made`` past the first end [m]."""
     way = (made + speed * times) % (2.0 * (last - first))
-    places: Array = first + np.minimum(way, 2.0 * (last - first) - way)
-    return places
+    return first + np.minimum(way, 2.0 * (last - first) - way)
 
 
 def nearest(tracks: Tracks, position: ArrayLike, count: int, horizon: float = 1.5) -> Tracks:

@@ -255,8 +255,7 @@ def clearance(
     """
     s = np.reshape(t, (-1, 1))
     unsure = np.sqrt(doubt[:, 0] + s * doubt[:, 1] + s * s * doubt[:, 2])
-    left: Array = _MOVING(p, t, centre, velocity, fall, keep, flat) - unsure
-    return left
+    return _MOVING(p, t, centre, velocity, fall, keep, flat) - unsure
 
 
 def inverse_clearance(

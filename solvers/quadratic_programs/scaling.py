@@ -70,8 +70,7 @@ class Scaling:
     @cached_property
     def metric(self) -> Array:
         """(n,) what one on the diagonal of the scaled Hessian is in the units of the graph."""
-        metric: Array = self.columns**-2.0
-        return metric
+        return self.columns**-2.0
 
     @cached_property
     def smallest(self) -> float:
@@ -80,14 +79,12 @@ class Scaling:
 
     def hessian(self, pattern: Symmetric, entries: Array) -> Array:
         """Entries of a scaled Hessian."""
-        scaled: Array = entries * self.columns[pattern.indices] * self.columns[pattern.columns]
-        return scaled
+        return entries * self.columns[pattern.indices] * self.columns[pattern.columns]
 
     def jacobian(self, entries: Array) -> Array:
         """Entries of the scaled constraint Jacobian, in evaluation order."""
         constraints = self.program.constraints
-        scaled: Array = entries * self.rows[constraints.rows] * self.full[constraints.columns]
-        return scaled
+        return entries * self.rows[constraints.rows] * self.full[constraints.columns]
 
     def scaled(self, qp: QP) -> QP:
         """The subproblem with scaled unknowns and rows."""

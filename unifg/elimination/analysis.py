@@ -55,8 +55,7 @@ class Graph(NamedTuple):
         given = np.zeros(0, np.int64) if order is None else order
         pointer = np.arange(0, pairs.size + 1, 2)
         found = cliques(self.weight, stage, np.zeros(nodes, np.bool_), given, True, pairs.ravel(), pointer)
-        tree: Tree = postordered(*found[:4])
-        return tree
+        return postordered(*found[:4])
 
 
 class Structure(NamedTuple):

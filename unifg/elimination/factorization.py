@@ -222,8 +222,7 @@ class Factorization:
             UnifgError: there is no factorisation.
         """
         self._demand("pivots")
-        result: Array = (self.plan.signs / self.plan.pivots**2)[: self.pattern.size]
-        return result
+        return (self.plan.signs / self.plan.pivots**2)[: self.pattern.size]
 
     def last_block(self) -> Array:
         """(k, k) Schur complement of the ``last`` scalars.
@@ -246,8 +245,7 @@ class Factorization:
             here = place[np.append(own, plan.rows[index : index + rows])]
             kept = here >= 0  # a front may begin with others
             upper[np.ix_(here[:width][kept[:width]], here[kept])] = block[np.ix_(kept[:width], kept)]
-        result: Array = upper.T @ (plan.signs[chosen, None] * upper)
-        return result
+        return upper.T @ (plan.signs[chosen, None] * upper)
 
     @property
     def tree(self) -> EliminationTree:
@@ -269,8 +267,7 @@ class Factorization:
         Raises:
             UnifgError: there is no factorisation.
         """
-        result: Array = self._filled(None)[self.plan.slots]
-        return result
+        return self._filled(None)[self.plan.slots]
 
     def inverse_block(self, rows: IntArray) -> Array:
         """(k, k) block of the inverse: the joint covariance of some scalars when A is an information matrix.
@@ -286,10 +283,8 @@ class Factorization:
         chosen = self._position[rows]
         places = np.zeros((len(rows), len(rows)), np.int64)
         if locate(self.plan, self._owner, chosen, places):
-            block: Array = self._filled(chosen)[places]
-            return block
-        found: Array = block_of(self.plan, self._parent, self._owner, self._heights, chosen, self._clean)
-        return found
+            return self._filled(chosen)[places]
+        return block_of(self.plan, self._parent, self._owner, self._heights, chosen, self._clean)
 
     def inverse_blocks(self, first: IntArray, second: IntArray) -> Array:
         """(n, k + m, k + m) blocks of the inverse: joint covariances of n pairs of nodes anywhere in the tree.
@@ -305,11 +300,10 @@ class Factorization:
             UnifgError: there is no factorisation.
         """
         self._demand("inverse_blocks")
-        result: Array = blocks_of_pairs(
+        return blocks_of_pairs(
             self.plan, self._parent, self._owner, self._heights, self._position[np.asarray(first, dtype=np.int64)],
             self._position[np.asarray(second, dtype=np.int64)], self._clean,
         )  # fmt: skip
-        return result
 
     def products(self, starts: IntArray, rows: IntArray, values: Array) -> Array:
         """(c, d, d) products B' A^-1 B with matrices B (n, d) that have few rows which are not zero.
@@ -325,12 +319,11 @@ class Factorization:
             UnifgError: there is no factorisation.
         """
         self._demand("products")
-        result: Array = products(
+        return products(
             self.plan, self._parent, self._owner, np.asarray(starts, dtype=np.int64),
             self._position[np.asarray(rows, dtype=np.int64)], np.ascontiguousarray(values, dtype=np.float64),
             self._clean,
         )  # fmt: skip
-        return result
 
     def diagonal_blocks(self) -> list[Array]:
         """Marginal covariance (d, d) of every node, all in about the time of two factorisations.
@@ -368,8 +361,7 @@ class Factorization:
 
     @cached_property
     def _heights(self) -> IntArray:
-        found: IntArray = heights(self.plan, self._parent)
-        return found
+        return heights(self.plan, self._parent)
 
     @cached_property
     def _clean(self) -> Array:

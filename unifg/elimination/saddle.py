@@ -159,8 +159,7 @@ class SaddlePoint:
 
     def residual(self, solution: Array, right: Array) -> Array:
         """(n,) right - K x of the equilibrated system."""
-        rest: Array = self.scale * (right - self.factorization.pattern.times(self._data, solution))
-        return rest
+        return self.scale * (right - self.factorization.pattern.times(self._data, solution))
 
 
 @compiled

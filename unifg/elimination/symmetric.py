@@ -77,8 +77,7 @@ class Symmetric:
     @cached_property
     def diagonal(self) -> IntArray:
         """(size,) where the diagonal is stored: last in every column."""
-        place: IntArray = self.indptr[1:] - 1
-        return place
+        return self.indptr[1:] - 1
 
     def positions(self, rows: IntArray, columns: IntArray) -> IntArray:
         """Positions of the given entries."""

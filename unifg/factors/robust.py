@@ -62,8 +62,7 @@ class Formula:
         Raises:
             GraphError: naming the loss.
         """
-        for value in vars(self).values():
-            positive(value, type(self).__name__)
+        require_positive(type(self).__name__, GraphError, **vars(self))
 
     @property
     def form(self) -> Form:
@@ -206,9 +205,8 @@ class TruncatedLeastSquares(Formula):
 
     def __post_init__(self) -> None:
         """Refuse parameters that are not positive."""
-        positive(self.threshold, "TruncatedLeastSquares")
-        if self.mu != np.inf:
-            positive(self.mu, "TruncatedLeastSquares")
+        require_positive(type(self).__name__, GraphError, threshold=self.threshold)
+        require_positive(type(self).__name__, GraphError, finite=False, mu=self.mu)
 
     @property
     def form(self) -> Form:
@@ -251,11 +249,6 @@ class Reweighted:
     def weight(self, squared: Array) -> Array:
         """w(s), the derivative of w(s) s wherever the weight is locally constant."""
         return self.rule(squared)
-
-
-def positive(value: float, name: str) -> None:
-    """Raise unless a loss parameter is positive and finite."""
-    require_positive(name, GraphError, **{"its parameter": value})
 
 
 def form_of(loss: Loss | None) -> Form | None:

@@ -128,8 +128,7 @@ def steps_for(sizes: Array, root: int) -> Array:
 
 def uncertainties(size: Array, steps: Array) -> Array:
     """Error bounds of derivatives by two points where numbers of these sizes are rounded."""
-    result: Array = ROUNDINGS * EPSILON * size / (2.0 * steps)
-    return result
+    return ROUNDINGS * EPSILON * size / (2.0 * steps)
 
 
 SHORTEST_OF = tuple(SHORTEST.get(root, 0) for root in range(5))

@@ -98,8 +98,7 @@ class LastPlan:
 
     def within(self, controls: Array) -> Array:
         """Controls (k, m) clipped to their limits."""
-        clipped: Array = np.clip(controls, self.least, self.most)
-        return clipped
+        return np.clip(controls, self.least, self.most)
 
 
 @dataclass(frozen=True)

@@ -186,8 +186,7 @@ class RecedingHorizon:
         if not isinstance(steps, Tree):
             require_steps("a horizon", "steps", steps)
         tree = steps if isinstance(steps, Tree) else Tree(tuple(range(steps)))
-        if not deadline > 0.0:
-            raise GraphError(f"the deadline must be positive, got {deadline} s")
+        require_positive("RecedingHorizon", GraphError, finite=False, **{"the deadline [s]": deadline})
         require_positive("RecedingHorizon", GraphError, control_weight=control_weight)
         if delay < 0 or (delay and (coupling == "joint" or robot.predict is None)):
             raise GraphError(

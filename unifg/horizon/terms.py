@@ -53,8 +53,7 @@ class Context(Generic[G]):
     @property
     def lengths(self) -> Array:
         """(N,) lengths of the steps of the future [s]."""
-        found: Array = self.times[1:] - (self.times[:-1] if self.tree is None else self.times[self.tree.begins])
-        return found
+        return self.times[1:] - (self.times[:-1] if self.tree is None else self.times[self.tree.begins])
 
     @property
     def past(self) -> History:

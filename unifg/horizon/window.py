@@ -259,7 +259,8 @@ class Window:
                 raise GraphError(f"the guess of '{name}' is none of the robot's steps: {known}", family=name)
         if history.full:
             if self.left.pending_prior is None:
-                self._look_again()
+                # Linearised where it is believed to be, without moving it.
+                self._conclude(self._look.solve(self.guess(), data=self.data(self._given)))
             self.left.arrival, self.left.pending_prior = self.left.pending_prior, None
         history.move(applied, expected, entering, steps or {})
 
@@ -330,10 +331,6 @@ class Window:
         self._conclude(solution)
         return solution
 
-    def _look_again(self) -> None:
-        """Linearise the window where it is believed to be, without moving it."""
-        self._conclude(self._look.solve(self.guess(), data=self.data(self._given)))
-
     def _conclude(self, solution: Solution) -> None:
         self.solution, self._due = solution, True
         self._past.depart(solution)
@@ -357,32 +354,21 @@ class Window:
         reset_all(self.terms)
 
     def _prior_covariance(self) -> Array:
-        blocks = [np.linalg.inv(self.left.initial[1])]
-        for static in self.robot.constants:
-            sigma = np.broadcast_to(
-                np.asarray(static.sigma, dtype=np.float64), (len(static.values), static.manifold.dim)
-            )
-            blocks += [np.diag(row**2) for row in sigma]
-        size = sum(len(block) for block in blocks)
-        covariance, at = np.zeros((size, size)), 0
-        for block in blocks:
-            covariance[at : at + len(block), at : at + len(block)] = block
-            at += len(block)
+        present = np.linalg.inv(self.left.initial[1])
+        variances = [np.ravel(np.square(static.sigma)) for static in self.robot.constants]
+        covariance = np.diag(np.concatenate([np.diag(present), *variances]))
+        covariance[: len(present), : len(present)] = present
         return covariance
 
 
 def _covariance(sigma: ArrayLike, dim: int) -> Array:
     """(d, d) covariance of standard deviations (d,), or as it is."""
     array = doubles("the standard deviations at the start", sigma).copy()
-    positive = bool(np.isfinite(array).all())
-    if array.ndim < 2:
-        positive = positive and array.shape in ((), (1,), (dim,)) and bool(np.all(array > 0.0))
-        covariance = np.diag(np.broadcast_to(array, (dim,)) ** 2) if positive else array
-    else:
-        covariance = array
-        positive = positive and array.shape == (dim, dim) and np.allclose(array, array.T, rtol=1e-9, atol=0.0)
-        positive = positive and bool(np.all(np.linalg.eigvalsh(array) > 0.0))
-    if not positive:
+    deviations = array.shape in ((), (1,), (dim,))
+    covariance = np.diag(np.broadcast_to(array, (dim,)) ** 2) if deviations else array
+    fits = covariance.shape == (dim, dim) and bool(np.isfinite(array).all())
+    fits = fits and np.allclose(covariance, covariance.T, rtol=1e-9, atol=0.0)
+    if not (fits and np.all((array if deviations else np.linalg.eigvalsh(array)) > 0.0)):
         raise GraphError(
             f"the standard deviations at the start must be ({dim},) positive, or a covariance; got {array}"
         )

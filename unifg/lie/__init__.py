@@ -35,6 +35,4 @@ __all__ = [
 ]
 
 
-def __dir__() -> list[str]:
-    """List what is public."""
-    return list(__all__)
+__dir__ = __all__.copy

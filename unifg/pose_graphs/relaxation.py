@@ -202,8 +202,7 @@ def _close(found: Array, wanted: Array | float, size: Array | None = None) -> Bo
 def sheared(moved: Array, point: Array) -> Array:
     """(n, d, d) sym(V Y'): what directions V (n, d + 1, r) do to the orthonormality of a point's frames Y."""
     product = moved[:, 1:] @ np.swapaxes(point[:, 1:], 1, 2)
-    found: Array = 0.5 * (product + np.swapaxes(product, 1, 2))
-    return found
+    return 0.5 * (product + np.swapaxes(product, 1, 2))
 
 
 @compiled

@@ -301,8 +301,7 @@ class Submaps:
             unit[at, axis] = 1.0
             reach[axis] = submap.reduced(unit.ravel())[1]
             own[axis] = -submap.step(unit.ravel(), np.zeros((len(places), dim)))[at]
-        result: Array = own + reach @ self._known().covariance(places) @ reach.T
-        return result
+        return own + reach @ self._known().covariance(places) @ reach.T
 
     def _known(self) -> _Separator:
         """The separator at the present poses."""

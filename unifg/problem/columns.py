@@ -86,15 +86,13 @@ class Columns:
         """(n, d) columns of a selection."""
         family = selection.family
         base = self.offsets[family] + selection.indices * family.manifold.dim
-        columns: IntArray = base[:, None] + np.arange(selection.tangent.start, selection.tangent.stop)
-        return columns
+        return base[:, None] + np.arange(selection.tangent.start, selection.tangent.stop)
 
     def starts(self, selection: Selection) -> IntArray:
         """(n,) where the storage of each selected member, or of its selected component, starts."""
         family = selection.family
         first = self.storage[family] + selection.storage.start
-        starts: IntArray = first + selection.indices * family.manifold.storage
-        return starts
+        return first + selection.indices * family.manifold.storage
 
     def values(self, parts: Mapping[Family, Array]) -> Values:
         """One array per family as views of one flat array; values that are such already stay as they are."""

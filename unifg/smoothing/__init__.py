@@ -6,6 +6,4 @@ from unifg.smoothing.incremental import Incremental
 __all__ = ["FixedLag", "Incremental"]
 
 
-def __dir__() -> list[str]:
-    """List what is public."""
-    return list(__all__)
+__dir__ = __all__.copy

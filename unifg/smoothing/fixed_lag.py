@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from unifg.errors import GraphError, require_kinds
+from unifg.errors import GraphError, require_kinds, require_positive
 from unifg.locks import synchronized
 from unifg.modeling.variables import Selection, Variable, as_selection
 from unifg.smoothing.factors import Staged
@@ -71,8 +71,7 @@ class FixedLag(Smoother):
             raise GraphError("FixedLag: give either lag= (a number of members) or seconds=")
         require_kinds("FixedLag", GraphError, FixedLag.__init__.__annotations__, {"lag": lag, "seconds": seconds})
         self.lag = float(lag if lag is not None else seconds)  # type: ignore[arg-type]
-        if not self.lag > 0.0:
-            raise GraphError(f"FixedLag: the lag must be positive, found {self.lag}")
+        require_positive("FixedLag", GraphError, finite=False, **{"the lag": self.lag})
         if late not in ("refuse", "drop"):
             raise GraphError(f"FixedLag: late must be 'refuse' or 'drop', found {late!r}")
         self.dropped = 0

@@ -235,8 +235,7 @@ class Revocables:
         """(n,) |W r|^2 at the estimates."""
         squared = np.empty(len(self))
         squared_errors(smoother._memory, self.rows, squared)
-        found: Array = np.where(self.accepted, squared, squared / LEAST)
-        return found
+        return np.where(self.accepted, squared, squared / LEAST)
 
     def _cost(self, smoother: Smoother) -> float:
         """Truncated cost at the estimates."""

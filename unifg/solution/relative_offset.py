@@ -374,8 +374,7 @@ def _idle(program: CompiledProblem, diagonal: Array) -> BoolArray:
         on = np.ones(term.count, dtype=bool) if term.active is None else term.active
         for columns in term.columns:
             touched[columns[on]] = True
-    idle: BoolArray = bare & ~touched[program.columns.free]
-    return idle
+    return bare & ~touched[program.columns.free]
 
 
 def _extents(program: CompiledProblem) -> tuple[IntArray, IntArray, Array]:

@@ -263,8 +263,7 @@ class Solution:
         arrays = self._lin.constraints, self._lower, self._upper
         rows, lower, upper = (self._program.by_term(array)[name] for array in arrays)
         value = rows + soft[name].signed(self._lin.values[soft[name].family])  # a slack may exceed what is needed
-        outside: Array = np.maximum(value - upper, 0.0) - np.maximum(lower - value, 0.0)
-        return outside
+        return np.maximum(value - upper, 0.0) - np.maximum(lower - value, 0.0)
 
     def shifted(self, *families: Family, by: int = 1) -> Guess:
         """A guess moved ``by`` stages towards the end of the horizon, for the next control tick.

@@ -167,15 +167,13 @@ class Solver(Backend):
         kinds = {field.name: field.type for field in fields(self)} | {"tolerance": "float"}
         require_kinds(self.name, BackendError, kinds, vars(self))
         require_positive(self.name, BackendError, tolerance=self.tolerance)
-        if self.feasibility_tolerance is not None and not self.feasibility_tolerance > 0.0:
-            found = self.feasibility_tolerance
-            raise BackendError(f"{self.name}: feasibility_tolerance must be positive or None, found {found}")
+        feasible = 1.0 if self.feasibility_tolerance is None else self.feasibility_tolerance
+        require_positive(self.name, BackendError, finite=False, feasibility_tolerance=feasible)
         if np.isnan(self.time_limit):
             raise BackendError(f"{self.name}: time_limit must be a number of seconds, found {self.time_limit}")
-        if self.max_iterations < 0:
-            raise BackendError(f"{self.name}: max_iterations must not be negative, found {self.max_iterations}")
-        if self.search_iterations < 0:
-            raise BackendError(f"{self.name}: search_iterations must not be negative, found {self.search_iterations}")
+        for name in ("max_iterations", "search_iterations"):
+            if vars(self)[name] < 0:
+                raise BackendError(f"{self.name}: {name} must not be negative, found {vars(self)[name]}")
 
     @property
     def tolerances(self) -> Tolerances:

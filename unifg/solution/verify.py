@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unifg.errors import GraphError, require_kinds
+from unifg.errors import GraphError, require_positive
 from unifg.modeling.terms import Constraint
 from unifg.modeling.variables import Data, Family
 from unifg.problem.compiled_problem import CompiledProblem
@@ -207,8 +207,7 @@ class Conditions:
         np.maximum.at(forces, A.columns, np.abs(A.numbers * multipliers[A.rows]))
         sizes = np.zeros(kinds.max(initial=-1) + 1)
         np.maximum.at(sizes, kinds, SHARE * forces)
-        found: Array = np.where(sizes > 0.0, sizes, np.inf)[kinds]
-        return found
+        return np.where(sizes > 0.0, sizes, np.inf)[kinds]
 
     def _offset(self, slope: Array, doubt: Array) -> tuple[float, float]:
         """Relative offset of least squares, and by how much it may be wrong."""
@@ -260,8 +259,7 @@ class Conditions:
             if not wrong.any():
                 break
             free ^= wrong
-        signed: Array = np.where(sign * multipliers < 0.0, 0.0, multipliers)
-        return signed
+        return np.where(sign * multipliers < 0.0, 0.0, multipliers)
 
 
 def require_tolerance(tolerance: float) -> None:
@@ -270,9 +268,7 @@ def require_tolerance(tolerance: float) -> None:
     Raises:
         GraphError: with what was found.
     """
-    require_kinds("verify", GraphError, require_tolerance.__annotations__, {"tolerance": tolerance})
-    if not tolerance > 0.0:
-        raise GraphError(f"verify: tolerance must be positive, found {tolerance}")
+    require_positive("verify", GraphError, finite=False, tolerance=tolerance)
 
 
 def verified(

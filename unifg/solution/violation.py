@@ -53,8 +53,7 @@ class ViolationModel:
     @property
     def lengths(self) -> Array:
         """(n,) how far each unknown would have to go, by itself, to make a difference."""
-        lengths: Array = np.sqrt(2.0 * self.value / self.size)
-        return lengths
+        return np.sqrt(2.0 * self.value / self.size)
 
     def damped(self, damping: float, size: Array) -> Array:
         """Entries of the Hessian with ``damping`` times ``size`` on its diagonal."""

@@ -6,6 +6,4 @@ from unifg.view.scene import Scene
 __all__ = ["Live", "Scene"]
 
 
-def __dir__() -> list[str]:
-    """List what is public."""
-    return list(__all__)
+__dir__ = __all__.copy

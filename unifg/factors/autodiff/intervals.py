@@ -89,8 +89,7 @@ def _wave(x: Interval, quarter: float) -> Interval:
 
     def within(first: float) -> BoolArray:
         margin = ULPS * (2.0 + np.abs(low) + np.abs(high))
-        found: BoolArray = 2.0 * np.ceil((low - margin - first) / 2.0) + first <= high + margin
-        return found
+        return 2.0 * np.ceil((low - margin - first) / 2.0) + first <= high + margin
 
     error = ULPS * (2.0 + np.pi * (np.abs(low) + np.abs(high)))
     least = np.where(within(1.0), -1.0, np.minimum(*ends) - error)

@@ -326,8 +326,7 @@ class Symbols(np.ndarray[Any, np.dtype[Any]]):
         """Round to so many places."""
         if out is not None:
             raise TraceError("rounds into another array; assign the result")
-        rounded: Any = np.rint(self * 10.0**decimals) / 10.0**decimals if decimals else np.rint(self)
-        return rounded
+        return np.rint(self * 10.0**decimals) / 10.0**decimals if decimals else np.rint(self)
 
 
 class Length(int):
