@@ -107,7 +107,8 @@ def accelerated(clearance: Clearance, many: bool | None = None) -> Barrier:
     def of_accelerated(x: Array, t: Any, centre: Array, velocity: Array, acceleration: Any, *rest: Any) -> Array:
         if axes is None:
             _refuse_sets(centre, t)
-        s = _per_factor(t, axes)
+        each = (-1,) + (1,) * (axes or 1)
+        s = np.reshape(t, each if np.size(t) > 1 else ())  # one time for all factors stays a number
         there = centre + s * velocity
         if acceleration is not None:
             there = there + 0.5 * s * s * acceleration
@@ -139,11 +140,6 @@ def _axes(clearance: Clearance) -> int | None:
         return None
     expected = kernel.arguments[1]
     return expected if isinstance(expected, int) else len(expected) if isinstance(expected, tuple) else 1
-
-
-def _per_factor(t: Any, axes: int | None) -> Any:
-    """A time for each factor as what centres are multiplied with; one for all of them stays a number."""
-    return np.reshape(t, (-1,) + (1,) * (axes or 1)) if np.size(t) > 1 else np.reshape(t, ())
 
 
 def _refuse_sets(centre: Array, t: Any) -> None:

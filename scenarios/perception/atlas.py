@@ -35,8 +35,7 @@ class Atlas:
     @property
     def used(self) -> BoolArray:
         """(K,) which slots hold a landmark."""
-        used: BoolArray = self.names != FREE
-        return used
+        return np.not_equal(self.names, FREE)
 
     def tick(self) -> None:
         """Time goes on."""
@@ -73,9 +72,8 @@ class Atlas:
 
     def retire(self, slot: int, position: Array, covariance: Array) -> None:
         """Free a slot; what it held stays on the map as it was last believed."""
-        name = int(self.names[slot])
-        row = (int(self._first[slot]), name, position.copy(), covariance.copy(), float(self.radii[slot]))
-        self._retired.append((*row, int(self.kinds[slot])))
+        first, name, kind = int(self._first[slot]), int(self.names[slot]), int(self.kinds[slot])
+        self._retired.append((first, name, position.copy(), covariance.copy(), float(self.radii[slot]), kind))
         self.strike(slot)
 
     def strike(self, slot: int) -> None:

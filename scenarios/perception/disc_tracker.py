@@ -105,11 +105,8 @@ class DiscTracker:
         self._predict(dt)
         track, disc = self._associate(discs)
         self._correct(track, disc, discs, dt)
-        missed = np.ones(len(self._rows), dtype=bool)
-        missed[track] = False
-        self._review(missed, scan, place, dt)
-        new = np.ones(len(discs.radius), dtype=bool)
-        new[disc] = False
+        self._review(~np.isin(np.arange(len(self._rows)), track), scan, place, dt)
+        new = ~np.isin(np.arange(len(discs)), disc)
         if new.any():  # no track explains them
             fresh = discs.at(new)
             identity = self._next_identity + np.arange(len(fresh), dtype=np.intp)
@@ -183,8 +180,7 @@ class DiscTracker:
         rows.radius_information[track] = np.minimum(total, _RADIUS_SIGMA_FLOOR**-2)
 
         rows.hits[track] += 1
-        rows.unseen[track] = 0.0
-        rows.clear[track] = 0
+        rows.unseen[track] = rows.clear[track] = 0
         self._judge_motion(track, variance)
         self._count_rest(track, dt)
 
@@ -221,9 +217,7 @@ class DiscTracker:
             return
         rows = self._rows
         rows.unseen[missed] += dt
-        through = np.zeros_like(missed)
-        through[missed] = self._seen_through(missed, scan, pose)
-        rows.clear[through] += 1
+        rows.clear[missed] += self._seen_through(missed, scan, pose)
         limit = np.where(rows.moving, 2, _CLEAR_LIMIT)
         gone = (rows.hits < 2) | (rows.clear >= limit) | (rows.moving & (rows.unseen > _PATIENCE))
         if (gone & missed).any():
@@ -240,9 +234,8 @@ class DiscTracker:
         away = np.abs((scan.angles - bearing[:, None] + np.pi) % (2.0 * np.pi) - np.pi)
         aimed = (away < half[:, None]) & ~np.isnan(scan.ranges)
         clear = aimed & (scan.ranges > (distance + 0.1)[:, None])
-        aimed_count = aimed.sum(axis=1)
-        through: BoolArray = (aimed_count > 0) & (clear.sum(axis=1) > 0.7 * aimed_count)
-        through &= distance < self.finder.range_max
+        count, within = aimed.sum(axis=1), distance < self.finder.range_max
+        through: BoolArray = within & (count > 0) & (clear.sum(axis=1) > 0.7 * count)
         return through
 
 

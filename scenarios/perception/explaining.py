@@ -6,7 +6,7 @@ plan has to keep clear of, whatever shape they belong to.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -92,9 +92,6 @@ class PointWatch:
     def update(self, seen: Explained, tracks: Tracks, count: int) -> Array:
         """Take in a scan of ``count`` beams, with the discs that are tracked after it."""
         new = (seen.excess > 0.0) & (seen.ranges <= POINT_RANGE)
-        if not new.any():
-            self.points = self._before = np.zeros((0, 2))
-            return self.points
         points, beams = seen.points[new], seen.beams[new]
         beside = np.zeros(len(points), dtype=bool)
         if len(points) > 1:
@@ -103,9 +100,8 @@ class PointWatch:
             )
             beside = close | np.roll(close, 1)
         points = points[beside]
-        again = _near(points, self._before, AGAIN)
+        fresh = points[_near(points, self._before, AGAIN)]
         self._before = points
-        fresh = points[again]
         for centre, radius in zip(tracks.centre, tracks.radius.tolist(), strict=True):
             fresh = fresh[np.hypot(*(fresh - centre).T) > radius + BESIDE_DISC]
         self.points = thinned(fresh, APART)
@@ -115,15 +111,11 @@ class PointWatch:
         """The points as small discs that stand."""
         count = len(self.points)
         still = Tracks.of_movers(self.points, np.zeros((count, 2)), np.full(count, RADIUS))
-        return Tracks(
-            still.centre, still.velocity, still.radius, -1 - still.identity, still.unseen, np.zeros(count, dtype=bool)
-        )
+        return replace(still, identity=-1 - still.identity, mover=np.zeros(count, dtype=bool))
 
 
 def thinned(points: Array, apart: float) -> Array:
     """Of points (n, 2) one for each square of side ``apart`` [m] that holds any: the first."""
-    if not len(points):
-        return points
     _, first = np.unique(np.floor(points / apart).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(first)]
 

@@ -207,7 +207,7 @@ class MonteCarlo:
         spread = np.abs(self.particles[:, :2] - self.particles[:, :2].mean(axis=0)).max()
         if not own.skip or spread > own.gathered:
             return everything
-        counted: BoolArray = (distance < own.explained).mean(axis=0) >= own.few
+        counted = np.mean(distance < own.explained, axis=0) >= own.few
         return counted if (~counted).mean() < own.most else everything
 
     def _draw(self) -> None:
@@ -223,10 +223,8 @@ class MonteCarlo:
         _, first = np.unique(self._cells(chosen), axis=0, return_index=True)
         occupied = np.searchsorted(np.sort(first), np.arange(1, count + 1), side="left")  # among the first n
         enough = np.array([needed(int(k), own) for k in range(len(first) + 1)])[occupied] <= np.arange(1, count + 1)
-        kept = int(np.argmax(enough)) + 1 if enough.any() else count
-        kept = max(kept, own.particles[0])
-        self.particles, self.weights = chosen[:kept], np.full(kept, 1.0 / kept)
-        self.iterations = kept
+        kept = max(int(np.argmax(enough)) + 1 if enough.any() else count, own.particles[0])
+        self.particles, self.weights, self.iterations = chosen[:kept], np.full(kept, 1.0 / kept), kept
 
     def _anywhere(self, count: int) -> Array:
         """(count, 3) poses all over the free cells."""
@@ -254,7 +252,6 @@ class MonteCarlo:
         weights = self.weights[inside] / self.weights[inside].sum()
         poses = self.particles[inside]
         heading = math.atan2(float(weights @ np.sin(poses[:, 2])), float(weights @ np.cos(poses[:, 2])))
-        self._mean: Array = np.array([*(weights @ poses[:, :2]), heading])
-        self.pose = self._mean
+        self.pose = self._mean = np.array([*(weights @ poses[:, :2]), heading])
         apart = SE2.local(np.tile(self._mean, (len(poses), 1)), poses)
         self.covariance: Array = (weights[:, None] * apart).T @ apart + 1e-8 * np.eye(3)

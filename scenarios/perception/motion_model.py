@@ -197,9 +197,8 @@ class MotionModel:
 
     def _adopted(self, place: Array, names: IntArray) -> Past:
         """The past of a lost track on whose line a new one begins, or none."""
-        for name in [name for name in self._pasts if name not in names]:
-            past = self._pasts[name]
-            if past.axis is not None and past.wave is not None:
+        for name, past in self._pasts.items():
+            if name not in names and past.axis is not None and past.wave is not None:
                 offset = place - past.axis[0]
                 along = float(np.clip(offset @ past.axis[1], *past.wave[:2]))
                 if np.hypot(*(offset - along * past.axis[1])) < ADOPTED:

@@ -51,15 +51,13 @@ tally = Tally()
 @contextmanager
 def counting() -> Iterator[Tally]:
     """Counts of a block; complete when it is left."""
-    marks = len(tally.compiled), len(tally.generated), len(tally.read), len(tally.files)
+    marks = {name: len(functions) for name, functions in vars(tally).items()}
     added = Tally()
     try:
         yield added
     finally:
-        added.compiled += tally.compiled[marks[0] :]
-        added.generated += tally.generated[marks[1] :]
-        added.read += tally.read[marks[2] :]
-        added.files += tally.files[marks[3] :]
+        for name, mark in marks.items():
+            vars(added)[name] += vars(tally)[name][mark:]
 
 
 class _Listener(event.Listener):  # type: ignore[misc]

@@ -113,8 +113,7 @@ def shapes(path: str) -> dict[str, Shape]:
 @cache
 def _shapes(path: str, date: int, size: int) -> dict[str, Shape]:
     """Syntax of a file as it was at a date."""
-    with open(path, "rb") as file:
-        content = file.read()
+    content = Path(path).read_bytes()
     digest = hashlib.sha256(content).hexdigest()
     found = archived().get(digest)
     if found is None:

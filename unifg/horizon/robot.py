@@ -67,8 +67,7 @@ class Constant:
     @property
     def information(self) -> Array:
         """(count, dim, dim) about the start."""
-        count, dim = len(self.values), self.manifold.dim
-        return information_of(np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (count, dim)))
+        return information_of(np.asarray(self.sigma, dtype=np.float64))
 
     @property
     def known(self) -> bool:

@@ -505,9 +505,8 @@ class Model:
         check_fix(unique, selection, held.value if isinstance(held, Data) else held)
         compare(unique, "fix", (selection, value), ALIKE, {1: selection.manifold})
         for other in self.fixes:
-            if other is not replaced and other.selection.family is selection.family:
-                if _overlap(other.selection, selection):
-                    _require_once(selection, other.selection.indices, f"by '{other.name}' already")
+            if other is not replaced and _overlap(other.selection, selection):
+                _require_once(selection, other.selection.indices, f"by '{other.name}' already")
         members, times = np.unique(selection.indices, return_counts=True)
         _require_once(selection, members[times > 1], "twice")
         return Fix(unique, selection, held)
@@ -629,7 +628,9 @@ def itself(value: Array) -> Array:
 
 
 def _overlap(first: Selection, second: Selection) -> bool:
-    return first.component is None or second.component is None or first.component == second.component
+    return first.family is second.family and (
+        None in (first.component, second.component) or first.component == second.component
+    )
 
 
 def title(function: Any) -> str:

@@ -67,10 +67,8 @@ def ellipse(size: float, colour: str) -> list[Part]:
 def car(size: float, colour: str) -> list[Part]:
     """A car of that length between its bumpers, its origin in the middle of the rear axle."""
     along, wide = 0.6 * size, 0.42 * size
-    wheels = []
-    for x in (0.0, along):
-        for side in (-1.0, 1.0):
-            wheels.append(box([x, side * 0.47 * wide, 0.09 * size], np.array([0.18, 0.06, 0.18]) * size))
+    places = [[x, side * 0.47 * wide, 0.09 * size] for x in (0.0, along) for side in (-1.0, 1.0)]
+    wheels = [box(place, np.array([0.18, 0.06, 0.18]) * size) for place in places]
     middle = 0.5 * along
     return [
         Part("body", box([middle, 0.0, 0.15 * size], [size, wide, 0.14 * size]), colour),

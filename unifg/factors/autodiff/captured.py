@@ -65,18 +65,13 @@ class _Watched:
             present = entries_of(container)
             if len(present) != len(entries) or any(now is not kept for now, kept in zip(present, entries, strict=True)):
                 return True
-        for interpolator, content in self.interpolators:
-            if fingerprint_of(interpolator) != content:
-                return True
-        return changed_arrays(self.arrays)
+        changed = any(fingerprint_of(interpolator) != content for interpolator, content in self.interpolators)
+        return changed or changed_arrays(self.arrays)
 
 
 def changed_arrays(contents: Sequence[tuple[Array, bytes]]) -> bool:
     """Test whether an array holds other numbers than it did."""
-    for array, content in contents:
-        if array.tobytes() != content:
-            return True
-    return False
+    return any(array.tobytes() != content for array, content in contents)
 
 
 @dataclass(frozen=True, eq=False)
