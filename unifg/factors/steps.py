@@ -88,11 +88,15 @@ def _parts_of(keys: tuple[Hashable, ...]) -> tuple[tuple[Part, Manifold], ...]:
             elif leaf == SO3:
                 parts.append((Part(TURN, at, 4, 3, tangent, -1), leaf))
             elif leaf == SE2:
-                parts.append((Part(VECTOR, at, 2, 2, tangent, at + 2), Rn(2)))
-                parts.append((Part(ANGLE, at + 2, 1, 1, tangent + 2, -1), SO2))
+                parts += [
+                    (Part(VECTOR, at, 2, 2, tangent, at + 2), Rn(2)),
+                    (Part(ANGLE, at + 2, 1, 1, tangent + 2, -1), SO2),
+                ]
             elif leaf == SE3:
-                parts.append((Part(VECTOR, at, 3, 3, tangent, at + 3), Rn(3)))
-                parts.append((Part(TURN, at + 3, 4, 3, tangent + 3, -1), SO3))
+                parts += [
+                    (Part(VECTOR, at, 3, 3, tangent, at + 3), Rn(3)),
+                    (Part(TURN, at + 3, 4, 3, tangent + 3, -1), SO3),
+                ]
             else:
                 parts.append((Part(OTHER, at, leaf.storage, leaf.dim, tangent, -1), leaf))
         start, column = start + manifold.storage, column + manifold.dim
