@@ -434,9 +434,11 @@ def test_the_violation_has_a_tolerance_of_its_own(solver: Solver) -> None:
     assert loose.converged and loose.violation > 1e-9 and loose.iterations < strict.iterations
 
 
-def test_a_tolerance_of_nothing_is_refused() -> None:
-    with pytest.raises(fg.BackendError, match="feasibility_tolerance must be positive, found 0"):
-        SQP(feasibility_tolerance=0.0)
+@pytest.mark.parametrize("bad", [0.0, np.inf, np.nan])
+@pytest.mark.parametrize("name", ["tolerance", "feasibility_tolerance"])
+def test_a_tolerance_of_nothing_or_of_everything_is_refused(name: str, bad: float) -> None:
+    with pytest.raises(fg.BackendError, match=f"SQP: {name} must be positive and finite, found {bad}"):
+        SQP(**{name: bad})  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("size", [1e-6, 1e6])

@@ -121,7 +121,7 @@ def test_solving_a_file_names_the_survey(tmp_path: Path) -> None:
     wrong = displaced(made, np.arange(60, 80), np.array([0.8, 0.5, 0.15]))
     write_g2o(tmp_path / "drive.g2o", wrong)
     out = tmp_path / "out"
-    options = ["--init", "file", "--effort", "cheap", "--out", str(out)]
+    options = ["--init", "file", "--effort", "cheap", "--scene", "--out", str(out)]
     assert command.main(["solve", str(tmp_path / "drive.g2o"), *options]) == 0
     (first, *_) = json.loads((out / "metrics.json").read_text())["verdict"]["clusters"]
     assert first["kind"] == "survey" and first["edges"] == [] and first["sightings"][0] == "point"

@@ -16,7 +16,7 @@ from weakref import ReferenceType, ref
 import numpy as np
 
 from unifg.codegen.inner import inner
-from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds, require_positive
+from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds
 from unifg.factors.steps import EPSILON
 from unifg.locks import ReentrantLock
 from unifg.modeling.model import Model
@@ -166,9 +166,9 @@ class Solver(Backend):
         """Refuse options no solve could honour."""
         kinds = {field.name: field.type for field in fields(self)} | {"tolerance": "float"}
         require_kinds(self.name, BackendError, kinds, vars(self))
-        require_positive(self.name, BackendError, tolerance=self.tolerance)
-        feasible = 1.0 if self.feasibility_tolerance is None else self.feasibility_tolerance
-        require_positive(self.name, BackendError, finite=False, feasibility_tolerance=feasible)
+        for name in ("tolerance", "feasibility_tolerance"):
+            if vars(self)[name] is not None and not 0.0 < vars(self)[name] < np.inf:
+                raise BackendError(f"{self.name}: {name} must be positive and finite, found {vars(self)[name]}")
         if np.isnan(self.time_limit):
             raise BackendError(f"{self.name}: time_limit must be a number of seconds, found {self.time_limit}")
         for name in ("max_iterations", "search_iterations"):
