@@ -14,7 +14,7 @@ from unifg.scenarios.ground.drive_parts import disc_limits, predicted
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.route import BETWEEN, PERIODS, TICK, Route
 from unifg.scenarios.ground.waiting import EARLY, LOOK, occupancy, timed, waiting
-from unifg.scenarios.perception.motion_model import GONE, MEMORY, SELDOM, UNLIKELY, MotionModel
+from unifg.scenarios.perception.motion_model import GONE, MEMORY, SELDOM, UNLIKELY, MotionModel, Past
 from unifg.scenarios.perception.tracks import Tracks, nearest, to_and_fro
 from unifg.scenarios.planning.grid import SPACING
 from unifg.scenarios.planning.space_time import CELL, Future, quickest
@@ -160,6 +160,13 @@ def test_a_mover_that_yields_is_not_known_to_go_to_and_fro() -> None:
     assert known[-100:].all() and not likely.any()
     last = stops[-1].sweep[0]
     assert np.isfinite(last[:4]).all() and np.isnan(last[4:]).all() and np.isfinite(stops[-1].wave).all(), "ends stay"
+
+
+@pytest.mark.parametrize(("yields", "known"), [(SELDOM, True), (0.5 * UNLIKELY, True), (2.0 * UNLIKELY, False)])
+def test_a_sweep_that_fits_is_not_known_of_one_who_yields(yields: float, known: bool) -> None:
+    places, wave, axis = np.zeros((9, 2)), np.array([-1.0, 1.0, 0.5, 1.0]), np.eye(2)
+    past = Past(np.arange(9.0), places, places, places, wave, axis, np.array([1.0, 0.0, 0.0, yields]))
+    assert np.isfinite(past.sweep[4:]).all() == known
 
 
 # ------------------------------------------------------------------ what is made of it
