@@ -28,7 +28,7 @@ from unifg.pose_graphs.verdict import Judgement, Verdict
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.options import Settings, count, existing, option
 from unifg.scenarios.stopwatch import Stopwatch
-from unifg.solution.chi_squared import exceeded
+from unifg.solution.chi_squared import upper_quantile
 from unifg.solution.history import Iteration
 from unifg.solution.solution import Solution
 from unifg.solution.status import Status
@@ -311,7 +311,7 @@ def robust_loss(text: str | None, dim: int) -> Loss | None:
 
 def threshold(dim: int) -> float:
     """The length of a whitened residual that a share of right measurements stays below."""
-    return math.sqrt(exceeded(dim, 1.0 - _INLIERS))
+    return math.sqrt(upper_quantile(dim, 1.0 - _INLIERS))
 
 
 def _chosen(kept: dict[int, Array]) -> tuple[list[int], Array]:

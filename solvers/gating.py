@@ -25,7 +25,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import ENTRY, ROW, WIDTH
 from unifg.problem.term import CompiledTerm
-from unifg.solution.chi_squared import exceeded
+from unifg.solution.chi_squared import upper_quantile
 from unifg.typing import Array, BoolArray, IntArray
 
 NEAR = 10  # members of a family between two measurements of one group, at most
@@ -56,7 +56,7 @@ class VarianceFactor:
         """
         if not 1.0 <= self.freedom < np.inf or self.squared <= 0.0:
             return 1.0
-        return min(1.0, self.squared / exceeded(self.freedom, 1.0 - CHANCE))
+        return min(1.0, self.squared / upper_quantile(self.freedom, 1.0 - CHANCE))
 
     def rejects(self, innovation: Array, size: int, count: int) -> BoolArray:
         """Test whether measurements scatter more than the others, at a false-alarm rate of ``CHANCE`` in ``count``.
@@ -67,7 +67,7 @@ class VarianceFactor:
             count: how many are looked at.
         """
         if np.isinf(self.freedom):
-            return innovation > exceeded(size, CHANCE / max(count, 1))
+            return innovation > upper_quantile(size, CHANCE / max(count, 1))
         rest = self.freedom - size
         if rest < 1.0:
             return np.zeros(len(innovation), dtype=np.bool_)

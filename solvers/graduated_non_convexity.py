@@ -50,7 +50,7 @@ from unifg.modeling.terms import Cost
 from unifg.modeling.variables import Data
 from unifg.problem.linearization import Linearization
 from unifg.problem.term import CompiledTerm
-from unifg.solution.chi_squared import exceeded
+from unifg.solution.chi_squared import upper_quantile
 from unifg.solution.history import Iteration
 from unifg.solution.outlier_report import Group, OutlierReport
 from unifg.solution.solution import AnyGuess, NotConverged, Solution, values_of
@@ -556,7 +556,7 @@ class _Answer:
     @property
     def consistent(self) -> bool:
         """Test whether the sum of all squares is no larger than what is stated makes likely."""
-        return self.scatter.freedom < 1.0 or self.scatter.squared <= exceeded(self.scatter.freedom, CHANCE)
+        return self.scatter.freedom < 1.0 or self.scatter.squared <= upper_quantile(self.scatter.freedom, CHANCE)
 
     def units_with(self, other: _Answer, shares: Mapping[str, _Sum]) -> dict[str, float]:
         """Variance of unit weight of each term, over all measurements that this answer or another one keeps.

@@ -32,7 +32,7 @@ from unifg.pose_graphs.verdict import Kind
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.term import CompiledTerm
-from unifg.solution.chi_squared import exceeded
+from unifg.solution.chi_squared import upper_quantile
 from unifg.solution.conditioning import HARDLY
 from unifg.solution.graph import Graph
 from unifg.solution.solution import Solution
@@ -233,12 +233,12 @@ def _solved(
 def limit_of(squared: float, freedom: int, size: int, count: int) -> float:
     """Fall of the sum of squares that right measurements of ``size`` numbers stay below, one of ``count``."""
     noise = SPARE * VarianceFactor(squared, freedom).unit
-    return min(1.0, max(CALM, noise)) * exceeded(size, CHANCE / max(count, 1))
+    return min(1.0, max(CALM, noise)) * upper_quantile(size, CHANCE / max(count, 1))
 
 
 def over_stated(squared: float, freedom: int) -> float:
     """Least factor by which noise is larger than stated, one where it may be as stated."""
-    return max(1.0, squared / exceeded(freedom, 1.0 - CHANCE)) if freedom > 0 else 1.0
+    return max(1.0, squared / upper_quantile(freedom, 1.0 - CHANCE)) if freedom > 0 else 1.0
 
 
 def _clusters(edges: Edges, chosen: BoolArray) -> list[IntArray]:

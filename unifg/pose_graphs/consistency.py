@@ -19,7 +19,7 @@ import numpy as np
 from unifg.errors import GraphError, require_kinds
 from unifg.factors.whitening import quick_roots
 from unifg.pose_graphs.pose_graph import PoseGraph
-from unifg.solution.chi_squared import exceeded
+from unifg.solution.chi_squared import upper_quantile
 from unifg.typing import Array, BoolArray, IntArray
 
 __all__ = ["most_consistent", "pairwise_consistent"]
@@ -132,7 +132,7 @@ def _agreements(
     covariance = across @ covariance @ np.swapaxes(across, 1, 2)
     moved = gone[second] - gone[first]
     pairs = part[first] * (int(part.max(initial=0)) + 1) + part[second]
-    bound = exceeded(dim, 1.0 - probability)
+    bound = upper_quantile(dim, 1.0 - probability)
     for one in np.unique(pairs):
         own = np.flatnonzero(pairs == one)
         agreeing = np.zeros((len(own), len(own)), dtype=np.bool_)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 
-def exceeded(freedom: float, chance: float) -> float:
+def upper_quantile(freedom: float, chance: float) -> float:
     """Value that a chi-squared variable exceeds with a probability.
 
     The series of the incomplete gamma function (Abramowitz and Stegun 6.5.29) is bisected below a bound of Laurent and
