@@ -27,7 +27,8 @@ from unifg.codegen.jit import compiled
 from unifg.errors import BackendError, require_positive
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
-from unifg.solution.solver import Solver, SolveState
+from unifg.solution.solve_state import SolveState
+from unifg.solution.solver import Solver
 from unifg.solution.status import Status
 from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import STRAIGHT, damped_step, model_step

@@ -38,7 +38,8 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
 from unifg.problem.systems import aim, fill
-from unifg.solution.solver import Solver, SolveState
+from unifg.solution.solve_state import SolveState
+from unifg.solution.solver import Solver
 from unifg.solution.status import Status
 from unifg.solvers.active_set import ActiveSet
 from unifg.solvers.augmented_objective import DIAGONAL_FLOOR

@@ -1,6 +1,6 @@
 """The short names of the backends: the one table that commands, scenarios, benchmarks and tests read.
 
-Which graphs a backend takes stands in its class (:class:`unifg.solution.solver.Backend`); the lists of names below are
+Which graphs a backend takes stands in its class (:class:`unifg.solution.backend.Backend`); the lists of names below are
 made from that.
 """
 
@@ -10,7 +10,8 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from unifg.errors import BackendError
-from unifg.solution.solver import Backend, Solver
+from unifg.solution.backend import Backend
+from unifg.solution.solver import Solver
 from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
 from unifg.solvers.graduated_non_convexity import GraduatedNonConvexity
 from unifg.solvers.interior_point.method import InteriorPoint

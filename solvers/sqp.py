@@ -24,7 +24,8 @@ from unifg.errors import BackendError
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.capabilities import require
-from unifg.solution.solver import Solver, SolveState
+from unifg.solution.solve_state import SolveState
+from unifg.solution.solver import Solver
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import RestorationTrigger, leave, resume, settle
 from unifg.solvers.globalize.norms import largest

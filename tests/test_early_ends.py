@@ -14,7 +14,7 @@ from problems.graphs import drawn_to, graph_with
 from unifg.models import obstacles, unicycle
 from unifg.problem.linearization import Linearization
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
-from unifg.solution.solver import SolveState
+from unifg.solution.solve_state import SolveState
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 from unifg.typing import Array
 

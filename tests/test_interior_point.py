@@ -21,7 +21,7 @@ from unifg.factors.robust import Loss
 from unifg.models import avoidance, quadrotor
 from unifg.problem.columns import Values
 from unifg.solution.optimality import optimality, read_numbers
-from unifg.solution.solver import SolveState
+from unifg.solution.solve_state import SolveState
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.interior_point import method
 from unifg.solvers.interior_point.method import Workspace

@@ -14,7 +14,8 @@ import unifg as fg
 from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.solution.multipliers import Slopes, estimated
 from unifg.solution.optimality import optimality
-from unifg.solution.solver import Solver, SolveState
+from unifg.solution.solve_state import SolveState
+from unifg.solution.solver import Solver
 from unifg.solvers import (
     KKT,
     SQP,

@@ -144,7 +144,7 @@ def test_nothing_is_worked_out_unless_asked(monkeypatch: pytest.MonkeyPatch) -> 
         made.append(1)
         return factor_norms(*given)
 
-    monkeypatch.setattr("unifg.solution.solver.factor_norms", counted)
+    monkeypatch.setattr("unifg.solution.solve_state.factor_norms", counted)
     graph, guess = short_drive()
     SQP(verbose=False).solve(graph, guess, callback=lambda row: None)
     assert not made

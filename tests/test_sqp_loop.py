@@ -14,7 +14,7 @@ from problems.control import Quadrotor, Unicycle
 from problems.graphs import drawn_to, graph_with
 from problems.hock_schittkowski import SMALL
 from unifg.errors import GraphError
-from unifg.solution.solver import SolveState
+from unifg.solution.solve_state import SolveState
 from unifg.solvers import SQP
 from unifg.solvers.globalize import slow_convergence
 from unifg.solvers.globalize.feasibility_restoration import FALLING, PATIENCE, RestorationTrigger

@@ -56,7 +56,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "binding",
         "plots",
     ),
-    "unifg/solution/solver.py": (
+    "unifg/solution/prepared.py": ("answers", "early_ends", "solvers", "refusals", "verification"),
+    "unifg/solution/solve_state.py": (
         "answers",
         "early_ends",
         "interior_point",

@@ -15,7 +15,7 @@ import numpy as np
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.optimality import infeasible_stationary, within_bounds
-from unifg.solution.solver import SolveState
+from unifg.solution.solve_state import SolveState
 from unifg.solution.status import Status
 from unifg.solution.violation import ViolationModel, descent
 from unifg.solvers.globalize.norms import norm

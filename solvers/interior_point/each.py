@@ -13,7 +13,7 @@ from unifg.problem.guess import settle
 from unifg.problem.linearization import all_finite
 from unifg.solution.export import REFUSED
 from unifg.solution.multipliers import SUSPICIOUS
-from unifg.solution.solver import UNBOUNDED_COST
+from unifg.solution.solve_state import UNBOUNDED_COST
 from unifg.solvers.interior_point.state import (
     CONVERGED,
     LIMIT_REACHED,

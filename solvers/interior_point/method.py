@@ -30,7 +30,8 @@ from unifg.solution.export import Exported
 from unifg.solution.history import Iteration
 from unifg.solution.multipliers import SUSPICIOUS, Slopes
 from unifg.solution.optimality import Optimality, Tolerances, optimality, read_numbers
-from unifg.solution.solver import UNBOUNDED_COST, Conclusion, Solver, SolveState
+from unifg.solution.solve_state import UNBOUNDED_COST, Conclusion, SolveState
+from unifg.solution.solver import Solver
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import nearest
 from unifg.solvers.interior_point import each, state

@@ -17,7 +17,7 @@ from unifg.problem.limits import clip
 from unifg.problem.table import TermArrays
 from unifg.solution.multipliers import raise_slopes
 from unifg.solution.optimality import kkt_numbers
-from unifg.solution.solver import UNBOUNDED_COST
+from unifg.solution.solve_state import UNBOUNDED_COST
 from unifg.solvers.globalize.merit import FARTHEST
 from unifg.solvers.quadratic_programs.attempt import (
     FIND_UNITS,

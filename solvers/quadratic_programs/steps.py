@@ -19,7 +19,7 @@ from unifg.problem.scalars import add_scalars, evaluate_scalars
 from unifg.problem.snapshot import LinearizationMemory
 from unifg.solution.history import Iteration
 from unifg.solution.optimality import Tolerances, read_numbers
-from unifg.solution.solver import SolveState
+from unifg.solution.solve_state import SolveState
 from unifg.solvers.quadratic_programs.attempt import (
     AIMED,
     CORRECT,

@@ -27,8 +27,9 @@ from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data
 from unifg.solution.graph import Graph
 from unifg.solution.history import subproblems
+from unifg.solution.prepared import Prepared
 from unifg.solution.solution import Guess, Solution
-from unifg.solution.solver import Prepared, Solver
+from unifg.solution.solver import Solver
 from unifg.solution.status import Status
 from unifg.typing import Array, ArrayLike
 

@@ -1,8 +1,9 @@
 """Many instances of one graph: other data, other guesses, one structure.
 
-Where the backend's whole loop is compiled (:meth:`unifg.solution.solver.Solver.solve_each`), instances run one after
-the other without Python, and threads run at once. What such a loop does not end with success is solved again as usual,
-and so are all instances of a graph that Python has a part in. Statuses are therefore those of single solves.
+Where the backend's whole loop is compiled (:meth:`unifg.solution.solve_state.IterativeMethod.solve_each`), instances
+run one after the other without Python, and threads run at once. What such a loop does not end with success is solved
+again as usual, and so are all instances of a graph that Python has a part in. Statuses are therefore those of single
+solves.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Outcomes(NamedTuple):
 
 
 class Worker(Protocol):
-    """Prepared solver of one thread, :class:`unifg.solution.solver.Prepared`."""
+    """Prepared solver of one thread, :class:`unifg.solution.prepared.Prepared`."""
 
     program: CompiledProblem
 
@@ -79,7 +80,7 @@ class Batch:
     """
 
     def __init__(self, prepared: Worker, data: Mapping[Data, Array], count: int) -> None:
-        """Make room; filled by :meth:`unifg.solution.solver.Prepared.solve_many`."""
+        """Make room; filled by :meth:`unifg.solution.prepared.Prepared.solve_many`."""
         program = prepared.program
         self._prepared, self._data = prepared, data
         self.statuses: list[Status] = [Status.INTERRUPTED] * count
@@ -191,7 +192,7 @@ def solve_batch(
     data: Mapping[Data, Numbers],
     threads: int,
 ) -> Batch:
-    """All instances; arguments and errors as for :meth:`unifg.solution.solver.Prepared.solve_many`."""
+    """All instances; arguments and errors as for :meth:`unifg.solution.prepared.Prepared.solve_many`."""
     given, count = stacked_data(data)
     if isinstance(guesses, Sequence):
         if count not in (None, len(guesses)):

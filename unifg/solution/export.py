@@ -102,7 +102,7 @@ class Exported(NamedTuple):
 
 
 class Exportable(Protocol):
-    """Prepared solver, :class:`unifg.solution.solver.Prepared`."""
+    """Prepared solver, :class:`unifg.solution.prepared.Prepared`."""
 
     program: CompiledProblem
 
