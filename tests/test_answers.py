@@ -10,6 +10,7 @@ from scipy.linalg import null_space
 
 import unifg as fg
 from problems.graphs import drawn_to, graph_of, graph_with
+from unifg.solution.marginal import cost_rows
 from unifg.solvers import (
     SQP,
     GaussNewton,
@@ -36,7 +37,7 @@ def eliminated(graph: fg.Graph, x: fg.Family, y: fg.Family) -> tuple[Array, Arra
     """Information about y and where it points, by dense algebra over everything but 'rest'."""
     program = graph.compile()
     lin = program.linearize({x: np.zeros((2, 2)), y: np.zeros((1, 2))})
-    rows = program.cost_rows(["prior", "step", "now"])
+    rows = cost_rows(program, ["prior", "step", "now"])
     J = program.costs.matrix(lin.jacobian).toarray()[rows]
     A = program.constraints.matrix(lin.constraint_jacobian).toarray()
     r, c = lin.residual[rows], lin.constraints

@@ -145,11 +145,8 @@ def test_weight_rises_with_every_robot_that_a_mover_yields_to() -> None:
 def test_weight_stays_for_a_mover_that_does_not_yield() -> None:
     assert yielding(met(22.0, ROBOTS, until=0.0)).max() <= SELDOM
     assert yielding(met(22.0, {})).max() <= SELDOM, "it met nobody"
-
-
-def test_a_turn_at_a_known_end_speaks_against_yielding_as_going_on_does() -> None:
-    robots = {k: 3.5 for k in (8.0, 13.0, 18.0, 23.0)}  # it would stop for them at its end
-    assert yielding(met(28.0, robots, 0.0, 2.5))[80:].max() < 0.1 * SELDOM
+    before_its_end = dict.fromkeys((8.0, 13.0, 18.0, 23.0), 3.5)
+    assert yielding(met(28.0, before_its_end, 0.0, 2.5))[80:].max() < 0.1 * SELDOM, "it turns there anyway"
 
 
 def test_weight_falls_for_a_mover_that_does_not_yield_any_more() -> None:

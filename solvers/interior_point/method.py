@@ -22,6 +22,7 @@ from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian, require_second
 from unifg.problem.linearization import Linearization
+from unifg.problem.python_parts import numbers_only
 from unifg.problem.snapshot import LinearizationMemory
 from unifg.problem.systems import stacked
 from unifg.problem.table import COST, COUNT, KERNEL_WIDTH, KIND, ROW, ROWS
@@ -104,7 +105,7 @@ class InteriorPoint(Solver):
 
     def solves_each(self, program: CompiledProblem) -> bool:
         """Test whether one compiled call may solve many instances."""
-        return self.runs_alone(program) and self.time_limit == np.inf and program.numbers_only
+        return self.runs_alone(program) and self.time_limit == np.inf and numbers_only(program)
 
     def solve_each(self, workspace: Workspace, rows: Array, guesses: Array, duals: Array) -> Outcomes:
         """Solve many instances, which differ in numbers alone."""

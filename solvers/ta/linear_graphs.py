@@ -33,7 +33,8 @@ from unifg.problem.linearization import Rows
 from unifg.problem.term import CompiledTerm
 from unifg.solution.capabilities import require
 from unifg.solution.graph import Graph
-from unifg.solution.solution import Guess, Solution
+from unifg.solution.guess import Guess
+from unifg.solution.solution import Solution
 from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, qp_error, subproblem
 from unifg.solvers.ta.elimination import (
     Contradiction,

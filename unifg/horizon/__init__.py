@@ -12,9 +12,10 @@ plan = loop.tick(measured={"position": z})
 
 from unifg.horizon.coupling import COUPLINGS
 from unifg.horizon.decision import Decision, LastPlan, LastPlanThenBrake, Plan
+from unifg.horizon.initial_guesses import InitialGuesses
 from unifg.horizon.mesh import plan_on_mesh
 from unifg.horizon.multistart import cheapest
-from unifg.horizon.receding_horizon import InitialGuesses, RecedingHorizon
+from unifg.horizon.receding_horizon import RecedingHorizon
 from unifg.horizon.robot import Constant, Robot
 from unifg.horizon.terms import Context, ControlCost, Dynamics, Measurement, Term
 from unifg.horizon.tree import Tree, tree_of

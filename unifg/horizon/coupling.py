@@ -22,7 +22,8 @@ from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.terms import Term as Stated
 from unifg.modeling.variables import Data, Family, Selection
 from unifg.solution.graph import Graph
-from unifg.solution.solution import Guess, Solution
+from unifg.solution.guess import Guess
+from unifg.solution.solution import Solution
 from unifg.typing import Array, ArrayLike
 
 Coupling: TypeAlias = Literal["separate", "sequential", "joint"]
@@ -187,6 +188,28 @@ class JointPresent:
     def believed(self, solution: Solution) -> tuple[Array, dict[str, Array]]:
         """Estimate taken from the solve."""
         return solution[self._present][0], {family.name: solution[family] for family in self.past.constants}
+
+
+def couple(
+    coupling: Coupling,
+    graph: Graph,
+    robot: Robot,
+    window: Window | None,
+    steps: int,
+    pull: float | Sequence[float] | Array,
+) -> PresentCoupling:
+    """The coupling that a horizon asks for; ``pull`` as of :class:`JointPresent`.
+
+    Raises:
+        GraphError: "joint" without a window, or with one of another robot.
+    """
+    if coupling != "joint":
+        return FixedPresent(graph, robot, steps, coupling == "separate")
+    if window is None:
+        raise GraphError("the coupling 'joint' needs a window: there is no past to join")
+    if window.robot is not robot:
+        raise GraphError("the window is of another robot")
+    return JointPresent(graph, window, steps, pull)
 
 
 def weighed(loss: Loss, weight: float) -> Loss | None:

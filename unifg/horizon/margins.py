@@ -18,7 +18,7 @@ from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.term import CompiledTerm
 from unifg.solution.graph import Graph
-from unifg.solution.solution import Guess
+from unifg.solution.guess import Guess
 from unifg.typing import Array, ArrayLike
 
 WIDEST = 0.45  # of what lies between two limits, so that something is left between them

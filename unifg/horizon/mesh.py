@@ -17,7 +17,8 @@ import numpy as np
 
 from unifg.errors import GraphError, require_kinds
 from unifg.horizon.decision import Plan
-from unifg.horizon.receding_horizon import InitialGuesses, RecedingHorizon
+from unifg.horizon.initial_guesses import InitialGuesses
+from unifg.horizon.receding_horizon import RecedingHorizon
 from unifg.horizon.robot import Robot
 from unifg.horizon.terms import Context, Term
 from unifg.modeling.duplicates import doubles

@@ -6,29 +6,31 @@ import time as clocks
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 
 from unifg.errors import BackendError, GraphError, NotFiniteError, require_kinds, require_positive
-from unifg.horizon.coupling import COUPLINGS, Coupling, FixedPresent, JointPresent, PresentCoupling, weigh
+from unifg.horizon.coupling import COUPLINGS, Coupling, couple, weigh
 from unifg.horizon.decision import AcceptancePolicy, Decision, LastPlan, LastPlanThenBrake, Plan
 from unifg.horizon.history import instant
+from unifg.horizon.initial_guesses import InitialGuesses
 from unifg.horizon.margins import Margins
 from unifg.horizon.multistart import LEAST_TIME, Jumps, cheapest
+from unifg.horizon.node_times import node_times
 from unifg.horizon.robot import Robot, control_limits, numbers, require_steps
-from unifg.horizon.terms import Context, Dynamics, Guessing, Term, handles_of, looked_at, reset_all, values_of
+from unifg.horizon.terms import Context, Guessing, Term, handles_of, looked_at, reset_all, values_of
 from unifg.horizon.tree import BranchedSelection, ExpectedCost, Tree
 from unifg.horizon.window import Window
 from unifg.locks import ReentrantLock
-from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data
 from unifg.solution.graph import Graph
+from unifg.solution.guess import Guess
 from unifg.solution.history import subproblems
 from unifg.solution.prepared import Prepared
-from unifg.solution.solution import Guess, Solution
+from unifg.solution.solution import Solution
 from unifg.solution.solver import Solver
 from unifg.solution.status import Status
 from unifg.typing import Array, ArrayLike
@@ -37,30 +39,6 @@ TIMES = 100_000  # ticks whose times are kept
 CLOSE = 1e-4  # a plan may bend constraints more, but noise of the past is as small as that
 FORGOTTEN = 0.95  # of the time of an iteration, until a slower one
 RESERVE = 0.1  # share of the deadline that more starts leave free
-
-
-@dataclass(frozen=True)
-class InitialGuesses:
-    """Initial guesses of solves without a last answer.
-
-    Attributes:
-        cold: ``cold(now)`` gives states (N + 1, storage) and controls (N, m); None: stay, with the control zero.
-        after_failure: the same after a solve whose plan was refused; None for ``cold``.
-        carry: ``carry(guess, now)`` what of a shifted last answer still holds; None for all of it.
-        others: ``others(now)`` more states and controls, for instance one pair for each side of an obstacle. They and
-            the cold guess are tried where there is no last answer, and beside the warm start where data have jumped
-            (:class:`unifg.horizon.multistart.Jumps`). Without any, ``lambda now: ()``, the cold guess alone is; None
-            for one start in every tick.
-    """
-
-    cold: Callable[[Context[Any]], tuple[Array, Array]] | None = None
-    after_failure: Callable[[Context[Any]], tuple[Array, Array]] | None = None
-    carry: Callable[[Guess, Context[Any]], Guess] | None = None
-    others: Callable[[Context[Any]], Iterable[tuple[Array, Array]]] | None = None
-
-    def __post_init__(self) -> None:
-        """Refuse what is no function before it is called."""
-        require_kinds("InitialGuesses", GraphError, InitialGuesses.__annotations__, vars(self))
 
 
 class RecedingHorizon:
@@ -196,12 +174,12 @@ class RecedingHorizon:
             )
         self._lock = ReentrantLock()
         self._terms, self.tree, self.path = looked_at(terms), tree, tree.paths[-1]
-        self.times = _node_times(times, tree, robot, self._terms)
+        self.times = node_times(times, tree, robot, self._terms)
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, len(tree), coupling, window, delay
         self._deadline, self._clock, self._patience = deadline, clock, patience
         between = control_limits((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
         graph = Graph()
-        self.tie: PresentCoupling = self._tied(graph, pull)
+        self.tie = couple(self.coupling, graph, robot, self.window, self.steps, pull)
         self.x, self.u = self.tie.ahead, graph.variables("u", robot.control, self.steps)
         before, tied = len(graph.terms), handles_of(graph)
         branches = len(tree.paths) > 1
@@ -244,15 +222,6 @@ class RecedingHorizon:
         self._portion, self.goes_on, self._step_time = portion, False, 0.0
         self.waited = 0
         self._believe_nothing()
-
-    def _tied(self, graph: Graph, pull: float | Sequence[float] | Array) -> PresentCoupling:
-        if self.coupling != "joint":
-            return FixedPresent(graph, self.robot, self.steps, self.coupling == "separate")
-        if self.window is None:
-            raise GraphError("the coupling 'joint' needs a window: there is no past to join")
-        if self.window.robot is not self.robot:
-            raise GraphError("the window is of another robot")
-        return JointPresent(graph, self.window, self.steps, pull)
 
     # ---------------------------------------------------------------- a tick
 
@@ -663,7 +632,7 @@ class RecedingHorizon:
             BackendError: while another thread plans.
         """
         with self._alone():
-            found = _node_times(times, self.tree, self.robot, self._terms)
+            found = node_times(times, self.tree, self.robot, self._terms)
             if self.guess is not None:
                 states = self.guess.values[self.x.family][-self.steps - 1 :]
                 self.guess = self._resampled(self.guess, states, self.guess.values[self.u], found)
@@ -724,24 +693,6 @@ class RecedingHorizon:
         self.solution = None
         self.estimate = self.robot.state.identity() if self.window is None else self.window.present
         self.constants, self.believed = {static.name: static.values for static in self.robot.constants}, False
-
-
-def _node_times(times: ArrayLike | None, tree: Tree, robot: Robot, terms: Sequence[Term]) -> Array:
-    """(N + 1,) times of the nodes, with which the steps of dynamics agree."""
-    given = tree.depths * (robot.tick or 1.0) if times is None else times
-    nodes, count = doubles("the times of the nodes", given).copy(), len(tree) + 1
-    growing = nodes.shape == (count,) and nodes[0] == 0.0 and np.isfinite(nodes).all()
-    if not (growing and (nodes[1:] > nodes[tree.begins]).all()):
-        raise GraphError(f"the times must be {count} growing numbers from 0 on, one for each node; got {nodes}")
-    if times is not None and robot.predict is not None and robot.tick is None:
-        raise GraphError("node times need the robot's tick: its predict(x, u, seconds) is given the length of a step")
-    if robot.tick is not None and not np.isclose(robot.tick, nodes[1], rtol=1e-9, atol=0.0):
-        raise GraphError(f"the first step must be as long as a tick of the robot ({robot.tick} s), got {nodes[1]} s")
-    lengths = None if times is None and robot.tick is None else nodes[1:] - nodes[tree.begins]
-    for term in terms:
-        if isinstance(term, Dynamics):
-            term.require_step(lengths)
-    return nodes
 
 
 def _close(solution: Solution, choice: Decision) -> bool:

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, cached_property
-from itertools import pairwise
 from time import perf_counter
 from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from unifg.codegen.buffers import Buffers
-from unifg.codegen.threads import share, threads
-from unifg.codegen.work_queue import entrance
+from unifg.codegen.threads import threads
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
 from unifg.factors.differences import convexified
@@ -37,10 +35,11 @@ from unifg.problem.linearization import Evaluation, Linearization, Rows
 from unifg.problem.retraction import Retraction
 from unifg.problem.scalars import add_scalars, evaluate_scalars
 from unifg.problem.soft_terms import softened
+from unifg.problem.structure import block_pattern, require_touched, row_slices, side_by_side
 from unifg.problem.systems import Systems
 from unifg.problem.table import ENTRY, PARAMETER, POSITION, ROW, WIDTH, TermArrays, TermTable
 from unifg.problem.term import CompiledTerm
-from unifg.problem.thread_partition import Shares
+from unifg.problem.thread_partition import Shares, linearize_shared
 from unifg.problem.units import Units, unit_memory
 from unifg.problem.verification import Verification
 from unifg.typing import Array, ArrayLike, BoolArray, IntArray
@@ -85,6 +84,8 @@ class CompiledProblem:
         batched: terms without a kernel, evaluated by NumPy.
         retraction: moves all variables.
         reader: of guesses.
+        readers: of every datum.
+        branches: comparisons of traces that are watched.
         scratch: memory for compiled loops.
         rebinds: whether something else than numbers for kernels and fixed variables is made of data.
         python_seconds: time spent so far in terms that Python evaluates.
@@ -121,10 +122,9 @@ class CompiledProblem:
         self.cost_terms = [c for c in self.terms if isinstance(c.term, Cost)]
         self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
         self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
-        self._require_touched()
-        variable, starts = self.columns.nodes()
-        self.blocks = variable[self.columns.free]
-        self.normal = self._pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, variable, starts)
+        require_touched(self.terms, self.columns)
+        self.blocks = self.columns.nodes()[0][self.columns.free]
+        self.normal = block_pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, self.columns)
         stacked = self.cost_terms + self.constraint_terms
         self.table = TermTable(stacked, self.scalar_terms, self.columns, self.normal)
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
@@ -137,8 +137,7 @@ class CompiledProblem:
         self.workspaces: list[tuple[type, dict[str, Any], Any]] = []
         self._found: dict[Callable[[CompiledProblem], Any], Any] = {}
         self._pairs: dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, Array, IntArray]] = {}
-        self._cost_slices = _slices(self.cost_terms)
-        self.slices = _slices(self.constraint_terms)
+        self.slices = row_slices(self.constraint_terms)
         shaped = zip(self.constraint_terms, self.slices, strict=True)
         self.places: Places = [(term.name, rows, (term.count, term.size)) for term, rows in shaped]
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
@@ -155,7 +154,7 @@ class CompiledProblem:
         self._watched: list[CompiledTerm] = []
         self.verifications: list[Verification] = []
         self.demanding: list[Verification] = []
-        self._watching, self._branches = False, Branches(self.table, (), self.scratch)
+        self._watching, self.branches = False, Branches(self.table, (), self.scratch)
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
@@ -179,31 +178,6 @@ class CompiledProblem:
         return not (self.batched or self._general or self.table.weighed) and self.retraction.compiled
 
     @property
-    def numbers_only(self) -> bool:
-        """True if instances with other data differ in numbers that compiled loops read, and Python has no part."""
-        return not (self.python_parts or self._branches)
-
-    @property
-    def python_parts(self) -> list[str]:
-        """Parts of a solve that are Python's, besides the verification of answers, with their names."""
-        traced = [known.term.name for known in self.demanding]
-        held = [self.row_name(row)[0] for row in self.fixed_rows().tolist()]
-        bound = [handle.name for handle, reader in self._readers.items() if reader.bound]
-        left = [*self.left_to_python, *(term.name for term in self.terms if term.differenced)]
-        found = {
-            "terms that are not traced, but evaluated or differenced": left,
-            "terms whose functions assert something": traced,
-            "data from which limits, weights or flags are made": bound,
-            "soft constraints": list(self.soft),
-            "constraints of fixed variables alone": held,
-            "families whose manifold has conditions of its own": [f.name for f, *_ in self.reader.particular],
-        }
-        parts = [f"{what}: {', '.join(dict.fromkeys(names))}" for what, names in found.items() if names]
-        if not parts and (self.differenced or not self.fully_compiled):
-            parts.append("a loss, a retraction or a derivative that is not compiled")
-        return parts
-
-    @property
     def hessian(self) -> Symmetric:
         """Pattern of the Gauss-Newton Hessian of the objective alone."""
         return self._objective[0]
@@ -223,7 +197,7 @@ class CompiledProblem:
         """
         changed = self.binding.take(data)
         for handle in changed:
-            for term in self._readers[handle].told:
+            for term in self.readers[handle].told:
                 term.forget()
         try:
             for price, which, stated in self._prices:
@@ -231,7 +205,7 @@ class CompiledProblem:
                     value = self.binding.present[price]
                     require_prices(stated.name, which, np.broadcast_to(value, (stated.count, stated.size)))
             if self.rebinds:
-                self._rebind([term for handle in changed for term in self._readers[handle].bound])
+                self._rebind([term for handle in changed for term in self.readers[handle].bound])
         except GraphError:
             self.binding.forget()
             raise
@@ -267,10 +241,10 @@ class CompiledProblem:
                 term.bind(binding.present)
         self._bind_limits()
         self.table.bind(self.terms, self.lower, self.upper)
-        self._readers: dict[Data, Reader] = {}
+        self.readers: dict[Data, Reader] = {}
         sources, targets = [], []
         for handle in binding.present:
-            reader = self._readers[handle] = Reader([], [])
+            reader = self.readers[handle] = Reader([], [])
             for term in self.terms:
                 if handle not in term.data:
                     continue
@@ -279,7 +253,7 @@ class CompiledProblem:
                 for place in places or ():
                     sources.append(np.broadcast_to(binding.place(handle).reshape(-1, place.shape[1]), place.shape))
                     targets.append(int(term.place[PARAMETER]) + place)
-        self.rebinds = any(reader.bound for reader in self._readers.values())
+        self.rebinds = any(reader.bound for reader in self.readers.values())
         moved = sources, targets, self.arrays.parameters
         sources, targets = [], []
         for fix, where in zip(self.graph.fixes, retraction.places, strict=True):
@@ -296,8 +270,8 @@ class CompiledProblem:
         return ByTerm(self.places, stacked)
 
     def _bind_limits(self) -> None:
-        self.lower = _stacked([c.lower for c in self.constraint_terms])
-        self.upper = _stacked([c.upper for c in self.constraint_terms])
+        self.lower = side_by_side([c.lower for c in self.constraint_terms])
+        self.upper = side_by_side([c.upper for c in self.constraint_terms])
         crossed = np.flatnonzero(self.lower > self.upper)
         if len(crossed):
             name, index = self.row_name(int(crossed[0]))
@@ -399,7 +373,7 @@ class CompiledProblem:
 
     def new_branches(self, values: Values, verified: bool) -> bool:
         """Test whether comparisons in watched traces come out as at no verified answer; ``verified``: this is one."""
-        return bool(self._branches) and self._branches.new(values, verified)
+        return bool(self.branches) and self.branches.new(values, verified)
 
     def renew_verifications(self) -> None:
         """Keep what verifies the present traces."""
@@ -409,7 +383,7 @@ class CompiledProblem:
         ]
         self.demanding = [known for known in self.verifications if known.demanding]
         if self._watching:
-            self._branches = Branches(self.table, [known.term for known in self.verifications], self.scratch)
+            self.branches = Branches(self.table, [known.term for known in self.verifications], self.scratch)
 
     def _give_up(self, term: CompiledTerm) -> None:
         """Leave a term that was traced to Python."""
@@ -510,7 +484,7 @@ class CompiledProblem:
                 residual, jacobian, constraints, constraint_jacobian, squares, weights, size, gradient, hessian
             )
             if shares is not None:
-                cost = _linearize_at_once(shares, terms, values.flat, out._replace(hessian=room))
+                cost = linearize_shared(shares, terms, values.flat, out._replace(hessian=room))
             else:
                 gradient[:], hessian[:] = 0.0, 0.0
                 cost = evaluation.linearize(terms, values.flat, *out, self.scratch, 0, 1)
@@ -678,92 +652,20 @@ class CompiledProblem:
         """Term and factor of a constraint row."""
         return self.row_place(row)[:2]
 
-    def cost_rows(self, names: Sequence[str]) -> BoolArray:
-        """(C,) whether each cost row belongs to one of the named terms.
-
-        Raises:
-            GraphError: when no least-squares cost has such a name.
-        """
-        chosen = np.zeros(self.costs.count, dtype=bool)
-        slices = {term.name: rows for term, rows in zip(self.cost_terms, self._cost_slices, strict=True)}
-        for name in [names] if isinstance(names, str) else names:
-            if name not in slices:
-                raise GraphError(f"no cost is called '{name}' (there are: {', '.join(slices) or 'none'})", term=name)
-            chosen[slices[name]] = True
-        return chosen
-
-    def _require_touched(self) -> None:
-        """Raise unless every unknown is part of some term.
-
-        Raises:
-            GraphError: naming the first variable that is not.
-        """
-        touched = np.zeros(self.columns.width, dtype=bool)
-        for term in self.terms:
-            for part in term.columns:
-                touched[part] = True
-        idle = self.columns.free[~touched[self.columns.free]]
-        if len(idle):
-            family, index = self.columns.name(int(idle[0]))
-            raise GraphError(
-                f"{family}[{index}] is in no cost or constraint and is not fixed: {len(idle)} tangent coordinates "
-                "are free to be anything; add a term, fix it, or make the family shorter",
-                family=family,
-                index=index,
-            )
-
-    def _pattern(self, terms: Sequence[CompiledTerm], variable: IntArray, starts: IntArray) -> Symmetric:
-        """Every two variables of a factor share a block."""
-        first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
-        for term in terms:
-            members = [variable[columns[:, 0]] for columns in term.columns]
-            for k, a in enumerate(members):
-                for b in members[:k]:
-                    first.append(np.minimum(a, b))
-                    second.append(np.maximum(a, b))
-        return Symmetric.of_blocks(starts, np.concatenate(first), np.concatenate(second))
-
     @cached_property
     def _objective(self) -> tuple[Symmetric, IntArray]:
         """Pattern of the objective's Hessian and where its entries stand in ``normal``."""
         if not self.constraint_terms:
             return self.normal, np.arange(self.normal.nnz)
-        pattern = self._pattern(self.cost_terms + self.scalar_terms, *self.columns.nodes())
+        pattern = block_pattern(self.cost_terms + self.scalar_terms, self.columns)
         columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         return pattern, self.normal.positions(pattern.indices, columns)
-
-
-def _slices(terms: Sequence[CompiledTerm]) -> list[slice]:
-    """Rows of each term in the stack."""
-    ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
-    return [slice(start, end) for start, end in pairwise(ends)]
-
-
-def _linearize_at_once(shares: Shares, terms: TermArrays, values: Array, out: LinearArrays) -> float:
-    """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
-    counters = np.zeros(6, np.int64)
-    own = shares.costs, shares.norms, shares.slopes, shares.contested, shares.scratch
-    given = terms._replace(positions=shares.positions), values, out
-    share(_entrance(), (*given, *own, counters.ctypes.data))
-    out.norms[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
-    return float(shares.costs.sum())
-
-
-@cache
-def _entrance() -> int:
-    """Of a linearisation that is shared."""
-    return entrance(evaluation.linearize_at_once)
 
 
 def _fixed_rows(program: CompiledProblem) -> IntArray:
     touched = np.zeros(program.constraints.count, dtype=bool)
     touched[program.constraints.free_rows] = True
     return np.flatnonzero(~touched)
-
-
-def _stacked(parts: list[Array]) -> Array:
-    """One flat array, also of nothing."""
-    return np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
 
 
 def compile_graph(graph: Model) -> CompiledProblem:

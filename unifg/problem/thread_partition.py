@@ -7,13 +7,19 @@ so in place; others write beside the matrix, and what stands there is added at t
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from unifg.codegen.buffers import Buffers
 from unifg.codegen.jit import compiled
+from unifg.codegen.threads import share
+from unifg.codegen.work_queue import entrance
 from unifg.elimination.ordering import filled
-from unifg.problem.table import COST, COUNT, KIND, POSITION, WIDTH, TermTable
-from unifg.typing import IntArray
+from unifg.problem import evaluation
+from unifg.problem.evaluation import LinearArrays
+from unifg.problem.table import COST, COUNT, KIND, POSITION, WIDTH, TermArrays, TermTable
+from unifg.typing import Array, IntArray
 
 
 class Shares:
@@ -44,6 +50,22 @@ class Shares:
         self.buffers = Buffers([*table.sizes, width, entries + (count - 1) * len(self.contested)])
         self.costs, self.norms = np.empty(count), np.empty((count, len(fields)))
         self.slopes, self.scratch = np.empty((count - 1, width)), np.empty((count, table.scratch))
+
+
+def linearize_shared(shares: Shares, terms: TermArrays, values: Array, out: LinearArrays) -> float:
+    """The pass over all terms, a share of the factors of each for every thread; sums are added up in order."""
+    counters = np.zeros(6, np.int64)
+    own = shares.costs, shares.norms, shares.slopes, shares.contested, shares.scratch
+    given = terms._replace(positions=shares.positions), values, out
+    share(_entrance(), (*given, *own, counters.ctypes.data))
+    out.norms[:] = np.sqrt(np.square(shares.norms).sum(axis=0))
+    return float(shares.costs.sum())
+
+
+@cache
+def _entrance() -> int:
+    """Of a linearisation that is shared."""
+    return entrance(evaluation.linearize_at_once)
 
 
 @compiled

@@ -20,7 +20,8 @@ from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data, Family
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.solution.solution import AnyGuess, Guess, Solution
+from unifg.solution.guess import Guess
+from unifg.solution.solution import AnyGuess, Solution
 from unifg.solution.status import Status
 from unifg.typing import Array, IntArray, Numbers
 

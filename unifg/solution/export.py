@@ -17,6 +17,7 @@ from unifg.atomic_write import write_atomically
 from unifg.codegen.standalone import NO_ROOM, Entry, object_code
 from unifg.errors import BackendError, UnifgError
 from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.python_parts import python_parts
 from unifg.solution.status import Status
 from unifg.typing import Array
 
@@ -115,7 +116,7 @@ def export(prepared: Exportable, folder: Path, name: str, target: str) -> list[P
     program = prepared.program
     if not re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII):
         raise BackendError(f"'{name}' is no name in C: letters, digits and underscores")
-    parts = program.python_parts
+    parts = python_parts(program)
     if program.binding.rows({}, 1) is None:
         parts.append("data that are booleans, or elements of a manifold with conditions of its own")
     if parts:

@@ -20,6 +20,7 @@ from unifg.errors import GraphError
 from unifg.modeling.variables import Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization, Rows
+from unifg.problem.structure import row_slices
 from unifg.typing import Array, BoolArray, IntArray
 
 Variables: TypeAlias = Variable | Sequence[Variable]
@@ -96,7 +97,7 @@ def information(
     Raises:
         GraphError: for an unknown cost, or when a counted row reaches outside ``columns``.
     """
-    rows = _dense(program, program.costs, program.cost_rows(terms), columns, terms)
+    rows = _dense(program, program.costs, cost_rows(program, terms), columns, terms)
     dense = rows.gather(lin.jacobian)
     return dense.T @ dense, dense.T @ lin.residual[rows.rows]
 
@@ -178,6 +179,21 @@ def marginal_prior(
     return np.concatenate(reference)[None], matrix
 
 
+def cost_rows(program: CompiledProblem, names: Sequence[str]) -> BoolArray:
+    """(C,) whether each cost row belongs to one of the named terms.
+
+    Raises:
+        GraphError: when no least-squares cost has such a name.
+    """
+    chosen = np.zeros(program.costs.count, dtype=bool)
+    slices = {term.name: rows for term, rows in zip(program.cost_terms, row_slices(program.cost_terms), strict=True)}
+    for name in [names] if isinstance(names, str) else names:
+        if name not in slices:
+            raise GraphError(f"no cost is called '{name}' (there are: {', '.join(slices) or 'none'})", term=name)
+        chosen[slices[name]] = True
+    return chosen
+
+
 def _selections(variables: Variables) -> list[Selection]:
     return [as_selection(v) for v in (variables if isinstance(variables, Sequence) else [variables])]
 
@@ -213,7 +229,7 @@ def _analyse(
     for name in terms:
         if name in slices:
             constrained[slices[name]] = True
-    costs = program.cost_rows([name for name in terms if name not in slices])
+    costs = cost_rows(program, [name for name in terms if name not in slices])
     return Removal(
         _dense(program, program.costs, costs, columns, terms, gone),
         _dense(program, program.constraints, constrained, columns, terms, gone),

@@ -26,7 +26,8 @@ from unifg.problem.linearization import all_finite
 from unifg.solution.backend import Callback
 from unifg.solution.batch import SAMPLED, Batch, Outcomes, solve_batch
 from unifg.solution.export import Exported, export
-from unifg.solution.solution import AnyGuess, Guess, NotConverged, Solution, values_of
+from unifg.solution.guess import Guess
+from unifg.solution.solution import AnyGuess, NotConverged, Solution, values_of
 from unifg.solution.solve_state import IterativeMethod, SolveState, hand_over
 from unifg.solution.status import Status
 from unifg.typing import Array, Numbers

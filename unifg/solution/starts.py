@@ -11,7 +11,7 @@ import numpy as np
 from unifg.lie import Manifold
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.solution.solution import Guess
+from unifg.solution.guess import Guess
 from unifg.typing import Array
 
 WAVES = 3  # half waves along a family at most
