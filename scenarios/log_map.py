@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from unifg.errors import ScenarioError
 from unifg.factors.robust import DCS, TruncatedLeastSquares
 from unifg.files.range_log import RangeLog
 from unifg.lie import SE2
@@ -83,8 +84,11 @@ def map_log(log: RangeLog, settings: MapSettings, progress: Progress = silent) -
         The map with the poses of all scans, and the solved pose graph of the keyframes.
 
     Raises:
+        ScenarioError: the lidar has seen nothing.
         KeyboardInterrupt: when stopped before there are two keyframes.
     """
+    if not lidar.usable(log.ranges, VIEW).any():
+        raise ScenarioError(f"{log.name}: no beam of it came back from within {VIEW:g} m: see its ranges [m]")
     began = time.perf_counter()
     start = (log.odometry if log.corrected is None else log.corrected)[0]
     mapper, chosen, interrupted = Mapper(log.angles, start), [0], False
@@ -160,10 +164,12 @@ class Mapper:
             self.way.append(0.0)
             return
         predicted, covariance = BASE.step(self.poses[-1][None], step[None], 1.0)[0], WHEELS.covariance(step, 1.0)
-        around = field_of(self._seen_from(np.arange(max(0, number - RECENT), number)))
-        slipped, _ = nearest_fit(around, scan, predicted, *SLIP)
-        believed = [Hypothesis(predicted, covariance), Hypothesis(slipped, FOUND, SLIPS)]
-        pose, covariance = registered(around, scan, believed)
+        known, pose = self._seen_from(np.arange(max(0, number - RECENT), number)), predicted
+        if len(known) and seen.any():  # else the wheels alone know
+            around = field_of(known)
+            slipped, _ = nearest_fit(around, scan, predicted, *SLIP)
+            believed = [Hypothesis(predicted, covariance), Hypothesis(slipped, FOUND, SLIPS)]
+            pose, covariance = registered(around, scan, believed)
         self.edges.append((number - 1, number, SE2.between(self.poses[-1], pose), covariance))
         self.way.append(self.way[-1] + float(np.hypot(*step[:2])))
         self.poses.append(pose)
@@ -187,10 +193,13 @@ class Mapper:
             return
         self.searches += 1
         last = np.arange(max(0, number - TOGETHER + 1), number + 1)
+        known = self._seen_from(near[np.argsort(away[near])[:MOST]])
         view = SE2.act(SE2.inverse(here), self._seen_from(last))
+        if not len(view) or not len(known):
+            return
         view = view[np.linspace(0, len(view) - 1, min(POINTS, len(view))).astype(np.intp)]
         scan = Scan(np.arctan2(view[:, 1], view[:, 0]), np.hypot(*view.T))
-        around = field_of(self._seen_from(near[np.argsort(away[near])[:MOST]]))
+        around = field_of(known)
         found, aside = nearest_fit(around, scan, here, drift, turned)
         pose, covariance = registered(around, scan, [Hypothesis(found, FOUND)])
         ends = np.abs(around.distance(SE2.act(pose, view))) <= ENDS

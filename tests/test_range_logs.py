@@ -95,6 +95,40 @@ def test_a_frequent_longest_range_means_that_nothing_was_hit(log: RangeLog, tmp_
     assert np.isfinite(read_range_log(tmp_path / "log.csv").ranges).all()
 
 
+def test_who_stands_for_an_hour_counts_in_seconds(log: RangeLog, tmp_path: Path) -> None:
+    assert log.corrected is not None
+    hour = log.time[-1] + 60.0 * np.arange(1.0, 200.0)
+    stood = [np.concatenate([a, np.repeat(a[-1:], len(hour), 0)]) for a in (log.ranges, log.odometry, log.corrected)]
+    write_csv(tmp_path / "log.csv", RangeLog("log", np.append(log.time, hour), log.angles, *stood))
+    np.testing.assert_allclose(read_range_log(tmp_path / "log.csv").time[: len(log)], log.time)
+
+
+@pytest.mark.parametrize("maximum", [0.0, -1.0])
+def test_a_maximum_that_is_none_hides_no_range(log: RangeLog, tmp_path: Path, maximum: float) -> None:
+    seen, step = np.where(np.isfinite(log.ranges), log.ranges, 0.0), log.angles[1] - log.angles[0]
+    lines = [
+        f"ROBOTLASER1 0 {log.angles[0]} 3.1 {step} {maximum} 0.01 0 {len(row)} {' '.join(map(str, row.tolist()))} 0 "
+        f"{k} 0 0 {k} 0 0 0 0 0.1 0.1 0 {k} host {k}\n"
+        for k, row in enumerate(seen)
+    ]
+    (tmp_path / "log.clf").write_text("".join(lines))
+    np.testing.assert_array_equal(np.isfinite(read_range_log(tmp_path / "log.clf").ranges), seen > 0.0)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "poses", "said"),
+    [
+        (1e3, [1.0, 1.0, 1.0], r"half of the ranges are beyond [12]\d\d\d: metres are read"),
+        (1.0, [1e3, 1e3, 1.0], r"12\d{4} m are driven in 1\d\d s: metres and seconds are read"),
+        (1.0, [1.0, 1.0, 180.0 / math.pi], r"headings turn by up to \d+.* between two scans: radians are read"),
+    ],
+)
+def test_other_units_are_no_log(log: RangeLog, tmp_path: Path, ranges: float, poses: list[float], said: str) -> None:
+    write_csv(tmp_path / "log.csv", replace(log, ranges=ranges * log.ranges, odometry=log.odometry * poses))
+    with pytest.raises(FileFormatError, match=said):
+        read_range_log(tmp_path / "log.csv")
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -335,6 +369,18 @@ def test_a_map_from_poor_odometry_is_consistent(kind: dict[str, Any], most: floa
     assert len(run.closures) > 10 and run.share.mean() > 0.95
     assert run.verdict and run.details["loop_closures"] + run.details["outliers"] == len(graph.closures)
     assert run.details["outliers"] <= 0.1 * len(graph.closures)  # measured backwards, more than half would be
+
+
+def test_a_lidar_that_sees_nothing_leaves_it_to_the_wheels(log: RangeLog) -> None:
+    """Not at first, and in a known place for so long that it has nothing left to be registered on."""
+    assert log.corrected is not None
+    ranges = log.ranges[:140].copy()
+    ranges[:3] = ranges[110:132] = np.nan
+    part = RangeLog("log", log.time[:140], log.angles, ranges, log.odometry[:140], log.corrected[:140])
+    run, _ = log_map.map_log(part, log_map.MapSettings(ANYWHERE))
+    assert run.errors is not None and run.errors[0].max() < 1.0
+    with pytest.raises(ScenarioError, match="no beam of it came back from within 20 m"):
+        log_map.map_log(replace(part, ranges=np.full_like(ranges, np.nan)), log_map.MapSettings(ANYWHERE))
 
 
 def test_closures_along_a_corridor_say_that_they_do_not_know_where() -> None:

@@ -34,6 +34,8 @@ POSE = ("x", "y", "theta")
 FIXED = 0.02  # [m, rad] by which the place of a laser on its robot may seem to change, as logs round
 PARTED = 1.0  # [m] between wheels and poses of scans, laid on each other, from where on the latter are corrected
 SLOWEST = 0.005  # [m/s]; who is slower counts time in thousandths
+FASTEST = 100.0  # [m/s]; who is faster counts no metres
+FARTHEST = 300.0  # [m], beyond which half of the ranges are in millimetres
 AT_MOST = 0.99  # of the longest range
 OFTEN, PEAK = 0.005, 3.0  # share of the ranges there, and over those a little shorter, if it means that nothing was hit
 LONGEST = 10**6  # characters of a line, which has no blanks
@@ -97,7 +99,7 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
         limits: of what it may hold.
 
     Raises:
-        FileFormatError: the file cannot be read.
+        FileFormatError: the file cannot be read, or its numbers would be absurd in metres, radians and seconds.
         ImportError: a package that reads it is not installed; the message names it.
     """
     path = Path(path)
@@ -172,7 +174,9 @@ def _in_order(
     order, beams = np.argsort(time, kind="stable"), np.argsort(angles, kind="stable")
     time, odometry, ranges = time[order], odometry[order], ranges[np.ix_(order, beams)]
     corrected = None if corrected is None else corrected[order]
-    way, lasted = np.hypot(*np.diff(odometry[:, :2], axis=0).T).sum(), time[-1] - time[0] if len(time) else 0.0
+    steps = np.hypot(*np.diff(odometry[:, :2], axis=0).T)
+    drove = 2.0 * len(steps) * steps >= steps.sum()  # who stands for hours says nothing of the unit
+    way, lasted = steps[drove].sum(), np.diff(time)[drove].sum()
     unit = 1.0
     while way > 1.0 and way < SLOWEST * lasted / unit:
         unit *= 1e3
@@ -180,11 +184,19 @@ def _in_order(
         logger.warning("%s: nothing would move in these times: taken for units of 1/%g s", name, unit)
     with np.errstate(invalid="ignore"):
         ranges = np.where(ranges > 0.0, ranges, np.nan)  # NaN stays
-        seen = ranges[np.isfinite(ranges)]
-        top = maximum if np.isfinite(maximum) else seen.max(initial=0.0)
+        seen, stated = ranges[np.isfinite(ranges)], 0.0 < maximum < math.inf
+        top = maximum if stated else seen.max(initial=0.0)
         longest, shorter = (int((seen > share * top).sum()) for share in (AT_MOST, 2.0 * AT_MOST - 1.0))
-        if np.isfinite(maximum) or longest > max(OFTEN * len(seen), PEAK * (shorter - longest)):
+        if stated or longest > max(OFTEN * len(seen), PEAK * (shorter - longest)):
             ranges = np.where(ranges > AT_MOST * top, np.inf, ranges)
+    turns, half = np.abs(np.diff(odometry[:, 2])), np.median(seen) if len(seen) else 0.0
+    units = (
+        (way > max(1.0, FASTEST * lasted / unit), f"{way:g} m are driven in {lasted / unit:g} s: metres and seconds"),
+        ((turns > ROUND).sum() > 1, f"headings turn by up to {turns.max(initial=0.0):g} between two scans: radians"),
+        (half > FARTHEST, f"half of the ranges are beyond {half:g}: metres"),
+    )
+    if odd := [said for wrong, said in units if wrong]:
+        raise FileFormatError(f"{name}: {odd[0]} are read; convert the log")
     return RangeLog(name, time / unit, angles[beams], ranges, odometry, corrected)
 
 
