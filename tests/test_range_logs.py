@@ -285,19 +285,23 @@ def test_a_drive_of_the_simulation_is_read(log: RangeLog, tmp_path: Path) -> Non
             read_range_log(tmp_path / "drive.npz")
 
 
-def messages(times: list[float], first: float = -1.0) -> list[tuple[str, str, Any]]:
+def messages(times: list[float], first: float = -1.0, frame: str = "laser") -> list[tuple[str, str, Any]]:
     """Scans of five beams at some times, and odometry along x from 0 to 4 s."""
 
     def header(time: float) -> Any:
-        return SimpleNamespace(stamp=SimpleNamespace(sec=int(time), nanosec=0), frame_id="laser")
+        return SimpleNamespace(stamp=SimpleNamespace(sec=int(time), nanosec=0), frame_id=frame)
 
     scan = {"ranges": [1.0, 2.0, 0.05, 40.0, 3.0], "range_min": 0.1, "range_max": 30.0, "angle_increment": 0.5}
     turn = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=1.0)
-    poses = [SimpleNamespace(position=SimpleNamespace(x=float(k), y=0.0), orientation=turn) for k in range(5)]
+    poses = [SimpleNamespace(position=SimpleNamespace(x=float(k), y=0.0, z=0.0), orientation=turn) for k in range(5)]
     return [
         *(("/scan", "LaserScan", SimpleNamespace(header=header(t), angle_min=first, **scan)) for t in times),
         *(
-            ("/odom", "Odometry", SimpleNamespace(header=header(p.position.x), pose=SimpleNamespace(pose=p)))
+            (
+                "/odom",
+                "Odometry",
+                SimpleNamespace(header=header(p.position.x), child_frame_id="base", pose=SimpleNamespace(pose=p)),
+            )
             for p in poses
         ),
     ]
@@ -317,6 +321,41 @@ def test_scans_that_nothing_moves_or_of_other_beams_are_left_out(
     monkeypatch.setattr(recordings, "_mcap", lambda path: iter(messages([1001.0, 1002.0, 1003.0])))
     with pytest.raises(FileFormatError, match=r"drive\.mcap: 0 of 3 scans have odometry at their time"):
         read_range_log("drive.mcap")
+
+
+def hung(child: str, parent: str, place: tuple[float, float], turn: tuple[float, float, float, float]) -> Any:
+    """A static frame; the quaternion has its scalar last."""
+    where = SimpleNamespace(
+        translation=SimpleNamespace(**dict(zip("xyz", (*place, 0.3), strict=True))),
+        rotation=SimpleNamespace(**dict(zip("xyzw", turn, strict=True))),
+    )
+    return SimpleNamespace(child_frame_id=child, header=SimpleNamespace(frame_id=parent), transform=where)
+
+
+@pytest.mark.parametrize("base", ["base", "foot"])
+def test_frames_are_followed_to_the_odometry(monkeypatch: pytest.MonkeyPatch, base: str) -> None:
+    """A plate half a turn about on the robot, ahead on it the laser, upside down: about its x axis.
+
+    The odometry may be of a frame that hangs on the robot itself.
+    """
+    frames = [
+        hung("laser", "/plate", (0.2, 0.0), (1.0, 0.0, 0.0, 0.0)),
+        hung("plate", "robot", (-0.5, 0.1), (0.0, 0.0, 1.0, 0.0)),
+        hung("base", "robot", (0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
+        hung("foot", "robot", (-0.1, 0.0), (0.0, 0.0, 0.0, 1.0)),
+    ]
+    told = messages([1.0, 2.0], frame="/laser") + messages([3.0], frame="behind")
+    for _, kind, message in told:
+        if kind == "Odometry":
+            message.child_frame_id = base
+    told.append(("/tf_static", "TFMessage", SimpleNamespace(transforms=frames)))
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter(told))
+    read = read_range_log("drive.mcap")
+    ahead = -0.7 + 0.1 * (base == "foot")
+    np.testing.assert_allclose(read.odometry[:, :2], [[1.0 + ahead, 0.1], [2.0 + ahead, 0.1]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(read.odometry[:, 2]), np.pi)
+    np.testing.assert_allclose(read.angles, [-1.0, -0.5, 0.0, 0.5, 1.0])
+    np.testing.assert_array_equal(read.ranges[0], [3.0, np.inf, np.nan, 2.0, 1.0])
 
 
 def test_a_broken_recording_is_refused(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import legible
-from unifg.lie import SE2
+from unifg.lie import SE2, SE3
 from unifg.typing import Array
 
 __all__ = ["Recorded", "read_rosbag"]
@@ -49,7 +49,9 @@ class Recorded(NamedTuple):
 def read_rosbag(path: Path) -> Recorded:
     """Read the topic with most scans, and the one with most odometry.
 
-    Scans before or after all odometry, or with other directions than most, are left out with a warning.
+    Scans before or after all odometry, or of another frame or other directions than most, are left out with a warning.
+    The laser stands where the static frames say, however many there are between it and the odometry's; of one that
+    hangs upside down the beams turn the other way round.
 
     Raises:
         FileFormatError: it cannot be read, or holds no scans or no odometry.
@@ -57,12 +59,15 @@ def read_rosbag(path: Path) -> Recorded:
     """
     own = path / "drive.npz" if path.is_dir() else path.with_name("drive.npz")
     hint = f"; of a run of unifg {legible(own)} is read" if path.exists() and own.is_file() else ""
-    name, topics, mounts = legible(path), dict[str, dict[str, list[Any]]](), dict[str, Array]()
+    name, topics, links = legible(path), dict[str, dict[str, list[Any]]](), dict[str, tuple[str, Array]]()
     try:
         for topic, kind, message in _mcap(path) if path.suffix == ".mcap" else _bag(path):
             if kind == FRAMES:
                 if topic.endswith("tf_static"):
-                    mounts |= {one.child_frame_id: _planar(one.transform) for one in message.transforms}
+                    links |= {
+                        _bare(a.child_frame_id): (_bare(a.header.frame_id), _pose(a.transform))
+                        for a in message.transforms
+                    }
             else:
                 topics.setdefault(kind, {}).setdefault(topic, []).append(message)
     except MemoryError:
@@ -74,14 +79,14 @@ def read_rosbag(path: Path) -> Recorded:
     if lacking := [kind for kind in (SCAN, ODOMETRY) if kind not in topics]:
         raise FileFormatError(f"{name}: no message of ROS of the kind {' and '.join(lacking)}{hint}")
     scans, wheels = (max(topics[kind].values(), key=len) for kind in (SCAN, ODOMETRY))
-    forms = Counter((len(scan.ranges), scan.angle_min, scan.angle_increment) for scan in scans)
-    (count, first, step), _ = forms.most_common(1)[0]
+    forms = Counter((scan.header.frame_id, len(scan.ranges), scan.angle_min, scan.angle_increment) for scan in scans)
+    (frame, count, first, step), _ = forms.most_common(1)[0]
     known, every = np.array([_stamp(one) for one in wheels]), len(scans)
     scans = [
         scan
         for scan in scans
         if known.min() <= _stamp(scan) <= known.max()
-        and len(scan.ranges) == count
+        and (scan.header.frame_id, len(scan.ranges)) == (frame, count)
         and abs(scan.angle_min - first) + count * abs(scan.angle_increment - step) < abs(step)
     ]
     if len(scans) < 2:
@@ -89,14 +94,15 @@ def read_rosbag(path: Path) -> Recorded:
     if len(scans) < every:
         logger.warning("%s: %d of %d scans left out: no odometry then, or other beams", name, every - len(scans), every)
     time = np.array([_stamp(scan) for scan in scans])
-    poses = np.array([_planar(one.pose.pose) for one in wheels])[np.argsort(known, kind="stable")]
+    poses = _planar(np.array([_pose(one.pose.pose) for one in wheels]))[np.argsort(known, kind="stable")]
     columns = (*poses[:, :2].T, np.unwrap(poses[:, 2]))
     at = np.column_stack([np.interp(time, np.sort(known), column) for column in columns])
-    mount = mounts.get(scans[0].header.frame_id, np.zeros(3))
+    base, laser = (_hung(links, _bare(one)) for one in (wheels[0].child_frame_id, frame))
+    mount = SE3.between(base, laser)
     ranges = np.array([scan.ranges for scan in scans], dtype=np.float64)
     ranges[ranges < scans[0].range_min] = np.nan
-    angles = first + step * np.arange(count, dtype=np.float64)
-    return Recorded(time, angles, ranges, float(scans[0].range_max), SE2.compose(at, mount))
+    angles = math.copysign(1.0, SE3.matrix(mount)[2, 2]) * (first + step * np.arange(count, dtype=np.float64))
+    return Recorded(time, angles, ranges, float(scans[0].range_max), SE2.compose(at, _planar(mount)))
 
 
 def _mcap(path: Path) -> Iterator[tuple[str, str, Any]]:
@@ -140,9 +146,30 @@ def _stamp(message: Any) -> float:
     return float(stamp.sec) + 1e-9 * float(getattr(stamp, "nanosec", 0) or getattr(stamp, "nsec", 0))
 
 
-def _planar(pose: Any) -> Array:
-    """(3,) x, y, heading of a pose or a transform in space."""
-    place = getattr(pose, "position", None) or pose.translation
-    turn = getattr(pose, "orientation", None) or pose.rotation
-    heading = math.atan2(2.0 * (turn.w * turn.z + turn.x * turn.y), 1.0 - 2.0 * (turn.y**2 + turn.z**2))
-    return np.array([place.x, place.y, heading])
+def _bare(frame: str) -> str:
+    """Name of a frame; ROS 1 may begin it with a slash."""
+    return frame.lstrip("/")
+
+
+def _pose(given: Any) -> Array:
+    """(7,) pose of `unifg.SE3` of a pose or a transform."""
+    place = getattr(given, "position", None) or given.translation
+    turn = getattr(given, "orientation", None) or given.rotation
+    numbers = [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
+    return SE3.from_quaternion(np.array(numbers), order="xyzw")
+
+
+def _planar(poses: Array) -> Array:
+    """(..., 3) x, y and heading of poses (..., 7), which is that of their x axis."""
+    matrix = SE3.matrix(poses)
+    return np.stack([*np.moveaxis(poses[..., :2], -1, 0), np.arctan2(matrix[..., 1, 0], matrix[..., 0, 0])], axis=-1)
+
+
+def _hung(links: dict[str, tuple[str, Array]], frame: str) -> Array:
+    """(7,) pose of a frame in the last one that it hangs on."""
+    pose = SE3.identity()
+    for _ in links:  # at most; frames may hang on each other
+        if frame in links:
+            frame, own = links[frame]
+            pose = SE3.compose(own, pose)
+    return pose
