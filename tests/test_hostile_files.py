@@ -152,12 +152,14 @@ def test_what_may_be_meant_is_warned_about_by_name(tmp_path: Path, caplog: pytes
         read_carmen(put(tmp_path, "minus.clf", swapped(CARMEN, b"1.0 2.0", b"-1.0 2.0")))
         read_carmen(put(tmp_path, "odometry.clf", CARMEN + CARMEN.replace(b"1.5 host 0.0", b"1.5 host -1.0")))
         read_g2o(put(tmp_path, "alone.g2o", PLANAR + b"VERTEX_SE2 9 0 0 0\nVERTEX_XY 10 1 1\n"))
+        read_g2o(put(tmp_path, "degrees.g2o", b"EDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\nEDGE_SE2 1 2 1 0 -90 1 0 0 1 0 1\n"))
     said = [record.message for record in caplog.records]
     assert any("back.tum, line 4: time runs backwards" in text for text in said)
     assert any("minus.clf: 1 ranges of scans are negative" in text for text in said)
     assert any("odometry.clf: time runs backwards: 1 times in ODOM" in text for text in said)
     assert any("alone.g2o: nothing has measured 1 of the poses: 9" in text for text in said)
     assert any("alone.g2o: nothing has measured 1 of the landmarks: 10" in text for text in said)
+    assert any("along 1 edge by more than a turn, first in line 2 (-90): radians are read" in text for text in said)
 
 
 def test_a_map_is_solved_beside_what_nothing_has_measured(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from unifg.elimination.symmetric import distinct
 from unifg.errors import FileFormatError, GraphError
 from unifg.files.contents import require_finite, write_text
 from unifg.files.text import Table, TextFile, norms
-from unifg.lie import SE3, LieGroup
+from unifg.lie import SE2, SE3, LieGroup
 from unifg.modeling.summary import counted
 from unifg.pose_graphs.information import Repair, indefinite, repaired, require_repair
 from unifg.pose_graphs.initialise import odometric
@@ -141,7 +141,13 @@ class _Remarks:
         return information if self.repair is None else repaired(information, self.repair)
 
     def pairs(self, edges: Edges, ids: Ids, lines: IntArray) -> None:
-        """Remark edges from a pose to itself, and edges that stand in the file twice, word by word."""
+        """Remark edges that turn beyond a turn or go from a pose to itself, and those given twice, word by word."""
+        planar = edges.measured.shape[1] == SE2.dim
+        wide = np.flatnonzero(planar & (np.abs(edges.measured[:, 2]) > 2.0 * np.pi))
+        if len(wide):
+            k = int(wide[0])
+            told = f"{counted(len(wide), 'edge')} by more than a turn, first in line {lines[k]}"
+            self.say(f"headings change along {told} ({edges.measured[k, 2]:g}): radians are read; convert degrees")
         own = np.flatnonzero(edges.first == edges.second)
         if len(own):
             k = int(own[0])
