@@ -244,6 +244,18 @@ def test_a_better_map_is_handed_over_with_its_landmarks() -> None:
     assert here.with_poses(verdict.better).chi2() > 2.0 * better.chi2()  # the old landmarks belong to another map
 
 
+@pytest.mark.parametrize("weight", [1e-12, 1.0, 1e12])
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3], ids=str)
+def test_of_maps_that_agree_with_every_edge_none_is_better(group: fg.LieGroup, weight: float) -> None:
+    rng, (first, second) = np.random.default_rng(1), np.array([[*range(19), 0, 3], [*range(1, 20), 10, 14]])
+    poses = group.exp(rng.normal(0.0, 0.5, (20, group.dim)))
+    exact = group.between(poses[first], poses[second])
+    edges = Edges(first, second, exact, np.tile(weight * np.eye(group.dim), (21, 1, 1)))
+    made = solved(PoseGraph(np.arange(20), group.retract(poses, rng.normal(0.0, 0.05, (20, group.dim))), edges))
+    verdict = made.verdict()
+    assert (verdict.claim, verdict.basins, verdict.better) == ("proven", 1, None)
+
+
 def test_edges_that_do_not_count_are_not_judged() -> None:
     made = manhattan(400, 3)
     dirty, (fault,) = aliased(made.pose_graph, made.truth, 1, 3)

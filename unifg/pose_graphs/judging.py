@@ -24,6 +24,7 @@ __all__: list[str] = []
 
 SAME = 1e-3  # relative difference of chi2 up to which minima count as one
 LOWER = 1e-4  # share of chi2 by which another basin has to be better: it is solved to within 1e-5
+ROUNDED = 1e-16  # of all weights: residuals of 1e-8 m and rad, which tell no map from another
 
 
 def _verdict(
@@ -144,8 +145,10 @@ def _basins(
     minima += [optimum(start, every, residual) for start in others]
     values = np.sort([chi2 for _, chi2 in minima])
     best = min(minima, key=lambda one: one[1])
-    basins = 1 + int((np.diff(values) > SAME * values[1:]).sum())
-    return len(others), basins, best if best[1] < (1.0 - LOWER) * judged.chi2(residual) else None
+    measured = (judged.edges, *judged.sightings.values(), *judged.priors.values())
+    nothing = ROUNDED * sum(float(np.einsum("nii->", part.information)) for part in measured)
+    basins = 1 + int((np.diff(values) > SAME * values[1:] + nothing).sum())
+    return len(others), basins, best if best[1] < (1.0 - LOWER) * judged.chi2(residual) - nothing else None
 
 
 @contextmanager
