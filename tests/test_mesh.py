@@ -117,6 +117,20 @@ def test_the_dynamics_hold_between_nodes_to_the_tolerance() -> None:
     np.testing.assert_allclose(missed, found.defects, atol=0.05e-3)
 
 
+def test_terms_are_given_what_the_caller_gives() -> None:
+    seen = []
+
+    class Told(Course):
+        def data(self, now: Context[Any]) -> dict[str, Array]:
+            seen.append(now.given)
+            return super().data(now)
+
+    goal = np.array([2.0, 0.0, 0.0])
+    terms: list[Term] = [Dynamics(unicycle.dynamics), Told()]
+    plan_on_mesh(CAR, terms, np.linspace(0.0, 4.0, 9), np.zeros(3), goal, solver=InteriorPoint(), rounds=1)
+    assert seen and all(one is goal for one in seen)
+
+
 def test_clearances_of_nothing_are_not_violated() -> None:
     for free in (lambda x: np.zeros((len(x), 0)), lambda x: np.full(len(x), np.inf)):
         assert not drive(between=free).violations.any()

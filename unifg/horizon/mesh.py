@@ -88,8 +88,8 @@ def plan_on_mesh(
             :class:`unifg.horizon.RecedingHorizon`.
     """
     options = {"defect": defect, "violation": violation, "substeps": substeps, "rounds": rounds}
-    given = {"robot": robot, "between": between, **options}
-    require_kinds("plan_on_mesh", GraphError, plan_on_mesh.__annotations__, given, Robot)
+    stated = {"robot": robot, "between": between, **options}
+    require_kinds("plan_on_mesh", GraphError, plan_on_mesh.__annotations__, stated, Robot)
     if robot.predict is None:
         raise GraphError("a mesh needs a robot that predicts: its model says what happens between nodes")
     if not (defect > 0.0 and violation > 0.0 and substeps > 1 and rounds > 0):
