@@ -254,6 +254,15 @@ def test_what_is_not_determined_is_still_named_so(kind: str) -> None:
             smoother.update({y: np.zeros((adrift + 1, 3)) + np.arange(adrift + 1)[:, None] * [1.0, 0.0, 0.1]})
 
 
+@pytest.mark.parametrize("information", [np.zeros((2, 2)), np.diag([1.0, 0.0])])
+def test_rows_without_information_determine_nothing(information: np.ndarray) -> None:
+    smoother = fg.Incremental()
+    x = smoother.variables("x", fg.Rn(2))
+    smoother.minimize(fg.prior, x[0], [1.0, 2.0], information=information)
+    with pytest.raises(fg.GraphError, match=r"^x\[0\] is not determined by its factors"):
+        smoother.update({x: np.zeros(2)})
+
+
 @pytest.mark.parametrize("error", [lambda x: np.log(x - 5.0), lambda x: x * np.nan, np.sqrt])
 @pytest.mark.parametrize("smoother", [fg.Incremental, lambda: fg.FixedLag(lag=3)])
 def test_a_residual_that_is_not_finite_is_no_estimate(smoother: Any, error: Any) -> None:

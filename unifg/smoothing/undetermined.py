@@ -6,7 +6,7 @@ import numpy as np
 
 from unifg.elimination.components import components
 from unifg.smoothing.state import State
-from unifg.typing import IntArray
+from unifg.typing import Array, IntArray, Records
 
 NOBODY: IntArray = np.zeros(0, dtype=np.int64)
 
@@ -14,7 +14,8 @@ NOBODY: IntArray = np.zeros(0, dtype=np.int64)
 def enough(state: State, variable: int) -> bool:
     """Test whether as many rows as unknowns, one of them from a single variable, touch all neighbours of a variable.
 
-    That does not prove that they determine it, but where it does not hold they cannot.
+    That does not prove that they determine it, but where it does not hold they cannot. A factor has no more rows than
+    columns that are not zero, as one without information.
 
     Args:
         state: of the smoother.
@@ -25,7 +26,7 @@ def enough(state: State, variable: int) -> bool:
     for factor in state.factors[state.factors["used"] == 1]:
         kind, at = state.types[factor["type"]], factor["variables"]
         touched.append(state.lists[at : at + kind["slots"]])
-        rows.append(kind["rows"])
+        rows.append(min(kind["rows"], np.count_nonzero(_diagonal(state, factor, kind))))
         single.append(kind["slots"] == 1)
     for clique in state.cliques[state.cliques["prior"] == 1]:
         at = clique["list"]
@@ -43,7 +44,12 @@ def enough(state: State, variable: int) -> bool:
 
 def sloped(state: State) -> bool:
     """Test whether the Jacobians of all factors are finite, by the diagonals of J'J that they keep."""
-    kinds, factors = state.types, state.factors[state.factors["used"] == 1]
-    starts, widths = factors["data"] + kinds["numbers"][factors["type"]], kinds["width"][factors["type"]]
-    diagonals = [start + np.arange(width) * (width + 2) for start, width in zip(starts, widths, strict=True)]
-    return bool(np.isfinite(state.numbers[np.concatenate([NOBODY, *diagonals])]).all())
+    used = state.factors[state.factors["used"] == 1]
+    return all(np.isfinite(_diagonal(state, factor, state.types[factor["type"]])).all() for factor in used)
+
+
+def _diagonal(state: State, factor: Records, kind: Records) -> Array:
+    """Diagonal (width,) of J'J of a factor; one column more stands beside it."""
+    at, width = int(factor["data"] + kind["numbers"]), int(kind["width"])
+    found: Array = state.numbers[at : at + width * (width + 2) : width + 2]
+    return found
