@@ -44,18 +44,20 @@ def detours(
         most: number of paths.
 
     Raises:
-        ModelError: for arrays that do not fit, radii below zero, no step, or a stride that is not positive.
+        ModelError: for arrays that do not fit or are not finite, radii below zero, no step, no path, or a stride that
+            is not positive.
     """
     require_kinds("detours", ModelError, detours.__annotations__, {"steps": steps, "most": most})
-    require_positive("detours", ModelError, stride=stride, steps=steps)
+    require_positive("detours", ModelError, stride=stride, steps=steps, most=most)
     given = {"start and goal": [start, goal], "centres": centres, "radii": radii}
     ends, middle, radius = (doubles(f"detours: {what}", part, error=ModelError) for what, part in given.items())
     middle = middle.reshape(-1, 2) if middle.size == 0 else middle
     fits = middle.ndim == 2 and middle.shape[1] == 2 and radius.ndim < 2 and radius.size in (1, len(middle))
-    if ends.shape != (2, 2) or not (fits and (radius >= 0.0).all() and np.isfinite(radius).all()):
+    finite = all(np.isfinite(part).all() for part in (ends, middle, radius))
+    if ends.shape != (2, 2) or not (fits and finite and (radius >= 0.0).all()):
         raise ModelError(
-            "detours: start and goal must be (2,), and radii (M,), finite and not negative, for centres (M, 2); got "
-            f"{ends.shape}, {radii!r} and {middle.shape}"
+            "detours: start and goal must be (2,), and radii (M,), not negative, for centres (M, 2), all finite; got "
+            f"{ends.shape}, {radii!r} and {middle.shape}{'' if finite else ', of which not all is finite'}"
         )
     radius = np.broadcast_to(radius, len(middle))
     length = max(float(np.hypot(*(ends[1] - ends[0]))), 1e-12)

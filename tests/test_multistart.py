@@ -236,7 +236,7 @@ def test_detours_pass_what_blocks_the_way_on_either_side() -> None:
     (straight,) = detours([0.0, 0.0], [0.0, 2.0], centres, 0.5, 10, 0.5)
     np.testing.assert_allclose(straight[:, 1], np.minimum(0.5 * np.arange(11), 2.0))
     assert np.array_equal(detours([1.0, 1.0], [1.0, 1.0], centres, 0.5, 3, 0.1), [np.ones((4, 2))])
-    with pytest.raises(fg.ModelError, match=r"radii .M,., finite and not negative"):
+    with pytest.raises(fg.ModelError, match=r"radii .M,., not negative, for centres"):
         detours([0.0, 0.0], [6.0, 0.0], centres, [0.5, 0.5], 9, 0.1)
 
 

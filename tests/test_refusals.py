@@ -253,16 +253,21 @@ OPTIONS: list[tuple[Callable[[fg.Graph, fg.Family, Any], object], Any, str]] = [
     (lambda g, x, bad: InertialMeasurements(bad), 0.1, "'imu': noise must be of the class ImuNoise, found 0.1"),
     (lambda g, x, bad: InertialMeasurements(ImuNoise(), gap=bad), "a", "'imu': gap must be a number, found 'a'"),
     (lambda g, x, bad: InertialMeasurements(ImuNoise(), body=bad), 3, "'imu': body must be of the class str or None"),
-    (lambda g, x, bad: passing(radii=bad), -0.5, "radii .M,., finite and not negative.* -0.5"),
-    (lambda g, x, bad: passing(radii=bad), np.nan, "radii .M,., finite and not negative.* nan"),
+    (lambda g, x, bad: passing(radii=bad), -0.5, "radii .M,., not negative.* -0.5"),
+    (lambda g, x, bad: passing(radii=bad), np.nan, "radii .M,., not negative.* nan"),
     (lambda g, x, bad: passing(start=bad), "a", "detours: start and goal"),
+    (lambda g, x, bad: passing(start=bad), [np.nan, 0.0], "of which not all is finite"),
+    (lambda g, x, bad: passing(centres=bad), [[1.5, np.nan]], "of which not all is finite"),
+    (lambda g, x, bad: passing(most=bad), -1, "detours: most must be positive, found -1"),
     (lambda g, x, bad: passing(steps=bad), -1, "detours: steps must be positive, found -1"),
     (lambda g, x, bad: headed([[0.0, 0.0], [1.0, 0.0]], bad), "a", "headed: heading must be a number, found 'a'"),
 ]
 
 
-def passing(start: Any = (0.0, 0.0), radii: Any = 0.5, steps: Any = 4) -> list[Array]:
-    return detours(start, [3.0, 0.0], [[1.5, 0.0]], radii, steps, 0.5)
+def passing(
+    start: Any = (0.0, 0.0), radii: Any = 0.5, steps: Any = 4, centres: Any = ((1.5, 0.0),), most: Any = 2
+) -> list[Array]:
+    return detours(start, [3.0, 0.0], centres, radii, steps, 0.5, most)
 
 
 def grown(occupied: Any = ((True, False),), resolution: Any = 1.0, cap: Any = None) -> DistanceMap:
