@@ -53,11 +53,12 @@ def detours(
     ends, middle, radius = (doubles(f"detours: {what}", part, error=ModelError) for what, part in given.items())
     middle = middle.reshape(-1, 2) if middle.size == 0 else middle
     fits = middle.ndim == 2 and middle.shape[1] == 2 and radius.ndim < 2 and radius.size in (1, len(middle))
-    finite = all(np.isfinite(part).all() for part in (ends, middle, radius))
-    if ends.shape != (2, 2) or not (fits and finite and (radius >= 0.0).all()):
+    if ends.shape != (2, 2) or not (
+        fits and (radius >= 0.0).all() and all(np.isfinite(part).all() for part in (ends, middle, radius))
+    ):
         raise ModelError(
             "detours: start and goal must be (2,), and radii (M,), not negative, for centres (M, 2), all finite; got "
-            f"{ends.shape}, {radii!r} and {middle.shape}{'' if finite else ', of which not all is finite'}"
+            f"{ends.tolist()}, {radii!r} and {middle.shape}"
         )
     radius = np.broadcast_to(radius, len(middle))
     length = max(float(np.hypot(*(ends[1] - ends[0]))), 1e-12)

@@ -146,8 +146,10 @@ class _Remarks:
         wide = np.flatnonzero(planar & (np.abs(edges.measured[:, 2]) > 2.0 * np.pi))
         if len(wide):
             k = int(wide[0])
-            told = f"{counted(len(wide), 'edge')} by more than a turn, first in line {lines[k]}"
-            self.say(f"headings change along {told} ({edges.measured[k, 2]:g}): radians are read; convert degrees")
+            self.say(
+                f"headings change along {counted(len(wide), 'edge')} by more than a turn, first in line {lines[k]} "
+                f"({edges.measured[k, 2]:g}): radians are read; convert degrees"
+            )
         own = np.flatnonzero(edges.first == edges.second)
         if len(own):
             k = int(own[0])

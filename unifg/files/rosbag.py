@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,10 +64,9 @@ def read_rosbag(path: Path) -> Recorded:
         for topic, kind, message in _mcap(path) if path.suffix == ".mcap" else _bag(path):
             if kind == FRAMES:
                 if topic.endswith("tf_static"):
-                    links |= {
-                        _bare(a.child_frame_id): (_bare(a.header.frame_id), _pose(a.transform))
-                        for a in message.transforms
-                    }
+                    poses = _poses([one.transform for one in message.transforms])
+                    for one, pose in zip(message.transforms, poses, strict=True):
+                        links[one.child_frame_id.lstrip("/")] = one.header.frame_id, pose
             else:
                 topics.setdefault(kind, {}).setdefault(topic, []).append(message)
     except MemoryError:
@@ -94,10 +93,10 @@ def read_rosbag(path: Path) -> Recorded:
     if len(scans) < every:
         logger.warning("%s: %d of %d scans left out: no odometry then, or other beams", name, every - len(scans), every)
     time = np.array([_stamp(scan) for scan in scans])
-    poses = _planar(np.array([_pose(one.pose.pose) for one in wheels]))[np.argsort(known, kind="stable")]
+    poses = _planar(_poses([one.pose.pose for one in wheels]))[np.argsort(known, kind="stable")]
     columns = (*poses[:, :2].T, np.unwrap(poses[:, 2]))
     at = np.column_stack([np.interp(time, np.sort(known), column) for column in columns])
-    base, laser = (_hung(links, _bare(one)) for one in (wheels[0].child_frame_id, frame))
+    base, laser = (_hung(links, one) for one in (wheels[0].child_frame_id, frame))
     mount = SE3.between(base, laser)
     ranges = np.array([scan.ranges for scan in scans], dtype=np.float64)
     ranges[ranges < scans[0].range_min] = np.nan
@@ -146,17 +145,14 @@ def _stamp(message: Any) -> float:
     return float(stamp.sec) + 1e-9 * float(getattr(stamp, "nanosec", 0) or getattr(stamp, "nsec", 0))
 
 
-def _bare(frame: str) -> str:
-    """Name of a frame; ROS 1 may begin it with a slash."""
-    return frame.lstrip("/")
-
-
-def _pose(given: Any) -> Array:
-    """(7,) pose of `unifg.SE3` of a pose or a transform."""
-    place = getattr(given, "position", None) or given.translation
-    turn = getattr(given, "orientation", None) or given.rotation
-    numbers = [place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w]
-    return SE3.from_quaternion(np.array(numbers), order="xyzw")
+def _poses(given: Iterable[Any]) -> Array:
+    """(n, 7) poses of `unifg.SE3` of poses or transforms."""
+    rows = []
+    for one in given:
+        place = getattr(one, "position", None) or one.translation
+        turn = getattr(one, "orientation", None) or one.rotation
+        rows.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
+    return SE3.from_quaternion(np.array(rows).reshape(-1, 7), order="xyzw")
 
 
 def _planar(poses: Array) -> Array:
@@ -166,10 +162,10 @@ def _planar(poses: Array) -> Array:
 
 
 def _hung(links: dict[str, tuple[str, Array]], frame: str) -> Array:
-    """(7,) pose of a frame in the last one that it hangs on."""
+    """(7,) pose of a frame in the last one that it hangs on; ROS 1 may begin their names with a slash."""
     pose = SE3.identity()
     for _ in links:  # at most; frames may hang on each other
-        if frame in links:
-            frame, own = links[frame]
+        if (name := frame.lstrip("/")) in links:
+            frame, own = links[name]
             pose = SE3.compose(own, pose)
     return pose
