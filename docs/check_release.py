@@ -3,7 +3,7 @@
 Both builds begin with a copy of what git tracks and end in dist/: a wheel, and an sdist whose times, owners and order
 are made the same. They have to be equal to the last bit, within the size that the page of releases allows.
 Then, with every Python that the classifiers name and this machine has, the wheel has to solve and answer
-`unifg doctor` in an environment of its own, and with its extras pass the tests of `TESTS`, drive, and solve a file,
+`unifg doctor` in an environment of its own, and with its extras pass `TESTS` and the tests of promises, drive, and solve a file,
 in a folder without sources: with the newest of all packages, and with the lowest where these have wheels for that
 Python, as they must for the oldest. What could not be tried is said.
 
@@ -20,6 +20,7 @@ import hashlib
 import io
 import os
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -237,7 +238,9 @@ def trial(wheel: Path, sdist: Path, python: str, home: Path, lowest: bool) -> st
     shutil.move(source / "tests", home / "away")
     shutil.move(source / "pyproject.toml", home / "away")  # what pytest is told
     shutil.rmtree(source)
-    paths = [f"tests/{name}" for name in TESTS]
+    paths = [
+        f"tests/{name}" for name in (*TESTS, *runpy.run_path(str(home / "away" / "tests" / "promises.py"))["NODES"])
+    ]
     summary = (
         run(scripts / "python", "-I", "-m", "pytest", "-q", *quiet, *paths, cwd=home / "away").strip().split("\n")[-1]
     )
