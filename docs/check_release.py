@@ -3,9 +3,9 @@
 Both builds begin with a copy of what git tracks and end in dist/: a wheel, and an sdist whose times, owners and order
 are made the same. They have to be equal to the last bit, within the size that the page of releases allows.
 Then, with every Python that the classifiers name and this machine has, the wheel has to solve and answer
-`unifg doctor` in an environment of its own, and with its extras pass `TESTS` and the tests of promises, drive, and solve a file,
-in a folder without sources: with the newest of all packages, and with the lowest where these have wheels for that
-Python, as they must for the oldest. What could not be tried is said.
+`unifg doctor` in an environment of its own, and with its extras pass `TESTS` and the tests of promises, drive, and
+solve a file, in a folder without sources: with the newest of all packages, and with the lowest where these have wheels
+for that Python, as they must for the oldest. What could not be tried is said.
 
 `--no-install` builds only, for the rest fetches packages; `--python 3.12` (repeated) chooses among the Pythons;
 `--newest` leaves the lowest packages out, `--lowest` the newest.
