@@ -18,7 +18,7 @@ from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.solution.status import Status
 from unifg.style.figures import write_figure
 
-__all__ = ["SETTINGS", "course_metrics", "results", "run", "summary"]
+__all__ = ["SETTINGS", "course_metrics", "run", "summary"]
 
 SETTINGS = courses.CourseSettings
 
@@ -30,8 +30,13 @@ def run(settings: courses.CourseSettings, progress: Progress, announce: Announce
     progress(1.0, "solved")
     interrupted = course.solution.status is Status.INTERRUPTED
     numbers = course_metrics(course)
-    flown = {"flight": course_log(course)}
-    return Outcome(course.succeeded, interrupted, summary(course), numbers, results(course), flown)
+    flown = course_log(course)
+    files: dict[str, Writer] = {
+        "metrics.json": lambda path: write_metrics(path, numbers),
+        "iterates.png": lambda path: write_figure(path, picture(course), 90),
+        "scene.html": lambda path: flight_scene(flown).save(path),
+    }
+    return Outcome(course.succeeded, interrupted, summary(course), numbers, files, {"flight": flown})
 
 
 def course_metrics(course: Course) -> dict[str, Any]:
@@ -71,15 +76,6 @@ def course_metrics(course: Course) -> dict[str, Any]:
     }
 
 
-def results(course: Course) -> dict[str, Writer]:
-    """Results of a flight with its iterates: numbers, a picture and a scene."""
-    return {
-        "metrics.json": lambda path: write_metrics(path, course_metrics(course)),
-        "iterates.png": lambda path: write_figure(path, picture(course), 90),
-        "scene.html": lambda path: flight_scene(course_log(course)).save(path),
-    }
-
-
 def summary(course: Course) -> str:
     """The outcome for people, as a table of two columns."""
     m = course_metrics(course)
@@ -91,15 +87,11 @@ def summary(course: Course) -> str:
         "iterations": f"{m['iterations']} in {m['solve_ms']:.0f} ms",
         "cost": f"{m['cost']:.4f}",
         "stationarity, violation": f"{m['stationarity']:.1e}, {m['violation']:.1e}",
-        "end": f"{m['target_distance_m']:.3f} m from the target, " + _said(m["arrived"], "arrived", "NOT ARRIVED"),
+        "end": f"{m['target_distance_m']:.3f} m from the target, " + ("arrived" if m["arrived"] else "NOT ARRIVED"),
         "least clearance of hull": f"{m['min_clearance_m']:.3f} m at nodes, "
-        f"{m['min_clearance_between_nodes_m']:.3f} m on the way, " + _said(m["clear"], "clear", "COLLISION"),
+        f"{m['min_clearance_between_nodes_m']:.3f} m on the way, " + ("clear" if m["clear"] else "COLLISION"),
         "flown": f"{m['path_length_m']:.2f} m, at most {m['max_speed_m_per_s']:.2f} m/s, tilt "
         f"{np.degrees(m['max_tilt_rad']):.0f} deg, thrust {m['min_thrust_n']:.1f} to {m['max_thrust_n']:.1f} N",
-        "can be flown as planned": _said(m["flyable"], "yes", "NO"),
+        "can be flown as planned": "yes" if m["flyable"] else "NO",
     }
     return table(rows.items())
-
-
-def _said(fact: bool, good: str, bad: str) -> str:
-    return good if fact else bad

@@ -40,8 +40,7 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
             used = replace(used, obstacles=settings.obstacles)
         if idle := [name for name, value in vars(used).items() if getattr(settings, name) != value]:
             raise ScenarioError(f"a recorded drive is not simulated, leave out: {', '.join(idle)}")
-        replayed = replays.SETTINGS(**taken)
-        return replays.run(replayed, progress)
+        return replays.run(replays.SETTINGS(**taken), progress)
     with watching_ticks(announce, drive_stage, drive_frame):
         log = navigation.run_navigation(settings, progress=progress)
     if log.ticks == 0:
@@ -68,7 +67,7 @@ def results(log: EpisodeLog) -> dict[str, Writer]:
 def summary(log: EpisodeLog) -> str:
     """The outcome of an episode as a table of two columns."""
     m = episode_metrics(log)
-    stopped = " (interrupted)" if m["interrupted"] else ""
+    placed, wanted, stopped = m["obstacles"], m["obstacles_wanted"], " (interrupted)" if m["interrupted"] else ""
     spread = "mean {mean:.4f} {unit}, std {std:.4f}, max {max:.4f}"
     rows = (
         ("scenario", f"{m['scenario']} on {m['map']}{one_graph(m['coupling'])}"),
@@ -76,7 +75,7 @@ def summary(log: EpisodeLog) -> str:
         ("base, body", f"{m['base']}, {m['body']}" if log.body or log.base != "unicycle" else ""),
         ("goals reached", f"{m['goals_reached']} of {m['goals']}{stopped}"),
         *((f"goal {k + 1}", words) for k, words in enumerate(m["outcomes"]) if words != "reached"),
-        ("obstacles", _fewer(m["obstacles"], m["obstacles_wanted"])),
+        ("obstacles", f"{placed} of {wanted} found a place that leaves a way" if placed < wanted else ""),
         ("health", health(m)),
         ("samples not let in", ", ".join(f"{count} {what}" for what, count in m["dropped_samples"].items())),
         ("collisions", f"{m['collisions']}"),
@@ -93,8 +92,3 @@ def summary(log: EpisodeLog) -> str:
         ("worst bound violation", f"{m['max_bound_violation']:.1e}"),
     )
     return table(rows)
-
-
-def _fewer(placed: int, wanted: int) -> str:
-    """Words where fewer obstacles found a place than were asked for."""
-    return f"{placed} of {wanted} found a place that leaves a way" if placed < wanted else ""

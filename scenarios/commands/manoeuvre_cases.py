@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from pathlib import Path
 
 import numpy as np
 
@@ -60,8 +58,7 @@ def run(settings: CaseSettings, progress: Progress, announce: Announce | None = 
 
     files: dict[str, Writer] = {"metrics.json": lambda path: write_metrics(path, numbers)}
     for one in solved:
-        files[f"{one.case.name}.png"] = partial(_draw, one)
-        files[f"{one.case.name}.html"] = partial(_show, one)
+        files |= _pictures(one)
     logs = {one.case.name: _driven(one) for one in solved}
     return Outcome(all(m.succeeded for m in solved), interrupted, manoeuvres.table(solved), numbers, files, logs)
 
@@ -79,9 +76,9 @@ def _driven(solved: manoeuvres.Manoeuvre) -> SolvedLog:
     )
 
 
-def _draw(solved: manoeuvres.Manoeuvre, path: Path) -> None:
-    write_figure(path, picture(solved), 105)
-
-
-def _show(solved: manoeuvres.Manoeuvre, path: Path) -> None:
-    manoeuvre_scene(solved).save(path)
+def _pictures(solved: manoeuvres.Manoeuvre) -> dict[str, Writer]:
+    """Picture and scene of one case."""
+    return {
+        f"{solved.case.name}.png": lambda path: write_figure(path, picture(solved), 105),
+        f"{solved.case.name}.html": lambda path: manoeuvre_scene(solved).save(path),
+    }

@@ -14,7 +14,7 @@ from unifg.scenarios.scenes.safe_plot import picture
 from unifg.scenarios.scenes.safe_scene import safe_frame, safe_scene, safe_stage
 from unifg.style.figures import write_figure
 
-__all__ = ["SETTINGS", "results", "run", "safe_numbers", "summary"]
+__all__ = ["SETTINGS", "run", "safe_numbers", "summary"]
 
 SETTINGS = safe_flight.SafeSettings
 
@@ -30,9 +30,14 @@ def run(settings: safe_flight.SafeSettings, progress: Progress, announce: Announ
         logs = [log for log in safe_flight.run_safe_flights(settings, progress) if log.ticks]
     if not logs:
         raise KeyboardInterrupt
-    succeeded = all(log.succeeded for log in logs)
+    numbers = safe_numbers(logs)
+    files: dict[str, Writer] = {
+        "metrics.json": lambda path: write_metrics(path, numbers),
+        "flights.png": lambda path: write_figure(path, picture(logs), 110),
+        "scene.html": lambda path: safe_scene(logs[0]).save(path),  # of the first
+    }
     flown = {log.label.replace(" ", "-").replace("/", "-per-") or "flight": log for log in logs}
-    return Outcome(succeeded, logs[-1].interrupted, summary(logs), safe_numbers(logs), results(logs), flown)
+    return Outcome(numbers["succeeded"], logs[-1].interrupted, summary(logs), numbers, files, flown)
 
 
 def safe_numbers(logs: Sequence[SafeLog]) -> dict[str, Any]:
@@ -45,15 +50,6 @@ def safe_numbers(logs: Sequence[SafeLog]) -> dict[str, Any]:
     }
 
 
-def results(logs: Sequence[SafeLog]) -> dict[str, Writer]:
-    """Results of flights of one case, of at least one tick each: numbers, a picture of all, a scene of the first."""
-    return {
-        "metrics.json": lambda path: write_metrics(path, safe_numbers(logs)),
-        "flights.png": lambda path: write_figure(path, picture(logs), 110),
-        "scene.html": lambda path: safe_scene(logs[0]).save(path),
-    }
-
-
 def summary(logs: Sequence[SafeLog]) -> str:
     """The outcome for people, one line for each flight."""
     rows = [("flight", "boundary distance", "path kept to", "top speed", "decided in", "outcome")]
@@ -61,14 +57,8 @@ def summary(logs: Sequence[SafeLog]) -> str:
         m = safe_metrics(log)
         near = m["min_boundary_distance_m"]
         kept = "TOUCHED" if log.touched else "margin NOT KEPT" if log.violated else "kept its distance"
-        words = [kept] if len(log.radii) else []
-        words += (
-            ["interrupted"]
-            if log.interrupted
-            else []
-            if log.end is None
-            else ["arrived" if log.arrived else "NOT THERE"]
-        )
+        arrived = "" if log.end is None else "arrived" if log.arrived else "NOT THERE"
+        words = [kept if len(log.radii) else "", "interrupted" if log.interrupted else arrived]
         rows.append(
             (
                 log.label,
@@ -76,7 +66,7 @@ def summary(logs: Sequence[SafeLog]) -> str:
                 "{rms:.3f} m rms".format(**m["tracking_error_m"]),
                 f"{m['max_speed_m_per_s']:.2f} m/s",
                 "{p50:.2f} ms, p99 {p99:.2f}".format(**m["decide_ms"]),
-                ", ".join(words) or "flown to the end",
+                ", ".join(filter(None, words)) or "flown to the end",
             )
         )
     return table(rows)
