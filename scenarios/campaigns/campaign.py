@@ -115,13 +115,15 @@ def run_campaign(
         _remark_changes(found, statement, code, done)
         write_manifest(folder, statement, code)
         found.outcomes = Counter(done.values())
-        tasks = _tasks(statement, code, done)
-        meter = _Meter(found, progress)
+        beat = partial(_tell, found, time.monotonic(), progress)
         if len(done) == len(known):
             return found
+        sources, base = fingerprint(), str(statement.base)
+        missing = (episode for episode in statement.episodes() if episode.key not in done)
+        tasks = (Task(statement.scenario, episode, base, code, sources) for episode in missing)
         with _executor(statement, workers, executor, scheduler) as (at_work, at_once):
             try:
-                for task, future in finished(at_work, run_task, tasks, at_once, meter.beat):
+                for task, future in finished(at_work, run_task, tasks, at_once, beat):
                     error = future.exception()
                     if isinstance(error, ScenarioError):  # of the workers: every other episode would say the same
                         raise error
@@ -131,9 +133,12 @@ def run_campaign(
                     journal.add(text)
                     found.outcomes[json.loads(text)["outcome"]] += 1
                     found.ran += 1
-                    meter.beat()
+                    beat()
             except BaseException as error:
-                _stop(at_work)
+                if isinstance(at_work, Workers):
+                    at_work.kill()
+                else:
+                    at_work.shutdown(wait=False, cancel_futures=True)
                 found.interrupted = isinstance(error, KeyboardInterrupt)
                 if not found.interrupted:
                     raise
@@ -254,13 +259,6 @@ def write_manifest(folder: Path, statement: Statement, code: str) -> None:
         raise ScenarioError(f"{path}: cannot be written ({error.strerror})") from None
 
 
-def _tasks(statement: Statement, code: str, done: dict[str, str]) -> Iterator[Task]:
-    sources, base = fingerprint(), str(statement.base)
-    for episode in statement.episodes():
-        if episode.key not in done:
-            yield Task(statement.scenario, episode, base, code, sources)
-
-
 @contextmanager
 def _executor(
     statement: Statement, workers: int, executor: Executor | None, scheduler: str | None
@@ -281,26 +279,12 @@ def _ready(module: str) -> None:
     fingerprint()
 
 
-def _stop(executor: Executor) -> None:
-    """End what is under way."""
-    if isinstance(executor, Workers):
-        executor.kill()
-    else:
-        executor.shutdown(wait=False, cancel_futures=True)
-
-
-class _Meter:
-    """Tells how far a campaign is, and how long it will take."""
-
-    def __init__(self, campaign: Campaign, progress: Progress) -> None:
-        self._campaign, self._progress, self._began = campaign, progress, time.monotonic()
-
-    def beat(self) -> None:
-        c = self._campaign
-        done = c.outcomes.total()
-        bad = ", ".join(f"{c.outcomes[name]} {name}" for name in (FAILED, ERROR, LOST) if c.outcomes[name])
-        text = f"{done} of {c.episodes}" + (f", {bad}" if bad else "")
-        if c.ran:
-            ahead = (time.monotonic() - self._began) / c.ran * (c.episodes - done)
-            text += f", {timedelta(seconds=round(ahead))} left"
-        self._progress(done / max(1, c.episodes), text)
+def _tell(c: Campaign, began: float, progress: Progress) -> None:
+    """Tell how far a campaign is that began at a monotonic time [s], and how long it will take."""
+    done = c.outcomes.total()
+    bad = ", ".join(f"{c.outcomes[name]} {name}" for name in (FAILED, ERROR, LOST) if c.outcomes[name])
+    text = f"{done} of {c.episodes}" + (f", {bad}" if bad else "")
+    if c.ran:
+        ahead = (time.monotonic() - began) / c.ran * (c.episodes - done)
+        text += f", {timedelta(seconds=round(ahead))} left"
+    progress(done / max(1, c.episodes), text)

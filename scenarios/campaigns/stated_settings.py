@@ -7,6 +7,7 @@ that are no options: ``controller.speed`` is the field ``speed`` of the settings
 from __future__ import annotations
 
 import argparse
+import glob
 import hashlib
 import math
 import tomllib
@@ -60,11 +61,7 @@ class Fields:
 
     def __contains__(self, name: str) -> bool:
         """True for a name that means one field."""
-        try:
-            self.named(name, "")
-        except ScenarioError:
-            return False
-        return True
+        return name in self._leaves or len(self._short.get(name.replace("-", "_"), [])) == 1
 
     def value(self, path: str, given: Any, where: str) -> Any:
         """A value as its field wants it.
@@ -165,18 +162,13 @@ def identity(value: Any) -> Any:
     """Identity of a value as JSON can hold it; of a file, a digest of it and of the files named like it."""
     if isinstance(value, Path):
         total = hashlib.sha256()
-        for beside in sorted(value.parent.glob(f"{_literal(value.stem)}.*")):
+        for beside in sorted(value.parent.glob(f"{glob.escape(value.stem)}.*")):
             if beside.is_file() and beside.suffix != ".toml":  # a campaign may be named like its map
                 total.update(beside.name.encode() + b"\0" + beside.read_bytes() + b"\0")
         return total.hexdigest()[:12]
     if isinstance(value, tuple):
         return [identity(one) for one in value]
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
-
-
-def _literal(name: str) -> str:
-    """A name that holds no wildcard."""
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
 
 
 def _single(kind: Any, given: Sequence[Any]) -> bool:
