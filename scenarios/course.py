@@ -58,7 +58,7 @@ class CourseSettings(Settings):
         horizon: steps N.
         dt: sampling time [s].
         solver: one of `unifg.solvers.names.SECOND_ORDER`.
-        hessian: of the Lagrangian; exact if none is named.
+        hessian: of the Lagrangian.
         avoidance: "potential" is Ta's cost 1/d for the cylinder and every wall, d from the hull; "hard" keeps the hull
             clear at every node.
         guess: "hover" stays at the start, "line" flies straight to the target through whatever stands there, "way"
@@ -89,9 +89,9 @@ class CourseSettings(Settings):
     horizon: AtLeastOne = 60
     dt: Positive[float] = 0.1
     solver: str = "sqp"
-    hessian: Hessian | None = option(None)
+    hessian: Hessian = option("exact")
     avoidance: Avoidance = option("potential")
-    guess: Start | None = option(None)
+    guess: Start = option("way")
     general: bool = option(False)
     seed: int | None = option(None, metavar="S")
     goal: Positive[float] = 0.04
@@ -116,16 +116,6 @@ class CourseSettings(Settings):
         if self.general and self.avoidance == "hard":
             raise fg.ScenarioError("general: a general cost states the potential, and avoidance 'hard' has none")
 
-    @property
-    def chosen_hessian(self) -> Hessian:
-        """The Hessian that is used."""
-        return self.hessian or "exact"
-
-    @property
-    def chosen_guess(self) -> Start:
-        """The guess that is used."""
-        return self.guess or "way"
-
     def layout(self) -> Layout:
         """Start, target and obstacles."""
         return obstacle_course(self.seed)
@@ -137,7 +127,7 @@ def backend(settings: CourseSettings, *, keep_values: bool = False) -> fg.Solver
     Raises:
         BackendError: for an unknown solver.
     """
-    options = {"tolerance": settings.tolerance, "hessian": settings.chosen_hessian, "keep_values": keep_values}
+    options = {"tolerance": settings.tolerance, "hessian": settings.hessian, "keep_values": keep_values}
     return names.backend(settings.solver, **options)
 
 
@@ -185,7 +175,7 @@ def course_guess(settings: CourseSettings, layout: Layout) -> tuple[Array, Array
     Raises:
         ScenarioError: for a guess along a way where there is none.
     """
-    s, kind = settings, settings.chosen_guess
+    s, kind = settings, settings.guess
     states = np.tile(_standing(layout), (s.horizon + 1, 1))
     controls = np.tile(quadrotor.hover(s.vehicle), (s.horizon, 1))
     if kind != "hover":

@@ -18,7 +18,6 @@ from unifg.scenarios import command
 from unifg.scenarios import course as obstacles
 from unifg.scenarios.commands.courses import course_metrics, summary
 from unifg.scenarios.course import (
-    AVOIDANCES,
     HESSIANS,
     Course,
     CourseSettings,
@@ -122,14 +121,12 @@ def test_guesses() -> None:
         np.testing.assert_allclose(states[-1, :3], layout.target, atol=1e-12)
         np.testing.assert_allclose(states[:-1, :3] + settings.dt * states[1:, 7:], states[1:, :3], atol=1e-12)
     assert (controls == quadrotor.hover(settings.vehicle)).all()
-    for kind in AVOIDANCES:
-        assert replace(settings, avoidance=kind).chosen_guess == "way"
-        assert replace(settings, avoidance=kind, guess="line").chosen_guess == "line"
+    assert settings.guess == "way"
 
 
 @pytest.mark.parametrize("solver", ["sqp", "ipm", "alm"])
 def test_the_hessian_that_is_asked_for_is_used(solver: str) -> None:
-    assert CourseSettings(solver=solver).chosen_hessian == "exact"
+    assert CourseSettings(solver=solver).hessian == "exact"
     for hessian in HESSIANS:
         assert backend(CourseSettings(solver=solver, hessian=hessian)).hessian == hessian  # type: ignore[attr-defined]
 

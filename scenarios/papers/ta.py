@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from unifg.scenarios.course import CourseSettings, Start, run_course
+from unifg.scenarios.course import GUESSES, CourseSettings, run_course
 from unifg.scenarios.papers import corridor_flights
 from unifg.scenarios.papers.comparison import Comparison, Effort, counted, measured
 from unifg.scenarios.papers.courses import Method, attempted
 from unifg.scenarios.papers.printed import texts
 from unifg.scenarios.simulation.layouts import CORRIDOR_SEEDS, COURSE_SEEDS
 
-GUESSES: tuple[Start, ...] = ("hover", "line", "way")
 OFTEN = 0.5  # share from which on a flight often succeeds
 
 

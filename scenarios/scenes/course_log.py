@@ -17,8 +17,8 @@ def course_log(course: Course) -> FlightLog:
     """The flight as planned, in the form scenes and plots of flights read; nothing is estimated in it."""
     c, s = course, course.settings
     settings: dict[str, object] = {
-        "scenario": "quadrotor-obstacles", "solver": f"{s.solver}, {s.chosen_hessian} Hessian",
-        "avoidance": s.avoidance, "guess": s.chosen_guess,
+        "scenario": "quadrotor-obstacles", "solver": f"{s.solver}, {s.hessian} Hessian",
+        "avoidance": s.avoidance, "guess": s.guess,
     }  # fmt: skip
     if s.seed is not None:
         settings["seed"] = s.seed

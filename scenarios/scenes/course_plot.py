@@ -109,7 +109,7 @@ def _extent(course: Course) -> Array:
 def _caption(course: Course, number: int) -> str:
     last = len(course.iterates) - 1
     cost = course.solution.cost if number == last else course.solution.history[number].cost
-    what = {0: f", the guess: {_GUESSES[course.settings.chosen_guess]}", last: ", the last"}.get(number, "")
+    what = {0: f", the guess: {_GUESSES[course.settings.guess]}", last: ", the last"}.get(number, "")
     return f"Iterate {number}{what}; cost {cost:.4g}"
 
 
@@ -120,6 +120,6 @@ def _title(course: Course) -> str:
     kept = "repelled by 1/d" if s.avoidance == "potential" else f"kept {s.clearance:g} m clear"
     return (
         f"A quadrotor is to fly to the yellow target, {kept} of three walls and a cylinder\n"
-        f"{c.layout.name}, {s.solver} with the {s.chosen_hessian} Hessian: {ended} after {c.solution.iterations} "
+        f"{c.layout.name}, {s.solver} with the {s.hessian} Hessian: {ended} after {c.solution.iterations} "
         f"iterations, {c.target_distance:.2f} m from the target, {clear}"
     )
