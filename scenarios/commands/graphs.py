@@ -65,7 +65,7 @@ def results(solved: SolvedGraph) -> dict[str, Writer]:
 def metrics(solved: SolvedGraph) -> dict[str, Any]:
     """The numbers of a solve, ready for JSON. chi2 is the sum of r' Omega r, without 1/2 and without robust loss."""
     settings, graph, solution = solved.settings, solved.after, solved.solution
-    in_file, at_start, at_end = solved.chi2
+    (in_file, at_start, at_end), edges, ids = solved.chi2, graph.edges, graph.ids
     return {
         "file": legible(settings.file.name),
         "poses": len(graph.poses),
@@ -100,7 +100,7 @@ def metrics(solved: SolvedGraph) -> dict[str, Any]:
         "cost": solution.cost,
         "stationarity": solution.stationarity,
         "outliers": int(solved.outliers.sum()),
-        "outlier_edges": _pairs(solved),
+        "outlier_edges": np.stack([ids[edges.first], ids[edges.second]], axis=1)[solved.outliers].tolist(),
         "rivals": [] if solution.verdict is None else [rival.cost for rival in solution.verdict.rivals],
         "groups": []
         if solution.verdict is None
@@ -204,10 +204,3 @@ def _words(verdict: Verdict | None) -> list[tuple[str, str]]:
         ("bounds", bounds if verdict.effort == "full" else ""),
         ("verdict", verdict.sentence()),
     ]
-
-
-def _pairs(solved: SolvedGraph) -> list[list[int]]:
-    """Identifiers of the poses that each outlier joins."""
-    edges, ids = solved.after.edges, solved.after.ids
-    pairs: list[list[int]] = np.stack([ids[edges.first], ids[edges.second]], axis=1)[solved.outliers].tolist()
-    return pairs

@@ -111,7 +111,14 @@ def cases() -> dict[str, Action]:
     """Actions of some milliseconds by name, each run once beforehand, so that nothing compiles later."""
     found: dict[str, Action] = {f"backend {name}": solve for name, solve, _ in self_tests()}
     found |= {f"tick {name}": _tick(name) for name in ("ipm", "alm", "sqp")}
-    found |= {"pose graph": _poses(), "covariances": _covariances(), "smoothing": _smooth, "statement": _state}
+    graph, x, guess = manhattan(300).pose_graph.graph()
+    city, hurried = backend("lm").prepare(graph), backend("lm", max_iterations=2).prepare(graph)
+    found |= {
+        "pose graph": lambda: city.solve(guess),
+        "covariances": lambda: hurried.solve(guess).marginals(x),
+        "smoothing": _smooth,
+        "statement": lambda: _drive()[0].compile(),
+    }
     for action in found.values():
         action()
     return found
@@ -146,20 +153,6 @@ def _tick(name: str) -> Action:
     return ticks
 
 
-def _poses() -> Action:
-    """A city of 300 poses by Levenberg and Marquardt."""
-    graph, _, guess = manhattan(300).pose_graph.graph()
-    run = backend("lm").prepare(graph)
-    return lambda: run.solve(guess)
-
-
-def _covariances() -> Action:
-    """The covariance of every pose of one."""
-    graph, x, guess = manhattan(300).pose_graph.graph()
-    run = backend("lm", max_iterations=2).prepare(graph)
-    return lambda: run.solve(guess).marginals(x)
-
-
 def _smooth() -> None:
     """Fifteen updates of an incremental estimate."""
     smoother = fg.Incremental()
@@ -171,11 +164,6 @@ def _smooth() -> None:
         else:
             smoother.minimize(fg.between, x[k - 1], x[k], [0.5, 0.0, 0.0], sigma=0.1)
         smoother.update({x: pose})
-
-
-def _state() -> None:
-    """A graph from its first line to its program."""
-    _drive()[0].compile()
 
 
 def measured(rounds: int, progress: Progress) -> Record:
