@@ -254,7 +254,16 @@ class Episode:
     def run(self, progress: Progress) -> EpisodeLog:
         """Tick until the last goal is reached or given up."""
         self.begin()
-        return self.finish(run_ticks(self.longest, self._tick, progress))
+        most = int(2.0 * sum(map(_longest, self.legs)) / self.settings.controller.dt)  # a detour doubles a way
+        interrupted = run_ticks(most, self._tick, progress)
+        return self._recorder.finish(
+            collisions=self.world.collisions,
+            reached=[outcome == REACHED for outcome in self._outcomes],
+            outcomes=self._outcomes,
+            dropped=dict(self.pilot.validator.dropped),
+            subproblems=dict(self.pilot.controller.loop.subproblems) if self.settings.planner == MPC else {},
+            interrupted=interrupted,
+        )
 
     def begin(self) -> None:
         """Open the log."""
@@ -289,22 +298,6 @@ class Episode:
         self._outcomes = ["time ran out"] * len(self.goals)
         self._goal, self._driven, self._dead_reckoning = 0, 0.0, self.pilot.pose
         self._begun, self._allowed, self._helpless = 0.0, 0.0, 0.0
-
-    @property
-    def longest(self) -> int:
-        """Ticks that the drive may take, if no detour is more than twice as long as its way."""
-        return int(2.0 * sum(map(_longest, self.legs)) / self.settings.controller.dt)
-
-    def finish(self, interrupted: bool) -> EpisodeLog:
-        """Close the log."""
-        return self._recorder.finish(
-            collisions=self.world.collisions,
-            reached=[outcome == REACHED for outcome in self._outcomes],
-            outcomes=self._outcomes,
-            dropped=dict(self.pilot.validator.dropped),
-            subproblems=dict(self.pilot.controller.loop.subproblems) if self.settings.planner == MPC else {},
-            interrupted=interrupted,
-        )
 
     def _tick(self, number: int) -> tuple[float, str] | None:
         """Decide and drive; None at the last goal."""

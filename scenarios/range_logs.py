@@ -14,7 +14,7 @@ from unifg.files.range_log import RangeLog, aligned, read_range_log
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2
 from unifg.models.odometry import OdometryNoise
-from unifg.scenarios.logs.drive_metrics import pose_errors
+from unifg.scenarios.logs.drive_metrics import nees, pose_errors
 from unifg.scenarios.options import Settings, existing, option, pose
 from unifg.typing import Array
 
@@ -118,9 +118,7 @@ class LogRun:
         """(n,) squared errors against the corrected poses, after alignment, by the covariances; empty without these."""
         if self.covariance is None or self.truth is None:
             return np.zeros(0)
-        off = SE2.local(aligned(self.poses, self.truth), self.truth)
-        found: Array = np.einsum("ni,ni->n", off, np.linalg.solve(self.covariance, off[:, :, None])[:, :, 0])
-        return found
+        return nees(aligned(self.poses, self.truth), self.truth, self.covariance)
 
 
 def step_of(log: RangeLog, begin: int, end: int) -> Array:

@@ -194,16 +194,11 @@ class Controller:
         constraints was tried: such plans brush past obstacles and creep up to those that stand in the way.
         """
         if solution.violation <= self.settings.feasible:
-            driven = self._within_reach(kept.within(controls), now.last)
+            driven, most = kept.within(controls), self.settings.most
+            driven[0] = np.clip(driven[0], now.last - most, now.last + most)  # no farther than the base can follow
             return Decision(driven, states, "solved", behind=is_behind(states, now.given.reference))
         way = now.given.evasive
         return Decision(way.controls, way.states, "evading" if way.evades else "braking")
-
-    def _within_reach(self, controls: Array, last: Array) -> Array:
-        """Controls (N, m) of which the first is no farther from the last than the base can follow."""
-        most = self.settings.most
-        controls[0] = np.clip(controls[0], last - most, last + most)
-        return controls
 
     def leaving(self, now: Context[Drive]) -> tuple[Array, Array]:
         """Guess the way out, which is feasible: a solver that failed finds the near side of what stopped it."""

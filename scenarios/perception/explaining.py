@@ -13,7 +13,7 @@ import numpy as np
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks
-from unifg.typing import Array, BoolArray, IntArray
+from unifg.typing import Array, IntArray
 
 __all__ = ["Explained", "PointWatch", "explained"]
 
@@ -100,7 +100,8 @@ class PointWatch:
             )
             beside = close | np.roll(close, 1)
         points = points[beside]
-        fresh = points[_near(points, self._before, AGAIN)]
+        gaps = np.hypot(*np.moveaxis(points[:, None] - self._before[None], 2, 0))
+        fresh = points[gaps.min(axis=1, initial=np.inf) <= AGAIN]
         self._before = points
         for centre, radius in zip(tracks.centre, tracks.radius.tolist(), strict=True):
             fresh = fresh[np.hypot(*(fresh - centre).T) > radius + BESIDE_DISC]
@@ -118,10 +119,3 @@ def thinned(points: Array, apart: float) -> Array:
     """Of points (n, 2) one for each square of side ``apart`` [m] that holds any: the first."""
     _, first = np.unique(np.floor(points / apart).astype(np.int64), axis=0, return_index=True)
     return points[np.sort(first)]
-
-
-def _near(points: Array, others: Array, reach: float) -> BoolArray:
-    """(n,) whether one of others (k, 2) is within reach of points (n, 2)."""
-    gaps = np.hypot(*np.moveaxis(points[:, None] - others[None], 2, 0))
-    near: BoolArray = gaps.min(axis=1, initial=np.inf) <= reach
-    return near

@@ -27,7 +27,7 @@ from unifg.scenarios.planning.passage import obstacle_distance
 from unifg.scenarios.simulation.bearing_range import Sensor, SensorModel
 from unifg.scenarios.simulation.disturbance import DisturbanceModel, Disturbances
 from unifg.scenarios.simulation.layouts import Layout
-from unifg.scenarios.simulation.placement import random_movers
+from unifg.scenarios.simulation.placement import random_mover
 from unifg.scenarios.simulation.space import OTHERS, Obstacle, Space
 from unifg.typing import Array, ArrayLike
 
@@ -93,7 +93,9 @@ class QuadrotorWorld(Space):
         self.sensor_model = sensor or SensorModel()
         self.disturbance_model = disturbance or DisturbanceModel()
         sensor_rng, disturbance_rng, mover_rng = np.random.default_rng([_WORLD_TAG, seed]).spawn(3)
-        self.movers = random_movers(layout, movers, mover_rng) if isinstance(movers, int) else tuple(movers)
+        if isinstance(movers, int):
+            movers = [random_mover(layout, index, mover_rng) for index in range(movers)]
+        self.movers = tuple(movers)
         self._disturbances = Disturbances(self.disturbance_model, disturbance_rng)
         self.grounded = False
         self._state = _start_state(layout, start)

@@ -21,7 +21,7 @@ from unifg.scenarios.simulation.layouts import Layout
 from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["PlacementRules", "place_obstacles", "random_movers"]
+__all__ = ["PlacementRules", "place_obstacles", "random_mover"]
 
 _DRAWS = 300  # per obstacle, before everything is begun anew
 _RESTARTS = 4
@@ -205,26 +205,22 @@ def _leaves_way(site: _Site, obstacles: list[Obstacle]) -> bool:
     )
 
 
-def random_movers(layout: Layout, count: int, rng: np.random.Generator) -> tuple[Obstacle, ...]:
-    """Draw discs that move on straight segments between start and target.
+def random_mover(layout: Layout, index: int, rng: np.random.Generator) -> Obstacle:
+    """Draw a disc that moves on a straight segment between start and target.
 
-    Radii are uniform in 0.3 to 0.5 m, speeds in 0.3 to 0.8 m/s, lengths of the segments in 1.5 to 4 m; the middle of
-    a segment is uniform over the layout's ground between start and target, its direction uniform. A segment is drawn
+    The radius is uniform in 0.3 to 0.5 m, the speed in 0.3 to 0.8 m/s, the length of the segment in 1.5 to 4 m; its
+    middle is uniform over the layout's ground between start and target, its direction uniform. A segment is drawn
     again if on it the disc would come within 0.1 m of a cylinder or a wall, leave the ground, or come nearer than
     1.5 m to start or target. Movers may cross each other.
 
     Args:
         layout: what stands.
-        count: number of movers.
+        index: of the mover, for the message.
         rng: source of all numbers.
 
     Raises:
-        ScenarioError: if a thousand draws find no room for a mover.
+        ScenarioError: if a thousand draws find no room for it.
     """
-    return tuple(_random_mover(layout, index, rng) for index in range(count))
-
-
-def _random_mover(layout: Layout, index: int, rng: np.random.Generator) -> Obstacle:
     ends = np.stack([layout.start[:2], layout.target[:2]])
     low, high = layout.size
     left, right = np.sort(ends[:, 0])
