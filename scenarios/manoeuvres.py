@@ -179,14 +179,14 @@ class Manoeuvre:
     @property
     def clearance(self) -> Array:
         """(N + 1,) distance of the hull to the nearest disc at each node [m]; infinite without discs."""
-        return self._clearance(self.states)
+        return self.gaps(self.states)
 
     @property
     def clearance_between(self) -> float:
         """Least distance of the hull to the discs on the whole way, also between nodes [m]."""
         parts = np.arange(SUBSTEPS) / SUBSTEPS * self.settings.dt
         way = [unicycle.step(self.states[:-1], self.controls, part) for part in parts]
-        return float(self._clearance(np.concatenate([*way, self.states[-1:]])).min())
+        return float(self.gaps(np.concatenate([*way, self.states[-1:]])).min())
 
     @property
     def within_limits(self) -> bool:
@@ -200,7 +200,8 @@ class Manoeuvre:
         """True if the solver converged and every limit is kept."""
         return self.solution.converged and self.within_limits
 
-    def _clearance(self, states: Array) -> Array:
+    def gaps(self, states: Array) -> Array:
+        """(n,) distances of the hull at states (n, 2 or 3) from the nearest disc [m]; infinite without discs."""
         if not self.case.discs:
             return np.full(len(states), np.inf)
         discs = np.array(self.case.discs)

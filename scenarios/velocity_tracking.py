@@ -34,6 +34,7 @@ __all__ = [
     "run_tracking",
     "state_problem",
     "table",
+    "travelled",
 ]
 
 ROUNDING = 1e-6  # relative, by which a limit may seem exceeded
@@ -185,6 +186,11 @@ def run_tracking(settings: TrackingSettings | None = None, progress: Callback | 
     graph, v, f, guess = state_problem(s, profile)
     solution = backend.solve(graph, guess, callback=progress)
     return Drive(s, profile, solution, solution[v][:, 0], solution[f][:, 0], solution.dual("dynamics")[:, 0])
+
+
+def travelled(speed: Array, dt: float) -> Array:
+    """(N + 1,) way of speeds (N + 1,) that change evenly between samples [m]."""
+    return dt * np.concatenate([[0.0], np.cumsum(0.5 * (speed[:-1] + speed[1:]))])
 
 
 def metrics(drive: Drive) -> dict[str, Any]:

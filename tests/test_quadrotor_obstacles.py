@@ -205,10 +205,7 @@ def test_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert command.main([*words, "--seed", "-1"]) == 2
 
 
-def test_the_command_line_reports_failure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from unifg.scenarios.commands import courses
-
-    monkeypatch.setattr(courses, "results", lambda course: {})
+def test_the_command_line_reports_failure(tmp_path: Path) -> None:
     words = ["run", "quadrotor-obstacles", "--avoidance", "hard", "--guess", "hover", "--out", str(tmp_path)]
     assert command.main(words) == 1
 

@@ -58,11 +58,6 @@ class Record:
     milliseconds: dict[str, float]
     ratios: dict[str, list[float]]
 
-    def line(self) -> str:
-        """As a file keeps it."""
-        rounded = {name: [round(value, 4) for value in row] for name, row in self.ratios.items()}
-        return json.dumps(asdict(self) | {"ratios": rounded})
-
 
 def reference() -> float:
     """A little of everything that a solve is made of, the same everywhere."""
@@ -208,11 +203,10 @@ def history(file: Path = HISTORY) -> list[Record]:
     try:
         records = [Record(**json.loads(line)) for line in lines if line.strip()]
         ratios = [np.array(row, dtype=np.float64) for record in records for row in record.ratios.values()]
-        positive = all(row.ndim == 1 and row.size and (row > 0.0).all() for row in ratios)
+        if not all(row.ndim == 1 and row.size and (row > 0.0).all() for row in ratios):
+            raise ValueError("ratios are positive")
     except (ValueError, TypeError, AttributeError) as error:
         raise ScenarioError(f"{file}: holds a line that is no record of `unifg bench` ({error})") from error
-    if not positive:
-        raise ScenarioError(f"{file}: holds a line that is no record of `unifg bench` (ratios are positive)")
     return records
 
 
@@ -224,7 +218,8 @@ def append(file: Path, record: Record) -> None:
     """
     try:
         with file.open("a", encoding="utf-8") as opened:
-            opened.write(record.line() + "\n")
+            rounded = {name: [round(value, 4) for value in row] for name, row in record.ratios.items()}
+            opened.write(json.dumps(asdict(record) | {"ratios": rounded}) + "\n")
     except OSError as error:
         raise ScenarioError(f"{file}: cannot be written ({error.strerror})") from error
 

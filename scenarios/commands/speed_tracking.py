@@ -40,15 +40,13 @@ def run(settings: velocity_tracking.TrackingSettings, progress: Progress, announ
 
 def _driven(drive: velocity_tracking.Drive) -> SolvedLog:
     """The drive along a straight road."""
-    dt, ways = drive.profile.dt, []
-    for speed in (drive.speed, drive.profile.speed):
-        way = dt * np.concatenate([[0.0], np.cumsum(0.5 * (speed[:-1] + speed[1:]))])
-        ways.append(np.column_stack([way, np.zeros((len(way), 2))]))
+    ways = [velocity_tracking.travelled(speed, drive.profile.dt) for speed in (drive.speed, drive.profile.speed)]
+    pose, wanted = (np.column_stack([way, np.zeros((len(way), 2))]) for way in ways)
     return SolvedLog(
         discs=np.zeros((0, 3)),
-        time=dt * np.arange(len(drive.speed), dtype=np.float64),
-        pose=ways[0],
-        wanted=ways[1],
+        time=drive.time,
+        pose=pose,
+        wanted=wanted,
         speed=drive.speed,
         control=held(np.reshape(drive.force, (-1, 1))),
     )

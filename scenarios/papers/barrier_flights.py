@@ -80,17 +80,12 @@ def threats(flight: SafeFlight, log: SafeLog, tick: int) -> list[Threat]:
     return found
 
 
-def first_sight(flight: SafeFlight, log: SafeLog) -> int:
-    """Tick at which the last obstacle is first seen with its velocity."""
-    balls = [body.motion.release for body in flight.situation.bodies.bodies if isinstance(body.motion, Thrown)]
-    return min(int(np.ceil(max(balls, default=0.0) / log.dt)), log.ticks - 1)
-
-
 def judged(flight: SafeFlight, log: SafeLog) -> Row:
     """Answer of the oracle at first sight, and for a lost margin whether it ever was "yes"."""
     loops = flight.settings.books.loops
     authority = Authority(VEHICLE, 0.1, loops.delay + flight.settings.dt + TILT)
-    first = first_sight(flight, log)
+    balls = [body.motion.release for body in flight.situation.bodies.bodies if isinstance(body.motion, Thrown)]
+    first = min(int(np.ceil(max(balls, default=0.0) / log.dt)), log.ticks - 1)
     answer: Answer = exists(threats(flight, log, first), authority)
     if not log.violated:
         return {"oracle": answer}

@@ -161,6 +161,11 @@ class Obstacles:
         """(M, 3) of :attr:`doubt`, zeros where there is none."""
         return np.zeros((len(self.keep), 3)) if self.doubt is None else self.doubt
 
+    @property
+    def fall(self) -> Array:
+        """(M, 3) acceleration of those that fall [m/s^2]."""
+        return np.array([0.0, 0.0, -quadrotor.GRAVITY]) * self.falls[:, None]
+
     def off(self, later: Array) -> Array:
         """(n, M) distance to be kept ``later`` (n,) [s], with what is uncertain [m]."""
         t = later[:, None, None] ** np.arange(3)
@@ -170,8 +175,7 @@ class Obstacles:
     def at(self, later: Array) -> Array:
         """(n, M, 3) where they are expected ``later`` (n,) [s]: at constant velocity, or falling."""
         t = later[:, None, None]
-        down = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * self.falls[:, None]
-        return self.position + self.velocity * t + 0.5 * down * t * t
+        return self.position + self.velocity * t + 0.5 * self.fall * t * t
 
     def clearance(self, places: Array, later: Array) -> Array:
         """(n, M) distances of places (n, 3) from where they are expected ``later`` (n,), beyond what is to be kept."""
@@ -580,10 +584,9 @@ class Barriers(Held):
         near = now.given.obstacles
         flat = np.ones((self.settings.slots, 3))
         flat[near.upright, 2] = 0.0
-        fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * near.falls[:, None]
         return {
             "since": now.given.later + self.nodes[:-1], "centre": near.position, "velocity": near.velocity,
-            "fall": fall, "keep": near.keep, "flat": flat, "doubt": near.doubts,
+            "fall": near.fall, "keep": near.keep, "flat": flat, "doubt": near.doubts,
         }  # fmt: skip
 
 

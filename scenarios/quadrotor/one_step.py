@@ -17,7 +17,6 @@ import numpy as np
 import qpsolvers
 import scipy.sparse
 
-from unifg.models import quadrotor
 from unifg.scenarios.options import AtLeastOne, Positive, Settings
 from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.typing import Array
@@ -61,14 +60,13 @@ def filtered(
     s = settings
     near = obstacles.nearest(state[:3], s.slots, later)
     count = len(near.keep)
-    fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * near.falls[:, None]
     flat = np.where(near.upright[:, None], [1.0, 1.0, 0.0], 1.0)
     away = (state[:3] - near.at(np.array([later]))[0]) * flat
-    speed = (state[7:] - near.velocity - fall * later) * flat
+    speed = (state[7:] - near.velocity - near.fall * later) * flat
     distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
     normal = away / distance[:, None]
     rate = np.sum(normal * speed, axis=1)
-    bend = (np.sum(speed * speed, axis=1) - rate * rate) / distance - np.sum(normal * fall, axis=1)
+    bend = (np.sum(speed * speed, axis=1) - rate * rate) / distance - np.sum(normal * near.fall, axis=1)
     least = -(bend + (s.alpha + s.beta) * rate + s.alpha * s.beta * (distance - near.off(np.array([later]))[0]))
     weights = np.concatenate([np.ones(3), np.full(count, s.price)])
     box = np.array([s.level, s.level, s.vertical])

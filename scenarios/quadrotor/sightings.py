@@ -24,7 +24,6 @@ from dataclasses import dataclass
 import numpy as np
 
 import unifg as fg
-from unifg.models import quadrotor
 from unifg.scenarios.options import AtLeastOne, Positive, Settings
 from unifg.scenarios.quadrotor.cbf_mpc import Obstacles
 from unifg.solvers import GaussNewton
@@ -82,7 +81,6 @@ class Sightings:
         s, m = settings, len(obstacles.keep)
         self.settings, self._like, self.relative = s, obstacles, relative
         self._times, self._seen = np.full(s.looks, np.nan), np.zeros((s.looks, m, 3))
-        fall = np.array([0.0, 0.0, -quadrotor.GRAVITY]) * obstacles.falls[:, None]
         graph = fg.Graph()
         self.place, self.speed = graph.variables("place", fg.Rn(3), m), graph.variables("speed", fg.Rn(3), m)
         every = np.tile(np.arange(m), s.looks)
@@ -92,7 +90,7 @@ class Sightings:
         self._active = graph.data("remembered", np.zeros(n, dtype=bool), each=True)
         self.own = graph.variables("own", fg.Rn(3), 1)
         ends = self.place[every], self.speed[every], self.own[np.zeros(n, dtype=np.intp)]
-        looks = self._since, np.tile(fall, (s.looks, 1)), self._looks, float(relative)
+        looks = self._since, np.tile(obstacles.fall, (s.looks, 1)), self._looks, float(relative)
         graph.minimize(missed, *ends, *looks, sigma=s.believed, active=self._active, name="looks")
         graph.minimize(fg.prior, self.speed, np.zeros(3), sigma=s.fast, name="fast")
         self._unsure = graph.data("unsure", np.ones(3))

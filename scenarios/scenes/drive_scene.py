@@ -18,7 +18,7 @@ from unifg.models.planar import base_of
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.logs.metrics import collision_words, health, one_graph
-from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
+from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show, spent
 from unifg.scenarios.scenes.parts import CLEAR, draw_way, lidar_hits, pillar, standing
 from unifg.typing import Array
 from unifg.view import Scene, shapes
@@ -51,11 +51,6 @@ def _deviations(log: Any, k: int) -> str:
     return f"{greatest:.1f} and {least:.1f} cm"
 
 
-def _spent(log: Any, k: int) -> str:
-    """Times of the estimate and of the plan."""
-    return f"{log.localise_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + " (compiled)" * bool(log.compiled[k])
-
-
 def _whole(log: Any, k: int) -> str:
     """Time of a tick."""
     return f"{log.perceive_ms[k] + log.route_ms[k] + log.localise_ms[k] + log.plan_ms[k]:.1f} ms"
@@ -80,7 +75,10 @@ NUMBERS = (
         plot={"unit": "m", "limit": 0.0, "colour": "horizon"},
     ),
     Number("contacts", lambda log, k: str(int(log.contacts[k])), alarm=lambda log, k: log.contacts[k] > 0),
-    Number("localise, plan", _spent, alarm=lambda log, k: log.compiled[k] > 0),
+    Number(
+        "localise, plan", lambda log, k: spent(log.localise_ms[k], log.plan_ms[k], log.compiled[k]),
+        alarm=lambda log, k: log.compiled[k] > 0,
+    ),
     Number("whole tick", _whole),
     Number(
         "plan", lambda log, k: log.status[k].replace("_", " ") + ": stored one driven" * bool(log.emergency[k]),

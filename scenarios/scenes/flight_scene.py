@@ -15,7 +15,7 @@ import numpy as np
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics, has_estimate
 from unifg.scenarios.logs.metrics import collision_words, health, one_graph
-from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show
+from unifg.scenarios.scenes.numbers import Number, declare, filled, in_words, metres, show, spent
 from unifg.scenarios.scenes.parts import CLEAR, draw_way, layout, pillar, vehicle
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.bearing_range import SensorModel
@@ -42,11 +42,6 @@ def _mass(log: Any, k: int) -> str:
     """Mass as believed, where it is estimated."""
     mass, sigma = log.parameters[k][0], log.parameters_sigma[k][0]
     return f"{mass:.3f} \u00b1 {sigma:.3f} kg" if sigma > 0.0 else ""
-
-
-def _times(log: Any, k: int) -> str:
-    """Times of estimate and plan."""
-    return f"{log.estimate_ms[k]:.1f} ms, {log.plan_ms[k]:.1f} ms" + " (compiled)" * bool(log.compiled[k])
 
 
 NUMBERS_OF_A_PLAN = (
@@ -79,7 +74,10 @@ NUMBERS = (
     ),
     Number("mass \u00b1 \u03c3", _mass),
     Number("true mass", lambda log, k: f"{log.parameters_true[0]:.3f} kg" if _mass(log, k) else ""),
-    Number("estimate, plan", _times, alarm=lambda log, k: log.compiled[k] > 0),
+    Number(
+        "estimate, plan", lambda log, k: spent(log.estimate_ms[k], log.plan_ms[k], log.compiled[k]),
+        alarm=lambda log, k: log.compiled[k] > 0,
+    ),
 )  # fmt: skip
 """Lines and curves of a flight."""
 

@@ -131,13 +131,7 @@ def _discs(manoeuvre: Manoeuvre, scene: Scene, ax: Axes, low: Array, high: Array
         return
     places = np.array(m.case.discs)
     kept = m.settings.robot_radius + m.settings.clearance
-
-    def distance(points: Array) -> Array:
-        offset = points[:, None] - places[:, :2]
-        nearest: Array = (np.linalg.norm(offset, axis=2) - places[:, 2]).min(axis=1) - kept
-        return nearest
-
-    shade_distance(ax, low, high, distance, _REACH, "#b9c2cf")
+    shade_distance(ax, low, high, lambda points: m.gaps(points) - m.settings.clearance, _REACH, "#b9c2cf")
     scene.discs("discs", places, colour="fixed", legend="unforeseen disc (ground: nearer is darker)")
     rings = merge([ring(row[:2], row[2] + kept - 0.005, 0.01, 0.001, corners=64) for row in places])
     scene.mesh("rings", rings, colour="ink", swatch="ring", legend="the robot's centre stays outside")

@@ -12,7 +12,7 @@ from unifg.errors import ViewError
 from unifg.view import Scene
 from unifg.view.canvas import Frame
 
-__all__ = ["Number", "declare", "filled", "in_words", "metres", "show"]
+__all__ = ["Number", "declare", "filled", "in_words", "metres", "show", "spent"]
 
 
 @dataclass(frozen=True)
@@ -73,6 +73,11 @@ def filled(log: Any, begin: Callable[[], Scene], draw: Callable[[Scene, Frame, A
 def in_words(state: str, cause: str) -> str:
     """State of health with its cause."""
     return state + (f": {cause}" if cause else "")
+
+
+def spent(estimate: float, plan: float, compiled: object) -> str:
+    """Times of estimate and plan [ms], and whether anything was compiled."""
+    return f"{estimate:.1f} ms, {plan:.1f} ms" + " (compiled)" * bool(compiled)
 
 
 def metres(value: float) -> str:

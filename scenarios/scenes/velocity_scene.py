@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.scenarios.scenes.numbers import Number, declare, show
-from unifg.scenarios.velocity_tracking import Drive, TrackingSettings, metrics
+from unifg.scenarios.velocity_tracking import Drive, TrackingSettings, metrics, travelled
 from unifg.typing import Array
 from unifg.view import Scene, shapes
 
@@ -32,14 +32,14 @@ NUMBERS = (
         "force", lambda d, k: f"{_force(d, k):.0f} N, " + ("drives" if _force(d, k) >= 0.0 else "brakes"), _force,
         plot={"unit": "N", "limit": 0.0, "colour": "horizon"},
     ),
-    Number("driven", lambda d, k: f"{_travelled(d.speed, d.profile.dt)[k]:.0f} m"),
+    Number("driven", lambda d, k: f"{travelled(d.speed, d.profile.dt)[k]:.0f} m"),
 )  # fmt: skip
 """Lines and curves of a drive."""
 
 
 def velocity_scene(drive: Drive) -> Scene:
     """The scene of one drive along a straight road."""
-    way, wanted = (_travelled(speed, drive.profile.dt) for speed in (drive.speed, drive.profile.speed))
+    way, wanted = (travelled(speed, drive.profile.dt) for speed in (drive.speed, drive.profile.speed))
     height, end = _heights(way, drive), float(max(way[-1], wanted[-1])) + 2.0 * _CAR
     scene = Scene(f"unifg: velocity tracking, {drive.profile.name}", dt=drive.profile.dt)
     scene.ground, scene.speeds = False, (1, 2, 4, 8, 16)
@@ -87,11 +87,6 @@ def velocity_stage(settings: TrackingSettings) -> Scene:
     scene.way("profile", np.column_stack([0.1 * time, profile.speed]), colour="goal", legend="profile to follow")
     scene.facts["a metre is"] = "10 s along, 1 m/s upwards"
     return scene
-
-
-def _travelled(speed: Array, dt: float) -> Array:
-    """(N + 1,) way of speeds that change evenly between samples [m]."""
-    return np.concatenate([[0.0], np.cumsum(0.5 * dt * (speed[:-1] + speed[1:]))])
 
 
 def _heights(way: Array, drive: Drive) -> Array:

@@ -130,7 +130,9 @@ def corridor(seed: int, count: int = 10) -> Layout:
     rng = np.random.default_rng([_CORRIDOR_TAG, seed])
     start, target = np.array([_INSET, 0.0, _HEIGHT]), np.array([_LENGTH - _INSET, 0.0, _HEIGHT])
     walls = np.array([[[0.0, side], [_LENGTH, side]] for side in (_HALF_WIDTH, -_HALF_WIDTH)])
-    fence = _fence()
+    far, near = _LENGTH + 10.0, -10.0
+    corners = np.array([[near, -_HALF_WIDTH], [far, -_HALF_WIDTH], [far, _HALF_WIDTH], [near, _HALF_WIDTH]])
+    fence = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)  # drawn out and joined: no way leads around it
     for _ in range(1000):
         cylinders = np.array([_corridor_cylinder(rng, start, target) for _ in range(count)]).reshape(-1, 3)
         if widest_way(start, target, cylinders, fence) >= WAY_CLEARANCE:
@@ -150,13 +152,6 @@ def _corridor_cylinder(rng: np.random.Generator, start: Array, target: Array) ->
         y = rng.uniform(-1.0, 1.0) * (_HALF_WIDTH - radius)
         if min(np.hypot(x - end[0], y - end[1]) for end in (start, target)) >= _FREE + radius:
             return np.array([x, y, radius])
-
-
-def _fence() -> Array:
-    """(4, 2, 2) both walls drawn out beyond the corridor and joined there: no way leads around them."""
-    far, near = _LENGTH + 10.0, -10.0
-    corners = np.array([[near, -_HALF_WIDTH], [far, -_HALF_WIDTH], [far, _HALF_WIDTH], [near, _HALF_WIDTH]])
-    return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
 
 
 def obstacle_course(seed: int | None = None) -> Layout:
