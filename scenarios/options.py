@@ -14,6 +14,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, dataclass, field, replace
 from functools import cache, partial
 from numbers import Real
@@ -27,6 +28,7 @@ from unifg.files.contents import legible
 __all__ = [
     "AboveZero",
     "AtLeastOne",
+    "AtLeastTwo",
     "Help",
     "Leaf",
     "Option",
@@ -323,14 +325,12 @@ Positive: TypeAlias = Annotated[T, positive]
 AboveZero: TypeAlias = Annotated[T, above_zero]  # may be infinite, as limits of an ideal base
 Signed: TypeAlias = Annotated[T, number("a finite number", math.isfinite)]
 AtLeastOne: TypeAlias = Annotated[int, partial(count, least=1)]
+AtLeastTwo: TypeAlias = Annotated[int, partial(count, least=2)]
 
 
 def pose(text: str) -> tuple[float, ...]:
     """Three numbers X,Y,THETA."""
-    values = _numbers(text)
-    if len(values) != 3:
-        what = "expected three numbers X,Y,THETA [m, m, rad], without blanks"
-        raise argparse.ArgumentTypeError(f"{text!r} is not a pose: {what}")
+    values = _numbers(text, 3, "a pose: expected three numbers X,Y,THETA [m, m, rad], without blanks")
     if not all(abs(value) < math.inf for value in values):
         raise argparse.ArgumentTypeError(f"{text!r} is not a pose: every number must be finite")
     return values
@@ -338,20 +338,19 @@ def pose(text: str) -> tuple[float, ...]:
 
 def pair(text: str) -> tuple[float, ...]:
     """Two numbers LO,HI, the first below the second."""
-    values = _numbers(text)
-    if len(values) != 2:
-        raise argparse.ArgumentTypeError(f"{text!r} is not LO,HI: expected two numbers [N], without blanks")
+    values = _numbers(text, 2, "LO,HI: expected two numbers [N], without blanks")
     if not values[0] < values[1]:
         raise argparse.ArgumentTypeError(f"{text!r}: the first number must be below the second")
     return values
 
 
-def _numbers(text: str) -> tuple[float, ...]:
-    """Numbers between commas; none where a word is no number."""
-    try:
-        return tuple(float(word) for word in text.split(","))
-    except ValueError:
-        return ()
+def _numbers(text: str, size: int, what: str) -> tuple[float, ...]:
+    """Some numbers between commas, which are ``what`` in words."""
+    with suppress(ValueError):
+        values = tuple(float(word) for word in text.split(","))
+        if len(values) == size:
+            return values
+    raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
 
 
 def find_modules_in(folder: Path) -> None:

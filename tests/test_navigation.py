@@ -307,7 +307,7 @@ def test_impossible_settings_of_the_controller_are_refused(wrong: dict[str, Any]
 
 @pytest.mark.parametrize("wrong", [{"beams": 0}, {"beams": 1}, {"range_max": 0.0}], ids=str)
 def test_a_lidar_without_beams_is_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ScenarioError, match="two beams or more"):
+    with pytest.raises(ScenarioError, match=next(iter(wrong))):
         LidarModel(**wrong)
 
 

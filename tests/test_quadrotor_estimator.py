@@ -337,7 +337,7 @@ def test_what_moves_is_left_out() -> None:
 @pytest.mark.parametrize(
     ("settings", "wrong", "words"),
     [
-        (WindowSettings, {"length": 1}, "at least two past states"),
+        (WindowSettings, {"length": 1}, "length: '1' is not a whole number of at least 2"),
         (WindowSettings, {"landmarks": 0}, "landmarks: '0' is not a whole number of at least 1"),
         (WindowSettings, {"estimated": ("weight",)}, "'weight' is no parameter"),
         (EstimatorSettings, {"association": "guessed"}, "choose known, unknown"),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Annotated
+from functools import cached_property
 
 import numpy as np
 
@@ -16,11 +15,11 @@ from unifg.models.planar import Base, base_of
 from unifg.scenarios.options import (
     AboveZero,
     AtLeastOne,
+    AtLeastTwo,
     Positive,
     Settings,
     Signed,
     checked,
-    count,
     option,
     positive,
 )
@@ -85,7 +84,7 @@ class ControllerSettings(Settings):
 
     base: str = option("unicycle", text=checked(base_of), metavar="BASE")
     body: str = option("", text=checked(body_of), metavar="BODY")
-    horizon: Annotated[int, partial(count, least=2)] = 30
+    horizon: AtLeastTwo = 30
     dt: Positive[float] = 0.1
     speed: float = option(1.0, text=positive, metavar="M/S")
     limits: Positive[tuple[float, float]] = (1.0, 1.0)

@@ -129,11 +129,7 @@ class Route:
         self._nearest, self._starts = np.inf, FRESH_STARTS
         self._trail: list[Array] = []
         self._crumbs: list[Array] = []
-        self._follow(finished(self._plan(start, goal)))
-
-    def _plan(self, start: Array, goal: Array) -> Planning:
-        """A way (P, 3) on the map alone."""
-        return self._way(self._occupancy, self._distance_map, start, goal)
+        self._follow(finished(self._way(occupancy, distance_map, start, goal)))
 
     def _way(
         self, occupancy: OccupancyMap, distance_map: DistanceMap, start: Array, goal: Array, discs: Array | None = None
@@ -339,7 +335,7 @@ class Route:
             return
         way = headed(resample(back, SPACING), float(pose[2]))
         try:
-            onward = yield from self._plan(back[-1], self.path[-1])
+            onward = yield from self._way(self._occupancy, self._distance_map, back[-1], self.path[-1])
         except ScenarioError:
             return
         self._follow(np.concatenate([way[:-1], onward]))

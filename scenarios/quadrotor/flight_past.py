@@ -18,7 +18,7 @@ from unifg.factors.residuals import Residual
 from unifg.horizon import Constant, Context, Measurement, Robot, Term, Window
 from unifg.models import landmarks, quadrotor
 from unifg.models.inertial import specific_force
-from unifg.scenarios.options import AtLeastOne, Positive, Settings
+from unifg.scenarios.options import AtLeastOne, AtLeastTwo, Positive, Settings
 from unifg.scenarios.quadrotor.arrival import arrival, seen_from_the_vehicle
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -37,7 +37,7 @@ class WindowSettings(Settings):
     """Sizes and standard deviations.
 
     Attributes:
-        length: past states kept.
+        length: past states kept, at least two.
         landmarks: slots for landmarks.
         estimated: which of mass, drag, wind and updraft are unknown; mass and updraft together are not observable at
             hover.
@@ -53,7 +53,7 @@ class WindowSettings(Settings):
         ScenarioError: on a window that is too short, no slot, or an unknown parameter.
     """
 
-    length: int = 20
+    length: AtLeastTwo = 20
     landmarks: AtLeastOne = 16
     estimated: tuple[str, ...] = ("mass", "drag", "wind")
     noise_sigma: Positive[tuple[float, ...]] = tuple(DisturbanceModel().white_sigma(0.05).tolist())
@@ -68,8 +68,6 @@ class WindowSettings(Settings):
     def __post_init__(self) -> None:
         """Refuse what cannot be a window."""
         super().__post_init__()
-        if self.length < 2:
-            raise fg.ScenarioError(f"a window needs at least two past states, found {self.length}")
         for name in self.estimated:
             if name not in PLACES:
                 raise fg.ScenarioError(f"'{name}' is no parameter of a quadrotor: choose from {', '.join(PLACES)}")

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Annotated, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
 import unifg as fg
-from unifg.scenarios.options import Positive, Settings, Signed, count, option
+from unifg.scenarios.options import AtLeastTwo, Positive, Settings, Signed, option
 from unifg.scenarios.quadrotor.guide import GuideSettings
 from unifg.solvers import names
 from unifg.typing import Array, ArrayLike
@@ -53,7 +52,7 @@ class ControllerSettings(Settings):
         give: largest violation of a clearance in such a plan [m]; less than the margin.
     """
 
-    horizon: Annotated[int, partial(count, least=2)] = 30
+    horizon: AtLeastTwo = 30
     dt: Positive[float] = 0.05
     position_sigma: Positive[tuple[float, float, float]] = (0.5, 0.5, 0.3)
     velocity_sigma: Positive[tuple[float, float, float]] = (0.7, 0.7, 0.7)

@@ -24,7 +24,7 @@ from unifg.lie import SE2
 from unifg.models import unicycle
 from unifg.models.footprint import Body
 from unifg.models.planar import Base
-from unifg.scenarios.options import Settings, not_negative, option, positive, share
+from unifg.scenarios.options import AtLeastTwo, Positive, Settings, not_negative, option, positive, share
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.simulation.rectangles import wall_rectangles
@@ -60,8 +60,8 @@ class LidarModel(Settings):
         field: of view, its middle ahead [rad]; a full turn begins behind.
     """
 
-    beams: int = 360
-    range_max: float = 12.0
+    beams: AtLeastTwo = 360
+    range_max: Positive[float] = 12.0
     sigma: float = option(0.02, text=not_negative, metavar="M", flag="range-sigma")
     dropout: float = option(0.01, text=share, metavar="SHARE")
     clutter: float = option(0.0, text=share, metavar="SHARE")
@@ -70,12 +70,8 @@ class LidarModel(Settings):
     field: float = option(2.0 * math.pi, text=positive, metavar="RAD", flag="field-of-view")
 
     def __post_init__(self) -> None:
-        """Refuse a field of view that is none, and fewer than two beams."""
+        """Refuse a field of view that is none."""
         super().__post_init__()
-        if not (self.beams >= 2 and self.range_max > 0.0):
-            raise ScenarioError(
-                f"a lidar has two beams or more and some range, got {self.beams} of {self.range_max:g} m"
-            )
         if self.field > 2.0 * math.pi + 1e-9:
             raise ScenarioError(f"the lidar's field of view must be in (0, 2 pi] rad, got {self.field:g}")
 
