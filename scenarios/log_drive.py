@@ -13,7 +13,6 @@ from unifg.files.range_log import RangeLog
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2
 from unifg.models.distance_map import DistanceMap
-from unifg.models.planar import base_of
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.ground.localiser import FEWEST_BEAMS, FITS, Localiser
 from unifg.scenarios.ground.protocols import Estimator
@@ -22,7 +21,7 @@ from unifg.scenarios.options import existing, option, pose
 from unifg.scenarios.perception.explaining import FARTHEST, explained
 from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
-from unifg.scenarios.range_logs import WHEELS, LogRun, LogSettings, step_of
+from unifg.scenarios.range_logs import BASE, WHEELS, LogRun, LogSettings, step_of
 from unifg.typing import Array
 
 __all__ = ["LocaliseSettings", "localise"]
@@ -34,7 +33,6 @@ LOOKED = 30  # scans at most whose places are searched for on the map
 RADIUS = 0.1  # [m] that a laser keeps from walls
 EXPLAINED = 0.5  # share of the beams of the last scans, below which the robot is lost
 LAST = 20  # of them
-BASE = base_of("omnidirectional")
 
 
 @dataclass(frozen=True)

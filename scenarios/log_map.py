@@ -22,7 +22,6 @@ from unifg.files.range_log import RangeLog
 from unifg.lie import SE2
 from unifg.models import lidar
 from unifg.models.distance_map import DistanceMap
-from unifg.models.planar import base_of
 from unifg.pose_graphs import Edges, PoseGraph
 from unifg.scenarios.episode import Progress, silent
 from unifg.scenarios.ground.hypotheses import Hypothesis
@@ -33,7 +32,7 @@ from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
 from unifg.scenarios.pose_graph import OUTLIER_WEIGHT, threshold
-from unifg.scenarios.range_logs import WHEELS, LogRun, LogSettings, step_of
+from unifg.scenarios.range_logs import BASE, WHEELS, LogRun, LogSettings, step_of
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -54,7 +53,6 @@ FOUND = np.diag([0.3, 0.3, 0.04]) ** 2  # of a place that a search has found
 BEST = 0.75  # share of points that have to end at old ones
 ENDS = 0.12  # [m] from them
 OPEN = "no loop was closed: the map is as good as the registration of one scan on the next"
-BASE = base_of("omnidirectional")
 EVERY = 5  # closures after which the graph is solved
 SHIFT, TURN = 0.2, 0.05  # [m, rad] by which a closure moves the last pose, after which it is solved at once
 

@@ -14,13 +14,15 @@ from unifg.files.range_log import RangeLog, aligned, read_range_log
 from unifg.files.ros_map import OccupancyMap
 from unifg.lie import SE2
 from unifg.models.odometry import OdometryNoise
+from unifg.models.planar import base_of
 from unifg.scenarios.logs.drive_metrics import nees, pose_errors
 from unifg.scenarios.options import Settings, existing, option, pose
 from unifg.typing import Array
 
-__all__ = ["WHEELS", "LogRun", "LogSettings", "step_of"]
+__all__ = ["BASE", "WHEELS", "LogRun", "LogSettings", "step_of"]
 
 WHEELS = OdometryNoise(0.1, 0.1, 0.04)  # of wheels that nobody has calibrated
+BASE = base_of("omnidirectional")  # of a log, which does not tell
 SCALE, NOISE = 0.05, 0.02  # of odometry that is made of corrected poses, as in `OdometryModel`
 
 
