@@ -51,6 +51,7 @@ __all__ = [
     "plain",
     "pose",
     "positive",
+    "read_word",
     "replaced",
     "settings_of",
     "share",
@@ -171,10 +172,7 @@ class Settings:
                 if leaf.choices and one is not None and one not in leaf.choices:
                     raise ScenarioError(f"unknown {name} {one!r}: choose {', '.join(leaf.choices)}")
                 if isinstance(one, Real) and not isinstance(one, bool):
-                    try:
-                        (leaf.within or leaf.text or not_negative)(str(one))
-                    except argparse.ArgumentTypeError as error:
-                        raise ScenarioError(f"{name}: {error}") from None
+                    read_word(leaf.within or leaf.text or not_negative, str(one), name)
 
 
 @cache
@@ -278,12 +276,24 @@ def _help(leaf: Leaf, default: Any) -> str:
     return words if quiet else f"{words} (default: {default})"
 
 
-def checked(read: Callable[[str], object]) -> Text:
-    """A word that ``read`` takes; one that it refuses is refused by the message of its error."""
+def read_word(text: Text, word: str, where: str) -> Any:
+    """Value of a word.
+
+    Raises:
+        ScenarioError: for a word that is refused, naming where it stands.
+    """
+    try:
+        return text(word)
+    except argparse.ArgumentTypeError as error:
+        raise ScenarioError(f"{where}: {error}") from None
+
+
+def checked(reader: Callable[[str], object]) -> Text:
+    """A word that ``reader`` takes; one that it refuses is refused by the message of its error."""
 
     def word(text: str) -> str:
         try:
-            read(text)
+            reader(text)
         except UnifgError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
         return text

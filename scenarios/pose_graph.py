@@ -26,7 +26,7 @@ from unifg.pose_graphs.judgement import judge
 from unifg.pose_graphs.pose_graph import PoseGraph, ResidualName, RobustOn
 from unifg.pose_graphs.verdict import Judgement, Verdict
 from unifg.scenarios.episode import Progress, silent
-from unifg.scenarios.options import Settings, count, existing, option
+from unifg.scenarios.options import Settings, count, existing, option, positive, read_word
 from unifg.scenarios.stopwatch import Stopwatch
 from unifg.solution.chi_squared import upper_quantile
 from unifg.solution.history import Iteration
@@ -300,13 +300,7 @@ def robust_loss(text: str | None, dim: int) -> Loss | None:
         raise ScenarioError(f"--robust {text}: expected one of {', '.join(LOSSES)}, with :PARAMETER if you like")
     if ":" not in text:
         return LOSSES[name](_DEFAULTS[name] if name in _DEFAULTS else threshold(dim))
-    try:
-        value = float(parameter)
-    except ValueError:
-        value = 0.0
-    if not 0.0 < value < np.inf:
-        raise ScenarioError(f"--robust {text}: {parameter!r} is not a positive number")
-    return LOSSES[name](value)
+    return LOSSES[name](read_word(positive, parameter, f"--robust {text}"))
 
 
 def threshold(dim: int) -> float:

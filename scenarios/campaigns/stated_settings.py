@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from unifg.errors import ScenarioError
-from unifg.scenarios.options import Option, Text, leaves, plain, replaced
+from unifg.scenarios.options import Option, Text, leaves, plain, read_word, replaced
 
 __all__ = ["Fields", "identity", "nearest"]
 
@@ -134,22 +134,15 @@ class Fields:
             return given
         if text is None or not isinstance(given, str):
             raise ScenarioError(f"{where}: {_words(kind)} cannot be stated in a file" + " but by a word" * bool(text))
-        try:  # the word that the command line takes
-            return text(given)
-        except argparse.ArgumentTypeError as error:
-            raise ScenarioError(f"{where}: {error}") from None
+        return read_word(text, given, where)
 
     def _permitted(self, path: str, option: Option | None, value: Any, where: str) -> None:
         """Refuse what the command line refuses."""
         words = self.choices.get(path, option.choices if option is not None else ())
         if words and value not in words:
             raise ScenarioError(f"{where}: {value!r} is none of {', '.join(words)}")
-        if option is None or option.text is None or isinstance(value, tuple | bool):
-            return
-        try:
-            option.text(str(value))
-        except argparse.ArgumentTypeError as error:
-            raise ScenarioError(f"{where}: {error}") from None
+        if option is not None and option.text is not None and not isinstance(value, tuple | bool):
+            read_word(option.text, str(value), where)
 
 
 def nearest(name: str, known: Sequence[str]) -> str:
