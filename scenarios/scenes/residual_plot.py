@@ -31,7 +31,7 @@ class ResidualMonitor:
     solve as it goes on.
 
     Attributes:
-        rows: (n,) of the history, one per iteration.
+        rows: (n,) norms of every factor by term, one mapping per iteration.
     """
 
     def __init__(self, terms: Sequence[str] | None = None, path: str | Path | None = None, *, dpi: int = 100) -> None:
@@ -42,20 +42,20 @@ class ResidualMonitor:
             path: PNG file that is rewritten at each iteration; None to draw nothing until :meth:`figure`.
             dpi: dots per inch of that file.
         """
-        self.rows: list[Iteration] = []
+        self.rows: list[Mapping[str, Array]] = []
         self._terms, self._dpi = terms, dpi
         self._path = None if path is None else Path(path)
 
     def __call__(self, row: Iteration) -> bool:
         """Take in a row of the history; never ends the solve."""
-        self.rows.append(row)
+        self.rows.append(row.residuals)
         if self._path is not None:
             write_figure(self._path, self.figure(), self._dpi)
         return False
 
     def figure(self) -> Figure:
         """The picture of what has been seen so far."""
-        return residual_picture(self.rows, self._terms)
+        return _drawn(self.rows, self._terms)
 
 
 def residual_picture(history: Sequence[Iteration], terms: Sequence[str] | None = None) -> Figure:
@@ -72,16 +72,7 @@ def residual_picture(history: Sequence[Iteration], terms: Sequence[str] | None =
         GraphError: when no term has one of these names.
         UnifgError: when the residuals were not kept, or there is no row.
     """
-    rows = [row.residuals for row in history]
-    if not rows:
-        raise UnifgError("there is no iteration to draw: solve first")
-    names = list(rows[0]) if terms is None else list(terms)
-    across = min(_ACROSS, len(names))
-    down = -(-len(names) // across)
-    with new_figure((_PANEL[0] * across, _PANEL[1] * down)) as figure:
-        for place, name in enumerate(names, start=1):
-            plot_residuals(rows, name, figure.add_subplot(down, across, place))
-    return figure
+    return _drawn([row.residuals for row in history], terms)
 
 
 def plot_residuals(rows: Sequence[Mapping[str, Array]], term: str, ax: Axes) -> Axes:
@@ -115,3 +106,15 @@ def plot_residuals(rows: Sequence[Mapping[str, Array]], term: str, ax: Axes) -> 
     for axis, length in ((ax.xaxis, table.shape[1]), (ax.yaxis, count)):
         axis.set_major_locator(MaxNLocator(min(6, length), integer=True) if length > 1 else FixedLocator([0]))
     return ax
+
+
+def _drawn(rows: Sequence[Mapping[str, Array]], terms: Sequence[str] | None) -> Figure:
+    if not rows:
+        raise UnifgError("there is no iteration to draw: solve first")
+    names = list(rows[0]) if terms is None else list(terms)
+    across = min(_ACROSS, len(names))
+    down = -(-len(names) // across)
+    with new_figure((_PANEL[0] * across, _PANEL[1] * down)) as figure:
+        for place, name in enumerate(names, start=1):
+            plot_residuals(rows, name, figure.add_subplot(down, across, place))
+    return figure
