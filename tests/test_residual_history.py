@@ -208,10 +208,10 @@ def test_a_picture_shows_every_factor_at_every_iteration() -> None:
 def test_a_monitor_draws_while_the_solver_goes_on(tmp_path: Path) -> None:
     graph, guess = short_drive()
     sizes: list[int] = []
-    monitor = ResidualMonitor(["dynamics", "limits"], path=tmp_path / "live.png")
+    monitor, later = ResidualMonitor(["dynamics", "limits"], path=tmp_path / "live.png"), ResidualMonitor()
 
     def watch(row: fg.Iteration) -> bool:
-        stop = monitor(row)
+        stop = monitor(row) or later(row)
         sizes.append((tmp_path / "live.png").stat().st_size)
         return stop
 
@@ -221,6 +221,7 @@ def test_a_monitor_draws_while_the_solver_goes_on(tmp_path: Path) -> None:
     figure = monitor.figure()
     (image,) = panels(figure)["dynamics: 12 factors"].get_images()
     assert image.get_array().shape[1] == len(solution.history)
+    assert "dynamics: 12 factors" in panels(later.figure()), "drawn after the solve alone"
 
 
 def test_what_fits_exactly_can_be_drawn() -> None:
