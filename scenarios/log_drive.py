@@ -21,7 +21,7 @@ from unifg.scenarios.options import existing, option, pose
 from unifg.scenarios.perception.explaining import FARTHEST, explained
 from unifg.scenarios.perception.monte_carlo import MonteCarlo, MonteCarloSettings
 from unifg.scenarios.perception.readings import Scan
-from unifg.scenarios.range_logs import BASE, WHEELS, LogRun, LogSettings, step_of
+from unifg.scenarios.range_logs import BASE, EXPLAINED, WHEELS, LogRun, LogSettings, step_of
 from unifg.typing import Array
 
 __all__ = ["LocaliseSettings", "localise"]
@@ -31,7 +31,6 @@ SURE = 0.05, 0.03  # [m, rad] of a prediction that is one place to begin at: sca
 STILL = 0.05  # [m] and [rad], up to which a robot has not moved, and sees nothing new
 LOOKED = 30  # scans at most whose places are searched for on the map
 RADIUS = 0.1  # [m] that a laser keeps from walls
-EXPLAINED = 0.5  # share of the beams of the last scans, below which the robot is lost
 LAST = 20  # of them
 
 

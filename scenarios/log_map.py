@@ -32,7 +32,7 @@ from unifg.scenarios.perception.explaining import explained
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
 from unifg.scenarios.pose_graph import OUTLIER_WEIGHT, threshold
-from unifg.scenarios.range_logs import BASE, WHEELS, LogRun, LogSettings, step_of
+from unifg.scenarios.range_logs import BASE, EXPLAINED, WHEELS, LogRun, LogSettings, step_of
 from unifg.solvers import GaussNewton, GraduatedNonConvexity
 from unifg.typing import Array, BoolArray, IntArray
 
@@ -52,6 +52,7 @@ SLIP, SLIPS = (0.3, 0.36), 0.1  # [m, rad] and the share of belief of wheels tha
 FOUND = np.diag([0.3, 0.3, 0.04]) ** 2  # of a place that a search has found
 BEST = 0.75  # share of points that have to end at old ones
 ENDS = 0.12  # [m] from them
+TURNS = 1.0  # [rad] by the wheels, from which on those of the map are compared with them
 OPEN = "no loop was closed: the map is as good as the registration of one scan on the next"
 EVERY = 5  # closures after which the graph is solved
 SHIFT, TURN = 0.2, 0.05  # [m, rad] by which a closure moves the last pose, after which it is solved at once
@@ -113,15 +114,17 @@ def map_log(log: RangeLog, settings: MapSettings, progress: Progress = silent) -
     occupancy = mapped(log.angles, log.ranges[chosen], graph.poses, settings.resolution, settings.reach)
     around = DistanceMap.from_occupancy(occupancy.occupied, occupancy.resolution, occupancy.origin)
     share = [explained(around, Scan(log.angles, log.ranges[k]), poses[k]).share for k in range(number)]
+    wheels, turns = (SE2.between(poses[:-1], poses[1:])[:, 2] for poses in (log.odometry[chosen], graph.poses))
+    ratio = float(turns @ wheels / (wheels @ wheels)) if np.abs(wheels).sum() > TURNS else 1.0
     numbers = {
         "keyframes": len(chosen), "loop_closures": len(joined), "outliers": int((~kept).sum()),
         "chi2": float(graph.squared_errors()[kept].sum()), "degrees_of_freedom": 3 * len(joined),
-        "claim": verdict.claim if verdict else "", "searches": mapper.searches,
+        "claim": verdict.claim if verdict else "", "searches": mapper.searches, "turns_over_wheels": ratio,
     }  # fmt: skip
     run = LogRun(
         log, "map", occupancy, poses, np.array(share), details=numbers, closures=np.array(chosen)[joined],
-        verdict=verdict.sentence() if verdict else OPEN, succeeded=not interrupted, interrupted=interrupted,
-        seconds=time.perf_counter() - began,
+        verdict=verdict.sentence() if verdict else OPEN, succeeded=bool(np.mean(share) >= EXPLAINED),
+        interrupted=interrupted, seconds=time.perf_counter() - began,
     )  # fmt: skip
     return run, graph
 

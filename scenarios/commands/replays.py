@@ -69,6 +69,12 @@ def metrics(made: LogRun) -> dict[str, Any]:
 def summary(made: LogRun) -> str:
     """The outcome as a table of two columns."""
     m = metrics(made)
+    failed, ratio = not made.succeeded, m.get("turns_over_wheels", 1.0)
+    doubts = {
+        "lost: the map does not explain the last scans": failed and made.kind == "localise",
+        "wrong: the map explains less than half of the beams that it was made of": failed and made.kind == "map",
+        f"scans turn by {ratio:.2f} of what the wheels do: are beams or headings mirrored?": not 0.8 < ratio < 1.25,
+    }
     known, many = "error_m" in m, "mean {mean:.3f} {unit}, std {std:.3f}, max {max:.3f}"
     rows = (
         ("log", f"{m['log']}: {m['scans']} scans of {m['beams']} beams, {m['path_length_m']:.1f} m"),
@@ -85,6 +91,6 @@ def summary(made: LogRun) -> str:
         ("NEES", f"{m['nees']:.2f}, of 3 degrees of freedom" if "nees" in m else ""),
         ("time", f"{m['seconds']:.1f} s, {1e3 * m['seconds'] / m['scans']:.1f} ms a scan"),
         ("verdict", m["verdict"]),
-        ("", "" if made.succeeded else "lost: the map does not explain the last scans" * (made.kind == "localise")),
+        *(("", said) for said, holds in doubts.items() if holds),
     )
     return table(rows)
