@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 
-from scripts import CHECKOUT
+from scripts import CHECKOUT, files_in_git
 
 SIDES = ("solvers", "models", "scenarios")
 # Only the extra `scenarios` installs these; the language, the backends and the models must do without.
@@ -161,11 +161,13 @@ def test_wheel_holds_the_packages_and_nothing_else(source: Path, wheel: Path) ->
 
 
 @pytest.mark.product(1, of="wheels")
-def test_sdist_holds_the_examples(source: Path, wheel: Path) -> None:
+@pytest.mark.parametrize("folder", ["examples", "tests"])
+def test_sdist_holds_examples_and_tests(source: Path, wheel: Path, folder: str) -> None:
     del wheel  # building it leaves the sdist beside it
     (sdist,) = (source / "dist").glob("*.tar.gz")
-    names = {Path(name).name for name in tarfile.open(sdist).getnames() if Path(name).parent.name == "examples"}
-    assert names >= {path.name for path in (CHECKOUT / "examples").glob("*.py")}
+    names = {Path(*Path(name).parts[1:]) for name in tarfile.open(sdist).getnames()}
+    tracked = {path.relative_to(CHECKOUT) for path in files_in_git() if path.is_relative_to(CHECKOUT / folder)}
+    assert tracked <= names
 
 
 @pytest.mark.product(1, of="wheels")
