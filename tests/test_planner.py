@@ -118,6 +118,18 @@ def test_discs_are_avoided_and_can_close_the_way() -> None:
         plan(occupancy, field, start, goal, robot_radius=RADIUS, extra_discs=[[3.0, 3.25, 0.6]])
 
 
+@pytest.mark.parametrize("radius", [0.5, 2.2, 3.0])
+def test_discs_are_avoided_by_robots_of_any_size(radius: float) -> None:
+    walls = np.zeros((200, 200), dtype=bool)
+    floor = OccupancyMap(walls, ~walls, 0.1, (0.0, 0.0, 0.0))
+    field = DistanceMap.from_occupancy(walls, 0.1, floor.origin)
+    disc = np.array([[10.0, 10.3, 0.4]])
+    path = plan(floor, field, [4.0, 10.0], [16.0, 10.0, 0.0], robot_radius=radius, extra_discs=disc)
+    assert np.hypot(*(path[:, :2] - disc[0, :2]).T).min() - 0.4 >= radius
+    between = np.array([[10.0, y, 0.4] for y in np.arange(0.0, 21.0, 2.0 * radius)])
+    assert not path_exists(floor, field, [4.0, 10.0], [16.0, 10.0], 2.0 * radius, between)
+
+
 def test_unknown_cells_are_not_driven_through() -> None:
     occupancy = room(30)
     free = occupancy.free.copy()

@@ -92,6 +92,11 @@ def test_a_saved_map_reads_back_identically(tmp_path: Path, seed: int) -> None:
     assert (read.resolution, read.origin, read.name) == (written.resolution, written.origin, written.name)
 
 
+def test_a_map_that_was_turned_round_and_round_reads_back(tmp_path: Path) -> None:
+    save_map(tmp_path / "plan.yaml", random_map(0, 20.0))
+    assert load_map(tmp_path / "plan.yaml").origin[2] == pytest.approx(20.0 - 6.0 * math.pi)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -102,6 +107,7 @@ def test_a_saved_map_reads_back_identically(tmp_path: Path, seed: int) -> None:
         ("[1.0, 2.0, 0.0]", "[1.0, 2.0]", "origin is"),
         ("[1.0, 2.0, 0.0]", "[1.0, .nan, 0.0]", "origin is"),
         ("[1.0, 2.0, 0.0]", "7", "origin is 7"),
+        ("[1.0, 2.0, 0.0]", "[1.0, 2.0, 90]", "yaw [rad], a turn at the most"),
         ("free_thresh: 0.196", "free_thresh: 0.9", "free_thresh 0.9"),
         ("negate: 0", "negate: 3", "negate is 3"),
         ("negate: 0", "mode: raw", "'raw' is not supported"),

@@ -37,6 +37,7 @@ WEIGHTS = (0.125, 0.75, 0.125)  # of the quadratic B-spline in the middle of a c
 SPACING = 0.05  # between the poses of a planned path [m]
 _COMFORT = 0.15  # inflation beyond the robot's radius that is tried first [m]
 _LEVEL_STEP = 0.01  # the inflation is lowered by steps of this size until a way exists [m]
+_FREE = 2.0  # clearance beyond the robot's radius that no inflation asks for [m]
 _WIDE = 0.6  # clearance beyond the robot's radius from which more is worth nothing [m]
 _PENALTY = 4.0  # a path touching the inflation costs 1 + this per metre
 _LOOKAHEAD = 100  # longest shortcut tried, in strides along the path
@@ -52,8 +53,10 @@ _ATTACH = 0.5  # how far start or goal may lie from the inflated free space [m]
 class Clearance:
     """Distance to the nearest wall or disc, on the cells and between them."""
 
-    def __init__(self, occupancy: OccupancyMap, distance_map: DistanceMap, discs: ArrayLike | None) -> None:
-        """Lower a map's distances around discs (K, 3) x, y, radius [m]."""
+    def __init__(
+        self, occupancy: OccupancyMap, distance_map: DistanceMap, discs: ArrayLike | None, robot_radius: float
+    ) -> None:
+        """Lower a map's distances around discs (K, 3) x, y, radius [m], as far as a robot's radius [m] makes a need."""
         self.occupancy = occupancy
         self.field = distance_map
         # Compiled for one layout: a part of a map, or a read-only array, would be compiled for anew.
@@ -63,7 +66,7 @@ class Clearance:
         if len(self.discs):
             self.grid = self.grid.copy()
         for x, y, radius in self.discs:
-            self._lower_around(x, y, radius)
+            self._lower_around(x, y, radius, robot_radius + _FREE)
         self.passable: BoolArray = occupancy.free
 
     def restrict(self, least: float) -> None:
@@ -91,8 +94,8 @@ class Clearance:
             highest = np.maximum(highest, np.maximum(side, after))
         return highest
 
-    def _lower_around(self, x: float, y: float, radius: float) -> None:
-        reach = (radius + 2.0) / self.occupancy.resolution  # beyond two metres no inflation asks
+    def _lower_around(self, x: float, y: float, radius: float, beyond: float) -> None:
+        reach = (radius + beyond) / self.occupancy.resolution
         column, row = self.occupancy.world_to_grid(np.array([x, y])) - 0.5
         height, width = self.grid.shape
         rows = np.arange(max(0, int(row - reach)), min(height, math.ceil(row + reach) + 1))
@@ -209,7 +212,7 @@ def planning(
         is no way.
     """
     start_pose, goal_pose = np.asarray(start, dtype=np.float64), np.asarray(goal, dtype=np.float64)
-    clearance = Clearance(occupancy, distance_map, extra_discs)
+    clearance = Clearance(occupancy, distance_map, extra_discs, robot_radius)
     for name, pose in (("start", start_pose), ("goal", goal_pose)):
         _check_standing(clearance, name, pose, robot_radius)
     least = robot_radius if clearance_least is None else max(clearance_least, robot_radius)
@@ -280,7 +283,7 @@ def path_exists(
         clearance: distance from the robot's centre to every wall and disc along the way [m].
         discs: (K, 3) x, y, radius [m] of obstacles that are not on the map.
     """
-    room = Clearance(occupancy, distance_map, discs)
+    room = Clearance(occupancy, distance_map, discs, clearance)
     first, last = (np.asarray(pose, dtype=np.float64)[:2] for pose in (start, goal))
     return _connected(room, first, last, clearance, 0.0) is not None
 

@@ -98,7 +98,7 @@ def plan_poses(
         ScenarioError: the body does not fit at the start or at the goal, or there is no way.
     """
     ends = np.array([start, goal], dtype=np.float64)
-    clearance = Clearance(occupancy, distance_map, extra_discs)
+    clearance = Clearance(occupancy, distance_map, extra_discs, body.radius)
     field, discs = SmoothField(distance_map), clearance.discs
     places = body.places(ends)
     distance = field.distance(places)

@@ -156,10 +156,10 @@ def load_map(path: str | Path, limits: Limits = LIMITS) -> OccupancyMap:
         raise FileFormatError(f"{name}: 'image' is {reprlib.repr(image)}; no file has so long a name")
     grey, visible = _read_image(name, path.parent / image, limits)
     width = resolution * max(grey.shape)
-    if width > _WIDEST or max(map(abs, origin)) > 1e12 * resolution:
+    if width > _WIDEST or max(map(abs, origin)) > 1e12 * resolution or abs(origin[2]) > 2.0 * math.pi:
         raise FileFormatError(
             f"{name}: {grey.shape[1]} x {grey.shape[0]} cells of {resolution:g} m at {origin} are no map of a place; "
-            "the resolution is the side of a cell [m]"
+            "the resolution is the side of a cell [m], and the origin is x, y [m] and yaw [rad], a turn at the most"
         )
     probability = (grey if header.get("negate", 0) else 255.0 - grey) / 255.0
     return OccupancyMap(
@@ -190,7 +190,7 @@ def save_map(path: str | Path, occupancy: OccupancyMap) -> None:
         path,
         f"image: {json.dumps(image.name, ensure_ascii=False)}\nmode: trinary\n"
         f"resolution: {_yaml_float(occupancy.resolution)}\n"
-        f"origin: [{_yaml_float(x)}, {_yaml_float(y)}, {_yaml_float(yaw)}]\nnegate: 0\n"
+        f"origin: [{_yaml_float(x)}, {_yaml_float(y)}, {_yaml_float(math.remainder(yaw, math.tau))}]\nnegate: 0\n"
         f"occupied_thresh: {_DEFAULT_OCCUPIED}\nfree_thresh: {_DEFAULT_FREE}\n",
     )
 
