@@ -8,6 +8,7 @@ the beams of an emergency stop and pictures go by the hull.
 from __future__ import annotations
 
 import math
+import reprlib
 from dataclasses import dataclass
 from functools import cache, cached_property
 
@@ -19,6 +20,7 @@ from unifg.modeling.duplicates import doubles
 from unifg.typing import Array, ArrayLike
 
 EXCESS = 0.03  # [m] by which covering discs may stick out of a polygon
+FARTHEST = 30.0  # corner of a polygon [m]
 FINE = 61  # places to a side among which discs are chosen
 INSIDE = 1e-9  # [m]; on the hull is inside
 
@@ -55,11 +57,15 @@ class Body:
         """A convex polygon of corners (P, 2) [m].
 
         Raises:
-            ModelError: fewer than three corners, or a polygon that is not convex.
+            ModelError: fewer than three corners, one that is farther than `FARTHEST` ahead, behind or aside, or a
+                polygon that is not convex.
         """
         points = doubles("the corners of a polygon", corners, error=ModelError)
-        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not np.isfinite(points).all():
-            raise ModelError(f"a polygon has at least three corners x, y [m], got shape {points.shape}")
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3 or not (np.abs(points) <= FARTHEST).all():
+            raise ModelError(
+                f"a polygon has at least three corners x, y [m], none farther than {FARTHEST:g} m: found "
+                f"{reprlib.repr(points.tolist())}"
+            )
         edges = np.roll(points, -1, axis=0) - points
         turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
         if turns.sum() < 0.0:
@@ -149,17 +155,20 @@ def _cover(corners: Array) -> Array:
     """
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes = [np.linspace(a, b, FINE) for a, b in zip(low, high, strict=True)]
-    places = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    # Pieces of the edges: one is covered by a disc that both of its ends are in, and by that about its own middle.
+    rim = _along(corners, min(float(np.ptp(corners, axis=0).max()) / FINE, 1.5 * EXCESS))
+    places = np.concatenate(
+        [np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2), 0.5 * (rim + np.roll(rim, -1, axis=0))]
+    )
     depth = -_to_polygon(corners, places)
-    places, radii = places[depth >= 0.0], depth[depth >= 0.0] + EXCESS
-    rim = _along(corners, float(np.ptp(corners, axis=0).max()) / FINE)
-    step = float(np.hypot(*np.diff(rim[:2], axis=0)[0]))
-    covers = np.hypot(*np.moveaxis(places[:, None] - rim, 2, 0)) <= radii[:, None] - 0.1 * step
-    left, discs = np.ones(len(rim), dtype=bool), []
+    places, radii = places[depth >= -INSIDE], depth[depth >= -INSIDE] + EXCESS
+    within = np.hypot(*np.moveaxis(places[:, None] - rim, 2, 0)) <= radii[:, None]
+    covers = (within & np.roll(within, -1, axis=1)).astype(np.float32)
+    left, discs = np.ones(len(rim), dtype=np.float32), []
     while left.any():
-        chosen = int(np.argmax(covers[:, left].sum(axis=1) + 1e-3 * radii))
+        chosen = int(np.argmax(covers @ left + 1e-3 * radii))
         discs.append([*places[chosen], radii[chosen]])
-        left &= ~covers[chosen]
+        left[covers[chosen] > 0.0] = 0.0
     return np.array(discs)
 
 

@@ -67,6 +67,16 @@ def test_discs_cover_a_polygon_and_stick_out_of_it_by_no_more_than_they_may(text
     assert body.bound == pytest.approx(float(np.hypot(*edges.T).max()), abs=1e-3)
 
 
+NEEDLE = "polygon:0,0;4,0.02;0,0.04"
+
+
+@pytest.mark.parametrize("text", [CAR, "2x0.5", "4x0.4", "10x0.3", "5x0.01", NEEDLE, "12x2.5", "0.05x0.01"])
+def test_discs_leave_nothing_of_the_edges_however_long_and_thin(text: str) -> None:
+    body = body_of(text)
+    assert Body(body.discs).gap(body.boundary(0.002)).max() <= 1e-9
+    assert body.gap(Body(body.discs).boundary(0.02)).max() <= EXCESS + 1e-9
+
+
 def test_the_rim_of_a_body_is_where_a_ray_leaves_it() -> None:
     angles = np.linspace(-np.pi, np.pi, 33)
     for body in (body_of("0.6x0.4"), body_of("discs:0.1,0,0.2;-0.15,0,0.18"), Body.disc(0.2)):
@@ -92,6 +102,7 @@ def test_the_rim_of_a_body_is_where_a_ray_leaves_it() -> None:
         "disc:1,2",
         "disc:1;2",
         "polygon:a,0;1,0;0,1",
+        "600x400",
     ],
 )
 def test_what_is_no_body_is_refused(text: str) -> None:
