@@ -83,6 +83,32 @@ def test_a_window_equals_the_whole_history(rng: Generator) -> None:
     assert fed > 20 and sensor.counts.late == sensor.counts.full == 0
 
 
+@pytest.mark.parametrize("tick", [None, H])
+def test_nodes_without_times_stand_as_far_apart_as_their_dynamics_step(tick: float | None, rng: Generator) -> None:
+    """Stamps are of seconds: a node at every second would take those of another place."""
+    controls, truth, _ = walk(rng, 12)
+    ahead = step if tick is None else lambda x, u, seconds: x + seconds * u
+    robot, found = Robot(fg.Rn(2), fg.Rn(2), predict=ahead, tick=tick), []
+    for times in (H * np.arange(1, 13), [None] * 12):
+        sensor = fixes_of()
+        window = Window(robot, 4, [Dynamics(drift, H, sigma=0.01), sensor], start=np.zeros(2), sigma=0.2)
+        for k, time in enumerate(times):
+            window.move(controls[k], time)
+            sensor.add(H * (k + 0.5), 0.5 * (truth[k] + truth[k + 1]))
+            window.estimate()
+        found.append(window.present)
+        assert np.linalg.norm(window.present - truth[-1]) < 0.05 and sensor.counts.late == 0
+    np.testing.assert_allclose(*found, atol=1e-9)
+
+
+def test_nodes_at_another_spacing_than_the_step_of_dynamics_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
+    window = Window(POINT, 4, [Dynamics(drift, H, sigma=0.01)], start=np.zeros(2), sigma=0.2)
+    window.move(np.zeros(2), 1.2 * H)
+    assert not caplog.records
+    window.move(np.zeros(2), 3.2 * H)  # a tick is lost
+    assert "0.2 s after the last one, but a step of its dynamics is 0.1 s" in caplog.text
+
+
 def test_the_present_alone_keeps_what_comes() -> None:
     """Before the first step there is no interval: measurements wait, and are placed with the next node."""
     sensor = fixes_of()

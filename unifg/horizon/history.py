@@ -93,13 +93,13 @@ class History:
         state: Array = self.states[-1]
         return state
 
-    def later(self, time: float | None) -> float:
-        """The time of a new node; None for one more than that of the present one.
+    def later(self, time: float | None, step: float = 1.0) -> float:
+        """The time of a new node; None for a step [s] after that of the present one.
 
         Raises:
             GraphError: when time is not finite or runs backwards.
         """
-        new = float(self.times[-1]) + 1.0 if time is None else instant(time)
+        new = float(self.times[-1]) + step if time is None else instant(time)
         if not new > self.times[-1]:
             raise GraphError(f"the new node at {new} s is not later than the present one at {self.times[-1]} s")
         return new

@@ -239,7 +239,7 @@ class RecedingHorizon:
             given: what terms ask for in ``now.given``.
             measured: values at the present node, by name; what is missing or None was not measured.
             applied: (m,) since the last tick; None for what the last plan said.
-            time: of the present [s]; None for one more than at the last tick.
+            time: of the present [s]; None for one step after the last tick, as :meth:`Window.move` has it.
 
         Raises:
             GraphError: without a window; for a measurement, a control or a time that does not fit, which leaves
