@@ -186,6 +186,15 @@ def test_dynamics_of_one_step_are_refused_beside_other_times() -> None:
     assert loop.times[-1] == pytest.approx(6 * TICK)
 
 
+@pytest.mark.parametrize("robot", [CART, Robot(fg.Rn(2), fg.Rn(1))])
+def test_a_past_of_another_step_than_a_tick_is_refused(robot: Robot) -> None:
+    """Its estimate would move half as far as the robot."""
+    past = Dynamics(motion, 0.5 * TICK, sigma=[0.1, 0.1])
+    window = Window(robot, 3, [past], start=np.zeros(2), sigma=0.1)
+    with pytest.raises(fg.GraphError, match=r"its step is 0.05 s, but .* in a window give the length of a tick"):
+        loop_of(TIMES, robot, window=window)
+
+
 def moving(**options: Any) -> RecedingHorizon:
     """A loop whose node times may change, with costs of the states in proportion to the steps before them."""
 

@@ -174,7 +174,7 @@ class RecedingHorizon:
             )
         self._lock = ReentrantLock()
         self._terms, self.tree, self.path = looked_at(terms), tree, tree.paths[-1]
-        self.times = node_times(times, tree, robot, self._terms)
+        self.times = node_times(times, tree, robot, self._terms, window)
         self.robot, self.steps, self.coupling, self.window, self.delay = robot, len(tree), coupling, window, delay
         self._deadline, self._clock, self._patience = deadline, clock, patience
         between = control_limits((-np.inf, np.inf) if limits is None else limits, robot.control.storage)
@@ -632,7 +632,7 @@ class RecedingHorizon:
             BackendError: while another thread plans.
         """
         with self._alone():
-            found = node_times(times, self.tree, self.robot, self._terms)
+            found = node_times(times, self.tree, self.robot, self._terms, self.window)
             if self.guess is not None:
                 states = self.guess.values[self.x.family][-self.steps - 1 :]
                 self.guess = self._resampled(self.guess, states, self.guess.values[self.u], found)

@@ -190,7 +190,7 @@ class Dynamics:
             raise GraphError(f"term '{self.name}': its step must be positive [s], found {self.step}", term=self.name)
 
     def require_step(self, lengths: Array | None) -> None:
-        """Refuse a step that contradicts the lengths (N,) of a horizon's steps [s], and none where there are none."""
+        """Refuse a step that contradicts the lengths (N,) of steps [s], and none where there are none."""
         step: Any = lengths if self.step is None or isinstance(self.step, Data) else self.step
         if self.step is None and lengths is None:
             raise GraphError(
@@ -202,7 +202,7 @@ class Dynamics:
         if lengths is not None and fits and not np.allclose(np.ravel(step), lengths, rtol=1e-9, atol=0.0):
             raise GraphError(
                 f"term '{self.name}': its step is {self.step} s, but the nodes of the horizon are {lengths} s apart: "
-                "leave step= out to follow them",
+                "leave step= out to follow them, or in a window give the length of a tick",
                 term=self.name,
             )
 
