@@ -148,6 +148,7 @@ FULL, BARE = np.ones((2, 3), dtype=bool), np.zeros((2, 3), dtype=bool)
     [
         (FULL, 0.1, 0.0, "both occupied and free"),
         (BARE[:1], 0.1, 0.0, "one shape"),
+        (BARE.astype(int), 0.1, 0.0, "int64.*must be bool arrays"),
         (BARE, 0.0, 0.0, "resolution"),
         (BARE, 0.1, math.inf, "origin"),
     ],

@@ -54,12 +54,14 @@ class OccupancyMap:
         """Refuse masks and numbers that cannot be a map.
 
         Raises:
-            ModelError: shapes differ, a cell is both occupied and free, or a number is not usable.
+            ModelError: masks are no boolean arrays, shapes differ, a cell is both occupied and free, or a number is
+                not usable.
         """
-        if self.occupied.ndim != 2 or self.occupied.shape != self.free.shape or self.occupied.size == 0:
+        kinds = [(str(getattr(mask, "dtype", "no array")), np.shape(mask)) for mask in (self.occupied, self.free)]
+        if kinds[0] != kinds[1] or kinds[0][0] != "bool" or self.occupied.ndim != 2 or self.occupied.size == 0:
             raise ModelError(
-                f"map {self.name!r}: occupied {self.occupied.shape} and free {self.free.shape} must be "
-                "(H, W) of one shape"
+                f"map {self.name!r}: occupied, {kinds[0]}, and free, {kinds[1]}, must be bool arrays (H, W) of one "
+                "shape; numbers would be taken for indices"
             )
         if np.any(self.occupied & self.free):
             raise ModelError(f"map {self.name!r}: some cells are both occupied and free")
