@@ -86,7 +86,7 @@ def read_profile(path: Path, limits: Limits = LIMITS) -> Profile:
 
     Raises:
         FileFormatError: naming the line of what is missing, no number, or no speed, time or slope of a road; also where
-            two columns hold the same.
+            two columns hold the same, or one seems to hold it in another unit, as ``slope_deg``.
     """
     name = legible(path)
     try:
@@ -119,6 +119,12 @@ def _column(
 ) -> Array | None:
     """The one of the named columns that is there, with numbers within a range."""
     matching = [k for k, name in enumerate(head) if name in names]
+    stems = {name.split("_")[0] for name in names}
+    if not matching and (alike := [name for name in head if name.split("_")[0] in stems]):
+        raise FileFormatError(
+            f"{file}, line 1: the column '{alike[0]}' is not read: convert it to '{names[0]}', as its unit is another, "
+            "or call it otherwise"
+        )
     if not matching:
         return None
     if len(matching) > 1:
