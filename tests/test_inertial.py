@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -39,6 +40,9 @@ def log_of(count: int, rng: Generator, rate: float = 200.0, turn: float = 1.0) -
     phase, speed = rng.uniform(0.0, 6.0, (2, 3)), rng.uniform(0.5, 3.0, (2, 3))
     w, a = (np.sin(t[:, None] * speed[k] + phase[k]) for k in range(2))
     return t, turn * w, 3.0 * a + [0.0, 0.0, 9.81]
+
+
+MOVED = preintegrate([0.0], np.zeros((1, 3)), np.zeros((1, 3)), [0.0, 0.01], NOISE, NONE)
 
 
 # ---------------------------------------------------------------- one sample
@@ -183,30 +187,29 @@ def test_what_is_not_covered_has_no_information(rng: Generator) -> None:
     assert empty.held[0] == np.inf
 
 
-def test_bad_logs_are_refused(rng: Generator) -> None:
+@pytest.mark.parametrize(
+    ("kind", "changed", "words"),
+    [
+        (ModelError, lambda t, w: {"gyro": w[:4]}, r"\(k, 3\) rates"),
+        (ModelError, lambda t, w: {"gyro": np.where(w == w[2, 1], np.nan, w)}, "must be finite"),
+        (ModelError, lambda t, w: {"stamps": t[::-1]}, "stamps must be finite and increase"),
+        (ModelError, lambda t, w: {"times": [0.0, 0.0]}, "times must be finite and increase"),
+        (ModelError, lambda t, w: {"times": [0.0, np.inf]}, "times must be finite"),
+        (ModelError, lambda t, w: {"times": [0.0]}, "two or more node times"),
+        (ModelError, lambda t, w: {"bias": np.full(6, np.nan)}, "must be finite"),
+        (ModelError, lambda t, w: {"bias": np.zeros(3)}, r"a bias is \(6,\).*found \(3,\)"),
+        (fg.GraphError, lambda t, w: {"gyro": np.ma.masked_array(w, w > 0.0)}, "rates is a masked"),
+        (fg.GraphError, lambda t, w: {"gyro": w + 0j}, "found complex numbers"),
+        # The class has attributes of these names, too: its defaults.
+        (ModelError, lambda t, w: {"noise": ImuNoise}, "noise must be of the class ImuNoise"),
+        (ModelError, lambda t, w: {"noise": None}, "noise must be of the class ImuNoise"),
+    ],
+)
+def test_bad_logs_are_refused(kind: type[Exception], changed: Any, words: str, rng: Generator) -> None:
     t, w, a = log_of(5, rng)
-    broken = w.copy()
-    broken[2, 1] = np.nan
-    for arguments, words in (
-        ((t, w[:4], a, [0.0, 1.0]), r"\(k, 3\) rates"),
-        ((t, broken, a, [0.0, 1.0]), "must be finite"),
-        ((t[::-1], w, a, [0.0, 1.0]), "stamps must be finite and increase"),
-        ((t, w, a, [0.0, 0.0]), "times must be finite and increase"),
-        ((t, w, a, [0.0, np.inf]), "times must be finite"),
-        ((t, w, a, [0.0]), "two or more node times"),
-    ):
-        with pytest.raises(ModelError, match=words):
-            preintegrate(*arguments, NOISE, NONE)
-    with pytest.raises(ModelError, match="must be finite"):
-        preintegrate(t, w, a, [0.0, 1.0], NOISE, np.full(6, np.nan))
-    with pytest.raises(ModelError, match=r"a bias is \(6,\).*found \(3,\)"):
-        preintegrate(t, w, a, [0.0, 1.0], NOISE, np.zeros(3))
-    for wrong, words in ((np.ma.masked_array(w, w > 0.0), "rates is a masked"), (w + 0j, "found complex numbers")):
-        with pytest.raises(fg.GraphError, match=words):
-            preintegrate(t, wrong, a, [0.0, 1.0], NOISE, NONE)
-    for noise in (ImuNoise, None):  # the class has attributes of these names, too: its defaults
-        with pytest.raises(ModelError, match="noise must be of the class ImuNoise"):
-            preintegrate(t, w, a, [0.0, 1.0], noise, NONE)  # type: ignore[arg-type]
+    log = {"stamps": t, "gyro": w, "accelerometer": a, "times": [0.0, 1.0], "noise": NOISE, "bias": NONE}
+    with pytest.raises(kind, match=words):
+        preintegrate(**log | changed(t, w))
 
 
 @pytest.mark.parametrize("density", [0.0, -1e-3, np.nan, np.inf, 1e-200, 1e200])
@@ -319,23 +322,34 @@ def test_a_mean_force_is_felt_between_two_nodes() -> None:
     assert abs(inertial.specific_force(gravity=(0.0, 0.0, -3.71))(start[None], end[None], force[None], 10.0)).max() > 5
 
 
-def test_manifolds_and_gravity_are_checked() -> None:
-    for made in (inertial.motion, inertial.specific_force):
-        for manifold in (fg.SE3, fg.Product(p=fg.Rn(3), v=fg.Rn(3)), fg.Product(p=fg.Rn(2), v=fg.Rn(3), R=SO3)):
-            with pytest.raises(ModelError, match="needs a position, a velocity and an orientation"):
-                made(manifold)
-        for gravity in ((0.0, 0.0), (0.0, 0.0, np.nan)):
-            with pytest.raises(ModelError, match="three finite numbers"):
-                made(gravity=gravity)  # type: ignore[arg-type]
-    moved = preintegrate(*log_of(5, np.random.default_rng(0)), [0.0, 0.01], NOISE, NONE)
-    for wrong in (-9.81, [0.0, -9.81]):  # a number for all axes is no gravity
-        with pytest.raises(ModelError, match="three finite numbers"):
-            predict(SE23.identity(), moved, wrong)
-        with pytest.raises(ModelError, match="three finite numbers"):
-            at_rest(SO3.identity(), wrong)
+@pytest.mark.parametrize("made", [inertial.motion, inertial.specific_force])
+@pytest.mark.parametrize(
+    "manifold", [fg.SE3, fg.Product(p=fg.Rn(3), v=fg.Rn(3)), fg.Product(p=fg.Rn(2), v=fg.Rn(3), R=SO3)], ids=str
+)
+def test_states_that_have_not_all_parts_are_refused(made: Any, manifold: fg.Manifold) -> None:
+    with pytest.raises(ModelError, match="needs a position, a velocity and an orientation"):
+        made(manifold)
+
+
+@pytest.mark.parametrize("gravity", [-9.81, (0.0, -9.81), (0.0, 0.0), (0.0, 0.0, np.nan)], ids=str)
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda gravity: inertial.motion(gravity=gravity),
+        lambda gravity: inertial.specific_force(gravity=gravity),
+        lambda gravity: predict(SE23.identity(), MOVED, gravity),
+        lambda gravity: at_rest(SO3.identity(), gravity),
+    ],
+)
+def test_a_gravity_is_three_numbers(made: Any, gravity: Any) -> None:
+    """A number for all axes is no gravity."""
+    with pytest.raises(ModelError, match="three finite numbers"):
+        made(gravity)
+
+
+def test_a_prediction_begins_at_a_state() -> None:
     with pytest.raises(ModelError, match=r"SE23, \(10,\), found \(7,\)"):
-        predict(np.zeros(7), moved)
-    assert inertial.motion().kernel is inertial.motion().kernel  # derived once
+        predict(np.zeros(7), MOVED)
 
 
 # ---------------------------------------------------------------- GTSAM
@@ -488,29 +502,38 @@ def test_order_of_arrival_changes_no_bit_of_the_data(rng: Generator) -> None:
         assert np.array_equal(mine, other)
 
 
-def test_misuse_of_the_bookkeeping_is_named() -> None:
+@pytest.mark.parametrize(
+    ("kind", "act", "words"),
+    [
+        (fg.GraphError, lambda graph, x, imu: InertialMeasurements(NOISE).at(fg.Graph(), [0.0, 1.0], NONE), "imu"),
+        (
+            ModelError,
+            lambda graph, x, imu: InertialMeasurements(NOISE, bias="offset").state(graph, x),
+            "neither SE23 nor the graph has a 'offset'",
+        ),
+        (ModelError, lambda graph, x, imu: InertialMeasurements(NOISE).state(graph, x[:1]), "a bias on"),
+        (ModelError, lambda graph, x, imu: InertialMeasurements(NOISE).state(graph, x[:2]), "a bias on"),
+        (ModelError, lambda graph, x, imu: InertialMeasurements(NOISE, bias="x").state(graph, x), "a bias on"),
+        (ModelError, lambda graph, x, imu: imu.at(graph, [0.0, 1.0], NONE), "3 times are needed"),
+        (
+            ModelError,
+            lambda graph, x, imu: imu.add([0.0, 1.0], np.zeros((2, 3)), np.zeros(3)),
+            r"need rates and forces \(2, 3\)",
+        ),
+        (
+            fg.GraphError,
+            lambda graph, x, imu: imu.add(0.0, np.ma.masked_array(np.zeros(3), [True] * 3), np.zeros(3)),
+            "rates is a masked",
+        ),
+        (fg.GraphError, lambda graph, x, imu: imu.add(0.0, 1j * np.ones(3), np.zeros(3)), "complex"),
+        (ModelError, lambda graph, x, imu: InertialMeasurements(NOISE, gap=0.0), "must be positive"),
+        (ModelError, lambda graph, x, imu: InertialMeasurements(NOISE, gap=np.nan), "must be positive"),
+    ],
+)
+def test_misuse_of_the_bookkeeping_is_named(kind: type[Exception], act: Any, words: str) -> None:
     graph, x, _, imu, _ = estimator(3)
-    fresh = InertialMeasurements(NOISE)
-    with pytest.raises(fg.GraphError, match="imu"):
-        fresh.at(fg.Graph(), [0.0, 1.0], NONE)
-    with pytest.raises(ModelError, match="neither SE23 nor the graph has a 'offset'"):
-        InertialMeasurements(NOISE, bias="offset").state(graph, x)
-    for nodes, bias in ((x[:1], "bias"), (x[:2], "bias"), (x, "x")):
-        with pytest.raises(ModelError, match="a bias on"):
-            InertialMeasurements(NOISE, bias=bias).state(graph, nodes)
-    with pytest.raises(ModelError, match="3 times are needed"):
-        imu.at(graph, [0.0, 1.0], NONE)
-    with pytest.raises(ModelError, match=r"need rates and forces \(2, 3\)"):
-        imu.add([0.0, 1.0], np.zeros((2, 3)), np.zeros(3))
-    for wrong, words in (
-        (np.ma.masked_array(np.zeros(3), [True] * 3), "rates is a masked"),
-        (1j * np.ones(3), "complex"),
-    ):
-        with pytest.raises(fg.GraphError, match=words):
-            imu.add(0.0, wrong, np.zeros(3))
-    for gap in (0.0, np.nan):
-        with pytest.raises(ModelError, match="must be positive"):
-            InertialMeasurements(NOISE, gap=gap)
+    with pytest.raises(kind, match=words):
+        act(graph, x, imu)
     assert imu.counts == SampleCounts()
 
 
@@ -542,3 +565,4 @@ def test_the_factor_is_compiled_with_exact_derivatives(rng: Generator) -> None:
     data = imu.at(graph, [0.0, 0.2, 0.4], NONE)
     routes = graph.check({x: SE23.random(rng, (3,)), bias: np.zeros((3, 6))}, data=data).routes
     assert "derivatives exact" in routes["imu"]
+    assert inertial.motion().kernel is inertial.motion().kernel  # derived once
