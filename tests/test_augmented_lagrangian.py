@@ -157,11 +157,6 @@ def test_second_derivatives_are_those_of_the_lagrangian() -> None:
         assert solution.iterations <= 12
 
 
-def test_unknown_hessians_are_refused() -> None:
-    with pytest.raises(fg.BackendError, match="hessian must be 'exact' or 'gauss-newton', found 'bfgs'"):
-        AugmentedLagrangian(hessian="bfgs")  # type: ignore[arg-type]
-
-
 def test_flights_among_cylinders() -> None:
     """Layouts where Gauss-Newton's Hessian crawled to the limit, and one that is easy."""
     stated = [flight(seed).formulation() for seed in (0, 5, 16)]

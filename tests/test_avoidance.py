@@ -10,7 +10,7 @@ import pytest
 import unifg as fg
 from problems.graphs import graph_with
 from unifg.errors import GraphError
-from unifg.factors.residuals import Residual, residual
+from unifg.factors.residuals import residual
 from unifg.models import avoidance, obstacles
 from unifg.solvers import SQP, InteriorPoint
 from unifg.typing import Array
@@ -176,14 +176,8 @@ def test_potentials_are_traced_in_graphs() -> None:
     assert len(routes) == 4 and all(route.endswith("derivatives exact") for route in routes.values()), routes
 
 
-def test_what_the_potential_needs() -> None:
-    with pytest.raises(fg.ModelError, match="1/d: nearest must be positive"):
-        avoidance.inverse_distance_root(avoidance.cylinder_clearance, 0.0)
-    with pytest.raises(fg.ModelError, match="1/d: nearest must be positive"):
-        avoidance.inverse_distance(avoidance.cylinder_clearance, np.nan)
-    attached: Residual = residual(lambda p: p[:, :1], lambda p: [np.ones((len(p), 1, 3))], "attached")
-    with pytest.raises(fg.ModelError, match="plain function, found 'attached'"):
-        avoidance.inverse_distance_root(attached)
+def test_the_potential_takes_any_clearance() -> None:
+
     own = avoidance.inverse_distance_root(residual(lambda p: p[:, :1]))
     np.testing.assert_allclose(own(np.array([[2.0, 0.0, 0.0]])), [[1.0]])
     planar = avoidance.inverse_distance_root(obstacles.disc_clearance)  # any clearance, also of other robots

@@ -116,22 +116,6 @@ def test_nan_in_gives_nan_out_and_batches_keep_their_shape() -> None:
     assert field.distance_and_gradient(np.zeros((0, 2)))[1].shape == (0, 2)
 
 
-def test_bad_grids_are_refused() -> None:
-    with pytest.raises(ModelError, match="finite"):
-        DistanceMap(np.array([[math.nan]]), 0.1, (0.0, 0.0, 0.0))
-    with pytest.raises(ModelError, match="resolution"):
-        DistanceMap(np.zeros((2, 2)), -0.1, (0.0, 0.0, 0.0))
-    for resolution in (-0.1, math.nan):  # which is no matter of the cap
-        with pytest.raises(ModelError, match=r"resolution .* must be positive"):
-            DistanceMap.from_occupancy(np.eye(3, dtype=bool), resolution, (0, 0, 0))
-    with pytest.raises(ModelError, match="origin"):
-        DistanceMap(np.zeros((2, 2)), 0.1, (0.0, math.nan, 0.0))
-    with pytest.raises(ModelError, match="cap"):
-        DistanceMap.from_occupancy(np.eye(3, dtype=bool), 0.1, (0, 0, 0), cap=-1.0)
-    with pytest.raises(ModelError, match="grid"):
-        DistanceMap.from_occupancy(np.zeros(3, dtype=bool), 0.1, (0, 0, 0))
-
-
 @pytest.mark.parametrize("shape", [(4, 3), (4, 1), (3,)])
 def test_poses_are_no_points(shape: tuple[int, ...]) -> None:
     """Four poses are as many numbers as six points: the look-up would write past the end of its results."""

@@ -293,13 +293,6 @@ def test_levenberg_marquardt_follows_an_open_chain() -> None:
     assert LEVENBERG.solve(graph, guess, check=True).iterations <= 10
 
 
-def test_words_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(fg.BackendError, match="globalization must be 'line-search' or 'levenberg-marquardt'"):
-        KKT(globalization="filter")  # type: ignore[arg-type]
-    with pytest.raises(fg.BackendError, match="choose one"):
-        KKT(full_steps=True, globalization="levenberg-marquardt")
-
-
 def test_a_full_step_that_will_probably_be_taken_is_linearised_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is not evaluated before, unless steps have been shortened of late."""
     stated = Unicycle("straight", False, 20).formulation()

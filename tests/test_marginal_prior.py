@@ -202,11 +202,6 @@ def test_a_marginal_prior_with_an_offset_is_the_same_model(rng: np.random.Genera
     np.testing.assert_array_equal(information, information.T)
 
 
-def test_a_joint_prior_needs_a_manifold() -> None:
-    with pytest.raises(fg.GraphError, match="at least one variable"):
-        fg.joint_prior()
-
-
 @pytest.mark.parametrize("offset", [False, True])
 def test_many_are_eliminated_by_the_tree_as_by_dense_matrices(monkeypatch: pytest.MonkeyPatch, offset: bool) -> None:
     """Poses of a city around eight that stay, of which one is fixed; a part that nothing determines is refused."""

@@ -95,9 +95,8 @@ def test_the_planar_chart_is_a_difference(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(fg.wrap_angle(y - x - z)[:, 2], chart[:, 2], atol=1e-12)
 
 
-def test_charts_are_for_poses_and_pickle() -> None:
-    with pytest.raises(fg.GraphError, match="needs poses in SE2 or SE3, found Rn"):
-        chart_between.on(fg.Rn(2))
+def test_charts_pickle() -> None:
+
     for group in (fg.SE2, fg.SE3):
         assert pickle.loads(pickle.dumps(chart_between.on(group))).name == "chart between"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,26 +12,35 @@ import pytest
 import unifg as fg
 from problems.graphs import drawn_to, graph_with
 from problems.known import line, short_drive
-from unifg.models import barriers
-from unifg.models.avoidance import inverse_distance_root, sphere_clearance
+from unifg.models import barriers, rkmk
+from unifg.models.avoidance import cylinder_clearance, inverse_distance, inverse_distance_root, sphere_clearance
 from unifg.models.detours import detours, headed
 from unifg.models.distance_map import DistanceMap
 from unifg.models.footprint import Body
 from unifg.models.inertial import InertialMeasurements
+from unifg.models.interpolation import cubic
+from unifg.models.landmarks import observe, tilt
 from unifg.models.lidar import endpoint_loss
 from unifg.models.matching import Gates
 from unifg.models.obstacles import disc_clearance
 from unifg.models.planar import ackermann
 from unifg.models.potential import potential
 from unifg.models.preintegration import ImuNoise
+from unifg.models.quadrotor import STATE
+from unifg.models.space_landmarks import bearing_3d, bearing_range_3d, observe_3d
 from unifg.models.spline import SplineCurve, SplineField
 from unifg.models.stamped import StampedMeasurements
 from unifg.models.terminal import brakeable
 from unifg.models.trajectory import CubicTrajectory
-from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton
+from unifg.pose_graphs.residuals import chart_between
+from unifg.solvers import KKT, SQP, AugmentedLagrangian, GaussNewton, GraduatedNonConvexity, Penalty, names
 from unifg.typing import Array
 
 Breaks = Callable[[fg.Graph, fg.Family], object]
+WITHOUT_SPEEDS = fg.Product(pose=fg.SE3, velocity=fg.Rn(3))
+AT_POINTS = fg.Product(p=fg.Rn(3), R=fg.SO3)
+
+ATTACHED = fg.residual(lambda p: p[:, :1], lambda p: [np.ones((len(p), 1, 3))], "attached")
 
 REFUSALS: list[tuple[str, Breaks, str]] = [
     ("no members", lambda g, x: g.variables("y", fg.Rn(1), 0), "at least one"),
@@ -287,6 +297,66 @@ def test_options_of_another_kind_are_refused(make: Any, bad: Any, message: str) 
     graph, x = drawn_to([0.0, 0.0], 4)
     with pytest.raises(fg.UnifgError, match=message):
         make(graph, x, bad)
+
+
+MADE: list[tuple[type[fg.UnifgError], Callable[[], object], str]] = [
+    (fg.BackendError, lambda: AugmentedLagrangian(hessian="bfgs"), "must be 'exact' or 'gauss-newton', found 'bfgs'"),  # type: ignore[arg-type]
+    (fg.BackendError, lambda: SQP(hessian="newton"), "'newton'"),  # type: ignore[arg-type]
+    (fg.BackendError, lambda: KKT(globalization="filter"), "must be 'line-search' or 'levenberg-marquardt'"),  # type: ignore[arg-type]
+    (fg.BackendError, lambda: KKT(full_steps=True, globalization="levenberg-marquardt"), "choose one"),
+    (fg.BackendError, lambda: Penalty(penalty=0.0), "penalty must be positive"),
+    (fg.BackendError, lambda: Penalty(penalty_growth=1.0), "penalty_growth must be above 1"),
+    (fg.BackendError, lambda: GraduatedNonConvexity(growth=1.0), "growth"),
+    (fg.BackendError, lambda: GraduatedNonConvexity(stage_iterations=0), "stage_iterations"),
+    (fg.BackendError, lambda: GaussNewton(search_iterations=-1), "search_iterations must not be negative, found -1"),
+    (fg.BackendError, lambda: names.backend("newton"), "unknown backend 'newton': choose one of gn, lm, dogleg, kkt"),
+    (fg.BackendError, lambda: names.backend("penalty", hessian="exact"), "Penalty has no option 'hessian'"),
+    (fg.GraphError, fg.joint_prior, "at least one variable"),
+    (fg.GraphError, lambda: fg.residual(lambda x: x, derivatives="exact"), "'trace' or 'differences'"),  # type: ignore[arg-type]
+    (fg.GraphError, lambda: fg.each(1.0), "found a scalar"),
+    (fg.GraphError, lambda: fg.shared(["a"]), "must be real numbers"),
+    (fg.GraphError, lambda: chart_between.on(fg.Rn(2)), "needs poses in SE2 or SE3, found Rn"),
+    (fg.GraphError, lambda: observe(STATE.identity(), np.zeros((3, 3))), "argument 1 has shape"),
+    (fg.GraphError, lambda: observe(np.zeros(9), np.zeros((3, 2))), "argument 0 has shape"),
+    (fg.GraphError, lambda: tilt(fg.SO3.identity(), np.zeros(2)), "argument 1 has shape"),
+    (fg.UnifgError, lambda: fg.Product(), "no components"),
+    (fg.UnifgError, lambda: fg.Product(p=3), "'p' of Product is 3: give a manifold"),  # type: ignore[call-overload]
+    (fg.UnifgError, lambda: fg.Product(p=fg.Rn), r"'p' of Product is .*Rn.*: give a manifold"),  # type: ignore[call-overload]
+    (fg.UnifgError, lambda: fg.Product(_p=fg.SE2), "underscore"),
+    (fg.UnifgError, lambda: fg.Rn(0), r"Rn\(0\)"),
+    *((fg.ModelError, partial(cubic, m), "cubic needs velocities") for m in (fg.SE3, WITHOUT_SPEEDS, AT_POINTS)),
+    *(
+        (fg.ModelError, partial(bearing_range_3d, m), "needs a position and an orientation")
+        for m in (fg.SE2, fg.Product(p=fg.Rn(3)), fg.Product(pose=fg.SE2))
+    ),
+    *(
+        (fg.ModelError, partial(bearing_3d, fg.SE3, place), "must be an element of SE3")
+        for place in (np.zeros(7), np.zeros(6), [np.nan] * 7)
+    ),
+    # Three places in the plane are no two in space.
+    (fg.ModelError, lambda: observe_3d(fg.SE3.identity(), np.zeros((3, 2))), "observe_3d: a state .7,., places .M, 3."),
+    (fg.ModelError, lambda: observe_3d(fg.SE3.identity()[None], np.zeros((3, 3))), "observe_3d: a state .7,., places"),
+    (fg.ModelError, lambda: rkmk.integrator(fg.SE2, len, "half"), "'simplified trapezoid'.*found 'half'"),  # type: ignore[arg-type]
+    (fg.ModelError, lambda: inverse_distance_root(cylinder_clearance, 0.0), "1/d: nearest must be positive"),
+    (fg.ModelError, lambda: inverse_distance(cylinder_clearance, np.nan), "1/d: nearest must be positive"),
+    (fg.ModelError, lambda: inverse_distance_root(ATTACHED), "plain function, found 'attached'"),
+    (fg.ModelError, lambda: potential(disc_clearance, near=0.9), r"0 < near < far, found near = 0\.9"),
+    (fg.ModelError, lambda: potential(disc_clearance, vortex=-1.0, sense="aside"), "found 'aside', -1"),
+    (fg.ModelError, lambda: potential(fg.residual(lambda x: x[:, :1])), "has no attached Jacobian"),
+    (fg.ModelError, lambda: DistanceMap(np.array([[np.nan]]), 0.1, [0.0] * 3), "finite"),
+    (fg.ModelError, lambda: DistanceMap(np.zeros((2, 2)), -0.1, [0.0] * 3), "resolution"),
+    (fg.ModelError, lambda: DistanceMap(np.zeros((2, 2)), 0.1, [0.0, np.nan, 0.0]), "origin"),
+    (fg.ModelError, lambda: grown(resolution=-0.1), "resolution .* must be positive"),  # which is no matter of the cap
+    (fg.ModelError, lambda: grown(resolution=np.nan), "resolution .* must be positive"),
+    (fg.ModelError, lambda: grown(cap=-1.0), "cap"),
+    (fg.ModelError, lambda: grown(np.zeros(3, dtype=bool)), "grid"),
+]
+
+
+@pytest.mark.parametrize(("kind", "make", "message"), MADE, ids=[message for *_, message in MADE])
+def test_what_cannot_be_made_is_refused(kind: type[fg.UnifgError], make: Any, message: str) -> None:
+    with pytest.raises(kind, match=message):
+        make()
 
 
 def test_questions_of_another_kind_are_refused() -> None:

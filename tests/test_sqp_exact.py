@@ -240,8 +240,3 @@ def test_gauss_newton_model_is_what_it_was() -> None:
     curved = wide.with_curvature(np.full(program.constraints.count, 0.7))
     assert np.abs(full(curved) - full(wide)).max() > 1e-3
     np.testing.assert_array_equal(full(curved.gauss_newton()), full(wide))
-
-
-def test_unknown_hessian_is_refused() -> None:
-    with pytest.raises(fg.BackendError, match="'newton'"):
-        SQP(hessian="newton")  # type: ignore[arg-type]

@@ -10,6 +10,7 @@ from copy import deepcopy
 from io import BytesIO
 from pathlib import Path
 from threading import Thread
+from typing import Any
 
 import numpy as np
 import pytest
@@ -164,13 +165,11 @@ def test_cubics_are_of_fourth_order_and_their_velocities_of_third(states: fg.Pro
     assert orders[0] > 3.7 and orders[1] > 2.7, orders
 
 
-def test_cubics_need_velocities() -> None:
-    for manifold in (fg.SE3, fg.Product(pose=fg.SE3, velocity=fg.Rn(3)), fg.Product(p=fg.Rn(3), R=fg.SO3)):
-        with pytest.raises(ModelError, match="cubic needs velocities"):
-            cubic(manifold)
-
-
 # ---------------------------------------------------------------- a graph with fixes
+
+
+def sensor(size: int = 2, capacity: int = 1, name: str = "fixes", **options: Any) -> StampedMeasurements:
+    return StampedMeasurements(place, size, capacity=capacity, sigma=1.0, name=name, **options)
 
 
 def window(count: int = 5, capacity: int = 3) -> tuple[fg.Graph, fg.Family, StampedMeasurements]:
@@ -272,42 +271,57 @@ def test_nodes_whose_measurements_have_left_are_named_in_full() -> None:
         fixes.at(graph, 1.7e9 + TIMES)
 
 
-def test_shapes_and_times_are_checked() -> None:
-    graph, x, fixes = window()
-    with pytest.raises(ModelError, match=r"need values \(2,\), found \(3,\)"):
-        fixes.add(0.1, np.zeros(3))
-    with pytest.raises(ModelError, match=r"need values \(3, 2\), found \(2, 2\)"):
-        fixes.add(np.zeros(3), np.zeros((2, 2)))
-    masked = np.ma.masked_array(np.zeros((3, 2)), [[False] * 2, [True] * 2, [False] * 2])
-    for stamps, values, words in (
-        (np.zeros(3), masked, "'fixes': values is a masked array"),
+@pytest.mark.parametrize(
+    ("kind", "act", "words"),
+    [
+        (ModelError, lambda graph, x, fixes: fixes.add(0.1, np.zeros(3)), r"need values \(2,\), found \(3,\)"),
         (
-            np.array(["2026-01-01"], dtype="M8[D]"),
-            np.zeros((1, 2)),
+            ModelError,
+            lambda graph, x, fixes: fixes.add(np.zeros(3), np.zeros((2, 2))),
+            r"need values \(3, 2\), found \(2, 2\)",
+        ),
+        (
+            fg.GraphError,
+            lambda graph, x, fixes: fixes.add(np.zeros(3), np.ma.masked_array(np.zeros((3, 2)), [3 * [True]] * 2)),
+            "'fixes': values is a masked array",
+        ),
+        (
+            fg.GraphError,
+            lambda graph, x, fixes: fixes.add(np.array(["2026-01-01"], dtype="M8[D]"), np.zeros((1, 2))),
             "'fixes': stamps must be real numbers, found dates",
         ),
-        ([0.1], [["1", "2"]], "'fixes': values must be real numbers, found text"),
-    ):
-        with pytest.raises(fg.GraphError, match=words):
-            fixes.add(stamps, values)
+        (
+            fg.GraphError,
+            lambda graph, x, fixes: fixes.add([0.1], [["1", "2"]]),
+            "'fixes': values must be real numbers, found text",
+        ),
+        (ModelError, lambda graph, x, fixes: fixes.at(graph, TIMES[:4]), "5 finite, increasing numbers"),
+        (ModelError, lambda graph, x, fixes: fixes.at(graph, TIMES[::-1]), "5 finite, increasing numbers"),
+        (ModelError, lambda graph, x, fixes: fixes.at(graph, np.zeros(5)), "5 finite, increasing numbers"),
+        (
+            ModelError,
+            lambda graph, x, fixes: fixes.at(graph, [0.0, 0.1, np.nan, 0.3, 0.4]),
+            "5 finite, increasing numbers",
+        ),
+        (ModelError, lambda graph, x, fixes: fixes.at(graph, TIMES, offset=np.nan), "finite, increasing"),
+        (fg.GraphError, lambda graph, x, fixes: sensor(name="stamped").at(graph, TIMES), "stamped"),
+        (ModelError, lambda graph, x, fixes: sensor(offset="x").state(graph, x[0]), "two nodes or more"),
+        (ModelError, lambda graph, x, fixes: sensor(offset="x").state(graph, x), r"one variable on Rn\(1\)"),
+        (ModelError, lambda graph, x, fixes: sensor(0), "must be at least 1"),
+        (ModelError, lambda graph, x, fixes: sensor(capacity=0), "must be at least 1"),
+    ],
+)
+def test_shapes_and_times_are_checked(kind: type[Exception], act: Any, words: str) -> None:
+    graph, x, fixes = window()
+    with pytest.raises(kind, match=words):
+        act(graph, x, fixes)
     assert fixes.counts == Counts()
-    for times in (TIMES[:4], TIMES[::-1], np.zeros(5), [0.0, 0.1, np.nan, 0.3, 0.4]):
-        with pytest.raises(ModelError, match="5 finite, increasing numbers"):
-            fixes.at(graph, times)
-    with pytest.raises(ModelError, match="finite, increasing"):
-        fixes.at(graph, TIMES, offset=np.nan)
-    fresh = StampedMeasurements(place, 2, capacity=1, sigma=1.0, offset="x")
-    with pytest.raises(fg.GraphError, match="stamped"):
-        fresh.at(graph, TIMES)
-    with pytest.raises(ModelError, match="two nodes or more"):
-        fresh.state(graph, x[0])
-    with pytest.raises(ModelError, match=r"one variable on Rn\(1\)"):
-        fresh.state(graph, x)
-    for size, capacity in ((0, 1), (1, 0)):
-        with pytest.raises(ModelError, match="must be at least 1"):
-            StampedMeasurements(place, size, capacity=capacity, sigma=1.0)
-    ranges = StampedMeasurements(place, 1, capacity=2, sigma=1.0, name="ranges")
-    ranges.add([0.1, 0.2], [1.0, 2.0])  # single numbers need no second axis
+
+
+def test_single_numbers_need_no_second_axis() -> None:
+    graph, x, _ = window()
+    ranges = sensor(1, capacity=2, name="ranges")
+    ranges.add([0.1, 0.2], [1.0, 2.0])
     ranges.add(0.3, 3.0)
     ranges.state(graph, x)
     ranges.at(graph, TIMES)
