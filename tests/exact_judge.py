@@ -269,8 +269,7 @@ class Judge:
 
     def _outside(self, rows: Array) -> Array:
         """(M,) signed distances to the limits, positive above the upper ones."""
-        outside: Array = np.maximum(rows - self.upper, 0.0) - np.maximum(self.lower - rows, 0.0)
-        return outside
+        return np.asarray(np.maximum(rows - self.upper, 0.0) - np.maximum(self.lower - rows, 0.0))
 
     def _stages(self) -> tuple[IntArray, IntArray] | None:
         """Order of coordinates and rows by stages x_0 u_0 x_1 ...; None unless there are just states and controls."""

@@ -83,8 +83,7 @@ def exponentials(matrices: Array) -> Array:
     """Return ``expm`` of (..., k, k) matrices; SciPy refuses empty batches on some versions."""
     if matrices.size == 0:
         return np.zeros_like(matrices)
-    result: Array = expm(matrices)
-    return result
+    return np.asarray(expm(matrices))
 
 
 def integrated(generators: Array, exponential: Callable[[Array], Any] = exponentials) -> Any:
@@ -98,8 +97,7 @@ def integrated(generators: Array, exponential: Callable[[Array], Any] = exponent
 
 def times(matrices: Array, vectors: Array) -> Array:
     """Return matrix times vector over any batch."""
-    product: Array = (matrices @ vectors[..., None])[..., 0]
-    return product
+    return np.asarray((matrices @ vectors[..., None])[..., 0])
 
 
 def assert_close(actual: Array, desired: Array, tolerance: float = ALGEBRA) -> None:

@@ -24,8 +24,7 @@ class Carried:
         return u + moved
 
     def after(self, x: Array, u: Array, w: Array, time: float) -> Array:
-        moved: Array = self.group.compose(self.group.exp(time * w), self.group.retract(x, time * u))
-        return moved
+        return np.asarray(self.group.compose(self.group.exp(time * w), self.group.retract(x, time * u)))
 
 
 def drag_and_thrust(x: Array, u: Array) -> Array:

@@ -64,8 +64,7 @@ class SphereManifold(fg.ManifoldBase):
 
     def random(self, rng: Generator, /, shape: Batch = ()) -> Array:
         x = rng.standard_normal((*shape, 3))
-        unit: Array = x / np.linalg.norm(x, axis=-1, keepdims=True)
-        return unit
+        return np.asarray(x / np.linalg.norm(x, axis=-1, keepdims=True))
 
     def is_valid(self, x: ArrayLike, /) -> BoolArray:
         return np.asarray(np.abs(np.linalg.norm(x, axis=-1) - 1.0) < 1e-9)
@@ -87,20 +86,17 @@ class Sphere:
     def retract(self, x: Array, d: Array) -> Array:
         step = (self._basis(x) @ d[..., None])[..., 0]
         angle = np.linalg.norm(d, axis=-1, keepdims=True)
-        moved: Array = np.cos(angle) * x + np.sinc(angle / np.pi) * step
-        return moved
+        return np.asarray(np.cos(angle) * x + np.sinc(angle / np.pi) * step)
 
     def local(self, x: Array, y: Array) -> Array:
         across = (np.swapaxes(self._basis(x), -1, -2) @ y[..., None])[..., 0]
         sine = np.linalg.norm(across, axis=-1, keepdims=True)
         angle = np.arctan2(sine, (x * y).sum(axis=-1, keepdims=True))
-        step: Array = across / np.sinc(angle / np.pi)
-        return step
+        return np.asarray(across / np.sinc(angle / np.pi))
 
     def random(self, rng: Generator, shape: Batch = ()) -> Array:
         x = rng.standard_normal((*shape, 3))
-        unit: Array = x / np.linalg.norm(x, axis=-1, keepdims=True)
-        return unit
+        return np.asarray(x / np.linalg.norm(x, axis=-1, keepdims=True))
 
     def is_valid(self, x: Array) -> BoolArray:
         return np.asarray(np.abs(np.linalg.norm(x, axis=-1) - 1.0) < 1e-9)

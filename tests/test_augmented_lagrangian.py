@@ -389,8 +389,7 @@ def test_a_trace_that_is_given_up_between_two_solves_is_left_to_python() -> None
     def own(v: Array) -> Array:
         if factor[0] > 2.0:
             return np.array([[factor[0] * float(row[0]) - 1.0] for row in v])
-        found: Array = factor[0] * v[:, :1] - 1.0
-        return found
+        return np.asarray(factor[0] * v[:, :1] - 1.0)
 
     graph, x = graph_with(fg.Rn(2))
     graph.minimize(own, x, name="own")

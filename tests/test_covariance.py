@@ -24,8 +24,7 @@ def dense(solution: fg.Solution, unit: Array) -> Array:
     H = upper + upper.T - np.diag(upper.diagonal())
     A, H = A * unit, H * np.outer(unit, unit)
     Z = null_space(A / np.linalg.norm(A, axis=1)[:, None])
-    covariance: Array = Z @ np.linalg.solve(Z.T @ H @ Z, Z.T)
-    return covariance
+    return np.asarray(Z @ np.linalg.solve(Z.T @ H @ Z, Z.T))
 
 
 @pytest.mark.parametrize("noise", [1.0, 1e-3])

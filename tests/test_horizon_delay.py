@@ -18,8 +18,7 @@ LIMITS = np.array([-1.0, -1.5]), np.array([1.0, 1.5])
 
 
 def advance(x: Array, u: Array) -> Array:
-    moved: Array = unicycle.step(x[None], u[None], H)[0]
-    return moved
+    return np.asarray(unicycle.step(x[None], u[None], H)[0])
 
 
 CAR = Robot(fg.SE2, fg.Rn(2), predict=advance)

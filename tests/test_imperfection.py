@@ -83,8 +83,7 @@ def moved_by(given: OccupancyMap, true: OccupancyMap) -> Array:
     field = maps.field(true)
     rows, columns = np.nonzero(given.occupied)
     middles = np.column_stack([columns, rows]).astype(np.float64) + 0.5
-    inside: Array = field.distance(given.grid_to_world(middles))
-    return inside
+    return np.asarray(field.distance(given.grid_to_world(middles)))
 
 
 def test_walls_stand_a_little_elsewhere() -> None:

@@ -54,8 +54,7 @@ FLIGHT = (
 
 @cache
 def flown() -> Array:
-    end: Array = rkmk.rollout(FLYER, drag_and_thrust, *FLIGHT, h=0.4, count=1, substeps=512)[-1]
-    return end
+    return np.asarray(rkmk.rollout(FLYER, drag_and_thrust, *FLIGHT, h=0.4, count=1, substeps=512)[-1])
 
 
 @EVERY_METHOD

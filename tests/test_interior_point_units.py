@@ -91,8 +91,7 @@ def test_the_judge_agrees_on_rows_that_were_scaled() -> None:
 
 def apart(p: Array, q: Array) -> Array:
     """(n, 1) distances of poses from points."""
-    lengths: Array = np.linalg.norm(p[:, :2] - q, axis=1, keepdims=True)
-    return lengths
+    return np.asarray(np.linalg.norm(p[:, :2] - q, axis=1, keepdims=True))
 
 
 class Pillar:

@@ -24,8 +24,7 @@ BACKENDS = [GaussNewton(), LevenbergMarquardt(), DogLeg(), SQP(), InteriorPoint(
 
 
 def distance(p: Array, q: Array) -> Array:
-    lengths: Array = np.linalg.norm(p - q, axis=1)[:, None]
-    return lengths
+    return np.asarray(np.linalg.norm(p - q, axis=1)[:, None])
 
 
 def opaque(p: Array, q: Array) -> Array:

@@ -22,22 +22,19 @@ Function = Callable[[Array, Array, Array], Array]
 
 def distances(x: Array, c: Array, r: Array) -> Array:
     offset = x[:, None, :2] - c
-    found: Array = np.sqrt(np.sum(offset * offset, axis=-1)) - r
-    return found
+    return np.asarray(np.sqrt(np.sum(offset * offset, axis=-1)) - r)
 
 
 def softest(x: Array, c: Array, r: Array) -> Array:
     """A sum of sums: weights that add up to one."""
     weight = np.exp(-distances(x, c, r))
-    found: Array = weight / weight.sum(axis=1, keepdims=True)
-    return found
+    return np.asarray(weight / weight.sum(axis=1, keepdims=True))
 
 
 def alternating(x: Array, c: Array, r: Array) -> Array:
     """Rows of two kinds in turn, with comparisons and functions of the C library."""
     offset = x[:, None, :2] - c
-    found: Array = np.where(offset > 0.3, np.sin(offset), np.abs(offset) * r[..., None]).reshape(len(x), -1)
-    return found
+    return np.asarray(np.where(offset > 0.3, np.sin(offset), np.abs(offset) * r[..., None]).reshape(len(x), -1))
 
 
 def mixed(x: Array, c: Array, r: Array) -> Array:

@@ -166,8 +166,7 @@ class Pillar(Term):
 
 
 def apart(x: Array, place: Array) -> Array:
-    found: Array = np.linalg.norm(x[:, :2] - place, axis=1, keepdims=True)
-    return found
+    return np.asarray(np.linalg.norm(x[:, :2] - place, axis=1, keepdims=True))
 
 
 @pytest.mark.parametrize("shared", [0.0, 1.0], ids=["independent", "moves with the robot"])

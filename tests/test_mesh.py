@@ -36,8 +36,7 @@ class Course:
 
 def clear(x: Array) -> Array:
     """(n, M) distances to the hull."""
-    distance: Array = disc_clearance(x, DISC, RADIUS)
-    return distance
+    return np.asarray(disc_clearance(x, DISC, RADIUS))
 
 
 def dense(robot: Robot, found: MeshPlan, pieces: int = 50) -> list[Array]:

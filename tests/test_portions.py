@@ -161,8 +161,7 @@ def boat(steps: int) -> tuple[RecedingHorizon, Robot]:
             return {"berth": [now.given, 0.0]}
 
     def predict(x: Array, u: Array, seconds: float) -> Array:
-        found: Array = -motion(x[None], u[None], np.zeros((1, 2)), np.full(1, seconds))[0]
-        return found
+        return np.asarray(-motion(x[None], u[None], np.zeros((1, 2)), np.full(1, seconds))[0])
 
     robot = Robot(fg.Rn(2), fg.Rn(1), predict=predict, tick=0.5)
     terms: list[Term] = [Dynamics(motion), Berth(), ControlCost(sigma=2.0)]

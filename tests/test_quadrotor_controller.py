@@ -51,8 +51,7 @@ def belief(present: Array, known: Landmarks | None = None, parameters: quadrotor
 
 def gaps(positions: Array, known: Landmarks) -> Array:
     """(n, K) from the vehicle's centre to surfaces."""
-    surfaces: Array = np.hypot(*np.moveaxis(positions[:, None, :2] - known.positions, 2, 0)) - known.radii
-    return surfaces
+    return np.asarray(np.hypot(*np.moveaxis(positions[:, None, :2] - known.positions, 2, 0)) - known.radii)
 
 
 # ---------------------------------------------------------------- ways and references

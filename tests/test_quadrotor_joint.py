@@ -117,8 +117,7 @@ def defects(plan: Plan, parameters: quadrotor.Parameters, dt: float) -> Array:
         along = np.einsum("nji,nj->ni", R, states[:, 7:])
         force = u[:, 3:] * R[:, :, 2] - np.einsum("nij,nj->ni", R, np.array(parameters.drag) * along)
         world = np.array([*parameters.wind, parameters.updraft - quadrotor.GRAVITY])
-        total: Array = force / parameters.mass + world
-        return total
+        return np.asarray(force / parameters.mass + world)
 
     turned = SO3.log(SO3.compose(SO3.inverse(x[:, 3:7]), y[:, 3:7]))
     moved = y[:, :3] - x[:, :3] - 0.5 * dt * (x[:, 7:] + y[:, 7:])

@@ -31,8 +31,7 @@ def flown(ticks: int, tick: float) -> tuple[Array, Array]:
 def missed(before: Array, after: Array, h: float, gust: Array) -> Array:
     loops = quadrotor_loops.held(LOOPS.gain, LOOPS.lag, [h])
     given = np.array([[HEAVY.mass]]), np.array([HEAVY.drag]), gust[None]
-    wrong: Array = quadrotor_loops.defect(before[None], TOLD[None], *given, after[None], np.array([h]), loops)[0]
-    return wrong
+    return np.asarray(quadrotor_loops.defect(before[None], TOLD[None], *given, after[None], np.array([h]), loops)[0])
 
 
 @pytest.mark.parametrize("h", [0.01, 0.05])

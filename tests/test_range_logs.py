@@ -53,8 +53,7 @@ def made(log: RangeLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def apart(poses: Array, truth: Array) -> Array:
-    found: Array = np.hypot(*(poses - truth)[:, :2].T)
-    return found
+    return np.asarray(np.hypot(*(poses - truth)[:, :2].T))
 
 
 # ---------------------------------------------------------------- readers

@@ -51,14 +51,12 @@ def test_the_positive_part_is_that_of_the_eigenvalues(n: int) -> None:
 def inverse_distance(place: Array, mark: Array, weight: Array) -> Array:
     """(n,) weight over distance: saddles everywhere."""
     offset = place - mark
-    value: Array = weight[:, 0] / np.sqrt((offset**2).sum(axis=1))
-    return value
+    return np.asarray(weight[:, 0] / np.sqrt((offset**2).sum(axis=1)))
 
 
 def saddle(pose: Array, shared: Array) -> Array:
     """(n,) of a pose and a number that all factors share."""
-    value: Array = np.cos(pose[:, 2]) * pose[:, 0] * shared[:, 0] + pose[:, 1] ** 2 * shared[:, 0]
-    return value
+    return np.asarray(np.cos(pose[:, 2]) * pose[:, 0] * shared[:, 0] + pose[:, 1] ** 2 * shared[:, 0])
 
 
 def repelled(derivatives: Derivatives) -> tuple[fg.Graph, dict[fg.Family, Array]]:

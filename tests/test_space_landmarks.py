@@ -19,8 +19,7 @@ MOUNT = SE3.from_parts([0.3, -0.2, 0.1], SO3.from_rpy(0.4, -1.2, 2.0))
 
 def unit(rng: Generator, count: int) -> Array:
     x = rng.standard_normal((count, 3))
-    found: Array = x / np.linalg.norm(x, axis=1, keepdims=True)
-    return found
+    return np.asarray(x / np.linalg.norm(x, axis=1, keepdims=True))
 
 
 def test_gtsam_agrees(rng: Generator) -> None:

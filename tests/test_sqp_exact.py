@@ -37,8 +37,7 @@ def two_rotations() -> tuple[fg.Graph, Guess]:
     graph.constrain(lambda q: fg.SO3.matrix(q)[:, 2, :2], r[0], lower=[0.6, 0.3], upper=[0.6, 0.3], name="axis")
 
     def cosine(p: Array, q: Array) -> Array:
-        cosines: Array = np.einsum("ni,ni->n", fg.SO3.matrix(p)[:, :, 0], fg.SO3.matrix(q)[:, :, 0])[:, None]
-        return cosines
+        return np.asarray(np.einsum("ni,ni->n", fg.SO3.matrix(p)[:, :, 0], fg.SO3.matrix(q)[:, :, 0])[:, None])
 
     graph.constrain(cosine, r[0], r[1], lower=0.2, upper=0.2, name="angle")
     return graph, {r: fg.SO3.exp(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.7]]))}

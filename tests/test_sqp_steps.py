@@ -103,8 +103,7 @@ def test_positions_in_small_units_beside_headings_are_scaled() -> None:
         a, b = a * unit, b * unit
         heading = a[:, 2] + 0.1 * u[:, 1]
         along = np.stack([u[:, 0] * np.cos(heading), u[:, 0] * np.sin(heading), u[:, 1]], axis=1)
-        gap: Array = b - a - 0.2 * along
-        return gap
+        return np.asarray(b - a - 0.2 * along)
 
     graph, x, u = graph_of(("x", fg.Rn(3), 9), ("u", fg.Rn(2), 8))
     graph.fix(x[0], np.zeros(3))

@@ -24,8 +24,7 @@ SLOPE, ROWS = RNG.standard_normal((STATES, STATES + CONTROLS)), RNG.standard_nor
 
 def straight(x: Array, u: Array, after: Array) -> Array:
     """A linear system of 27 columns."""
-    apart: Array = after - np.einsum("ab,nb->na", SLOPE, np.hstack([x, u]))
-    return apart
+    return np.asarray(after - np.einsum("ab,nb->na", SLOPE, np.hstack([x, u])))
 
 
 def bent(x: Array, u: Array, after: Array) -> Array:

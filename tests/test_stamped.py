@@ -348,8 +348,7 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
     beacon = drive(1.0)[:2] + np.array([3.0, 2.0])
 
     def gap(x: Array, z: Array) -> Array:
-        found: Array = np.linalg.norm(x[:, :2] - beacon, axis=1, keepdims=True) - z
-        return found
+        return np.asarray(np.linalg.norm(x[:, :2] - beacon, axis=1, keepdims=True) - z)
 
     step, count = 0.1, 6
     readings: list[tuple[float, str, float, Array]] = []  # arrival, sensor, stamp, value

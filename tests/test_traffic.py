@@ -136,8 +136,7 @@ def test_a_map_of_half_a_kilometre_is_read(monkeypatch: pytest.MonkeyPatch, tmp_
 def test_obstacles_may_be_other_than_the_robot_expects() -> None:
     def radii(between: tuple[float, float]) -> Array:
         settings = NavigationSettings(obstacles=6, seed=2, obstacle_radius=between)
-        radius: Array = Episode(settings, rehearsal=True).world.discs()[:, 2]
-        return radius
+        return np.asarray(Episode(settings, rehearsal=True).world.discs()[:, 2])
 
     assert 0.15 <= radii((0.15, 0.25)).min() and radii((0.15, 0.25)).max() <= 0.25
     assert 0.08 <= radii((0.08, 0.1)).min() and radii((0.08, 0.1)).max() <= 0.1

@@ -44,8 +44,7 @@ def drive(
         a, u, b = a * state, u * input_, b * state
         heading = a[:, 2] + 0.5 * DT * u[:, 1]
         along = np.stack([u[:, 0] * np.cos(heading), u[:, 0] * np.sin(heading), u[:, 1]], axis=1)
-        gap: Array = dynamics * (b - a - DT * along)
-        return gap
+        return np.asarray(dynamics * (b - a - DT * along))
 
     def motion_slopes(a: Array, u: Array, b: Array) -> list[Array]:
         a, u = a * state, u * input_
@@ -61,8 +60,7 @@ def drive(
 
     def room(a: Array) -> Array:
         squared: Array = ((a[:, :2] * position - CENTRE) ** 2).sum(axis=1, keepdims=True)
-        inside: Array = clearance * (squared - radius**2)
-        return inside
+        return np.asarray(clearance * (squared - radius**2))
 
     def room_slope(a: Array) -> list[Array]:
         slope = np.zeros((len(a), 1, 3))
@@ -74,8 +72,7 @@ def drive(
     pull, effort, change = cost * np.diag(state / SIGMA), cost * np.diag(input_ / 2.0), cost * np.diag(input_)
 
     def tracking(a: Array) -> Array:
-        apart: Array = a @ pull - cost * GOAL / SIGMA
-        return apart
+        return np.asarray(a @ pull - cost * GOAL / SIGMA)
 
     graph.minimize(fg.residual(tracking, jacobian=lambda a: [np.tile(pull, (len(a), 1, 1))]), x[-1], name="goal")
     graph.minimize(fg.residual(lambda a: a @ effort, jacobian=lambda a: [np.tile(effort, (len(a), 1, 1))]), u)

@@ -45,8 +45,7 @@ def figure_eight(t: Array) -> tuple[Array, Array]:
 def gust(now: float) -> Array:
     """(6,) what the air does to rates [rad/s] and accelerations [m/s^2] at a time."""
     k = np.arange(6)
-    push: Array = np.repeat([0.05, 0.5], 3) * np.sin((1.3 + 0.37 * k) * 7.0 * now + k)
-    return push
+    return np.asarray(np.repeat([0.05, 0.5], 3) * np.sin((1.3 + 0.37 * k) * 7.0 * now + k))
 
 
 def field_of(x: Array, u: Array) -> Array:

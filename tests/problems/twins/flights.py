@@ -139,8 +139,7 @@ def slew(seed: int, equalities_only: bool = False) -> Twin:
         return 2 * error[0] * error[1:]
 
     def towards_sun(q: Array) -> Array:
-        cosine: Array = (fg.SO3.act(q, camera) * sun).sum(axis=1, keepdims=True)
-        return cosine
+        return np.asarray((fg.SO3.act(q, camera) * sun).sum(axis=1, keepdims=True))
 
     def towards_sun_exact(q: Any) -> Any:
         # First column of the rotation matrix, as homogeneous polynomials of a unit quaternion.
@@ -178,8 +177,7 @@ def minimum_snap(seed: int, equalities_only: bool = False) -> Twin:
     def motion(x: Array, u: Array, after: Array) -> Array:
         parts = [*np.split(x, 4, axis=1), u]
         ahead = [sum(powers[j - k] * parts[j] for j in range(k, 5)) for k in range(4)]
-        apart: Array = after - np.hstack(ahead)
-        return apart
+        return np.asarray(after - np.hstack(ahead))
 
     def motion_exact(x: Any, u: Any, after: Any) -> Any:
         p, v, a, j = x[:3], x[3:6], x[6:9], x[9:]

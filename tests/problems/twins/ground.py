@@ -70,8 +70,7 @@ def hull_clearance_exact(x: Any, centres: Any) -> Any:
 
 def kerb_and_lane(x: Array) -> Array:
     """Height of the hull's first and last disc [m]."""
-    height: Array = x[:, 1:2] + np.sin(x[:, 2:3]) * DISCS[[0, 3]]
-    return height
+    return np.asarray(x[:, 1:2] + np.sin(x[:, 2:3]) * DISCS[[0, 3]])
 
 
 HULL_RESIDUAL = fg.residual(hull_clearance, rows=24)
