@@ -7,8 +7,8 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import drawn_to, graph_with
-from problems.known import STARTS, active_bounds, ecg2o, ecg2o_inequality, inactive_inequality, short_drive
+from problems.graphs import graph_with
+from problems.known import STARTS, active_bounds, ecg2o, ecg2o_inequality, inactive_inequality
 from unifg.solvers import Penalty
 
 
@@ -55,22 +55,6 @@ def test_a_light_last_weight_ends_without_the_claim() -> None:
     assert solution.violation == pytest.approx(0.01, rel=0.1)
     assert solution.worst == ("curve", 0)
     assert solution.dual("curve")[0, 0] == pytest.approx(-1.0, abs=0.1)
-
-
-def test_infeasible_problem_is_named() -> None:
-    graph, x = drawn_to([0.0])
-    graph.bound(x, lower=2.0, name="above")
-    graph.constrain(lambda p: p, x, upper=1.0, name="below")
-    solution = Penalty().solve(graph, {x: np.zeros((1, 1))})
-    assert solution.status is fg.Status.LOCALLY_INFEASIBLE, solution.report()
-    assert solution.violation == pytest.approx(1.0, abs=1e-6)  # bounds are kept
-    assert solution.worst == ("below", 0)
-
-
-def test_limits_of_the_loop() -> None:
-    graph, guess = short_drive()
-    assert Penalty(max_iterations=2).solve(graph, guess).status is fg.Status.ITERATION_LIMIT
-    assert Penalty(time_limit=0.0).solve(graph, guess).status is fg.Status.TIME_LIMIT
 
 
 def test_a_scalar_cost_is_refused() -> None:
