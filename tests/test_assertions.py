@@ -10,7 +10,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import unifg as fg
 from asserting import below, decides, edge, nested, newton, perhaps, spread
-from problems.graphs import graph_with
+from problems.graphs import graph_with, smoother_with
 from test_derive import curved, evaluated
 from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.rates import rate
@@ -258,8 +258,7 @@ def test_what_is_asserted_of_the_batch_as_a_whole_is_left_to_python() -> None:
 
 @pytest.mark.product(1, of="studies")
 def test_smoothers_leave_functions_that_assert_to_python() -> None:
-    smoother = fg.Incremental()
-    x = smoother.variables("x", fg.Rn(1))
+    smoother, x = smoother_with(fg.Incremental(), fg.Rn(1))
     smoother.minimize(below, x[0], sigma=1.0, name="own")
     smoother.minimize(fg.prior, x[0], [4.0], sigma=0.1, name="pull")
     with pytest.raises(AssertionError, match="too far"):

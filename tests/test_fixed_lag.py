@@ -10,6 +10,7 @@ import pytest
 
 import unifg as fg
 from dense import Batch, Model, drive, one_by_one, state
+from problems.graphs import smoother_with
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.smoothing import FixedLag, Incremental
@@ -87,8 +88,7 @@ def test_a_loop_beyond_the_first_guess(fixed_points: bool) -> None:
 def test_a_prior_is_rewritten_when_a_point_moves(group: Any) -> None:
     """H and g in steps from the new point are those of d(d') = Log(Exp(e) Exp(d')), differentiated numerically."""
     rng, d = np.random.default_rng(1), group.dim
-    smoother = FixedLag(3)
-    x = smoother.variables("x", group)
+    smoother, x = smoother_with(FixedLag(3), group)
     smoother.minimize(fg.prior, x[0], group.random(rng), sigma=0.5)
     for i, j in ((0, 1), (0, 2), (1, 2), (0, 3), (2, 3)):
         smoother.minimize(fg.between, x[i], x[j], group.random(rng), sigma=rng.uniform(0.2, 1.0, d))
@@ -124,8 +124,7 @@ def test_a_prior_is_rewritten_when_a_point_moves(group: Any) -> None:
 
 def test_memory_and_tables_stay_as_they_are() -> None:
     rng = np.random.default_rng(0)
-    smoother = FixedLag(6, late="drop")
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(FixedLag(6, late="drop"), fg.SE2)
     ends: list[IntArray] = []
     for k, statements in enumerate(drive(fg.SE2, rng, 900)):
         state(smoother, x, statements)
@@ -160,8 +159,7 @@ def test_kept_landmarks_collect_their_priors() -> None:
 
 
 def test_a_lag_in_seconds() -> None:
-    smoother = FixedLag(seconds=1.0)
-    x = smoother.variables("x", fg.Rn(1))
+    smoother, x = smoother_with(FixedLag(seconds=1.0), fg.Rn(1))
     for k, time in enumerate([0.0, 0.3, 0.9, 1.0, 1.95, 4.0]):
         smoother.minimize(fg.prior, x[k], [float(k)], sigma=1.0)
         effort = smoother.update({x: [0.0]}, time=time)
@@ -174,8 +172,7 @@ def test_a_lag_in_seconds() -> None:
 
 def test_late_factors_are_refused_or_counted() -> None:
     for late in ("refuse", "drop"):
-        smoother = FixedLag(2, late=late)
-        x = smoother.variables("x", fg.Rn(1))
+        smoother, x = smoother_with(FixedLag(2, late=late), fg.Rn(1))
         smoother.minimize(fg.prior, x[[0, 1, 2]], [0.0], sigma=1.0)
         smoother.update({x: np.zeros((3, 1))})
         smoother.minimize(fg.between, x[[0, 1, 2]], x[3], [1.0], sigma=1.0)
@@ -232,8 +229,7 @@ def test_a_variable_may_be_older_than_the_newest() -> None:
 def test_manhattan_3500_in_a_window(shared_data: Path) -> None:
     """Relative poses inside the window agree with the optimum of the whole graph where the window saw its loops."""
     graph = read_g2o(shared_data / "pose_graphs" / "M3500.g2o.gz")
-    smoother = FixedLag(50, late="drop")
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(FixedLag(50, late="drop"), fg.SE2)
     steps = []
     for k, (pose, edges) in enumerate(one_by_one(graph)):
         if k == 0:

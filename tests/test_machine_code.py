@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_with, smoother_with
 from unifg.codegen import native, objects
 from unifg.codegen.native import Native
 from unifg.codegen.objects import SWITCH, Objects
@@ -251,8 +251,7 @@ def test_the_graph_goes_while_another_thread_solves() -> None:
 
 @pytest.mark.parametrize("copied", COPIES)
 def test_copies_of_smoothers_run_code_of_their_own(copied: Function) -> None:
-    smoother = Incremental(relinearize=0.0)
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(relinearize=0.0), fg.SE2)
     smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
     smoother.minimize(stepped, x[0], x[1], np.ones(3), sigma=0.1)
     smoother.update({x: np.zeros((2, 3))})

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import smoother_with
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o
 from unifg.pose_graphs import manhattan
@@ -57,8 +58,7 @@ def with_wrong(edges: Edges, rng: np.random.Generator, groups: int, size: int) -
 
 def driven(edges: Edges, closures: Any, revocable: float | None = C) -> Incremental:
     """Smoother that took in odometry and those closures; initial guesses follow the odometry."""
-    smoother = Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(), fg.SE2)
     smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=1e-3)
     smoother.update({x: np.zeros(3)})
     for k, odometry, found in steps(edges):
@@ -111,8 +111,7 @@ def test_wrong_closures_of_a_city(shared_data: Path, size: int) -> None:
 
 def loop(length: int = 20) -> tuple[Incremental, Any]:
     """A smoother of a straight drive whose heading is worse than its way."""
-    smoother = Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(), fg.SE2)
     smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=1e-3)
     for k in range(1, length):
         smoother.minimize(fg.between, x[k - 1], x[k], STEP, sigma=SIGMA)
@@ -216,8 +215,7 @@ def test_what_is_stated_as_always_counting_is_as_it_was() -> None:
 
 
 def test_one_that_came_with_a_failing_update_is_judged_by_the_next() -> None:
-    smoother = Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(), fg.SE2)
     smoother.minimize(fg.between, x[0], x[1], STEP, sigma=SIGMA)
     smoother.minimize(fg.between, x[0], x[1], STEP + 0.05, sigma=SIGMA, revocable=C)
     with pytest.raises(GraphError, match="not determined"):

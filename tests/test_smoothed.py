@@ -12,6 +12,7 @@ import pytest
 
 import unifg as fg
 from problems.closures import aliased
+from problems.graphs import smoother_with
 from unifg.errors import GraphError
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.pose_graphs import PoseGraph, Sightings, bearing_range, from_smoother, judge, manhattan, sighting, sphere
@@ -22,8 +23,7 @@ from unifg.typing import Array, BoolArray
 def grown(made: PoseGraph, revocable: float | None = None) -> fg.Incremental:
     """Smoother that took in the edges of a graph by the later of their poses."""
     edges, group = made.edges, made.group
-    smoother = fg.Incremental()
-    x = smoother.variables("x", group)
+    smoother, x = smoother_with(fg.Incremental(), group)
     smoother.minimize(fg.prior, x[0], made.poses[0], sigma=1e-3)
     smoother.update({x: made.poses[0]})
     late = np.maximum(edges.first, edges.second)

@@ -14,6 +14,7 @@ import pytest
 import unifg as fg
 from dense import seen_once
 from own_manifolds import Sphere
+from problems.graphs import smoother_with
 from unifg.errors import GraphError
 from unifg.models.avoidance import landmark_clearance
 from unifg.smoothing import FixedLag, Incremental
@@ -40,8 +41,7 @@ def seen(pose: Array, point: Array, measured: Any) -> Array:
     """A point in the frame of the pose, batched."""
     c, s = np.cos(pose[:, 2]), np.sin(pose[:, 2])
     dx, dy = point[:, 0] - pose[:, 0], point[:, 1] - pose[:, 1]
-    r: Array = np.stack([c * dx + s * dy, c * dy - s * dx], axis=1) - measured
-    return r
+    return np.asarray(np.stack([c * dx + s * dy, c * dy - s * dx], axis=1) - measured)
 
 
 def seen_jacobian(pose: Array, point: Array, measured: Any) -> list[Array]:
@@ -345,8 +345,7 @@ def test_one_variable_is_seen_by_all_factors_of_a_statement(kind: str) -> None:
 
 
 def test_a_statement_without_active_factors_states_nothing() -> None:
-    smoother = Incremental()
-    x = smoother.variables("x", fg.Rn(2))
+    smoother, x = smoother_with(Incremental(), fg.Rn(2))
     smoother.minimize(fg.prior, x[np.arange(2)], fg.each(np.eye(2)), sigma=fg.each(np.ones((2, 2))))
     for limit in (None, 3.0):
         smoother.minimize(fg.prior, x[np.arange(2)], np.ones(2), active=np.zeros(2, dtype=bool), revocable=limit)
@@ -412,8 +411,7 @@ def test_a_function_in_python_that_reads_something_else_later_is_named(
 
 @pytest.mark.parametrize("method", ["constrain", "bound", "fix", "minimize_scalar"])
 def test_what_is_no_least_squares_is_refused(method: str) -> None:
-    smoother = FixedLag(3)
-    x = smoother.variables("x", fg.Rn(1))
+    smoother, x = smoother_with(FixedLag(3), fg.Rn(1))
     with pytest.raises(GraphError, match=rf"FixedLag\.{method}: .* or solve the whole as a fg\.Graph"):
         getattr(smoother, method)(x[0])
 
@@ -439,15 +437,13 @@ def test_the_second_of_a_kind_says_what_the_first_would_have_said(kind: str) -> 
     """Stated one by one, or each by a smoother that sees its kind for the first time: the same numbers."""
     function, numbers, options = kinds()[kind]
     rng, staged = np.random.default_rng(0), []
-    smoother = Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(), fg.SE2)
     for k in range(3):
         given = tuple(number + 0.1 * rng.standard_normal(number.shape) for number in numbers)
         weight = {
             name: value * (1.0 + k) if name in ("sigma", "information") else value for name, value in options.items()
         }
-        fresh = Incremental()
-        y = fresh.variables("x", fg.SE2)
+        fresh, y = smoother_with(Incremental(), fg.SE2)
         smoother.minimize(function, x[k], x[k + 1], *given, **weight)
         fresh.minimize(function, y[k], y[k + 1], *given, **weight)
         staged.append((smoother._staged[-1], fresh._staged[-1]))
@@ -477,8 +473,7 @@ def test_the_second_of_a_kind_says_what_the_first_would_have_said(kind: str) -> 
 def test_the_second_of_a_kind_is_refused_as_the_first(
     numbers: tuple[Any, ...], options: dict[str, Any], words: str
 ) -> None:
-    smoother = Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(), fg.SE2)
     for weight in ({"sigma": 0.1}, {"sigma": np.full(3, 0.1)}, {"information": np.eye(3)}):
         for k in range(2):
             smoother.minimize(fg.between, x[k], x[k + 1], STEP, **weight)
@@ -488,8 +483,7 @@ def test_the_second_of_a_kind_is_refused_as_the_first(
 
 
 def test_singular_information_counts_also_the_second_time() -> None:
-    smoother = Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(), fg.SE2)
     for information in (np.eye(3), np.diag([1.0, 0.0, 1.0])):
         smoother.minimize(fg.between, x[0], x[1], STEP, information=information)
     np.testing.assert_allclose(smoother._staged[1].data[0, 3:].reshape(3, 3) ** 2, np.diag([1.0, 0.0, 1.0]), atol=1e-15)
@@ -503,8 +497,7 @@ def test_kinds_differ_by_family_component_and_what_a_function_reaches() -> None:
     reached = np.array([1.0, 2.0, 3.0])
 
     def own(a: Array, b: Array) -> Array:
-        r: Array = b - a - reached
-        return r
+        return np.asarray(b - a - reached)
 
     for _ in range(2):
         for ends in ((x[0], x[1]), (x[0], y[1]), (pair[0].a, pair[1].a), (pair[0].a, pair[1].b)):
@@ -525,8 +518,7 @@ def test_kinds_differ_by_family_component_and_what_a_function_reaches() -> None:
 
 
 def test_a_copy_states_its_own_factors() -> None:
-    smoother = Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(), fg.SE2)
     smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
     smoother.minimize(fg.between, x[0], x[1], STEP, sigma=0.1)
     smoother.update({x: np.zeros((2, 3))})
@@ -540,8 +532,7 @@ def test_a_copy_states_its_own_factors() -> None:
 
 
 def test_finite_measurements_whose_sum_is_none_are_taken() -> None:
-    smoother = fg.Incremental()
-    x = smoother.variables("x", fg.Rn(2))
+    smoother, x = smoother_with(fg.Incremental(), fg.Rn(2))
     for _ in range(2):
         smoother.minimize(fg.prior, x[0], np.array([1e308, 1.5e308]), sigma=1e300)
     smoother.minimize(fg.prior, x[0], np.zeros(2), sigma=1e300)

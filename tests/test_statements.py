@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import drawn_to, graph_of, graph_with
+from problems.graphs import drawn_to, graph_of, graph_with, smoother_with
 from problems.known import line, short_drive
 from unifg.models import obstacles, unicycle
 from unifg.solvers import SQP, GaussNewton, InteriorPoint, LevenbergMarquardt
@@ -222,8 +222,7 @@ def test_data_and_guesses_that_are_no_numbers_are_refused(wrong: Any) -> None:
 
 
 def test_smoothers_refuse_the_same_and_go_on() -> None:
-    smoother = fg.Incremental()
-    x = smoother.variables("x", fg.Rn(2))
+    smoother, x = smoother_with(fg.Incremental(), fg.Rn(2))
     for wrong, message in (("0.1", "real numbers"), (np.array([1j, 1j]), "complex"), ([0.1, -1.0], "found -1")):
         with pytest.raises(fg.GraphError, match=f"sigma.*{message}"):
             smoother.minimize(fg.prior, x[0], [1.0, 2.0], sigma=wrong, name="t")

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.graphs import graph_with
 from unifg.models import landmarks, obstacles, quadrotor, space_landmarks, unicycle
 from unifg.models.inertial import motion
 from unifg.solvers import LevenbergMarquardt
@@ -24,8 +25,7 @@ def plane(frame: str | None = "map", name: str = "x") -> tuple[fg.Graph, fg.Fami
 
 
 def flight() -> tuple[fg.Graph, fg.Family, fg.Family]:
-    graph = fg.Graph()
-    x = graph.variables("x", quadrotor.STATE, 3, units=FLYING, frame="map_T_body")
+    graph, x = graph_with(quadrotor.STATE, 3, units=FLYING, frame="map_T_body")
     return graph, x, graph.variables("u", quadrotor.CONTROL, 2, units="rad/s, rad/s, rad/s, N", frame="body")
 
 
@@ -76,8 +76,7 @@ def test_one_unit_holds_for_all_numbers_of_a_vector() -> None:
 
 
 def test_angles_of_vectors_may_count_turns(caplog: pytest.LogCaptureFixture) -> None:
-    graph = fg.Graph()
-    joint = graph.variables("joint", fg.Rn(1), 2, units="rad")
+    graph, joint = graph_with(fg.Rn(1), 2, "joint", units="rad")
     with caplog.at_level(logging.WARNING, "unifg"):
         graph.minimize(fg.prior, joint, [90.0])
     assert "more than two turns" in caplog.text
@@ -85,8 +84,7 @@ def test_angles_of_vectors_may_count_turns(caplog: pytest.LogCaptureFixture) -> 
 
 @pytest.mark.parametrize("declare", [fg.each, fg.shared])
 def test_quaternions_x_first_are_refused(declare: Callable[..., Any]) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 2, units="m, m, m, wxyz")
+    graph, x = graph_with(fg.SE3, 2, units="m, m, m, wxyz")
     text = said(lambda: graph.minimize(fg.prior, x, declare([TURNED] * 2, units="m, m, m, xyzw"), name="pose"))
     assert "'xyzw'" in text and "from_quaternion(rows, order='xyzw')" in text and "'pose'" in text
     right = fg.SE3.from_quaternion(np.array([TURNED] * 2), order="xyzw")
@@ -95,8 +93,7 @@ def test_quaternions_x_first_are_refused(declare: Callable[..., Any]) -> None:
 
 
 def test_quaternions_that_look_x_first_are_remarked(caplog: pytest.LogCaptureFixture) -> None:
-    graph = fg.Graph()
-    x = graph.variables("x", fg.SE3, 2, units="m, m, m, rad, rad, rad")
+    graph, x = graph_with(fg.SE3, 2, units="m, m, m, rad, rad, rad")
     y = graph.variables("y", fg.SE3, 2)
     with caplog.at_level(logging.WARNING, "unifg"):
         graph.minimize(fg.between, y[:1], y[1:], TURNED)
@@ -154,8 +151,7 @@ def test_frames_of_other_names_are_refused() -> None:
     ):
         text = said(add)
         assert "'odom'" in text and "expected 'map' (family 'x')" in text
-    limit = fg.Graph()
-    p = limit.variables("p", fg.Rn(2), 1, units="m, m", frame="map")
+    limit, p = graph_with(fg.Rn(2), 1, "p", units="m, m", frame="map")
     corner = limit.data("corner", [1.0, 1.0], units="mm, mm")
     assert "'mm'" in said(lambda: limit.bound(p, upper=corner))
 
@@ -169,8 +165,7 @@ def test_sigma_of_a_deviation_is_in_tangent_coordinates() -> None:
 
 
 def test_limits_of_angles_may_be_none_or_count_turns(caplog: pytest.LogCaptureFixture) -> None:
-    graph = fg.Graph()
-    wheel = graph.variables("wheel", fg.Rn(2), 2, units="m, rad")
+    graph, wheel = graph_with(fg.Rn(2), 2, "wheel", units="m, rad")
     graph.bound(wheel, lower=-np.inf, upper=[1.0, np.inf])
     assert not caplog.records
     graph.bound(wheel, upper=[1.0, 90.0])
@@ -238,12 +233,10 @@ def test_functions_of_ones_own_declare_what_they_take() -> None:
 
 def test_declarations_change_no_bit(caplog: pytest.LogCaptureFixture) -> None:
     def solved(**declared: str) -> Array:
-        graph = fg.Graph()
-        x = graph.variables("x", fg.SE2, 3, **declared)
+        graph, x = graph_with(fg.SE2, 3, **declared)
         graph.minimize(fg.prior, x[0], [0.0, 0.1, 0.2], sigma=0.1)
         graph.minimize(fg.between, x[:-1], x[1:], [1.0, 0.0, 0.3], sigma=[0.1, 0.1, 0.05])
-        found: Array = LevenbergMarquardt().solve(graph, {x: np.zeros((3, 3))})[x]
-        return found
+        return np.asarray(LevenbergMarquardt().solve(graph, {x: np.zeros((3, 3))})[x])
 
     with caplog.at_level(logging.WARNING, "unifg"):
         assert np.array_equal(solved(), solved(units="m, m, rad", frame="map"))

@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, overload
+from typing import Any, TypeVar, overload
 
 import unifg as fg
+from unifg.smoothing.families import GrowingFamily
+from unifg.smoothing.smoother import Smoother
 
 Members = tuple[str, fg.Manifold, int]
+AnySmoother = TypeVar("AnySmoother", bound=Smoother)
 
 
-def graph_with(manifold: fg.Manifold, count: int = 1, name: str = "x") -> tuple[fg.Graph, fg.Family]:
-    """An empty graph and its one family of variables."""
+def graph_with(manifold: fg.Manifold, count: int = 1, name: str = "x", **options: Any) -> tuple[fg.Graph, fg.Family]:
+    """An empty graph and its one family of variables; options are those of the family."""
     graph = fg.Graph()
-    return graph, graph.variables(name, manifold, count)
+    return graph, graph.variables(name, manifold, count, **options)
+
+
+def smoother_with(smoother: AnySmoother, manifold: fg.Manifold, name: str = "x") -> tuple[AnySmoother, GrowingFamily]:
+    """A smoother and its one family of variables."""
+    return smoother, smoother.variables(name, manifold)
 
 
 @overload
