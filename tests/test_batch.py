@@ -116,25 +116,42 @@ def test_an_infeasible_instance_has_its_own_status() -> None:
     assert not batch.converged
 
 
-def test_what_does_not_fit_is_refused() -> None:
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (
+            lambda run, guess, data, start: run.solve_many(guess, data={start: data[start][0]}),
+            r"data 'start' of many instances has shape \(3,\), expected \(K, 3\)",
+        ),
+        (
+            lambda run, guess, data, start: run.solve_many(guess, data={**data, start: data[start][:2]}),
+            r"is given for \d instances, others for \d",
+        ),
+        (
+            lambda run, guess, data, start: run.solve_many([guess] * 2, data=data),
+            "2 guesses are given for 3 instances",
+        ),
+        (lambda run, guess, data, start: run.solve_many(guess), "solve_many of what"),
+        (
+            lambda run, guess, data, start: run.solve_many(guess, data={start: [[1.0, 2.0, 3.0], [1.0]]}),
+            "data 'start' of many instances cannot be read as an array",
+        ),
+        (
+            lambda run, guess, data, start: run.solve_many(guess, data={start: "here"}),
+            "data 'start' of many instances must be real numbers, found 'here'",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused(ask: Any, message: str) -> None:
     stated, each = instances(Unicycle("straight", False, 20), 3)
     prepared, data = InteriorPoint().prepare(stated.graph), stacked(each)
     start = next(handle for handle in data if handle.name == "start")
-    with pytest.raises(fg.GraphError, match=r"data 'start' of many instances has shape \(3,\), expected \(K, 3\)"):
-        prepared.solve_many(stated.guess, data={start: each[0][start]})
-    with pytest.raises(fg.GraphError, match=r"is given for \d instances, others for \d"):
-        prepared.solve_many(stated.guess, data={**data, start: data[start][:2]})
-    with pytest.raises(fg.GraphError, match="2 guesses are given for 3 instances"):
-        prepared.solve_many([stated.guess] * 2, data=data)
-    with pytest.raises(fg.GraphError, match="solve_many of what"):
-        prepared.solve_many(stated.guess)
+    with pytest.raises(fg.GraphError, match=message):
+        ask(prepared, stated.guess, data, start)
     assert len(prepared.solve_many([])) == 0
-    for wrong, message in (
-        ([[1.0, 2.0, 3.0], [1.0]], "data 'start' of many instances cannot be read as an array"),
-        ("here", "data 'start' of many instances must be real numbers, found 'here'"),
-    ):
-        with pytest.raises(fg.GraphError, match=message):
-            prepared.solve_many(stated.guess, data={start: wrong})
+
+
+def test_a_single_number_is_no_datum_of_many_instances() -> None:
     graph, x = graph_with(fg.Rn(1), 1)
     number = graph.data("number", 1.0)
     graph.minimize(lambda p, at: p - at, x, number, name="there")

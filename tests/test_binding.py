@@ -112,23 +112,25 @@ def test_a_default_of_another_shape_is_refused() -> None:
         run.solve(stated.guess)
 
 
-def test_a_refused_datum_changes_nothing_and_is_named() -> None:
+@pytest.mark.parametrize(
+    ("bad", "words"),
+    [
+        (
+            lambda stated: {stated.start: [9.0, 9.0], stated.wanted: [[1.0, 2.0], [5.0, np.nan]]},
+            r"'wanted' contains NaN at \(1, 1\)",
+        ),
+        (lambda stated: {stated.idle: [np.nan]}, "'idle' contains NaN"),
+        (lambda stated: {stated.idle: [0.0, 1.0]}, "'idle' has shape"),
+        (lambda stated: {Stated().wanted: np.zeros((2, 2))}, "does not belong to this graph"),
+        (lambda stated: {stated.sigma: -1.0}, "sigma"),
+    ],
+)
+def test_a_refused_datum_changes_nothing_and_is_named(bad: Any, words: str) -> None:
     stated = Stated()
     run = InteriorPoint(tolerance=1e-9).prepare(stated.graph)
-    wanted = np.array([[1.0, 2.0], [5.0, np.nan]])
-    with pytest.raises(fg.GraphError, match=r"'wanted' contains NaN at \(1, 1\)"):
-        run.solve(stated.guess, data={stated.start: [9.0, 9.0], stated.wanted: wanted})
+    with pytest.raises(fg.GraphError, match=words):
+        run.solve(stated.guess, data=bad(stated))
     np.testing.assert_array_equal(run.program.arrays.parameters[:4], [1.0, 2.0, 3.0, 4.0])
-    for bad, words in (
-        ({stated.idle: [np.nan]}, "'idle' contains NaN"),
-        ({stated.idle: [0.0, 1.0]}, "'idle' has shape"),
-    ):
-        with pytest.raises(fg.GraphError, match=words):
-            run.solve(stated.guess, data=bad)
-    with pytest.raises(fg.GraphError, match="does not belong to this graph"):
-        run.solve(stated.guess, data={Stated().wanted: np.zeros((2, 2))})
-    with pytest.raises(fg.GraphError, match="sigma"):
-        run.solve(stated.guess, data={stated.sigma: -1.0})
     np.testing.assert_allclose(run.solve(stated.guess)[stated.x[1]][0], [1.5, 2.0], atol=1e-6)
 
 
@@ -192,22 +194,21 @@ def test_a_shifted_guess_may_be_changed_before_it_is_used(how: str) -> None:
     np.testing.assert_array_equal(solution[stated.x[1]], [[0.25, 0.25]])
 
 
-def test_guesses_are_looked_at_wherever_they_come_from() -> None:
-    stated = Stated()
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda guess, x: np.put(guess.values[x], 2, np.nan), r"x\[1\]"),
+        (lambda guess, x: np.put(guess.multipliers["limit"], 1, np.inf), "'limit' are not finite"),
+        (lambda guess, x: guess.values.pop(x), "no values for family 'x'"),
+    ],
+)
+def test_guesses_are_looked_at_wherever_they_come_from(spoil: Any, words: str) -> None:
+    stated, other = Stated(), Stated()
     run = InteriorPoint().prepare(stated.graph)
     guess = run.solve(stated.guess).shifted(stated.x)
-    guess.values[stated.x][1, 0] = np.nan
-    with pytest.raises(fg.GraphError, match=r"x\[1\]"):
+    spoil(guess, stated.x)
+    with pytest.raises(fg.GraphError, match=words):
         run.solve(guess)
-    guess = run.solve(stated.guess).shifted(stated.x)
-    guess.multipliers["limit"][0, 1] = np.inf
-    with pytest.raises(fg.GraphError, match="'limit' are not finite"):
-        run.solve(guess)
-    guess = run.solve(stated.guess).shifted(stated.x)
-    del guess.values[stated.x]  # type: ignore[attr-defined]
-    with pytest.raises(fg.GraphError, match="no values for family 'x'"):
-        run.solve(guess)
-    other = Stated()
     with pytest.raises(fg.GraphError, match="no family of this graph"):
         run.solve(InteriorPoint().solve(other.graph, other.guess).shifted(other.x))
 

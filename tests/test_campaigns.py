@@ -192,17 +192,20 @@ def test_spawned_seeds_go_on_where_fewer_ended() -> None:
     assert all(seed == int(float(seed)) for seed in more), "programs that know only doubles read them right"
 
 
-def test_files_that_are_none(tmp_path: Path) -> None:
-    with pytest.raises(ScenarioError, match="cannot be read"):
-        read(tmp_path / "missing.toml")
+@pytest.mark.parametrize(
+    ("content", "words"), [(None, "cannot be read"), (b"\xff\xfe", "is no TOML"), (b"scenario = ", "is no TOML")]
+)
+def test_files_that_are_none(content: bytes | None, words: str, tmp_path: Path) -> None:
+    path = tmp_path / "campaign.toml"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ScenarioError, match=words):
+        read(path)
+
+
+def test_a_file_as_editors_on_windows_write_it(tmp_path: Path) -> None:
     path = tmp_path / "weg ü.toml"
-    path.write_bytes(b"\xff\xfe")
-    with pytest.raises(ScenarioError, match="is no TOML"):
-        read(path)
-    path.write_text("scenario = ", encoding="utf-8")
-    with pytest.raises(ScenarioError, match="is no TOML"):
-        read(path)
-    path.write_text(f'\ufeffscenario = "{WALKS}"\nseeds = [1]\n', encoding="utf-8")  # as editors on Windows write it
+    path.write_text(f'\ufeffscenario = "{WALKS}"\nseeds = [1]\n', encoding="utf-8")
     assert read(path).title == "weg ü"
 
 
@@ -664,20 +667,24 @@ def test_a_report_of_nothing_yet(tmp_path: Path) -> None:
     assert "0 of 3 episodes" in write_report(tmp_path)[1].read_text()
 
 
-def test_no_campaign_is_a_sentence(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("below", "text", "why"),
+    [
+        ("nowhere", None, "there is no such folder"),
+        ("a file", None, "campaign.json cannot be read"),
+        (".", None, "there is no campaign.json in it"),
+        (".", "{", "campaign.json is damaged"),
+        (".", "[]", "damaged"),
+        (".", "{}", "entries are missing"),
+    ],
+)
+def test_no_campaign_is_a_sentence(below: str, text: str | None, why: str, tmp_path: Path) -> None:
     (tmp_path / "a file").touch()
-    for folder, why in (
-        (tmp_path / "nowhere", "there is no such folder"),
-        (tmp_path / "a file", "campaign.json cannot be read"),
-        (tmp_path, "there is no campaign.json in it"),
-    ):
-        with pytest.raises(ScenarioError) as error:
-            campaigns.manifest_of(folder)
-        assert why in str(error.value) and "Errno" not in str(error.value)
-    for text, why in (("{", "campaign.json is damaged"), ("[]", "damaged"), ("{}", "entries are missing")):
+    if text:
         (tmp_path / "campaign.json").write_text(text)
-        with pytest.raises(ScenarioError, match=why):
-            campaigns.manifest_of(tmp_path)
+    with pytest.raises(ScenarioError, match=why) as error:
+        campaigns.manifest_of(tmp_path / below)
+    assert "Errno" not in str(error.value)
 
 
 def test_chance_of_differences() -> None:

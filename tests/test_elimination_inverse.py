@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from typing import Any
 
 import numpy as np
 import pytest
@@ -139,17 +140,21 @@ def test_pickles_carry_the_structure(rng: np.random.Generator) -> None:
     assert np.array_equal(copy.solve(right), factorization.solve(right))
 
 
-def test_wrong_shapes_are_refused(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda f, data, label: f.factor(data[:-1]), "data has shape"),
+        (lambda f, data, label: f.factor(np.append(data, 0.0)), "data has shape"),
+        (lambda f, data, label: f.factor(data, np.zeros(3)), "added has shape"),
+        (lambda f, data, label: f.solve(np.zeros(f.pattern.size + 1)), "shape"),
+        (lambda f, data, label: f.solve(np.zeros((3, 2))), "shape"),
+        (lambda f, data, label: f.solve(np.zeros((f.pattern.size, 2, 2))), "shape"),
+        (lambda f, data, label: Factorization(f.pattern, label, ordering="amd").factor(data), "unknown"),  # type: ignore[arg-type]
+    ],
+)
+def test_wrong_shapes_are_refused(ask: Any, words: str, rng: np.random.Generator) -> None:
     pattern, data, label, _ = grid(rng, 3, 2)
     factorization = Factorization(pattern, label)
-    for refused in (data[:-1], np.append(data, 0.0)):
-        with pytest.raises(UnifgError, match="data has shape"):
-            factorization.factor(refused)
-    with pytest.raises(UnifgError, match="added has shape"):
-        factorization.factor(data, np.zeros(3))
     assert factorization.factor(data)
-    for right in (np.zeros(pattern.size + 1), np.zeros((3, 2)), np.zeros((pattern.size, 2, 2))):
-        with pytest.raises(UnifgError, match="shape"):
-            factorization.solve(right)
-    with pytest.raises(UnifgError, match="unknown"):
-        Factorization(pattern, label, ordering="amd").factor(data)  # type: ignore[arg-type]
+    with pytest.raises(UnifgError, match=words):
+        ask(factorization, data, label)

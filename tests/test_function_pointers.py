@@ -27,12 +27,9 @@ def read_only() -> Any:
 def test_arrays_of_another_type_are_refused(matrix: Any) -> None:
     memory = Memory()
     memory.describe(FIRST)
-    with pytest.raises(UnifgError, match="compiled for arrays of type"):
-        memory.describe((matrix, FIRST[1]))
-    with pytest.raises(UnifgError, match="compiled for arrays of type"):
-        memory.describe((FIRST[0], FIRST[1], FIRST[0]))
-    with pytest.raises(UnifgError, match="compiled for arrays of type"):
-        memory.describe((FIRST[0], *FIRST[1]))
+    for wrong in ((matrix, FIRST[1]), (FIRST[0], FIRST[1], FIRST[0]), (FIRST[0], *FIRST[1])):
+        with pytest.raises(UnifgError, match="compiled for arrays of type"):
+            memory.describe(wrong)
 
 
 def test_equal_layouts_are_named_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from unifg.typing import Array, BoolArray
 
 PLANE = manhattan(300, seed=5).pose_graph
 SPACE = sphere(8, 12, seed=1).pose_graph
+SEEN = Sightings(np.zeros(1, int), np.zeros(1, int), np.zeros((1, 2)), np.eye(2)[None])
 
 
 def begun(made: PoseGraph) -> PoseGraph:
@@ -213,29 +215,32 @@ def test_a_folder_is_written_over(tmp_path: Path) -> None:
         parted.covariance(3)
 
 
-def test_refusals(tmp_path: Path) -> None:
-    made = begun(PLANE)
-    with pytest.raises(GraphError, match="no submaps here"):
-        Submaps(tmp_path / "nothing")
-    one = np.zeros(1, int)
-    seen = replace(made, sightings={"point": Sightings(one, one, np.zeros((1, 2)), np.eye(2)[None])})
-    lost = made.with_poses(np.where(np.arange(300)[:, None] == 7, np.nan, made.poses))
-    cases: list[tuple[PoseGraph, float, str]] = [
-        (replace(made, edges=made.edges[:0]), 10, "found 0 edges"),
-        (made, 0, "submaps of 0 poses"),
-        (made, 2.5, "largest must be a whole number, found 2.5"),
-        (lost, 10, "pose 7 is not finite"),
-        (seen, 10, "of poses and edges"),
-    ]
-    for graph, largest, words in cases:
-        with pytest.raises(GraphError, match=words):
-            Submaps.split(graph, tmp_path, largest)  # type: ignore[arg-type]
-    parted = Submaps.split(made, tmp_path, 60)
-    with pytest.raises(GraphError, match="max_iterations must be a whole number, found 'many'"):
-        parted.optimize(max_iterations="many")  # type: ignore[arg-type]
-    for pose, words in ((-1, "pose -1 of 300"), (300, "pose 300 of 300"), ("a", "pose must be a whole number")):
-        with pytest.raises(GraphError, match=words):
-            parted.covariance(pose)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda made, into: Submaps(into / "nothing"), "no submaps here"),
+        (lambda made, into: Submaps.split(replace(made, edges=made.edges[:0]), into, 10), "found 0 edges"),
+        (lambda made, into: Submaps.split(made, into, 0), "submaps of 0 poses"),
+        (lambda made, into: Submaps.split(made, into, 2.5), "largest must be a whole number, found 2.5"),  # type: ignore[arg-type]
+        (
+            lambda made, into: Submaps.split(
+                made.with_poses(np.where(np.arange(300)[:, None] == 7, np.nan, made.poses)), into, 10
+            ),
+            "pose 7 is not finite",
+        ),
+        (lambda made, into: Submaps.split(replace(made, sightings={"point": SEEN}), into, 10), "of poses and edges"),
+        (
+            lambda made, into: Submaps.split(made, into, 60).optimize(max_iterations="many"),  # type: ignore[arg-type]
+            "max_iterations must be a whole number, found 'many'",
+        ),
+        (lambda made, into: Submaps.split(made, into, 60).covariance(-1), "pose -1 of 300"),
+        (lambda made, into: Submaps.split(made, into, 60).covariance(300), "pose 300 of 300"),
+        (lambda made, into: Submaps.split(made, into, 60).covariance("a"), "pose must be a whole number"),  # type: ignore[arg-type]
+    ],
+)
+def test_refusals(ask: Any, words: str, tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match=words):
+        ask(begun(PLANE), tmp_path)
 
 
 @pytest.mark.parametrize("poses", [[200], [200, 201, 202]])

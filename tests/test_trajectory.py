@@ -102,25 +102,34 @@ def test_whole_numbers_of_spacings_need_no_pose_more(start: float, spacing: floa
         curve.places([start + 1.01 * spacing], 4)
 
 
-def test_moments_outside_are_refused() -> None:
+def test_places_and_counts_of_controls() -> None:
     curve = CubicTrajectory(fg.SE2, start=5.0, spacing=0.5)
-    assert (
-        curve.controls(5.0) == 4 and curve.controls(5.5) == 4 and curve.controls(5.6) == 5 and curve.controls(8.0) == 9
-    )
+    assert [curve.controls(end) for end in (5.0, 5.5, 5.6, 8.0)] == [4, 4, 5, 9]
     first, fraction = curve.places([5.0, 5.49, 5.5, 8.0], 9)
     assert first.tolist() == [0, 0, 1, 5]
     np.testing.assert_allclose(fraction, [0.0, 0.98, 0.0, 1.0], atol=1e-9)
-    for moments, words in (([6.0, 4.9], "number 1"), ([8.1], "outside of 5 .. 8 s"), ([np.nan], "outside")):
-        with pytest.raises(ModelError, match=words):
-            curve.places(moments, 9)
-    with pytest.raises(ModelError, match="hold no moment"):
-        curve.places([5.0], 3)
-    for spacing in (0.0, -1.0, np.inf, np.nan):
-        with pytest.raises(ModelError, match="spacing"):
-            CubicTrajectory(fg.SE2, spacing=spacing)
-    for end in (np.inf, np.nan):
-        with pytest.raises(ModelError, match="must be finite"):
-            CubicTrajectory(fg.SE2).controls(end)
+
+
+@pytest.mark.parametrize(
+    ("ask", "words"),
+    [
+        (lambda curve: curve.places([6.0, 4.9], 9), "number 1"),
+        (lambda curve: curve.places([8.1], 9), "outside of 5 .. 8 s"),
+        (lambda curve: curve.places([np.nan], 9), "outside"),
+        (lambda curve: curve.places([5.0], 3), "hold no moment"),
+        (lambda curve: curve.controls(np.inf), "must be finite"),
+        (lambda curve: curve.controls(np.nan), "must be finite"),
+    ],
+)
+def test_moments_outside_are_refused(ask: Any, words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        ask(CubicTrajectory(fg.SE2, start=5.0, spacing=0.5))
+
+
+@pytest.mark.parametrize("spacing", [0.0, -1.0, np.inf, np.nan])
+def test_a_spacing_is_positive_and_finite(spacing: float) -> None:
+    with pytest.raises(ModelError, match="spacing"):
+        CubicTrajectory(fg.SE2, spacing=spacing)
 
 
 def test_a_long_run_is_found_from_sensors_that_know_no_nodes(rng: np.random.Generator) -> None:
