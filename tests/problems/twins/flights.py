@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 
 import unifg as fg
-from problems.twins.twin import Twin, quaternion_exp, quaternion_times
+from problems.twins.twin import Twin, driven, quaternion_exp, quaternion_times
 from unifg.typing import Array
 
 GRAVITY = 9.81
@@ -20,11 +20,10 @@ def free_time(seed: int, equalities_only: bool = False) -> Twin:
     steps = 40
     start, goal = np.array([0.0, 0.0, 0.0, 0.0]), np.array([*rng.uniform([4.0, -1.0], [6.0, 1.0]), 0.0, 0.0])
     disc = np.append(0.5 * goal[:2] + rng.uniform(-0.4, 0.4, 2), rng.uniform(0.4, 0.8))
-    twin = Twin("free final time", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(4), np.linspace(start, goal, steps + 1))
-    u = twin.variables("u", fg.Rn(2), np.full((steps, 2), 0.01))
+    twin, x, u = driven(
+        "free final time", seed, equalities_only, np.linspace(start, goal, steps + 1), np.full((steps, 2), 0.01)
+    )
     total = twin.variables("T", fg.Rn(1), [[5.0]])
-    twin.fix(x[0], start)
 
     def motion(x: Array, u: Array, after: Array, total: Array) -> Array:
         middle = 0.5 * (x + after)
@@ -54,10 +53,13 @@ def landing(seed: int, equalities_only: bool = False) -> Twin:
     place, speed = rng.uniform([-40, -40, 80], [40, 40, 120]), rng.uniform([-6, -6, -15], [6, 6, -5])
     start = np.array([*place, *speed, 1.0])
     end = np.zeros(6)
-    twin = Twin("thrust cone", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(7), np.linspace(start, np.append(end, 0.9), steps + 1))
-    u = twin.variables("u", fg.Rn(3), np.tile([0.0, 0.0, GRAVITY], (steps, 1)))  # thrust over the first mass
-    twin.fix(x[0], start)
+    twin, x, u = driven(
+        "thrust cone",
+        seed,
+        equalities_only,
+        np.linspace(start, np.append(end, 0.9), steps + 1),
+        np.tile([0.0, 0.0, GRAVITY], (steps, 1)),  # thrust over the first mass
+    )
     down = np.array([0.0, 0.0, GRAVITY])
 
     def motion(x: Array, u: Array, after: Array) -> Array:
@@ -163,15 +165,11 @@ def minimum_snap(seed: int, equalities_only: bool = False) -> Twin:
     rng = np.random.default_rng([24, seed])
     steps, dt = 40, 0.1
     points = np.cumsum(rng.uniform([0.8, -0.8, -0.5], [1.6, 0.8, 0.5], (3, 3)), axis=0)
-    start = np.zeros(12)
     line = np.zeros((steps + 1, 12))
     knots = [0, 13, 26, 40]
     for k in range(3):
         line[:, k] = np.interp(np.arange(steps + 1), knots, [0.0, *points[:, k]])
-    twin = Twin("minimum snap", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(12), line)
-    u = twin.variables("u", fg.Rn(3), np.zeros((steps, 3)))
-    twin.fix(x[0], start)
+    twin, x, u = driven("minimum snap", seed, equalities_only, line, np.zeros((steps, 3)))
     powers = [dt**k / f for k, f in enumerate((1.0, 1.0, 2.0, 6.0, 24.0))]
 
     def motion(x: Array, u: Array, after: Array) -> Array:
@@ -216,10 +214,7 @@ def gates(seed: int, equalities_only: bool = False) -> Twin:
     thick, tall, width = 0.35, 2.0, 0.9
     walls = np.array([[2.0 + 2.0 * k, c + s * (tall + width / 2)] for k, c in enumerate(openings) for s in (-1, 1)])
     size = np.array([thick, tall])
-    twin = Twin("gates", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(4), np.linspace(start, goal, steps + 1))
-    u = twin.variables("u", fg.Rn(2), np.zeros((steps, 2)))
-    twin.fix(x[0], start)
+    twin, x, u = driven("gates", seed, equalities_only, np.linspace(start, goal, steps + 1), np.zeros((steps, 2)))
     move = np.array([[1, 0, dt, 0], [0, 1, 0, dt], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     push = np.array([[dt**2 / 2, 0], [0, dt**2 / 2], [dt, 0], [0, dt]])
     twin.minimize(lambda u: u, lambda u: u, u, sigma=2.0, name="effort")
@@ -245,10 +240,13 @@ def hover(seed: int, equalities_only: bool = False) -> Twin:
     steps, dt, drag = 40, 0.06, rng.uniform(0.1, 0.4)
     wind = rng.uniform(-5.0, 5.0, 2) * [1.0, 0.3]
     start = np.array([*rng.uniform(-1, 1, 2), rng.uniform(-1.0, 1.0), *rng.uniform(-3, 3, 2), rng.uniform(-2, 2)])
-    twin = Twin("hover with drag", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(6), np.linspace(start, np.zeros(6), steps + 1))
-    u = twin.variables("u", fg.Rn(2), np.full((steps, 2), 0.5 * GRAVITY))
-    twin.fix(x[0], start)
+    twin, x, u = driven(
+        "hover with drag",
+        seed,
+        equalities_only,
+        np.linspace(start, np.zeros(6), steps + 1),
+        np.full((steps, 2), 0.5 * GRAVITY),
+    )
 
     def motion(x: Array, u: Array, after: Array) -> Array:
         m = 0.5 * (x + after)
@@ -280,10 +278,7 @@ def orbit(seed: int, equalities_only: bool = False) -> Twin:
     steps, high = 40, rng.uniform(1.3, 1.6)
     dt = rng.uniform(5.0, 7.0) / steps
     start, goal = np.array([1.0, 0.0, 1.0]), np.array([high, 0.0, high**-0.5])
-    twin = Twin("orbit", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(3), np.linspace(start, goal, steps + 1))
-    u = twin.variables("u", fg.Rn(2), np.full((steps, 2), 0.01))
-    twin.fix(x[0], start)
+    twin, x, u = driven("orbit", seed, equalities_only, np.linspace(start, goal, steps + 1), np.full((steps, 2), 0.01))
 
     def rate(x: Array, u: Array) -> Array:
         r, a, b = x.T

@@ -14,7 +14,7 @@ import numba
 import numpy as np
 
 import unifg as fg
-from problems.twins.twin import Twin
+from problems.twins.twin import Twin, driven
 from unifg.models import unicycle
 from unifg.typing import Array
 
@@ -88,10 +88,9 @@ def parking(seed: int, equalities_only: bool = False) -> Twin:
     # Parked cars: three discs each, before and behind the gap, in its line.
     ends = gap / 2.0 + np.array([0.95, 2.3, 3.6])
     cars = np.array([[side * end, 0.0, 0.95] for side in (1.0, -1.0) for end in ends])
-    twin = Twin("parking", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(5), np.linspace(start, goal, PARK_STEPS + 1))
-    u = twin.variables("u", fg.Rn(2), np.zeros((PARK_STEPS, 2)))
-    twin.fix(x[0], start)
+    twin, x, u = driven(
+        "parking", seed, equalities_only, np.linspace(start, goal, PARK_STEPS + 1), np.zeros((PARK_STEPS, 2))
+    )
     twin.minimize(lambda u: u, lambda u: u, u, sigma=[1.0, 0.5], name="effort")
     twin.minimize(
         lambda x: x[:, 3:], lambda x: x[3:], x[1:], sigma=[3.0, 2.0], name="speed and steering",
@@ -216,14 +215,11 @@ def lane_change(seed: int, equalities_only: bool = False) -> Twin:
     """A car between two others changes its lane; jerk and steering rate are limited. All NumPy."""
     rng = np.random.default_rng([14, seed])
     steps, dt, speed = 40, 0.15, rng.uniform(12.0, 20.0)
-    twin = Twin("lane change", seed, equalities_only)
     start = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])  # x, y, heading, speed, acceleration, curvature
     line = np.tile(start, (steps + 1, 1))
     line[:, 0] += speed * dt * np.arange(steps + 1)
     line[:, 1] = np.linspace(0.0, 3.5, steps + 1)
-    x = twin.variables("x", fg.Rn(6), line)
-    u = twin.variables("u", fg.Rn(2), np.zeros((steps, 2)))
-    twin.fix(x[0], start)
+    twin, x, u = driven("lane change", seed, equalities_only, line, np.zeros((steps, 2)))
 
     def motion(x: Array, u: Array, after: Array) -> Array:
         def rate(x: Array) -> Array:
@@ -299,10 +295,7 @@ def pendulum(seed: int, equalities_only: bool = False) -> Twin:
     rng = np.random.default_rng([15, seed])
     steps, torque = 50, rng.uniform(2.5, 5.0)
     start, goal = np.array([rng.uniform(-0.3, 0.3), 0.0]), np.array([np.pi, 0.0])
-    twin = Twin("pendulum", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(2), np.linspace(start, goal, steps + 1))
-    u = twin.variables("u", fg.Rn(1), np.zeros((steps, 1)))
-    twin.fix(x[0], start)
+    twin, x, u = driven("pendulum", seed, equalities_only, np.linspace(start, goal, steps + 1), np.zeros((steps, 1)))
 
     def rate(x: Any, u: Any) -> Any:
         return ca.vertcat(x[1], u - 9.81 * ca.sin(x[0]) - 0.1 * x[1])
@@ -350,10 +343,7 @@ def cart_pole(seed: int, equalities_only: bool = False) -> Twin:
     rng = np.random.default_rng([16, seed])
     steps, force, rail = 50, rng.uniform(8.0, 20.0), rng.uniform(1.0, 2.0)
     start, goal = np.array([rng.uniform(-0.5, 0.5), 0.0, 0.0, 0.0]), np.array([0.0, np.pi, 0.0, 0.0])
-    twin = Twin("cart-pole", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(4), np.linspace(start, goal, steps + 1))
-    u = twin.variables("u", fg.Rn(1), np.zeros((steps, 1)))
-    twin.fix(x[0], start)
+    twin, x, u = driven("cart-pole", seed, equalities_only, np.linspace(start, goal, steps + 1), np.zeros((steps, 1)))
 
     def rate(x: Any, u: Any) -> Any:
         s, c, w = ca.sin(x[1]), ca.cos(x[1]), x[3]

@@ -7,8 +7,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-import unifg as fg
-from problems.twins.twin import Twin
+from problems.twins.twin import Twin, driven
 from unifg.typing import Array
 
 GRAVITY = 9.81
@@ -23,10 +22,9 @@ def payload(seed: int, equalities_only: bool = False) -> Twin:
     goal = np.array([distance, 0.0, rope, 0.0, 0.0, 0.0])
     box = np.array([0.5 * distance, rope + 0.1])  # its top is above the load's way
     half = np.array([0.4, rng.uniform(0.3, 0.6)])
-    twin = Twin("payload", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(6), np.linspace(start, goal, steps + 1))
-    u = twin.variables("u", fg.Rn(2), np.zeros((steps, 2)))  # accelerations of trolley and rope
-    twin.fix(x[0], start)
+    twin, x, u = driven(
+        "payload", seed, equalities_only, np.linspace(start, goal, steps + 1), np.zeros((steps, 2))
+    )  # accelerations of trolley and rope
 
     def motion(x: Array, u: Array, after: Array) -> Array:
         m = 0.5 * (x + after)
@@ -63,10 +61,9 @@ def arm(seed: int, equalities_only: bool = False) -> Twin:
     steps, dt = 40, 0.04
     start = np.array([rng.uniform(-0.4, 0.2), rng.uniform(0.2, 0.8), 0.0, 0.0])
     goal = np.array([rng.uniform(1.2, 1.9), rng.uniform(-0.6, 0.6), 0.0, 0.0])
-    twin = Twin("two-link arm", seed, equalities_only)
-    x = twin.variables("x", fg.Rn(4), np.linspace(start, goal, steps + 1))
-    u = twin.variables("u", fg.Rn(2), np.zeros((steps, 2)))
-    twin.fix(x[0], start)
+    twin, x, u = driven(
+        "two-link arm", seed, equalities_only, np.linspace(start, goal, steps + 1), np.zeros((steps, 2))
+    )
     middle = 0.5 * (start + goal)
     both = np.array([middle[0], middle[0] + middle[1]])
     disc = np.array([np.cos(both).sum(), np.sin(both).sum()]) * rng.uniform(0.95, 1.08)

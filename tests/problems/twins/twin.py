@@ -233,3 +233,14 @@ def _retract(manifold: fg.Manifold, z: Any, d: Any) -> Any:
             *(_retract(part.manifold, z[part.storage], d[part.tangent]) for part in manifold.components.values())
         )
     raise ValueError(f"no casadi retraction for {manifold.name}: add one")
+
+
+def driven(
+    kind: str, seed: int, equalities_only: bool, line: Array, controls: Array
+) -> tuple[Twin, fg.Family, fg.Family]:
+    """A problem with states guessed along a line, the first one given, and controls between them."""
+    twin = Twin(kind, seed, equalities_only)
+    x = twin.variables("x", fg.Rn(line.shape[1]), line)
+    u = twin.variables("u", fg.Rn(controls.shape[1]), controls)
+    twin.fix(x[0], line[0])
+    return twin, x, u
