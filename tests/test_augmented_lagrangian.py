@@ -226,13 +226,13 @@ def test_the_literal_loop_is_that_of_the_paper(build: Callable[[], tuple[fg.Grap
 
 
 @pytest.mark.parametrize("penalty", [1.0, 10.0, 1e2, 1e3])
-def test_the_damped_loop_of_the_paper_takes_every_start(penalty: float) -> None:
+@pytest.mark.parametrize("start", STARTS)
+def test_the_damped_loop_of_the_paper_takes_every_start(start: Any, penalty: float) -> None:
     """Undamped it runs away from two of the six starts of ecg2o's second study, whatever its penalty."""
-    for start in STARTS:
-        graph, guess = ecg2o(start)
-        solution = AugmentedLagrangian(schedule="bazzana-damped", penalty=penalty).solve(graph, guess, check=True)
-        assert judge(graph, solution).worst() < 2e-6
-        assert {row.details["penalty"] for row in solution.history[1:]} == {penalty}
+    graph, guess = ecg2o(start)
+    solution = AugmentedLagrangian(schedule="bazzana-damped", penalty=penalty).solve(graph, guess, check=True)
+    assert judge(graph, solution).worst() < 2e-6
+    assert {row.details["penalty"] for row in solution.history[1:]} == {penalty}
 
 
 @pytest.mark.parametrize("penalty", [1.0, 3.0, 10.0, 1e3, 1e4])
@@ -364,23 +364,6 @@ def test_no_steps_are_taken_at_what_rounding_leaves_of_a_gradient() -> None:
     lengths = [row.step_norm for row in solution.history[1:]]
     assert sum(length < 1e-10 for length in lengths) <= 5, lengths
     assert solution.iterations <= 18
-
-
-def test_fixed_variables_stay_and_limits_may_change_in_kind() -> None:
-    graph, x = graph_with(fg.SO3, 3)
-    start = graph.data("start", [1.0, 0.0, 0.0, 0.0])
-    upper = graph.data("upper", np.zeros(3))
-    graph.fix(x[0], start)
-    graph.minimize(fg.prior, x, np.tile([0.8, 0.6, 0.0, 0.0], (3, 1)), sigma=1.0)
-    graph.constrain(fg.difference, x[:-1], x[1:], lower=np.zeros(3), upper=upper, name="turn")
-    run = AugmentedLagrangian().prepare(graph)
-    guess = {x: np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))}
-    unnormal = np.array([1.0, 4e-10, 0.0, 0.0])  # as it was given, to the last digit
-    for limits in (np.zeros(3), np.full(3, 0.2), np.zeros(3)):
-        solution = run.solve(guess, data={start: unnormal, upper: limits}, check=True)
-        np.testing.assert_array_equal(solution[x][0], unnormal)
-        turns = fg.SO3.local(solution[x][:-1], solution[x][1:])
-        np.testing.assert_allclose(turns[:, 0], limits[0], atol=1e-5)
 
 
 def test_a_trace_that_is_given_up_between_two_solves_is_left_to_python() -> None:

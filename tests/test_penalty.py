@@ -7,7 +7,6 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
 from problems.known import STARTS, active_bounds, ecg2o, ecg2o_inequality, inactive_inequality
 from unifg.solvers import Penalty
 
@@ -55,10 +54,3 @@ def test_a_light_last_weight_ends_without_the_claim() -> None:
     assert solution.violation == pytest.approx(0.01, rel=0.1)
     assert solution.worst == ("curve", 0)
     assert solution.dual("curve")[0, 0] == pytest.approx(-1.0, abs=0.1)
-
-
-def test_a_scalar_cost_is_refused() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize_scalar(lambda p: p[:, 0] ** 4, x, name="quartic")
-    with pytest.raises(fg.BackendError, match="scalar cost 'quartic'"):
-        Penalty().solve(graph, {x: np.ones((1, 1))})

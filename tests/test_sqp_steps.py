@@ -10,7 +10,7 @@ from problems.control import Unicycle
 from problems.graphs import drawn_to, graph_of, graph_with
 from problems.hock_schittkowski import SMALL
 from unifg.solution.optimality import Tolerances
-from unifg.solvers import SQP
+from unifg.solvers import SQP, AugmentedLagrangian
 from unifg.solvers.quadratic_programs.attempt import SECANT_DECAY
 from unifg.solvers.quadratic_programs.scaling import Scaling
 from unifg.solvers.quadratic_programs.steps import Steps
@@ -116,14 +116,15 @@ def test_positions_in_small_units_beside_headings_are_scaled() -> None:
     assert prepared.solve(guess).converged and not prepared._workspace.scaling.neutral
 
 
-def test_limits_may_change_in_kind_between_solves() -> None:
+@pytest.mark.parametrize("solver", [SQP(qp="graph"), AugmentedLagrangian(tolerance=1e-7)], ids=["sqp", "alm"])
+def test_fixed_variables_stay_and_limits_may_change_in_kind(solver: fg.Solver) -> None:
     graph, x = graph_with(fg.SO3, 3)
     start = graph.data("start", [1.0, 0.0, 0.0, 0.0])
     lower, upper = graph.data("lower", np.zeros(3)), graph.data("upper", np.zeros(3))
     graph.fix(x[0], start)
     graph.minimize(fg.prior, x, np.tile([0.8, 0.6, 0.0, 0.0], (3, 1)), sigma=1.0)
     graph.constrain(fg.difference, x[:-1], x[1:], lower=lower, upper=upper, name="turn")
-    run = SQP(qp="graph").prepare(graph)
+    run = solver.prepare(graph)
     guess = {x: np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))}
     unnormal = np.array([1.0, 4e-10, 0.0, 0.0])  # as it was given, to the last digit
     kinds = [
