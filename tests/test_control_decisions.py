@@ -533,11 +533,11 @@ def test_a_scan_without_returns_changes_nothing(field: DistanceMap) -> None:
     assert np.abs(smoother.pose - OPEN).max() < 1e-9
 
 
-def test_backends_take_the_settings_tolerances() -> None:
+@pytest.mark.parametrize("name", ["sqp", "alm"])
+def test_backends_take_the_settings_tolerances(name: str) -> None:
     from unifg.scenarios.ground.drive_settings import backend
 
-    for name in ("sqp", "alm"):
-        warm, cold = (backend(name, SETTINGS, patience) for patience in (1, 3))
-        assert cold.max_iterations == 3 * warm.max_iterations
-        assert warm.tolerance == SETTINGS.tolerance
-        assert isinstance(warm, SQP) == (name == "sqp")
+    warm, cold = (backend(name, SETTINGS, patience) for patience in (1, 3))
+    assert cold.max_iterations == 3 * warm.max_iterations
+    assert warm.tolerance == SETTINGS.tolerance
+    assert isinstance(warm, SQP) == (name == "sqp")

@@ -349,11 +349,11 @@ def test_what_is_not_chosen_does_not_spoil_what_is() -> None:
     np.testing.assert_array_equal([r[0], J[0, 0], S[0, 0]], [0.0, 2.0, 0.0])
 
 
-def test_numbers_that_are_none_stay_so() -> None:
-    for function in (np.maximum, np.minimum, np.fmod, np.hypot):
-        expression = traced(lambda x, f=function: f(x[:, :1], x[:, 1:]), (Rn(2),))
-        points = np.array([[np.nan, 1.0], [1.0, np.nan]])
-        assert np.isnan(evaluated(expression, points, np.zeros((1, 0)))[0]).all()
+@pytest.mark.parametrize("function", [np.maximum, np.minimum, np.fmod, np.hypot])
+def test_numbers_that_are_none_stay_so(function: Any) -> None:
+    expression = traced(lambda x, f=function: f(x[:, :1], x[:, 1:]), (Rn(2),))
+    points = np.array([[np.nan, 1.0], [1.0, np.nan]])
+    assert np.isnan(evaluated(expression, points, np.zeros((1, 0)))[0]).all()
 
 
 # ---------------------------------------------------------------- compiled functions of one factor

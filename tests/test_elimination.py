@@ -99,13 +99,13 @@ def test_positive_definite_grids(rng: np.random.Generator, side: int, ordering: 
 
 
 @pytest.mark.parametrize("size", [40, 150])
-def test_large_fronts(rng: np.random.Generator, size: int) -> None:
+@pytest.mark.parametrize("multipliers", [0, 1])
+def test_large_fronts(multipliers: int, rng: np.random.Generator, size: int) -> None:
     """Fronts wide enough for BLAS, positive and signed."""
-    for multipliers in (0, 1):
-        pattern, data, label, _ = system(rng, [size] * 4, [(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)], multipliers)
-        factorization = solving(rng, pattern, data, 1e-11, label)
-        assert factorization.inertia == (size * (4 - multipliers), size * multipliers, 0)
-        assert factorization.definite == (multipliers == 0)
+    pattern, data, label, _ = system(rng, [size] * 4, [(0, 1), (1, 2), (0, 2), (1, 3), (2, 3)], multipliers)
+    factorization = solving(rng, pattern, data, 1e-11, label)
+    assert factorization.inertia == (size * (4 - multipliers), size * multipliers, 0)
+    assert factorization.definite == (multipliers == 0)
 
 
 graphs = st.integers(2, 14).flatmap(

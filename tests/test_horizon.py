@@ -328,16 +328,16 @@ def test_a_slot_that_gets_another_landmark_forgets_the_first() -> None:
     )
 
 
-def test_what_is_known_is_no_unknown() -> None:
+@pytest.mark.parametrize("coupling", COUPLINGS)
+def test_what_is_known_is_no_unknown(coupling: Any) -> None:
     """A bias that is known is the same in every graph, and no measurement or wish moves it."""
-    for coupling in COUPLINGS:
-        loop = line_loop(KNOWN, coupling=coupling)
-        plans, _ = drive(loop, 12)
-        assert loop.constants["bias"][0, 0] == BIAS
-        before, after = plans[-1].states[:2]
-        np.testing.assert_allclose(after, T @ before + B @ (plans[-1].control + BIAS), atol=1e-6)
-        assert loop.window is not None
-        assert not loop.window.covariance[loop.window.place("bias")].any()
+    loop = line_loop(KNOWN, coupling=coupling)
+    plans, _ = drive(loop, 12)
+    assert loop.constants["bias"][0, 0] == BIAS
+    before, after = plans[-1].states[:2]
+    np.testing.assert_allclose(after, T @ before + B @ (plans[-1].control + BIAS), atol=1e-6)
+    assert loop.window is not None
+    assert not loop.window.covariance[loop.window.place("bias")].any()
 
 
 class Timed:

@@ -487,10 +487,10 @@ def braking(brake: Any) -> Plan:
     return loop_of(judge=LastPlanThenBrake(POINT, feasible=-1.0, brake=lambda now: brake)).plan([0.0, 0.0])
 
 
-def test_a_loop_brakes_by_one_control_or_by_all() -> None:
-    for brake in (0.5, [0.5], np.full((4, 1), 0.5)):
-        plan = braking(brake)
-        assert plan.source == "braking" and (plan.controls == 0.5).all()
+@pytest.mark.parametrize("brake", [0.5, [0.5], np.full((4, 1), 0.5)])
+def test_a_loop_brakes_by_one_control_or_by_all(brake: Any) -> None:
+    plan = braking(brake)
+    assert plan.source == "braking" and (plan.controls == 0.5).all()
 
 
 class Log:

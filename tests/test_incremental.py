@@ -11,6 +11,7 @@ import pytest
 
 import unifg as fg
 from dense import Batch, drive, one_by_one, state
+from problems.graphs import smoother_with
 from unifg.elimination.symbolic import cliques as find_cliques
 from unifg.elimination.symbolic import separators as find_separators
 from unifg.errors import GraphError
@@ -24,8 +25,7 @@ from unifg.smoothing import Incremental
 def test_every_update_is_a_batch_step(group: Any, seed: int) -> None:
     """Thresholds zero: after each update the estimates are those of a Gauss-Newton step over everything."""
     rng = np.random.default_rng(seed)
-    smoother = Incremental(relinearize=0.0, wildfire=0.0)
-    x = smoother.variables("x", group)
+    smoother, x = smoother_with(Incremental(relinearize=0.0, wildfire=0.0), group)
     batch = Batch([group])
     for k, statements in enumerate(drive(group, rng, 25)):
         state(smoother, x, statements)
@@ -56,8 +56,7 @@ def test_every_update_is_a_batch_step(group: Any, seed: int) -> None:
 def test_some_points_move_and_others_stay(group: Any, seed: int) -> None:
     """With a threshold the estimates solve the linear problem of the factors at the points the smoother reports."""
     rng = np.random.default_rng(seed)
-    smoother = Incremental(relinearize=0.05, wildfire=0.0)
-    x = smoother.variables("x", group)
+    smoother, x = smoother_with(Incremental(relinearize=0.05, wildfire=0.0), group)
     batch = Batch([group])
     moved = stayed = 0
     for k, statements in enumerate(drive(group, rng, 50)):
@@ -79,8 +78,7 @@ def test_wildfire_leaves_small_changes_alone() -> None:
     rng = np.random.default_rng(0)
     estimates, work = [], []
     for wildfire in (0.0, 1e-3):
-        smoother = Incremental(relinearize=0.05, wildfire=wildfire)
-        x = smoother.variables("x", fg.SE2)
+        smoother, x = smoother_with(Incremental(relinearize=0.05, wildfire=wildfire), fg.SE2)
         efforts = []
         for statements in drive(fg.SE2, np.random.default_rng(7), 80):
             state(smoother, x, statements)
@@ -95,8 +93,7 @@ def test_the_best_estimate_is_that_of_complete_back_substitution() -> None:
     """However little is passed on from update to update, and without a trace in the smoother."""
     found = []
     for wildfire in (0.0, 0.2):
-        smoother = Incremental(relinearize=np.inf, wildfire=wildfire)
-        x = smoother.variables("x", fg.SE2)
+        smoother, x = smoother_with(Incremental(relinearize=np.inf, wildfire=wildfire), fg.SE2)
         for k, statements in enumerate(drive(fg.SE2, np.random.default_rng(7), 80)):
             state(smoother, x, statements)
             smoother.update({x: np.array([0.3 * k, 0.0, 0.02 * k])})
@@ -111,8 +108,7 @@ def test_the_best_estimate_is_that_of_complete_back_substitution() -> None:
 
 
 def test_what_is_missing_is_named_and_may_be_added_later() -> None:
-    smoother = Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(), fg.SE2)
     smoother.minimize(fg.between, x[0], x[1], [1.0, 0.0, 0.0], sigma=0.1)
     with pytest.raises(GraphError, match=r"x\[1\] has no value"):
         smoother.update({x: np.zeros(3)})
@@ -211,8 +207,7 @@ def test_cliques_hold_what_they_must(seed: int) -> None:
 def test_manhattan_3500_pose_by_pose(shared_data: Path) -> None:
     """The optimum of the batch problem, 1/2 chi2 = 68.9574391, is reached on the way, not afterwards."""
     graph = read_g2o(shared_data / "pose_graphs" / "M3500.g2o.gz")
-    smoother = Incremental(relinearize=0.01)
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(Incremental(relinearize=0.01), fg.SE2)
     for k, (pose, edges) in enumerate(one_by_one(graph)):
         smoother.minimize(fg.prior, x[0], pose, sigma=1e-3) if k == 0 else smoother.minimize(
             fg.between, x[edges.first], x[edges.second], edges.measured, information=edges.information
@@ -226,8 +221,7 @@ def test_manhattan_3500_pose_by_pose(shared_data: Path) -> None:
 
 def test_ill_conditioning_is_named_as_what_it_is() -> None:
     """First guesses that are 2.7 rad off, one after the other: all poses are determined, and the numbers are not."""
-    smoother = fg.Incremental()
-    x = smoother.variables("x", fg.SE2)
+    smoother, x = smoother_with(fg.Incremental(), fg.SE2)
     smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
     smoother.update({x: np.zeros(3)})
     with pytest.raises(fg.GraphError, match=r"^x\[\d+\] is determined by its factors, but lost to rounding: .*guesses"):
@@ -237,21 +231,21 @@ def test_ill_conditioning_is_named_as_what_it_is() -> None:
 
 
 @pytest.mark.parametrize("kind", ["incremental", "fixed lag"])
-def test_what_is_not_determined_is_still_named_so(kind: str) -> None:
+@pytest.mark.parametrize("adrift", [1, 3])
+def test_what_is_not_determined_is_still_named_so(adrift: int, kind: str) -> None:
     """Beside many poses that are: too few rows, and a loop of poses that nothing holds in place."""
-    for adrift in (1, 3):
-        smoother: Any = fg.Incremental() if kind == "incremental" else fg.FixedLag(5)
-        x, y = smoother.variables("x", fg.SE2), smoother.variables("y", fg.SE2)
-        smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
-        smoother.update({x: np.zeros(3)})
-        for k in range(1, 12):
-            smoother.minimize(fg.between, x[k - 1], x[k], [1.0, 0.0, 0.1], sigma=0.1)
-            smoother.update({x: fg.SE2.compose(smoother.estimate(x[-1])[0], np.array([1.0, 0.0, 0.1]))})
-        for k in range(adrift):
-            smoother.minimize(fg.between, y[k], y[(k + 1) % (adrift + 1)], [1.0, 0.0, 0.1], sigma=0.1)
-        smoother.minimize(fg.between, y[adrift], y[0], [-adrift, 0.0, 0.0], sigma=0.1)
-        with pytest.raises(fg.GraphError, match=r"^y\[\d\] is not determined by its factors"):
-            smoother.update({y: np.zeros((adrift + 1, 3)) + np.arange(adrift + 1)[:, None] * [1.0, 0.0, 0.1]})
+    smoother: Any = fg.Incremental() if kind == "incremental" else fg.FixedLag(5)
+    x, y = smoother.variables("x", fg.SE2), smoother.variables("y", fg.SE2)
+    smoother.minimize(fg.prior, x[0], np.zeros(3), sigma=0.1)
+    smoother.update({x: np.zeros(3)})
+    for k in range(1, 12):
+        smoother.minimize(fg.between, x[k - 1], x[k], [1.0, 0.0, 0.1], sigma=0.1)
+        smoother.update({x: fg.SE2.compose(smoother.estimate(x[-1])[0], np.array([1.0, 0.0, 0.1]))})
+    for k in range(adrift):
+        smoother.minimize(fg.between, y[k], y[(k + 1) % (adrift + 1)], [1.0, 0.0, 0.1], sigma=0.1)
+    smoother.minimize(fg.between, y[adrift], y[0], [-adrift, 0.0, 0.0], sigma=0.1)
+    with pytest.raises(fg.GraphError, match=r"^y\[\d\] is not determined by its factors"):
+        smoother.update({y: np.zeros((adrift + 1, 3)) + np.arange(adrift + 1)[:, None] * [1.0, 0.0, 0.1]})
 
 
 @pytest.mark.parametrize("information", [np.zeros((2, 2)), np.diag([1.0, 0.0])])
@@ -266,8 +260,7 @@ def test_rows_without_information_determine_nothing(information: np.ndarray) -> 
 @pytest.mark.parametrize("error", [lambda x: np.log(x - 5.0), lambda x: x * np.nan, np.sqrt])
 @pytest.mark.parametrize("smoother", [fg.Incremental, lambda: fg.FixedLag(lag=3)])
 def test_a_residual_that_is_not_finite_is_no_estimate(smoother: Any, error: Any) -> None:
-    live = smoother()
-    y = live.variables("y", fg.Rn(1))
+    live, y = smoother_with(smoother(), fg.Rn(1), "y")
     live.minimize(fg.prior, y[0], [0.0], sigma=1.0)
     live.update({y: [0.0]})
     live.minimize(error, y[0], sigma=1.0)

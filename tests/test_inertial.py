@@ -18,14 +18,13 @@ from unifg.errors import ModelError
 from unifg.lie import SE23, SO3
 from unifg.models import inertial, preintegration
 from unifg.models.inertial import InertialMeasurements, SampleCounts
-from unifg.models.preintegration import BIAS, GRAVITY, ImuNoise, Preintegrated, at_rest, predict, preintegrate
+from unifg.models.preintegration import BIAS, ImuNoise, Preintegrated, at_rest, predict, preintegrate
 from unifg.models.quadrotor import STATE
 from unifg.solvers import LevenbergMarquardt
 from unifg.typing import Array
 
 NOISE = ImuNoise(gyro=1e-3, accelerometer=1e-2, gyro_walk=1e-4, accelerometer_walk=1e-3)
 NONE = np.zeros(6)
-G = np.array(GRAVITY)
 
 
 def sample(w: Array, a: Array, h: float) -> tuple[Array, Array]:
@@ -244,14 +243,14 @@ def test_a_covariance_without_an_inverse_is_refused(rng: Generator) -> None:
         assert found._replace(covariance=covariance).information is None
 
 
-def test_biases_without_a_walk_are_one() -> None:
-    for noise in (ImuNoise(gyro_walk=0.0), ImuNoise(accelerometer_walk=0.0)):
-        graph, x = graph_with(SE23, 3)
-        graph.variables("bias", BIAS, 3)
-        with pytest.raises(ModelError, match="which must be positive; one bias that stays"):
-            InertialMeasurements(noise).state(graph, x)
-        graph.variables("one", BIAS, 1)
-        InertialMeasurements(noise, bias="one").state(graph, x)
+@pytest.mark.parametrize("noise", [ImuNoise(gyro_walk=0.0), ImuNoise(accelerometer_walk=0.0)])
+def test_biases_without_a_walk_are_one(noise: Any) -> None:
+    graph, x = graph_with(SE23, 3)
+    graph.variables("bias", BIAS, 3)
+    with pytest.raises(ModelError, match="which must be positive; one bias that stays"):
+        InertialMeasurements(noise).state(graph, x)
+    graph.variables("one", BIAS, 1)
+    InertialMeasurements(noise, bias="one").state(graph, x)
 
 
 # ---------------------------------------------------------------- the factor

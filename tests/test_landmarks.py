@@ -43,13 +43,13 @@ def test_nothing_to_see() -> None:
     assert landmarks.observe(state((0.0, 0.0, 1.0)), np.zeros((0, 2))).shape == (0, 2)
 
 
-def test_the_vertical_tells_roll_and_pitch_but_no_heading() -> None:
+@pytest.mark.parametrize("yaw", [0.0, 1.0, 3.0])
+def test_the_vertical_tells_roll_and_pitch_but_no_heading(yaw: float) -> None:
     up = np.array([0.0, 0.0, 1.0])
-    for yaw in (0.0, 1.0, 3.0):
-        attitude = fg.SO3.from_rpy(0.2, -0.3, yaw)
-        seen = landmarks.tilt(attitude, np.zeros(3))[0]
-        np.testing.assert_allclose(seen, fg.SO3.to_matrix(attitude).T @ up, atol=1e-15)
-        np.testing.assert_allclose(seen, landmarks.tilt(fg.SO3.from_rpy(0.2, -0.3, 0.0), np.zeros(3))[0], atol=1e-15)
+    attitude = fg.SO3.from_rpy(0.2, -0.3, yaw)
+    seen = landmarks.tilt(attitude, np.zeros(3))[0]
+    np.testing.assert_allclose(seen, fg.SO3.to_matrix(attitude).T @ up, atol=1e-15)
+    np.testing.assert_allclose(seen, landmarks.tilt(fg.SO3.from_rpy(0.2, -0.3, 0.0), np.zeros(3))[0], atol=1e-15)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, 1.5, np.pi])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 import pytest
@@ -59,10 +60,10 @@ def test_manifolds_are_values(case: Case) -> None:
     assert group != "SE2"
 
 
-def test_singletons_survive_pickling() -> None:
-    for group in (SE2, SO2, SE3, SO3):
-        assert pickle.loads(pickle.dumps(group)) is group
-        assert copy.copy(group) is group
+@pytest.mark.parametrize("group", [SE2, SO2, SE3, SO3])
+def test_singletons_survive_pickling(group: Any) -> None:
+    assert pickle.loads(pickle.dumps(group)) is group
+    assert copy.copy(group) is group
 
 
 def test_equal_arguments_make_equal_manifolds() -> None:

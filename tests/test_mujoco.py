@@ -144,12 +144,12 @@ def test_a_cylinder_a_wall_and_a_mover_stop_it_once() -> None:
     assert standing.collisions >= 1 and standing.state[1] > 0.1  # pushed along
 
 
-def test_a_soft_landing_is_no_collision() -> None:
-    for thrust, hits in ((0.97, 0), (0.5, 1)):
-        world = flyer(layout=field(height=0.5))
-        for _ in range(60):
-            world.step([0.0, 0.0, 0.0, thrust * GRAVITY])
-        assert world.grounded and world.collisions == hits and abs(world.state[2]) < 0.01
+@pytest.mark.parametrize(("thrust", "hits"), [(0.97, 0), (0.5, 1)])
+def test_a_soft_landing_is_no_collision(thrust: float, hits: int) -> None:
+    world = flyer(layout=field(height=0.5))
+    for _ in range(60):
+        world.step([0.0, 0.0, 0.0, thrust * GRAVITY])
+    assert world.grounded and world.collisions == hits and abs(world.state[2]) < 0.01
 
 
 def test_the_engine_sees_what_the_own_plant_sees() -> None:

@@ -218,14 +218,14 @@ def test_what_may_be_reordered_is_kept_from_it() -> None:
 
 
 @pytest.mark.parametrize("asked", ["soft", "hard goal", "obstacle"])
-def test_a_moved_world_is_the_same_problem(asked: str) -> None:
+@pytest.mark.parametrize(("name", "kind"), [("SE(2)", "shipped"), ("{p, R, v}", "shipped")])
+def test_a_moved_world_is_the_same_problem(name: str, kind: str, asked: str) -> None:
     """A slice of ``make offsets``; a penalty's last iterations are decided by rounding."""
-    for name, kind in (("SE(2)", "shipped"), ("{p, R, v}", "shipped")):
-        case = offsets.drive_case(name, offsets.SPACES[name], kind, asked)
-        case.backends = {name: make for name, make in case.backends.items() if name not in ("Penalty", "KKT")}
-        for row in offsets.run(case):
-            assert row.same, row
-            assert set(row.status) == {"CONVERGED"}, row
+    case = offsets.drive_case(name, offsets.SPACES[name], kind, asked)
+    case.backends = {name: make for name, make in case.backends.items() if name not in ("Penalty", "KKT")}
+    for row in offsets.run(case):
+        assert row.same, row
+        assert set(row.status) == {"CONVERGED"}, row
 
 
 def test_the_gradient_of_a_logarithm_near_zero() -> None:

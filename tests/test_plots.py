@@ -172,11 +172,11 @@ def test_large_graphs_are_drawn_family_by_family() -> None:
     assert {"odometry  1999", "seen 0, ... (60 terms)  120", "2000", "SE2, 1 fixed", "landmark.."} <= words
 
 
-def test_the_limit_between_both_drawings() -> None:
-    for count in (factor_graph.NODES // 2, factor_graph.NODES // 2 + 1):
-        graph, x = line(count)
-        graph.minimize(fg.prior, x, np.zeros(2))
-        assert len(marks(graph.draw(), "o")) == (count if 2 * count <= factor_graph.NODES else 1)
+@pytest.mark.parametrize("count", [factor_graph.NODES // 2, factor_graph.NODES // 2 + 1])
+def test_the_limit_between_both_drawings(count: Any) -> None:
+    graph, x = line(count)
+    graph.minimize(fg.prior, x, np.zeros(2))
+    assert len(marks(graph.draw(), "o")) == (count if 2 * count <= factor_graph.NODES else 1)
 
 
 def test_odd_graphs_are_drawn() -> None:
@@ -374,24 +374,24 @@ def test_histories_of_every_kind_are_plotted() -> None:
 # ---------------------------------------------------------------- marginals of every member
 
 
-def test_marginals_are_the_blocks_of_the_joint_covariance() -> None:
+@pytest.mark.parametrize("constrained", [False, True])
+def test_marginals_are_the_blocks_of_the_joint_covariance(constrained: bool) -> None:
     """Of every member and component, fixed and held ones too, with constraints and without."""
     state = fg.Product(pose=fg.SE2, steer=fg.Rn(1))
-    for constrained in (False, True):
-        graph, s, u = graph_of(("s", state, 6), ("u", fg.Rn(2), 5))
-        graph.fix(s[0].pose, np.zeros(3))
-        graph.minimize(fg.between, s[:-1].pose, s[1:].pose, [1.0, 0.0, 0.2], sigma=[0.1, 0.2, 0.05])
-        graph.minimize(lambda a, b, c: b - a - c[:, :1], s[:-1].steer, s[1:].steer, u, sigma=0.3)
-        graph.minimize(fg.prior, u, [0.1, 0.0], sigma=[0.5, 2.0])
-        graph.minimize(fg.prior, s.steer, [0.0], sigma=1.0)
-        if constrained:
-            graph.bound(s[3].steer, upper=-0.5)
-            graph.constrain(lambda p: p[:, :1], s[5].pose, lower=4.0, upper=4.0)
-        solution = SQP().solve(graph, {s: np.zeros((6, 4)), u: np.zeros((5, 2))}, check=True)
-        for variable in (s, u, s.pose, s.steer, s.pose[1:4], s[[4, 2]].steer):
-            each = solution.marginals(variable)
-            assert each.shape[0] == len(variable)
-            for k in range(len(variable)):
-                np.testing.assert_allclose(each[k], solution.covariance(variable[k]), atol=1e-10)
-        assert not solution.marginals(s.pose[0]).any()
-        assert (solution.marginals(s[3].steer)[0, 0, 0] < 1e-9) == constrained
+    graph, s, u = graph_of(("s", state, 6), ("u", fg.Rn(2), 5))
+    graph.fix(s[0].pose, np.zeros(3))
+    graph.minimize(fg.between, s[:-1].pose, s[1:].pose, [1.0, 0.0, 0.2], sigma=[0.1, 0.2, 0.05])
+    graph.minimize(lambda a, b, c: b - a - c[:, :1], s[:-1].steer, s[1:].steer, u, sigma=0.3)
+    graph.minimize(fg.prior, u, [0.1, 0.0], sigma=[0.5, 2.0])
+    graph.minimize(fg.prior, s.steer, [0.0], sigma=1.0)
+    if constrained:
+        graph.bound(s[3].steer, upper=-0.5)
+        graph.constrain(lambda p: p[:, :1], s[5].pose, lower=4.0, upper=4.0)
+    solution = SQP().solve(graph, {s: np.zeros((6, 4)), u: np.zeros((5, 2))}, check=True)
+    for variable in (s, u, s.pose, s.steer, s.pose[1:4], s[[4, 2]].steer):
+        each = solution.marginals(variable)
+        assert each.shape[0] == len(variable)
+        for k in range(len(variable)):
+            np.testing.assert_allclose(each[k], solution.covariance(variable[k]), atol=1e-10)
+    assert not solution.marginals(s.pose[0]).any()
+    assert (solution.marginals(s[3].steer)[0, 0, 0] < 1e-9) == constrained

@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,16 +67,18 @@ def distance(group: fg.LieGroup, a: Array, b: Array) -> float:
 # ---------------------------------------------------------------- residuals
 
 
-def test_charts_agree_with_logarithms_only_to_first_order_and_half(rng: np.random.Generator) -> None:
-    for group, factor in ((fg.SE2, 1.0), (fg.SE3, 0.5)):
-        x, z = group.random(rng, (2, 8))
-        d = 1e-5 * rng.normal(size=(8, group.dim))
-        y = group.compose(x, group.retract(z, d))
-        log, chart = fg.between.on(group)(x, y, z), chart_between.on(group)(x, y, z)
-        np.testing.assert_allclose(log, d, atol=1e-10)
-        size = group.point_dim
-        np.testing.assert_allclose(chart[:, :size], d[:, :size], atol=1e-9)
-        np.testing.assert_allclose(chart[:, size:], factor * d[:, size:], atol=1e-9)
+@pytest.mark.parametrize(("group", "factor"), [(fg.SE2, 1.0), (fg.SE3, 0.5)])
+def test_charts_agree_with_logarithms_only_to_first_order_and_half(
+    group: Any, factor: float, rng: np.random.Generator
+) -> None:
+    x, z = group.random(rng, (2, 8))
+    d = 1e-5 * rng.normal(size=(8, group.dim))
+    y = group.compose(x, group.retract(z, d))
+    log, chart = fg.between.on(group)(x, y, z), chart_between.on(group)(x, y, z)
+    np.testing.assert_allclose(log, d, atol=1e-10)
+    size = group.point_dim
+    np.testing.assert_allclose(chart[:, :size], d[:, :size], atol=1e-9)
+    np.testing.assert_allclose(chart[:, size:], factor * d[:, size:], atol=1e-9)
 
 
 def test_the_spatial_chart_does_not_care_for_the_sign_of_a_quaternion(rng: np.random.Generator) -> None:
@@ -95,10 +98,10 @@ def test_the_planar_chart_is_a_difference(rng: np.random.Generator) -> None:
     np.testing.assert_allclose(fg.wrap_angle(y - x - z)[:, 2], chart[:, 2], atol=1e-12)
 
 
-def test_charts_pickle() -> None:
+@pytest.mark.parametrize("group", [fg.SE2, fg.SE3])
+def test_charts_pickle(group: Any) -> None:
 
-    for group in (fg.SE2, fg.SE3):
-        assert pickle.loads(pickle.dumps(chart_between.on(group))).name == "chart between"
+    assert pickle.loads(pickle.dumps(chart_between.on(group))).name == "chart between"
 
 
 @pytest.mark.parametrize("residual", ["log", "g2o"])
@@ -210,12 +213,12 @@ def test_linear_guesses_are_better_than_odometry() -> None:
             assert graph.with_poses(method(graph)).chi2() < 1.3 * best < 0.1 * graph.chi2()
 
 
-def test_damping_does_not_stiffen_a_chain() -> None:
-    for seed in range(3):
-        graph, _, guess = manhattan(1000, seed).pose_graph.graph()
-        bare, damped = (solver().solve(graph, guess, check=True) for solver in (GaussNewton, LevenbergMarquardt))
-        assert damped.iterations == bare.iterations < 8
-        assert LevenbergMarquardt(damping=1e-3).solve(graph, guess).iterations > damped.iterations
+@pytest.mark.parametrize("seed", range(3))
+def test_damping_does_not_stiffen_a_chain(seed: int) -> None:
+    graph, _, guess = manhattan(1000, seed).pose_graph.graph()
+    bare, damped = (solver().solve(graph, guess, check=True) for solver in (GaussNewton, LevenbergMarquardt))
+    assert damped.iterations == bare.iterations < 8
+    assert LevenbergMarquardt(damping=1e-3).solve(graph, guess).iterations > damped.iterations
 
 
 def test_landmarks_alone_do_not_initialise(rng: np.random.Generator) -> None:

@@ -101,7 +101,7 @@ def test_the_worst_run_counts() -> None:
     assert "| ipm | joint | 2 | 5000 | 10.0 | 10.0 | 10.0 | 9.0 / 9.0 | 1.0 / 1.0 |" in quadrotor_tables.ticks(rows)
 
 
-def test_wilson_intervals() -> None:
-    for good, count in ((95, 100), (5, 5), (0, 7), (1, 2), (81, 263)):
-        wanted = stats.binomtest(good, count).proportion_ci(0.95, "wilson")
-        assert share(good, count) == pytest.approx((wanted.low, wanted.high), abs=1e-4)
+@pytest.mark.parametrize(("good", "count"), [(95, 100), (5, 5), (0, 7), (1, 2), (81, 263)])
+def test_wilson_intervals(good: int, count: int) -> None:
+    wanted = stats.binomtest(good, count).proportion_ci(0.95, "wilson")
+    assert share(good, count) == pytest.approx((wanted.low, wanted.high), abs=1e-4)

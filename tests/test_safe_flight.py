@@ -349,12 +349,14 @@ def test_situations_are_what_they_are_called_and_a_seed_moves_them() -> None:
         SafeSettings(case="flat")  # type: ignore[arg-type]
 
 
-def test_a_path_too_short_for_its_speed_says_which_it_reaches(caplog: pytest.LogCaptureFixture) -> None:
-    for speed, said in ((3.4, False), (6.0, True)):
-        about = situation("static", speed)
-        fastest = np.linalg.norm(about.path.at(np.linspace(0.0, about.duration, 5001)).velocity, axis=1).max()
-        assert ("too short for 6 m/s: it reaches" in caplog.text) == said
-        assert abs(fastest - speed) < 0.01 or f"{fastest:.2f} m/s" in caplog.text
+@pytest.mark.parametrize(("speed", "said"), [(3.4, False), (6.0, True)])
+def test_a_path_too_short_for_its_speed_says_which_it_reaches(
+    speed: float, said: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    about = situation("static", speed)
+    fastest = np.linalg.norm(about.path.at(np.linspace(0.0, about.duration, 5001)).velocity, axis=1).max()
+    assert ("too short for 6 m/s: it reaches" in caplog.text) == said
+    assert abs(fastest - speed) < 0.01 or f"{fastest:.2f} m/s" in caplog.text
 
 
 @pytest.mark.product(2, of="drives and flights")

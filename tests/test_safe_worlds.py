@@ -131,14 +131,14 @@ PATHS = {
 
 
 @pytest.mark.parametrize("path", PATHS.values(), ids=list(PATHS))
-def test_paths_are_differentiated_rightly(path: FlatPath) -> None:
+@pytest.mark.parametrize("k", range(3))
+def test_paths_are_differentiated_rightly(k: int, path: FlatPath) -> None:
     times = np.linspace(-0.5, 6.0, 321) + 1e-4  # beside the corners
     h = 1e-5
     ahead, here, behind = path.at(times + h), path.at(times), path.at(times - h)
-    for k in range(3):
-        corner = np.abs(here[k + 1] - ahead[k + 1]).max(axis=1) + np.abs(here[k + 1] - behind[k + 1]).max(axis=1) > 0.1
-        slope = (ahead[k] - behind[k]) / (2.0 * h)
-        np.testing.assert_allclose(slope[~corner], here[k + 1][~corner], atol=2e-4)
+    corner = np.abs(here[k + 1] - ahead[k + 1]).max(axis=1) + np.abs(here[k + 1] - behind[k + 1]).max(axis=1) > 0.1
+    slope = (ahead[k] - behind[k]) / (2.0 * h)
+    np.testing.assert_allclose(slope[~corner], here[k + 1][~corner], atol=2e-4)
 
 
 def test_a_line_is_a_trapezoid() -> None:

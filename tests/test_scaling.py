@@ -126,9 +126,9 @@ def test_constraints_that_miss_each_other_by_little_are_infeasible(build: Any, g
 
 
 @pytest.mark.parametrize("build", [beside_disc, between_lines])
-def test_constraints_that_just_meet_are_not(build: Any) -> None:
-    for gap in (-1e-5, -1e-3):
-        replace(SQP()).solve(*build(gap), check=True)
+@pytest.mark.parametrize("gap", [-1e-5, -1e-3])
+def test_constraints_that_just_meet_are_not(gap: float, build: Any) -> None:
+    replace(SQP()).solve(*build(gap), check=True)
 
 
 @pytest.mark.parametrize("information", [1e-24, 1e-12, 1e-6, 1e6, 1e12, 1e24])

@@ -273,12 +273,12 @@ def count(box: IntArray | None = None) -> IntArray:
     return second
 
 
-def test_a_pass_is_done_whoever_comes() -> None:
-    for helpers in (1, 2, 4):
-        fg.use_threads(helpers)
-        for pause in (0.0, 0.01) * 10:  # threads that look out, and threads that sleep
-            time.sleep(pause)
-            assert (count() == 1000).all()
+@pytest.mark.parametrize("helpers", [1, 2, 4])
+def test_a_pass_is_done_whoever_comes(helpers: int) -> None:
+    fg.use_threads(helpers)
+    for pause in (0.0, 0.01) * 10:  # threads that look out, and threads that sleep
+        time.sleep(pause)
+        assert (count() == 1000).all()
 
 
 def test_threads_that_nobody_calls_sleep_and_are_woken() -> None:

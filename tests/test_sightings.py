@@ -63,18 +63,18 @@ def test_looks_are_weighed_as_dense_least_squares_weigh_them(relative: bool) -> 
     np.testing.assert_allclose(found.velocity, like.velocity + now * fall, atol=2.0)
 
 
-def test_what_is_unsure_is_what_the_barrier_of_that_name_takes_away() -> None:
+@pytest.mark.parametrize("j", range(2))
+def test_what_is_unsure_is_what_the_barrier_of_that_name_takes_away(j: int) -> None:
     """With the root of the covariance of where something will be, the same along every axis."""
     doubt, places, t = np.array([[0.01, -0.02, 0.3], [0.0, 0.0, 0.0]]), np.array([[1.0, 0.5, 1.0]]), np.array([0.4])
     found = things(doubt).clearance(places, t)
     sigma = np.sqrt(doubt[:, 0] + t * doubt[:, 1] + t**2 * doubt[:, 2])
     flat = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 1.0]])
-    for j in range(2):
-        like = things()
-        given = like.position[j : j + 1], like.velocity[j : j + 1], like.falls[j] * DOWN[None], like.keep[j : j + 1]
-        h = barriers.uncertain(barriers.accelerated(apart, many=True), 1.0)
-        expected = h(places, t, sigma[j] * np.eye(3), *given, flat[j : j + 1])
-        assert found[0, j] == pytest.approx(expected[0, 0], abs=1e-12)
+    like = things()
+    given = like.position[j : j + 1], like.velocity[j : j + 1], like.falls[j] * DOWN[None], like.keep[j : j + 1]
+    h = barriers.uncertain(barriers.accelerated(apart, many=True), 1.0)
+    expected = h(places, t, sigma[j] * np.eye(3), *given, flat[j : j + 1])
+    assert found[0, j] == pytest.approx(expected[0, 0], abs=1e-12)
 
 
 def test_those_that_are_not_there_are_sure() -> None:

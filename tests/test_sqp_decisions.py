@@ -53,9 +53,9 @@ def line(limit: float = -1.0) -> tuple[fg.Graph, fg.Family]:
     return graph, x
 
 
-def test_the_highest_price_is_that_of_scaled_rows_and_at_least_one() -> None:
-    for penalty, row, price in ((6.0, 2.0, 3.0), (6.0, 0.5, 12.0), (0.1, 1.0, 1.0)):
-        assert highest_price(np.array([penalty]), np.array([row])) == pytest.approx(price)
+@pytest.mark.parametrize(("penalty", "row", "price"), [(6.0, 2.0, 3.0), (6.0, 0.5, 12.0), (0.1, 1.0, 1.0)])
+def test_the_highest_price_is_that_of_scaled_rows_and_at_least_one(penalty: float, row: float, price: float) -> None:
+    assert highest_price(np.array([penalty]), np.array([row])) == pytest.approx(price)
 
 
 def test_prices_stay_above_their_multipliers_and_come_down_slowly() -> None:
