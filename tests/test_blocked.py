@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -180,17 +181,22 @@ def test_a_drive_is_stored_so_that_others_can_read_it(tmp_path: Path) -> None:
             assert value == other, name
 
 
-def test_files_that_are_no_drive_are_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda path: path.write_bytes(b""), "is no unifg drive log 3"),
+        (lambda path: path.write_bytes(b"not a file"), "is no unifg drive log 3"),
+        (lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]), "is no unifg drive log 3"),
+        (
+            lambda path: np.savez(path, about=np.array('{"kind": "something else", "units": {}}')),
+            "is no unifg drive log 3",
+        ),
+        (lambda path: path.unlink(), "drive.npz"),
+    ],
+)
+def test_files_that_are_no_drive_are_refused(spoil: Any, words: str, tmp_path: Path) -> None:
     path = tmp_path / "drive.npz"
     episode(3).save(path)
-    whole = path.read_bytes()
-    for content in (b"", b"not a file", whole[: len(whole) // 2]):
-        path.write_bytes(content)
-        with pytest.raises(FileFormatError, match="is no unifg drive log 3"):
-            EpisodeLog.load(path)
-    with np.errstate(all="ignore"):
-        np.savez(path, about=np.array('{"kind": "something else", "units": {}}'))
-    with pytest.raises(FileFormatError, match="is no unifg drive log 3"):
+    spoil(path)
+    with pytest.raises(FileFormatError, match=words):
         EpisodeLog.load(path)
-    with pytest.raises(FileFormatError):
-        EpisodeLog.load(tmp_path / "nothing.npz")
