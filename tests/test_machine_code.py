@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from at_once import at_once
 from problems.graphs import graph_with, smoother_with
 from unifg.codegen import native, objects
 from unifg.codegen.native import Native
@@ -279,19 +280,7 @@ def stepped(x: Array, y: Array, by: Array) -> Array:
 
 def test_threads_share_what_they_generate() -> None:
     kernel = StatedKernel(lambda x: np.sin(x) * x, (fg.Rn(2),), 2)
-    found: list[tuple[Expression, Native, int]] = []
-    barrier = threading.Barrier(6)
-
-    def work() -> None:
-        barrier.wait()
-        expression = kernel.expression
-        found.append((expression, expression.residual(), kernel.address))
-
-    threads = [threading.Thread(target=work) for _ in range(6)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    found = at_once(lambda k: (kernel.expression, kernel.expression.residual(), kernel.address), 6)
     assert len(set(map(id, (e for e, _, _ in found)))) == len({id(n) for _, n, _ in found}) == 1
     assert {a for _, _, a in found} == {found[0][1].address}
 

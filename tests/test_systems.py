@@ -1,13 +1,12 @@
 """One owner of a program's linear systems: structure once, whoever asks; numbers that nobody else writes to."""
 
-import pickle
 from collections.abc import Iterator
-from threading import Thread
 
 import numpy as np
 import pytest
 
 import unifg as fg
+from at_once import at_once
 from problems.graphs import graph_with
 from unifg.elimination import analysis, factorization
 from unifg.problem.systems import KEPT
@@ -48,8 +47,7 @@ def analyses(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
 
 def advance(a: Array, b: Array) -> Array:
     """Distance of the second pose ahead of the first."""
-    ahead: Array = b[:, :1] - a[:, :1]
-    return ahead
+    return np.asarray(b[:, :1] - a[:, :1])
 
 
 def chain(kind: str, poses: int = 12) -> tuple[fg.Graph, fg.Family, fg.Data]:
@@ -126,24 +124,20 @@ def test_threads_share_structure_and_nothing_else(analyses: list[int]) -> None:
     rehearse(KKT())
     del analyses[:]
     graph.compiled = None
-    program, found = graph.compile(), {}
+    program = graph.compile()
 
-    def work(k: int) -> None:
+    def work(k: int) -> tuple[Array, Array]:
         prepared = KKT().prepare(graph)
         for _ in range(5):
             solution = prepared.solve(guesses[k])
-            found[k] = solution[x], solution.marginals(x)
+        return solution[x], solution.marginals(x)
 
-    threads = [Thread(target=work, args=(k,)) for k in range(len(guesses))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    found = at_once(work, len(guesses))
     assert graph.compile() is program
     assert len(analyses) == len(set(analyses))
-    for k, (values, marginals) in enumerate(wanted):
-        assert np.array_equal(found[k][0], values)
-        assert np.array_equal(found[k][1], marginals)
+    for (values, marginals), own in zip(wanted, found, strict=True):
+        assert np.array_equal(own[0], values)
+        assert np.array_equal(own[1], marginals)
 
 
 def test_what_is_handed_out_has_memory_of_its_own() -> None:
@@ -163,13 +157,3 @@ def test_what_is_handed_out_has_memory_of_its_own() -> None:
     assert kkt.factorization.structure is twin.factorization.structure
     assert not np.shares_memory(kkt.arrays.plan.numbers, twin.arrays.plan.numbers)
     assert not np.shares_memory(kkt.saddle.scale, twin.saddle.scale)
-
-
-def test_solutions_pickle_after_their_covariance_was_asked() -> None:
-    for kind in ("free", "all"):
-        graph, x, _ = chain(kind)
-        solution = SQP().solve(graph, {x: np.zeros((len(x), 3))})
-        block = solution.covariance(x[-1])
-        again = pickle.loads(pickle.dumps(solution))
-        family = next(family for family in again.values if family.name == "x")
-        assert np.allclose(again.covariance(family[-1]), block, rtol=1e-12)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from at_once import at_once
 from backends import BACKENDS, LENGTH, Walk, goal_of
 from problems.graphs import graph_with
 from test_horizon_hostile import loop_of, window_of
@@ -30,26 +31,6 @@ def restless() -> Iterator[None]:
     sys.setswitchinterval(1e-5)
     yield
     sys.setswitchinterval(usual)
-
-
-def at_once(work: Callable[[int], Any], threads: int = THREADS) -> list[Any]:
-    """Results of threads that begin together: values returned, or exceptions raised."""
-    begin, found = threading.Barrier(threads), [None] * threads
-
-    def run(number: int) -> None:
-        begin.wait()
-        try:
-            found[number] = work(number)
-        except Exception as error:
-            found[number] = error  # type: ignore[call-overload]
-
-    running = [threading.Thread(target=run, args=(number,)) for number in range(threads)]
-    for thread in running:
-        thread.start()
-    for thread in running:
-        thread.join(60.0)
-        assert not thread.is_alive(), "they wait for each other for ever"
-    return found
 
 
 @pytest.mark.product(4)
@@ -128,22 +109,22 @@ def test_a_solve_within_a_solve_has_data_of_its_own(name: str) -> None:
     np.testing.assert_array_equal(inside[0], right[1])
 
 
-def test_a_solution_answers_several_threads() -> None:
-    for name in ("gn", "ipm"):
-        walk = Walk(name)
-        solution = walk.solved(name, 3)
-        right = solution.marginals(walk.x), solution.covariance(walk.x[1:4])
-        other = walk.solved(name, 3)
+@pytest.mark.parametrize("name", ["gn", "ipm"])
+def test_a_solution_answers_several_threads(name: str) -> None:
+    walk = Walk(name)
+    solution = walk.solved(name, 3)
+    right = solution.marginals(walk.x), solution.covariance(walk.x[1:4])
+    other = walk.solved(name, 3)
 
-        def ask(number: int, other: fg.Solution = other, walk: Walk = walk, name: str = name) -> Any:
-            if number % 2:
-                walk.solved(name, number)
-            return [(other.marginals(walk.x), other.covariance(walk.x[1:4])) for _ in range(3)]
+    def ask(number: int, other: fg.Solution = other, walk: Walk = walk, name: str = name) -> Any:
+        if number % 2:
+            walk.solved(name, number)
+        return [(other.marginals(walk.x), other.covariance(walk.x[1:4])) for _ in range(3)]
 
-        for found in at_once(ask):
-            for marginals, covariance in found:
-                np.testing.assert_array_equal(marginals, right[0])
-                np.testing.assert_array_equal(covariance, right[1])
+    for found in at_once(ask):
+        for marginals, covariance in found:
+            np.testing.assert_array_equal(marginals, right[0])
+            np.testing.assert_array_equal(covariance, right[1])
 
 
 @pytest.mark.parametrize("kind", ["incremental", "fixed lag"])

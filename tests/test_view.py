@@ -7,7 +7,6 @@ import math
 import re
 import shutil
 import subprocess
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from at_once import at_once
 from problems.graphs import graph_of, graph_with
 from scenes import check_offline, commands_of, data_of, tracks_of, without_viewer
 from scripts import CHECKOUT, run_script
@@ -399,17 +399,7 @@ def test_long_ways_over_many_ticks_stay_small() -> None:
 
 
 def test_scenes_in_threads_do_not_meet() -> None:
-    wanted, found = everything().html(), dict[int, str]()
-
-    def make(k: int) -> None:
-        found[k] = everything().html()
-
-    threads = [threading.Thread(target=make, args=(k,)) for k in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert set(found.values()) == {wanted} and len(found) == 4
+    assert at_once(lambda k: everything().html()) == [everything().html()] * 4
 
 
 def test_a_distance_map_has_walls_where_the_distance_is_not_positive() -> None:
