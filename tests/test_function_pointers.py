@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
+from calls import calls_of
+from unifg.codegen import function_pointers
 from unifg.codegen.function_pointers import LAYOUT, Memory
 from unifg.errors import UnifgError
 
@@ -33,14 +34,7 @@ def test_arrays_of_another_type_are_refused(matrix: Any) -> None:
 
 
 def test_equal_layouts_are_named_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    named = list[object]()
-    typeof = numba.typeof
-
-    def naming(value: object) -> object:
-        named.append(value)
-        return typeof(value)
-
-    monkeypatch.setattr("unifg.codegen.function_pointers.typeof", naming)
+    named = calls_of(monkeypatch, function_pointers, "typeof")
     memory, again = Memory(), (np.ones((1, 5)), (np.arange(7), np.ones(1)))
     memory.describe(FIRST)
     words = memory.describe(again)

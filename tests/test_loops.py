@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 
+from calls import calls_of
 from unifg.factors.autodiff import loops
 from unifg.factors.autodiff.emit import _Writer
 from unifg.factors.autodiff.operations import Op
@@ -83,14 +83,7 @@ def test_loops_compute_what_straight_lines_do(
     function: Function, manifold: Manifold, count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("UNIFG_KEEP_CODE", "0")
-    written: list[Any] = []
-    loop = _Writer.loop
-
-    def noted(*given: Any) -> None:
-        written.append(given)
-        loop(*given)
-
-    monkeypatch.setattr(_Writer, "loop", noted)
+    written = calls_of(monkeypatch, _Writer, "loop")
     looped = numbers(function, manifold, count)
     assert bool(written) == (function is not chained)
     monkeypatch.setattr(loops, "FEWEST", 10_000)

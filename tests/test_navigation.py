@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from calls import calls_of
 from maps import building, field, stop_after
 from unifg.errors import BackendError, ScenarioError
 from unifg.files.ros_map import OccupancyMap, load_map, save_map
-from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.ground.route import Route
 from unifg.scenarios.logs.drive_metrics import episode_metrics, pose_errors
@@ -21,7 +21,7 @@ from unifg.scenarios.navigation import Episode, NavigationSettings, run_navigati
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.polyline import path_length, polyline_distance
-from unifg.scenarios.simulation.plane import LidarModel, World
+from unifg.scenarios.simulation.plane import World
 from unifg.scenarios.simulation.space import Obstacle
 from unifg.typing import Array
 
@@ -299,18 +299,6 @@ def test_impossible_episodes_are_refused(change: dict[str, Any], message: str) -
         run_navigation(replace(CORRIDOR, **change))
 
 
-@pytest.mark.parametrize("wrong", [{"dt": 0.0}, {"horizon": 0}, {"sigmas": -1.0}, {"wall_clearance": -0.1}], ids=str)
-def test_impossible_settings_of_the_controller_are_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ScenarioError, match=next(iter(wrong))):
-        ControllerSettings(**wrong)
-
-
-@pytest.mark.parametrize("wrong", [{"beams": 0}, {"beams": 1}, {"range_max": 0.0}], ids=str)
-def test_a_lidar_without_beams_is_refused(wrong: dict[str, Any]) -> None:
-    with pytest.raises(ScenarioError, match=next(iter(wrong))):
-        LidarModel(**wrong)
-
-
 def test_a_map_of_ones_own_needs_start_and_goal(tmp_path: Path) -> None:
     occupied = np.zeros((44, 240), dtype=bool)
     save_map(tmp_path / "hall.yaml", OccupancyMap(occupied, ~occupied, 0.05, (0.0, -0.1, 0.0), "hall"))
@@ -421,21 +409,14 @@ def test_who_does_not_know_where_he_is_has_not_arrived(sigma: tuple[float, float
 
 
 @pytest.mark.parametrize("coupling", ["sequential", "joint"])
-def test_the_first_leg_begins_where_the_robot_believes_to_be(coupling: str) -> None:
+def test_the_first_leg_begins_where_the_robot_believes_to_be(coupling: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody tells it the true start: it looks around first, and plans from what that says; no scan counts twice."""
     episode = Episode(replace(CORRIDOR, seed=4, coupling=coupling))
     believed = episode.pilot.pose
     assert np.hypot(*(believed - episode.start)[:2]) > 0.03
-    updates: list[Any] = []
-    inner = episode.pilot.estimator.update
-
-    def counted(scan: Scan | None, odometry: Array | None, dt: float) -> None:
-        updates.append(odometry)
-        inner(scan, odometry, dt)
-
-    episode.pilot.estimator.update = counted  # type: ignore[method-assign]
+    updates = calls_of(monkeypatch, episode.pilot.estimator, "update")
     log = episode.run(stop_after(2))
-    assert [u is None for u in updates] == [True, False]
+    assert [odometry is None for _, odometry, _ in updates] == [True, False]
     first = log.route[0][0, :2]
     assert not np.array_equal(first, episode.start[:2])
     assert np.hypot(*(first - log.estimate[0, :2])) < 0.02

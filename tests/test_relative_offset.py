@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import drawn_to, graph_of, graph_with
+from calls import calls_of
+from problems.graphs import drawn_to, graph_of, graph_with, program_of
 from unifg.elimination.factorization import Factorization
 from unifg.files.g2o import read_g2o
 from unifg.lie import LieGroup
@@ -123,8 +125,7 @@ def dense_offset(program: CompiledProblem, lin: Linearization) -> float:
 def test_the_offset_is_that_of_a_dense_projection(problem: str) -> None:
     """At the guess, on the way with a factor that is one step old, damped or not, and at the end."""
     graph, guess = PROBLEMS[problem](1e3)
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     for solver in (GaussNewton, LevenbergMarquardt):
         for k in range(6):
             solution = solver(max_iterations=k).solve(graph, guess)
@@ -140,14 +141,7 @@ def test_the_offset_is_that_of_a_dense_projection(problem: str) -> None:
 
 
 def test_backends_that_lend_their_factor_take_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[int] = []
-    factor = Factorization.factor
-
-    def counted(self: Factorization, data: Array, added: Array | None = None) -> bool:
-        made.append(1)
-        return factor(self, data, added)
-
-    monkeypatch.setattr(Factorization, "factor", counted)
+    made = calls_of(monkeypatch, Factorization, "factor")
     for graph, _, guess in (manhattan(200, seed=4).pose_graph.graph(), sphere(5, 10).pose_graph.graph()):
         for solver, own in ((GaussNewton(), 1), (DogLeg(), 1), (LevenbergMarquardt(), 0)):  # LM's are compiled
             made.clear()
@@ -265,24 +259,24 @@ def exact(manifold: LieGroup, offset: float, sigma: float) -> Made:
 @pytest.mark.parametrize("offset", [0.0, 1e3, 5e6])
 @pytest.mark.parametrize("sigma", [1.0, 1e-3])
 @pytest.mark.parametrize("manifold", GROUPS, ids=lambda m: m.name)
-def test_graphs_that_fit_exactly_end_at_rounding(manifold: LieGroup, sigma: float, offset: float) -> None:
+@pytest.mark.parametrize("solver", [GaussNewton(), LevenbergMarquardt(), DogLeg(radius=1e3)])
+def test_graphs_that_fit_exactly_end_at_rounding(solver: Any, manifold: LieGroup, sigma: float, offset: float) -> None:
     """Their residual is rounding, and so is every angle with it: the floor ends the solve, not the limit."""
     graph, guess = exact(manifold, offset, sigma)
-    for solver in (GaussNewton(), LevenbergMarquardt(), DogLeg(radius=1e3)):
-        solution = solver.solve(graph, guess, check=True)
-        assert solution.iterations <= 8
-        assert solution.stationarity == 0.0 or solution.stationarity <= 1e-6
-        rounding = 12 * 1e-15 * max(1.0, offset) / sigma
-        assert solution.cost <= rounding**2 * 12
+    solution = solver.solve(graph, guess, check=True)
+    assert solution.iterations <= 8
+    assert solution.stationarity == 0.0 or solution.stationarity <= 1e-6
+    rounding = 12 * 1e-15 * max(1.0, offset) / sigma
+    assert solution.cost <= rounding**2 * 12
 
 
-def test_an_exact_answer_of_zero_takes_few_steps() -> None:
+@pytest.mark.parametrize("solver", [GaussNewton(), LevenbergMarquardt(), DogLeg()])
+def test_an_exact_answer_of_zero_takes_few_steps(solver: Any) -> None:
     graph, x = graph_with(fg.Rn(2), 3)
     graph.minimize(fg.prior, x[0], [0.0, 0.0], sigma=0.3)
     graph.minimize(lambda a, b: b - a + 0.1 * np.sin(b - a), x[:-1], x[1:], sigma=0.3)
-    for solver in (GaussNewton(), LevenbergMarquardt(), DogLeg()):
-        solution = solver.solve(graph, {x: np.arange(6.0).reshape(3, 2)}, check=True)
-        assert solution.iterations <= 8
+    solution = solver.solve(graph, {x: np.arange(6.0).reshape(3, 2)}, check=True)
+    assert solution.iterations <= 8
 
 
 def test_scalar_costs_keep_the_gradient_and_constraints_the_kkt_test() -> None:
@@ -379,8 +373,7 @@ def test_a_solve_ends_when_every_variable_has_converged(solver: type[fg.Solver])
     between = 0
     for seed in (1, 2, 3, 4):
         graph, _, guess = manhattan(60, seed).pose_graph.graph()
-        program = graph.compile()
-        program.bind({})
+        program = program_of(graph)
         for k in range(7):
             solution = solver(max_iterations=k, tolerance=1e-5).solve(graph, guess)
             lin = program.linearize(solution.values)
@@ -454,11 +447,13 @@ def edged(height: float, far: float) -> Callable[[float], Made]:
 
 @pytest.mark.parametrize("far", [0.0, 2.0, 2e8])
 @pytest.mark.parametrize("solver", BACKENDS, ids=lambda s: s.name)
-def test_a_kink_is_not_undetermined(solver: fg.Solver, far: float) -> None:
+@pytest.mark.parametrize(
+    ("height", "status"), [(0.0, fg.Status.CONVERGED), (1.0, fg.Status.CONVERGED), (-1.0, fg.Status.STALLED)]
+)
+def test_a_kink_is_not_undetermined(height: float, status: Any, solver: fg.Solver, far: float) -> None:
     """The slope that NumPy gives an edge is zero; a little further it is one."""
-    for height, status in ((0.0, fg.Status.CONVERGED), (1.0, fg.Status.CONVERGED), (-1.0, fg.Status.STALLED)):
-        graph, guess = edged(height, far)(2.0)
-        assert solver.solve(graph, guess).status is status, height
+    graph, guess = edged(height, far)(2.0)
+    assert solver.solve(graph, guess).status is status, height
 
 
 @pytest.mark.parametrize("far", [0.0, 2e8])

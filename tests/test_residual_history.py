@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_of, graph_with
+from calls import calls_of
+from problems.graphs import drawn_to, graph_of, graph_with
 from problems.known import short_drive
 from unifg.scenarios.scenes.residual_plot import ResidualMonitor, residual_picture
-from unifg.solution.history import factor_norms
+from unifg.solution import solve_state
 from unifg.solvers import (
     KKT,
     SQP,
@@ -138,13 +139,7 @@ def test_a_callback_sees_them_live_and_keeps_what_it_asks_for() -> None:
 
 
 def test_nothing_is_worked_out_unless_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    made: list[int] = []
-
-    def counted(*given: Any) -> Any:
-        made.append(1)
-        return factor_norms(*given)
-
-    monkeypatch.setattr("unifg.solution.solve_state.factor_norms", counted)
+    made = calls_of(monkeypatch, solve_state, "factor_norms")
     graph, guess = short_drive()
     SQP(verbose=False).solve(graph, guess, callback=lambda row: None)
     assert not made
@@ -168,8 +163,7 @@ def test_the_data_of_a_row_are_those_of_its_solve() -> None:
 
 
 def test_stages_of_another_solver_keep_theirs() -> None:
-    graph, x = graph_with(fg.Rn(1))
-    graph.minimize(fg.prior, x, np.zeros(1), name="prior")
+    graph, x = drawn_to([0.0], name="prior")
     measured = graph.data("measured", [[0.1], [0.2], [9.0]], each=True)
     graph.minimize(lambda a, z: a - z, x, measured, robust=fg.TruncatedLeastSquares(1.0), name="range")
     solver = GraduatedNonConvexity(solver=GaussNewton(keep_residuals=True))
@@ -226,8 +220,7 @@ def test_a_monitor_draws_while_the_solver_goes_on(tmp_path: Path) -> None:
 
 def test_what_fits_exactly_can_be_drawn() -> None:
     """Zeros have no logarithm; a term without any error is one even colour."""
-    graph, x = graph_with(fg.Rn(1), 2)
-    graph.minimize(fg.prior, x, np.zeros(1), name="prior")
+    graph, x = drawn_to([0.0], 2, name="prior")
     solution = GaussNewton(keep_residuals=True).solve(graph, {x: np.zeros((2, 1))})
     figure = residual_picture(solution.history)
     (image,) = panels(figure)["prior: 2 factors"].get_images()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from calls import calls_of
 from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.factors.autodiff import symbols
 from unifg.factors.autodiff.calculus import jacobian
@@ -141,17 +142,10 @@ def test_insisting_on_the_trace_is_an_error_then(wrong_above: Function) -> None:
 def test_a_loop_is_verified_on_a_schedule(monkeypatch: pytest.MonkeyPatch) -> None:
     graph, x, _ = stated(lambda x: np.tanh(x), constrained=False)
     prepared = GaussNewton().prepare(graph)
-    asked = list[tuple[int, bool]]()
-    honest = prepared.program.mistraced
-
-    def noted(values: Any, slopes: bool, seed: int) -> dict[str, str]:
-        asked.append((seed, slopes))
-        return honest(values, slopes, seed)
-
-    monkeypatch.setattr(prepared.program, "mistraced", noted)
+    asked = calls_of(monkeypatch, prepared.program, "mistraced")
     checked = [prepared.solve({x: np.zeros((N, 1))}).checked for _ in range(frame.EVERY + 1)]
-    assert asked == [(n, True) for n in (1, 2, 4, 8, 16, 32, 64)] + [(frame.EVERY, False)]
-    assert [n for n, yes in enumerate(checked, 1) if yes] == [n for n, _ in asked]
+    assert [given[1:] for given in asked] == [(True, n) for n in (1, 2, 4, 8, 16, 32, 64)] + [(False, frame.EVERY)]
+    assert [n for n, yes in enumerate(checked, 1) if yes] == [n for _, _, n in asked]
 
 
 def test_a_solve_without_time_left_is_verified_after_the_next() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, TypeVar, overload
 
 import unifg as fg
+from unifg.problem.compiled_problem import CompiledProblem
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.smoother import Smoother
 
@@ -41,3 +42,10 @@ def drawn_to(target: Sequence[float], count: int = 1, **options: Any) -> tuple[f
     graph, x = graph_with(fg.Rn(len(target)), count)
     graph.minimize(fg.prior, x, target, **options)
     return graph, x
+
+
+def program_of(graph: fg.Graph) -> CompiledProblem:
+    """A graph compiled, its data at their defaults."""
+    program = graph.compile()
+    program.bind({})
+    return program
