@@ -9,7 +9,6 @@ import pytest
 
 from episodes import room
 from maps import field
-from unifg.errors import ScenarioError
 from unifg.models.distance_map import DistanceMap, SmoothField
 from unifg.scenarios.ground.drive_control import Controller
 from unifg.scenarios.ground.drive_parts import disc_limits, predicted, wall_limits
@@ -91,8 +90,3 @@ def test_every_way_leads_around_a_disc_beside_the_path(flat: DistanceMap, avoida
     assert plan.source == "solved" and room_left.min() > 0.02
     far = controller.plan(PLACE, ahead(s), standing(3.0, 4.5, 0.2))
     assert np.abs(far.states[:, 1] - plan.states[:, 1]).max() > 0.05, "it is the disc that made the difference"
-
-
-def test_an_unknown_way_is_refused() -> None:
-    with pytest.raises(ScenarioError, match="unknown avoidance 'hope': choose clearance, barrier, potential, vortex"):
-        ControllerSettings(avoidance="hope")

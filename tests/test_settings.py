@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from unifg.errors import UnifgError
+from unifg.errors import ScenarioError, UnifgError
 from unifg.models.matching import Gates
 from unifg.models.vehicle import Vehicle
 from unifg.scenarios.course import CourseSettings
@@ -17,9 +17,11 @@ from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.navigation import NavigationSettings
 from unifg.scenarios.options import leaves, plain, replaced
 from unifg.scenarios.quadrotor.cbf_mpc import KeeperSettings
+from unifg.scenarios.quadrotor.flight_joint import JointSettings
 from unifg.scenarios.quadrotor.flight_settings import ControllerSettings as FlightControl
 from unifg.scenarios.safe_flight import SafeSettings
 from unifg.scenarios.simulation.disturbance import DisturbanceModel
+from unifg.scenarios.simulation.plane import LidarModel
 from unifg.scenarios.velocity_tracking import TrackingSettings
 
 SIGNED = {
@@ -73,6 +75,30 @@ def test_every_number_is_judged(settings: Any) -> None:
 )
 def test_numbers_in_rows_and_of_parts_are_judged(settings: Any, wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(UnifgError, match=message):
+        settings(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("settings", "wrong", "message"),
+    [
+        (ControllerSettings, {"dt": 0.0}, "dt"),
+        (ControllerSettings, {"horizon": 0}, "horizon"),
+        (ControllerSettings, {"sigmas": -1.0}, "sigmas"),
+        (ControllerSettings, {"wall_clearance": -0.1}, "wall_clearance"),
+        (ControllerSettings, {"avoidance": "hope"}, "unknown avoidance 'hope': .* potential, vortex"),
+        (ControllerSettings, {"futures": "best"}, "unknown futures 'best'"),
+        (ControllerSettings, {"futures": "tree", "tails": 1}, "two tails or more"),
+        (ControllerSettings, {"futures": "tree", "shared": 30}, "shares 1 to 29 of 30 steps"),
+        (LidarModel, {"beams": 0}, "two beams or more"),
+        (LidarModel, {"beams": 1}, "two beams or more"),
+        (LidarModel, {"range_max": 0.0}, "two beams or more"),
+        (JointSettings, {"pull": 0.0}, "sequential"),
+        (JointSettings, {"pull": -1.0}, "sequential"),
+        (JointSettings, {"pull": math.nan}, "sequential"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(settings: Any, wrong: dict[str, Any], message: str) -> None:
+    with pytest.raises(ScenarioError, match=message):
         settings(**wrong)
 
 
