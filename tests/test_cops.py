@@ -148,15 +148,15 @@ def test_interior_point_names_an_equality_that_loses_its_slope(function: Any) ->
     assert InteriorPoint().solve(graph, {x: [[1.0]]}).status is fg.Status.DEGENERATE
 
 
-def test_hessian_of_an_answer_is_that_of_gauss_newton() -> None:
+@pytest.mark.parametrize("callback", [None, lambda row: None])
+def test_hessian_of_an_answer_is_that_of_gauss_newton(callback: Any) -> None:
     """The loop does without the convex part of each factor where nothing needs it; an answer has it."""
     graph, guess = electrons(6)
-    for callback in (None, lambda row: None):
-        found = InteriorPoint(tolerance=1e-8).solve(graph, guess, callback=callback)
-        fresh = found._program.linearize(found.values)
-        np.testing.assert_allclose(found._lin.hessian, fresh.hessian, atol=1e-10)
-        np.testing.assert_allclose(found._lin.concavity, fresh.concavity, atol=1e-10)
-        assert np.abs(fresh.concavity).max() > 0.1 and found.iterations <= 60
+    found = InteriorPoint(tolerance=1e-8).solve(graph, guess, callback=callback)
+    fresh = found._program.linearize(found.values)
+    np.testing.assert_allclose(found._lin.hessian, fresh.hessian, atol=1e-10)
+    np.testing.assert_allclose(found._lin.concavity, fresh.concavity, atol=1e-10)
+    assert np.abs(fresh.concavity).max() > 0.1 and found.iterations <= 60
 
 
 def test_steps_of_restoration_are_counted() -> None:

@@ -288,12 +288,12 @@ def test_the_bound_waits_for_what_goes_away_and_no_longer() -> None:
     assert arrival(LANE, (1.05, 0.55), (11.05, 0.55), leaves) == pytest.approx(15.0 + 11.05 - 5.53, abs=0.2)
 
 
-def test_a_lane_that_stays_closed_has_no_arrival() -> None:
-    assert arrival(LANE, (1.05, 0.55), (11.05, 0.55), lambda time: np.array([[6.0, 0.55, 0.3]])) == math.inf
-
-
-def test_one_who_cannot_get_out_of_the_way_does_not_arrive() -> None:
-    assert arrival(LANE, (1.05, 0.55), (11.05, 0.55), lambda time: np.array([[6.0 - time, 0.55, 0.3]])) == math.inf
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_a_lane_that_stays_closed_has_no_arrival(speed: float) -> None:
+    """Neither past what stands nor for one who cannot get out of the way of what comes."""
+    assert (
+        arrival(LANE, (1.05, 0.55), (11.05, 0.55), lambda time: np.array([[6.0 - speed * time, 0.55, 0.3]])) == math.inf
+    )
 
 
 def corridor(width: float = 2.0) -> Route:

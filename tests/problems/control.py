@@ -143,9 +143,13 @@ class Problem(ABC):
     def reference(self, first: int = 0) -> tuple[Array, Array]:
         """Reference states (N + 1, ...) from step ``first`` on, and controls (N, m)."""
 
-    @abstractmethod
     def guess(self) -> tuple[Array, Array]:
-        """The cold guess."""
+        """The reference itself, even through obstacles; ``ahead`` and ``goto`` begin with the robot at rest."""
+        states, controls = self.reference()
+        if self.instance in ("ahead", "goto"):
+            states[:] = self.start
+        states[0] = self.start
+        return states, controls
 
     @abstractmethod
     def plant(self, state: Array, control: Array, index: int) -> Array:
@@ -242,14 +246,6 @@ class Unicycle(Problem):
             "behind": ((-0.5 * t, zero, zero + np.pi), (0.5, 0.0)),
         }[self.instance]
         return np.column_stack(states), np.tile(control, (self.horizon, 1))
-
-    def guess(self) -> tuple[Array, Array]:
-        """The reference itself, even through the discs; ``ahead`` has none and begins with the robot at rest."""
-        states, controls = self.reference()
-        if self.instance == "ahead":
-            states[:] = STARTS["ahead"]
-        states[0] = self.start
-        return states, controls
 
     def plant(self, state: Array, control: Array, index: int) -> Array:
         """(3,) pose after closed-loop step ``index``, heading not wrapped."""
@@ -352,14 +348,6 @@ class Quadrotor(Problem):
         )
         controls[:, 3] = np.linalg.norm(force, axis=1)
         return states, controls[:-1]
-
-    def guess(self) -> tuple[Array, Array]:
-        """The reference itself, even through the spheres; ``goto`` begins with hovering at the start."""
-        states, controls = self.reference()
-        if self.instance == "goto":
-            states[:] = self.start
-        states[0] = self.start
-        return states, controls
 
     def plant(self, state: Array, control: Array, index: int) -> Array:
         """(10,) state after closed-loop step ``index``."""

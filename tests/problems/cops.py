@@ -63,15 +63,15 @@ def columns(*parts: Any) -> Any:
 
 
 def flight(
-    graph: fg.Graph, rate: Callable[..., Any], steps: int, states: int, controls: int
-) -> tuple[fg.Family, fg.Family, fg.Family]:
+    rate: Callable[..., Any], steps: int, states: int, controls: int
+) -> tuple[fg.Graph, fg.Family, fg.Family, fg.Family]:
     """Nodes of states and controls that follow a rate, and the duration."""
-    x = graph.variables("x", fg.Rn(states), steps + 1)
-    u = graph.variables("u", fg.Rn(controls), steps + 1)
-    t = graph.variables("duration", fg.Rn(1), 1)
+    graph, x, u, t = graph_of(
+        ("x", fg.Rn(states), steps + 1), ("u", fg.Rn(controls), steps + 1), ("duration", fg.Rn(1), 1)
+    )
     arguments = x[:-1], u[:-1], x[1:], u[1:], t, 1.0 / steps
     graph.constrain(trapezoid(rate), *arguments, lower=0.0, upper=0.0, name="dynamics")
-    return x, u, t
+    return graph, x, u, t
 
 
 def polygon(corners: int) -> Stated:
@@ -321,8 +321,7 @@ def robot(steps: int) -> Stated:
             x[:, 3], x[:, 4], x[:, 5], u[:, 0] / 5.0, u[:, 1] / (inertia * sin(x[:, 2]) ** 2), u[:, 2] / inertia
         )
 
-    graph = fg.Graph()
-    x, u, t = flight(graph, rate, steps, 6, 3)
+    graph, x, u, t = flight(rate, steps, 6, 3)
     graph.fix(x[0], [4.5, 0.0, pi / 4, 0.0, 0.0, 0.0])
     graph.fix(x[-1], [4.5, 2.0 * pi / 3, pi / 4, 0.0, 0.0, 0.0])
     inf = np.inf
@@ -343,8 +342,7 @@ def steering(steps: int) -> Stated:
     def rate(x: Any, u: Any) -> Any:
         return columns(x[:, 2], x[:, 3], 100.0 * cos(u[:, 0]), 100.0 * sin(u[:, 0]))
 
-    graph = fg.Graph()
-    x, u, t = flight(graph, rate, steps, 4, 1)
+    graph, x, u, t = flight(rate, steps, 4, 1)
     graph.fix(x[0], np.zeros(4))
     graph.constrain(lambda end: end[:, 1:], x[-1], lower=[5.0, 45.0, 0.0], upper=[5.0, 45.0, 0.0], name="end")
     graph.bound(u, lower=-pi / 2, upper=pi / 2, name="angle")
@@ -362,8 +360,7 @@ def rocket(steps: int) -> Stated:
         drag = 310.0 * v**2 * exp(-500.0 * (h - 1.0))
         return columns(v, (thrust - drag) / m - 1.0 / h**2, -2.0 * thrust)
 
-    graph = fg.Graph()
-    x, u, t = flight(graph, rate, steps, 3, 1)
+    graph, x, u, t = flight(rate, steps, 3, 1)
     graph.fix(x[0], [1.0, 0.0, 1.0])
     graph.constrain(lambda end: end[:, 2:], x[-1], lower=0.6, upper=0.6, name="burnt")
     graph.bound(x, lower=[1.0, 0.0, 0.6], upper=[np.inf, np.inf, 1.0], name="box")
@@ -388,8 +385,7 @@ def glider(steps: int) -> Stated:
         along, up = x[:, 2] / speed, rise / speed
         return columns(x[:, 2], x[:, 3], (-lift * up - drag * along) / 100.0, (lift * along - drag * up) / 100.0 - 9.81)
 
-    graph = fg.Graph()
-    x, u, t = flight(graph, rate, steps, 4, 1)
+    graph, x, u, t = flight(rate, steps, 4, 1)
     graph.fix(x[0], [0.0, 1000.0, 13.23, -1.288])
     wanted = [900.0, 13.23, -1.288]
     graph.constrain(lambda end: end[:, 1:], x[-1], lower=wanted, upper=wanted, name="end")
@@ -483,9 +479,10 @@ def catalyst(intervals: int) -> Stated:
     }  # fmt: skip
 
 
-def grid(graph: fg.Graph, nx: int, ny: int) -> tuple[fg.Family, IntArray]:
+def grid(nx: int, ny: int) -> tuple[fg.Graph, fg.Family, IntArray]:
     """Heights at (nx + 2) x (ny + 2) nodes, and their numbers."""
-    return graph.variables("height", fg.Rn(1), (nx + 2) * (ny + 2)), np.arange((nx + 2) * (ny + 2)).reshape(nx + 2, -1)
+    graph, v = graph_with(fg.Rn(1), (nx + 2) * (ny + 2), "height")
+    return graph, v, np.arange((nx + 2) * (ny + 2)).reshape(nx + 2, -1)
 
 
 def triangles(v: fg.Family, at: IntArray) -> list[tuple[Any, Any, Any, IntArray]]:
@@ -503,8 +500,7 @@ def edge(at: IntArray) -> IntArray:
 
 def torsion(nx: int, ny: int) -> Stated:
     """Elastic-plastic torsion."""
-    graph = fg.Graph()
-    v, at = grid(graph, nx, ny)
+    graph, v, at = grid(nx, ny)
     hx, hy = 1.0 / (nx + 1), 1.0 / (ny + 1)
     x, y = np.minimum(np.arange(nx + 2), nx + 1 - np.arange(nx + 2)), np.arange(ny + 2)
     far = np.minimum(x[:, None] * hx, np.minimum(y, ny + 1 - y) * hy).ravel()
@@ -523,8 +519,7 @@ def torsion(nx: int, ny: int) -> Stated:
 
 def bearing(nx: int, ny: int) -> Stated:
     """Pressure in a journal bearing."""
-    graph = fg.Graph()
-    v, at = grid(graph, nx, ny)
+    graph, v, at = grid(nx, ny)
     hx, hy, e = 2.0 * pi / (nx + 1), 20.0 / (ny + 1), 0.1
     wide = (1.0 + e * cos(np.arange(-1, nx + 3) * hx)) ** 3
 
@@ -544,8 +539,7 @@ def bearing(nx: int, ny: int) -> Stated:
 
 def surface(nx: int, ny: int) -> Stated:
     """Minimal surface over a square plate."""
-    graph = fg.Graph()
-    v, at = grid(graph, nx, ny)
+    graph, v, at = grid(nx, ny)
     hx, hy = 1.0 / (nx + 1), 1.0 / (ny + 1)
     x, y = np.arange(nx + 2), np.arange(ny + 2)
 
@@ -577,8 +571,7 @@ def orbit(steps: int) -> Stated:
             1.0 + 0.0 * r,
         )
 
-    graph = fg.Graph()
-    x, u, t = flight(graph, rate, steps, 4, 1)
+    graph, x, u, t = flight(rate, steps, 4, 1)
     graph.fix(t, 3.32)
     graph.fix(x[0], [1.0, 0.0, 1.0, 0.0])
     graph.constrain(
@@ -598,8 +591,7 @@ def brachistochrone(steps: int, squared: bool = False) -> Stated:
     def rate(x: Any, u: Any) -> Any:
         return columns(x[:, 2] * sin(u[:, 0]), -x[:, 2] * cos(u[:, 0]), 9.81 * cos(u[:, 0]))
 
-    graph = fg.Graph()
-    x, u, t = flight(graph, rate, steps, 3, 1)
+    graph, x, u, t = flight(rate, steps, 3, 1)
     graph.fix(x[0], np.zeros(3))
     graph.constrain(lambda end: end[:, :2], x[-1], lower=[10.0, -5.0], upper=[10.0, -5.0], name="end")
     graph.bound(u, lower=0.0, upper=pi, name="angle")
@@ -618,8 +610,7 @@ def landing(steps: int) -> Stated:
             [x[:, 3:6], u / m - np.array([[0.0, 0.0, 3.7114]]), -5.09e-4 * sqrt((u**2).sum(axis=1))[:, None]], axis=1
         )
 
-    graph = fg.Graph()
-    x, u, t = flight(graph, rate, steps, 7, 3)
+    graph, x, u, t = flight(rate, steps, 7, 3)
     graph.fix(x[0], [2000.0, 0.0, 1500.0, 100.0, 0.0, -75.0, 1905.0])
     graph.constrain(lambda end: end[:, :6], x[-1], lower=0.0, upper=0.0, name="landed")
     graph.constrain(lambda u: sqrt((u**2).sum(axis=1))[:, None], u, lower=4972.0, upper=13260.0, name="thrust")

@@ -122,11 +122,14 @@ def hs48() -> tuple[fg.Graph, Guess]:
     return graph, {x: np.array([[3.0, 5.0, -3.0, 2.0, -2.0]])}
 
 
-def square_of_poses() -> tuple[fg.Graph, Guess]:
-    """Four exact relative poses around a square, closed: cost zero at the square."""
+def square_of_poses(anchored: bool = False) -> tuple[fg.Graph, Guess]:
+    """Four exact relative poses around a square, closed: cost zero there; the first is fixed, or a constraint."""
     graph, x = graph_with(fg.SE2, 4)
     quarter = [1.0, 0.0, np.pi / 2.0]
-    graph.fix(x[0], [0.0, 0.0, 0.0])
+    if anchored:  # which the guess keeps
+        graph.constrain(fg.prior, x[0], [0.0, 0.0, 0.0], lower=0.0, upper=0.0, name="anchor")
+    else:
+        graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.between, x, x[[1, 2, 3, 0]], quarter, information=np.diag([4.0, 4.0, 25.0]))
     return graph, {x: np.array([[0.0, 0.0, 0.0], [1.3, -0.2, 1.2], [0.7, 1.2, 2.8], [-0.3, 0.8, -1.2]])}
 
@@ -213,15 +216,6 @@ def pose_chain(
     return graph, {x: guess}
 
 
-def anchored_square() -> tuple[fg.Graph, Guess]:
-    """The square of poses, its first one held by a constraint that the guess keeps."""
-    graph, x = graph_with(fg.SE2, 4)
-    quarter = [1.0, 0.0, np.pi / 2.0]
-    graph.constrain(fg.prior, x[0], [0.0, 0.0, 0.0], lower=0.0, upper=0.0, name="anchor")
-    graph.minimize(fg.between, x, x[[1, 2, 3, 0]], quarter, information=np.diag([4.0, 4.0, 25.0]))
-    return graph, {x: np.array([[0.0, 0.0, 0.0], [1.3, -0.2, 1.2], [0.7, 1.2, 2.8], [-0.3, 0.8, -1.2]])}
-
-
 def rolled_out_drive() -> tuple[fg.Graph, Guess]:
     """A drive whose guess keeps its dynamics, its start, stated as a constraint, and its limits."""
     count, dt = 12, 0.2
@@ -298,7 +292,7 @@ PROBLEMS = [
     Problem("short drive", short_drive, np.nan),
     Problem(
         "anchored square",
-        anchored_square,
+        partial(square_of_poses, anchored=True),
         0.0,
         answer={"x": [[0, 0, 0], [1, 0, np.pi / 2], [1, 1, np.pi], [0, 1, -np.pi / 2]]},
         duals={"anchor": [[0.0, 0.0, 0.0]]},
