@@ -12,7 +12,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_of, graph_with
+from problems.graphs import graph_of, graph_with, smoother_with
 from problems.guarded_flight import NAMES, SPHERES, START, GuardedFlight
 from unifg.errors import GraphError, ModelError
 from unifg.factors.autodiff.operations import Op
@@ -43,8 +43,7 @@ CENTRE, RADIUS = np.array([[0.0, 0.0, 0.0], [1.5, 0.2, 0.1]]), np.array([0.4, 0.
 
 
 def spheres(p: Array) -> Array:
-    found: Array = np.linalg.norm(p[:, None] - CENTRE, axis=2) - RADIUS
-    return found
+    return np.asarray(np.linalg.norm(p[:, None] - CENTRE, axis=2) - RADIUS)
 
 
 # ---------------------------------------------------------------- rates inside functions
@@ -64,8 +63,7 @@ def test_rates_of_rates_are_second_derivatives() -> None:
         return avoidance.sphere_clearance(p + s * v, CENTRE, RADIUS)
 
     def faster(s: Any, p: Array) -> Array:
-        found: Array = rate(distance, p + s * v)
-        return found
+        return np.asarray(rate(distance, p + s * v))
 
     to = p[:, None] - CENTRE
     length = np.linalg.norm(to, axis=2)
@@ -77,8 +75,7 @@ def test_nothing_is_left_of_the_parameter_of_a_path() -> None:
     """It would be taken for one more tangent coordinate by whoever differentiates again."""
 
     def speed(p: Array) -> Array:
-        found: Array = rate(lambda s, p: avoidance.sphere_clearance(p + s * 2.0, CENTRE, RADIUS), p)
-        return found
+        return np.asarray(rate(lambda s, p: avoidance.sphere_clearance(p + s * 2.0, CENTRE, RADIUS), p))
 
     expression = traced(speed, (fg.Rn(3),))
     tape = expression.tape
@@ -108,8 +105,7 @@ def test_residuals_may_be_called_in_a_trace() -> None:
     def all_corners(x: Array) -> Array:  # three rows of arguments for each factor
         corners = np.concatenate([fg.SE2.compose(x, np.array([[a, 0.0, 0.0]])) for a in (-0.3, 0.0, 0.3)])
         away = obstacles.disc_clearance(corners, CENTRE[:, :2], RADIUS).reshape(3, -1, 2)
-        least: Array = away.min(axis=(0, 2))[:, None]
-        return least
+        return np.asarray(away.min(axis=(0, 2))[:, None])
 
     graph.minimize(both, x[:-1], u, x[1:], name="both")
     graph.minimize(shifted, p, name="shifted")
@@ -128,8 +124,7 @@ def test_the_same_function_of_another_residual_is_another() -> None:
     """One closure over two clearances of the same shapes: neither is taken for the other."""
 
     def near(p: Array, centre: Array, radius: Array) -> Array:
-        found: Array = np.abs(p[:, None] - centre).sum(axis=2) - radius
-        return found
+        return np.asarray(np.abs(p[:, None] - centre).sum(axis=2) - radius)
 
     manhattan = fg.residual(StatedKernel(near, (fg.Rn(3), (2, 3), (2,)), 2))
     graph, p = graph_with(fg.Rn(3), 3, "p")
@@ -309,8 +304,7 @@ def test_a_set_of_a_plain_function_moves_as_that_of_a_shipped_one(n: int) -> Non
     """Whoever writes a clearance says whether it is of many: as many centres as times is no hint."""
 
     def mine(p: Array, centre: Array, radius: Array) -> Array:
-        found: Array = np.linalg.norm(p[:, None] - centre, axis=2) - radius
-        return found
+        return np.asarray(np.linalg.norm(p[:, None] - centre, axis=2) - radius)
 
     p, t = RNG.normal(size=(n, 3)), np.linspace(0.0, 0.7, n)
     for make in (barriers.moving, barriers.thrown):
@@ -556,13 +550,15 @@ def test_inactive_intervals_are_not_held() -> None:
     assert reached[0] > -1e-3 and reached[1] == pytest.approx(-0.3, abs=1e-4)
 
 
-def test_the_first_interval_is_a_tick() -> None:
+@pytest.mark.parametrize(
+    ("count", "tick", "node"), [(0, 0.01, 0.05), (3, 0.0, 0.05), (3, 0.1, 0.05), (3, 0.01, np.inf), (3, np.nan, 0.1)]
+)
+def test_the_first_interval_is_a_tick(count: int, tick: Any, node: Any) -> None:
     begins, lengths = keeping.grid(4, 0.01, 0.05)
     np.testing.assert_allclose(lengths, [0.01, 0.05, 0.05, 0.05])
     np.testing.assert_allclose(begins, [0.0, 0.01, 0.06, 0.11])
-    for count, tick, node in ((0, 0.01, 0.05), (3, 0.0, 0.05), (3, 0.1, 0.05), (3, 0.01, np.inf), (3, np.nan, 0.1)):
-        with pytest.raises(ModelError, match="grid"):
-            keeping.grid(count, tick, node)
+    with pytest.raises(ModelError, match="grid"):
+        keeping.grid(count, tick, node)
 
 
 def past_two(form: keeping.Form, unit: float, offset: float, flat: bool) -> tuple[Any, Any, Any, Any]:
@@ -611,8 +607,7 @@ def test_neither_units_nor_offsets_nor_the_robot_matter(name: str, form: keeping
 
 
 def test_a_slack_in_a_smoother_is_refused_with_what_to_say_instead() -> None:
-    smoother = fg.Incremental()
-    p = smoother.variables("p", fg.Rn(3))
+    smoother, p = smoother_with(fg.Incremental(), fg.Rn(3), "p")
     with pytest.raises(ModelError, match=r"Incremental is no graph.*keeping.hinge"):
         keeping.keep(smoother, avoidance.sphere_clearance, p[0], CENTRE, RADIUS, obstacles=2)  # type: ignore[arg-type]
 
@@ -638,8 +633,7 @@ def catch_sight(k: float, seed: int, sightings: int = 8) -> tuple[Array, Array]:
     graph.minimize(fg.prior, p[0], np.zeros(3), sigma=0.02, name="where we are")
 
     def sighting(p: Array, c: Array, v: Array, s: Array, z: Array) -> Array:
-        error: Array = c + s * v + s**2 * down - p - z
-        return error
+        return np.asarray(c + s * v + s**2 * down - p - z)
 
     here = p[np.zeros(sightings, dtype=int)]
     graph.minimize(sighting, here, ball, throw, before, seen, sigma=sigma, name="seen")
@@ -840,10 +834,10 @@ def closed_loop(
 
 
 @pytest.mark.parametrize("end", ["rest", "brake"])
-def test_a_terminal_set_keeps_hard_plans_possible(end: str) -> None:
-    for seed in range(6):
-        held, away = closed_loop(end, seed)
-        assert all(held) and away.min() > -1e-6, (end, seed, len(held))
+@pytest.mark.parametrize("seed", range(6))
+def test_a_terminal_set_keeps_hard_plans_possible(seed: int, end: str) -> None:
+    held, away = closed_loop(end, seed)
+    assert all(held) and away.min() > -1e-6, (end, seed, len(held))
 
 
 def test_aligned_nodes_stay_where_they_are() -> None:

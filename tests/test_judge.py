@@ -106,17 +106,17 @@ def test_derivatives_do_not_vanish_far_out(size: float) -> None:
 
 @pytest.mark.parametrize("solver", [InteriorPoint(), SQP()], ids=lambda s: s.name)
 @pytest.mark.parametrize("scale", [1.0, 1e8])
-def test_rounding_above_the_tolerance_is_said(solver: Solver, scale: float) -> None:
+@pytest.mark.parametrize("derivatives", ["differences", "trace"])
+def test_rounding_above_the_tolerance_is_said(derivatives: Any, solver: Solver, scale: float) -> None:
     """Of 1e8 cosh(x - 1) differences know the slope to 1e-4: 1e-6 cannot be claimed. What was derived is exact."""
-    for derivatives in ("differences", "trace"):
-        graph, x = graph_with(fg.Rn(1))
-        cost = fg.residual(lambda p: scale * np.cosh(p[:, 0] - 1.0), derivatives=derivatives)
-        graph.minimize_scalar(cost, x)
-        solution = solver.solve(graph, {x: np.full((1, 1), 1.3)})
-        assert solution[x][0, 0] == pytest.approx(1.0, abs=1e-5)
-        rounded = derivatives == "differences" and scale != 1.0
-        assert solution.converged is not rounded
-        assert (solution.rounding > solver.tolerance) is rounded
+    graph, x = graph_with(fg.Rn(1))
+    cost = fg.residual(lambda p: scale * np.cosh(p[:, 0] - 1.0), derivatives=derivatives)
+    graph.minimize_scalar(cost, x)
+    solution = solver.solve(graph, {x: np.full((1, 1), 1.3)})
+    assert solution[x][0, 0] == pytest.approx(1.0, abs=1e-5)
+    rounded = derivatives == "differences" and scale != 1.0
+    assert solution.converged is not rounded
+    assert (solution.rounding > solver.tolerance) is rounded
 
 
 @numba.njit  # type: ignore[untyped-decorator]
@@ -374,14 +374,16 @@ def test_multipliers_of_a_stalled_solve_are_estimated_from_the_gradients(
     assert solution.dual("limit").item() == pytest.approx(multiplier if found is None else found)
 
 
-def test_estimated_multipliers_have_the_sign_of_their_limits() -> None:
+@pytest.mark.parametrize(
+    ("goal", "lower", "expected"), [(3.0, -np.inf, 2.0), (0.0, -np.inf, 0.0), (3.0, 1.0, 2.0), (0.0, 1.0, -1.0)]
+)
+def test_estimated_multipliers_have_the_sign_of_their_limits(goal: float, lower: Any, expected: float) -> None:
     """Pulled away from its limit, a row has none; between limits that meet it may have either."""
-    for goal, lower, expected in ((3.0, -np.inf, 2.0), (0.0, -np.inf, 0.0), (3.0, 1.0, 2.0), (0.0, 1.0, -1.0)):
-        graph, x = drawn_to([goal])
-        graph.constrain(lambda p: p, x, lower=lower, upper=1.0)
-        program = graph.compile()
-        multipliers = estimated(program, program.linearize({x: np.ones((1, 1))}), 1e-6)
-        assert multipliers is not None and multipliers.item() == pytest.approx(expected)
+    graph, x = drawn_to([goal])
+    graph.constrain(lambda p: p, x, lower=lower, upper=1.0)
+    program = graph.compile()
+    multipliers = estimated(program, program.linearize({x: np.ones((1, 1))}), 1e-6)
+    assert multipliers is not None and multipliers.item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("watched", [False, True])
@@ -389,10 +391,9 @@ def test_estimated_multipliers_have_the_sign_of_their_limits() -> None:
 @pytest.mark.product(4)
 def test_rows_between_fixed_variables_are_judged_first_and_named(solver: Solver, watched: bool) -> None:
     """No step changes them: nothing is gained by an iteration."""
-    graph, x = graph_with(fg.Rn(2), 3)
+    graph, x = drawn_to([3.0, 1.0], 3)
     where = graph.data("where", [[0.0, 0.0], [1.0, 0.5]])
     graph.fix(x[:2], where)
-    graph.minimize(fg.prior, x, [3.0, 1.0])
     graph.constrain(lambda a, b: b - a, x[:-1], x[1:], lower=-1.0, upper=1.0, name="step")
     graph.bound(x, upper=2.0, name="fence")
     run = replace(solver, keep_values=watched).prepare(graph)
@@ -410,9 +411,8 @@ def test_rows_between_fixed_variables_are_judged_first_and_named(solver: Solver,
 
 
 def test_check_names_violated_rows_between_fixed_variables() -> None:
-    graph, x = graph_with(fg.Rn(2), 3)
+    graph, x = drawn_to([3.0, 1.0], 3)
     graph.fix(x[:2], [[0.0, 0.0], [1.0, 1.5]])
-    graph.minimize(fg.prior, x, [3.0, 1.0])
     graph.constrain(lambda a, b: b - a, x[:-1], x[1:], lower=-1.0, upper=1.0, name="step")
     report = graph.check({x: np.zeros((3, 2))})
     (finding,) = report.findings

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.optimize import minimize
 
 import unifg as fg
 from problems.control import Unicycle
-from problems.graphs import graph_of, graph_with
+from problems.graphs import graph_of, graph_with, program_of
 from unifg.factors.robust import Formula, Loss, bend_of, form_of
 from unifg.modeling.terms import Cost
 from unifg.problem.compiled_problem import CompiledProblem
@@ -131,8 +132,7 @@ def test_formulas_are_those_of_the_papers(loss: Formula) -> None:
 @pytest.mark.parametrize("loss", [*LOSSES, Welsch(), HALF], ids=lambda loss: repr(loss).split(" object")[0][:30])
 def test_cost_gradient_and_hessian(loss: Loss, compiled: bool) -> None:
     graph, guess, active = poses(loss, compiled)
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     values = program.values_from(guess)
     lin = program.linearize(values)
     assert lin.cost == pytest.approx(objective(program, guess, loss, active), rel=1e-12)
@@ -224,22 +224,22 @@ def test_a_loss_that_is_never_active_changes_no_step(name: str) -> None:
         np.testing.assert_allclose([row.cost for row in run.history], [row.cost for row in runs[0].history], rtol=1e-9)
 
 
-def test_shipped_losses_leave_nothing_to_python() -> None:
-    for loss, alone in ((fg.Tukey(3.0), True), (HALF, False), (Welsch(), False)):
-        graph, _, _ = poses(loss, True)
-        graph.bound(graph.families["shared"], upper=5.0)
-        assert graph.compile().fully_compiled == alone
+@pytest.mark.parametrize(("loss", "alone"), [(fg.Tukey(3.0), True), (HALF, False), (Welsch(), False)])
+def test_shipped_losses_leave_nothing_to_python(loss: Any, alone: bool) -> None:
+    graph, _, _ = poses(loss, True)
+    graph.bound(graph.families["shared"], upper=5.0)
+    assert graph.compile().fully_compiled == alone
 
 
-def test_masks_come_and_go_with_data() -> None:
+@pytest.mark.parametrize("loss", [*LOSSES, Welsch(), HALF])
+def test_masks_come_and_go_with_data(loss: Any) -> None:
     """A factor switched off by data counts for nothing, whatever its loss, and comes back."""
-    for loss in [*LOSSES, Welsch(), HALF]:
-        graph, x = graph_with(fg.Rn(1))
-        on = graph.data("on", np.array([True, True]), each=True)
-        graph.minimize(fg.prior, x, np.array([[0.0], [0.5]]), robust=loss, active=on)
-        graph.bound(x, upper=9.0)
-        run = InteriorPoint(tolerance=1e-9).prepare(graph)
-        found = [run.solve({x: [[0.1]]}, data={on: np.array(mask)})[x][0, 0] for mask in ([1, 1], [1, 0], [0, 1])]
-        both = run.solve({x: [[0.1]]})[x][0, 0]
-        np.testing.assert_allclose(found, [both, 0.0, 0.5], atol=1e-7, err_msg=str(loss))
-        assert 0.0 < both < 0.5
+    graph, x = graph_with(fg.Rn(1))
+    on = graph.data("on", np.array([True, True]), each=True)
+    graph.minimize(fg.prior, x, np.array([[0.0], [0.5]]), robust=loss, active=on)
+    graph.bound(x, upper=9.0)
+    run = InteriorPoint(tolerance=1e-9).prepare(graph)
+    found = [run.solve({x: [[0.1]]}, data={on: np.array(mask)})[x][0, 0] for mask in ([1, 1], [1, 0], [0, 1])]
+    both = run.solve({x: [[0.1]]})[x][0, 0]
+    np.testing.assert_allclose(found, [both, 0.0, 0.5], atol=1e-7, err_msg=str(loss))
+    assert 0.0 < both < 0.5

@@ -519,15 +519,15 @@ def test_a_robot_whose_scan_fits_another_place_better_is_lost() -> None:
         assert pilot._elsewhere == 0.0, "a scan that fits leaves nothing to look for"
 
 
-def test_a_place_that_fits_badly_itself_is_no_better_one() -> None:
+@pytest.mark.parametrize(("fitting", "elsewhere"), [(0.8, 0.0), (0.9, 0.45)])
+def test_a_place_that_fits_badly_itself_is_no_better_one(fitting: float, elsewhere: float) -> None:
     pilot, sample = lost_pilot(), World(HALL, (22.6, 3.5, -2.5)).scan()
     pilot.supervisor.verdict = HealthReport(Health.OK, 1.0, "")
-    for fitting, elsewhere in ((0.8, 0.0), (0.9, 0.45)):
-        pilot._search = Finding(*[Found(None, fitting, "")] * DOUBTFUL)  # type: ignore[assignment]
-        pilot.share = 0.45
-        for _ in range(DOUBTFUL):
-            pilot._find_again(sample, np.zeros(2))
-        assert pilot._elsewhere == pytest.approx(elsewhere)
+    pilot._search = Finding(*[Found(None, fitting, "")] * DOUBTFUL)  # type: ignore[assignment]
+    pilot.share = 0.45
+    for _ in range(DOUBTFUL):
+        pilot._find_again(sample, np.zeros(2))
+    assert pilot._elsewhere == pytest.approx(elsewhere)
 
 
 def test_a_map_put_askew_leaves_the_robot_in_the_open() -> None:
@@ -760,14 +760,14 @@ def test_what_pushes_is_flown_against_at_once() -> None:
     assert watch.hover(still, least, most)[0] > 1.0, "it leans against it"
 
 
-def test_a_landing_is_broken_off_when_all_is_well_again_but_not_near_the_floor() -> None:
-    for height, lands in ((1.5, False), (0.4, True)):
-        watch, here = FlightWatch(0.05, SPREAD), believed()
-        here.state[2] = height
-        looked(watch, [None] * 60, here)
-        assert watch.lands
-        looked(watch, [reading()] * 20, here, 60)
-        assert watch.verdict.health is not Health.LOST and watch.lands is lands
+@pytest.mark.parametrize(("height", "lands"), [(1.5, False), (0.4, True)])
+def test_a_landing_is_broken_off_when_all_is_well_again_but_not_near_the_floor(height: float, lands: bool) -> None:
+    watch, here = FlightWatch(0.05, SPREAD), believed()
+    here.state[2] = height
+    looked(watch, [None] * 60, here)
+    assert watch.lands
+    looked(watch, [reading()] * 20, here, 60)
+    assert watch.verdict.health is not Health.LOST and watch.lands is lands
 
 
 @pytest.mark.product(2, of="drives and flights")
@@ -787,10 +787,10 @@ def test_a_flight_without_its_detector_hovers_and_its_pictures_say_why(tmp_path:
     assert FlightLog.load(path).causes == log.causes
 
 
-def test_touching_the_floor_softly_is_a_landing() -> None:
+@pytest.mark.parametrize(("speed", "touched"), [(0.5, 0), (1.5, 1)])
+def test_touching_the_floor_softly_is_a_landing(speed: float, touched: int) -> None:
     layout = corridor(0)
-    for speed, touched in ((0.5, 0), (1.5, 1)):
-        start = np.concatenate([layout.start[:2], [0.05, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -speed]])
-        world = QuadrotorWorld(layout, 0, start=start)
-        world.step([0.0, 0.0, 0.0, quadrotor.GRAVITY], 0.2)
-        assert world.state[2] < 0.01 and world.collisions == touched
+    start = np.concatenate([layout.start[:2], [0.05, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -speed]])
+    world = QuadrotorWorld(layout, 0, start=start)
+    world.step([0.0, 0.0, 0.0, quadrotor.GRAVITY], 0.2)
+    assert world.state[2] < 0.01 and world.collisions == touched

@@ -124,19 +124,22 @@ def test_what_jumps_has_no_slope(op: Op) -> None:
     assert r[0, 0] == expected.get(Op(op), 1.0) and not J.any() and not expression.slopes
 
 
-def test_a_choice_has_the_slope_of_what_is_chosen() -> None:
+@pytest.mark.parametrize(
+    ("point", "value", "slope", "bend"),
+    [
+        ((2.0, 3.0), 4.0, [4.0, 0.0], [[2.0, 0.0], [0.0, 0.0]]),
+        ((3.0, 2.0), 6.0, [2.0, 3.0], [[0.0, 1.0], [1.0, 0.0]]),
+        ((2.0, 2.0), 4.0, [2.0, 2.0], [[0.0, 1.0], [1.0, 0.0]]),
+    ],
+)
+def test_a_choice_has_the_slope_of_what_is_chosen(point: Any, value: float, slope: Any, bend: Any) -> None:
     tape = Tape()
     x, y = (tape.add(tape.leaf(Op.VARIABLE, k), tape.leaf(Op.TANGENT, k)) for k in range(2))
     chosen = tape.select(tape.apply(Op.LESS, x, y), tape.multiply(x, x), tape.multiply(x, y))
     expression, nothing = Expression(tape, (chosen,), 2, "choice"), np.zeros((1, 0))
-    for point, value, slope, bend in (
-        ((2.0, 3.0), 4.0, [4.0, 0.0], [[2.0, 0.0], [0.0, 0.0]]),
-        ((3.0, 2.0), 6.0, [2.0, 3.0], [[0.0, 1.0], [1.0, 0.0]]),
-        ((2.0, 2.0), 4.0, [2.0, 2.0], [[0.0, 1.0], [1.0, 0.0]]),
-    ):
-        r, J = evaluated(expression, np.array([point]), nothing)
-        S = curved(expression, np.array([point]), nothing, np.ones((1, 1)))[0]
-        assert r[0, 0] == value and J[0, 0].tolist() == slope and S.tolist() == bend
+    r, J = evaluated(expression, np.array([point]), nothing)
+    S = curved(expression, np.array([point]), nothing, np.ones((1, 1)))[0]
+    assert r[0, 0] == value and J[0, 0].tolist() == slope and S.tolist() == bend
 
 
 @pytest.mark.parametrize("condition", [1.0, 1e5, 1e10])
