@@ -237,8 +237,7 @@ def test_a_shift_moves_values_and_multipliers_and_repeats_the_end() -> None:
 
 
 def test_the_worst_row_is_named_where_something_is_violated() -> None:
-    graph, x = graph_with(fg.Rn(1), 3)
-    graph.minimize(fg.prior, x, np.zeros(1), name="wish")
+    graph, x = drawn_to([0.0], 3, name="wish")
     graph.bound(x, upper=5.0, name="loose")
     graph.constrain(lambda a: a, x, lower=np.array([[0.0], [2.0], [1.0]]), name="tight")
     solution = SQP(max_iterations=0).solve(graph, {x: np.zeros((3, 1))})

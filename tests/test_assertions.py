@@ -10,7 +10,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 import unifg as fg
 from asserting import below, decides, edge, nested, newton, perhaps, spread
-from problems.graphs import graph_with, smoother_with
+from problems.graphs import drawn_to, graph_with, smoother_with
 from test_derive import curved, evaluated
 from unifg.factors.autodiff.expression import Expression
 from unifg.factors.autodiff.rates import rate
@@ -167,9 +167,8 @@ def test_python_says_the_same() -> None:
 
 def test_a_factor_that_is_switched_off_asserts_too() -> None:
     """As in Python, where the function is called for the whole batch."""
-    graph, x = graph_with(fg.Rn(1), N)
+    graph, x = drawn_to([1.9], N, sigma=1.0, name="pull")
     active = graph.data("active", np.ones(N, dtype=bool), each=True)
-    graph.minimize(fg.prior, x, [1.9], sigma=1.0, name="pull")
     graph.minimize(below, x, active=active, sigma=1.0, name="own")
     run = GaussNewton().prepare(graph)
     assert run.solve({x: np.zeros((N, 1))}).converged
@@ -195,9 +194,8 @@ def test_a_demand_about_data_is_kept() -> None:
             raise ValueError("gains must be positive")
         return x * gain
 
-    graph, x = graph_with(fg.Rn(1), N)
+    graph, x = drawn_to([1.0], N, sigma=1.0, name="pull")
     gain = graph.data("gain", np.ones(1))
-    graph.minimize(fg.prior, x, [1.0], sigma=1.0, name="pull")
     graph.minimize(scaled, x, gain, sigma=1.0, name="own")
     run, guess = GaussNewton().prepare(graph), {x: np.zeros((N, 1))}
     assert graph.check(guess).routes["own"].startswith("traced") and run.solve(guess, data={gain: [2.0]}).converged

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_of, graph_with
+from problems.graphs import drawn_to, graph_of, graph_with
 from unifg.files.g2o import read_g2o
 from unifg.lie import Product
 from unifg.models.odometry import driven, held
@@ -180,8 +180,7 @@ def test_members_come_in_when_enough_says_where_they_are() -> None:
 
 
 def test_no_chain_is_an_error_with_a_remedy() -> None:
-    graph, x = graph_with(fg.Rn(2), 3)
-    graph.minimize(fg.prior, x, np.zeros(2))
+    graph, x = drawn_to([0.0, 0.0], 3)
     with pytest.raises(fg.GraphError, match="along="):
         fg.best_guess(graph, {x: np.ones((3, 2))})
 

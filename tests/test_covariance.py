@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
-from problems.graphs import graph_of, graph_with
+from problems.graphs import drawn_to, graph_of
 from test_kkt import chain
 from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.typing import Array
@@ -97,9 +97,8 @@ INFORMATION = np.array([[4.0, 1.0, 0.5], [1.0, 3.0, -0.5], [0.5, -0.5, 2.0]])
 
 def pressed(limit: float) -> tuple[fg.Graph, fg.Family, fg.Data]:
     """A point that wants to be at (2, 1, 3), below a plane whose height is data, under a bound and above another."""
-    graph, x = graph_with(fg.Rn(3))
+    graph, x = drawn_to([2.0, 1.0, 3.0], information=INFORMATION)
     height = graph.data("height", limit)
-    graph.minimize(fg.prior, x, [2.0, 1.0, 3.0], information=INFORMATION)
     graph.constrain(lambda p: p[:, :1] + 2.0 * p[:, 1:2], x, upper=height, name="plane")
     graph.bound(x, lower=[-9.0, -9.0, -9.0], upper=[9.0, 9.0, 2.5])
     return graph, x, height

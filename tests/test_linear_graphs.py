@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import drawn_to, graph_of, graph_with
+from problems.graphs import drawn_to, graph_of, graph_with, program_of
 from problems.known import PROBLEMS, Guess, ecg2o, ecg2o_inequality, three_variable_qp
 from test_sqp_exact import two_rotations
 from unifg.models import unicycle
@@ -47,8 +47,7 @@ def repulsion() -> tuple[fg.Graph, Guess]:
 
 
 def _equalities_only(build: Callable[[], tuple[fg.Graph, Guess]]) -> bool:
-    program = build()[0].compile()
-    program.bind({})
+    program = program_of(build()[0])
     return bool(program.equality.all())
 
 
@@ -69,8 +68,7 @@ def test_there_are_problems_enough() -> None:
 
 def prepared(name: str) -> tuple[CompiledProblem, Guess]:
     graph, guess = BUILD[name]()
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     return program, guess
 
 
@@ -238,9 +236,8 @@ def test_inequalities_are_refused_by_name() -> None:
     with pytest.raises(fg.BackendError, match="'ellipse'"):
         LinearGraphs.at(graph, guess)
     # What data turn into an inequality is refused when it becomes one.
-    graph, x = graph_with(fg.Rn(1))
+    graph, x = drawn_to([1.0])
     upper = graph.data("upper", np.zeros(1))
-    graph.minimize(fg.prior, x, [1.0])
     graph.constrain(lambda p: p, x, lower=0.0, upper=upper, name="wall")
     run = SQP(qp="elimination").prepare(graph)
     assert run.solve({x: np.ones((1, 1))}).converged

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_with, program_of
 from test_derive import differences
 from test_jacobians import CASES
 from unifg.factors.residuals import Residual, residual
@@ -38,8 +38,7 @@ def hessian(which: Residual, points: list[Array], manifolds: list[Manifold], con
         graph.minimize(which, *families, *constants, sigma=0.5)
     else:
         graph.constrain(which, *families, *constants, lower=0.0, upper=0.0)
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     lin = program.linearize(program.values_from(dict(zip(families, points, strict=True))))
     multipliers = np.linspace(-1.0, 2.0, program.constraints.count)
     return lagrangian_hessian(program, lin, multipliers) - lin.hessian

@@ -204,10 +204,9 @@ def test_weights_of_rows_and_of_stages(each: bool, as_data: bool) -> None:
 
 @pytest.mark.parametrize("solver", [InteriorPoint(), SQP(), AugmentedLagrangian()], ids=named)
 def test_data_as_limits_and_masks(solver: fg.Solver) -> None:
-    graph, x = graph_with(fg.Rn(1), 3)
+    graph, x = drawn_to([3.0], 3, sigma=1.0)
     upper = graph.data("upper", np.array([[1.0], [2.0], [np.inf]]))
     active = graph.data("active", np.ones(3, dtype=bool), each=True)
-    graph.minimize(fg.prior, x, [3.0], sigma=1.0)
     graph.constrain(lambda x: x, x, upper=upper, soft=fg.Soft(linear=0.2, quadratic=1.0), active=active, name="most")
     run, guess = solver.prepare(graph), {x: np.zeros((3, 1))}
 
@@ -314,9 +313,8 @@ def test_a_graph_with_soft_constraints_changes_as_any_other() -> None:
 
 
 def test_data_of_prices_leave_with_their_term() -> None:
-    graph, x = graph_with(fg.Rn(1), 2)
+    graph, x = drawn_to([3.0], 2, sigma=1.0)
     price = graph.data("price", 2.0)
-    graph.minimize(fg.prior, x, [3.0], sigma=1.0)
     graph.constrain(lambda x: x, x, upper=1.0, soft=price, name="most")
     assert "price" in str(graph)
     graph.replace("most", soft=1.0)

@@ -11,7 +11,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import drawn_to, graph_with
+from problems.graphs import drawn_to, graph_with, program_of
 from problems.hock_schittkowski import SMALL
 from problems.known import PROBLEMS, Guess, Problem, ecg2o, ecg2o_inequality, hs6, pose_beside_disc, short_drive
 from unifg.problem.compiled_problem import CompiledProblem
@@ -118,8 +118,7 @@ def test_exact_solves_what_gauss_newton_solves(problem: Problem, qp: str) -> Non
 def saddle_qp(equality: bool, multiplier: float, level: float = 0.3) -> tuple[CompiledProblem, QP]:
     """The exact subproblem of the saddle."""
     graph, guess = saddle(equality, level)
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     lin = program.linearize(program.values_from(guess))
     multipliers = np.zeros(program.constraints.count)
     multipliers[0] = multiplier
@@ -199,8 +198,7 @@ def test_wrong_inertia_takes_gauss_newton_and_right_inertia_does_not() -> None:
     """On the circle H = (1 + 2 lambda) I: negative along the tangent for lambda < -1/2."""
     graph, x = drawn_to([1.0, 0.0])
     graph.constrain(lambda p: (p**2).sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0, name="circle")
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     lin = program.linearize(program.values_from({x: np.array([[-0.8, 0.6]])}))
     exact = ExactHessian(program)
     right = exact.subproblem(lin, np.array([-0.4]), 0.0, Scaling.none(program))
@@ -231,8 +229,7 @@ def test_saddles_are_solved_and_curvature_is_not_clipped(equality: bool) -> None
 
 def test_gauss_newton_model_is_what_it_was() -> None:
     graph, guess = short_drive()
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     lin = program.linearize(program.values_from(guess))
     narrow, wide = subproblem(program, lin, 0.5), subproblem(program, lin, 0.5, program.normal)
     np.testing.assert_array_equal(full(narrow), full(wide))

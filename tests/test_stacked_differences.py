@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_of, graph_with
+from problems.graphs import graph_of, graph_with, program_of
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
@@ -62,8 +62,7 @@ def chain(function: Callable[..., Array], *more: Any) -> tuple[CompiledProblem, 
     function = fg.residual(function, derivatives="differences")
     x, u = graph.variables("x", fg.Rn(STATES), N + 1), graph.variables("u", fg.Rn(CONTROLS), N)
     graph.constrain(function, x[:-1], u, x[1:], *more, lower=0.0, upper=0.0, name="motion")
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     return program, program.linearize(program.values_from({x: X, u: U}))
 
 
@@ -96,8 +95,7 @@ def test_long_batches_are_cut() -> None:
 
     graph, x = graph_with(fg.Rn(40), 200)
     graph.minimize(wide, x, name="wide")
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     program.linearize(program.values_from({x: RNG.standard_normal((200, 40))}))
     assert 200 * 40 < longest <= 1 << 15
 
@@ -154,8 +152,7 @@ def test_functions_that_know_their_batch(which: str, derivatives: Any) -> None:
         more = (graph.data("rows", ROWS, each=True),)
     stated = fg.residual(function, derivatives=derivatives)
     graph.constrain(stated, x[:-1], u, x[1:], *more, lower=0.0, upper=0.0, name="motion")
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     lin = program.linearize(program.values_from({x: X, u: U}))
     expected = bent_hessian(X[:-1], X[1:], PULL)
     diagonal = np.arange(STATES)
@@ -177,8 +174,7 @@ def test_a_function_may_refuse_points_that_only_the_trial_asks_for() -> None:
 
     graph, x = graph_with(fg.Rn(2), 3)
     graph.minimize(edge, x, name="edge")
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     lin = program.linearize(program.values_from({x: np.zeros((3, 2))}))
     np.testing.assert_allclose(lin.jacobian.reshape(3, 2, 2), np.tile(np.eye(2), (3, 1, 1)), atol=1e-9)
 
@@ -202,8 +198,7 @@ def test_a_term_may_be_straight_at_one_point_and_bent_at_another(derivatives: An
     graph, x = graph_with(fg.Rn(3), 4)
     hinge = fg.residual(lambda x: np.maximum(x[:, :1] - 1.0, 0.0) * x[:, 1:2], derivatives=derivatives)
     graph.constrain(hinge, x, upper=0.0, name="hinge")
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     at = np.zeros((4, 3))
     term, pull = program.terms[0], np.ones((4, 1))
     assert not term.second_derivatives(program.values_from({x: at}), pull).any()

@@ -254,9 +254,8 @@ def test_tolerance_counts(plan: fg.Solution) -> None:
 
 
 def test_constraints_of_fixed_variables_alone_pass() -> None:
-    graph, x = graph_with(fg.Rn(1), 2)
+    graph, x = drawn_to([0.0], 2, name="cost")
     graph.fix(x, [[1.0], [2.0]])
-    graph.minimize(fg.prior, x, [0.0], name="cost")
     graph.constrain(lambda a, b: b - a, x[:1], x[1:], lower=0.5, name="apart")
     found = InteriorPoint().solve(graph, {x: [[1.0], [2.0]]}, check=True).verify()
     assert found and found.multipliers is not None and not found.multipliers["apart"].any()
