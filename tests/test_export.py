@@ -72,6 +72,14 @@ def flat(prepared: Prepared, guess: Any) -> tuple[Array, Array]:
     return values.flat, multipliers
 
 
+def ready(build: Callable[[], tuple[fg.Graph, Any, fg.Data]]) -> tuple[Prepared, Any]:
+    """A backend that has solved a problem once, and the guess."""
+    graph, guess, _ = build()
+    prepared = InteriorPoint().prepare(graph)
+    prepared.solve(guess)
+    return prepared, guess
+
+
 def assert_same(prepared: Prepared, folder: Path, guess: Any, each: Sequence[Mapping[fg.Data, Any]]) -> None:
     """Solves in C and in Python agree in every bit, cold and from the answer before."""
     run, enumerated = built(folder, threads=2), words(folder)
@@ -139,9 +147,7 @@ def test_nothing_but_mathematics_is_expected_of_others(tmp_path: Path) -> None:
     """The shared object is linked without any symbol left open, and keeps its own names to itself."""
     if (nm := shutil.which("nm")) is None:
         pytest.skip("no nm is here")
-    graph, guess, _ = with_losses()
-    prepared = InteriorPoint().prepare(graph)
-    prepared.solve(guess)
+    prepared, _ = ready(with_losses)
     *_, shared = prepared.export(tmp_path, name="mine")
     listed = subprocess.run([nm, "-D", "-P", str(shared)], capture_output=True, text=True, check=True).stdout
     symbols = [line.split()[:2] for line in listed.splitlines()]
@@ -152,9 +158,7 @@ def test_nothing_but_mathematics_is_expected_of_others(tmp_path: Path) -> None:
 
 
 def test_code_that_needs_more_than_mathematics_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    graph, guess, _ = around_a_disc()
-    prepared = InteriorPoint().prepare(graph)
-    prepared.solve(guess)
+    prepared, _ = ready(around_a_disc)
     monkeypatch.setattr(standalone, "OUTSIDE", re.compile(r"llvm\.|log1p$"))
     with pytest.raises(BackendError, match="expects cos, sin, sqrt, tan, which is a part of Python"):
         prepared.export(tmp_path)
@@ -170,9 +174,7 @@ def test_code_that_needs_more_than_mathematics_is_refused(tmp_path: Path, monkey
 @pytest.mark.product(1, of="exports")
 @compiled_by_c
 def test_input_that_python_refuses_is_refused(tmp_path: Path) -> None:
-    graph, guess, _ = with_losses()
-    prepared = InteriorPoint().prepare(graph)
-    prepared.solve(guess)
+    prepared, guess = ready(with_losses)
     prepared.export(tmp_path)
     data, (values, multipliers) = in_order(prepared, {}), flat(prepared, guess)
     wrong = []
@@ -234,9 +236,7 @@ def test_a_workspace_that_was_moved_is_set_up_anew(tmp_path: Path) -> None:
 @compiled_by_c
 def test_too_little_room_is_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compiled functions that find none go on with what they have not computed."""
-    graph, guess, _ = around_a_disc()
-    prepared = InteriorPoint().prepare(graph)
-    prepared.solve(guess)
+    prepared, guess = ready(around_a_disc)
     found = prepared.entry()
     monkeypatch.setattr(prepared, "entry", lambda: found._replace(entry=found.entry._replace(room=64)))
     prepared.export(tmp_path)
@@ -263,9 +263,7 @@ def test_the_program_of_the_page_plans(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.product(1, of="exports")
 def test_an_object_file_for_another_processor(tmp_path: Path) -> None:
-    graph, guess, _ = with_losses()
-    prepared = InteriorPoint().prepare(graph)
-    prepared.solve(guess)
+    prepared, _ = ready(with_losses)
     header, made = prepared.export(tmp_path / "new", name="arm", target="aarch64-unknown-linux-gnu")
     code = made.read_bytes()
     assert code[:4] == b"\x7fELF" and code[18] == 183 and b"arm_solve\0" in code
@@ -280,9 +278,7 @@ def test_an_object_file_for_another_processor(tmp_path: Path) -> None:
 def test_without_a_compiler_it_says_how_to_link(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    graph, guess, _ = around_a_disc()
-    prepared = InteriorPoint().prepare(graph)
-    prepared.solve(guess)
+    prepared, _ = ready(around_a_disc)
     monkeypatch.setenv("CC", "no-such-compiler")
     with caplog.at_level(logging.WARNING, "unifg"):
         assert [file.name for file in prepared.export(tmp_path)] == ["solver.h", "solver.o"]
@@ -347,11 +343,9 @@ def test_parts_of_python_are_refused_by_name() -> None:
 
 @pytest.mark.product(1, of="exports")
 def test_the_header_tells_order_shapes_and_units(tmp_path: Path) -> None:
-    graph, guess, _ = around_a_disc()
-    prepared = InteriorPoint().prepare(graph)
-    prepared.solve(guess)
+    prepared, _ = ready(around_a_disc)
     prepared.export(tmp_path)
     words = " ".join((tmp_path / "solver.h").read_text().replace("\n * ", " ").split())
     assert "row by row (the last axis runs fastest)" in words and "units the graph was written in" in words
-    for family in graph.families.values():
+    for family in prepared.program.families:
         assert f"{family.name}, {family.count} x {family.manifold.storage} {family.manifold.name}" in words

@@ -44,6 +44,12 @@ def log() -> RangeLog:
 
 
 @pytest.fixture(scope="module")
+def truth(log: RangeLog) -> Array:
+    assert log.corrected is not None
+    return log.corrected
+
+
+@pytest.fixture(scope="module")
 def made(log: RangeLog, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder with a log and the results of ``unifg map`` on it."""
     folder = tmp_path_factory.mktemp("made")
@@ -69,13 +75,12 @@ def test_a_table_is_read_as_it_was_written(log: RangeLog, tmp_path: Path) -> Non
 
 
 def test_beams_and_scans_in_any_order_and_unit_are_one_log(
-    log: RangeLog, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    log: RangeLog, truth: Array, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert log.corrected is not None
     back, turned = np.arange(len(log))[::-1], np.arange(len(log.angles))[::-1]
     other = replace(
         log, time=log.time[back], angles=log.angles[turned], ranges=log.ranges[np.ix_(back, turned)],
-        odometry=log.odometry[back], corrected=log.corrected[back],
+        odometry=log.odometry[back], corrected=truth[back],
     )  # fmt: skip
     write_csv(tmp_path / "log.csv", other, unit=1e6)
     with caplog.at_level(logging.WARNING):
@@ -163,9 +168,8 @@ def carmen(path: Path, log: RangeLog, laser: Array, robot: Array, odometry: Arra
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_a_carmen_log_says_which_poses_are_corrected(log: RangeLog, tmp_path: Path) -> None:
-    path, truth = tmp_path / "log.clf", log.corrected
-    assert truth is not None
+def test_a_carmen_log_says_which_poses_are_corrected(log: RangeLog, truth: Array, tmp_path: Path) -> None:
+    path = tmp_path / "log.clf"
     mount = np.array([0.3, 0.0, 0.0])
     carmen(path, log, SE2.compose(log.odometry, mount), log.odometry, None)
     raw = read_range_log(path)
@@ -189,9 +193,7 @@ def test_a_carmen_log_says_which_poses_are_corrected(log: RangeLog, tmp_path: Pa
     assert read_range_log(path).corrected is None
 
 
-def test_poses_are_laid_on_each_other(log: RangeLog) -> None:
-    truth = log.corrected
-    assert truth is not None
+def test_poses_are_laid_on_each_other(log: RangeLog, truth: Array) -> None:
     np.testing.assert_allclose(
         aligned(SE2.compose(np.array([3.0, -2.0, 0.7]), truth), truth)[:, :2], truth[:, :2], atol=1e-9
     )
@@ -377,9 +379,8 @@ def test_a_field_is_the_distance_to_the_nearest_point() -> None:
     assert np.abs(field_of(points).distance(places) + 0.025 - nearest)[near].max() < 0.05
 
 
-def test_a_map_of_true_poses_is_the_building(log: RangeLog) -> None:
-    truth, (building, _) = log.corrected, corridors()
-    assert truth is not None
+def test_a_map_of_true_poses_is_the_building(log: RangeLog, truth: Array) -> None:
+    building, _ = corridors()
     found = mapped(log.angles, log.ranges, truth)
     rows, columns = np.nonzero(found.occupied)
     field = DistanceMap.from_occupancy(building.occupied, building.resolution, building.origin)
@@ -521,10 +522,9 @@ def test_several_hypotheses_are_held_until_a_corridor_ends() -> None:
     assert localiser.hypotheses == 1
 
 
-def test_a_scan_that_does_not_fit_makes_hypotheses_of_which_one_has_to_fit_well(log: RangeLog) -> None:
+def test_a_scan_that_does_not_fit_makes_hypotheses_of_which_one_has_to_fit_well(log: RangeLog, truth: Array) -> None:
     """A robot that was pushed is found nearby; one before which people stand is not looked for elsewhere."""
-    building, truth, rng = corridors()[0], log.corrected, np.random.default_rng(0)
-    assert truth is not None
+    building, rng = corridors()[0], np.random.default_rng(0)
     field = DistanceMap.from_occupancy(building.occupied, building.resolution, building.origin)
     sigma = np.array([0.05, 0.05, 0.03])
     pushed: list[float] = []
@@ -542,9 +542,8 @@ def test_a_scan_that_does_not_fit_makes_hypotheses_of_which_one_has_to_fit_well(
 
 
 @pytest.mark.product(1, of="large maps")
-def test_a_start_that_nobody_knows_is_searched_for(log: RangeLog) -> None:
-    truth, occupancy = log.corrected, corridors()[0]
-    assert truth is not None
+def test_a_start_that_nobody_knows_is_searched_for(log: RangeLog, truth: Array) -> None:
+    occupancy = corridors()[0]
     elsewhere = replace(log, odometry=SE2.compose(np.array([40.0, 10.0, 1.0]), log.odometry), corrected=None)
     run = log_drive.localise(elsewhere, occupancy, log_drive.LocaliseSettings(ANYWHERE, ANYWHERE))
     assert apart(run.poses, truth)[-1] < 0.1
