@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of
 from unifg.models import obstacles, unicycle
 from unifg.typing import Array
 
@@ -31,8 +31,7 @@ def cart(steps: int, speed: float, tracking: float, wanted: float) -> tuple[fg.G
         tracking: weight of the distance to the place and of the speed.
         wanted: the place [m].
     """
-    graph, x = graph_with(fg.Rn(2), steps + 1)
-    a = graph.variables("a", fg.Rn(1), steps)
+    graph, x, a = graph_of(("x", fg.Rn(2), steps + 1), ("a", fg.Rn(1), steps))
     graph.fix(x[0], [0.0, speed])
     graph.minimize(fg.prior, a, [0.0], name="effort")
     if tracking:
@@ -67,8 +66,7 @@ def wall_too_close(speed: float, steps: int = 20, tracking: float = 0.0) -> Stat
 
 def blocked_corridor(goal: bool) -> Stated:
     """A unicycle in a corridor of 2 m that two discs close; the guess drives through them, perhaps to a goal."""
-    graph, x = graph_with(fg.SE2, 31)
-    u = graph.variables("u", fg.Rn(2), 30)
+    graph, x, u = graph_of(("x", fg.SE2, 31), ("u", fg.Rn(2), 30))
     graph.fix(x[0], [0.0, 0.0, 0.0])
     graph.minimize(fg.prior, u, [0.0, 0.0])
     graph.constrain(unicycle.dynamics, x[:-1], u, x[1:], 0.2, lower=0.0, upper=0.0, name="motion")

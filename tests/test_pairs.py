@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of, graph_with
 from unifg.files.g2o import read_g2o
 from unifg.lie import LieGroup
 from unifg.problem.compiled_problem import CompiledProblem
@@ -30,8 +30,7 @@ def random_information(rng: np.random.Generator, count: int, dim: int) -> Array:
 def web(group: LieGroup, seed: int, **options: Any) -> tuple[fg.Graph, dict[fg.Family, Array]]:
     """Twelve poses, edges in both directions, some fixed, another family of variables in front and behind."""
     rng = np.random.default_rng(seed)
-    graph, before = graph_with(fg.Rn(2), 3, "before")
-    x = graph.variables("poses", group, 12)
+    graph, before, x = graph_of(("before", fg.Rn(2), 3), ("poses", group, 12))
     after = graph.variables("after", group, 4)
     first, second = rng.permuted(np.tile(np.arange(12), (40, 1)), axis=1)[:, :2].T
     dim = group.dim

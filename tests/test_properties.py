@@ -13,7 +13,7 @@ from numpy.random import Generator
 
 import unifg as fg
 from judge import judge
-from problems.graphs import graph_with
+from problems.graphs import graph_of
 from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.solvers.names import backends
 from unifg.typing import Array, IntArray
@@ -42,8 +42,7 @@ def curved(x: Array, a: Array, b: Array) -> Array:
 def wild(seed: int) -> tuple[fg.Graph, Guess]:
     """A graph of points, poses and attitudes with random costs and constraints, which may have no answer at all."""
     rng = np.random.default_rng(seed)
-    graph, points = graph_with(fg.Rn(2), 3, "points")
-    poses = graph.variables("poses", fg.SE2, 3)
+    graph, points, poses = graph_of(("points", fg.Rn(2), 3), ("poses", fg.SE2, 3))
     turn = graph.variables("turn", fg.SO3, 2)
     graph.minimize(fg.prior, points, rng.standard_normal((3, 2)), sigma=rng.uniform(0.5, 2.0))
     graph.minimize(curved, points[:2], *rng.standard_normal((2, 2)), name="curved")

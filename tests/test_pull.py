@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import solve
 
 import unifg as fg
-from problems.graphs import graph_with
+from problems.graphs import graph_of
 from unifg.models import unicycle
 from unifg.solvers import KKT, SQP, GaussNewton
 from unifg.typing import Array
@@ -22,8 +22,7 @@ PAST, AHEAD = 6, 15
 def linear(weight: float, seed: int = 0) -> tuple[fg.Graph, fg.Family, fg.Family]:
     """Past of a mass on a line with positions measured; its future is left out where the weight is zero."""
     rng = np.random.default_rng(seed)
-    graph, x = graph_with(fg.Rn(2), PAST + (AHEAD if weight else 0) + 1)
-    u = graph.variables("u", fg.Rn(1), AHEAD)
+    graph, x, u = graph_of(("x", fg.Rn(2), PAST + (AHEAD if weight else 0) + 1), ("u", fg.Rn(1), AHEAD))
     past = x[: PAST + 1]
     graph.minimize(fg.prior, past[0], [0.2, 0.5], sigma=[0.5, 0.3], name="arrival")
     graph.minimize(lambda a, b: b - a @ A.T, past[:-1], past[1:], sigma=[0.02, 0.05], name="drift")
@@ -86,8 +85,7 @@ def drive(past: bool, weight: float, start: Array | None = None) -> Drive:
     now, ahead, dt = 10, 20, 0.1
     truth = unicycle.rollout(np.zeros(3), np.tile([0.8, 0.6], (now, 1)), dt)
     fixes = truth[:, :2] + 0.05 * np.random.default_rng(3).standard_normal((now + 1, 2))
-    graph, x = graph_with(fg.SE2, (now if past else 0) + ahead + 1)
-    u = graph.variables("u", fg.Rn(2), ahead)
+    graph, x, u = graph_of(("x", fg.SE2, (now if past else 0) + ahead + 1), ("u", fg.Rn(2), ahead))
     here = now if past else 0
     if past:
         moved = fg.SE2.exp([0.08, 0.0, 0.06])

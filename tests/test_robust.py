@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ import unifg as fg
 from benchmarks import gtsam_peer
 from benchmarks.wrong_closures import COLUMNS, METHODS, aligned_error, attempt
 from problems.closures import Claim, with_wrong_closures
-from problems.graphs import drawn_to, graph_with
+from problems.graphs import drawn_to, graph_with, program_of
 from unifg.errors import BackendError, GraphError
 from unifg.factors.robust import Graduated, Loss
 from unifg.files.g2o import read_g2o
@@ -54,9 +55,9 @@ def test_surrogates_go_from_convex_to_the_loss(loss: Graduated) -> None:
     np.testing.assert_allclose(stages[-2].value(norms**2), loss.value(norms**2), rtol=0.3)
 
 
-def test_no_outlier_needs_no_surrogate() -> None:
-    for loss in GRADUATED:
-        assert list(loss.surrogates(largest=0.1, growth=1.4)) == [loss]
+@pytest.mark.parametrize("loss", GRADUATED)
+def test_no_outlier_needs_no_surrogate(loss: Any) -> None:
+    assert list(loss.surrogates(largest=0.1, growth=1.4)) == [loss]
 
 
 @pytest.mark.parametrize("make", [fg.DCS, fg.GemanMcClure, fg.TruncatedLeastSquares])
@@ -208,8 +209,7 @@ def test_innovations_are_those_of_dense_algebra() -> None:
     sim = manhattan(60, seed=3, outliers=0.3)
     pose_graph = sim.pose_graph.with_poses(sim.truth)
     graph, _, guess = pose_graph.graph(robust=fg.TruncatedLeastSquares(3.4))
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     lin = program.linearize(guess)
     plain_graph, _, same = pose_graph.graph()
     plain = plain_graph.compile().linearize(same)
@@ -249,8 +249,7 @@ def test_what_a_measurement_would_be_without_itself() -> None:
     sim = manhattan(60, seed=3)
     pose_graph = sim.pose_graph.with_poses(sim.truth)
     graph, _, guess = pose_graph.graph(robust=fg.TruncatedLeastSquares(50.0))
-    program = graph.compile()
-    program.bind({})
+    program = program_of(graph)
     lin = program.linearize(guess)
     term = next(term for term, _ in program.table.robust)
     matrix = program.normal.matrix(lin.hessian).toarray()

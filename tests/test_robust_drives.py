@@ -12,7 +12,7 @@ import pytest
 import unifg as fg
 from problems.closures import with_wrong_closures
 from problems.drives import Kind, aliased, drive, slipped
-from problems.graphs import graph_with
+from problems.graphs import graph_with, program_of
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.pose_graphs import Edges, PoseGraph, chordal, lago, manhattan, odometric, pairwise_consistent
 from unifg.scenarios import command
@@ -206,8 +206,7 @@ def test_a_group_is_taken_out_as_dense_algebra_does() -> None:
     """The fall of the sum of squares without some closures, at the optimum; the redundancies of all terms."""
     graph = squares(manhattan(60, seed=3).pose_graph)
     stated, _, guess = graph.graph(robust=fg.TruncatedLeastSquares(50.0))
-    program = stated.compile()
-    program.bind({})
+    program = program_of(stated)
     lin = program.linearize(guess)
     jacobian, residual = program.costs.matrix(lin.jacobian).toarray(), lin.residual.copy()
     residual -= jacobian @ np.linalg.lstsq(jacobian, residual, rcond=None)[0]

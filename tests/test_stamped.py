@@ -339,9 +339,6 @@ def drive(t: float) -> Array:
 def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generator) -> None:
     """Three sensors at their own rates and delays; one loses readings; each tick equals a graph built for it alone."""
 
-    def fix(x: Array, z: Array) -> Array:
-        return x[:, :2] - z
-
     def direction(x: Array, z: Array) -> Array:
         return fg.wrap_angle(x[:, 2:] - z)
 
@@ -365,7 +362,7 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
 
     def stated(graph: fg.Graph, x: fg.Family) -> dict[str, StampedMeasurements]:
         sensors = {
-            "fix": StampedMeasurements(fix, 2, capacity=1, sigma=0.01, name="fix"),
+            "fix": StampedMeasurements(place, 2, capacity=1, sigma=0.01, name="fix"),
             "direction": StampedMeasurements(direction, 1, capacity=3, sigma=0.01, name="direction"),
             "gap": StampedMeasurements(gap, 1, capacity=1, sigma=0.01, name="gap", robust=fg.Huber(3.0)),
         }
@@ -411,7 +408,7 @@ def test_a_sliding_window_with_delays_is_the_batch_of_what_has_come(rng: Generat
             def between(a: Array, b: Array, s: float = s) -> Array:
                 return fg.SE2.compose(a, fg.SE2.exp(s * fg.SE2.log(fg.SE2.compose(fg.SE2.inverse(a), b))))
 
-            error = {"fix": fix, "direction": direction, "gap": gap}[name]
+            error = {"fix": place, "direction": direction, "gap": gap}[name]
             own.minimize(
                 fg.residual(lambda a, b, z, e=error, m=between: e(m(a, b), z), derivatives="differences"),
                 y[k], y[k + 1], value, sigma=0.01, robust=fg.Huber(3.0) if name == "gap" else None,
@@ -525,8 +522,7 @@ def test_threads_add_while_others_ask() -> None:
 
 
 def test_a_refused_sensor_leaves_the_graph_as_it_was() -> None:
-    graph, x = graph_with(SE23, 3)
-    bias = graph.variables("bias", BIAS, 3)
+    graph, x, bias = graph_of(("x", SE23, 3), ("bias", BIAS, 3))
     before = str(graph)
     with pytest.raises(fg.GraphError, match="sigma"):
         StampedMeasurements(lambda x, z: x[:, :2] - z, 2, capacity=1, sigma=-1.0, name="fixes").state(graph, x)
