@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -106,6 +106,15 @@ def carry_on(window: Window, drive: Drive, k: int) -> None:
     window.estimate(None)
 
 
+def ticks(window: Window, count: int, control: float = 0.0) -> Iterator[int]:
+    """Numbers of ticks, each between the move to its node and the estimate: the time to record."""
+    for k in range(count):
+        if k:
+            window.move([control])
+        yield k
+        window.estimate()
+
+
 @pytest.mark.product(2)
 @pytest.mark.parametrize("length", [1, 3, 7])
 @pytest.mark.parametrize("static", [False, True])
@@ -165,11 +174,8 @@ def test_a_covariance_through_exact_dynamics_is_the_same_in_any_unit(unit: float
     motion = Dynamics(lambda x, u, c, y, h: y - x - h * (u + c), 0.1, constants=("drift",))
     terms: list[Term] = [motion, Measurement("gps", position, (1,), 0.3 * unit)]
     window = Window(robot, 3, terms, start=[0.0], sigma=0.05 * unit)
-    for k in range(6):
-        if k:
-            window.move([unit])
+    for k in ticks(window, 6, unit):
         window.record("gps", [0.1 * k * unit])
-        window.estimate()
     rows = np.stack([np.ones(6), 0.1 * np.arange(6)], axis=1)  # of the start and the drift
     whole = np.linalg.inv(np.diag([0.05**-2, 0.1**-2]) + rows.T @ rows / 0.3**2)
     present = np.array([[1.0, 0.5], [0.0, 1.0]])
@@ -199,8 +205,8 @@ def test_factors_over_several_nodes_leave_whole() -> None:
     ]
     exact = GaussNewton(tolerance=1e-12)
     window: Window = Window(robot, 3, terms, start=START, sigma=0.8, solver=exact)
-    drive, ticks = Drive(12, seed=3), 12
-    graph, x, m = graph_of(("x", fg.Rn(2), ticks + 1), ("m", fg.Rn(1), 2))
+    drive, count = Drive(12, seed=3), 13
+    graph, x, m = graph_of(("x", fg.Rn(2), count), ("m", fg.Rn(1), 2))
     graph.minimize(fg.prior, x[0], START, sigma=0.8)
     graph.minimize(fg.prior, m, [[0.0], [7.0]], sigma=[[2.0], [0.1]])
     graph.minimize(lambda a, b, c: a - 2.0 * b + c, x[:-2], x[1:-1], x[2:], sigma=0.3)
@@ -208,13 +214,10 @@ def test_factors_over_several_nodes_leave_whole() -> None:
     at = np.flatnonzero(drive.seen)
     graph.minimize(position, x[at], graph.data("z", drive.positions[at], each=True), sigma=GPS)
     graph.minimize(lambda x: x[:, 1:] - 0.3, x, sigma=1.0)
-    whole = exact.solve(graph, {x: np.zeros((ticks + 1, 2)), m: np.zeros((2, 1))})
-    for k in range(ticks + 1):
-        if k:
-            window.move([0.0])
+    whole = exact.solve(graph, {x: np.zeros((count, 2)), m: np.zeros((2, 1))})
+    for k in ticks(window, count):
         window.record("gps", drive.positions[k])
         window.record("speed", [0.3])
-        window.estimate(None)
     np.testing.assert_allclose(window.history.states, whole[x][-4:], atol=1e-9)
     np.testing.assert_allclose(window.history.constants["mark"], whole[m], atol=1e-9)
 
@@ -295,28 +298,25 @@ def test_a_slot_that_gets_another_landmark_forgets_the_first() -> None:
     terms: list[Term] = [Dynamics(step, 0.1, sigma=NOISE), Marks()]
     exact = GaussNewton(tolerance=1e-12)
     window = Window(robot, 2, terms, start=START, sigma=0.8, solver=exact)
-    rng, ticks, change = np.random.default_rng(7), 12, 8
-    gaps = rng.normal(size=(ticks + 1, 2))
-    seen = np.array([[k < 4 or k >= change, True] for k in range(ticks + 1)])
-    for k in range(ticks + 1):
-        if k:
-            window.move([0.0])
+    rng, count, change = np.random.default_rng(7), 13, 8
+    gaps = rng.normal(size=(count, 2))
+    seen = np.array([[k < 4 or k >= change, True] for k in range(count)])
+    for k in ticks(window, count):
         if k == change:
             window.forget("mark", 0)
             window.admit("mark", 0, [1.0], 1e3)
             assert window.history.constants["mark"][0, 0] == 1.0
         window.record("gaps", np.column_stack([gaps[k], seen[k]]))
-        window.estimate(None)
-    graph, x, m = graph_of(("x", fg.Rn(2), ticks + 1), ("m", fg.Rn(1), 3))
+    graph, x, m = graph_of(("x", fg.Rn(2), count), ("m", fg.Rn(1), 3))
     graph.minimize(fg.prior, x[0], START, sigma=0.8)
     graph.minimize(fg.prior, m, [[0.0], [0.0], [1.0]], sigma=1e3)
-    still = graph.data("u", np.zeros((ticks, 1)), each=True)
+    still = graph.data("u", np.zeros((count - 1, 1)), each=True)
     graph.minimize(step, x[:-1], still, x[1:], 0.1, sigma=NOISE)
     at, j = np.nonzero(seen)
     which = np.where((j == 0) & (at >= change), 2, j)
     values = graph.data("z", gaps[at, j][:, None], each=True)
     graph.minimize(lambda x, m, z: m - x[:, :1] - z, x[at], m[which], values, sigma=0.1)
-    whole = exact.solve(graph, {x: np.zeros((ticks + 1, 2)), m: np.zeros((3, 1))})
+    whole = exact.solve(graph, {x: np.zeros((count, 2)), m: np.zeros((3, 1))})
     # What was believed of the first mark before it was seen, to a kilometre, goes with it.
     np.testing.assert_allclose(window.present, whole[x][-1], atol=1e-6)
     np.testing.assert_allclose(window.history.constants["mark"], whole[m][[2, 1]], atol=1e-6)
@@ -397,11 +397,8 @@ def test_data_that_depend_on_beliefs_are_asked_for_again(rounds: int, solves: in
 
 def test_a_loop_made_on_a_window_leaves_what_it_knows() -> None:
     window = line_window(4)
-    for k in range(6):
-        if k:
-            window.move([0.1])
+    for k in ticks(window, 6, 0.1):
         window.record("gps", [0.1 * k])
-        window.estimate(None)
     states = window.history.states.copy()
     loop = line_loop(window=window, coupling="joint")
     assert np.array_equal(window.history.states, states)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from test_horizon import ticks
 from unifg.horizon import (
     Constant,
     Context,
@@ -115,12 +116,9 @@ def test_what_is_recorded_after_the_estimate_leaves_with_its_node(place: int, la
     found = []
     for after in (late, False):
         window = window_of(length=3)
-        for k in range(5):
-            if k:
-                window.move([0.1])
+        for k in ticks(window, 5, 0.1):
             if k == 4 and not after:
                 window.record("p", [10.0], place)
-            window.estimate()
         if after:
             window.record("p", [10.0], place)
         for _ in range(3):
