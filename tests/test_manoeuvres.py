@@ -172,11 +172,6 @@ def test_a_broken_limit_is_no_success() -> None:
     assert "NO" in table([replace(m, controls=m.controls * 1.001)])
 
 
-def test_unknown_solver_is_refused() -> None:
-    with pytest.raises(fg.BackendError, match="unknown backend 'ipopt': choose one of gn, lm"):
-        run_manoeuvre(CASES["behind"], "ipopt")
-
-
 def test_small_controls_are_no_reversals() -> None:
     m = solved("behind", "sqp")
     v = np.array([-1.0, -0.1, 1e-9, -1e-9, 0.0, 0.2, 0.4, -1e-5, 0.3, -0.5])

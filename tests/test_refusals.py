@@ -11,7 +11,7 @@ import pytest
 
 import unifg as fg
 from problems.graphs import drawn_to, graph_with
-from problems.known import line, short_drive
+from problems.known import line
 from unifg.models import barriers, rkmk
 from unifg.models.avoidance import cylinder_clearance, inverse_distance, inverse_distance_root, sphere_clearance
 from unifg.models.detours import detours, headed
@@ -142,12 +142,6 @@ def test_not_finite_at_the_guess_names_the_factor(solver: fg.Solver) -> None:
 
 
 # ------------------------------------------------------------------ graph.check
-
-
-def test_check_finds_nothing_in_a_sound_graph() -> None:
-    graph, guess = short_drive()
-    report = graph.check(guess)
-    assert report, str(report)
 
 
 def test_check_finds_what_nothing_determines() -> None:
