@@ -326,6 +326,13 @@ def test_size_keeps_its_budget() -> None:
     assert {f: density for f, (_, density) in measured.items() if density > DENSITY.get(f, 16.0)} == {}
 
 
+def test_files_and_functions_are_short() -> None:
+    files = [path for path in EVERYTHING if not path.is_relative_to(CHECKOUT / "tests")]
+    assert {name_of(path): lines for path in files if (lines := text_of(path).count("\n")) > 700} == {}
+    functions = [node for path in files for node in nodes_in(path) if isinstance(node, ast.FunctionDef)]
+    assert {one.name for one in functions if (one.end_lineno or one.lineno) - one.lineno >= 150} == set()
+
+
 def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
     words = ("What", "Whether", "Who", "Where", "How", "Which", "When", "By")
     asking = [
