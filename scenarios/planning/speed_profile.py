@@ -119,8 +119,9 @@ def _column(
 ) -> Array | None:
     """The one of the named columns that is there, with numbers within a range."""
     matching = [k for k, name in enumerate(head) if name in names]
-    stems = {name.split("_")[0] for name in names}
-    if not matching and (alike := [name for name in head if name.split("_")[0] in stems]):
+    if not matching and (
+        alike := [name for name in head if name.split("_")[0] in {own.split("_")[0] for own in names}]
+    ):
         raise FileFormatError(
             f"{file}, line 1: the column '{alike[0]}' is not read: convert it to '{names[0]}', as its unit is another, "
             "or call it otherwise"

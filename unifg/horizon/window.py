@@ -102,7 +102,7 @@ class Window:
                 term=fixed[0].name,
             )
         moving = [own.step for own in self.terms if isinstance(own, Dynamics) and not isinstance(own.step, Data | None)]
-        self._tick = robot.tick or (float(np.mean(np.asarray(moving[0]))) if moving else 0.0)
+        self._step = float(np.mean(np.asarray(moving[0]))) if moving else 0.0
         self._arrival = arrival or Tangent()
         self._records: dict[str, tuple[int, ...]] = {}
         for term in self.terms:
@@ -244,8 +244,8 @@ class Window:
 
         Args:
             control: (m,) applied since the last node.
-            time: of the new node [s]; None for one step after the last: of the robot's tick, or of the step of
-                dynamics, and 1 s where neither is told. Another spacing than that is warned of.
+            time: of the new node [s]; None for one step of the dynamics after the last, or the robot's tick, or 1 s.
+                Another spacing than the step of dynamics is warned of.
             state: (storage,) a guess of the new node; None for where the robot's model expects it.
             steps: (storage,) guesses of the new step's unknowns, by name.
 
@@ -254,7 +254,7 @@ class Window:
                 window is as it was.
         """
         robot, history = self.robot, self.history
-        applied, entering = robot.applicable(control), history.later(time, self._tick or 1.0)
+        applied, entering = robot.applicable(control), history.later(time, self._step or robot.tick or 1.0)
         expected = self._expected(applied) if state is None else robot.point(state, "the new node")
         for name, value in (steps or {}).items():
             if name not in robot.steps or np.shape(value) != (robot.steps[name].storage,):
@@ -265,10 +265,10 @@ class Window:
                 # Linearised where it is believed to be, without moving it.
                 self._conclude(self._look.solve(self.guess(), data=self.data(self._given)))
             self.left.arrival, self.left.pending_prior = self.left.pending_prior, None
-        if self._tick and not 0.5 < (gap := entering - float(history.times[-1])) / self._tick < 1.5:
+        if self._step and not 0.5 < (gap := entering - float(history.times[-1])) / self._step < 1.5:
             logger.warning(
                 "the new node of the window is %g s after the last one, but a step of its dynamics is %g s: give the "
-                "times of nodes in seconds, or dynamics that take durations from now.past.times", gap, self._tick,
+                "times of nodes in seconds, or dynamics that take durations from now.past.times", gap, self._step,
             )  # fmt: skip
         history.move(applied, expected, entering, steps or {})
 
