@@ -19,7 +19,7 @@ from unifg.scenarios.planning.polyline import arc_lengths, at_stations
 from unifg.scenarios.planning.visibility import Ways
 from unifg.scenarios.simulation.air import VEHICLE_RADIUS
 from unifg.scenarios.simulation.layouts import Layout, obstacle_course
-from unifg.solution.backend import Callback
+from unifg.solution.solve_state import Callback
 from unifg.solvers import names
 from unifg.typing import Array
 

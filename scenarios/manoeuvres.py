@@ -16,7 +16,7 @@ import numpy as np
 import unifg as fg
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.logs import metrics
-from unifg.solution.backend import Callback
+from unifg.solution.solve_state import Callback
 from unifg.solvers import names
 from unifg.typing import Array
 

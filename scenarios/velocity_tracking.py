@@ -23,7 +23,7 @@ from unifg.models.vehicle import Vehicle
 from unifg.scenarios.logs import metrics as numbers
 from unifg.scenarios.options import Positive, Settings, count, existing, option, pair, positive
 from unifg.scenarios.planning.speed_profile import Profile, drive_cycle, read_profile
-from unifg.solution.backend import Callback
+from unifg.solution.solve_state import Callback
 from unifg.solvers import names
 from unifg.typing import Array
 

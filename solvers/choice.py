@@ -18,8 +18,8 @@ from unifg.errors import GraphError, NotFiniteError, require_kinds
 from unifg.modeling.model import Model
 from unifg.modeling.variables import Data
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
-from unifg.solution.backend import Callback
 from unifg.solution.solution import AnyGuess, NotConverged, Solution
+from unifg.solution.solve_state import Callback
 from unifg.solution.solver import Solver
 from unifg.solution.starts import spread
 from unifg.solution.status import Found, Status

@@ -22,8 +22,8 @@ from unifg.modeling.variables import Data, Family
 from unifg.problem.columns import Values
 from unifg.solution.graph import Graph
 from unifg.solution.guess import Guess
-from unifg.solution.prepared import Prepared
 from unifg.solution.solution import AnyGuess, values_of
+from unifg.solution.solver import Prepared
 from unifg.solution.starts import extent
 from unifg.solvers.least_squares import LevenbergMarquardt
 from unifg.typing import Array, BoolArray, IntArray, Numbers

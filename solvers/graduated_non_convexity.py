@@ -50,13 +50,12 @@ from unifg.modeling.terms import Cost
 from unifg.modeling.variables import Data
 from unifg.problem.linearization import Linearization
 from unifg.problem.term import CompiledTerm
-from unifg.solution.backend import Backend, Callback
 from unifg.solution.chi_squared import upper_quantile
 from unifg.solution.history import Iteration
 from unifg.solution.outlier_report import Group, OutlierReport
-from unifg.solution.prepared import Prepared
 from unifg.solution.solution import AnyGuess, NotConverged, Solution, values_of
-from unifg.solution.solver import Solver
+from unifg.solution.solve_state import Backend, Callback
+from unifg.solution.solver import Prepared, Solver
 from unifg.solution.status import Status
 from unifg.solvers.gating import CHANCE, Innovations, VarianceFactor, groups_of
 from unifg.solvers.least_squares import GaussNewton, LevenbergMarquardt
@@ -180,7 +179,7 @@ class GraduatedNonConvexity(Backend):
     ) -> Solution:
         """Solve without the losses, through their surrogates, and with the losses themselves.
 
-        Arguments as for :class:`unifg.solution.backend.Backend`; every surrogate starts at the guess.
+        Arguments as for :class:`unifg.solution.solve_state.Backend`; every surrogate starts at the guess.
 
         Returns:
             The solution of the graph as stated, judged with its own losses. The history holds all stages, numbered

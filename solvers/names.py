@@ -1,7 +1,7 @@
 """The short names of the backends: the one table that commands, scenarios, benchmarks and tests read.
 
-Which graphs a backend takes stands in its class (:class:`unifg.solution.backend.Backend`); the lists of names below are
-made from that.
+Which graphs a backend takes stands in its class (:class:`unifg.solution.solve_state.Backend`); the lists of names below
+are made from that.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from unifg.errors import BackendError
-from unifg.solution.backend import Backend
+from unifg.solution.solve_state import Backend
 from unifg.solution.solver import Solver
 from unifg.solvers.augmented_lagrangian import AugmentedLagrangian
 from unifg.solvers.graduated_non_convexity import GraduatedNonConvexity

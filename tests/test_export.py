@@ -24,7 +24,7 @@ from problems.graphs import drawn_to, graph_of, graph_with
 from scripts import CHECKOUT
 from unifg.codegen import standalone
 from unifg.errors import BackendError
-from unifg.solution.prepared import Prepared
+from unifg.solution.solver import Prepared
 from unifg.solvers import SQP, InteriorPoint
 from unifg.typing import Array
 

@@ -22,7 +22,7 @@ from unifg.scenarios.quadrotor.estimator import DeadReckoning, Dynamics, Estimat
 from unifg.scenarios.quadrotor.flight_past import WindowSettings
 from unifg.scenarios.simulation.air import QuadrotorWorld
 from unifg.scenarios.simulation.layouts import Layout
-from unifg.solution.prepared import Prepared
+from unifg.solution.solver import Prepared
 from unifg.solvers import KKT
 from unifg.typing import Array
 

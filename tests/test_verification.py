@@ -15,7 +15,7 @@ from unifg.factors.autodiff import symbols
 from unifg.factors.autodiff.calculus import jacobian
 from unifg.factors.autodiff.operations import Op
 from unifg.problem import term
-from unifg.solution import prepared as frame
+from unifg.solution import solver as frame
 from unifg.solvers import SQP, AugmentedLagrangian, GaussNewton, InteriorPoint, LevenbergMarquardt
 from unifg.typing import Array
 

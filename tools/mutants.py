@@ -56,7 +56,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "binding",
         "plots",
     ),
-    "unifg/solution/prepared.py": ("answers", "early_ends", "solvers", "refusals", "verification"),
+    "unifg/solution/solver.py": ("answers", "early_ends", "solvers", "refusals", "verification"),
     "unifg/solution/solve_state.py": (
         "answers",
         "early_ends",

@@ -48,16 +48,15 @@ from unifg.modeling.factors import between, difference, prior
 from unifg.modeling.joint_prior import joint_prior
 from unifg.modeling.soft import Soft
 from unifg.modeling.variables import Data, Family, Selection, each, shared
-from unifg.solution.backend import Callback as _Callback
 from unifg.solution.check import Report
 from unifg.solution.graph import Graph
 from unifg.solution.guess import Guess
 from unifg.solution.history import Iteration
 from unifg.solution.optimality import optimality
-from unifg.solution.prepared import Prepared
 from unifg.solution.solution import AnyGuess as _AnyGuess
 from unifg.solution.solution import NotConverged, Solution
-from unifg.solution.solver import Solver
+from unifg.solution.solve_state import Callback as _Callback
+from unifg.solution.solver import Prepared, Solver
 from unifg.solution.status import Status
 from unifg.typing import Numbers as _Numbers
 

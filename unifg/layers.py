@@ -18,8 +18,8 @@ from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data, Family
 from unifg.problem.parameters import datum
 from unifg.solution.batch import Batch
-from unifg.solution.prepared import Prepared
 from unifg.solution.solution import AnyGuess
+from unifg.solution.solver import Prepared
 from unifg.typing import Array, Numbers
 
 __all__ = ["Layer"]

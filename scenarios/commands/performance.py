@@ -203,10 +203,11 @@ def history(file: Path = HISTORY) -> list[Record]:
     try:
         records = [Record(**json.loads(line)) for line in lines if line.strip()]
         ratios = [np.array(row, dtype=np.float64) for record in records for row in record.ratios.values()]
-        if not all(row.ndim == 1 and row.size and (row > 0.0).all() for row in ratios):
-            raise ValueError("ratios are positive")
+        positive = all(row.ndim == 1 and row.size and (row > 0.0).all() for row in ratios)
     except (ValueError, TypeError, AttributeError) as error:
         raise ScenarioError(f"{file}: holds a line that is no record of `unifg bench` ({error})") from error
+    if not positive:
+        raise ScenarioError(f"{file}: holds a line that is no record of `unifg bench` (ratios are positive)")
     return records
 
 

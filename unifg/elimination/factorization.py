@@ -399,7 +399,7 @@ class Factorization:
     @property
     def _shared(self) -> bool:
         """True if several threads work on it."""
-        return threads() > 1 and len(self.plan.part) > 0
+        return len(self.plan.part) > 0 and threads() > 1
 
     def _forget(self) -> None:
         self._ready = False

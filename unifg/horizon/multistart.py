@@ -14,8 +14,8 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.modeling.variables import Data
-from unifg.solution.prepared import Prepared
 from unifg.solution.solution import AnyGuess, Solution
+from unifg.solution.solver import Prepared
 from unifg.typing import ArrayLike, Numbers
 
 FEASIBLE = 1e-4  # violation of an answer that counts as a plan

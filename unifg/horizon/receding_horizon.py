@@ -29,9 +29,8 @@ from unifg.modeling.variables import Data
 from unifg.solution.graph import Graph
 from unifg.solution.guess import Guess
 from unifg.solution.history import subproblems
-from unifg.solution.prepared import Prepared
 from unifg.solution.solution import Solution
-from unifg.solution.solver import Solver
+from unifg.solution.solver import Prepared, Solver
 from unifg.solution.status import Status
 from unifg.typing import Array, ArrayLike
 

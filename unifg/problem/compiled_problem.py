@@ -24,6 +24,7 @@ from unifg.modeling.soft import are_prices, require_prices
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem import evaluation
+from unifg.problem import table as stacking
 from unifg.problem.binding import Binding, Holder
 from unifg.problem.branches import Branches
 from unifg.problem.by_term import ByTerm, Places
@@ -35,7 +36,6 @@ from unifg.problem.linearization import Evaluation, Linearization, Rows
 from unifg.problem.retraction import Retraction
 from unifg.problem.scalars import add_scalars, evaluate_scalars
 from unifg.problem.soft_terms import softened
-from unifg.problem.structure import block_pattern, require_touched, row_slices, side_by_side
 from unifg.problem.systems import Systems
 from unifg.problem.table import ENTRY, PARAMETER, POSITION, ROW, WIDTH, TermArrays, TermTable
 from unifg.problem.term import CompiledTerm
@@ -122,9 +122,9 @@ class CompiledProblem:
         self.cost_terms = [c for c in self.terms if isinstance(c.term, Cost)]
         self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
         self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
-        require_touched(self.terms, self.columns)
+        stacking.require_touched(self.terms, self.columns)
         self.blocks = self.columns.nodes()[0][self.columns.free]
-        self.normal = block_pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, self.columns)
+        self.normal = stacking.block_pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, self.columns)
         stacked = self.cost_terms + self.constraint_terms
         self.table = TermTable(stacked, self.scalar_terms, self.columns, self.normal)
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
@@ -137,7 +137,7 @@ class CompiledProblem:
         self.workspaces: list[tuple[type, dict[str, Any], Any]] = []
         self._found: dict[Callable[[CompiledProblem], Any], Any] = {}
         self._pairs: dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, Array, IntArray]] = {}
-        self.slices = row_slices(self.constraint_terms)
+        self.slices = stacking.row_slices(self.constraint_terms)
         shaped = zip(self.constraint_terms, self.slices, strict=True)
         self.places: Places = [(term.name, rows, (term.count, term.size)) for term, rows in shaped]
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
@@ -154,7 +154,8 @@ class CompiledProblem:
         self._watched: list[CompiledTerm] = []
         self.verifications: list[Verification] = []
         self.demanding: list[Verification] = []
-        self._watching, self.branches = False, Branches(self.table, (), self.scratch)
+        self._watching = False
+        self.branches: Branches | None = None
         self.python_seconds = 0.0
         read = {value for term in self.terms for value in term.data}
         read |= {fix.value for fix in graph.fixes if isinstance(fix.value, Data)}
@@ -270,8 +271,8 @@ class CompiledProblem:
         return ByTerm(self.places, stacked)
 
     def _bind_limits(self) -> None:
-        self.lower = side_by_side([c.lower for c in self.constraint_terms])
-        self.upper = side_by_side([c.upper for c in self.constraint_terms])
+        self.lower = _side_by_side([c.lower for c in self.constraint_terms])
+        self.upper = _side_by_side([c.upper for c in self.constraint_terms])
         crossed = np.flatnonzero(self.lower > self.upper)
         if len(crossed):
             name, index = self.row_name(int(crossed[0]))
@@ -373,7 +374,7 @@ class CompiledProblem:
 
     def new_branches(self, values: Values, verified: bool) -> bool:
         """Test whether comparisons in watched traces come out as at no verified answer; ``verified``: this is one."""
-        return bool(self.branches) and self.branches.new(values, verified)
+        return self.branches is not None and bool(self.branches) and self.branches.new(values, verified)
 
     def renew_verifications(self) -> None:
         """Keep what verifies the present traces."""
@@ -501,8 +502,7 @@ class CompiledProblem:
 
     def _shared(self) -> Shares | None:
         """Shares of the factors for every thread, where that is worth it."""
-        count = threads()
-        if count == 1 or not self.large:
+        if not self.large or (count := threads()) == 1:
             return None
         if self._shares is None or self._shares.count != count:
             self._shares = Shares(self.table, self.columns.width, self.normal.nnz, count)
@@ -657,7 +657,7 @@ class CompiledProblem:
         """Pattern of the objective's Hessian and where its entries stand in ``normal``."""
         if not self.constraint_terms:
             return self.normal, np.arange(self.normal.nnz)
-        pattern = block_pattern(self.cost_terms + self.scalar_terms, self.columns)
+        pattern = stacking.block_pattern(self.cost_terms + self.scalar_terms, self.columns)
         columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         return pattern, self.normal.positions(pattern.indices, columns)
 
@@ -666,6 +666,11 @@ def _fixed_rows(program: CompiledProblem) -> IntArray:
     touched = np.zeros(program.constraints.count, dtype=bool)
     touched[program.constraints.free_rows] = True
     return np.flatnonzero(~touched)
+
+
+def _side_by_side(parts: list[Array]) -> Array:
+    """One flat array, also of nothing."""
+    return np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
 
 
 def compile_graph(graph: Model) -> CompiledProblem:

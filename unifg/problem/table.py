@@ -7,6 +7,7 @@ entries of the Jacobian, columns, and the places of J'J in the matrix of the nor
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -373,3 +374,43 @@ def locate(
                         column_before = beside
                         positions[at] = -2 - low if a == b and d != e else low
                     at += 1
+
+
+def require_touched(terms: Sequence[CompiledTerm], columns: Columns) -> None:
+    """Raise unless every unknown is part of some term.
+
+    Raises:
+        GraphError: naming the first variable that is not.
+    """
+    touched = np.zeros(columns.width, dtype=bool)
+    for term in terms:
+        for part in term.columns:
+            touched[part] = True
+    idle = columns.free[~touched[columns.free]]
+    if len(idle):
+        family, index = columns.name(int(idle[0]))
+        raise GraphError(
+            f"{family}[{index}] is in no cost or constraint and is not fixed: {len(idle)} tangent coordinates "
+            "are free to be anything; add a term, fix it, or make the family shorter",
+            family=family,
+            index=index,
+        )
+
+
+def block_pattern(terms: Sequence[CompiledTerm], columns: Columns) -> Symmetric:
+    """Pattern of a Hessian: every two variables of a factor share a block."""
+    variable, starts = columns.nodes()
+    first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
+    for term in terms:
+        members = [variable[part[:, 0]] for part in term.columns]
+        for k, a in enumerate(members):
+            for b in members[:k]:
+                first.append(np.minimum(a, b))
+                second.append(np.maximum(a, b))
+    return Symmetric.of_blocks(starts, np.concatenate(first), np.concatenate(second))
+
+
+def row_slices(terms: Sequence[CompiledTerm]) -> list[slice]:
+    """Rows of each term in the stack."""
+    ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
+    return [slice(start, end) for start, end in pairwise(ends)]

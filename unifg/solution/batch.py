@@ -49,7 +49,7 @@ class Outcomes(NamedTuple):
 
 
 class Worker(Protocol):
-    """Prepared solver of one thread, :class:`unifg.solution.prepared.Prepared`."""
+    """Prepared solver of one thread, :class:`unifg.solution.solver.Prepared`."""
 
     program: CompiledProblem
 
@@ -81,7 +81,7 @@ class Batch:
     """
 
     def __init__(self, prepared: Worker, data: Mapping[Data, Array], count: int) -> None:
-        """Make room; filled by :meth:`unifg.solution.prepared.Prepared.solve_many`."""
+        """Make room; filled by :meth:`unifg.solution.solver.Prepared.solve_many`."""
         program = prepared.program
         self._prepared, self._data = prepared, data
         self.statuses: list[Status] = [Status.INTERRUPTED] * count
@@ -193,7 +193,7 @@ def solve_batch(
     data: Mapping[Data, Numbers],
     threads: int,
 ) -> Batch:
-    """All instances; arguments and errors as for :meth:`unifg.solution.prepared.Prepared.solve_many`."""
+    """All instances; arguments and errors as for :meth:`unifg.solution.solver.Prepared.solve_many`."""
     given, count = stacked_data(data)
     if isinstance(guesses, Sequence):
         if count not in (None, len(guesses)):

@@ -103,7 +103,7 @@ class Exported(NamedTuple):
 
 
 class Exportable(Protocol):
-    """Prepared solver, :class:`unifg.solution.prepared.Prepared`."""
+    """Prepared solver, :class:`unifg.solution.solver.Prepared`."""
 
     program: CompiledProblem
 

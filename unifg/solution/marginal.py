@@ -20,7 +20,7 @@ from unifg.errors import GraphError
 from unifg.modeling.variables import Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization, Rows
-from unifg.problem.structure import row_slices
+from unifg.problem.table import row_slices
 from unifg.typing import Array, BoolArray, IntArray
 
 Variables: TypeAlias = Variable | Sequence[Variable]

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import math
 import time
-from abc import abstractmethod
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
 from unifg.codegen.inner import inner
 from unifg.errors import BackendError, require_kinds
 from unifg.factors.steps import EPSILON
+from unifg.modeling.model import Model
+from unifg.modeling.variables import Data
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.units import SMALL_FORCES
-from unifg.solution.backend import Backend, Callback
 from unifg.solution.batch import Outcomes
-from unifg.solution.capabilities import require
+from unifg.solution.capabilities import Constraints, require
 from unifg.solution.conditioning import HARDLY
 from unifg.solution.export import Exported
 from unifg.solution.history import HEADER, Deferred, Iteration, factor_norms, line, show
@@ -29,9 +30,11 @@ from unifg.solution.incumbent import Incumbent, Incumbents
 from unifg.solution.multipliers import Slopes, estimated
 from unifg.solution.optimality import Optimality, Tolerances, infeasible_stationary, optimality, within_bounds
 from unifg.solution.relative_offset import Factored
-from unifg.solution.solution import Solution
+from unifg.solution.solution import AnyGuess, Solution
 from unifg.solution.status import Status
-from unifg.typing import Array
+from unifg.typing import Array, Numbers
+
+Callback: TypeAlias = Callable[[Iteration], bool | None]
 
 UNBOUNDED_COST = -1e20
 NEARLY, FEW_DIGITS = 100.0, 1e-4  # times the tolerance: KKT numbers, and rounding of unknowns, that may go together
@@ -45,6 +48,55 @@ WITHOUT_SUCCESS = (
     Status.INTERRUPTED,
 )
 """Endings that return the best iterate."""
+
+
+class Backend(ABC):
+    """Solver of a graph.
+
+    Attributes:
+        constraints: which it takes.
+        scalar_costs: whether it takes costs that are no squares.
+        soft: whether it takes the linear prices of soft constraints in any case.
+        states_subproblems: whether rows of its history name the solver of a quadratic program, as their detail "qp".
+        rehearses: whether :meth:`Solver.prepare` may take it through small problems of its own
+            (:mod:`unifg.solution.warmup_run`).
+    """
+
+    constraints: ClassVar[Constraints] = "all"
+    scalar_costs: ClassVar[bool] = True
+    soft: ClassVar[bool] = False
+    states_subproblems: ClassVar[bool] = False
+    rehearses: ClassVar[bool] = False
+
+    @property
+    def name(self) -> str:
+        """The backend's class name."""
+        return type(self).__name__
+
+    @abstractmethod
+    def solve(
+        self,
+        graph: Model,
+        guess: AnyGuess,
+        *,
+        data: Mapping[Data, Numbers] | None = None,
+        check: bool = False,
+        callback: Callback | None = None,
+    ) -> Solution:
+        """Solve once.
+
+        Args:
+            graph: the problem.
+            guess: values per family, or a guess or solution that carries multipliers too.
+            data: values of data for this solve; others keep their defaults.
+            check: raise instead of returning a solution that did not converge.
+            callback: called with every row of the history; returning True ends the solve.
+
+        Raises:
+            GraphError: when the graph, guess or data is malformed.
+            BackendError: when this backend cannot take this class of problem.
+            NotConverged: with ``check=True``.
+        """
 
 
 class Conclusion(NamedTuple):
@@ -319,10 +371,11 @@ class SolveState:
     def _settle(self, lin: Linearization, multipliers: Array, measured: Optimality, candidate: bool) -> None:
         """Make an iterate the present one; a ``candidate`` may be returned if the solve ends without success."""
         self.lin, self._values, self.multipliers, self.optimality = lin, None, multipliers, measured
+        values = lin.stored
         if measured.violation < self._least:
-            self._least, self._least_at = measured.violation, lin.stored
+            self._least, self._least_at = measured.violation, values
         if candidate and measured.finite:
-            self.consider(lin.cost, lin.constraints.copy(), lin.stored, multipliers)
+            self.consider(lin.cost, lin.constraints.copy(), values, multipliers)
 
     def pass_by(
         self, number: int, violation: float, cost: float, constraints: Array, values: Array, multipliers: Array
