@@ -98,7 +98,7 @@ def test_nodes_without_times_stand_as_far_apart_as_their_dynamics_step(tick: flo
             window.estimate()
         found.append(window.present)
         assert np.linalg.norm(window.present - truth[-1]) < 0.05 and sensor.counts.late == 0
-    np.testing.assert_allclose(*found, atol=1e-9)
+    np.testing.assert_allclose(found[0], found[1], atol=1e-9)
 
 
 def test_nodes_at_another_spacing_than_the_step_of_dynamics_are_warned_of(caplog: pytest.LogCaptureFixture) -> None:
