@@ -123,8 +123,9 @@ class CompiledProblem:
         self.scalar_terms = [c for c in self.terms if isinstance(c.term, ScalarCost)]
         self.constraint_terms = [c for c in self.terms if isinstance(c.term, Constraint)]
         stacking.require_touched(self.terms, self.columns)
-        self.blocks = self.columns.nodes()[0][self.columns.free]
-        self.normal = stacking.block_pattern(self.cost_terms + self.scalar_terms + self.constraint_terms, self.columns)
+        variable, starts = self.columns.nodes()
+        self.blocks, every = variable[self.columns.free], self.cost_terms + self.scalar_terms + self.constraint_terms
+        self.normal = stacking.block_pattern(every, variable, starts)
         stacked = self.cost_terms + self.constraint_terms
         self.table = TermTable(stacked, self.scalar_terms, self.columns, self.normal)
         self.least_squares = bool(self.cost_terms) and not (self.scalar_terms or self.constraint_terms)
@@ -137,7 +138,7 @@ class CompiledProblem:
         self.workspaces: list[tuple[type, dict[str, Any], Any]] = []
         self._found: dict[Callable[[CompiledProblem], Any], Any] = {}
         self._pairs: dict[CompiledTerm, tuple[IntArray, IntArray, IntArray, Array, IntArray]] = {}
-        self.slices = stacking.row_slices(self.constraint_terms)
+        self.slices = [stacking.rows_in_stack(term) for term in self.constraint_terms]
         shaped = zip(self.constraint_terms, self.slices, strict=True)
         self.places: Places = [(term.name, rows, (term.count, term.size)) for term, rows in shaped]
         self.bound_rows = np.zeros(self.constraints.count, dtype=bool)
@@ -572,9 +573,8 @@ class CompiledProblem:
 
     def rows_of(self, term: CompiledTerm, residual: Array, constraints: Array) -> Array:
         """(n, m) rows of a term in the stacked residuals."""
-        start = int(term.place[ROW])
         target = residual if isinstance(term.term, Cost) else constraints
-        return target[start : start + term.count * term.size].reshape(term.count, term.size)
+        return target[stacking.rows_in_stack(term)].reshape(term.count, term.size)
 
     def _entries_of(self, term: CompiledTerm, costs: Array, constraints: Array, blocks: list[Array]) -> None:
         """Copy (n, m, d_k) blocks side by side into the stacked Jacobian."""
@@ -657,7 +657,7 @@ class CompiledProblem:
         """Pattern of the objective's Hessian and where its entries stand in ``normal``."""
         if not self.constraint_terms:
             return self.normal, np.arange(self.normal.nnz)
-        pattern = stacking.block_pattern(self.cost_terms + self.scalar_terms, self.columns)
+        pattern = stacking.block_pattern(self.cost_terms + self.scalar_terms, *self.columns.nodes())
         columns = np.repeat(np.arange(pattern.size), np.diff(pattern.indptr))
         return pattern, self.normal.positions(pattern.indices, columns)
 

@@ -52,6 +52,7 @@ from unifg.problem.table import (
     WHITENER,
     WIDTH,
     TermArrays,
+    rows_in_stack,
 )
 from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, IntArray
@@ -119,7 +120,7 @@ def loss_curvature(term: CompiledTerm, lin: Linearization) -> Array:
     """(n, D, D) of one robust term what :func:`add_losses` adds for all."""
     m, width, start = (int(term.place[field]) for field in (ROWS, WIDTH, ENTRY))
     J = lin.jacobian[start : start + term.count * m * width].reshape(term.count, m, width)
-    r = lin.residual[term.place[ROW] : term.place[ROW] + term.count * m].reshape(term.count, m)
+    r = lin.residual[rows_in_stack(term)].reshape(term.count, m)
     weights, form = _of_factors(term, lin.weights), form_of(term.term.robust) if isinstance(term.term, Cost) else None
     if form is None:
         return np.zeros((term.count, width, width))

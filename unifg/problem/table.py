@@ -7,7 +7,6 @@ entries of the Jacobian, columns, and the places of J'J in the matrix of the nor
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -397,9 +396,14 @@ def require_touched(terms: Sequence[CompiledTerm], columns: Columns) -> None:
         )
 
 
-def block_pattern(terms: Sequence[CompiledTerm], columns: Columns) -> Symmetric:
-    """Pattern of a Hessian: every two variables of a factor share a block."""
-    variable, starts = columns.nodes()
+def block_pattern(terms: Sequence[CompiledTerm], variable: IntArray, starts: IntArray) -> Symmetric:
+    """Pattern of a Hessian: every two variables of a factor share a block.
+
+    Args:
+        terms: of the factors.
+        variable: of every full column, as of :meth:`Columns.nodes`.
+        starts: first unknown of each variable, as of the same.
+    """
     first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
     for term in terms:
         members = [variable[part[:, 0]] for part in term.columns]
@@ -410,7 +414,7 @@ def block_pattern(terms: Sequence[CompiledTerm], columns: Columns) -> Symmetric:
     return Symmetric.of_blocks(starts, np.concatenate(first), np.concatenate(second))
 
 
-def row_slices(terms: Sequence[CompiledTerm]) -> list[slice]:
-    """Rows of each term in the stack."""
-    ends = np.cumsum([0] + [term.count * term.size for term in terms]).tolist()
-    return [slice(start, end) for start, end in pairwise(ends)]
+def rows_in_stack(term: CompiledTerm) -> slice:
+    """Rows of a term among those of all costs, or of all constraints."""
+    start = int(term.place[ROW])
+    return slice(start, start + term.count * term.size)

@@ -20,7 +20,7 @@ from unifg.errors import GraphError
 from unifg.modeling.variables import Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization, Rows
-from unifg.problem.table import row_slices
+from unifg.problem.table import rows_in_stack
 from unifg.typing import Array, BoolArray, IntArray
 
 Variables: TypeAlias = Variable | Sequence[Variable]
@@ -185,12 +185,11 @@ def cost_rows(program: CompiledProblem, names: Sequence[str]) -> BoolArray:
     Raises:
         GraphError: when no least-squares cost has such a name.
     """
-    chosen = np.zeros(program.costs.count, dtype=bool)
-    slices = {term.name: rows for term, rows in zip(program.cost_terms, row_slices(program.cost_terms), strict=True)}
+    chosen, known = np.zeros(program.costs.count, dtype=bool), {term.name: term for term in program.cost_terms}
     for name in [names] if isinstance(names, str) else names:
-        if name not in slices:
-            raise GraphError(f"no cost is called '{name}' (there are: {', '.join(slices) or 'none'})", term=name)
-        chosen[slices[name]] = True
+        if name not in known:
+            raise GraphError(f"no cost is called '{name}' (there are: {', '.join(known) or 'none'})", term=name)
+        chosen[rows_in_stack(known[name])] = True
     return chosen
 
 
