@@ -19,10 +19,14 @@ from unifg.scenarios.logs.drive_metrics import nees, pose_errors
 from unifg.scenarios.options import Settings, existing, option, pose
 from unifg.typing import Array
 
-__all__ = ["BASE", "EXPLAINED", "WHEELS", "LogRun", "LogSettings", "step_of"]
+__all__ = ["BASE", "EXPLAINED", "FAILED", "WHEELS", "LogRun", "LogSettings", "step_of"]
 
 WHEELS = OdometryNoise(0.1, 0.1, 0.04)  # of wheels that nobody has calibrated
 BASE = base_of("omnidirectional")  # of a log, which does not tell
+FAILED = {  # in words, by what was made
+    "map": "wrong: the map explains less than half of the beams that it was made of",
+    "localise": "lost: the map does not explain the last scans",
+}
 EXPLAINED = 0.5  # share of beams below which a place or a map is not believed
 SCALE, NOISE = 0.05, 0.02  # of odometry that is made of corrected poses, as in `OdometryModel`
 

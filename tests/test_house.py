@@ -286,12 +286,12 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 33_965, "scenarios": 13_007, "benchmarks": 4_883, "tests": 37_498,
-    "docs examples": 1_984, "unifg/factors": 4_304, "unifg/problem": 3_529, "models": 2_313,
-    "unifg/elimination": 2_204, "solvers": 5_146, "unifg/solution": 3_305, "unifg/smoothing": 1_931,
+    "unifg solvers models": 33_963, "scenarios": 13_009, "benchmarks": 4_883, "tests": 37_500,
+    "docs examples": 1_984, "unifg/factors": 4_304, "unifg/problem": 3_528, "models": 2_313,
+    "unifg/elimination": 2_204, "solvers": 5_146, "unifg/solution": 3_304, "unifg/smoothing": 1_931,
     "unifg/lie": 1_399, "unifg/view": 1_513, "unifg/files": 1_282, "unifg/pose_graphs": 1_971,
     "unifg/horizon": 1_595, "unifg/modeling": 1_194, "unifg/codegen": 1_347, "unifg/plots": 415,
-    "scenarios/scenes": 1_317, "scenarios/simulation": 1_373, "scenarios/campaigns": 913,
+    "scenarios/scenes": 1_318, "scenarios/simulation": 1_373, "scenarios/campaigns": 913,
     "scenarios/quadrotor": 1_748, "scenarios/ground": 1_852, "scenarios/commands": 667,
     "scenarios/logs": 648, "scenarios/perception": 948, "scenarios/planning": 878,
 }  # fmt: skip

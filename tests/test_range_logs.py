@@ -33,6 +33,7 @@ from unifg.scenarios.ground.localiser import Localiser
 from unifg.scenarios.perception.readings import Scan
 from unifg.scenarios.perception.scan_map import field_of, mapped
 from unifg.scenarios.range_logs import LogSettings
+from unifg.scenarios.scenes.log_scene import log_scene
 from unifg.typing import Array
 
 ANYWHERE = Path("log")
@@ -443,6 +444,7 @@ def test_a_map_of_absurd_scans_is_doubted(log: RangeLog, mirrored: bool | None, 
     words = replays.summary(run)
     assert re.search(said, words) if said else not re.search("wrong|mirrored", words)
     assert run.succeeded is (mirrored is not None)
+    assert log_scene(run).outcome.startswith("mapped" if run.succeeded else "wrong: the map explains less than half")
 
 
 def test_closures_along_a_corridor_say_that_they_do_not_know_where() -> None:
@@ -610,6 +612,7 @@ def test_an_interrupt_leaves_the_map_so_far(log: RangeLog) -> None:
             raise KeyboardInterrupt
 
     run, _ = log_map.map_log(log, log_map.MapSettings(ANYWHERE), stop)
+    assert (log_scene(run).outcome, log_scene(run).good) == ("interrupted", False)
     assert run.interrupted and 10 < len(run.poses) < 0.5 * len(log)
     followed = log_drive.localise(log, corridors()[0], log_drive.LocaliseSettings(ANYWHERE, ANYWHERE), stop)
     assert followed.interrupted and 10 < len(followed.poses) < 0.5 * len(log)

@@ -13,7 +13,7 @@ from unifg.files.tum import write_tum
 from unifg.scenarios import log_drive
 from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
 from unifg.scenarios.logs.metrics import errors, spread, table, write_metrics
-from unifg.scenarios.range_logs import LogRun
+from unifg.scenarios.range_logs import FAILED, LogRun
 from unifg.scenarios.scenes.log_scene import log_scene, picture
 from unifg.style.figures import write_figure
 
@@ -69,10 +69,9 @@ def metrics(made: LogRun) -> dict[str, Any]:
 def summary(made: LogRun) -> str:
     """The outcome as a table of two columns."""
     m = metrics(made)
-    failed, ratio = not made.succeeded, m.get("turns_over_wheels", 1.0)
+    ratio = m.get("turns_over_wheels", 1.0)
     doubts = {
-        "lost: the map does not explain the last scans": failed and made.kind == "localise",
-        "wrong: the map explains less than half of the beams that it was made of": failed and made.kind == "map",
+        FAILED[made.kind]: not made.succeeded,
         f"scans turn by {ratio:.2f} of what the wheels do: are beams or headings mirrored?": not 0.8 < ratio < 1.25,
     }
     known, many = "error_m" in m, "mean {mean:.3f} {unit}, std {std:.3f}, max {max:.3f}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.plots.shown import every
-from unifg.scenarios.range_logs import LogRun
+from unifg.scenarios.range_logs import EXPLAINED, FAILED, LogRun
 from unifg.scenarios.scenes.parts import lidar_hits
 from unifg.style.colours import css
 from unifg.style.figures import face, headline, key_of, new_figure
@@ -78,12 +78,13 @@ def log_scene(run: LogRun) -> Scene:
         hits = lidar_hits(run.poses[k], run.log.ranges[k][beams], run.log.angles[beams], _WALL + 0.02)
         frame.points("scan", hits, pixels=4.0, colour="scan", legend="lidar hits")
         frame.value("explained", 100.0 * float(run.share[k]))
-        frame.readout("explained", f"{100.0 * run.share[k]:.0f} % of the beams", alarm=bool(run.share[k] < 0.5))
+        frame.readout("explained", f"{100.0 * run.share[k]:.0f} % of the beams", alarm=bool(run.share[k] < EXPLAINED))
         if len(run.hypotheses):
             frame.readout("hypotheses", str(int(run.hypotheses[k])), alarm=bool(run.hypotheses[k] > 1))
         if run.errors is not None:
             frame.readout("error", f"{100.0 * run.errors[0][k]:.1f} cm")
     scene.outcome, scene.good = ("followed to the end" if run.succeeded else "lost"), run.succeeded
     if run.kind == "map":
-        scene.outcome = "interrupted" if run.interrupted else "mapped"
+        scene.outcome = "interrupted" if run.interrupted else "mapped" if run.succeeded else FAILED["map"]
+        scene.good = run.succeeded and not run.interrupted
     return scene
