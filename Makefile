@@ -148,11 +148,9 @@ $(VENV)/installed: pyproject.toml
 	@$(PIP) install --no-compile --editable ".[scenarios]"
 	@touch $@
 
-# Tests raise warnings, also those that compiling the packages' sources gives: it is done beforehand.
 $(VENV)/ready: $(VENV)/installed
 	@echo "Installing what tests need into $(VENV)"
 	@$(PIP) install --editable ".[scenarios,test]"
-	@$(BIN)/python -W ignore -m compileall -qq $(VENV)/lib || true
 	@touch $@
 
 $(VENV)-lowest/ready: pyproject.toml tests/lowest.py
