@@ -72,6 +72,9 @@ BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
 FIRST_SLACK = 1e-2  # smallest slack of a cold start
 FINER = 0.03  # times the least mu, where the KKT test asks for more
 LEAST_FINER = 1e-10  # of the least mu, where the KKT test asks for more
+STUCK = 30  # iterations in which nothing becomes better: the rest is rounding
+BETTER = 0.9  # times the violation or the stationarity, by which an iterate is better
+SAME_MERIT = 1e-12  # of the barrier function, by which it does not change
 WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active has been found
 
 
@@ -280,7 +283,7 @@ def begin(address: int) -> None:
     now.theta_small, now.theta_large = 1e-4 * max(1.0, theta), 1e3 * max(1.0, theta)
     now.filtered = now.failures = now.short_steps = 0
     now.delta = now.last_delta = now.step = now.taken = 0.0
-    now.estimated = 0
+    now.estimated, now.stuck_phi = 0, math.inf
     run(links[0].measure, (address,))
     if now.cold == 1 and now.exact == 1 and len(heights):
         run(links[0].examine, (address,))
@@ -384,6 +387,11 @@ def test(address: int) -> None:
     phi, theta = merit(now, sides, pairs, penalties, row_units, rows, lower, cost, constraints, 0.0)
     now.phi, now.theta = phi, theta
     now.trials, now.corrected, now.answer = 0, 0, TRY
+    moved = abs(phi - now.stuck_phi) > SAME_MERIT * max(now.cost_unit, abs(phi))
+    if moved or theta < BETTER * now.stuck_theta or now.stationarity < BETTER * now.stuck_force:
+        now.stuck, now.stuck_phi, now.stuck_theta, now.stuck_force = now.iteration, phi, theta, now.stationarity
+    elif now.iteration >= now.stuck + STUCK:
+        now.answer = STALLED
 
 
 @linked

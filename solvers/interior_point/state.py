@@ -39,6 +39,9 @@ NOW = np.dtype(
         ("finer", np.float64),  # share of the least mu
         ("step", np.float64),  # norm of the last step taken
         ("taken", np.float64),  # its length
+        ("stuck_phi", np.float64),  # barrier function at that iteration
+        ("stuck_theta", np.float64),  # theta there
+        ("stuck_force", np.float64),  # stationarity there
         ("trial_cost", np.float64),
         ("saved_slope", np.float64),  # of the step that a correction replaces
         ("saved_alpha", np.float64),
@@ -81,6 +84,7 @@ NOW = np.dtype(
         ("concluded", np.int64),  # whether the present iterate has been judged
         ("kept", np.int64),  # whether an iterate kept all constraints
         ("short_steps", np.int64),  # in a row
+        ("stuck", np.int64),  # iteration after which nothing has become better
         ("scaling", np.int64),  # whether units are to be found
         ("raises", np.int64),  # of the penalties
         ("assisted", np.int64),  # whether Python evaluates, linearises and bends
