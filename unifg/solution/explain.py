@@ -22,6 +22,7 @@ SMALL = 1e-6  # a multiplier of which nothing is said, relative to the largest o
 UNLIKELY = 1e-3  # probability of the largest of all residuals of a term, by its weights
 WEAK = 1e-8  # curvature, relative to the diagonal, of a direction that is hardly determined
 NOTHING = 1e-13  # of one that is not determined at all
+SAVED = 1e-4  # share of the cost
 MUCH = 0.1  # share of the time
 MOST = 3  # sentences of a kind
 
@@ -32,6 +33,28 @@ def violated(program: CompiledProblem, worst: tuple[str, int] | None, violation:
         name, factor = worst
         where = members(_term(program, name), factor)
         yield f"'{name}' is violated most, by {violation:.3g} in factor {factor} ({where})."
+
+
+def tolerated(
+    cost: float, multipliers: Array, constraints: Array, lower: Array, upper: Array, tolerance: float
+) -> Iterator[str]:
+    """Sentence about the share of the cost that an answer saves by violations within its tolerance.
+
+    Args:
+        cost: objective.
+        multipliers: (M,).
+        constraints: (M,) with limits ``lower`` and ``upper``.
+        lower: limits.
+        upper: limits.
+        tolerance: of the solve; less than a thousandth of it is rounding.
+    """
+    outside = constraints - constraints.clip(lower, upper)
+    saved = inner(multipliers, np.where(np.abs(outside) > 1e-3 * tolerance, outside, 0.0))
+    if saved > SAVED * abs(cost):
+        yield (
+            f"Constraints are violated by up to {np.abs(outside).max():.1g}, within the tolerance: held exactly they "
+            f"would add about {saved:.3g} to the cost. Solve with a smaller feasibility_tolerance where that counts."
+        )
 
 
 def members(term: CompiledTerm, factor: int) -> str:

@@ -20,7 +20,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.conditioning import Conditioning, cheap, conditioning
 from unifg.solution.covariance import Covariances
-from unifg.solution.explain import disagreeing, holding, slow, violated, weak
+from unifg.solution.explain import disagreeing, holding, slow, tolerated, violated, weak
 from unifg.solution.fit import Fit, fit_of
 from unifg.solution.gains import feedback_gains, require_data
 from unifg.solution.guess import Guess
@@ -600,14 +600,15 @@ class Solution:
     def explain(self) -> str:
         """Sentences, one a line, on what shapes this solution and what it took.
 
-        The backend and why it was picked; the status; constraints that hold the solution, with what a unit of loosening
-        saves; soft ones that give way; measurements that disagree with their weights, of least squares; the direction
-        that is hardly determined; terms left to Python. One factorisation, where it is cheap.
+        The backend and why it was picked; the status; what violations within the tolerance save; constraints that hold
+        the solution, with what a unit of loosening saves; soft ones that give way; measurements that disagree with
+        their weights, of least squares; the direction that is hardly determined; terms left to Python. One
+        factorisation, where it is cheap.
         """
         program, held = self._program, self._equality | self._held()
         sentences = [f"{self.solver} was {self.picked or 'chosen by name'}.", self.status.value]
-        if not self.converged:
-            sentences += violated(program, self.worst, self.violation)
+        told = self.cost, self._multipliers, self._lin.constraints, self._lower, self._upper, self.tolerance
+        sentences += tolerated(*told) if self.converged else violated(program, self.worst, self.violation)
         sentences += [*holding(program, self._multipliers, self._equality, held), *self._gave_way()]
         if self.converged and (fit := self.fit) is not None:
             sentences += disagreeing(program, fit)
