@@ -15,7 +15,8 @@ from tqdm import tqdm
 from benchmarks.report import table, words
 from benchmarks.runner import Timing
 from benchmarks.timing import clocked, interleave, number, ratio
-from problems.cops import LEFT_OUT, PROBLEMS, Problem, program
+from problems.cops import LEFT_OUT, PROBLEMS, Problem
+from problems.cops_casadi import program
 from problems.scaled import Units, scaled
 from unifg.solvers import InteriorPoint
 
