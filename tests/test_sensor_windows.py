@@ -8,7 +8,7 @@ from numpy.random import Generator
 
 import unifg as fg
 from problems.graphs import graph_with
-from test_horizon import Timed
+from test_window import Timed
 from unifg.horizon import Constant, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.lie import SE23, SO3
 from unifg.models.inertial import InertialMeasurements
