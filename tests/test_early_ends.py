@@ -224,7 +224,7 @@ def test_nothing_unbounded_is_called_converged() -> None:
 def test_a_limit_returns_the_iterate_of_least_merit(
     name: str, iterations: int, feasible: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Cost plus the largest multiplier so far times the sum of violations, of the guess and all iterates."""
+    """Cost plus the largest multiplier so far times the sum of violations beyond the tolerance, of all iterates."""
     loop = RecedingHorizon(limits="kkt" not in name, disc="kkt" not in name)
     ahead = np.tile([0.2, 0.1], (N, 1))
     poses = unicycle.rollout(np.zeros(3), ahead, DT)
@@ -332,6 +332,21 @@ def test_the_price_is_the_largest_on_the_way() -> None:
 
     solution = Forgets([3.0, 0.8, 0.2], 4.0, fg.Status.STALLED).solve(graph, {x: [[5.0]]})
     assert solution.returned == 2
+
+
+def test_what_is_feasible_as_stated_is_judged_by_its_cost() -> None:
+    """A huge multiplier on the way priced a violation within the tolerance, and the dearer guess was returned."""
+    graph, x = wall(1.0)
+
+    class Overshoots(Walks):
+        def iterate(self, run: SolveState, workspace: None) -> fg.Status | None:
+            self.multiplier, self.points = 1e6, [0.9]
+            super().iterate(run, workspace)
+            self.multiplier, self.points = 4.0, [1.0 + 5e-7, 0.97, 1.0 + 9e-6]
+            return super().iterate(run, workspace)
+
+    solution = Overshoots([], 0.0, fg.Status.STALLED).solve(graph, {x: [[0.95]]})
+    assert (solution.returned, solution.violation) == (2, pytest.approx(5e-7))
 
 
 def test_single_steps_are_returned_whatever_they_cost() -> None:

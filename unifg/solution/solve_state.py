@@ -267,7 +267,7 @@ class SolveState:
         self.tolerances = solver.tolerances
         self.history: list[Iteration] = []
         self.status: Status | None = None
-        self.incumbents = Incumbents(program)
+        self.incumbents = Incumbents(program, self.tolerances.violation)
         self._recall: Callable[[], list[Iteration]] | None = None
         self._least, self._start = np.inf, values
         self._least_at: Array | None = None
