@@ -44,6 +44,7 @@ from unifg.factors.differences import jacobian
 from unifg.factors.residuals import Residual, residual
 from unifg.lie import LieGroup
 from unifg.lie.functions import functions_of
+from unifg.modeling.duplicates import doubles
 from unifg.models.tableau import METHODS, Tableau
 from unifg.typing import Array, ArrayLike
 
@@ -172,6 +173,11 @@ def _parts(
         sigma = row[END] * xi + h * sum(a * k for a, k in zip(before, speeds, strict=True))
         point = group.retract(x, sigma) if inside else after if row[END] else x
         speed = field(point, *inputs)
+        if np.shape(speed) not in ((len(x), group.dim), (1, group.dim)):
+            raise ModelError(
+                f"a field gives velocities in {group.name}, one row for each state, ({len(x)}, {group.dim}); found "
+                f"shape {np.shape(speed)}: np.stack([...], axis=1) makes rows of (n,) numbers"
+            )
         if (inside or row[END]) and not row[FLAT]:
             speed = times(group.right_jacobian_inverse(sigma), speed)
         speeds.append(speed)
@@ -212,7 +218,7 @@ def rollout(
     field: Field,
     start: ArrayLike,
     *inputs: ArrayLike,
-    h: float,
+    h: ArrayLike,
     method: Method = "rk4",
     count: int | None = None,
     substeps: int = 1,
@@ -224,9 +230,9 @@ def rollout(
         field: F(x, u, ...).
         start: (storage,).
         inputs: (n, k) each, held over a step; (k,) or (1, k) when held over all of them.
-        h: step [s].
+        h: step [s], one or (n,).
         method: as for :func:`integrator`.
-        count: n, needed only when no input tells it.
+        count: n, needed only when neither inputs nor steps tell it.
         substeps: steps of the method, of length h / substeps, for each row of the inputs.
 
     Raises:
@@ -236,24 +242,29 @@ def rollout(
     tableau = _tableau(method)
     require_substeps("rollout", substeps)
     parts = [np.atleast_2d(np.asarray(part, dtype=np.float64)) for part in inputs]
-    count = max([len(part) for part in parts], default=1) if count is None else count
-    if np.size(start) != group.storage or any(len(part) not in (1, count) for part in parts):
-        found = ", ".join(str(np.shape(part)) for part in (start, *parts))
-        raise ModelError(f"rollout takes a start ({group.storage},) and inputs ({count}, k) or (k,), found {found}")
+    lengths = np.ravel(doubles("rollout: h", h)) / substeps
+    even, rows = len(lengths) == 1, {len(part) for part in (*parts, lengths)}
+    count = max(rows) if count is None else count
+    if np.size(start) != group.storage or not rows <= {1, count}:
+        found = ", ".join(str(np.shape(part)) for part in (start, *parts, h))
+        raise ModelError(
+            f"rollout takes a start ({group.storage},), inputs ({count}, k) or (k,) and h, one or ({count},); found "
+            f"{found}"
+        )
     parts = [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
     states = np.empty((count + 1, group.storage))
     states[0] = start
-    functions = functions_of(group) if count * substeps > FEW and tableau.explicit else None
-    step = _stepping(group, field, tableau, states[0], parts, h / substeps) if functions is not None else None
+    functions = functions_of(group) if count * substeps > FEW and tableau.explicit and even else None
+    step = _stepping(group, field, tableau, states[0], parts, lengths[0]) if functions is not None else None
     if functions is not None and step is not None:  # which goes, and its machine code with it, when its name does
         code, retraction = step.address, address(functions.retract, RETRACTION)
         u = np.concatenate([*parts, np.empty((count, 0))], axis=1)
-        _follow(code, retraction, u, h / substeps, substeps, np.empty(group.dim), states)
+        _follow(code, retraction, u, lengths[0], substeps, np.empty(group.dim), states)
         return states
-    for n in range(count):
+    for n, length in enumerate(np.broadcast_to(lengths, count)):
         x, held = states[n : n + 1], [part[n : n + 1] for part in parts]
         for _ in range(substeps):
-            x = _advance(group, field, tableau, x, held, h / substeps)
+            x = _advance(group, field, tableau, x, held, length)
         states[n + 1] = x[0]
     return states
 

@@ -55,6 +55,43 @@ def test_arguments_in_another_order_or_without_rows_are_refused() -> None:
     graph.minimize(step, x[:-1], u, fg.shared([[0.1, 0.3]]), x[1:], 0.1)
 
 
+@pytest.mark.parametrize(
+    ("velocity", "found"),
+    [
+        (lambda x, u: u[:, 0], r"\(4,\)"),
+        (lambda x, u: u[:, :1], r"\(4, 1\)"),
+        (lambda x, u: np.stack([x[:, 1], u[:, 0]]), r"\(2, 4\)"),
+        (lambda x, u: np.concatenate([u, u], axis=1), r"\(4, 4\)"),
+    ],
+)
+@pytest.mark.parametrize("form", ["explicit euler", "implicit midpoint", "rk4"])
+def test_velocities_of_another_shape_are_refused(velocity: Any, found: str, form: Method) -> None:
+    """Broadcasting would give every coordinate the velocity of one of them."""
+    plane, u = fg.Rn(2), np.ones((4, 2))
+    with pytest.raises(fg.ModelError, match=rf"velocities in Rn\(2\).* \(4, 2\); found shape {found}"):
+        rkmk.advance(plane, velocity, np.zeros((4, 2)), u, h=0.1, method=form)
+    with pytest.raises(fg.ModelError, match=r"velocities in Rn\(2\)"):
+        rkmk.rollout(plane, velocity, [0.0, 0.0], u, h=0.1, method=form)
+    graph = fg.Graph()
+    x, control = graph.variables("x", plane, 5), graph.variables("u", fg.Rn(2), 4)
+    with pytest.raises(fg.ModelError, match=rf"^term '{form}': a field gives velocities in Rn\(2\)"):
+        graph.minimize(rkmk.integrator(plane, velocity, form), x[:-1], control, x[1:], 0.1)
+
+
+@pytest.mark.parametrize("form", ["rk4", "implicit midpoint"])
+@pytest.mark.parametrize("count", [3, 150])
+def test_a_simulation_takes_a_step_for_each_row(form: Method, count: int) -> None:
+    lengths, u = np.linspace(0.01, 0.05, count), RNG.normal(size=(count, 2))
+    states = rkmk.rollout(fg.SE2, current, START[0], u, h=lengths, method=form)
+    for k in (0, 1, count - 1):
+        alone = rkmk.advance(fg.SE2, current, states[k : k + 1], u[k : k + 1], h=lengths[k], method=form)
+        assert np.abs(states[k + 1] - alone[0]).max() < 1e-12
+    held = rkmk.rollout(fg.SE2, current, START[0], u[0], h=lengths[:2], method=form)
+    assert held.shape == (3, 3) and np.abs(held[1] - states[1]).max() < 1e-12
+    with pytest.raises(fg.ModelError, match=rf"and h, one or \({count},\); found .* \(2,\)"):
+        rkmk.rollout(fg.SE2, current, START[0], u, h=lengths[:2], method=form)
+
+
 def test_midpoint_model_is_close_but_not_the_same() -> None:
     """Bazzana's kinematics takes the chord v h for the arc: it differs from Exp by v h (1 - sinc(omega h / 2))."""
     x, u, h = np.zeros((1, 3)), np.array([[1.0, 1.0]]), 0.1
