@@ -78,6 +78,19 @@ def test_several_instances_share_what_is_given_once(layer: Layer) -> None:
     np.testing.assert_allclose(weight, [one[2] for one in each], rtol=1e-5)
 
 
+def test_what_is_repeated_along_an_axis_has_the_sum_of_its_slopes(layer: Layer) -> None:
+    given = [STARTS, GOALS[:1], WEIGHTS[:1]]
+    answers, whole = layer.solve(*given), layer.solve(STARTS, GOALS[0], WEIGHTS[0])
+    np.testing.assert_array_equal(answers.values[0], whole.values[0])
+    slopes = [np.ones_like(values) for values in answers.values]
+    for one, found, right in zip(given, layer.pull(answers, slopes), layer.pull(whole, slopes), strict=True):
+        assert found.shape == one.shape
+        np.testing.assert_array_equal(np.squeeze(found), right)
+    # whichever comes first
+    first, second = (layer.solve(start, GOALS, 0.5).values[0] for start in (STARTS[:1], STARTS[0]))
+    np.testing.assert_array_equal(first, second)
+
+
 def test_slopes_along_the_length_of_a_quaternion_are_zero() -> None:
     graph = fg.Graph()
     q, seen = (
@@ -226,3 +239,19 @@ def test_a_training_loop_of_jax_falls_and_vmap_is_a_batch() -> None:
     assert float(step(log_weight)[0]) < 0.2 * first
     mapped = jax.vmap(lambda start, goal: solve(start, goal, 0.5)[0])(STARTS, GOALS)
     np.testing.assert_allclose(mapped, solve(STARTS, GOALS, np.full(3, 0.5))[0], atol=1e-8)
+
+
+def test_vmap_over_what_instances_share_is_a_loop() -> None:
+    """The axis of vmap stands in front of the instances, not in their place."""
+    jax = pytest.importorskip("jax", reason="the extra 'jax' is not installed")
+    solve, _ = _jax()
+
+    def total(weight: Any) -> Any:
+        return (solve(STARTS, GOALS, weight)[0] ** 2).sum()
+
+    slopes = jax.vmap(jax.value_and_grad(total))(WEIGHTS)
+    for k, weight in enumerate(WEIGHTS):
+        for many, one in zip(slopes, jax.value_and_grad(total)(weight), strict=True):
+            np.testing.assert_allclose(many[k], one, rtol=1e-6)
+    with pytest.raises(fg.GraphError, match=r"data 'goal' have shape \(3,\), expected \(2,\)"):
+        solve(STARTS[0], np.zeros(3), 0.5)

@@ -49,8 +49,7 @@ def layer(*args: Any, **options: Any) -> Callable[..., Any]:
 
     @jax.custom_vjp  # type: ignore[untyped-decorator]
     def solve(*given: Any) -> tuple[Any, ...]:
-        leads = [one.shape[: one.ndim - h.value.ndim] for one, h in zip(given, inner.inputs, strict=True)]
-        lead, dtype = max(leads, key=len), given[0].dtype
+        lead, dtype = inner.together([one.shape for one in given])[0], given[0].dtype
         shapes = [(*lead, family.count, family.manifold.storage) for family in inner.outputs]
         results = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in shapes)
         return tuple(jax.pure_callback(answer, results, *given, vmap_method="broadcast_all"))
@@ -63,7 +62,9 @@ def layer(*args: Any, **options: Any) -> Callable[..., Any]:
 
     def call(*given: Any) -> Any:
         arrays = [jax.numpy.asarray(one) for one in given]
-        found = solve(*(one.astype(jax.numpy.result_type(one, float)) for one in arrays))
+        # all instances in front of each, so that an axis that vmap adds stands in the same place of all
+        alike = map(jax.numpy.broadcast_to, arrays, inner.together([one.shape for one in arrays])[1])
+        found = solve(*(one.astype(jax.numpy.result_type(one, float)) for one in alike))
         return found if len(found) > 1 else found[0]
 
     return call

@@ -8,6 +8,7 @@ what leaves a manifold, as the length of a quaternion, is zero.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -93,20 +94,12 @@ class Layer:
         Raises:
             GraphError: shapes do not fit; an instance does not converge.
         """
-        if len(given) != len(self.inputs):
-            raise GraphError(f"layer: takes {len(self.inputs)} inputs, found {len(given)}")
-        arrays = [doubles(f"layer: data '{h.name}'", one) for one, h in zip(given, self.inputs, strict=True)]
-        leads = [a.shape[: max(0, a.ndim - h.value.ndim)] for a, h in zip(arrays, self.inputs, strict=True)]
-        lead = max(leads, key=len, default=())
-        data = {}
-        for array, handle in zip(arrays, self.inputs, strict=True):
-            try:
-                data[handle] = np.broadcast_to(array, lead + handle.value.shape).reshape(-1, *handle.value.shape)
-            except ValueError:
-                raise GraphError(
-                    f"layer: data '{handle.name}' have shape {array.shape}, expected {handle.value.shape}, with "
-                    f"{lead} in front for several instances"
-                ) from None
+        arrays = [doubles(f"layer: data '{h.name}'", one) for one, h in zip(given, self.inputs, strict=False)]
+        lead, wanted = self.together([np.shape(one) for one in given])
+        data = {
+            handle: np.broadcast_to(array, shape).reshape(-1, *handle.value.shape)
+            for array, handle, shape in zip(arrays, self.inputs, wanted, strict=True)
+        }
         batch = self._prepared.solve_many(self._guess, data=data, threads=self._threads)
         for index, status in enumerate(batch.statuses):
             if not status.converged and self._failed == "raise":
@@ -115,6 +108,28 @@ class Layer:
                 )
         values = [batch[family].reshape(*lead, family.count, family.manifold.storage) for family in self.outputs]
         return Answers(values, batch, tuple(array.shape for array in arrays))
+
+    def together(self, shapes: Sequence[tuple[int, ...]]) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
+        """Axes of the instances that inputs of such shapes make together, and the shape of each with all of them.
+
+        Raises:
+            GraphError: shapes do not fit.
+        """
+        if len(shapes) != len(self.inputs):
+            raise GraphError(f"layer: takes {len(self.inputs)} inputs, found {len(shapes)}")
+        own = [handle.value.shape for handle in self.inputs]
+        leads = [shape[: max(0, len(shape) - len(last))] for shape, last in zip(shapes, own, strict=True)]
+        lead = max(leads, key=len, default=())
+        with suppress(ValueError):
+            lead = np.broadcast_shapes(*leads)
+        wanted = [lead + last for last in own]
+        for handle, shape, whole in zip(self.inputs, shapes, wanted, strict=True):
+            if any(size not in (1, full) for size, full in zip(shape[::-1], whole[::-1], strict=False)):
+                raise GraphError(
+                    f"layer: data '{handle.name}' have shape {shape}, expected {handle.value.shape}, with {lead} in "
+                    "front for several instances"
+                )
+        return lead, wanted
 
     def pull(self, answers: Answers, slopes: Sequence[Array]) -> list[Array]:
         """Slopes in the shapes of the inputs, from slopes in those of the outputs; the sums where instances share one.
@@ -141,7 +156,14 @@ class Layer:
                 out[index] = gradient if manifold is None else _stored(manifold, data[handle], gradient)
         lead = answers.values[0].shape[:-2]
         many = [p.reshape(lead + handle.value.shape) for p, handle in zip(pulled, self.inputs, strict=True)]
-        return [p.sum(axis=tuple(range(p.ndim - len(s)))) for p, s in zip(many, answers.shapes, strict=True)]
+        return [_folded(p, shape) for p, shape in zip(many, answers.shapes, strict=True)]
+
+
+def _folded(array: Array, shape: tuple[int, ...]) -> Array:
+    """Sums over what a shape was repeated along."""
+    total = array.sum(axis=tuple(range(array.ndim - len(shape))))
+    once = tuple(k for k, size in enumerate(shape) if size == 1)
+    return np.asarray(total.sum(axis=once, keepdims=True))
 
 
 def _tangent(manifold: Manifold, points: Array, slopes: Array) -> Array:
