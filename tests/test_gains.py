@@ -190,6 +190,27 @@ def test_gains_at_rest_are_not_those_of_other_weights() -> None:
     np.testing.assert_array_equal(first.gains(x, u), gains)
 
 
+@pytest.mark.parametrize("unit", [1e-4, 1e-7, 1e4])
+def test_the_unit_of_the_costs_does_not_matter(unit: float) -> None:
+    """Multipliers of small costs are small, and limits act all the same."""
+
+    def limited(unit: float) -> fg.Solution:
+        graph, x, u = graph_of(("x", fg.Rn(3), 9), ("u", fg.Rn(2), 8))
+        graph.fix(x[0], [1.0, 1.0, 1.0])
+        graph.minimize(fg.prior, x, np.zeros(3), information=unit * Q, name="stages")
+        graph.minimize(fg.prior, u, np.zeros(2), information=unit * R, name="effort")
+        graph.constrain(motion, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="dynamics")
+        graph.bound(u, lower=-0.5, upper=0.5, name="limits")
+        return solved(graph, tolerance=1e-6)
+
+    expected, found = limited(1.0), limited(unit)
+    at_limits = np.isclose(np.abs(expected["u"]), 0.5, atol=1e-5)
+    gains = found.gains("x", "u")
+    assert at_limits.sum() == 1 and np.abs(gains[at_limits]).max() < 1e-9
+    np.testing.assert_allclose(gains, expected.gains("x", "u"), atol=1e-4)
+    np.testing.assert_allclose(unit * found.covariance("u"), expected.covariance("u"), atol=1e-4)
+
+
 def test_a_constraint_that_cannot_be_kept_from_another_state_has_no_gain_there() -> None:
     """A wall for a position that the control reaches two steps later; from farther away it can be kept."""
     graph, x, u = graph_of(("x", fg.Rn(2), 6), ("u", fg.Rn(1), 5))

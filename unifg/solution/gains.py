@@ -26,6 +26,7 @@ from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization
 from unifg.problem.systems import KktSystem, fill
 from unifg.solution.covariance import SOLVED
+from unifg.solution.multipliers import size_of_costs
 from unifg.typing import Array, BoolArray, IntArray
 
 REPLACED = "the data of this solution have been replaced since; ask before the next solve"
@@ -56,7 +57,8 @@ def feedback_gains(
         twin, here = unfixed(program, columns, lin)
     system = twin.systems.kkt(held)
     entries = np.zeros(system.pattern.nnz)
-    fill(system.arrays, lagrangian_hessian(twin, here, multipliers), here.constraint_jacobian, entries)
+    hessian = lagrangian_hessian(twin, here, multipliers) / size_of_costs(program, lin)  # gains have no unit of costs
+    fill(system.arrays, hessian, here.constraint_jacobian, entries)
 
     def numbered(selection: Selection) -> IntArray:
         return twin.columns.unknown[twin.columns.of(selection)]

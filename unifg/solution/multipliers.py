@@ -179,6 +179,16 @@ def weakest(
     return row, slack, abs(multipliers[row]) / scale if row >= 0 else 0.0
 
 
+def size_of_costs(program: CompiledProblem, lin: Linearization) -> float:
+    """Largest slope or curvature of the costs at a solution; 1 where it is larger, or nothing.
+
+    Multipliers over it are those of costs in units of order one, beside which distances to limits are judged.
+    """
+    curvature = lin.hessian[program.normal.diagonal]
+    size = float(max(np.abs(part).max(initial=0.0) for part in (lin.gradient, curvature)))
+    return size if 0.0 < size < 1.0 else 1.0
+
+
 @compiled
 def hold(constraints: Array, lower: Array, upper: Array, multipliers: Array, held: BoolArray) -> None:
     """Write which inequalities are active: their multiplier outweighs the distance to its limit."""

@@ -26,7 +26,7 @@ from unifg.solution.gains import feedback_gains, require_data
 from unifg.solution.guess import Guess
 from unifg.solution.history import FactorNorms, History, Iteration, factor_norms
 from unifg.solution.marginal import Variables, information, marginal_prior
-from unifg.solution.multipliers import hold
+from unifg.solution.multipliers import hold, size_of_costs
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.saved import write_answer
@@ -637,7 +637,8 @@ class Solution:
     def _held(self) -> BoolArray:
         """Inequalities that are active: the multiplier outweighs the distance to its limit."""
         held: BoolArray = np.empty(len(self._multipliers), dtype=bool)
-        hold(self._lin.constraints, self._lower, self._upper, self._multipliers, held)
+        multipliers = self._multipliers / size_of_costs(self._program, self._lin)
+        hold(self._lin.constraints, self._lower, self._upper, multipliers, held)
         return held
 
     def _selection(self, variable: Variable | str) -> Selection:
