@@ -150,9 +150,9 @@ def drive(start: Array, u: Array, **options: Any) -> Array:
         (lambda: unicycle.rollout(np.zeros(2), np.zeros((3, 2)), 0.1), r"starts at a pose \(3,\), got \(2,\)"),
         (
             lambda: drive(np.zeros(2), np.zeros((3, 2))),
-            r"start \(3,\) and inputs \(3, k\).*, found \(2,\), \(3, 2\)",
+            r"start \(3,\), inputs \(3, k\).*; found \(2,\), \(3, 2\)",
         ),
-        (lambda: drive(np.zeros(3), np.zeros((3, 2)), count=5), r"inputs \(5, k\) or \(k,\), found \(3,\), \(3, 2\)"),
+        (lambda: drive(np.zeros(3), np.zeros((3, 2)), count=5), r"inputs \(5, k\) or .*; found \(3,\), \(3, 2\)"),
         (lambda: quadrotor.Parameters(drag=1.0), "a quadrotor's parameters are numbers, of drag 3"),  # type: ignore[arg-type]
         (lambda: quadrotor.Parameters(mass="light"), "a quadrotor's parameters are numbers"),  # type: ignore[arg-type]
     ],
