@@ -23,6 +23,7 @@ EXCESS = 0.03  # [m] by which covering discs may stick out of a polygon
 FARTHEST = 30.0  # corner of a polygon [m]
 FINE = 61  # places to a side among which discs are chosen
 INSIDE = 1e-9  # [m]; on the hull is inside
+_STRAIGHT = 1e-9  # [rad] by which a straight side may turn in a corner
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Body:
 
     @staticmethod
     def polygon(corners: ArrayLike) -> Body:
-        """A convex polygon of corners (P, 2) [m].
+        """A convex polygon of corners (P, 2) [m], without those that are repeated or lie on a straight side.
 
         Raises:
             ModelError: fewer than three corners, one that is farther than `FARTHEST` ahead, behind or aside, or a
@@ -66,12 +67,14 @@ class Body:
                 f"a polygon has at least three corners x, y [m], none farther than {FARTHEST:g} m: found "
                 f"{reprlib.repr(points.tolist())}"
             )
-        edges = np.roll(points, -1, axis=0) - points
-        turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
+        points = points[(points != np.roll(points, -1, axis=0)).any(axis=1)]
+        turns, ahead = _turns(points)
+        points = points[(np.abs(turns) > _STRAIGHT * np.abs(ahead)) | (ahead <= 0.0)]
+        turns, _ = _turns(points)
         if turns.sum() < 0.0:
             points, turns = points[::-1], -turns
-        angles = np.unwrap(np.arctan2(*edges.T[::-1]))
-        if not (turns > 0.0).all() or abs(angles[-1] - angles[0]) >= 2.0 * math.pi:
+        angles = np.unwrap(np.arctan2(*(np.roll(points, -1, axis=0) - points).T[::-1]))
+        if len(points) < 3 or not (turns > 0.0).all() or abs(angles[-1] - angles[0]) >= 2.0 * math.pi:
             raise ModelError("the polygon of a body must be convex; give a union of discs for another")
         return Body(tuple(map(tuple, _cover(points).tolist())), tuple(map(tuple, points.tolist())))
 
@@ -133,6 +136,12 @@ class Body:
         ]
         points = np.concatenate(rings)
         return points[self.gap(points) >= -INSIDE]
+
+
+def _turns(points: Array) -> tuple[Array, Array]:
+    """Vector and scalar products (P,) [m^2] of the edges that meet in each corner of a polygon (P, 2)."""
+    into, out = points - np.roll(points, 1, axis=0), np.roll(points, -1, axis=0) - points
+    return into[:, 0] * out[:, 1] - into[:, 1] * out[:, 0], (into * out).sum(axis=1)
 
 
 def _to_polygon(corners: Array, points: Array) -> Array:

@@ -67,6 +67,22 @@ def test_discs_cover_a_polygon_and_stick_out_of_it_by_no_more_than_they_may(text
     assert body.bound == pytest.approx(float(np.hypot(*edges.T).max()), abs=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [
+        ("polygon:0,0;0.3,0;0.6,0;0.6,0.4;0,0.4", "polygon:0,0;0.6,0;0.6,0.4;0,0.4"),
+        ("polygon:0.1,0.1;0.2,0.2;0.3,0.3;0,0.4", "polygon:0.1,0.1;0.3,0.3;0,0.4"),  # straight but for rounding
+        ("polygon:0,0.4;0.6,0.4;0.6,0;0.4,0;0.2,0;0,0", "polygon:0,0;0.6,0;0.6,0.4;0,0.4"),  # the other way round
+        ("polygon:0,0;0.6,0;0.6,0.4;0,0.4;0,0", "polygon:0,0;0.6,0;0.6,0.4;0,0.4"),  # closed, as in files of maps
+    ],
+)
+def test_corners_on_a_straight_side_are_none(text: str, same: str) -> None:
+    found, clean = set(body_of(text).outline), set(body_of(same).outline)
+    assert found == clean
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 2))
+    np.testing.assert_allclose(body_of(text).gap(points), body_of(same).gap(points), atol=1e-12)
+
+
 NEEDLE = "polygon:0,0;4,0.02;0,0.04"
 
 
@@ -93,6 +109,9 @@ def test_the_rim_of_a_body_is_where_a_ray_leaves_it() -> None:
         "disc:x",
         "polygon:0,0;1,0",
         "polygon:0,0;1,0;0.2,0.2;0,1",
+        "polygon:0,0;1,0;2,0",
+        "polygon:0,0;0,0;0,0",
+        "polygon:0,0;2,0;1,0;1,1",
         "discs:0,0",
         "ball:1",
         "axb",
