@@ -210,7 +210,7 @@ class Episode:
         believed = self.start + sigma * belief.standard_normal(3)
         if settings.believed is not None:
             believed = _pose(settings.believed, None, "believed")
-        self.faults = DriveFaults(settings.faults, settings.seed, control.kind)
+        self.faults = DriveFaults(settings.faults, settings.seed, control.kind, range_max=settings.lidar.range_max)
         self._right, self._drawn = (self.occupancy, self.distance_map), drawn
         self.pilot = self._pilot(believed, sigma)
         if not rehearsal:

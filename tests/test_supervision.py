@@ -47,7 +47,7 @@ from unifg.scenarios.simulation.air import QuadrotorWorld
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
 from unifg.scenarios.simulation.faults import DRIVE_FAULTS, FLIGHT_FAULTS, Fault, one_of
 from unifg.scenarios.simulation.layouts import corridor
-from unifg.scenarios.simulation.plane import World
+from unifg.scenarios.simulation.plane import LidarModel, World
 from unifg.typing import Array
 
 BEAMS = 360
@@ -548,6 +548,13 @@ def test_faults_are_read_and_refused_by_name() -> None:
     for text in ("lidar-nan", "lidar-nan@", "lidar-nan@x", "lidar-nan@-1", "lidar-nan@1:0", "lidar-nan@nan", "gust@1"):
         with pytest.raises(argparse.ArgumentTypeError):
             read(text)
+
+
+def test_a_lidar_that_sees_nothing_says_its_own_range() -> None:
+    settings = NavigationSettings(lidar=LidarModel(range_max=5.0), faults=(Fault("lidar-max", 0.0),))
+    episode = Episode(settings)
+    found = episode.faults.scan(episode.world.scan(), 0.0)
+    assert found is not None and (found.ranges == 5.0).all()
 
 
 SHORT = NavigationSettings(start=(6.5, 14.0, 0.0), goals=((13.5, 14.1, 0.0),), obstacles=1)

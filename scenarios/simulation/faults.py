@@ -49,7 +49,6 @@ SIZES = {
 
 BLIND = 0.3  # [rad] to both sides of straight ahead, where a lidar that is half covered sees nothing
 LATE = 0.4  # [s] by which a delayed scan comes late
-RANGE_MAX = 12.0  # [m]; what a lidar that sees nothing may say
 AXLE = 0.3  # [m] between the wheels
 CARRIED = 3.0  # [m]; a robot is carried at least so far
 ROOM = 0.5  # [m] from walls where it is put down
@@ -129,8 +128,16 @@ class _Faults:
 class DriveFaults(_Faults):
     """Faults of a drive."""
 
-    def __init__(self, faults: Sequence[Fault], seed: int, base: Base = unicycle.BASE) -> None:
+    def __init__(
+        self, faults: Sequence[Fault], seed: int, base: Base = unicycle.BASE, *, range_max: float = 12.0
+    ) -> None:
         """Begin before the first tick.
+
+        Args:
+            faults: what goes wrong.
+            seed: of what is random about it.
+            base: of the robot.
+            range_max: of its lidar [m], which says so where it sees nothing.
 
         Raises:
             ScenarioError: a fault of wheels that the base does not have.
@@ -140,7 +147,7 @@ class DriveFaults(_Faults):
             raise ScenarioError("the fault 'wheel-dead' is one of a unicycle's two wheels: leave it or --base out")
         self._scans: deque[Scan] = deque(maxlen=100)
         self._frozen: Scan | None = None
-        self._driven = np.zeros(base.size)
+        self._driven, self._range_max = np.zeros(base.size), range_max
         self._carried = False
 
     def scan(self, scan: Scan, now: float) -> Scan | None:
@@ -162,7 +169,7 @@ class DriveFaults(_Faults):
             "lidar-blind": replace(scan, ranges=np.where(np.abs(scan.angles) < BLIND, math.nan, scan.ranges)),
             "lidar-nan": replace(scan, ranges=np.full_like(scan.ranges, math.nan)),
             "lidar-inf": replace(scan, ranges=np.full_like(scan.ranges, math.inf)),
-            "lidar-max": replace(scan, ranges=np.full_like(scan.ranges, RANGE_MAX)),
+            "lidar-max": replace(scan, ranges=np.full_like(scan.ranges, self._range_max)),
             "lidar-negative": replace(scan, ranges=-scan.ranges),
         }
         return next((found for kind, found in arriving.items() if self.hold(kind, now)), scan)
