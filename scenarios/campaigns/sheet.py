@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -107,8 +107,10 @@ def load(folder: Path, any_code: bool = False, failed_too: bool = False) -> Shee
         ScenarioError: there is none.
     """
     kept = manifest_of(folder)
-    keys, unreadable = set(kept["keys"]), list[int]()
-    rows = [row for row in episodes_of(folder, unreadable) if row["key"] in keys]
+    axes, unreadable = kept["axes"], list[int]()
+    # Rows have the labels of the day on which they ran: those of today are the manifest's, whose keys go seed by seed.
+    labels = dict(zip(kept["keys"], cycle(dict(zip(axes, each, strict=True)) for each in product(*axes.values()))))
+    rows = [row | {"labels": labels[row["key"]]} for row in episodes_of(folder, unreadable) if row["key"] in labels]
     mine = [row for row in rows if any_code or row.get("code") == kept["code"]]
     sheet = sheet_of(folder, kept, mine, failed_too)
     sheet.others, sheet.unreadable = len(rows) - len(mine), unreadable
