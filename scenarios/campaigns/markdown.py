@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 __all__ = ["cell", "table"]
+
+_MARKS = re.compile(r"[\\`*<&\[|~]|\b_|_\b")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], text: int = 1) -> str:
@@ -14,5 +17,5 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], text: int = 1) -> 
 
 
 def cell(text: str) -> str:
-    """Somebody else's words as they may stand in a table."""
-    return " ".join(text.split()).replace("|", "\\|")
+    """Somebody else's words as they may stand in a heading or table, where they mark and mean nothing."""
+    return _MARKS.sub(r"\\\g<0>", " ".join(text.split()))
