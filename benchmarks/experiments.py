@@ -18,7 +18,7 @@ from benchmarks.comparison import interval, portion
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.report import CAMPAIGNS, OUT, table
 from benchmarks.runner import Timing
-from unifg.scenarios.campaigns.campaign import EPISODES, code_of_scenario, replay_command, run_campaign, write_manifest
+from unifg.scenarios.campaigns.campaign import EPISODES, code_of, replay_command, run_campaign, write_manifest
 from unifg.scenarios.campaigns.report import PAIRED, differences
 from unifg.scenarios.campaigns.sheet import Sheet, load
 from unifg.scenarios.campaigns.statement import Statement, read, stated
@@ -215,7 +215,7 @@ def tables(runs: int) -> str:
         restore(archive, folder / EPISODES)
         run_campaign(replace(whole, seeds=whole.seeds[:runs]), folder, any_code=True)
         keep(folder / EPISODES, archive)
-        write_manifest(folder, whole, code_of_scenario("navigation"))  # not of the first runs alone
+        write_manifest(folder, whole, code_of(whole))  # not of the first runs alone
         sheets[name] = load(folder, any_code=True, failed_too=True)
     return rendered(sheets)
 

@@ -28,6 +28,7 @@ from unifg.scenarios.campaigns.journal import Journal, lines_of
 from unifg.scenarios.campaigns.replay import episode_of
 from unifg.scenarios.campaigns.sheet import load
 from unifg.scenarios.campaigns.sources import fingerprint
+from unifg.scenarios.campaigns.stated_settings import identity
 from unifg.scenarios.campaigns.statement import Episode, Statement, read, spawned, stated
 from unifg.scenarios.campaigns.task import Task, WrongLibrary, run_task
 from unifg.scenarios.episode import silent
@@ -45,7 +46,7 @@ def walks(seeds: object = (0, 1, 2), base: Path | str = ".", **entries: Any) -> 
 @pytest.fixture(autouse=True)
 def _one_code(monkeypatch: pytest.MonkeyPatch) -> None:
     """The digest of everything takes seconds; a test that is about it sets another one."""
-    monkeypatch.setattr(campaigns, "code_of_scenario", lambda scenario: "now")
+    monkeypatch.setattr(campaigns, "code_of", lambda statement: "now")
 
 
 def run(statement: Statement, folder: Path, **options: Any) -> Campaign:
@@ -116,6 +117,21 @@ def test_the_same_episode_has_the_same_key_however_it_is_stated(tmp_path: Path) 
         (tmp_path / folder / "büro [1].pgm").write_text(content)
     a, b, c = (keys(tmp_path / folder, settings={"map": "büro [1].yaml"}) for folder in "abc")
     assert a == b != c, "a file is what it and its image hold, wherever it lies"
+    settings = {"map": "büro [1].yaml"}
+    for image in ("floor.pgm", "more/floor.pgm"):
+        (tmp_path / "a" / "more").mkdir(exist_ok=True)
+        (tmp_path / "a" / "büro [1].yaml").write_text(f'image: "{image}"\r\nresolution: 0.05\n', newline="")
+        (tmp_path / "a" / image).write_text("x")
+        before = keys(tmp_path / "a", settings=settings)
+        (tmp_path / "a" / image).write_text("y")
+        assert keys(tmp_path / "a", settings=settings) != before, "an image may have a name of its own"
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "bag.db3").write_text(name)
+        (tmp_path / f"log-{name}").write_text(name)
+    for pattern in ("{}", "log-{}"):
+        one, two = (identity(tmp_path / pattern.format(name)) for name in ("one", "two"))
+        assert one != two, "a folder is what its files hold, and so is a file without an ending"
 
 
 @pytest.mark.parametrize(
@@ -162,6 +178,7 @@ def test_the_same_episode_has_the_same_key_however_it_is_stated(tmp_path: Path) 
         ({"seeds": {"spawn": 0}}, "`seeds` must be"),
         ({"seeds": {"spawn": 3, "form": 2}}, "`seeds` must be"),
         ({"compare": ["pcae"], "grid": {"pace": [1.0]}}, "`compare` names 'pcae', which is no axis; did you mean pace"),
+        ({"succeeded_only": "false"}, "`succeeded_only` must be true or false, got 'false'"),
         ({"measures": "length_m"}, "`measures` must be a list of names"),
         ({"scenario": "velocity-tracking"}, "has nothing random and no seed; leave `seeds` out"),
         ({"scenario": "navigation", "settings": {"solver": "lm"}}, "'lm' is none of"),
@@ -468,7 +485,7 @@ def test_changes_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     ]
     fewer = run(walks((0,)), tmp_path)
     assert fewer.ran == 0 and "2 episodes on file are not of this campaign (any more): left alone" in fewer.remarks
-    monkeypatch.setattr(campaigns, "code_of_scenario", lambda scenario: "later")
+    monkeypatch.setattr(campaigns, "code_of", lambda statement: "later")
     assert run(walks((0,)), tmp_path, any_code=True).ran == 0
     changed = run(walks((0,)), tmp_path)
     assert changed.ran == 1 and any("the code has changed (later now, on file 1 of now)" in r for r in changed.remarks)
@@ -478,6 +495,34 @@ def test_changes_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert {r.split(":")[0] for r in run(walks((0,)), tmp_path).remarks} >= {
         campaigns.EPISODES, f"{campaigns.MANIFEST} cannot be read"
     }  # fmt: skip
+
+
+def test_a_module_that_settings_name_is_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    found = []
+    for text in ("", "class Mine: ..."):
+        (tmp_path / "myplanner.py").write_text(text)
+        fingerprint.cache_clear()
+        found.append(campaigns.code_of(walks(settings={"mark": "myplanner:Mine"})))
+    assert found[0] != found[1] and campaigns.code_of(walks()) not in found
+
+
+def test_rows_have_the_labels_of_the_present_file(tmp_path: Path) -> None:
+    def load_with(*names: str) -> Any:
+        grid = {"which": [{"name": name, "pace": pace} for name, pace in zip(names, (1.0, 2.0), strict=True)]}
+        run(walks((0, 1), measures=["length_m"], grid={**grid, "shoes.size": [40, 41]}), tmp_path)
+        return load(tmp_path)
+
+    first, turned = load_with("slow", "fast"), load_with("fast", "slow")
+    assert len(rows(tmp_path)) == 8, "names are for people: nothing runs again"
+    for size in ("40", "41"):
+        np.testing.assert_array_equal(
+            first.column("length_m", ("slow", size)), turned.column("length_m", ("fast", size))
+        )
+    renamed = load_with("A", "B")
+    assert [sum(renamed.counts(which).values()) for which in renamed.combinations] == [2, 2, 2, 2]
 
 
 @pytest.mark.product(2, of="processes of their own")
@@ -506,7 +551,7 @@ def test_workers_that_cannot_start_are_no_lost_episodes() -> None:
 KILLED = """
 import sys
 from unifg.scenarios.campaigns import campaign
-campaign.code_of_scenario = lambda scenario: "now"
+campaign.code_of = lambda statement: "now"
 from unifg.scenarios import command
 if __name__ == "__main__":
     sys.exit(command.main(sys.argv[1:]))
@@ -612,7 +657,7 @@ def test_a_report_says_what_the_rows_say(tmp_path: Path) -> None:
     from unifg.scenarios.campaigns.sheet import load
 
     made = walks(
-        tuple(range(6)), title="Walks | <ways>", measures=["length_m"],
+        tuple(range(6)), title="Walks | <ways> *_& `a_b`", measures=["length_m"],
         grid={"pace": [1.0, 2.0], "behaviour": ["walk", "fail", "raise", "nan"]},
     )  # fmt: skip
     run(made, tmp_path / "a b")
@@ -625,7 +670,8 @@ def test_a_report_says_what_the_rows_say(tmp_path: Path) -> None:
     assert "| 1 | raise | 0 | - |" in markdown and "| 1 | nan | 6 | 6 | 0 | 0 | 0 | 100 |" in markdown
     assert "| 1 | nan | 0 | - |" in markdown, "what is not finite is not counted as a number"
     assert f"| length_m | 2 - 1 | 18 | +{short.mean():.2g} |" in markdown
-    assert markdown.startswith("# Walks \\| <ways>") and "<h1>Walks | &lt;ways&gt;</h1>" in html
+    assert markdown.startswith("# Walks \\| \\<ways> \\*\\_\\& \\`a_b\\`\n")
+    assert "<h1>Walks | &lt;ways&gt; *_&amp; `a_b`</h1>" in html
     assert "24 failures" in markdown
     failed = next(row for row in rows(tmp_path / "a b") if row["outcome"] == "failed")
     assert f"unifg replay '{tmp_path / 'a b'}' {failed['key']}" in markdown and "arrived: no" in markdown

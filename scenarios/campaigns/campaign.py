@@ -23,10 +23,11 @@ from unifg.scenarios.campaigns.sources import fingerprint
 from unifg.scenarios.campaigns.statement import Statement, module_of, read
 from unifg.scenarios.campaigns.task import ERROR, FAILED, LOST, OK, Task, lost, run_task
 from unifg.scenarios.episode import Progress, silent
+from unifg.scenarios.options import find_modules_in
 from unifg.scenarios.workers import Workers, cluster, died, finished
 
 __all__ = [
-    "EPISODES", "MANIFEST", "Campaign", "code_of_scenario", "episodes_of", "manifest_of", "replay_command",
+    "EPISODES", "MANIFEST", "Campaign", "code_of", "episodes_of", "manifest_of", "replay_command",
     "run_campaign", "write_manifest",
 ]  # fmt: skip
 
@@ -106,7 +107,7 @@ def run_campaign(
     """
     statement = campaign if isinstance(campaign, Statement) else read(campaign)
     folder = Path(out)
-    code = code_of_scenario(statement.scenario)
+    code = code_of(statement)
     found = Campaign(folder, len(statement))
     with Journal(folder / EPISODES) as journal:
         found.remarks += [journal.mended] if journal.mended else []
@@ -145,9 +146,10 @@ def run_campaign(
     return found
 
 
-def code_of_scenario(scenario: str) -> str:
-    """Digest of the library, and of the package of a scenario that is not of it."""
-    return fingerprint(module_of(scenario).__name__)
+def code_of(statement: Statement) -> str:
+    """Digest of the library, and of the packages of a scenario, planners and worlds that are not of it."""
+    find_modules_in(Path.cwd())
+    return fingerprint(*statement.modules)
 
 
 def manifest_of(folder: Path) -> dict[str, Any]:

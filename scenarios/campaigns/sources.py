@@ -15,15 +15,14 @@ _SIDES = ("unifg.solvers", "unifg.models", "unifg.scenarios")
 
 
 @cache
-def fingerprint(module: str = "unifg") -> str:
+def fingerprint(*modules: str) -> str:
     """Digest of all sources of the library with the maps beside them.
 
     Args:
-        module: that a scenario is stated in; where it is not of the library, its whole package is counted, too.
+        modules: that are used besides; of those that are not of the library, the whole package is counted, too.
     """
     total = hashlib.sha256()
-    top = module.partition(".")[0]
-    for name in dict.fromkeys(("unifg", *_SIDES, top)):
+    for name in dict.fromkeys(("unifg", *_SIDES, *(module.partition(".")[0] for module in modules))):
         for path, inside in sorted((path, inside) for path, inside in _files(name) if path.suffix in COUNTED):
             if name == "unifg" and f"unifg.{inside.partition('/')[0]}" in _SIDES:
                 continue  # installed, or reached by a link, they lie inside

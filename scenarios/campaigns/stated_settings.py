@@ -10,6 +10,8 @@ import argparse
 import glob
 import hashlib
 import math
+import os
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -152,16 +154,27 @@ def nearest(name: str, known: Sequence[str]) -> str:
 
 
 def identity(value: Any) -> Any:
-    """Identity of a value as JSON can hold it; of a file, a digest of it and of the files named like it."""
+    """Identity of a value as JSON can hold it; of a file or folder, a digest of it and of what belongs to it."""
     if isinstance(value, Path):
         total = hashlib.sha256()
-        for beside in sorted(value.parent.glob(f"{glob.escape(value.stem)}.*")):
-            if beside.is_file() and beside.suffix != ".toml":  # a campaign may be named like its map
-                total.update(beside.name.encode() + b"\0" + beside.read_bytes() + b"\0")
+        for part in sorted(_parts(value)):
+            total.update(part.name.encode() + b"\0" + part.read_bytes() + b"\0")
         return total.hexdigest()[:12]
     if isinstance(value, tuple):
         return [identity(one) for one in value]
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def _parts(path: Path) -> set[Path]:
+    """Files of a folder; or a file, those that are named like it, and the image that a map names."""
+    if path.is_dir():
+        return {part for part in path.rglob("*") if part.is_file()}
+    beside = path.parent.glob(f"{glob.escape(path.stem)}.*")
+    found = {path, *(part for part in beside if part.suffix != ".toml")}  # a campaign may be named like its map
+    if path.suffix in (".yaml", ".yml") and path.is_file():
+        named = re.findall(rb"""^image:[ \t]*["']?(.*?)["']?[ \t\r]*$""", path.read_bytes(), re.MULTILINE)
+        found |= {path.parent / os.fsdecode(image) for image in named}
+    return {part for part in found if part.is_file()}
 
 
 def _single(kind: Any, given: Sequence[Any]) -> bool:

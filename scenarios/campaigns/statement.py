@@ -26,6 +26,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
@@ -111,6 +112,13 @@ class Statement:
     def fields(self) -> Fields:
         """The settings there are."""
         return fields_of(self.scenario, self.base)
+
+    @cached_property
+    def modules(self) -> tuple[str, ...]:
+        """Modules that settings name, as MODULE:CLASS, and that of the scenario first."""
+        words = (str(word) for _, settings in self.combinations() for word in settings.values())
+        named = (word.partition(":")[0] for word in words if re.fullmatch(r"[^\W\d][\w.]*:[^\W\d]\w*", word))
+        return tuple(dict.fromkeys((module_of(self.scenario).__name__, *named)))
 
     def __len__(self) -> int:
         """Number of episodes."""
@@ -199,6 +207,8 @@ def stated(given: Mapping[str, Any], base: str | Path = ".", name: str = "campai
     scenario = given.get("scenario")
     if not isinstance(scenario, str):
         raise ScenarioError(f"{name}: `scenario` must name one of {', '.join(SCENARIOS)}")
+    if not isinstance(given.get("succeeded_only", False), bool):
+        raise ScenarioError(f"{name}: `succeeded_only` must be true or false, got {given['succeeded_only']!r}")
     base = Path(base).resolve()
     known = fields_of(scenario, base)
     fixed = _assigned(known, _table(given, "settings", name), f"{name}, settings")
@@ -211,7 +221,7 @@ def stated(given: Mapping[str, Any], base: str | Path = ".", name: str = "campai
             set_by[path] = f"the axis {axis.name!r}"
     made = Statement(
         scenario, str(given.get("title", name)), fixed, axes, _seeds(given, known, name),
-        _names(given, "measures", name), _compared(given, axes, name), bool(given.get("succeeded_only", False)),
+        _names(given, "measures", name), _compared(given, axes, name), given.get("succeeded_only", False),
         base, given,
     )  # fmt: skip
     for labels, settings in made.combinations():  # settings that do not go together are refused before the first run
