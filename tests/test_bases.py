@@ -381,6 +381,9 @@ def test_speed_plant_and_belief_are_those_asked_for() -> None:
     slow = Episode(replace(corridor, plant="pmb2", drivetrain=Drivetrain(turning=1.5)), rehearsal=True)
     assert slow.controller.accelerations == (1.0, 1.5), "what is given is kept"
     assert Episode(replace(corridor, plant="harsh"), rehearsal=True).settings.drivetrain.lag == 0.1
+    usual = Drivetrain(acceleration=2.5, turning=3.2, lag=0.0, latency=0.0, slip=0.0, skid=0.0)
+    asked = Episode(replace(corridor, plant="harsh", drivetrain=usual), rehearsal=True).settings.drivetrain
+    assert asked == usual, "what is asked for is kept, also where it is what another base has"
     own = replace(corridor, believed=(6.6, 14.0, 0.02), initial_sigma=(0.2, 0.1, 0.1))
     np.testing.assert_array_equal(Episode(own, rehearsal=True).pilot.pose, (6.6, 14.0, 0.02))
     for wrong in ({"plant": "tank"}, {"initial_sigma": (0.0, 0.1, 0.1)}):

@@ -25,6 +25,10 @@ __all__ = ["COMPUTED", "PLANTS", "Drivetrain", "Wheels", "followed", "plant"]
 COMPUTED = -1.0  # latency that is the measured time of each tick
 
 
+class Usual(float):
+    """A number that nobody has asked for, in whose place a named base has its own."""
+
+
 def latency_of(text: str) -> float:
     """Seconds, or "auto" for `COMPUTED`."""
     return COMPUTED if text in ("auto", str(COMPUTED)) else not_negative(text)
@@ -48,13 +52,13 @@ class Drivetrain(Settings):
         skid: outward drift of a base that turns, per lateral acceleration [(m/s)/(m/s^2)].
     """
 
-    acceleration: float = option(2.5, text=above_zero, metavar="M/S2")
-    turning: float = option(3.2, text=above_zero, metavar="RAD/S2")
-    load: float = option(0.0, text=not_negative, metavar="SHARE")
-    lag: float = option(0.0, text=not_negative, metavar="S")
-    latency: float = option(0.0, text=latency_of, metavar="S")
-    slip: float = option(0.0, text=share, metavar="SHARE")
-    skid: float = option(0.0, text=not_negative, metavar="S")
+    acceleration: float = option(Usual(2.5), text=above_zero, metavar="M/S2")
+    turning: float = option(Usual(3.2), text=above_zero, metavar="RAD/S2")
+    load: float = option(Usual(0.0), text=not_negative, metavar="SHARE")
+    lag: float = option(Usual(0.0), text=not_negative, metavar="S")
+    latency: float = option(Usual(0.0), text=latency_of, metavar="S")
+    slip: float = option(Usual(0.0), text=share, metavar="SHARE")
+    skid: float = option(Usual(0.0), text=not_negative, metavar="S")
 
     @staticmethod
     def ideal() -> Drivetrain:
@@ -76,10 +80,9 @@ PLANTS: dict[str, dict[str, float]] = {
 
 
 def plant(name: str, drivetrain: Drivetrain) -> Drivetrain:
-    """A drivetrain with the numbers of a named base where it has the usual ones."""
-    usual = Drivetrain()
-    preset = {key: value for key, value in PLANTS[name].items() if getattr(drivetrain, key) == getattr(usual, key)}
-    return replace(drivetrain, **preset)
+    """A drivetrain with the numbers of a named base where nobody has asked for others."""
+    own = {key: value for key, value in PLANTS[name].items() if isinstance(getattr(drivetrain, key), Usual)}
+    return replace(drivetrain, **own)
 
 
 class Wheels:
