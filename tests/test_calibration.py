@@ -257,7 +257,12 @@ def test_faults_have_a_size_where_there_is_one() -> None:
     read = one_of(DRIVE_FAULTS)
     assert read("range-bias=-0.2@3:1") == Fault("range-bias", 3.0, 1.0, -0.2)
     assert str(read("range-bias=-0.2@3:1")) == "range-bias=-0.2@3:1"
-    for text, words in (("kidnapped=1@3", "no size"), ("range-bias=x@3", "KIND"), ("range-bias=inf@3", "KIND")):
+    for text, words in (
+        ("kidnapped=1@3", "no size"),
+        ("range-bias=x@3", "KIND"),
+        ("range-bias=inf@3", "KIND"),
+        ("actuator-lag=-1@3", "zero"),
+    ):
         with pytest.raises(argparse.ArgumentTypeError, match=words):
             read(text)
     faults = DriveFaults([Fault("odometry-slip", 1.0, 1.0), Fault("odometry-slip", 5.0, size=2.0)], 0)
@@ -270,6 +275,11 @@ def test_faults_of_wheels_and_motors_do_as_they_say() -> None:
     asked = np.array([1.0, 0.5])
     np.testing.assert_array_equal(faults.odometry(asked, 0.9), asked)
     np.testing.assert_allclose(faults.odometry(asked, 1.0), 1.3 * asked)
+    dead = (
+        DriveFaults([Fault("wheel-scale", 1.0, size=0.0)], 0),
+        DriveFaults([Fault("odometry-slip", 1.0, size=0.0)], 0),
+    )
+    assert [each.odometry(asked, 1.0).tolist() for each in dead] == [[0.0, 0.0], [0.0, 0.5]], "zero is a size, too"
     np.testing.assert_array_equal(faults.control(asked, 0.9, DT), asked)
     np.testing.assert_array_equal(faults.control(np.zeros(2), 1.0, DT), asked)
 

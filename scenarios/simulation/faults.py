@@ -96,6 +96,8 @@ def one_of(kinds: Sequence[str]) -> Callable[[str], Fault]:
             raise argparse.ArgumentTypeError(f"{text!r} is not KIND[=SIZE]@SECONDS[:DURATION], such as {kinds[0]}@5:2")
         if size and kind in kinds and kind not in SIZES:
             raise argparse.ArgumentTypeError(f"a fault {kind!r} has no size: leave '={size}' out")
+        if kind == "actuator-lag" and (fault.size or 0.0) < 0.0:
+            raise argparse.ArgumentTypeError(f"{text!r}: a motor lags by a time constant of zero or more [s]")
         if kind not in kinds:
             raise argparse.ArgumentTypeError(f"unknown fault {kind!r}: choose {', '.join(kinds)}")
         return fault
@@ -178,8 +180,11 @@ class DriveFaults(_Faults):
         """Odometry (m,) that arrives."""
         if self.hold("odometry-nan", now):
             return np.full(len(measured), math.nan)
-        spin = self.size("odometry-slip", now) or 1.0
-        return measured * [*[spin] * (len(measured) - 1), 1.0] * (self.size("wheel-scale", now) or 1.0)
+        spin, scale = (
+            1.0 if size is None else size
+            for size in (self.size(kind, now) for kind in ("odometry-slip", "wheel-scale"))
+        )  # one of zero is a wheel that does not count
+        return measured * [*[spin] * (len(measured) - 1), 1.0] * scale
 
     def control(self, asked: Array, now: float, dt: float) -> Array:
         """Controls (m,) that the motors make of those asked for over ``dt`` [s]."""
