@@ -17,7 +17,7 @@ import unifg as fg
 from unifg.elimination.components import components
 from unifg.errors import GraphError
 from unifg.files.pose_graph import read_pose_graph
-from unifg.pose_graphs import Edges, PoseGraph, Sightings, chordal, lago, manhattan, odometric, sphere
+from unifg.pose_graphs import Edges, PoseGraph, Sightings, chordal, judge, lago, manhattan, odometric, sphere
 from unifg.pose_graphs.certificate import certify
 from unifg.pose_graphs.residuals import chart_between
 from unifg.solvers import GaussNewton, LevenbergMarquardt
@@ -165,6 +165,23 @@ def test_every_part_gets_an_anchor(rng: np.random.Generator) -> None:
     assert parts.anchors()[0].tolist() == [0, 4]
     assert replace(parts, fixed_ids=(6,)).anchors()[0].tolist() == [0, 6]
     assert solved(parts).chi2() < 1e-12
+
+
+def test_a_bridge_without_information_joins_nothing(rng: np.random.Generator) -> None:
+    graph, truth = chain(fg.SE2, 9, rng)
+    across = (graph.edges.first < 4) != (graph.edges.second < 4)  # a step of odometry, and loops
+    measured, information = graph.edges.measured.copy(), graph.edges.information.copy()
+    measured[across], information[across] = [50.0, 0.0, 1.0], 0.0
+    edges = replace(graph.edges, measured=measured, information=information)
+    parts = replace(graph, edges=edges)
+    assert parts.anchors()[0].tolist() == [0, 4]
+    judged = judge(parts)
+    assert judged.parts == 2 and judged.anchors == (0, 4)
+    assert "2 parts that nothing connects; held are the first poses, 0, 4" in judged.sentences()
+    moved = fg.SE2.retract(truth, 0.1 * rng.normal(size=truth.shape))
+    moved[[0, 4]] = truth[[0, 4]]
+    for found in (solved(replace(parts, poses=moved)).poses, odometric(replace(parts, poses=moved))):
+        np.testing.assert_allclose(found, truth, atol=1e-9)
 
 
 def test_a_landmark_can_be_known(rng: np.random.Generator) -> None:

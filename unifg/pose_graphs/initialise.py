@@ -25,6 +25,7 @@ from unifg.typing import Array, BoolArray, IntArray
 __all__ = ["Start", "best_guess", "chordal", "incremental", "lago", "odometric", "starts"]
 
 _CLOSURE_COST = 1e6  # a spanning tree takes loop closures only where there is no odometry
+_BLIND_COST = 1e12  # and what carries no information only where there is nothing else
 _BLIND = 1e-12  # [1 / rad^2]; an edge with less information about the turn is the last that a tree takes
 
 
@@ -107,12 +108,14 @@ def odometric(pose_graph: PoseGraph) -> Array:
         GraphError: a pose is connected to the others through landmarks only.
     """
     group, fixed = pose_graph.group, pose_graph.anchors()[0]
-    cost = np.where(pose_graph.edges.odometry, 1.0, _CLOSURE_COST)
+    edges = pose_graph.edges
+    cost = np.where(edges.odometry, 1.0, _CLOSURE_COST)
+    cost[~edges.information.any(axis=(1, 2))] = _BLIND_COST
     parent, edge, forward = _tree(pose_graph, fixed, cost, shortest=False)
     count = len(pose_graph.poses)
     relative = np.tile(group.identity(), (count + 1, 1))
     inner = np.flatnonzero(edge >= 0)
-    measured = pose_graph.edges.measured[edge[inner]]
+    measured = edges.measured[edge[inner]]
     along = forward[inner][:, None]
     relative[inner] = np.where(along, measured, group.inverse(measured))
     relative[fixed] = pose_graph.poses[fixed]

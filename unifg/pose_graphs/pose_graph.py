@@ -308,7 +308,7 @@ class PoseGraph:
         return np.sort(np.concatenate([poses, loose])), landmarks
 
     def parts(self) -> IntArray:
-        """(n + k,) number of the connected part of every pose, then of every landmark.
+        """(n + k,) number of the connected part of every pose, then of every landmark; zero information joins nothing.
 
         Raises:
             GraphError: a measurement speaks of a pose or landmark that there is not.
@@ -320,9 +320,13 @@ class PoseGraph:
             _require(f"a sighting of kind {kind!r}", "landmarks", (seen.landmark,), len(self.landmarks))
         for kind, held in self.priors.items():
             _require(f"a prior of kind {kind!r}", "poses", (held.pose,), count)
-        rows = [self.edges.first, *(seen.pose for seen in self.sightings.values())]
-        columns = [self.edges.second, *(count + seen.landmark for seen in self.sightings.values())]
-        return components(count + len(self.landmarks), np.concatenate(rows), np.concatenate(columns))
+        pairs = [(self.edges.first, self.edges.second)]
+        pairs += [(seen.pose, count + seen.landmark) for seen in self.sightings.values()]
+        tells = [batch.information.any(axis=(1, 2)) for batch in (self.edges, *self.sightings.values())]
+        rows, columns = np.concatenate(
+            [np.stack(ends)[:, told] for ends, told in zip(pairs, tells, strict=True)], axis=1
+        )
+        return components(count + len(self.landmarks), rows, columns)
 
     def _terms(self, residual: str, edges: Mapping[str, Edges]) -> list[_Term]:
         """Terms of some edges, by name, then of all sightings and priors."""

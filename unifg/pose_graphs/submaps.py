@@ -198,6 +198,10 @@ class Submaps:
         home.mkdir(parents=True, exist_ok=True)
         for old in (home / INDEX, home / INFORMATION, *home.glob("[0-9]*.npz")):
             old.unlink(missing_ok=True)
+        tied = pose_graph.parts()
+        if len(apart := np.flatnonzero(tied[edges.first] != tied[edges.second])):
+            at, to = int(apart[0]), int(edges.second[apart[0]])
+            raise GraphError(f"the edges do not determine pose {to}: edge {at} to it has no information", index=at)
         part = _cut(np.asarray(poses[:, : pose_graph.group.point_dim]), largest)
         fixed, shared = np.zeros(len(poses), np.bool_), np.zeros(len(poses), np.bool_)
         fixed[pose_graph.anchors()[0]] = True

@@ -59,7 +59,8 @@ class Judgement:
         if self.freedom < 0:
             said.append(f"{-self.freedom} unknowns more than rows of measurements: some poses are not determined")
         if self.parts > 1:
-            said.append(f"{self.parts} parts that nothing connects")
+            held = f"; held are the first poses, {_some(self.anchors)}" if self.anchors else ""
+            said.append(f"{self.parts} parts that nothing connects{held}")
         if self.isolated:
             said.append(f"{counted(len(self.isolated), 'pose')} without any measurement: {_some(self.isolated)}")
         if len(self.blind):
