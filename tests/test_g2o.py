@@ -142,6 +142,11 @@ def test_every_sighting_survives(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.chi2(), graph.chi2(), rtol=1e-14)
 
 
+def test_vertices_below_zero_can_be_known(tmp_path: Path) -> None:
+    known = "VERTEX_SE2 -1 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 -1 1 1 0 0 1 0 0 1 0 1\nFIX -1\n"
+    assert read_g2o(write(tmp_path, known)).fixed_ids == (-1,)
+
+
 def test_unknown_tags_are_counted_and_named_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     text = PLANAR + "VERTEX_CAM 1 2 3\nEDGE_SOMETHING\nVERTEX_CAM 4 5 6\n"
     with caplog.at_level(logging.WARNING, "unifg"):

@@ -114,6 +114,23 @@ def test_tum_skips_comments_and_scales_quaternions(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.abs(trajectory.planar()[:, 2]), [0.0, np.pi])
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("1403636579763555584 0 0 0 0 0 0 1", "line 1: the time 1.40364e+18 is read as seconds; divide nanoseconds"),
+        ("1403636579763.5 0 0 0 0 0 0 1", "is read as seconds"),
+        ("0.1 0 0 0 1 0 0 0", "line 1: the scalar is read last, so that the body lies on its back; is it first here?"),
+        ("1403636579.763555584 0 0 0 0 0 0 1", ""),
+        ("0.1 0 0 0 0.99999 0.001 0 0", ""),
+    ],
+)
+def test_tum_files_of_another_kind_are_remarked(
+    line: str, words: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert len(read_tum(put(tmp_path, line + "\n")).time) == 1
+    assert words in caplog.text and bool(words) == bool(caplog.text)
+
+
 def test_spatial_poses_come_back(tmp_path: Path, rng: np.random.Generator) -> None:
     poses = fg.SE3.random(rng, (9,))
     read = read_tum(write_tum(tmp_path / "t.tum", np.arange(9.0), poses))
@@ -122,7 +139,9 @@ def test_spatial_poses_come_back(tmp_path: Path, rng: np.random.Generator) -> No
     lines = write_kitti(tmp_path / "t.kitti", poses).read_text().splitlines()
     assert (len(lines), len(lines[0].split())) == (9, 12)
     np.testing.assert_allclose(float(lines[3].split()[7]), poses[3, 1], rtol=1e-9)  # y ends the second row
-    np.testing.assert_allclose(fg.SE3.matrix(read_kitti(tmp_path / "t.kitti")), fg.SE3.matrix(poses), atol=2e-9)
+    np.testing.assert_allclose(fg.SE3.matrix(read_kitti(tmp_path / "t.kitti")), fg.SE3.matrix(poses), atol=1e-15)
+    poses[:, :3] += [5e5, 5.3e6, 400.0]  # in UTM
+    np.testing.assert_array_equal(read_kitti(write_kitti(tmp_path / "t.kitti", poses))[:, :3], poses[:, :3])
 
 
 def test_kitti_lifts_the_plane(tmp_path: Path) -> None:

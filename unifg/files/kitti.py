@@ -56,7 +56,7 @@ def read_kitti(path: str | Path, limits: Limits = LIMITS) -> Array:
 
 
 def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
-    """Write poses with nine decimals of the mantissa; planar ones are lifted to z = 0.
+    """Write poses so that the same numbers are read; planar ones are lifted to z = 0.
 
     Args:
         path: file to write; an existing one is replaced.
@@ -78,4 +78,4 @@ def write_kitti(path: str | Path, poses: ArrayLike) -> Path:
     else:
         rows[:, 2, 2] = 1.0
         rows[:, :2, [0, 1, 3]] = SE2.matrix(array)[:, :2]
-    return write_rows(path, [rows.reshape(-1, 12) + 0.0], spelled="{:.9e}".format, separator=" ")  # no -0.0
+    return write_rows(path, [rows.reshape(-1, 12) + 0.0], separator=" ")  # no -0.0

@@ -341,7 +341,7 @@ def _fixed(file: TextFile, names: Ids) -> tuple[int, ...]:
     known, fixed = set(names.tolist()), list[int]()
     for row in file.rows("FIX").tolist():
         for word in file.words(row):
-            if not word.isdecimal() or int(word) not in known:
+            if not word.removeprefix("-").isdecimal() or int(word) not in known:
                 raise FileFormatError(f"{file.place(row)}: FIX {word}: there is no such vertex in the file")
             fixed.append(int(word))
     return tuple(fixed)
