@@ -6,6 +6,7 @@ Exactly eight fields separated by single blanks, no trailing blank, the quaterni
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,9 @@ from unifg.typing import Array, ArrayLike
 
 __all__ = ["read_tum", "write_tum"]
 
+logger = logging.getLogger("unifg")
+
+_LATEST = 1e11  # [s] since 1970, three thousand years
 _FIELDS = "t tx ty tz qx qy qz qw"
 
 
@@ -74,7 +78,7 @@ def write_tum(path: str | Path, time: ArrayLike, poses: ArrayLike) -> Path:
 def read_tum(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
     """Read a trajectory; empty lines and lines starting with ``#`` are skipped, quaternions are normalised.
 
-    Times that run backwards are named in one warning.
+    Warnings name times that run backwards or are no seconds, and a first quaternion whose scalar seems to be first.
 
     Args:
         path: the file, gzipped or not.
@@ -90,4 +94,10 @@ def read_tum(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
     rows = Table.read(path, 0, _FIELDS, limits)
     table = rows.numbers
     rows.remark_order()
+    if len(table) and abs(table[0, 0]) > _LATEST:
+        logger.warning("%s: the time %g is read as seconds; divide nanoseconds by 1e9", rows.place(0), table[0, 0])
+    if len(table) and (np.abs(table[0, 4:]) == [1.0, 0.0, 0.0, 0.0]).all():
+        logger.warning(
+            "%s: the scalar is read last, so that the body lies on its back; is it first here?", rows.place(0)
+        )
     return Trajectory(table[:, 0], table[:, 1:4], table[:, 4:] / norms(table[:, 4:], rows.place)[:, None])
