@@ -297,3 +297,19 @@ def test_what_cannot_be_revoked_is_refused(options: dict[str, Any], said: str) -
             smoother.minimize(function, x[0], x[19], revocable=C, name="odd")
     smoother.update()
     assert not smoother.revocable and len(smoother) == count and LEAST < 1e-9
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_right_closures_beside_a_wrong_one_come_back(order: int) -> None:
+    """Stated at once, a right and a wrong one with ends side by side are revoked together; the right one returns."""
+    city, p = smoother_with(Incremental(), fg.SE2)
+    city.minimize(fg.prior, p[0], np.zeros(3), sigma=1e-3)
+    for k in range(39):
+        city.minimize(fg.between, p[k], p[k + 1], STEP, sigma=SIGMA)
+    city.update({p: np.arange(40.0)[:, None] * STEP})
+    measured = np.array([[39.0, 3.0, 0.0], [10.0, 0.0, 0.0], [20.0, 0.0, 0.0], [30.0, 0.0, 0.0], [38.0, 0.0, 0.0]])
+    measured = measured[::order]
+    ends = measured[:, 0].astype(int)
+    city.minimize(fg.between, p[np.zeros(5, int)], p[ends], measured, sigma=SIGMA, revocable=C)
+    city.update()
+    assert [each.accepted for each in city.revocable] == (measured[:, 1] == 0.0).tolist()

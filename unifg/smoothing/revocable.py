@@ -158,6 +158,7 @@ class Revocables:
             wanted[worst] = False
             if not self._better(smoother, wanted, [], 1):
                 return
+            self._revise(smoother)  # of those that were revoked together, some may agree with the rest
 
     def _deletion(self, smoother: Smoother, number: int, counting: list[int]) -> float:
         """Decrease of |W r|^2 of all factors without some of a group, to first order.
