@@ -301,7 +301,7 @@ def test_what_cannot_be_revoked_is_refused(options: dict[str, Any], said: str) -
 
 @pytest.mark.parametrize("order", [1, -1])
 def test_right_closures_beside_a_wrong_one_come_back(order: int) -> None:
-    """Stated at once, a right and a wrong one with ends side by side are revoked together; the right one returns."""
+    """Stated at once, a right and a wrong one side by side are revoked together, and the right one comes back."""
     city, p = smoother_with(Incremental(), fg.SE2)
     city.minimize(fg.prior, p[0], np.zeros(3), sigma=1e-3)
     for k in range(39):
