@@ -430,7 +430,8 @@ class _Search:
         each other is wrong: the cost as stated decides.
         """
         units: Mapping[str, float] = {}
-        if self._plain_terms and (self._calm is None or spare == 1.0):
+        usual = all(_bound(s.goal) >= t.size for s, t in zip(self._stages, self._terms, strict=True))
+        if self._plain_terms and usual and (self._calm is None or spare == 1.0):
             units = {name: min(1.0, spare * unit) for name, unit in one.units_with(other, self._shares).items()}
         return one.judged(units) < (1.0 - LESS) * other.judged(units)
 

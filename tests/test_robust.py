@@ -204,6 +204,19 @@ def test_wrong_loop_closures_between_weak_odometry(shared_data: Path) -> None:
         assert solution.cost == pytest.approx(cost, abs=1e-3)
 
 
+@pytest.mark.parametrize("unit", [1e-8, 1e-4, 1e8])
+def test_information_and_threshold_in_another_unit_give_the_same_answer(unit: float) -> None:
+    sim = manhattan(150, 2, outliers=0.3)
+    found = []
+    for scale in (1.0, unit):
+        edges = replace(sim.pose_graph.edges, information=scale * sim.pose_graph.edges.information)
+        graph, x, guess = replace(sim.pose_graph, edges=edges).graph(fg.TruncatedLeastSquares(3.4 * np.sqrt(scale)))
+        solution = GraduatedNonConvexity().solve(graph, guess, check=True)
+        found.append((solution.cost / scale, solution[x]))
+    assert found[1][0] == pytest.approx(found[0][0], rel=1e-6)
+    np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-4)
+
+
 def test_innovations_are_those_of_dense_algebra() -> None:
     """r' (I + J S J')^-1 r of what is left out, S from what counts."""
     sim = manhattan(60, seed=3, outliers=0.3)
