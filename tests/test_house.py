@@ -286,12 +286,12 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 33_963, "scenarios": 13_009, "benchmarks": 4_883, "tests": 37_500,
-    "docs examples": 1_984, "unifg/factors": 4_304, "unifg/problem": 3_528, "models": 2_313,
-    "unifg/elimination": 2_204, "solvers": 5_146, "unifg/solution": 3_304, "unifg/smoothing": 1_931,
-    "unifg/lie": 1_399, "unifg/view": 1_513, "unifg/files": 1_282, "unifg/pose_graphs": 1_971,
+    "unifg solvers models": 34_024, "scenarios": 13_026, "benchmarks": 4_883, "tests": 37_679,
+    "docs examples": 1_984, "unifg/factors": 4_304, "unifg/problem": 3_528, "models": 2_323,
+    "unifg/elimination": 2_204, "solvers": 5_155, "unifg/solution": 3_319, "unifg/smoothing": 1_932,
+    "unifg/lie": 1_399, "unifg/view": 1_513, "unifg/files": 1_288, "unifg/pose_graphs": 1_981,
     "unifg/horizon": 1_595, "unifg/modeling": 1_194, "unifg/codegen": 1_347, "unifg/plots": 415,
-    "scenarios/scenes": 1_318, "scenarios/simulation": 1_373, "scenarios/campaigns": 913,
+    "scenarios/scenes": 1_318, "scenarios/simulation": 1_374, "scenarios/campaigns": 929,
     "scenarios/quadrotor": 1_748, "scenarios/ground": 1_852, "scenarios/commands": 667,
     "scenarios/logs": 648, "scenarios/perception": 948, "scenarios/planning": 878,
 }  # fmt: skip
@@ -327,8 +327,8 @@ def test_size_keeps_its_budget() -> None:
 
 
 def test_files_and_functions_are_short() -> None:
+    assert {name_of(path): lines for path in EVERYTHING if (lines := text_of(path).count("\n")) > 700} == {}
     files = [path for path in EVERYTHING if not path.is_relative_to(CHECKOUT / "tests")]
-    assert {name_of(path): lines for path in files if (lines := text_of(path).count("\n")) > 700} == {}
     functions = [node for path in files for node in nodes_in(path) if isinstance(node, ast.FunctionDef)]
     assert {one.name for one in functions if (one.end_lineno or one.lineno) - one.lineno >= 150} == set()
 

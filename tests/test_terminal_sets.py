@@ -1,4 +1,4 @@
-"""Where a plan may end, and barriers in flight: hard plans stay possible, the guarded flight keeps clear."""
+"""Sets in which a plan may end, and barriers in flight: hard plans stay possible, the guarded flight keeps clear."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a function closes over may change between solves; kernels are shared, kept and carried."""
+"""Changes between solves of what a function closes over; kernels that are shared, kept and carried."""
 
 import copy
 import pickle
