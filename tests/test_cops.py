@@ -67,6 +67,14 @@ def test_digits_that_are_not_there_are_not_waited_for() -> None:
     assert far.cost == pytest.approx(plain.cost, rel=1e-4)
 
 
+def test_a_long_way_to_a_root_is_gone_to_its_end() -> None:
+    """Newton's steps of length one along an exponential: no cost changes on the way, the violation does."""
+    graph, x = graph_with(fg.Rn(1))
+    graph.constrain(lambda p: 1e20 * (np.exp(p) - np.exp(-60.0)), x, lower=0.0, upper=0.0, name="root")
+    found = InteriorPoint().solve(graph, {x: [[0.0]]}, check=True)
+    assert found.iterations > 1.5 * STUCK and found[x].item() == pytest.approx(-60.0)
+
+
 @pytest.mark.parametrize("name", ["marine", "orbit"])  # with rows far apart, and without
 def test_units_follow_what_a_graph_is_written_in(name: str) -> None:
     def found(units: Units) -> measures.Units:

@@ -72,8 +72,8 @@ BOTTOMLESS = -1e12  # an objective below it, while constraints are violated
 FIRST_SLACK = 1e-2  # smallest slack of a cold start
 FINER = 0.03  # times the least mu, where the KKT test asks for more
 LEAST_FINER = 1e-10  # of the least mu, where the KKT test asks for more
-STUCK = 30  # iterations in which nothing becomes better: the rest is rounding
-BETTER = 0.9  # times the violation or the stationarity, by which an iterate is better
+STUCK = 30  # iterations in which nothing becomes better: the rest is rounding, and multipliers are estimated at the end
+BETTER = 0.9  # times the violation, by which an iterate is better
 SAME_MERIT = 1e-12  # of the barrier function, by which it does not change
 WARM_MU = 1e-5  # largest first mu of a start with multipliers: what is active has been found
 
@@ -388,8 +388,8 @@ def test(address: int) -> None:
     now.phi, now.theta = phi, theta
     now.trials, now.corrected, now.answer = 0, 0, TRY
     moved = abs(phi - now.stuck_phi) > SAME_MERIT * max(now.cost_unit, abs(phi))
-    if moved or theta < BETTER * now.stuck_theta or now.stationarity < BETTER * now.stuck_force:
-        now.stuck, now.stuck_phi, now.stuck_theta, now.stuck_force = now.iteration, phi, theta, now.stationarity
+    if moved or theta < BETTER * now.stuck_theta:
+        now.stuck, now.stuck_phi, now.stuck_theta = now.iteration, phi, theta
     elif now.iteration >= now.stuck + STUCK:
         now.answer = STALLED
 

@@ -41,7 +41,6 @@ NOW = np.dtype(
         ("taken", np.float64),  # its length
         ("stuck_phi", np.float64),  # barrier function at that iteration
         ("stuck_theta", np.float64),  # theta there
-        ("stuck_force", np.float64),  # stationarity there
         ("trial_cost", np.float64),
         ("saved_slope", np.float64),  # of the step that a correction replaces
         ("saved_alpha", np.float64),
