@@ -286,7 +286,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 34_024, "scenarios": 13_026, "benchmarks": 4_883, "tests": 37_684,
+    "unifg solvers models": 34_024, "scenarios": 13_026, "benchmarks": 4_883, "tests": 37_694,
     "docs examples": 1_984, "unifg/factors": 4_304, "unifg/problem": 3_528, "models": 2_323,
     "unifg/elimination": 2_204, "solvers": 5_155, "unifg/solution": 3_319, "unifg/smoothing": 1_932,
     "unifg/lie": 1_399, "unifg/view": 1_513, "unifg/files": 1_288, "unifg/pose_graphs": 1_981,

@@ -349,3 +349,16 @@ def test_parts_are_of_equal_size() -> None:
     assert sizes.all() and np.bincount(part).min() >= 50
     spans = [np.ptp(places[part == k], axis=0) for k in range(part.max() + 1)]
     assert max(span[0] for span in spans) < 1.5  # cut across the longer side
+
+
+def test_a_refused_split_leaves_what_the_folder_held(tmp_path: Path) -> None:
+    """A bridge without information is found before anything is removed."""
+    made = begun(PLANE)
+    Submaps.split(made, tmp_path, 60)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    information = made.edges.information.copy()
+    information[(made.edges.first == 299) | (made.edges.second == 299)] = 0.0
+    blind = replace(made, edges=replace(made.edges, information=information))
+    with pytest.raises(GraphError, match=r"do not determine pose .*: edge [0-9]+ to it has no information"):
+        Submaps.split(blind, tmp_path, 60)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before

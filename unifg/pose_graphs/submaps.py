@@ -183,7 +183,8 @@ class Submaps:
             largest: number of poses of a submap at most.
 
         Raises:
-            GraphError: sightings or priors, which submaps do not know; no edges; a submap of no pose; NaN.
+            GraphError: sightings or priors, which submaps do not know; no edges; a submap of no pose; NaN; a
+                pose that only edges without information reach. What the folder held stays.
         """
         require_kinds("split", GraphError, cls.split.__annotations__, {"largest": largest})
         if pose_graph.sightings or pose_graph.priors:
@@ -195,13 +196,13 @@ class Submaps:
             if not np.isfinite(numbers).all():
                 at = int(np.flatnonzero(~np.isfinite(numbers).all(axis=1))[0])
                 raise GraphError(f"{what} {at} is not finite: {numbers[at]}", index=at)
-        home.mkdir(parents=True, exist_ok=True)
-        for old in (home / INDEX, home / INFORMATION, *home.glob("[0-9]*.npz")):
-            old.unlink(missing_ok=True)
         tied = pose_graph.parts()
         if len(apart := np.flatnonzero(tied[edges.first] != tied[edges.second])):
             at, to = int(apart[0]), int(edges.second[apart[0]])
             raise GraphError(f"the edges do not determine pose {to}: edge {at} to it has no information", index=at)
+        home.mkdir(parents=True, exist_ok=True)
+        for old in (home / INDEX, home / INFORMATION, *home.glob("[0-9]*.npz")):
+            old.unlink(missing_ok=True)
         part = _cut(np.asarray(poses[:, : pose_graph.group.point_dim]), largest)
         fixed, shared = np.zeros(len(poses), np.bool_), np.zeros(len(poses), np.bool_)
         fixed[pose_graph.anchors()[0]] = True
