@@ -27,6 +27,7 @@ from unifg.codegen.jit import compiled
 from unifg.errors import BackendError, require_positive
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
+from unifg.solution.multipliers import size_of_costs
 from unifg.solution.solve_state import SolveState
 from unifg.solution.solver import Solver
 from unifg.solution.status import Status
@@ -272,6 +273,7 @@ class AugmentedLagrangian(Solver):
         weights = scale**2
         if self.penalty is not None:
             return self.penalty, weights
+        unit = size_of_costs(run.program, run.lin)
         # With large multipliers the curvature of the constraints can outweigh a small penalty.
         least = WARM_PENALTY * largest(run.multipliers / scale)
         given = run.penalties > 0.0
@@ -281,8 +283,8 @@ class AugmentedLagrangian(Solver):
             weights = np.where(given, run.penalties / rho, weights)
         else:
             outside = float(np.square(scale * run.program.violation(run.lin.constraints)).sum())
-            rho = COLD_PENALTY * max(1.0, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
-        return float(np.clip(max(rho, least), 1e-3, 1e6)), weights
+            rho = COLD_PENALTY * max(unit, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
+        return float(np.clip(max(rho, least), 1e-3 * unit, 1e6)), weights
 
     def _scale(self, primal: Primal, lin: Linearization) -> Array:
         """(M,) factors that make constraints in different units alike, by the length of their gradients at a point.

@@ -43,12 +43,13 @@ def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None
     moved = [(family, row, column) for family, row, column in _free(graph)]
     if all(isinstance(term, Cost) for term in graph.terms):
         return KktNumbers(_relative_offset(graph, values, moved, data), 0.0, 0.0, 0.0)
-    gradient = np.array(
-        [(_f(graph, _at(values, m, STEP), data) - _f(graph, _at(values, m, -STEP), data)) for m in moved]
-    )
-    gradient /= 2.0 * STEP
+    beside = np.array([[_f(graph, _at(values, m, step), data) for step in (STEP, -STEP)] for m in moved])
+    gradient = (beside[:, 0] - beside[:, 1]) / (2.0 * STEP)
+    bend = np.abs(beside.sum(axis=1) - 2.0 * _f(graph, values, data)) / STEP**2
+    most = max(float(np.abs(gradient).max(initial=0.0)), float(bend.max(initial=0.0)))
+    least = most if 0.0 < most < 1.0 else 1.0  # size of costs
     duals = _duals(graph, solution)
-    scale = max(1.0, float(np.abs(duals).mean()) / 100.0) if len(duals) else 1.0
+    scale = max(least, float(np.abs(duals).mean()) / 100.0) if len(duals) else least
     # Or relative, to a hundredth of the largest of what a gradient is a sum of.
     sizes, shares = np.maximum(0.01 * np.abs(gradient), scale), np.full(len(duals), 1.0 / scale)
     if len(duals):

@@ -213,7 +213,7 @@ def swung_up() -> tuple[fg.Graph, dict[Any, Array]]:
     graph, x, f = graph_of(("x", cart_pole.STATE, n + 1), ("f", cart_pole.FORCE, n))
     graph.fix(x[0], np.zeros(4))
     graph.fix(x[-1], [1.0, np.pi - 1e-12, 0.0, 0.0])
-    graph.minimize(fg.prior, f, np.zeros(1), sigma=10.0)
+    graph.minimize(fg.prior, f, np.zeros(1), sigma=1.0)
     graph.constrain(cart_pole.dynamics(CartPole()), x[:-1], f, x[1:], h, lower=0.0, upper=0.0, name="motion")
     graph.bound(f, lower=-20.0, upper=20.0)
     return graph, {x: np.linspace([0.0, 0.0, 0.0, 0.0], [1.0, 3.1, 0.0, 0.0], n + 1), f: np.zeros((n, 1))}

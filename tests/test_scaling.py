@@ -11,7 +11,7 @@ import pytest
 import unifg as fg
 from judge import judge
 from problems.graphs import drawn_to, graph_with
-from unifg.solvers import SQP
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint, Penalty
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
 from unifg.solvers.quadratic_programs.scaling import MODEST, Scaling
 from unifg.solvers.quadratic_programs.subproblem import qp_error, subproblem
@@ -51,6 +51,38 @@ def test_units_do_not_decide_whether_sqp_converges(units: dict[str, Any], hessia
     assert solution.iterations <= 25, solution.report()
     if max(units.values()) <= 1e4:  # the judge's differences are too coarse for the others
         assert judge(graph, solution).worst() < 2e-6 * max(1.0, units.get("position", 1.0) / 1e2)
+
+
+SMALL_COSTS: dict[str, fg.Solver] = {
+    "ip": InteriorPoint(),
+    "sqp": SQP(),
+    "sqp graph": SQP(qp="graph"),
+    "al": AugmentedLagrangian(),
+    "penalty": Penalty(),
+}
+
+
+@pytest.mark.parametrize("cost", [1e-2, 1e-4])
+@pytest.mark.parametrize("name", SMALL_COSTS)
+def test_costs_are_judged_in_their_own_size(name: str, cost: float) -> None:
+    """Slopes below an absolute tolerance say nothing: costs of 1e-8 at the guess have no others."""
+    graph, guess = drive(cost=cost)
+    solution = SMALL_COSTS[name].solve(graph, guess)
+    off = np.abs(solution.cost / cost**2 / np.array([COST, OTHER_COST]) - 1.0).min()
+    assert solution.converged == (off < 1e-4) or name == "penalty"
+    assert solution.converged == bool(solution.verify())
+    assert solution.converged or name == "penalty"  # whose weights are what its user states
+
+
+def test_small_scalar_costs_are_judged_in_their_own_size() -> None:
+    """A guess with slopes of 1e-9 is no answer; at the answer they vanish, and curvature tells the size."""
+    graph, x = graph_with(fg.Rn(2))
+    graph.minimize_scalar(lambda v: 1e-9 * ((v[:, 0] - 1.0) ** 2 + (v[:, 0] - v[:, 1]) ** 4 + v[:, 1] ** 2), x)
+    graph.constrain(lambda v: v[:, :1], x, upper=5.0, name="far")
+    for solver in (InteriorPoint(), AugmentedLagrangian(), SQP()):
+        solution = solver.solve(graph, {x: np.zeros((1, 2))}, check=True)
+        assert solution.cost == pytest.approx(1.875e-10, rel=1e-3)
+        assert solution.verify()
 
 
 def test_without_scaling_units_decide() -> None:

@@ -366,7 +366,7 @@ def test_slopes_take_few_calls_where_the_function_allows_that(kind: str) -> None
     program = graph.compile()
     term = WrittenTerm(program.terms[0].term, program.columns, values, {})
     calls.clear()
-    slopes, doubt = term.slopes()
+    slopes, doubt, _ = term.slopes()
     assert len(calls) == most and max(calls) == 5 * 18
     expected = np.zeros((5, 2, 4))
     own = values[x] - (values[x].mean(axis=0) if kind == "the others" else 0.0)

@@ -158,7 +158,7 @@ def conclude(address: int) -> None:
     full, gradient, kkt, links, multipliers = parts(address, "full gradient kkt links multipliers")
     scalars, steepest_gradient, terms = parts(address, "scalars steepest_gradient terms")
     jacobian, measures, residual, sizes = parts(address, "jacobian measures residual sizes")
-    (steepest_jacobian,) = parts(address, "steepest_jacobian")
+    hessian, steepest_jacobian = parts(address, "hessian steepest_jacobian")
     now = scalars[0]
     if now.concluded == 1:
         return
@@ -167,7 +167,7 @@ def conclude(address: int) -> None:
     arrays = terms, multipliers, steepest_jacobian, steepest_gradient, free, now.tolerance
     now.suspicion = number(links[0].size_of, arrays)
     memory = free, measures.coordinates, sizes, now.violation_unit, now.tolerance
-    derivatives = gradient, residual, jacobian, constraints, constraint_jacobian
+    derivatives = gradient, measures.diagonal, hessian, residual, jacobian, constraints, constraint_jacobian
     run(links[0].kkt_numbers, (terms, *memory, *derivatives, multipliers, full, kkt))
     now.judging += seconds(now.clock) - began
 
@@ -310,6 +310,8 @@ def addresses(robust: bool, general: bool) -> Records:
         NUMBER,
         NUMBER,
         gradient,
+        free,
+        kinds["hessian"],
         residual,
         kinds["jacobian"],
         constraints,

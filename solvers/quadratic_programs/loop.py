@@ -134,8 +134,8 @@ def _record(problem: Problem, work: Work, shown: bool) -> bool:
     raise_slopes(work.next_jacobian, work.next_gradient, work.steepest_jacobian, work.steepest_gradient)
     kkt_numbers(
         problem.terms, problem.free, problem.coordinates, problem.sizes, now.violation_unit, now.tolerance,
-        work.next_gradient, work.residual, work.jacobian, work.next_constraints, work.next_jacobian, work.multipliers,
-        work.full, kkt,
+        work.next_gradient, problem.diagonal, work.next_hessian, work.residual, work.jacobian, work.next_constraints,
+        work.next_jacobian, work.multipliers, work.full, kkt,
     )  # fmt: skip
     finite = kkt[4] != 0.0 and math.isfinite(now.next_cost)
     if not finite:

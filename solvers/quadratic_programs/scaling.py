@@ -2,9 +2,11 @@
 
 The largest entry of every row and column is brought near one by taking square roots of it out of both, again and again
 (Ruiz, A scaling algorithm to equilibrate both rows and columns norms in matrices, RAL-TR-2001-034). Factors are rounded
-to powers of two: stating a problem in them rounds nothing. Bounds of unknowns say nothing about their scale, and take
-over that of the unknown. A graph whose units are within a thousand of balance is solved in them, unless it is one of
-least squares alone, which has no unit of cost. Answers, and the test they have to pass, stay in the units of the graph.
+to powers of two: stating a problem in them rounds nothing. Passes see no curvature that is small beside the entries of
+its rows everywhere; where it is very small, unknowns grow and rows shrink until the largest curvature is one. Bounds of
+unknowns say nothing about their scale, and take over that of the unknown. A graph whose units are within a thousand of
+balance is solved in them, unless it is one of least squares alone, which has no unit of cost. Answers, and the test
+they have to pass, stay in the units of the graph.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from unifg.typing import Array, BoolArray, IntArray
 
 PASSES, NEAR = 12, 1.5  # each pass halves what is left in the exponents; factors are rounded anyway
 LARGEST = 2.0**60
+SMALL = 1e-5  # curvatures of which dampings and shifts of 1e-9 are a share that shows
 MODEST = 2.0**10  # factors up to this change little in double precision, and are left alone
 
 
@@ -265,6 +268,13 @@ def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_facto
                 furthest = max(furthest, of_rows[k], 1.0 / of_rows[k])
         if furthest < NEAR:
             break
+    steepest = 0.0
+    for k in range(squares):
+        steepest = max(steepest, entries[k] * column_factors[firsts[k]] * column_factors[seconds[k]])
+    small = 0.0 < steepest < SMALL
+    if small:
+        column_factors /= np.sqrt(steepest)
+        row_factors *= np.sqrt(steepest)
     _round(column_factors)
     _round(row_factors)
     for k in range(len(free)):
@@ -276,7 +286,7 @@ def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_facto
     for row in range(len(row_factors)):
         if not of_bounds[row] and not 1.0 / MODEST <= row_factors[row] <= MODEST:
             return False
-    return True
+    return not small
 
 
 @compiled

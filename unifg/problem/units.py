@@ -424,6 +424,25 @@ def mean_force(terms: TermArrays, multipliers: Array, units: Array) -> float:
 
 
 @compiled
+def cost_size(diagonal: IntArray, hessian: Array, slope: Array) -> float:
+    """Largest slope or curvature of the costs; one where it is larger, or nothing.
+
+    A slope or a multiplier over it is that of costs in a unit in which they are of order one.
+
+    Args:
+        diagonal: (n,) places of the curvatures of the unknowns among the entries of the Hessian.
+        hessian: entries of that of Gauss-Newton.
+        slope: (width,) gradient of the costs.
+    """
+    size = 0.0
+    for k in range(len(diagonal)):
+        size = max(size, abs(hessian[diagonal[k]]))
+    for k in range(len(slope)):
+        size = max(size, abs(slope[k]))
+    return size if 0.0 < size < 1.0 else 1.0
+
+
+@compiled
 def find_sizes(
     terms: TermArrays,
     coordinates: IntArray,

@@ -105,8 +105,8 @@ class WrittenTerm:
             self._long = False
         return np.stack([self._rows([points[k] for points in there]) for k in range(times - 2)])
 
-    def slopes(self) -> tuple[Array, Array]:
-        """(n, m, D) derivatives along right perturbations, and bounds of their errors.
+    def slopes(self) -> tuple[Array, Array, Array]:
+        """(n, m, D) derivatives along right perturbations, bounds of their errors, and rough second derivatives.
 
         A kink at the point itself makes both quotients alike. It shows in second differences, which are there
         proportional to the step, and to its square where a function is smooth.
@@ -125,10 +125,14 @@ class WrittenTerm:
         ahead, behind, near, nearly = np.ascontiguousarray(found.transpose(0, 2, 3, 1))
         here = self.rows[:, :, None]
         long, short = (ahead - behind) / (2.0 * STEP), (near - nearly) / STEP
-        rounding = (self.rounding[:, :, None] + EPSILON * np.abs(here)) / STEP * np.maximum(1.0, np.abs(short))
-        kink = np.abs(4.0 * (near - here + (nearly - here)) - (ahead - here + (behind - here))) / STEP
+        bend = ahead - here + (behind - here)
+        numbers = here, short, bend / STEP**2
+        small = min(1.0, max(float(np.abs(part).max(initial=0.0)) for part in numbers))  # where all the term's are
+        of_variables = self.rounding[:, :, None] * np.maximum(small, np.abs(short))
+        rounding = (of_variables + EPSILON * np.abs(here) * np.maximum(1.0, np.abs(short))) / STEP
+        kink = np.abs(4.0 * (near - here + (nearly - here)) - bend) / STEP
         doubt = np.abs(long - short) + np.maximum(kink - NOISE * rounding, 0.0) + np.where(short == 0.0, 0.0, rounding)
-        return (4.0 * short - long) / 3.0, doubt
+        return (4.0 * short - long) / 3.0, doubt, numbers[2]
 
     def cost(self) -> tuple[Array, Array, Array]:
         """(n,) what each factor costs, (n, m) its derivatives with respect to the rows, (n, m, m) those of squares.

@@ -22,6 +22,7 @@ from unifg.codegen.loops import largest
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COST, COUNT, ENTRY, KIND, ROW, ROWS, WIDTH, TermArrays
+from unifg.problem.units import cost_size
 from unifg.typing import Array, BoolArray, IntArray
 
 LARGEST = 1e6  # the least of it: costates of a long chain add up to the square of its rows
@@ -147,6 +148,7 @@ def weakest(
     equality: BoolArray,
     forces: Array,
     out: BoolArray,
+    unit: float,
 ) -> tuple[int, float, float]:
     """Inequality that is closest to being active or not, by the larger of its two numbers.
 
@@ -159,6 +161,7 @@ def weakest(
         equality: rows that are equalities.
         forces: receives the multipliers of rows that are held.
         out: ends with the rows that are not.
+        unit: size of the costs, or one.
 
     Returns:
         Its row, -1 without one; its distance from the nearer limit; its multiplier, scaled as the KKT test does.
@@ -166,9 +169,9 @@ def weakest(
     total, first = 0.0, len(out) - len(multipliers)
     for multiplier in multipliers:
         total += abs(multiplier)
-    scale = max(1.0, total / 100.0 / max(len(multipliers), 1))
+    scale = max(unit, total / 100.0 / max(len(multipliers), 1))
     row, least, slack = -1, np.inf, 0.0
-    hold(constraints, lower, upper, multipliers, out[first:])
+    hold(constraints, lower, upper, multipliers, unit, out[first:])
     for k in range(len(multipliers)):
         held = counted[k] and (equality[k] or out[first + k])
         out[first + k], forces[k] = not held, multipliers[k] if held else 0.0
@@ -180,18 +183,13 @@ def weakest(
 
 
 def size_of_costs(program: CompiledProblem, lin: Linearization) -> float:
-    """Largest slope or curvature of the costs at a solution; 1 where it is larger, or nothing.
-
-    Multipliers over it are those of costs in units of order one, beside which distances to limits are judged.
-    """
-    curvature = lin.hessian[program.normal.diagonal]
-    size = float(max(np.abs(part).max(initial=0.0) for part in (lin.gradient, curvature)))
-    return size if 0.0 < size < 1.0 else 1.0
+    """Size of the costs at a point: :func:`unifg.problem.units.cost_size`."""
+    return cost_size(program.normal.diagonal, lin.hessian, lin.gradient)
 
 
 @compiled
-def hold(constraints: Array, lower: Array, upper: Array, multipliers: Array, held: BoolArray) -> None:
-    """Write which inequalities are active: their multiplier outweighs the distance to its limit."""
+def hold(constraints: Array, lower: Array, upper: Array, multipliers: Array, unit: float, held: BoolArray) -> None:
+    """Write which inequalities are active: their multiplier, in ``unit``, outweighs the distance to its limit."""
     for k in range(len(held)):
         limit = upper[k] if multipliers[k] > 0.0 else lower[k]
-        held[k] = abs(multipliers[k]) > abs(constraints[k] - limit)
+        held[k] = abs(multipliers[k]) > unit * abs(constraints[k] - limit)

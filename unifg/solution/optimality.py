@@ -8,11 +8,12 @@ For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipli
   limit that does not exist has the wrong sign, and the distance is one. The slack of a soft constraint has to be what
   its limit is violated by: what it does not pay for is a distance of its own, if larger, and counts as one of that row.
 
-Stationarity and complementarity are divided by max(1, mean|lambda| / 100), or they are relative, whichever is less: the
-gradient to s, the size of what it is a sum of along the coordinate of a family (`find_sizes` of
-:mod:`unifg.problem.units`), and lambda_i to what makes its force as large. Limits of slacks do not count in the mean
-(`mean_force` there). Where numbers are large, relative ones alone can be met: they do not depend on the units of cost,
-rows and unknowns. The violation is in the graph's units, with a tolerance of its own, which tells the unit of rows.
+Stationarity and complementarity are divided by max(c, mean|lambda| / 100), with c the largest slope or curvature of the
+costs or, if less, one (`cost_size` of :mod:`unifg.problem.units`); or they are relative, whichever is less: the
+gradient to s, the size of what it is a sum of along the coordinate of a family (`find_sizes` there), and lambda_i to
+what makes its force as large. Limits of slacks do not count in the mean (`mean_force` there). Where numbers are large,
+relative ones alone can be met. So no unit of cost decides, nor one of rows and unknowns where numbers are large. The
+violation is in the graph's units, with a tolerance of its own, which tells the unit of rows.
 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
@@ -46,7 +47,7 @@ from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, ENTRY, KIND, ROW, ROWS, SLACKS, WIDTH, TermArrays
-from unifg.problem.units import find_sizes, mean_force
+from unifg.problem.units import cost_size, find_sizes, mean_force
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
@@ -141,8 +142,8 @@ def optimality(
     gradient, found, sizes = np.empty(len(lin.gradient)), np.empty(NUMBERS), np.zeros(columns.dimensions)
     kkt_numbers(
         program.arrays, columns.free, columns.coordinates, sizes, violation_unit,
-        -1.0 if program.differenced else enough, lin.gradient, lin.residual, lin.jacobian, lin.constraints,
-        lin.constraint_jacobian, multipliers, gradient, found,
+        -1.0 if program.differenced else enough, lin.gradient, program.normal.diagonal, lin.hessian, lin.residual,
+        lin.jacobian, lin.constraints, lin.constraint_jacobian, multipliers, gradient, found,
     )  # fmt: skip
     measured = read_numbers(found, lin.cost)
     if not measured.finite:
@@ -150,7 +151,8 @@ def optimality(
     rounding = 0.0
     if program.differenced:
         uncertain = gradient_rounding(program, lin, multipliers)
-        scale = max(1.0, mean_force(program.arrays, multipliers, np.ones(len(multipliers))))
+        least = cost_size(program.normal.diagonal, lin.hessian, lin.gradient)
+        scale = max(least, mean_force(program.arrays, multipliers, np.ones(len(multipliers))))
         own = np.maximum(sizes[columns.coordinates[columns.free]], np.finfo(float).tiny)
         with np.errstate(over="ignore"):
             relative = float((uncertain / own).max(initial=0.0))
@@ -297,6 +299,8 @@ def kkt_numbers(
     violation_unit: float,
     enough: float,
     slope: Array,
+    diagonal: IntArray,
+    hessian: Array,
     residual: Array,
     jacobian: Array,
     constraints: Array,
@@ -315,6 +319,8 @@ def kkt_numbers(
         violation_unit: of the rows in the mean; 0 where nothing tells it.
         enough: where absolute numbers are below, relative ones are not looked for.
         slope: (width,) gradient of the objective.
+        diagonal: places of the curvatures of the unknowns in the next.
+        hessian: entries of that of Gauss-Newton.
         residual: (C,) of its squares.
         jacobian: entries of theirs.
         constraints: (M,) values.
@@ -349,7 +355,7 @@ def kkt_numbers(
             for k in range(terms.fields[t, COUNT] * terms.fields[t, ROWS]):
                 force = abs(multipliers[terms.fields[t, ROW] + k])
                 complementarity = max(complementarity, force * unpaid(terms, t, k, constraints))
-    scale = max(1.0, mean_force(terms, multipliers, np.ones(count)))
+    scale = max(cost_size(diagonal, hessian, slope), mean_force(terms, multipliers, np.ones(count)))
     stationarity, complementarity, least = stationarity / scale, complementarity / scale, scale
     if not max(stationarity, complementarity) <= enough and finite:
         find_sizes(terms, coordinates, residual, jacobian, multipliers, entries, sizes)

@@ -39,7 +39,7 @@ from unifg.problem.table import TermArrays
 from unifg.problem.units import mean_force
 from unifg.solution.covariance import SOLVED
 from unifg.solution.gains import REPLACED, SAME, require_data
-from unifg.solution.multipliers import weakest
+from unifg.solution.multipliers import size_of_costs, weakest
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
@@ -175,7 +175,8 @@ class Sensitivities:
         """
         program, lin, structure, saddle = self._program, self._lin, self._structure, system.saddle
         self._entries, right = np.empty(system.pattern.nnz), np.empty((2, len(self._out)))
-        held = lin.constraints, *self._limits, multipliers, structure.open, equality, self._multipliers, self._out
+        unit = size_of_costs(program, lin)
+        held = lin.constraints, *self._limits, multipliers, structure.open, equality, self._multipliers, self._out, unit
         if program.batched:
             weakest(*held)
         linearized = lin.stored, lin.residual, lin.jacobian, lin.squares, lin.weights, lin.constraint_jacobian
@@ -185,7 +186,7 @@ class Sensitivities:
             self._entries, right,
         )  # fmt: skip
         if row >= 0 and max(slack, force) < (least := WEAK * math.sqrt(tolerance)):
-            row, slack, force = self._weakest(multipliers, equality)
+            row, slack, force = self._weakest(multipliers, equality, unit)
         if row >= 0 and max(slack, force) < least:
             term, factor, place = self._place(row)
             raise GraphError(
@@ -209,7 +210,7 @@ class Sensitivities:
             )
         return dependent
 
-    def _weakest(self, multipliers: Array, equality: BoolArray) -> tuple[int, float, float]:
+    def _weakest(self, multipliers: Array, equality: BoolArray, unit: float) -> tuple[int, float, float]:
         """Inequality closest to being active or not, where prices of soft constraints say nothing of other rows.
 
         The limit of a slack is as far as the row that it gives way to, and square prices pull at it, too.
@@ -226,7 +227,7 @@ class Sensitivities:
                 apart = slack[before].reshape(term.count, -1)
                 force[rows] = np.maximum(force[rows], pull)
                 slack[rows] = np.maximum(slack[rows], np.tile(apart, (1, pull.size // apart.size)).ravel())
-        force /= max(1.0, mean_force(program.arrays, multipliers, np.ones(len(force))))
+        force /= max(unit, mean_force(program.arrays, multipliers, np.ones(len(force))))
         larger = np.where(self._structure.open & ~equality, np.maximum(slack, force), np.inf)
         row = int(np.argmin(larger))
         return row, float(slack[row]), float(force[row])

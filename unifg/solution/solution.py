@@ -637,8 +637,8 @@ class Solution:
     def _held(self) -> BoolArray:
         """Inequalities that are active: the multiplier outweighs the distance to its limit."""
         held: BoolArray = np.empty(len(self._multipliers), dtype=bool)
-        multipliers = self._multipliers / size_of_costs(self._program, self._lin)
-        hold(self._lin.constraints, self._lower, self._upper, multipliers, held)
+        unit = size_of_costs(self._program, self._lin)
+        hold(self._lin.constraints, self._lower, self._upper, self._multipliers, unit, held)
         return held
 
     def _selection(self, variable: Variable | str) -> Selection:

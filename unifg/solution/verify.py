@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from unifg.errors import GraphError, require_positive
-from unifg.modeling.terms import Constraint
+from unifg.modeling.terms import Constraint, ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution.as_written import WrittenTerm, moved_fix, off_manifold
@@ -121,7 +121,7 @@ class Conditions:
         program: the graph.
         cost: objective.
         g, lower, upper: (M,) constraint rows and their limits.
-        gradient: (size,) of the objective, after :meth:`differentiate`.
+        gradient, least: (size,) of the objective, and the force that counts as one, after :meth:`differentiate`.
         violation, worst: largest distance of a row outside its limits, and the row; -1 without constraints.
     """
 
@@ -152,25 +152,30 @@ class Conditions:
     def differentiate(self) -> None:
         """Find gradient, Jacobian of the constraints and, of least squares, the Gauss-Newton matrix."""
         unknown, size = self.program.columns.unknown, self.program.size
-        slope, doubtful, blocks, squares = np.zeros(size + 1), np.zeros(size + 1), [], 0.0  # the last, of what is fixed
+        slope, doubtful, curved, blocks, squares = *np.zeros((3, size + 1)), [], 0.0  # the last, of what is fixed
         self._forces = np.zeros(size + 1)
         for term, _, force, weights in self._costs:
-            slopes, doubt = term.slopes()
+            slopes, doubt, bend = term.slopes()
             own = unknown[term.columns]
             np.add.at(slope, own, np.einsum("nmd,nm->nd", slopes, force))
             np.maximum.at(self._forces, own, np.abs(slopes * force[:, :, None]).max(axis=1, initial=0.0))
+            square = np.einsum("nad,nab,nbd->nd", slopes, weights, slopes)  # zero for scalar costs
+            bent = np.maximum(bend[:, 0], 0.0) if isinstance(term.term, ScalarCost) else 0.0
+            np.add.at(curved, own, square + bent)
             rounding = np.abs(weights).sum(axis=2) * term.rounding
             squares += float((rounding * term.rounding).sum())
             np.add.at(doubtful, own, np.einsum("nmd,nm->nd", doubt, np.abs(force)))
             np.add.at(doubtful, own, np.einsum("nmd,nm->nd", np.abs(slopes), rounding))
             if self.program.least_squares:
-                square = np.einsum("nad,nab,nbe->nde", slopes, weights, slopes)
-                blocks.append((square, square, own[:, :, None], own[:, None, :]))
+                block = np.einsum("nad,nab,nbe->nde", slopes, weights, slopes)
+                blocks.append((block, block, own[:, :, None], own[:, None, :]))
         self.gradient, self._doubt, self._rounding = slope[:size], doubtful[:size], float(np.sqrt(squares))
+        largest = float(max(np.abs(slope[:size]).max(initial=0.0), curved[:size].max(initial=0.0)))
+        self.least = largest if 0.0 < largest < 1.0 else 1.0
         self._hessian, at, parts = Entries.of(blocks), 0, []
         for term in self._own:
             numbers = at + np.arange(term.rows.size).reshape(*term.rows.shape, 1)
-            parts.append((*term.slopes(), numbers, unknown[term.columns][:, None, :]))
+            parts.append((*term.slopes()[:2], numbers, unknown[term.columns][:, None, :]))
             at += term.rows.size
         self._jacobian = Entries.of(parts)
 
@@ -180,7 +185,7 @@ class Conditions:
         slope = self.gradient + np.bincount(A.columns, A.numbers * multipliers[A.rows], size)
         doubt = self._doubt + np.bincount(A.columns, A.errors * np.abs(multipliers[A.rows]), size)
         counted = np.abs(multipliers[self._counted])
-        scale = max(1.0, float(counted.mean()) / 100.0) if len(counted) else 1.0
+        scale = max(self.least, float(counted.mean()) / 100.0) if len(counted) else self.least
         sizes = self._sizes(multipliers)
         either = [
             tuple(float(np.abs(part / size).max(initial=0.0)) for part in (slope, doubt)) for size in (scale, sizes)
@@ -319,7 +324,7 @@ def verified(
     except Exception as error:  # a function may raise beside an answer, and SciPy at a singular matrix
         return Verified("undecided", f"slopes cannot be found: {type(error).__name__}: {error}", **measured)
     measured |= {"claimed": claimed, "least": least, "multipliers": dict(program.by_term(made))}
-    if not abs(here.cost - cost) <= COST * max(1.0, abs(cost)) and here.violation <= tolerance:
+    if not abs(here.cost - cost) <= COST * max(here.least, abs(cost)) and here.violation <= tolerance:
         return Verified("fails", f"the cost is {here.cost:.9g} where the solution says {cost:.9g}", **measured)
     apart = int(np.abs(made - multipliers).argmax()) if len(made) else -1
     return Verified(*_judged(here, claimed, least, apart, tolerance), **measured)
