@@ -21,7 +21,7 @@
 #   make offsets  solve the same problems with their worlds moved by up to 5000 km (minutes)
 #   make docs     build the site with the reference of all public names into out/site, every link checked
 #   make notebooks  run the notebooks of docs/notebooks as a reader does, with a kernel, into out/notebooks
-#   make fences   run all code shown in README.md and docs/; of pages of Python the tests draw a few
+#   make fences   run all code shown in README.md and docs/; FENCES=--half draws pages of shell commands by commit
 #   make clean    remove everything made here
 #
 # Choose the interpreter with PYTHON=/path/to/python3, the number of test processes with WORKERS=4, and what pytest
@@ -130,7 +130,7 @@ notebooks: $(VENV)/ready-notebooks
 
 fences: $(VENV)/ready
 	$(ONE_THREAD) $(BIN)/python -m pytest -n $(WORKERS) -q --all tests/test_docs.py -k python_blocks
-	$(BIN)/python docs/check_shell_fences.py
+	$(BIN)/python docs/check_shell_fences.py $(FENCES)
 
 clean:
 	rm -rf $(VENV) $(VENV)-lowest $(VENV)-peers out build dist unifg.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis .coverage htmlcov

@@ -15,6 +15,7 @@ Every other command runs as it stands. A fence is left out only by `<!-- skip: r
 import argparse
 import io
 import os
+import random
 import re
 import shutil
 import signal
@@ -27,8 +28,9 @@ from pathlib import Path
 from typing import TextIO
 
 CHECKOUT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(CHECKOUT / "tests"))  # one reader of fences serves the tests and this script
+sys.path.insert(0, str(CHECKOUT / "tests"))  # one reader of fences and one seed serve the tests and this script
 
+from drawn import seed  # noqa: E402
 from fences import SHELL, Fence, documents, fences, relative  # noqa: E402
 
 SHARED = CHECKOUT.parent / "shared"
@@ -163,9 +165,14 @@ def main() -> int:
     parser.add_argument("pages", nargs="*", type=Path, help="pages to check (default: README.md and docs/*.md)")
     parser.add_argument("--seconds", type=float, default=300.0, help="time limit of one fence [s]")
     parser.add_argument("--workers", type=int, default=2, help="pages at once")
+    parser.add_argument("--half", action="store_true", help="README.md and half of the other pages, drawn by commit")
     options = parser.parse_args()
     run, skipped, failures = 0, 0, list[str]()
     pages = [page.resolve() for page in options.pages] or documents()
+    pages = [page for page in pages if any(fence.language in SHELL for fence in fences(page))]
+    if options.half:
+        pages = pages[:1] + random.Random(seed()).sample(pages[1:], len(pages) // 2)
+        print(f"=== of half of the pages, drawn with UNIFG_TEST_SEED={seed()}")
     with ThreadPoolExecutor(options.workers) as pool:
         for counts in pool.map(partial(check_page, seconds=options.seconds), pages):
             run, skipped, failures = run + counts[0], skipped + counts[1], failures + counts[2]

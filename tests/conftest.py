@@ -8,16 +8,16 @@ and large maps, half of what carries no mark is drawn. ``--all`` runs the whole,
 import gc
 import os
 import random
-import subprocess
 from collections import defaultdict
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
 
-CHECKOUT = Path(__file__).resolve().parent.parent
+from drawn import seed
+from scripts import CHECKOUT
+
 HALVED = """
     barriers best_guess certificate consistency control_cases control_decisions cops covariance elastic
     elimination_pose_graphs experiments horizon hostile_files imperfection joint large_maps lidar mujoco navigation
@@ -72,17 +72,6 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(drawn, lambda canvas, path, **options: Path(path).write_text("png"))
 
 
-@cache
-def _seed() -> str:
-    """Seed of the drawn cases: $UNIFG_TEST_SEED, else the commit."""
-    if named := os.environ.get("UNIFG_TEST_SEED"):
-        return named
-    found = subprocess.run(
-        ["git", "rev-parse", "--short=8", "HEAD"], cwd=CHECKOUT, capture_output=True, text=True, check=False
-    )
-    return found.stdout.strip() or "0"
-
-
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add ``--all``."""
     parser.addoption("--all", action="store_true", help="run every case of the tests marked as products")
@@ -90,7 +79,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_report_header(config: pytest.Config) -> str:
     """Say how to repeat the draw."""
-    return "all cases" if config.getoption("--all") else f"products drawn with UNIFG_TEST_SEED={_seed()}"
+    return "all cases" if config.getoption("--all") else f"products drawn with UNIFG_TEST_SEED={seed()}"
 
 
 def pytest_collection_finish() -> None:
@@ -112,7 +101,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for name, cases in products.items():
         marker = cases[0].get_closest_marker("product")
         count = marker.args[0] if marker else (len(cases) + 1) // 2
-        kept = random.Random(f"{_seed()} {name}").sample(cases, min(len(cases), count))
+        kept = random.Random(f"{seed()} {name}").sample(cases, min(len(cases), count))
         dropped |= {*cases} - {*kept}
     config.hook.pytest_deselected(items=list(dropped))
     items[:] = [item for item in items if item not in dropped]
