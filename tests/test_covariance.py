@@ -46,6 +46,15 @@ def test_units_do_not_matter(units: tuple[float, ...], noise: float) -> None:
         np.testing.assert_allclose(each[k] / scale[own, own], expected[own, own], atol=1e-8)
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e5, 1e8])
+def test_costs_of_any_size_determine_unknowns_beside_constraints(scale: float) -> None:
+    graph, x = graph_of(("x", fg.Rn(2), 3))
+    graph.minimize(fg.prior, x, [1.0, 2.0], sigma=scale * np.array([1.0, 2.0]))
+    graph.constrain(lambda p: p.sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
+    solution = InteriorPoint().solve(graph, {x: np.zeros((3, 2))}, check=True)
+    np.testing.assert_allclose(solution.covariance(x[1]) / scale**2, [[0.8, -0.8], [-0.8, 0.8]], rtol=1e-9)
+
+
 @pytest.mark.parametrize("unit", [1e-6, 1e-3, 1.0, 1e3, 1e6])
 def test_what_nothing_determines_is_refused_in_any_unit(unit: float) -> None:
     """A bias that two constraints carry along and no cost knows; what does not depend on it has its covariance."""

@@ -15,6 +15,7 @@ from unifg.locks import ReentrantLock
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.systems import KktStructure, KktSystem, fill
+from unifg.solution.multipliers import size_of_costs
 from unifg.typing import Array, BoolArray, IntArray
 
 SOLVED = 1e-6  # residual of a column, in the equilibrated system, that belongs to a determined unknown
@@ -41,6 +42,7 @@ class Covariances:
         if active.any():
             self._structure = program.systems.structure(active)
             self._lin, self._data = lin, np.zeros(0)
+            self._unit = size_of_costs(program, lin)  # beside which rows of constraints are not large
             return
         self._factorization = program.systems.normal()
         diagonal = lin.hessian[program.normal.diagonal]
@@ -65,10 +67,10 @@ class Covariances:
         with self._lock, self._structure.borrowed() as system:
             if not len(self._data):
                 self._data = np.zeros(system.pattern.nnz)
-                fill(system.arrays, self._lin.hessian, self._lin.constraint_jacobian, self._data)
+                fill(system.arrays, self._lin.hessian / self._unit, self._lin.constraint_jacobian, self._data)
             if not system.load(self._data):
                 raise GraphError("the covariance does not exist: the Hessian is not finite")
-            result[np.ix_(free, free)] = _inverse_block(system, chosen[free])
+            result[np.ix_(free, free)] = _inverse_block(system, chosen[free]) / self._unit
         return result
 
     def blocks(self, columns: IntArray) -> Array:
