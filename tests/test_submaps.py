@@ -52,6 +52,25 @@ def test_submaps_find_the_map_and_its_covariances(made: PoseGraph, largest: int,
             np.testing.assert_allclose(opened.covariance(pose), expected, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.parametrize("largest", [1000, 60])
+@pytest.mark.parametrize("robust", [fg.Huber(1.0), fg.Cauchy(1.0), fg.GemanMcClure(2.0)])
+def test_wrong_closures_count_as_losses_say(robust: fg.Loss, largest: int, tmp_path: Path) -> None:
+    """Submaps cut edges anew, but know which of them are loop closures."""
+    made = manhattan(300, seed=5, outliers=0.2).pose_graph
+    made = made.with_poses(whole(begun(PLANE))[1])
+    graph, x, guess = made.graph(robust)
+    solution = GaussNewton(tolerance=1e-11).solve(graph, guess)
+    parted = Submaps.split(made, tmp_path / "map", largest, robust)
+    found = parted.optimize(tolerance=1e-9, max_iterations=200)
+    assert found.status is Status.CONVERGED
+    assert found.chi2 == pytest.approx(2.0 * solution.cost, rel=1e-8)
+    np.testing.assert_allclose(made.group.local(solution[x], parted.poses), 0.0, atol=1e-5)
+    again = Submaps(tmp_path / "map", robust)
+    np.testing.assert_allclose(again.covariance(200), solution.covariance(x[200]), rtol=1e-5)
+    with pytest.raises(GraphError, match=r"optimized with robust=\w+\(.*\), opened with None"):
+        Submaps(tmp_path / "map").covariance(200)
+
+
 @pytest.mark.parametrize(("largest", "moved_away"), [(1000, 0), (60, 0), (60, 37)])
 def test_a_step_is_that_of_the_whole_graph(largest: int, moved_away: int, tmp_path: Path) -> None:
     """Its offsets, of the whole and of every pose, and what is left of it at half its length, too."""

@@ -29,6 +29,7 @@ from unifg.elimination.factorization import Factorization
 from unifg.elimination.reduction import Reduction
 from unifg.elimination.symmetric import Symmetric, distinct, scatter
 from unifg.errors import GraphError, require_kinds
+from unifg.factors.robust import Loss
 from unifg.factors.steps import EPSILON
 from unifg.lie import LieGroup
 from unifg.modeling.factors import between
@@ -42,7 +43,7 @@ from unifg.typing import Array, BoolArray, IntArray
 
 logger = logging.getLogger("unifg")
 
-INDEX, SEPARATOR, INFORMATION = "submaps.json", "separator.npz", "information.npy"
+INDEX, SEPARATOR, INFORMATION = "submaps.json", "separator.npz", "information.npz"
 POSES, NEXT = "poses.npy", "next.npy"
 EDGES = "first", "second", "measured", "information"
 ARMIJO, SHORTEST = 1e-4, 2.0**-10
@@ -53,7 +54,7 @@ class Optimized(NamedTuple):
 
     Attributes:
         status: CONVERGED, ITERATION_LIMIT or STALLED.
-        chi2: sum of r' Omega r, without 1/2.
+        chi2: sum of r' Omega r, without 1/2; with a loss, of what it makes of them.
         iterations: Gauss-Newton steps taken.
         offset: relative offset of Bates and Watts, of all unknowns together.
     """
@@ -70,19 +71,21 @@ class _Pass(NamedTuple):
     Attributes:
         step: (S, d) of the poses of the separator, zero for fixed ones.
         chi2: where it was linearised.
+        squares: sum of r' Omega r there, as losses weigh them.
         decrease: of chi2 by the whole step, by the quadratic model; zero within the rounding of residuals.
         worst: largest relative offset of a single pose where the step before began.
     """
 
     step: Array
     chi2: float
+    squares: float
     decrease: float
     worst: float
 
     @property
     def offset(self) -> float:
         """Relative offset of the whole."""
-        return math.sqrt(self.decrease / self.chi2) if self.decrease > 0.0 else 0.0
+        return math.sqrt(self.decrease / self.squares) if self.decrease > 0.0 else 0.0
 
 
 class _Edges:
@@ -92,12 +95,17 @@ class _Edges:
         program: compiled.
     """
 
-    def __init__(self, group: LieGroup, count: int, edges: Edges) -> None:
-        graph = Graph()
-        self._x = graph.variables("x", group, count)
-        ends = self._x[edges.first], self._x[edges.second]
-        graph.minimize(between, *ends, edges.measured, information=edges.information, name="edges")
-        self.program, self._ends, self._group = CompiledProblem(graph), (edges.first, edges.second), group
+    def __init__(self, group: LieGroup, members: IntArray, edges: Edges, robust: Loss | None) -> None:
+        graph, ends = Graph(), []
+        self._x = graph.variables("x", group, len(members))
+        along = np.abs(members[edges.first] - members[edges.second]) == 1
+        for name, loss, part in (("odometry", None, edges[along]), ("closures", robust, edges[~along])):
+            if len(part):
+                own = self._x[part.first], self._x[part.second]
+                graph.minimize(between, *own, part.measured, information=part.information, robust=loss, name=name)
+                ends.append((part.first, part.second))
+        self.program, self._group = CompiledProblem(graph), group
+        self._ends = [np.concatenate(both) for both in zip(*ends, strict=True)]
 
     def linearize(self, poses: Array) -> Linearization:
         """Linearise."""
@@ -115,12 +123,12 @@ class _Edges:
 class _Submap:
     """A submap in memory: edges between inner poses and its boundary, the poses of the separator that it touches."""
 
-    def __init__(self, file: Path, group: LieGroup) -> None:
+    def __init__(self, file: Path, group: LieGroup, robust: Loss | None) -> None:
         with np.load(file) as known:
             self.inner, self.boundary = known["inner"], known["boundary"]
             edges = Edges(*(known[name] for name in EDGES))
         self.members = np.concatenate([self.inner, self.boundary])
-        self.edges = _Edges(group, len(self.members), edges)
+        self.edges = _Edges(group, self.members, edges, robust)
         self._tree = Reduction(self.edges.program.normal, len(self.boundary) * group.dim)
 
     def linearize(self, poses: Array) -> Linearization:
@@ -149,15 +157,20 @@ class Submaps:
     Attributes:
         folder: that of :meth:`split`.
         count: number of submaps.
+        robust: loss on loop closures.
     """
 
-    def __init__(self, folder: str | Path) -> None:
+    def __init__(self, folder: str | Path, robust: Loss | None = None) -> None:
         """Open what :meth:`split` has written.
+
+        Args:
+            folder: with the submaps.
+            robust: loss on the whitened residuals of the loop closures, in :meth:`optimize` and :meth:`covariance`.
 
         Raises:
             GraphError: the folder holds no submaps.
         """
-        self.folder = Path(folder)
+        self.folder, self.robust = Path(folder), robust
         try:
             known = json.loads((self.folder / INDEX).read_text(encoding="utf-8"))
             self.count = int(known["submaps"])
@@ -171,7 +184,9 @@ class Submaps:
         self._optimized = False
 
     @classmethod
-    def split(cls, pose_graph: PoseGraph, folder: str | Path, largest: int = 50_000) -> Submaps:
+    def split(
+        cls, pose_graph: PoseGraph, folder: str | Path, largest: int = 50_000, robust: Loss | None = None
+    ) -> Submaps:
         """Write a pose graph to a folder as submaps.
 
         Its arrays may be those of ``np.load(..., mmap_mode="r")``. Poses are cut where they lie, so the present ones
@@ -181,6 +196,7 @@ class Submaps:
             pose_graph: poses and edges; known poses are kept, and the first one of every part without.
             folder: to be made where there is none.
             largest: number of poses of a submap at most.
+            robust: as of the class.
 
         Raises:
             GraphError: sightings or priors, which submaps do not know; no edges; a submap of no pose; NaN; a
@@ -229,7 +245,7 @@ class Submaps:
         with replacing(home / POSES) as file:
             np.save(file, poses)
         write_atomically(home / INDEX, json.dumps({"submaps": count}))
-        return cls(home)
+        return cls(home, robust)
 
     @property
     def poses(self) -> Array:
@@ -256,7 +272,7 @@ class Submaps:
         self._optimized = False
         (self.folder / INFORMATION).unlink(missing_ok=True)
         result = self._optimize(tolerance, max_iterations)
-        np.save(self.folder / INFORMATION, self._separator.information)
+        np.savez(self.folder / INFORMATION, information=self._separator.information, robust=repr(self.robust))
         self._optimized = True
         return result
 
@@ -283,7 +299,7 @@ class Submaps:
         """(d, d) marginal covariance of a pose, over its tangent space, at the present poses; zero for a fixed one.
 
         Raises:
-            GraphError: there is no such pose, or nothing has been optimised yet.
+            GraphError: there is no such pose, nothing has been optimised yet, or with another loss.
         """
         count, dim = len(self.poses), self._group.dim
         require_kinds("covariance", GraphError, {"pose": "int"}, {"pose": pose})
@@ -298,7 +314,7 @@ class Submaps:
             at = int(np.searchsorted(interior, pose))
             if at < len(interior) and interior[at] == pose:
                 break
-        submap, places = _Submap(self.folder / f"{k}.npz", self._group), self._boundaries[k]
+        submap, places = self._submap(k), self._boundaries[k]
         submap.linearize(self.poses[submap.members])
         own, reach = np.empty((dim, dim)), np.empty((dim, len(places) * dim))
         for axis in range(dim):
@@ -312,9 +328,12 @@ class Submaps:
         """The separator at the present poses."""
         if not self._optimized:
             try:
-                self._separator.information[:] = np.load(self.folder / INFORMATION)
+                with np.load(self.folder / INFORMATION) as file:
+                    self._separator.information[:], robust = file["information"], str(file["robust"])
             except OSError:
                 raise GraphError(f"{self.folder}: no covariances yet; optimize() comes first") from None
+            if robust != repr(self.robust):
+                raise GraphError(f"{self.folder}: optimized with robust={robust}, opened with {self.robust!r}")
             self._separator.factor()
             self._optimized = True
         return self._separator
@@ -335,9 +354,9 @@ class Submaps:
             shutil.copyfile(self.folder / POSES, self.folder / NEXT)  # a full disk is found here, not in mapped memory
             following = np.load(self.folder / NEXT, mmap_mode="r+")
             following[self._shared] = shared = group.retract(shared, length * step)
-        chi2, slopes = separator.begin(shared)
+        chi2, squares, slopes = separator.begin(shared)
         for k, places in enumerate(self._boundaries):
-            submap = _Submap(self.folder / f"{k}.npz", group)
+            submap = self._submap(k)
             own, count = np.array(poses[submap.members]), len(submap.inner)
             lin = submap.linearize(own)
             if step is not None:
@@ -352,23 +371,34 @@ class Submaps:
             matrix, gradient, inside = submap.reduced(lin.gradient)
             separator.add(places, matrix, gradient)
             chi2, decrease = chi2 + 2.0 * lin.cost, decrease + inside
-            slopes += inner(lin.jacobian, lin.jacobian)
+            squares, slopes = squares + inner(lin.residual, lin.residual), slopes + inner(lin.jacobian, lin.jacobian)
         if step is not None:
             following.flush()
             worst = max(worst, _largest(offsets))
         found, outside = separator.solve()
         decrease += outside
-        return _Pass(found, chi2, decrease if decrease > 2.0 * rounding**2 * slopes else 0.0, worst)
+        return _Pass(found, chi2, squares, decrease if decrease > 2.0 * rounding**2 * slopes else 0.0, worst)
 
     @cached_property
     def _separator(self) -> _Separator:
-        return _Separator(self._group, self._fixed, self._across, self._boundaries)
+        return _Separator(self._group, self._shared, self._fixed, self._across, self._boundaries, self.robust)
+
+    def _submap(self, k: int) -> _Submap:
+        return _Submap(self.folder / f"{k}.npz", self._group, self.robust)
 
 
 class _Separator:
     """The poses of the separator: edges between them, and what is left of the submaps."""
 
-    def __init__(self, group: LieGroup, fixed: BoolArray, edges: Edges, boundaries: Sequence[IntArray]) -> None:
+    def __init__(
+        self,
+        group: LieGroup,
+        members: IntArray,
+        fixed: BoolArray,
+        edges: Edges,
+        boundaries: Sequence[IntArray],
+        robust: Loss | None,
+    ) -> None:
         """Find the structure."""
         free, dim = np.flatnonzero(~fixed), group.dim
         number = np.full(len(fixed), -1)
@@ -387,7 +417,8 @@ class _Separator:
         self._ends = distinct(np.concatenate([edges.first, edges.second]))
         if len(edges):
             first, second = (np.searchsorted(self._ends, end) for end in (edges.first, edges.second))
-            self._edges = _Edges(group, len(self._ends), replace(edges, first=first, second=second))
+            edges = replace(edges, first=first, second=second)
+            self._edges = _Edges(group, members[self._ends], edges, robust)
 
     def offsets(self, poses: Array, step: Array, rounding: float) -> Array:
         """(3, S) as of :meth:`_Edges.offsets`, of the edges of the separator."""
@@ -397,11 +428,11 @@ class _Separator:
             result[:, self._ends] = self._edges.offsets(lin, step[self._ends], rounding)
         return result
 
-    def begin(self, poses: Array) -> tuple[float, float]:
-        """Linearise the edges, of which nothing else is there yet; chi2, and the sum of squared slopes."""
+    def begin(self, poses: Array) -> tuple[float, float, float]:
+        """Linearise the edges, of which nothing else is there yet; chi2, and the sums of squares and squared slopes."""
         self.information[:], self._gradient[:] = 0.0, 0.0
         if self._edges is None:
-            return 0.0, 0.0
+            return 0.0, 0.0, 0.0
         lin = self._edges.linearize(poses[self._ends])
         pattern, column = self._edges.program.normal, self._columns[self._ends].ravel()
         rows, columns = column[pattern.indices], column[pattern.columns]
@@ -409,7 +440,7 @@ class _Separator:
         slots = self._pattern.positions(rows[free], columns[free])
         self.information[:] = scatter(slots, lin.hessian[free], self._pattern.nnz)
         self._gradient[column[column >= 0]] = lin.gradient[column >= 0]
-        return 2.0 * lin.cost, inner(lin.jacobian, lin.jacobian)
+        return 2.0 * lin.cost, inner(lin.residual, lin.residual), inner(lin.jacobian, lin.jacobian)
 
     def add(self, boundary: IntArray, matrix: Array, gradient: Array) -> None:
         """Add what is left of a submap; positions of its boundary are sorted."""

@@ -554,7 +554,7 @@ def settle(
     terms: TermArrays,
     kkt: KktArrays,
     saddle: SaddleArrays,
-    held: tuple[Array, Array, Array, Array, BoolArray, BoolArray, Array, BoolArray],
+    held: tuple[Array, Array, Array, Array, BoolArray, BoolArray, Array, BoolArray, float],
     linearized: tuple[Array, Array, Array, Array, Array, Array],
     hessian: Array,
     near: Array,
