@@ -10,7 +10,7 @@ import pytest
 from scipy.linalg import null_space
 
 import unifg as fg
-from problems.graphs import drawn_to, graph_of
+from problems.graphs import drawn_to, graph_of, graph_with
 from test_kkt import chain
 from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.typing import Array
@@ -48,7 +48,7 @@ def test_units_do_not_matter(units: tuple[float, ...], noise: float) -> None:
 
 @pytest.mark.parametrize("scale", [1.0, 1e5, 1e8])
 def test_costs_of_any_size_determine_unknowns_beside_constraints(scale: float) -> None:
-    graph, x = graph_of(("x", fg.Rn(2), 3))
+    graph, x = graph_with(fg.Rn(2), 3)
     graph.minimize(fg.prior, x, [1.0, 2.0], sigma=scale * np.array([1.0, 2.0]))
     graph.constrain(lambda p: p.sum(axis=1, keepdims=True), x, lower=1.0, upper=1.0)
     solution = InteriorPoint().solve(graph, {x: np.zeros((3, 2))}, check=True)
