@@ -26,7 +26,7 @@ from unifg.typing import Array, BoolArray, IntArray
 
 PASSES, NEAR = 12, 1.5  # each pass halves what is left in the exponents; factors are rounded anyway
 LARGEST = 2.0**60
-SMALL = 1e-5  # curvatures of which dampings and shifts of 1e-9 are a share that shows
+SMALL = 1e-4  # curvatures of which dampings and shifts of 1e-9 are a share that shows
 MODEST = 2.0**10  # factors up to this change little in double precision, and are left alone
 
 
