@@ -283,7 +283,10 @@ class AugmentedLagrangian(Solver):
             weights = np.where(given, run.penalties / rho, weights)
         else:
             outside = float(np.square(scale * run.program.violation(run.lin.constraints)).sum())
-            rho = COLD_PENALTY * max(unit, abs(run.lin.cost)) / max(1.0, 0.5 * outside)
+            # A constant may be added to scalar costs: their slopes tell how large they are.
+            scalars = sum(float(each.sum()) for each in run.lin.scalars.values())
+            size = max(unit, abs(run.lin.cost - scalars), largest(run.lin.gradient) if run.lin.scalars else 0.0)
+            rho = COLD_PENALTY * size / max(1.0, 0.5 * outside)
         return float(np.clip(max(rho, least), 1e-3 * unit, 1e6)), weights
 
     def _scale(self, primal: Primal, lin: Linearization) -> Array:

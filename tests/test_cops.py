@@ -187,3 +187,15 @@ def test_steps_of_restoration_are_counted() -> None:
         assert found.status is fg.Status.LOCALLY_INFEASIBLE
         assert found.restoration_steps > 0 and f"and {found.restoration_steps} steps of restoration" in found.report()
     assert "restoration" not in InteriorPoint().solve(*electrons(6)).report()
+
+
+@pytest.mark.parametrize("name", ["polygon", "orbit"])
+def test_first_penalties_follow_slopes_of_scalar_costs(name: str) -> None:
+    """Their values say nothing: a constant may be added to them."""
+    found = []
+    for constant in (0.0, 1e3):
+        graph, guess = NAMED[name].build()
+        graph.minimize_scalar(lambda v, c=constant: 0.0 * v[:, 0] + c, next(iter(guess))[0], name="constant")
+        found.append(AugmentedLagrangian().solve(graph, guess, check=True))
+        assert found[-1].cost - constant == pytest.approx(NAMED[name].best, rel=1e-4)
+    assert found[0].iterations == found[1].iterations <= 40
