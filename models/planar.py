@@ -75,6 +75,13 @@ class Base:
         found: Array = self.velocities(control[None])[0]
         return found
 
+    def turning(self, rate: float, speed: float) -> float:
+        """Last control that turns at a rate [rad/s] at a speed [m/s], which is not zero where it is an angle."""
+        if self.steering is None:
+            return rate
+        wheelbase = self.turning_radius * math.tan(self.steering[0])
+        return float(np.clip(math.atan(wheelbase * rate / speed), -self.steering[0], self.steering[0]))
+
     @cached_property
     def moving(self) -> StatedKernel:
         """``moving(x, u, dt)``: by how much poses change in world axes, (n, 3) [m, m, rad]."""

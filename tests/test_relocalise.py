@@ -14,6 +14,7 @@ import pytest
 import maps
 from test_supervision import BEAMS, DT
 from unifg.files.ros_map import save_map
+from unifg.models.planar import ackermann, base_of
 from unifg.scenarios.ground.calibration import BIAS
 from unifg.scenarios.ground.creeping import Creeping
 from unifg.scenarios.ground.drive_pilot import DOUBTFUL, Pilot, make_pilot
@@ -184,8 +185,27 @@ def test_other_places_are_tried_seldom_once_nothing_fits_for_long(monkeypatch: p
     assert corrects(wrong, 1) == [1] and corrects(right, 1) == [0] and corrects(wrong, 11) == [1] * 11
 
 
+def test_creeping_of_a_car_goes_back_where_it_cannot_turn() -> None:
+    creeping, bound = Creeping(0.44), 0.34
+    speed, turn = creeping.control(World(HALL, (13.0, 3.5, 0.1)).scan(), bound)
+    assert speed > 0.0 and -0.7 < turn < 0.0
+    for corner in ((25.0, 7.2, 0.0), (25.3, 3.5, 0.1)):  # a wall ahead: what is free aside is out of its reach
+        creeping = Creeping(0.44)
+        speed, turn = creeping.control(World(HALL, corner).scan(), bound)
+        assert speed < 0.0 and abs(turn) <= 0.5
+        assert creeping.control(World(HALL, corner).scan(), bound)[0] < 0.0, "it stays with that"
+    creeping.blocked()
+    creeping.moved(np.array([-10.0, 0.0]))
+    assert creeping.travelled == 10.0 and abs(creeping._heading) < 0.7
+    base = ackermann(0.3, 0.6)
+    for speed in (0.3, -0.3):
+        assert base.of(np.array([speed, base.turning(0.2, speed)]))[-1] == pytest.approx(0.2)
+    assert base.turning(5.0, 0.3) == 0.6 and base_of("unicycle").turning(0.2, 0.0) == 0.2
+
+
 @pytest.mark.product(1, of="drives and flights")
-def test_a_robot_lost_in_an_aisle_creeps_to_its_end_and_finds_itself(tmp_path: Path) -> None:
+@pytest.mark.parametrize("base", ["unicycle", "ackermann"])
+def test_a_robot_lost_in_an_aisle_creeps_to_its_end_and_finds_itself(base: str, tmp_path: Path) -> None:
     save_map(tmp_path / "hall.yaml", HALL)
     settings = NavigationSettings(
         map=tmp_path / "hall.yaml",
@@ -193,6 +213,7 @@ def test_a_robot_lost_in_an_aisle_creeps_to_its_end_and_finds_itself(tmp_path: P
         believed=(2.0, 6.5, 0.0),
         goals=((2.0, 1.0, 3.0),),
         obstacles=0,
+        controller=ControllerSettings(base=base),
     )
     episode = Episode(settings)
     log = episode.run(maps.stop_after(150))

@@ -293,7 +293,7 @@ class Pilot(Generic[PlannerT]):
         """The plan to rest, after one more control that leads to where places can be told apart."""
         s = self.controller.settings
         wanted, (speed, turn) = np.zeros(s.kind.size), creeping.control(scan, s.hull.bound)
-        wanted[0], wanted[-1] = min(speed, s.speed), turn
+        wanted[0], wanted[-1] = np.clip(speed, -s.speed, s.speed), s.kind.turning(turn, speed)
         wanted = self.driven + np.clip(wanted - self.driven, -s.most, s.most)
         plan = self._stop(replace(rest, controls=np.concatenate([wanted[None], rest.controls[1:]])), scan)
         if self.slowed and speed:
@@ -329,8 +329,8 @@ class Pilot(Generic[PlannerT]):
             self.estimator.reset(pose, FOUND_SIGMA)
             self.pose, self.relocated, self.calibration.pose = self.estimator.pose, True, None
             self._forget_tracks()
-        elif lost and len(result.rivals) > 1 and s.kind.steering is None:
-            self._creeping = self._creeping or Creeping()
+        elif lost and len(result.rivals) > 1:
+            self._creeping = self._creeping or Creeping(s.kind.turning_radius)
         self._pause = 0 if self.creeping else SEARCH_AGAIN
 
     def take_over(self, other: Pilot[PlannerT]) -> None:
