@@ -60,6 +60,88 @@ def test_portions_make_the_steps_of_one_solve(portion: int) -> None:
     assert again.iterations == portion and not np.array_equal(again[y], found[y])
 
 
+def hard() -> tuple[fg.Graph, fg.Family, fg.Data]:
+    """Points in steps of limited length around a disc that may be too large for them."""
+    graph, x = graph_with(fg.Rn(2), 6)
+    goal, radius = graph.data("goal", [3.0, 0.1]), graph.data("radius", 1.0)
+    graph.minimize(fg.prior, x[-1], goal, sigma=0.1, robust=fg.Huber(1.0))
+    graph.minimize(lambda a, b: b - a, x[:-1], x[1:], sigma=1.0, name="steps")
+    graph.fix(x[0], [-3.0, 0.0])
+    graph.constrain(lambda p, r: np.hypot(p[:, :1], p[:, 1:]) - r, x[1:], radius, lower=0.0, name="off")
+    graph.constrain(lambda a, b: ((b - a) ** 2).sum(axis=1, keepdims=True), x[:-1], x[1:], upper=2.5, name="length")
+    return graph, x, goal
+
+
+@pytest.mark.parametrize("options", [{}, {"step_tolerance": 1e-2}, {"max_iterations": 12}], ids=str)
+def test_a_portion_that_leaves_the_constraints_is_gone_on_with_from_where_it_ended(options: dict[str, Any]) -> None:
+    """Iterates that kept them are looked for at the end alone: that takes the memory which the solve goes on with."""
+    (graph, x, goal), (other, y, aim) = hard(), hard()
+    one, many = InteriorPoint(**options).prepare(graph), InteriorPoint(**options).prepare(other)
+    one.solve(around(x, 0.3)), many.solve(around(y, 0.3))
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        to, bent = 3.0 * rng.normal(size=2), rng.normal()
+        many.portioned(int(rng.integers(1, 4)))
+        expected, found = one.solve(around(x, bent), data={goal: to}), many.solve(around(y, bent), data={aim: to})
+        while many.unfinished:
+            found = many.proceed()
+        assert (found.status, found.iterations) == (expected.status, expected.iterations)
+        np.testing.assert_array_equal(found[y], expected[x])
+
+
+def around(x: fg.Family, bent: float) -> dict[Any, Array]:
+    return {x: np.column_stack([np.linspace(-3.0, 3.0, 6), np.full(6, bent)])}
+
+
+def test_a_solve_is_gone_on_with_by_its_own_data() -> None:
+    """Data are shared by all solves of a graph, and another one has come between."""
+    graph, x, goal = chain()
+    run, moved = InteriorPoint().prepare(graph), np.array([2.5, -0.4])
+    run.solve(guess(x, 0.3))
+    expected = run.solve(guess(x, -0.2), data={goal: moved})
+    run.portioned(2)
+    run.solve(guess(x, -0.2), data={goal: moved})
+    fg.solve(graph, guess(x, 0.3))
+    while run.unfinished:
+        found = run.proceed()
+    np.testing.assert_array_equal(found[x], expected[x])
+    assert found.cost == expected.cost and run.verify(found) == {}
+
+
+def test_many_instances_are_solved_whole() -> None:
+    graph, x, goal = chain()
+    run, each = InteriorPoint().prepare(graph), np.array([[2.5, -0.4], [3.0, 0.1]])
+    run.solve(guess(x, 0.3))
+    run.portioned(1)
+    assert run.solve_many(guess(x, -0.2), data={goal: each}).converged and not run.unfinished
+    assert run.solve(guess(x, -0.2), data={goal: each[0]}).iterations == 1
+
+
+def test_without_an_unfinished_solve_there_is_nothing_to_go_on_with() -> None:
+    graph, x, _ = chain()
+    run = InteriorPoint().prepare(graph)
+    for solved in (False, True):
+        if solved:
+            run.solve(guess(x, 0.3))
+        with pytest.raises(fg.BackendError, match="InteriorPoint has no unfinished solve to proceed with"):
+            run.proceed()
+    for count in (0, -1):
+        with pytest.raises(fg.BackendError, match=f"at least 1, or None for whole solves, found {count}"):
+            run.portioned(count)
+    with pytest.raises(fg.BackendError, match=r"count must be a whole number or None, found 1\.5"):
+        run.portioned(1.5)  # type: ignore[arg-type]
+
+
+def test_a_solve_whose_portion_shows_a_wrong_trace_is_made_anew_and_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x, _ = chain()
+    run = InteriorPoint().prepare(graph)
+    run.solve(guess(x, 0.3))
+    run.portioned(1)
+    told = iter([{"steps": "it differs"}, {}])
+    monkeypatch.setattr(run.program, "mistraced", lambda *_: next(told))
+    assert run.solve(guess(x, -0.2)).converged and not run.unfinished
+
+
 def keeper(**settings: Any) -> CbfMpc:
     plans = CbfMpc(KeeperSettings(**{"alpha": 1.0, "slots": 1, **settings}), Airframe(), DT)
     for k in range(3):  # the first is cold, the second begins with a warm start

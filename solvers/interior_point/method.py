@@ -153,6 +153,8 @@ class InteriorPoint(Solver):
         measured = read_numbers(work.kkt, cost)
         held = measured.passes(self.tolerances)
         workspace.unfinished = ending is Status.ITERATION_LIMIT and iterations < self.max_iterations
+        if not workspace.unfinished:
+            now["limit"] = self.max_iterations  # a restart is made in one portion
         if now["suspicion"] > SUSPICIOUS or not cost >= UNBOUNDED_COST or not measured.finite:
             return True
         if not held and ((now["kept"] and now["violation"] > now["feasible"]) or iterations >= self.max_iterations):
@@ -174,7 +176,8 @@ class InteriorPoint(Solver):
         now = workspace.now
         if now["clock"]:
             run.parts = now["evaluating"], now["solving"], now["judging"], workspace.compiled
-        if run.alone and not now["clocked"] and run.returns_best(run.status or reason):
+        ended = not workspace.unfinished  # else the loop goes on from where it is
+        if ended and run.alone and not now["clocked"] and run.returns_best(run.status or reason):
             self._replay(run, workspace, start, carried)
         if self.step_tolerance > 0.0 and now["kept"] and run.optimality.violation > now["keeping"]:
             ending = run.status or reason
@@ -420,7 +423,7 @@ class Workspace:
         if len(self.work.log) < options.max_iterations + 2:
             self.work = self.work._replace(log=np.zeros((options.max_iterations + 2, 9)))
             self._describe()
-        work, now, self._taken, self.compiled = self.work, self.now, None, 0.0
+        work, now, self._taken, self.compiled, self.unfinished = self.work, self.now, None, 0.0, False
         # The test of least squares has no absolute tolerance.
         kkt, violation, unit = options.tolerances
         now["tolerance"] = 0.0 if self.program.least_squares else kkt

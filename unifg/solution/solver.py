@@ -72,6 +72,7 @@ class Prepared:
         self._workspace: Any = None
         self._solves, self._owed, self._of_branches = 0, False, 0
         self._last: ReferenceType[Solution] | None = None
+        self._begun: tuple[Array, Array, dict[Data, Array]]  # start and data of a solve in portions
         self._lock = ReentrantLock()
         self._twins: list[Prepared] = []
         self._constraints = {
@@ -101,12 +102,21 @@ class Prepared:
             self._leave()
 
     def proceed(self) -> Solution:
-        """Go on with the last solve, which is :attr:`unfinished`, with its data, for another portion of iterations."""
+        """Go on with the last solve, which is :attr:`unfinished`, with its data, for another portion of iterations.
+
+        Raises:
+            BackendError: it is finished, or as of :meth:`solve`.
+        """
         self._enter()
         try:
-            work, program = self._workspace.work, self.program
-            reached = program.values_from(work.values.copy()), work.multipliers.copy(), program.no_penalties
-            return self._answered(*reached, None, time.perf_counter())
+            if not self.unfinished:
+                raise BackendError(f"this prepared {self.solver.name} has no unfinished solve to proceed with")
+            values, multipliers, data = self._begun
+            self.program.bind(data)  # of which other solves of the graph may have left their own
+            start = self.program.values_from(values), multipliers.copy(), self.program.no_penalties
+            solution = self._answered(*start, None, time.perf_counter())
+            self._last = ref(solution)
+            return solution
         finally:
             self._leave()
 
@@ -116,7 +126,14 @@ class Prepared:
         return getattr(self._workspace, "unfinished", False)
 
     def portioned(self, count: int | None) -> None:
-        """Let solves return after so many iterations, to :meth:`proceed` later; for backends that can."""
+        """Let solves return after so many iterations, to :meth:`proceed` later; for backends that can.
+
+        Raises:
+            BackendError: no iteration is left to a portion.
+        """
+        require_kinds("portioned", BackendError, Prepared.portioned.__annotations__, {"count": count})
+        if count is not None and count < 1:
+            raise BackendError(f"portioned: count must be at least 1, or None for whole solves, found {count}")
         if hasattr(self._workspace, "portion"):
             self._workspace.portion = count
 
@@ -136,7 +153,12 @@ class Prepared:
         require_kinds("solve_many", GraphError, Prepared.solve_many.__annotations__, {"threads": threads})
         if threads < 1:
             raise GraphError(f"solve_many: threads must be at least 1, found {threads}")
-        return solve_batch(self, guesses, data or {}, threads)
+        portion = getattr(self._workspace, "portion", None)
+        self.portioned(None)  # an instance that returned early would have no one to proceed with it
+        try:
+            return solve_batch(self, guesses, data or {}, threads)
+        finally:
+            self.portioned(portion)
 
     def export(self, folder: str | Path, *, name: str = "solver", target: str = "") -> list[Path]:
         """Write the solver as a C function for programs without Python: header, object file and shared object.
@@ -248,6 +270,9 @@ class Prepared:
             self._workspace.unfinished = False
         values, multipliers, penalties = self.read(guess, duals)
         began = time.perf_counter()
+        if getattr(self._workspace, "portion", None) is not None:
+            present = {handle: value.copy() for handle, value in program.binding.present.items()}
+            self._begun = values.flat.copy(), multipliers.copy(), present
         solution = self._verified(self._answered(values, multipliers, penalties, callback, began), began, callback)
         self._last = ref(solution)
         if check and not solution.converged:
