@@ -9,6 +9,7 @@ import pytest
 
 import unifg as fg
 from problems.graphs import graph_with
+from unifg import horizon
 from unifg.horizon import Context, ControlCost, Dynamics, Measurement, RecedingHorizon, Robot, Term, Window
 from unifg.models import quadrotor
 from unifg.scenarios.planning.flat_path import Line
@@ -282,3 +283,19 @@ def test_new_node_times_drop_what_was_begun_on_the_old_ones() -> None:
     assert loop.goes_on
     loop.set_times([0.0, 0.5, 1.5, 2.5, 3.5, 4.5, 5.5])
     assert loop.plan(np.zeros(2), 5.0).iterations == 1
+
+
+def test_a_portion_that_was_dropped_is_not_gone_on_with_after_a_cold_solve() -> None:
+    loop, _ = boat(6)
+    accepted = True
+
+    def judge(solution: fg.Solution, states: Array, controls: Array, now: Any, kept: Any) -> horizon.Decision:
+        return horizon.Decision(controls, states, "solved" if accepted else "braking")
+
+    loop.judge = judge
+    for to in (5.0, 5.0, -3.0):
+        loop.plan(np.zeros(2), to)
+    assert loop.warm.unfinished, "accepted as it was"
+    loop.forget()
+    accepted = False
+    assert loop.plan(np.zeros(2), 50.0).source == "braking" and not loop.goes_on

@@ -519,7 +519,8 @@ class RecedingHorizon:
         states, controls = self._planned(solution)
         self.kept.age += float(self.times[1])
         choice = self._judged(solution, states, controls, now)
-        self.goes_on = choice.source != "solved" and self._portion is not None and self.warm.unfinished
+        ours = self._portion is not None and self._solved_by is not self.cold  # begun in this tick or gone on with
+        self.goes_on = choice.source != "solved" and ours and self.warm.unfinished
         if late and choice.source == "solved":
             instead = self._instead(now)
             self._accept(solution, states, controls, choice)
