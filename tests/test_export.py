@@ -349,3 +349,18 @@ def test_the_header_tells_order_shapes_and_units(tmp_path: Path) -> None:
     assert "row by row (the last axis runs fastest)" in words and "units the graph was written in" in words
     for family in prepared.program.families:
         assert f"{family.name}, {family.count} x {family.manifold.storage} {family.manifold.name}" in words
+
+
+@pytest.mark.product(1, of="exports")
+@compiled_by_c
+def test_a_name_does_not_end_the_comment_that_it_stands_in(tmp_path: Path) -> None:
+    graph = fg.Graph()
+    x = graph.variables("state */ [m]", fg.Rn(1), 1)
+    graph.minimize(lambda p, to: p - to, x, graph.data("goal\n*/ int goal; /*", [2.0]), name="there")
+    graph.bound(x, upper=1.0, name="box")
+    prepared = InteriorPoint().prepare(graph)
+    prepared.solve({x: np.zeros((1, 1))})
+    prepared.export(tmp_path)
+    assert "0..0: goal * / int goal; / *, 1\n" in (tmp_path / "solver.h").read_text(encoding="utf-8")
+    [(status, values, *_)] = built(tmp_path)([(np.array([0.5]), np.zeros(1), np.zeros(1))])
+    assert status == words(tmp_path)["CONVERGED"] and abs(values[0] - 0.5) < 1e-5

@@ -158,11 +158,11 @@ def _header(name: str, program: CompiledProblem, found: Exported, workspace: int
 
 
 def _places(parts: Iterable[tuple[str, tuple[int, ...], str]]) -> str:
-    """Lines of a comment: names, places and shapes of arrays side by side."""
+    """Lines of a comment: names, which cannot end it, places and shapes of arrays side by side."""
     lines, first = [], 0
     for name, shape, what in parts:
-        last = first + int(np.prod(shape))
-        lines.append(f" *   {first}..{last - 1}: {name}, {' x '.join(map(str, shape)) or 'a number'} {what}".rstrip())
+        last, plain = first + int(np.prod(shape)), " ".join(name.split()).replace("*/", "* /").replace("/*", "/ *")
+        lines.append(f" *   {first}..{last - 1}: {plain}, {' x '.join(map(str, shape)) or 'a number'} {what}".rstrip())
         first = last
     return "\n".join(lines) or " *   none"
 
