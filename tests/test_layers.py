@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
-from problems.graphs import graph_of
+from problems.graphs import graph_of, graph_with
 from unifg.layers import Layer
 from unifg.models import unicycle
 from unifg.solvers import InteriorPoint
@@ -149,6 +149,44 @@ def test_what_makes_no_layer_is_refused() -> None:
             Layer(*changed)
     with pytest.raises(fg.GraphError, match="failed must be 'raise' or 'zero', found 'none'"):
         Layer(prepared, inputs, outputs, guess, failed="none")  # type: ignore[arg-type]
+
+
+def test_what_is_given_twice_is_refused() -> None:
+    """One of two slopes of an output would be lost, and two inputs of one datum would both have its slope."""
+    prepared, inputs, outputs, guess = arguments()
+    with pytest.raises(fg.GraphError, match="<Family x: 7 x SE2> is among the outputs twice"):
+        Layer(prepared, inputs, [*outputs, outputs[0]], guess)
+    with pytest.raises(fg.GraphError, match=r"<Data goal \(2,\)> is among the inputs twice"):
+        Layer(prepared, [inputs[1], *inputs], outputs, guess)
+
+
+def scaled() -> tuple[fg.Data, tuple[Any, ...]]:
+    """A quotient, whose divisor is a datum that is no input; and the arguments of a layer."""
+    graph, x = graph_with(fg.Rn(1), 1)
+    seen, scale = graph.data("seen", [2.0]), graph.data("scale", [4.0])
+    graph.minimize(lambda p, s, z: s * p - z, x, scale, seen, name="seen")
+    graph.bound(x, lower=-9.0, upper=9.0)
+    return scale, (InteriorPoint(tolerance=1e-10).prepare(graph), [seen], [x], {x: [[0.1]]})
+
+
+def test_slopes_are_those_of_the_other_data_that_an_answer_was_found_with() -> None:
+    scale, given = scaled()
+    own = Layer(*given)
+    answers = own.solve([2.0])
+    scale.value = np.array([8.0])
+    assert own.pull(answers, [np.ones((1, 1))])[0] == pytest.approx(0.25)
+    assert own.solve([2.0]).values[0] == pytest.approx(0.25) and answers.batch.solution(0).cost < 1e-12
+
+
+def test_other_data_that_have_changed_change_answers_of_jax() -> None:
+    pytest.importorskip("jax", reason="the extra 'jax' is not installed")
+    from unifg.jax import layer
+
+    scale, given = scaled()
+    solve = layer(*given)
+    assert solve(np.array([2.0])).item() == pytest.approx(0.5)
+    scale.value = np.array([8.0])
+    assert solve(np.array([2.0])).item() == pytest.approx(0.25)
 
 
 def _torch() -> tuple[Callable[..., Any], Callable[..., Any]]:

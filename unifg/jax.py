@@ -31,9 +31,9 @@ def layer(*args: Any, **options: Any) -> Callable[..., Any]:
     known: OrderedDict[bytes, Answers] = OrderedDict()
 
     def solved(given: tuple[Any, ...]) -> Answers:
-        """Answers, solved anew unless these very arrays were among the last ones."""
+        """Answers, solved anew unless these very arrays were among the last ones, with the other data as now."""
         arrays = [np.asarray(one, dtype=np.float64) for one in given]
-        key = b"".join(repr(array.shape).encode() + array.tobytes() for array in arrays)
+        key = b"".join(repr(array.shape).encode() + array.tobytes() for array in (*arrays, *inner.others))
         if key not in known:
             known[key] = inner.solve(*arrays)
             while len(known) > REMEMBERED:

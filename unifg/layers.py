@@ -79,11 +79,18 @@ class Layer:
                 raise GraphError(
                     f"layer: {what} are a list of objects of the class {kind.__name__}, found {given!r}"[:200]
                 )
+            if twice := [one for k, one in enumerate(given) if one in given[:k]]:
+                raise GraphError(f"layer: {twice[0]!r} is among the {what} twice, whose slopes would not be its own")
         if failed not in ("raise", "zero"):
             raise GraphError(f"layer: failed must be 'raise' or 'zero', found {failed!r}")
         self.inputs, self.outputs = tuple(inputs), tuple(outputs)
         self._prepared, self._guess, self._threads, self._failed = prepared, guess, threads, failed
         self._manifolds = [datum(prepared.program, handle).manifold for handle in inputs]
+
+    @property
+    def others(self) -> list[Array]:
+        """Values that all other data have now."""
+        return [handle.value for handle in self._prepared.program.binding.present if handle not in self.inputs]
 
     def solve(self, *given: Numbers) -> Answers:
         """Solve for data, one instance or several.

@@ -84,6 +84,8 @@ class Batch:
         """Make room; filled by :meth:`unifg.solution.solver.Prepared.solve_many`."""
         program = prepared.program
         self._prepared, self._data = prepared, data
+        # defaults may be others when somebody asks for a solution
+        self._rest = {h: h.value.copy() for h in program.binding.present if h not in data}
         self.statuses: list[Status] = [Status.INTERRUPTED] * count
         self.values, self.multipliers = np.empty((count, program.columns.stored)), np.empty((count, len(program.lower)))
         self.cost, self.stationarity, self.violation, self.complementarity = np.empty((4, count))
@@ -128,7 +130,7 @@ class Batch:
         Raises:
             GraphError: there is no such instance.
         """
-        program, data = self._prepared.program, self.data_of(index)
+        program, data = self._prepared.program, self.data_of(index) | self._rest
         arrays = self.values[index].copy(), self.multipliers[index].copy(), program.no_penalties
         return self._prepared.solve(Guess.stored(program, arrays), data=data)
 
