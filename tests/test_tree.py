@@ -257,7 +257,7 @@ def test_order_of_a_tree() -> None:
     assert FORK.earlier.tolist() == [0, 1, 2, 3, 1, 5, 6, 7] and FORK.later.tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
     assert FORK.probabilities([3.0, 1.0]) == pytest.approx([1, 1, 1, 0.75, 0.75, 0.75, 0.25, 0.25, 0.25, 0.25])
     for wrong in ([1.0], [1.0, -1.0], [0.0, 0.0], [np.nan, 1.0]):
-        with pytest.raises(GraphError, match="2 tails needs as many probabilities"):
+        with pytest.raises(GraphError, match="2 tails needs as many probabilities, finite ones that are not negative"):
             FORK.probabilities(wrong)
     for shared, tails in ((0, (2, 2)), (1, (2, 0))):
         with pytest.raises(GraphError, match="at least one step"):

@@ -114,8 +114,8 @@ class RecedingHorizon:
             steps: N of the future, or a tree of its nodes. The plan that is applied and kept is then that of its last
                 tail: let that be the one that holds whatever happens. The others are in ``solution``.
             terms: of the nodes and controls of the future.
-            probabilities: ``probabilities(now)`` gives those of the tails (L,), by which costs are weighted; prices of
-                soft constraints are not. They are constants of a solve. None: every cost counts fully.
+            probabilities: ``probabilities(now)`` gives those of the tails (L,), by which costs are weighted, by 1e-3 at
+                least; prices of soft constraints are not. They are constants of a solve. None: costs count fully.
             times: (N + 1,) of the nodes from the present on [s], from zero and of any spacing, the first step being as
                 long as a tick. Warm starts, kept plans and rollouts go by them. None: every step is a tick.
             solver: for a solve with a warm start.

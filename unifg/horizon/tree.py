@@ -133,7 +133,10 @@ class Tree:
         """
         given = doubles("the probabilities of the tails", leaves)
         if given.shape != self.leaves.shape or not (np.isfinite(given).all() and (given >= 0.0).all() and given.any()):
-            raise GraphError(f"a tree with {len(self.leaves)} tails needs as many probabilities, found {leaves!r}")
+            raise GraphError(
+                f"a tree with {len(self.leaves)} tails needs as many probabilities, finite ones that are not negative "
+                f"nor all zero; found {leaves!r}"
+            )
         found = np.zeros(len(self) + 1)
         for path, probability in zip(self.paths, given / given.sum(), strict=True):
             found[path] += probability
