@@ -262,6 +262,18 @@ def test_the_program_of_the_page_plans(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.product(1, of="exports")
+def test_the_data_of_the_header_are_those_of_the_last_solve(tmp_path: Path) -> None:
+    graph, guess, handle = around_a_disc()
+    prepared = InteriorPoint().prepare(graph)
+    prepared.solve(guess)
+    fg.solve(graph, guess, data={handle: handle.value + 0.1})
+    with pytest.raises(BackendError, match="have replaced the data of its last one: solve once more"):
+        prepared.export(tmp_path)
+    prepared.solve(guess)
+    assert prepared.export(tmp_path)
+
+
+@pytest.mark.product(1, of="exports")
 def test_an_object_file_for_another_processor(tmp_path: Path) -> None:
     prepared, _ = ready(with_losses)
     header, made = prepared.export(tmp_path / "new", name="arm", target="aarch64-unknown-linux-gnu")

@@ -70,7 +70,7 @@ class Prepared:
         self._edition = self._graph.edition
         self.single = False
         self._workspace: Any = None
-        self._solves, self._owed, self._of_branches = 0, False, 0
+        self._solves, self._owed, self._of_branches, self._bound = 0, False, 0, 0
         self._last: ReferenceType[Solution] | None = None
         self._begun: tuple[Array, Array, dict[Data, Array]]  # start and data of a solve in portions
         self._lock = ReentrantLock()
@@ -115,7 +115,7 @@ class Prepared:
             self.program.bind(data)  # of which other solves of the graph may have left their own
             start = self.program.values_from(values), multipliers.copy(), self.program.no_penalties
             solution = self._answered(*start, None, time.perf_counter())
-            self._last = ref(solution)
+            self._last, self._bound = ref(solution), self.program.binding.edition
             return solution
         finally:
             self._leave()
@@ -199,6 +199,8 @@ class Prepared:
             reason = "without constraints or general costs Python judges every step: add a bound"
         elif getattr(self.solver, "time_limit", math.inf) < math.inf:
             reason = "it has a time limit: limit its iterations"
+        elif self._solves > 0 and self._bound != self.program.binding.edition:
+            reason = "other solves have replaced the data of its last one: solve once more, and export then"
         elif self._workspace is not None and self._solves > 0:
             return self.solver.entry(self._workspace)
         raise BackendError(f"this prepared {self.solver.name} is not exported: {reason}")
@@ -274,7 +276,7 @@ class Prepared:
             present = {handle: value.copy() for handle, value in program.binding.present.items()}
             self._begun = values.flat.copy(), multipliers.copy(), present
         solution = self._verified(self._answered(values, multipliers, penalties, callback, began), began, callback)
-        self._last = ref(solution)
+        self._last, self._bound = ref(solution), program.binding.edition
         if check and not solution.converged:
             raise NotConverged(solution)
         return solution
