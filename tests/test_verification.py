@@ -283,6 +283,16 @@ def test_fields_of_discs_and_costs_with_kinks_raise_no_alarm(seed: int) -> None:
     assert solution.checked and not solution.mistraced
 
 
+def test_an_answer_is_not_verified_with_the_data_of_another_solve() -> None:
+    graph, x, target = stated(lambda x: 0.1 * np.tanh(x), constrained=False)
+    prepared, start = GaussNewton().prepare(graph), {x: np.zeros((N, 1))}
+    solution = prepared.solve(start, data={target: np.full((N, 1), 2.0)})
+    GaussNewton().solve(graph, start)
+    with pytest.raises(fg.UnifgError, match="the data of others are not kept"):
+        prepared.verify(solution)
+    assert prepared.verify(prepared.solve(start)) == {}
+
+
 def test_the_last_answer_is_verified_in_idle_time(wrong_above: Function) -> None:
     """Between the solves that are verified by themselves, and for the last solution alone."""
     wrong_above(2.0, smooth=True)  # no comparison that would come out otherwise

@@ -392,12 +392,13 @@ class Prepared:
             Reasons by the names of terms whose traces differ; from the next solve on they are evaluated by Python.
 
         Raises:
-            BackendError: while another thread solves with this object, within a solve, or for an older solution.
+            BackendError: while another thread solves with this object, within a solve, for an older solution, or once
+                another solve of the graph has brought other data.
         """
-        if self._last is None or solution is not self._last():
-            raise BackendError("only the last solution can be verified: the data of others are not kept")
         self._enter()
         try:
+            if self._last is None or solution is not self._last() or self._bound != self.program.binding.edition:
+                raise BackendError("only the last solution can be verified: the data of others are not kept")
             found = self.program.mistraced(solution._lin.values, True, self._solves)
         finally:
             self._leave()
