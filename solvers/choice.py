@@ -149,10 +149,12 @@ def _best_start(
     prepared, others, last = solver.bound(graph), list[Found](), best
     with prepared.program.lock:
         prepared.program.bind(data)
-        starts = spread(prepared.program, prepared.read(guess), count)[1:]
-    for start in starts:
-        if left <= 0.0 or last.status is Status.INTERRUPTED:
-            break
+        starts = spread(prepared.program, prepared.read(guess), count - 1)
+    while left > 0.0 and last.status is not Status.INTERRUPTED:
+        with prepared.program.lock:
+            prepared.program.bind(data)
+            if (start := next(starts, None)) is None:
+                break
         with suppress(NotFiniteError):
             last = replace(solver, time_limit=left).solve(graph, start, data=data, callback=callback)
             left -= last.seconds

@@ -10,7 +10,9 @@ import pytest
 import unifg as fg
 from problems.graphs import graph_of, graph_with
 from unifg.models import obstacles, unicycle
+from unifg.solution import starts as further
 from unifg.solution.solver import Solver
+from unifg.typing import Array
 
 
 def waves() -> tuple[fg.Graph, fg.Family]:
@@ -85,6 +87,20 @@ def test_every_start_is_solved_once_in_what_is_left_of_the_time(
     monkeypatch.setattr(Solver, "solve", timed)
     solution = fg.solve(graph, {x: [[-5.0]]}, starts=starts, time_limit=limit)
     assert given == left and len(solution.others) == len(left) - 1 and solution.checked
+
+
+def test_no_more_starts_are_made_than_there_is_time_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    graph, x = waves()
+    made: list[fg.Manifold] = []
+    honest = further._steps
+
+    def counted(manifold: fg.Manifold, points: Array, rng: np.random.Generator) -> Array:
+        made.append(manifold)
+        return honest(manifold, points, rng)
+
+    monkeypatch.setattr(further, "_steps", counted)
+    fg.solve(graph, {x: [[-5.0]]}, starts=1000, callback=lambda row: len(made) > 1)
+    assert len(made) == 2
 
 
 def test_a_callback_ends_all_starts() -> None:

@@ -6,6 +6,8 @@ member by member. The moves are as large as what the guess itself covers, so tha
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from unifg.lie import Manifold
@@ -18,23 +20,21 @@ WAVES = 3  # half waves along a family at most
 LONG = 5  # members from which on a family is taken for a trajectory
 
 
-def spread(program: CompiledProblem, guess: tuple[Values, Array, Array], count: int) -> list[Guess]:
-    """Starts around a guess, the same ones each time, within the bounds of the unknowns.
+def spread(program: CompiledProblem, guess: tuple[Values, Array, Array], count: int) -> Iterator[Guess]:
+    """Starts around a guess, the same ones each time, within the bounds of the unknowns; made one by one.
 
     Args:
-        program: the compiled graph, with its data bound.
-        guess: values, multipliers and penalties; the first of the starts.
-        count: of starts, 1 or more.
+        program: the compiled graph, with its data bound whenever a start is asked for.
+        guess: values, multipliers and penalties.
+        count: of starts.
     """
     rng, (values, multipliers, penalties) = np.random.default_rng(0), guess
-    starts = [Guess.stored(program, (values.flat.copy(), multipliers, penalties))]
-    for _ in range(count - 1):
+    for _ in range(count):
         moved = Values(program.columns, values.flat.copy())
         for family, points in moved.items():
             points[:] = family.manifold.retract(points, _steps(family.manifold, points, rng))
         program.retraction.fix(moved)
-        starts.append(Guess.stored(program, (program.within_bounds(moved).flat, multipliers, penalties)))
-    return starts
+        yield Guess.stored(program, (program.within_bounds(moved).flat, multipliers, penalties))
 
 
 def extent(manifold: Manifold, points: Array) -> Array:
