@@ -215,3 +215,16 @@ def test_a_cost_beyond_numbers_is_no_success() -> None:
     batch = prepared.solve_many(guess, data={slope: [1.0, 1e30]})
     assert batch.statuses == [prepared.solve(guess, data=batch.data_of(k)).status for k in range(2)]
     assert batch.statuses[1] is fg.Status.UNBOUNDED
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_numbers_that_a_function_captures_change_for_all_threads(threads: int) -> None:
+    graph, x = graph_with(fg.Rn(1), 1)
+    goal, most = graph.data("goal", [5.0]), np.array([1.0])
+    graph.minimize(lambda p, to: p - to, x, goal, name="to")
+    graph.constrain(lambda p: p - most, x, upper=0.0, name="most")
+    run, goals = InteriorPoint().prepare(graph), np.full((6, 1), 5.0)
+    for limit in (1.0, 2.0):
+        most[0] = limit
+        found = run.solve_many({x: [[0.0]]}, data={goal: goals}, threads=threads)
+        np.testing.assert_allclose(found[x].ravel(), limit, atol=1e-5)

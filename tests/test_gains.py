@@ -12,7 +12,8 @@ import unifg as fg
 from problems.control import Problem, Quadrotor, Stated, Unicycle
 from problems.graphs import graph_of
 from unifg.horizon import ControlCost, Dynamics, RecedingHorizon, Robot, Term
-from unifg.solvers import SQP, InteriorPoint
+from unifg.solution.solver import Prepared
+from unifg.solvers import KKT, SQP, InteriorPoint
 from unifg.typing import Array
 
 RNG = np.random.default_rng(0)
@@ -262,3 +263,23 @@ def test_a_soft_limit_that_is_kept_has_the_gains_of_a_hard_one() -> None:
         assert (np.abs(solution.dual("speed")) > 0.1).sum() > 2
         found.append(solution.gains(x, u))
     np.testing.assert_allclose(found[0], found[1], rtol=0.0, atol=1e-7)
+
+
+def test_gains_follow_numbers_that_a_function_captures() -> None:
+    def stated(weight: Array) -> tuple[Prepared, fg.Family, fg.Family]:
+        graph, x, u = graph_of(("x", fg.Rn(1), 4), ("u", fg.Rn(1), 3))
+        graph.fix(x[0], [1.0])
+        graph.minimize(lambda x: x * weight, x[1:], name="state")
+        graph.minimize(lambda u: u, u, name="effort")
+        graph.constrain(lambda x, u, y: y - x - u, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")
+        return KKT().prepare(graph), x, u
+
+    def gains(run: Prepared, x: fg.Family, u: fg.Family) -> Array:
+        return run.solve({x: np.zeros((4, 1)), u: np.zeros((3, 1))}).gains(x[:-1], u)
+
+    weight = np.array([1.0])
+    stage = stated(weight)
+    before = gains(*stage)
+    weight[0] = 3.0
+    np.testing.assert_allclose(gains(*stage), gains(*stated(np.array([3.0]))), atol=1e-12)
+    assert np.abs(gains(*stage) - before).max() > 0.1

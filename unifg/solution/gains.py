@@ -109,7 +109,9 @@ def unfixed(program: CompiledProblem, columns: IntArray, lin: Linearization) -> 
         known[dropped] = CompiledProblem(graph)
     twin = known[dropped]
     twin.bind({handle: value for handle, value in program.binding.present.items() if handle in twin.binding.present})
-    return twin, twin.linearize(twin.columns.values(lin.values))
+    values = twin.columns.values(lin.values)
+    twin.values_from(values.flat)  # functions are traced again that have changed since
+    return twin, twin.linearize(values)
 
 
 def _known(_: CompiledProblem) -> dict[frozenset[str], CompiledProblem]:

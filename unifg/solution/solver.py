@@ -225,6 +225,10 @@ class Prepared:
             rows = self.program.rows(data, count)
             if rows is None:
                 return None
+            self.program.bind({handle: value[0] for handle, value in data.items()})
+            self.program.values_from(guesses[0][0].copy())  # functions are traced again that have changed since
+            if not self.solves_each:
+                return None
             self.allocate()
             found = self.solver.solve_each(self._workspace, rows, *guesses)
             for k in range(SAMPLED - 1, count, SAMPLED):
