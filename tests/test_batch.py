@@ -140,6 +140,10 @@ def test_an_infeasible_instance_has_its_own_status() -> None:
             lambda run, guess, data, start: run.solve_many(guess, data={start: "here"}),
             "data 'start' of many instances must be real numbers, found 'here'",
         ),
+        (
+            lambda run, guess, data, start: run.solve_many([guess, guess, {}], data=data),
+            "instance 2: .*guess",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused(ask: Any, message: str) -> None:

@@ -8,8 +8,9 @@ solves.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import repeat
 from typing import NamedTuple, Protocol
 
@@ -183,9 +184,22 @@ def stacked_data(data: Mapping[Data, Numbers]) -> tuple[dict[Data, Array], int |
     return found, count
 
 
+@contextmanager
+def _of_instance(index: int) -> Iterator[None]:
+    """Say in errors whose guess or data they are about."""
+    try:
+        yield
+    except GraphError as error:
+        error.args = (f"instance {index}: {error}",)
+        raise
+
+
 def flat_guesses(prepared: Worker, guesses: AnyGuess | Sequence[AnyGuess]) -> tuple[Array, Array]:
     """(K or 1, S) stored values and (K or 1, M) multipliers of guesses, one for each instance or one for all."""
-    rows = [prepared.read(guess) for guess in (guesses if isinstance(guesses, Sequence) else [guesses])]
+    rows = []
+    for index, guess in enumerate(guesses if isinstance(guesses, Sequence) else [guesses]):
+        with _of_instance(index):
+            rows.append(prepared.read(guess))
     return np.stack([values.flat for values, *_ in rows]), np.stack([multipliers for _, multipliers, _ in rows])
 
 
@@ -209,11 +223,8 @@ def solve_batch(
         return batch
 
     def solve_one(index: int) -> None:
-        try:
+        with _of_instance(index):
             batch.take(index, prepared.solve(each[index], data=batch.data_of(index)))
-        except GraphError as error:
-            error.args = (f"instance {index}: {error}",)
-            raise
 
     solve_one(0)  # verified, as a first answer is
     left = np.arange(1, count)
