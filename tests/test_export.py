@@ -261,6 +261,14 @@ def test_the_program_of_the_page_plans(tmp_path: Path, monkeypatch: pytest.Monke
         assert line.split() == [str(plan.iterations), f"{plan[u][0, 0]:.17g}", f"{plan.cost:.17g}"]
 
 
+def test_every_export_begins_at_the_last_answer() -> None:
+    prepared, _ = ready(with_losses)
+    first, second = prepared.entry(), prepared.entry()
+    assert first.values.any() and first.multipliers.any()
+    np.testing.assert_array_equal(second.values, first.values)
+    np.testing.assert_array_equal(second.multipliers, first.multipliers)
+
+
 @pytest.mark.product(1, of="exports")
 def test_the_data_of_the_header_are_those_of_the_last_solve(tmp_path: Path) -> None:
     graph, guess, handle = around_a_disc()

@@ -122,8 +122,11 @@ class InteriorPoint(Solver):
 
     def entry(self, workspace: Workspace) -> Exported:
         """The compiled loop for one instance."""
-        last = workspace.work.values.copy(), workspace.work.multipliers.copy()
-        return Exported(workspace.entry(self), {word: ENDINGS[word] for word in each.WORDS}, *last)
+        work = workspace.work
+        last = work.values.copy(), work.multipliers.copy()
+        found = workspace.entry(self)
+        work.values[:], work.multipliers[:] = last  # for another export
+        return Exported(found, {word: ENDINGS[word] for word in each.WORDS}, *last)
 
     def workspace(self, program: CompiledProblem) -> Workspace:
         """Structure of the KKT matrix."""
