@@ -122,9 +122,12 @@ class CubicTrajectory:
         """Segments of (n,) moments [s] among this many control poses.
 
         Raises:
-            ModelError: naming a moment before the start, after the end or not finite, or too few control poses.
+            ModelError: naming a moment before the start, after the end or not finite; too few control poses; or moments
+                in a column or a table.
         """
         times = np.atleast_1d(doubles("trajectory: moments", times, error=ModelError))
+        if times.ndim > 1:
+            raise ModelError(f"trajectory: moments are (n,), found {times.shape}: np.ravel(moments)")
         if count < ORDER:
             raise ModelError(f"trajectory: {count} control poses hold no moment, {ORDER} the first interval")
         since = (times - self.start) / self.spacing

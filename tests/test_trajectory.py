@@ -117,6 +117,7 @@ def test_places_and_counts_of_controls() -> None:
         (lambda curve: curve.places([8.1], 9), "outside of 5 .. 8 s"),
         (lambda curve: curve.places([np.nan], 9), "outside"),
         (lambda curve: curve.places([5.0], 3), "hold no moment"),
+        (lambda curve: curve.at(np.zeros((9, 3)), [[5.1], [5.2], [5.3]]), r"moments are \(n,\), found \(3, 1\)"),
         (lambda curve: curve.controls(np.inf), "must be finite"),
         (lambda curve: curve.controls(np.nan), "must be finite"),
     ],
