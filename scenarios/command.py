@@ -39,7 +39,7 @@ from unifg.files.contents import legible
 from unifg.scenarios.commands.catalogue import FROM_FILES, SCENARIOS
 from unifg.scenarios.commands.extras import absent, remedy
 from unifg.scenarios.commands.outcome import Outcome, Progress
-from unifg.scenarios.options import Help, count, existing, settings_of
+from unifg.scenarios.options import Help, Unasked, count, existing, settings_of
 
 __all__ = ["main"]
 
@@ -335,7 +335,8 @@ def _run(chosen: argparse.Namespace) -> int:
     if chosen.stated:
         from unifg.scenarios.campaigns.stated_settings import Fields
 
-        settings = Fields(chosen.module.SETTINGS, Path.cwd()).restated(settings, chosen.stated)
+        asked = {name for name, value in vars(chosen).items() if not isinstance(value, Unasked)}
+        settings = Fields(chosen.module.SETTINGS, Path.cwd()).restated(settings, chosen.stated, asked)
     return _run_settings(chosen, chosen.module, settings, chosen.name)
 
 

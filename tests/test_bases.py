@@ -403,8 +403,12 @@ def test_any_setting_is_stated_by_its_name(capsys: pytest.CaptureFixture[str], t
         ("controller.margin=wide", "does not fit"),
         ("x", "="),
         ("latency=soon", "does not fit"),
+        ("seed=3", "--set seed=3: an option states seed, too"),
+        ("solver=alm", "an option states solver, too"),
+        ("controller.speed=0.4", "an option states controller.speed, too"),
     ):
-        assert main(["run", "navigation", "--set", word, "--out", str(tmp_path)]) == 2
+        options = ["--seed", "4", "--solver", "ipm", "--speed", "0.5"]
+        assert main(["run", "navigation", *options, "--set", word, "--out", str(tmp_path)]) == 2
         assert why in capsys.readouterr().err
 
 

@@ -13,7 +13,7 @@ import math
 import os
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
@@ -86,11 +86,16 @@ class Fields:
             made = replaced(made, path.split("."), value)
         return made
 
-    def restated(self, settings: S, words: Sequence[str]) -> S:
+    def restated(self, settings: S, words: Sequence[str], given_by_option: Collection[str] = ()) -> S:
         """Settings with other values, each stated as NAME=VALUE in the words of a campaign's file.
 
+        Args:
+            settings: with what options say.
+            words: of the command line.
+            given_by_option: paths of fields that an option has stated, which no word states once more.
+
         Raises:
-            ScenarioError: a word is none, or its value does not fit.
+            ScenarioError: a word is none, its value does not fit, or an option states that field, too.
         """
         for word in words:
             name, equals, text = word.partition("=")
@@ -101,6 +106,8 @@ class Fields:
             if not equals:
                 raise ScenarioError(f"--set {word}: give NAME=VALUE, such as controller.margin=0.3")
             path = self.named(name.strip(), "--set")
+            if path in given_by_option:
+                raise ScenarioError(f"--set {word}: an option states {path}, too; give one of the two")
             settings = replaced(settings, path.split("."), self.value(path, given, f"--set {word}"))
         return settings
 

@@ -51,8 +51,8 @@ class Scenario:
         if self.solvers:
             solvers = getattr(names, self.solvers)
             solver = next(f.default for f in fields(module.SETTINGS) if f.name == "solver")
-            about = f"{names.choices(solvers)} (default: %(default)s)"
-            parser.add_argument("--solver", choices=solvers, default=solver, help=about)
+            about = f"{names.choices(solvers)} (default: {solver})"
+            parser.add_argument("--solver", choices=solvers, default=argparse.SUPPRESS, help=about)
         parser.add_argument(
             "--out", type=Path, default=Path("out"), metavar="DIR", help="folder for results (default: %(default)s)"
         )
