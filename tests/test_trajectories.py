@@ -179,6 +179,21 @@ def test_euroc_times_that_run_backwards_are_named(tmp_path: Path, caplog: pytest
     assert found.time.tolist() == [0.0, -1.0] and "time runs backwards, here and 0 times more" in caplog.text
 
 
+@pytest.mark.parametrize(("unit", "named"), [("", "of 1 are"), ("000", "of 1000 are"), ("000000000", None)])
+def test_euroc_times_that_are_no_nanoseconds_are_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, unit: str, named: str | None
+) -> None:
+    read_euroc(put(tmp_path, "".join(f"{1403636580 + k}{unit},0,0,0,1,0,0,0\n" for k in range(3))))
+    assert ("read as nanoseconds" in caplog.text) is (named is not None) and (named or "") in caplog.text
+
+
+@pytest.mark.parametrize("read", [read_tum, read_kitti, read_euroc])
+def test_a_trajectory_without_poses_is_refused(tmp_path: Path, read: Callable[[Path], object]) -> None:
+    for text in ("", "# time and pose\n", "\n\n"):
+        with pytest.raises(FileFormatError, match="no line holds a pose"):
+            read(put(tmp_path, text))
+
+
 def test_evo_reads_what_is_written(tmp_path: Path, rng: np.random.Generator) -> None:
     """It asks for exactly eight, or twelve, fields with one blank between them."""
     evo = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")

@@ -35,10 +35,11 @@ def read_kitti(path: str | Path, limits: Limits = LIMITS) -> Array:
         (n, 7) poses of `unifg.SE3`.
 
     Raises:
-        FileFormatError: the file is missing, or a line (named in the message) is not twelve finite numbers with a
-            rotation among them.
+        FileFormatError: the file is missing or holds no pose, or a line (named in the message) is not twelve finite
+            numbers with a rotation among them.
     """
     rows = Table.read(path, 0, _FIELDS, limits)
+    rows.require_lines("a pose")
     matrices = rows.numbers.reshape(-1, 3, 4)
     rotations = matrices[:, :, :3]
     with np.errstate(all="ignore"):

@@ -23,7 +23,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, write_rows
 from unifg.files.text import Table
 from unifg.typing import Array
@@ -95,8 +94,7 @@ def read_mrclam(folder: str | Path, robot: int = 1, limits: Limits = LIMITS) -> 
     surveyed.distinct(surveyed.integers[:, 0], "landmark")
     surveyed.refuse(surveyed.numbers[:, 2:].min(axis=1) < 0.0, "a standard deviation is below zero")
     moves = Table.read(folder / f"Robot{robot}_Odometry.dat", 0, "time forward turning", limits)
-    if not len(moves):
-        raise FileFormatError(f"{moves.path}: no line holds odometry")
+    moves.require_lines("odometry")
     seen = Table.read(folder / f"Robot{robot}_Measurement.dat", 0, "time barcode range bearing", limits)
     seen.refuse(seen.numbers[:, 2] < 0.0, "the range is below zero")
     seen.refuse(np.abs(seen.numbers[:, 3]) > _TURN, "the bearing is beyond a turn: is it in radians?")

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, write_rows
 from unifg.files.text import Table
 from unifg.typing import Array
@@ -57,8 +56,7 @@ def read_plaza(odometry: str | Path, ranges: str | Path, limits: Limits = LIMITS
             numbers, a sender or beacon that is no whole number, or a range below zero; or there is no odometry.
     """
     moves = Table.read(odometry, 0, "time distance turn", limits)
-    if not len(moves):
-        raise FileFormatError(f"{moves.path}: no line holds odometry")
+    moves.require_lines("odometry")
     seen = Table.read(ranges, 0, "time sender beacon range", limits)
     seen.refuse(seen.numbers[:, 3] < 0.0, "the range is below zero")
     motion, order = moves.numbers[moves.in_time()], seen.in_time()

@@ -109,6 +109,15 @@ class Table:
             text = message if isinstance(message, str) else message(row)
             raise FileFormatError(f"{self.place(row)}: {text}")
 
+    def require_lines(self, what: str) -> None:
+        """Require that there is a line; ``what`` would stand in it.
+
+        Raises:
+            FileFormatError: there is none.
+        """
+        if not len(self):
+            raise FileFormatError(f"{self.path}: no line holds {what}")
+
     def distinct(self, names: NDArray[np.int64], what: str) -> None:
         """Require that every name (n,) is given once.
 

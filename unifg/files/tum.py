@@ -88,15 +88,16 @@ def read_tum(path: str | Path, limits: Limits = LIMITS) -> Trajectory:
         The trajectory, in the order of the file.
 
     Raises:
-        FileFormatError: the file is missing, or a line (named in the message) is not eight finite numbers
-            with a usable quaternion.
+        FileFormatError: the file is missing or holds no pose, or a line (named in the message) is not eight finite
+            numbers with a usable quaternion.
     """
     rows = Table.read(path, 0, _FIELDS, limits)
+    rows.require_lines("a pose")
     table = rows.numbers
     rows.remark_order()
-    if len(table) and abs(table[0, 0]) > _LATEST:
+    if abs(table[0, 0]) > _LATEST:
         logger.warning("%s: the time %g is read as seconds; divide nanoseconds by 1e9", rows.place(0), table[0, 0])
-    if len(table) and (np.abs(table[0, 4:]) == [1.0, 0.0, 0.0, 0.0]).all():
+    if (np.abs(table[0, 4:]) == [1.0, 0.0, 0.0, 0.0]).all():
         logger.warning(
             "%s: the scalar is read last, so that the body lies on its back; is it first here?", rows.place(0)
         )
