@@ -50,6 +50,7 @@ WORLDS = {
 OF_WORLD = ("step(control, dt)", "sense()", "discs()", "clearance()")
 CONFIRMATION = (4, 6)  # readings that show a cylinder before it is a landmark, and of how many, in clutter
 COLLISIONS = 3  # with so many a flight is given up
+ASTRAY = 10.0  # times as far from the target as the start is, a flight is given up
 
 logger = logging.getLogger("unifg")
 
@@ -208,7 +209,7 @@ class Flight:
             FlightLog, layout=world.layout, settings=settings.summary(), dt=dt, parameters_true=world.parameters.packed
         )
         self._control: Array | None = None
-        self._reached = self._landed = False
+        self._reached = self._landed = self._astray = False
         interrupted = run_ticks(round(settings.time_limit / dt), lambda number: self._tick(recorder), progress)
         return recorder.finish(
             collisions=world.collisions, reached=self._reached, interrupted=interrupted,
@@ -225,6 +226,8 @@ class Flight:
             return f"landed: {cause}"
         if self.world.collisions >= COLLISIONS:
             return "given up after collisions"
+        if self._astray:
+            return "given up far away from the target"
         return "timed out" + (f": {cause}" if cause else "")
 
     def _tick(self, recorder: Recorder[FlightLog]) -> tuple[float, str] | None:
@@ -240,11 +243,12 @@ class Flight:
         world.parameters = replace(empty, mass=load * empty.mass, wind=wind)
         world.step(self.faults.control(self._control, now), self.settings.controller.dt)
         self._landed = self.watch.lands and world.grounded
-        if self._landed or world.collisions >= COLLISIONS:
-            return None
         target, start = world.layout.target, world.layout.start
-        left = float(np.linalg.norm(target - world.state[:3]))
-        return 1.0 - left / float(np.linalg.norm(target - start)), f"{left:.1f} m to go"
+        left, whole = (float(np.linalg.norm(target - place)) for place in (world.state[:3], start))
+        self._astray = not left <= ASTRAY * whole  # also where it is nowhere
+        if self._landed or self._astray or world.collisions >= COLLISIONS:
+            return None
+        return 1.0 - left / whole, f"{left:.1f} m to go"
 
     @contextlib.contextmanager
     def _going_on(self) -> Iterator[None]:

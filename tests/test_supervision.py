@@ -32,7 +32,7 @@ from unifg.scenarios.perception.line_tracker import LineTracker
 from unifg.scenarios.perception.readings import Reading, Scan
 from unifg.scenarios.quadrotor.flight_watch import FlightWatch
 from unifg.scenarios.quadrotor.unmodelled import Unmodelled
-from unifg.scenarios.scenes.flight_plot import control
+from unifg.scenarios.scenes.flight_plot import control, estimates
 from unifg.scenarios.scenes.flight_scene import flight_scene
 from unifg.scenarios.simulation.air import QuadrotorWorld
 from unifg.scenarios.simulation.drivetrain import Drivetrain, Wheels
@@ -548,6 +548,15 @@ def test_a_landing_is_broken_off_when_all_is_well_again_but_not_near_the_floor(h
     assert watch.lands
     looked(watch, [reading()] * 20, here, 60)
     assert watch.verdict.health is not Health.LOST and watch.lands is lands
+
+
+@pytest.mark.product(2, of="drives and flights")
+def test_a_flight_that_a_gust_carries_away_is_given_up() -> None:
+    fault = one_of(FLIGHT_FAULTS)("gust=1e6@0.1")
+    log = Flight(FlightSettings(faults=(fault,), time_limit=1.0)).run(lambda done, text: None)
+    assert log.outcome == "given up far away from the target" and log.ticks <= 4
+    assert np.isfinite(log.truth).all() and not log.reached
+    estimates(log)
 
 
 @pytest.mark.product(2, of="drives and flights")
