@@ -110,7 +110,9 @@ class NavigationSettings(Settings):
     solver: str = "ipm"
     coupling: str = option("sequential", choices=("sequential", "joint"))
     obstacles: int = option(0, text=partial(count, most=200), metavar="K")
-    obstacle_radius: Positive[tuple[float, float]] = option((0.15, 0.25), text=pair, metavar="LO,HI")
+    obstacle_radius: Positive[tuple[float, float]] = option(
+        (0.15, 0.25), text=partial(pair, equal=True), metavar="LO,HI"
+    )
     mover_speed: float = option(0.3, text=positive, metavar="M/S")
     traffic: Traffic = field(default_factory=Traffic)
     seed: int = option(0, metavar="S")

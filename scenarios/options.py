@@ -346,11 +346,12 @@ def pose(text: str) -> tuple[float, ...]:
     return values
 
 
-def pair(text: str) -> tuple[float, ...]:
-    """Two numbers LO,HI, the first below the second."""
-    values = _numbers(text, 2, "LO,HI: expected two numbers [N], without blanks")
-    if not values[0] < values[1]:
-        raise argparse.ArgumentTypeError(f"{text!r}: the first number must be below the second")
+def pair(text: str, equal: bool = False) -> tuple[float, ...]:
+    """Two numbers LO,HI, the first below the second, or ``equal`` to it where it may be."""
+    values = _numbers(text, 2, "LO,HI: expected two numbers, without blanks")
+    if not (values[0] < values[1] or (equal and values[0] == values[1])):
+        beyond = "must not be above" if equal else "must be below"
+        raise argparse.ArgumentTypeError(f"{text!r}: the first number {beyond} the second")
     return values
 
 

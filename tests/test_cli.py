@@ -456,6 +456,17 @@ def test_fields_are_options() -> None:
             options_of(*wrong)
 
 
+def test_a_range_of_radii_may_be_one_radius(
+    navigation: FakeNavigation, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(tmp_path, "--obstacle-radius", "0.3,0.3") == 0
+    assert navigation.settings[0].obstacle_radius == (0.3, 0.3)
+    capsys.readouterr()
+    for word, why in (("0.3,0.2", "must not be above the second"), ("0.3", "expected two numbers, without blanks")):
+        assert run(tmp_path, "--obstacle-radius", word) == 2
+        assert why in capsys.readouterr().err
+
+
 def test_help_of_options_is_the_docstring(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         options_of("--help")

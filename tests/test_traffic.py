@@ -139,6 +139,7 @@ def test_obstacles_may_be_other_than_the_robot_expects() -> None:
         return np.asarray(Episode(settings, rehearsal=True).world.discs()[:, 2])
 
     assert 0.15 <= radii((0.15, 0.25)).min() and radii((0.15, 0.25)).max() <= 0.25
+    np.testing.assert_array_equal(radii((0.2, 0.2)), 0.2)
     assert 0.08 <= radii((0.08, 0.1)).min() and radii((0.08, 0.1)).max() <= 0.1
     with pytest.raises(ScenarioError, match=r"obstacle_radius.*not a positive number"):
         radii((0.0, 0.1))
