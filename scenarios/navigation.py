@@ -234,7 +234,7 @@ class Episode:
         settings = self.settings
         pilot: Pilot[Any] = make_pilot(
             settings.coupling, self.occupancy, self.distance_map, settings.solver, self.controller, pose, sigma,
-            self.world.lidar.beams,
+            self.world.lidar.beams, self.world.lidar.range_max,
         )  # fmt: skip
         of_planner, of_localiser = self._drawn.spawn(2)
         if settings.planner != MPC:

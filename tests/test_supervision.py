@@ -95,6 +95,14 @@ def test_a_scan_with_some_bad_beams_comes_in_without_them() -> None:
     assert found is not None and np.isinf(found.ranges[:300]).all(), "nothing within range is a measurement"
 
 
+def test_what_is_as_far_as_the_lidar_sees_is_no_measurement() -> None:
+    for reach, ranges, lets_in in ((8.0, 8.1, False), (8.0, 7.8, True), (12.0, 8.1, True)):
+        assert (Validator(BEAMS, reach).scan(scan(ranges), 1.0) is not None) is lets_in
+    pilot = Episode(replace(SHORT, lidar=LidarModel(range_max=4.0)), rehearsal=True).pilot
+    assert pilot.validator.scan(scan(4.1), 1.0) is None
+    assert pilot.validator.refused["lidar"] == "no beam came back (out of range)"
+
+
 def test_a_scan_once_more_is_none_only_for_a_robot_that_has_moved() -> None:
     validator, still = Validator(BEAMS), scan(3.0)
     assert validator.scan(still, 1.0) is not None

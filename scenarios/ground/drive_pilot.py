@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 from typing import Generic, TypeVar
 
@@ -89,6 +90,7 @@ class Pilot(Generic[PlannerT]):
         occupancy: OccupancyMap,
         distance_map: DistanceMap,
         beams: int,
+        range_max: float = math.inf,
     ) -> None:
         """Join what stands for itself."""
         s = controller.settings
@@ -97,7 +99,7 @@ class Pilot(Generic[PlannerT]):
         self.tracks = Tracks.none()
         self.clock = Stopwatch()
         self.pose = estimator.pose
-        self.validator, self.supervisor = Validator(beams), Supervisor(RAMPS)
+        self.validator, self.supervisor = Validator(beams, range_max), Supervisor(RAMPS)
         self.emergency_stop = EmergencyStop(s.hull, (float(s.most[0]) / s.dt, s.accelerations[1]), s.dt, s.kind)
         self.share, self.relocated, self.slowed, self.planless = 1.0, False, False, False
         self.driven = np.zeros(s.kind.size)
@@ -349,6 +351,7 @@ def make_pilot(
     pose: Array,
     sigma: Array,
     beams: int,
+    range_max: float = math.inf,
 ) -> Pilot[Controller]:
     """The pilot for a coupling.
 
@@ -361,6 +364,7 @@ def make_pilot(
         pose: (3,) believed at the start [m, m, rad].
         sigma: (3,) its standard deviations [m, m, rad].
         beams: number of beams in a scan.
+        range_max: of the lidar [m].
 
     Raises:
         BackendError: for an unknown solver.
@@ -372,4 +376,4 @@ def make_pilot(
     else:
         estimator = smoother = Smoother(distance_map, pose, sigma, beams, settings.dt, base=settings.kind)
         controller = Controller(distance_map, solver, settings, smoother.window)
-    return Pilot(estimator, controller, DiscTracker(distance_map), occupancy, distance_map, beams)
+    return Pilot(estimator, controller, DiscTracker(distance_map), occupancy, distance_map, beams, range_max)

@@ -19,6 +19,7 @@ __all__ = ["Validator", "first_true"]
 
 EARLY = 1e-6  # [s] by which a stamp may lie ahead of the clock
 MIN_RANGE, MAX_RANGE = 0.01, 10.0  # [m]; a beam from nearer has met nothing, a longer one says nothing about the map
+AT_MOST = 0.99  # of the lidar's own range; a longer reading means that nothing was hit
 MIN_BEAMS = 20  # between these that a scan must have
 MAX_AGE = 0.15  # [s]; an older scan says where the robot was, not where it is
 MOVED = (0.005, 0.005)  # [m, rad] after which a scan that repeats the last one, bit by bit, is none
@@ -34,11 +35,11 @@ class Validator:
         refused: what was wrong with the last sample of each sensor; no entry where it was let in.
     """
 
-    def __init__(self, beams: int = 0) -> None:
-        """Expect scans of so many beams."""
+    def __init__(self, beams: int = 0, range_max: float = math.inf) -> None:
+        """Expect scans of so many beams, of a lidar with some range [m]."""
         self.dropped: Counter[str] = Counter()
         self.refused: dict[str, str] = {}
-        self._beams = beams
+        self._beams, self._reach = beams, AT_MOST * range_max
         self._last: Array | None = None
         self._time = -math.inf
         self._since: Array = np.zeros(2)
@@ -63,7 +64,7 @@ class Validator:
         if ranges is None or angles is None or not np.isfinite(angles).all():
             return None, "not the size of a scan"
         stamp = now if scan.time is None else _number(scan.time)
-        measured = np.isfinite(ranges) & (ranges >= MIN_RANGE) & (ranges <= MAX_RANGE)
+        measured = np.isfinite(ranges) & (ranges >= MIN_RANGE) & (ranges <= min(MAX_RANGE, self._reach))
         wrong = first_true(
             (math.isnan(stamp), "its time is not a number"),
             (stamp > now + EARLY, "from the future"),
