@@ -170,6 +170,24 @@ def test_a_lag_in_seconds() -> None:
         smoother.update({x: [0.0]})
 
 
+def test_members_older_than_the_lag_are_refused_or_leave_at_once() -> None:
+    """Who took them was told a step later that a term was on a member that had left, and not why."""
+    for late in ("refuse", "drop"):
+        smoother, x = smoother_with(FixedLag(seconds=2.0, late=late), fg.Rn(1))
+        for k, time in enumerate([0.0, 3.0, 1.5]):  # the last is late, and in time
+            smoother.minimize(fg.prior, x[k], [0.0], sigma=1.0)
+            smoother.update({x: [0.0]}, time=time)
+        smoother.minimize(fg.prior, x[3], [0.0], sigma=1.0)
+        if late == "refuse":
+            with pytest.raises(GraphError, match=r"time 0.1 is 2.9 s before the newest, 3: .* does time run backwards"):
+                smoother.update({x: [0.0]}, time=0.1)
+            smoother.update({x: [0.0]}, time=3.1)
+            assert list(smoother.window(x).indices) == [1, 2, 3]
+        else:
+            smoother.update({x: [0.0]}, time=0.1)
+            assert list(smoother.window(x).indices) == [1, 2]
+
+
 def test_late_factors_are_refused_or_counted() -> None:
     for late in ("refuse", "drop"):
         smoother, x = smoother_with(FixedLag(2, late=late), fg.Rn(1))

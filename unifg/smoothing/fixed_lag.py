@@ -100,7 +100,7 @@ class FixedLag(Smoother):
 
         Raises:
             GraphError: as :meth:`Incremental.update`; also for a factor on a member that has left, when they are
-                refused, and for a missing or superfluous ``time``.
+                refused, and for a ``time`` that is missing, superfluous, or older than the lag.
         """
         if values and self._timed != (time is not None):
             raise GraphError(
@@ -110,6 +110,11 @@ class FixedLag(Smoother):
             )
         if time is not None and not np.isfinite(time):
             raise GraphError(f"FixedLag: time must be finite, found {time}")
+        if time is not None and time < self._newest - self.lag and not self._drop:
+            raise GraphError(
+                f"FixedLag: time {time:g} is {self._newest - time:g} s before the newest, {self._newest:g}: such "
+                f"members leave a lag of {self.lag:g} s at once; does time run backwards? late='drop' takes them"
+            )
         self._update(values, time, iterations)
         leaving = marginalize(self._memory, self._newest - self.lag, 1 if self._fixed else 2)
         for v in leaving.tolist():
