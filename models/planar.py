@@ -146,8 +146,19 @@ class Base:
         return self.rollout(pose, ramp(last, controls), dt)
 
     def _advance(self, x: Array, u: ArrayLike, dt: ArrayLike, moved: Array) -> None:
-        times = np.array(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)), order="C")
-        _advance_all(self.moving.address, x, _rows(u, moved, self.size), times, moved)
+        _advance_all(self.moving.address, x, _rows(u, moved, self.size), step_times(dt, len(moved)), moved)
+
+
+def step_times(dt: ArrayLike, count: int) -> Array:
+    """(count,) lengths of steps [s].
+
+    Raises:
+        ModelError: there are others than one or so many.
+    """
+    given = np.asarray(dt, dtype=np.float64)
+    if given.shape not in ((), (1,), (count,)):
+        raise ModelError(f"steps have one dt [s] for all or one for each of {count}; found shape {given.shape}")
+    return np.array(np.broadcast_to(given, count), order="C")
 
 
 def _same(u: Array) -> Array:
@@ -207,6 +218,8 @@ def _rows(part: ArrayLike, moved: Array, size: int) -> Array:
     array = np.asarray(part, dtype=np.float64)
     if array.ndim != 2 or array.shape[1] != size:
         raise ModelError(f"poses and controls of a base are (n, 3) and (n, m), here (n, {size}); got {array.shape}")
+    if len(array) not in (1, len(moved)):
+        raise ModelError(f"poses and controls of a base have as many rows, or one; got {len(array)} and {len(moved)}")
     return np.array(np.broadcast_to(array, (len(moved), size)), order="C")
 
 

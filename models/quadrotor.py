@@ -31,6 +31,7 @@ from unifg.factors.autodiff.stated import StatedKernel
 from unifg.factors.residuals import residual
 from unifg.lie import SO3, Product, Rn
 from unifg.models import quadrotor_dynamics
+from unifg.models.planar import step_times
 from unifg.models.quadrotor_dynamics import GRAVITY
 from unifg.models.rkmk import alike, require_substeps
 from unifg.typing import Array, ArrayLike
@@ -171,7 +172,8 @@ def step(x: ArrayLike, u: ArrayLike, dt: ArrayLike, parameters: Parameters) -> A
     """
     x, u = _rows(x, 10, "states"), _rows(u, 4, "controls")
     moved = np.empty((max(len(x), len(u)), 10))
-    quadrotor_dynamics.advance_all(_spread(x, moved), _spread(u, moved), _samples(dt, moved), parameters.packed, moved)
+    times = step_times(dt, len(moved))
+    quadrotor_dynamics.advance_all(_spread(x, moved), _spread(u, moved), times, parameters.packed, moved)
     return moved
 
 
@@ -185,7 +187,8 @@ def rollout(start: ArrayLike, u: ArrayLike, dt: ArrayLike, parameters: Parameter
     states = np.empty((len(u) + 1, 10))
     states[0] = start
     rest = states[1:]
-    quadrotor_dynamics.advance_all(states[:-1], _spread(u, rest), _samples(dt, rest), parameters.packed, rest)
+    times = step_times(dt, len(rest))
+    quadrotor_dynamics.advance_all(states[:-1], _spread(u, rest), times, parameters.packed, rest)
     return states
 
 
@@ -264,12 +267,9 @@ def _rows(given: ArrayLike, size: int, what: str) -> Array:
 
 def _spread(part: Array, moved: Array) -> Array:
     """One contiguous row per result."""
+    if len(part) not in (1, len(moved)):
+        raise ModelError(f"a quadrotor's states and controls are as many, or one; found {len(part)} and {len(moved)}")
     return np.array(np.broadcast_to(part, (len(moved), part.shape[1])), order="C")
-
-
-def _samples(dt: ArrayLike, moved: Array) -> Array:
-    """One sampling time per result."""
-    return np.array(np.broadcast_to(np.asarray(dt, dtype=np.float64), len(moved)), order="C")
 
 
 def _defect(

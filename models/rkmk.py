@@ -144,7 +144,7 @@ def alike(*parts: Array) -> list[Array]:
     """The same arrays, those of a single row repeated.
 
     Raises:
-        ModelError: one of them has no two axes.
+        ModelError: one of them has no two axes, or another number of rows.
     """
     if flat := [np.shape(part) for part in parts if len(np.shape(part)) < 2]:
         raise ModelError(
@@ -152,6 +152,8 @@ def alike(*parts: Array) -> list[Array]:
             "number for each step"
         )
     count = max(len(part) for part in parts)
+    if odd := [len(part) for part in parts if len(part) not in (1, count)]:
+        raise ModelError(f"states and inputs of a field have as many rows, or one; found {odd[0]} beside {count}")
     return [np.broadcast_to(part, (count, part.shape[1])) for part in parts]
 
 
@@ -193,7 +195,9 @@ def times(matrices: Array, vectors: Array) -> Array:
 # ---------------------------------------------------------------- simulation
 
 
-def advance(group: LieGroup, field: Field, x: Array, *inputs: Array, h: ArrayLike, method: Method = "rk4") -> Array:
+def advance(
+    group: LieGroup, field: Field, x: ArrayLike, *inputs: ArrayLike, h: ArrayLike, method: Method = "rk4"
+) -> Array:
     """One step of every state, (n, storage): the x_next at which the defect of :func:`integrator` vanishes.
 
     Explicit methods take it directly, implicit ones by Newton's method from a step of explicit Euler.
@@ -208,9 +212,16 @@ def advance(group: LieGroup, field: Field, x: Array, *inputs: Array, h: ArrayLik
 
     Raises:
         UnifgError: when Newton's method does not converge: the step is too long.
-        ModelError: on an unknown method.
+        ModelError: on an unknown method, or shapes that do not fit.
     """
-    return _advance(group, field, _tableau(method), x, inputs, h)
+    tableau = _tableau(method)
+    x, *held = alike(*(np.asarray(part, dtype=np.float64) for part in (x, *inputs)))
+    if x.shape[1] != group.storage or np.size(h) not in (1, len(x)):
+        raise ModelError(
+            f"advance takes states (n, {group.storage}) of {group.name}, inputs (n, k) and h, one or (n,); found "
+            f"{x.shape} and h {np.shape(h)}"
+        )
+    return _advance(group, field, tableau, x, held, h)
 
 
 def rollout(
@@ -245,6 +256,8 @@ def rollout(
     lengths = np.ravel(doubles("rollout: h", h)) / substeps
     even, rows = len(lengths) == 1, {len(part) for part in (*parts, lengths)}
     count = max(rows) if count is None else count
+    if not isinstance(count, int | np.integer) or count < 0:
+        raise ModelError(f"rollout takes a whole number of steps, 0 or more; found count={count!r}")
     if np.size(start) != group.storage or not rows <= {1, count}:
         found = ", ".join(str(np.shape(part)) for part in (start, *parts, h))
         raise ModelError(

@@ -171,6 +171,10 @@ def test_a_step_keeps_the_dynamics_and_goes_along_the_arc(name: str) -> None:
         base.step(x, u[:, :1], DT)
     with pytest.raises(ModelError, match="poses and controls of a base are"):
         base.rollout(x[0], u[0], DT)
+    with pytest.raises(ModelError, match=r"each of 9; found shape \(2,\)"):
+        base.step(x, u, [DT, DT])
+    with pytest.raises(ModelError, match="as many rows, or one; got 2 and 9"):
+        base.step(x, u[:2], DT)
 
 
 def test_a_car_turns_about_its_radius_and_not_on_the_spot() -> None:

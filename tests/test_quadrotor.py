@@ -196,6 +196,9 @@ def test_wrong_shapes_are_refused() -> None:
     wrong: dict[str, Callable[[], object]] = {
         r"states have shape \(n, 10\), found \(10,\)": lambda: quadrotor.step(x[0], u, 0.1, CALM),
         r"controls have shape \(n, 4\)": lambda: quadrotor.rollout(x[0], u[:, :3], 0.1, CALM),
+        r"steps have one dt .* each of 3; found shape \(2,\)": lambda: quadrotor.step(x, u, [0.1, 0.1], CALM),
+        r"found shape \(3, 1\)": lambda: quadrotor.rollout(x[0], u, np.full((3, 1), 0.1), CALM),
+        "as many, or one; found 2 and 3": lambda: quadrotor.step(x, u[:2], 0.1, CALM),
         r"state has shape \(10,\)": lambda: quadrotor.fly(x, u[0], 0.1, CALM),
         r"noise has shape \(6,\)": lambda: quadrotor.fly(x[0], u[0], 0.1, CALM, np.zeros(3)),
         "a whole number of substeps, 1 or more; found 0": lambda: quadrotor.fly(x[0], u[0], 0.1, CALM, substeps=0),

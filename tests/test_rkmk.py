@@ -92,6 +92,26 @@ def test_a_simulation_takes_a_step_for_each_row(form: Method, count: int) -> Non
         rkmk.rollout(fg.SE2, current, START[0], u, h=lengths[:2], method=form)
 
 
+@pytest.mark.parametrize("form", ["rk4", "implicit midpoint"])
+def test_what_is_no_step_is_refused(form: Method) -> None:
+    """These were errors of NumPy about shapes that nobody had given."""
+    take: dict[str, Any] = {"h": 0.1, "method": form}
+    moved = rkmk.advance(fg.SE2, current, [[0.0, 0.0, 0.0]], [[1.0, 0.2]], **take)
+    same = rkmk.advance(fg.SE2, current, np.zeros((1, 3)), np.array([[1.0, 0.2]]), **take)
+    np.testing.assert_array_equal(moved, same)
+    for count in (-1, 2.5):
+        with pytest.raises(fg.ModelError, match=f"a whole number of steps, 0 or more; found count={count}"):
+            rkmk.rollout(fg.SE2, current, START[0], [1.0, 0.2], count=count, **take)  # type: ignore[arg-type]
+    for x, u, h, words in (
+        (np.zeros(3), np.ones((1, 2)), 0.1, r"have rows, found shape \(3,\)"),
+        (np.zeros((3, 3)), np.ones((2, 2)), 0.1, "found 2 beside 3"),
+        (np.zeros((3, 4)), np.ones((3, 2)), 0.1, r"states \(n, 3\) of SE2.* found \(3, 4\) and h \(\)"),
+        (np.zeros((3, 3)), np.ones((3, 2)), [0.1, 0.1], r"one or \(n,\); found \(3, 3\) and h \(2,\)"),
+    ):
+        with pytest.raises(fg.ModelError, match=words):
+            rkmk.advance(fg.SE2, current, x, u, h=h, method=form)
+
+
 def test_midpoint_model_is_close_but_not_the_same() -> None:
     """Bazzana's kinematics takes the chord v h for the arc: it differs from Exp by v h (1 - sinc(omega h / 2))."""
     x, u, h = np.zeros((1, 3)), np.array([[1.0, 1.0]]), 0.1
