@@ -22,6 +22,7 @@ from problems import short_walks
 from unifg.errors import ScenarioError
 from unifg.scenarios import command
 from unifg.scenarios.campaigns import campaign as campaigns
+from unifg.scenarios.campaigns import replay as replaying
 from unifg.scenarios.campaigns import task
 from unifg.scenarios.campaigns.campaign import Campaign, run_campaign
 from unifg.scenarios.campaigns.journal import Journal, lines_of
@@ -45,7 +46,8 @@ def walks(seeds: object = (0, 1, 2), base: Path | str = ".", **entries: Any) -> 
 @pytest.fixture(autouse=True)
 def _one_code(monkeypatch: pytest.MonkeyPatch) -> None:
     """The digest of everything takes seconds; a test that is about it sets another one."""
-    monkeypatch.setattr(campaigns, "code_of", lambda statement: "now")
+    for module in (campaigns, replaying):
+        monkeypatch.setattr(module, "code_of", lambda statement: "now")
 
 
 def run(statement: Statement, folder: Path, **options: Any) -> Campaign:
@@ -417,7 +419,12 @@ def test_a_cluster_runs_a_campaign(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- the command
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(campaigns, "Workers", Threads)
     file, out = tmp_path / "fast.toml", tmp_path / "out"
     file.write_text(f'scenario = "{WALKS}"\nseeds = [1, 2]\n[grid]\nbehaviour = ["walk", "fail"]\n')
@@ -429,7 +436,10 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
     assert "note: the campaign has changed since it was begun here (grid, seeds)" in capsys.readouterr().out
     (key,) = json.loads((out / campaigns.MANIFEST).read_text())["keys"]
     assert command.main(["replay", str(out), key[:6]]) == 0
-    assert (out / "replay" / key[:6] / "walk.txt").is_file()
+    assert (out / "replay" / key[:6] / "walk.txt").is_file() and "other code" not in caplog.text
+    monkeypatch.setattr(replaying, "code_of", lambda statement: "0123")
+    assert command.main(["replay", str(out), key]) == 0
+    assert f"{key} was run by other code (now, now 0123): its numbers may differ" in caplog.text
     for words, message in (
         (["replay", str(out), "zzz"], "no episode 'zzz' is on file"),
         (["replay", str(tmp_path), key], "holds no campaign"),
