@@ -56,6 +56,8 @@ def test_a_file_holds_the_same_numbers(tmp_path: Path, name: str) -> None:
         ("1 1 1\n0 0 1.0 2.0\n" + "1\n" * 11, "holds 18 numbers, where 1 cameras, 1 points and 1 observations are 19"),
         ("1 1 1\n0 0 1.0 2.0\n" + "1\n" * 11 + "one\n", "line 14: 'one' is no finite number"),
         ("1 1 1\n0 0 nan 2.0\n" + "1\n" * 12, "line 2: 'nan' is no finite number"),
+        ("1 1 1\n0 0 1_5 2.0\n" + "1\n" * 12, "line 2: '1_5' is no finite number"),
+        ("1 1 1\n0 0 \u0663 2.0\n" + "1\n" * 12, "line 2: '\u0663' is no finite number"),
     ],
 )
 def test_a_wrong_file_is_named_with_its_line(tmp_path: Path, content: str, said: str) -> None:

@@ -145,7 +145,8 @@ def test_other_units_are_no_log(log: RangeLog, tmp_path: Path, ranges: float, po
         ("time,x,y,theta,0.1\n0,0,0,zero,1\n", "row 1 is not 5 numbers"),
         ("time,x,y,theta,0.1\n0,0,0,0,1\n", "at least two scans"),
         ("time,x,y,theta\n0,0,0,0\n1,0,0,0\n", "at least two scans"),
-        ("time,x,y,theta,0.1\n0,0,0,inf,1\n1,0,0,0,1\n", "finite times and poses"),
+        ("time,x,y,theta,0.1\n0,0,0,0,1\n1,0,0,inf,1\n", "row 2: theta is inf, not finite"),
+        ("time,x,y,theta,-5,0,5\n0,0,0,0,1,1,1\n1,0,0,0,1,1,1\n", "beams 10 rad apart are more than a turn"),
         ("time,x,y,theta,-90,90\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "-90 is no direction of a beam"),
         ("time,x,y,theta,0,nan\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "nan is no direction"),
         ("time,x,y,theta,x,0\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "the header has 'x' twice"),
@@ -155,6 +156,31 @@ def test_a_table_that_is_none_is_refused(tmp_path: Path, text: str, said: str) -
     (tmp_path / "log.csv").write_text(text)
     with pytest.raises(FileFormatError, match=said):
         read_range_log(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize("turning", [0.0, 0.02, 0.3])
+def test_headings_in_degrees_are_refused_by_where_the_way_goes(tmp_path: Path, turning: float) -> None:
+    """They turned by less than a turn between two scans, and were radians without a word."""
+    heading = 0.3 + turning * np.arange(200)
+    way = np.cumsum(0.05 * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    for factor in (1.0, 180.0 / math.pi):
+        poses = np.column_stack([way - 0.05 * np.stack([np.cos(heading), np.sin(heading)], axis=1), factor * heading])
+        log = RangeLog("log", 0.1 * np.arange(200.0), np.array([-0.1, 0.1]), np.full((200, 2), 3.0), poses, poses)
+        write_csv(tmp_path / "log.csv", log)
+        if factor > 1.0 and turning:
+            with pytest.raises(FileFormatError, match="where headings of degrees point: radians are read"):
+                read_range_log(tmp_path / "log.csv")
+        else:
+            assert len(read_range_log(tmp_path / "log.csv")) == 200
+
+
+def test_columns_that_are_left_out_are_named(log: RangeLog, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_csv(tmp_path / "log.csv", log)
+    assert read_range_log(tmp_path / "log.csv").corrected is not None and "left out" not in caplog.text
+    text = (tmp_path / "log.csv").read_text()
+    (tmp_path / "log.csv").write_text(text.replace("corrected_theta", "corrected_heading"))
+    assert read_range_log(tmp_path / "log.csv").corrected is None
+    assert "names are no directions: 'corrected_x', 'corrected_y', 'corrected_heading'" in caplog.text
 
 
 def carmen(path: Path, log: RangeLog, laser: Array, robot: Array, odometry: Array | None) -> None:

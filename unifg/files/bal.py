@@ -33,8 +33,10 @@ def read_bal(path: str | Path, limits: Limits = LIMITS) -> BundleAdjustment:
     name, text = legible(path), read_text(path, limits)
     words = text.split()
     try:
-        numbers = np.array(words, dtype=np.float64)
+        numbers = np.array(words if text.isascii() and "_" not in text else [], dtype=np.float64)
     except ValueError:
+        numbers = np.zeros(0)
+    if not len(numbers):
         numbers = np.array([_number(word) for word in words])
     wrong = np.flatnonzero(~np.isfinite(numbers))
     if wrong.size:
@@ -88,9 +90,9 @@ def write_bal(path: str | Path, problem: BundleAdjustment) -> Path:
 
 
 def _number(word: str) -> float:
-    """Value of a word, NaN where it is no number."""
+    """Value of a word, NaN where it is no number; ``1_000`` and the digits of other scripts are for programs."""
     try:
-        return float(word)
+        return float(word) if word.isascii() and "_" not in word else np.nan
     except ValueError:
         return np.nan
 

@@ -77,6 +77,8 @@ class RangeLog:
             raise FileFormatError(f"{self.name}: at least two scans with finite times and poses make a log")
         if odd := [angle for angle in self.angles.tolist() if not abs(angle) <= ROUND]:
             raise FileFormatError(f"{self.name}: {odd[0]:g} is no direction of a beam; directions are in radians")
+        if (width := float(np.ptp(self.angles))) > ROUND:
+            raise FileFormatError(f"{self.name}: beams {width:g} rad apart are more than a turn; are they in radians?")
 
     def __len__(self) -> int:
         """Number of scans."""
@@ -190,7 +192,14 @@ def _in_order(
         if stated or longest > max(OFTEN * len(seen), PEAK * (shorter - longest)):
             ranges = np.where(ranges > AT_MOST * top, np.inf, ranges)
     turns, half = np.abs(np.diff(odometry[:, 2])), np.median(seen) if len(seen) else 0.0
+    driven = np.arctan2(*np.diff(odometry[:, 1::-1], axis=0).T)
+    ahead = [  # 1 for who drives where headings point, or away from it, in radians, and in degrees
+        float(steps @ np.cos(2.0 * (driven - heading))) / max(float(steps.sum()), SLOWEST)
+        for heading in (odometry[:-1, 2], np.radians(odometry[:-1, 2]))
+    ]
+    whole = bool(np.ptp(odometry[:, 2]) > ROUND)
     units = (
+        (whole and ahead[0] < 0.5 and ahead[1] > 0.9, "the way goes where headings of degrees point: radians"),
         (way > max(1.0, FASTEST * lasted / unit), f"{way:g} m are driven in {lasted / unit:g} s: metres and seconds"),
         ((turns > ROUND).sum() > 1, f"headings turn by up to {turns.max(initial=0.0):g} between two scans: radians"),
         (half > FARTHEST, f"half of the ranges are beyond {half:g}: metres"),
@@ -219,9 +228,16 @@ def _table(path: Path, limits: Limits) -> RangeLog:
         if len(row) != len(header) or None in found:
             raise FileFormatError(f"{name}: row {number + 1} is not {len(header)} numbers, as in the header")
         values[number] = found
+    poses = ["time", *POSE]
     corrected = [f"corrected_{word}" for word in POSE]
     columns = {word: k for k, word in enumerate(header)}
     reference = values[:, [columns[word] for word in corrected]] if set(corrected) <= set(header) else None
+    poses += corrected if reference is not None else []
+    if left := [word for k, word in enumerate(header) if word not in poses and k not in beams]:
+        logger.warning("%s: columns left out, whose names are no directions: %s", name, ", ".join(map(repr, left[:5])))
+    for word in poses:
+        if (lost := np.flatnonzero(~np.isfinite(values[:, columns[word]]))).size:
+            raise FileFormatError(f"{name}: row {lost[0] + 1}: {word} is {values[lost[0], columns[word]]}, not finite")
     angles, odometry = np.array([float(header[k]) for k in beams]), values[:, [columns[word] for word in POSE]]
     return _in_order(name, values[:, columns["time"]], angles, values[:, beams], np.inf, odometry, reference)
 
