@@ -105,6 +105,7 @@ def test_what_is_wrong_is_named_with_its_line(read: object, content: bytes, mess
         (swapped(YAML, b"-1.0", b"1.0e+300"), "no map of a place"),
         (swapped(YAML, b"0.05", b"[" * 5000 + b"]" * 5000), "a word of 10000 characters"),
         (swapped(YAML, b"0.05", b"[ " * 5000 + b"] " * 5000), "line 3: nested too deeply"),
+        (YAML + b"\nresolution: 0.1\n", "the key 'resolution' is given twice"),
         (
             swapped(YAML, b"negate: 0", b"negate: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]"),
             "an alias, of which a map",

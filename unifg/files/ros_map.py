@@ -221,6 +221,10 @@ def _read_header(path: Path, limits: Limits) -> dict[str, Any]:
                 what = "nested too deeply" if depth > limits.depth else "an alias, of which a map has none"
                 raise FileFormatError(f"{name}, line {event.start_mark.line + 1 if event.start_mark else 1}: {what}")
         header = yaml.safe_load(text)
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        keys = [key.value for key, _ in node.value] if isinstance(node, yaml.MappingNode) else []
+        if twice := [key for k, key in enumerate(keys) if key in keys[:k]]:
+            raise FileFormatError(f"{name}: the key {twice[0]!r} is given twice")
     except FileFormatError:
         raise
     except Exception as error:  # beside its own, PyYAML lets out what dates, numbers and tags that are none raise
