@@ -174,6 +174,23 @@ def test_an_uncertain_robot_keeps_farther_off() -> None:
     assert heard[0] - heard[1] == pytest.approx(SETTINGS.sigmas * 0.1)
 
 
+def test_a_planner_may_write_into_what_it_is_given() -> None:
+    """One that laid the reference on the robot, in place, moved the estimate of the localiser."""
+
+    class Local(PurePursuit):
+        def control(self, now: Situation) -> Array | None:
+            for part in (now.pose, now.applied, now.reference):
+                part -= 1e3
+            return np.array([0.1, 0.0])
+
+    given = PlannerContext(hall(), SETTINGS, np.random.default_rng(0))
+    own, pose, reference = PlannerAdapter(Local(given), given), START.copy(), straight(START)
+    plan = own.plan(pose, reference, discs())
+    np.testing.assert_array_equal(pose, START)
+    np.testing.assert_array_equal(reference, straight(START))
+    np.testing.assert_allclose(plan.states[0], START)
+
+
 @pytest.mark.product(1)
 @pytest.mark.parametrize("name", OTHERS)
 def test_a_goal_is_reached_with_its_heading(name: str) -> None:

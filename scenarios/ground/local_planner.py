@@ -159,10 +159,11 @@ class PlannerAdapter:
             ScenarioError: the planner returned something else than finite controls (2,) or (K, 2), or None.
         """
         begin, s = time.perf_counter(), self.settings
-        self.estimate = np.asarray(pose, dtype=np.float64)
+        self.estimate = np.array(pose, dtype=np.float64)
         variance = 0.0 if covariance is None else float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
         doubt = s.sigmas * float(np.sqrt(max(variance, 0.0)))
-        now = Situation(self.estimate, self.applied, reference, tracks, self._walls, s, doubt)
+        lent, held, way = self.estimate.copy(), self.applied.copy(), reference.copy()  # which it may write into
+        now = Situation(lent, held, way, tracks, self._walls, s, doubt)
         answer = self.planner.control(now)
         size = s.kind.size
         wanted = np.zeros((1, size)) if answer is None else np.atleast_2d(np.asarray(answer, dtype=np.float64))
