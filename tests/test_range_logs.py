@@ -632,6 +632,17 @@ def test_odometry_is_made_of_corrected_poses(made: Path) -> None:
 
 
 @pytest.mark.product(1, of="large maps")
+def test_an_image_that_a_run_has_written_is_none_of_another_run(
+    log: RangeLog, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    few = RangeLog("log", log.time[:3], log.angles, log.ranges[:3], log.odometry[:3])
+    write_csv(tmp_path / "log.csv", replace(few, corrected=few.odometry))
+    for _ in range(2):
+        assert main(["map", str(tmp_path / "log.csv"), "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr()
+    assert str(tmp_path / "out" / "map.pgm") in said.out and "has not written" not in said.err
+
+
 def test_an_interrupt_leaves_the_map_so_far(log: RangeLog) -> None:
     def stop(done: float, text: str) -> None:
         if done > 0.3:

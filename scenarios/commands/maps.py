@@ -20,6 +20,7 @@ def run(settings: log_map.MapSettings, progress: Progress) -> Outcome:
         made,
         {
             "map.yaml": lambda path: save_map(path, made.occupancy),
+            "map.pgm": lambda path: path,  # which is there, as the image of the one before
             "graph.g2o": lambda path: write_g2o(path, graph),
         },
     )
