@@ -63,7 +63,8 @@ def check_answer(graph: Model, path: str | os.PathLike[str], tolerance: float = 
     except OSError as error:
         raise FileFormatError(f"{os.fspath(path)}: {error.strerror or error}") from error
     except (ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise FileFormatError(f"{os.fspath(path)} is no file of arrays as solution.save writes it: {error}") from error
+        why = "" if "pickle" in str(error) else f": {error}"  # NumPy advises to load whatever it is
+        raise FileFormatError(f"{os.fspath(path)} is no file of arrays as solution.save writes it{why}") from error
     program = idle_problem(graph)
 
     def take(name: str, shape: tuple[int, ...]) -> Array:
@@ -72,7 +73,8 @@ def check_answer(graph: Model, path: str | os.PathLike[str], tolerance: float = 
         array = found.pop(name)
         if array.shape != shape or array.dtype.kind not in "bif":
             raise FileFormatError(
-                f"{os.fspath(path)}: '{name}' is {array.dtype} of shape {array.shape}, in this graph of shape {shape}"
+                f"{os.fspath(path)}: '{name}' is {array.dtype} of shape {array.shape}, in this graph of shape {shape}, "
+                "of real numbers"
             )
         return np.array(array, dtype=np.float64)
 
