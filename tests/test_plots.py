@@ -179,6 +179,15 @@ def test_the_limit_between_both_drawings(count: Any) -> None:
     assert len(marks(graph.draw(), "o")) == (count if 2 * count <= factor_graph.NODES else 1)
 
 
+@pytest.mark.parametrize("name", ["$\\undefined$", "a$^$b$", "$", "$\\theta$"])
+def test_names_may_hold_dollars(name: str) -> None:
+    graph = fg.Graph()
+    x = graph.variables(name, fg.Rn(1), 2)
+    graph.minimize(fg.prior, x, [1.0], sigma=1.0, name=name)
+    for figure in (graph.draw(), fg.solve(graph, {x: np.zeros((2, 1))}).plot()):
+        figure.canvas.draw()
+
+
 def test_odd_graphs_are_drawn() -> None:
     with pytest.raises(fg.ViewError, match="no variables"):
         fg.Graph().draw()

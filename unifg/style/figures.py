@@ -75,6 +75,20 @@ def new_figure(size: tuple[float, float], ticks: int = 1) -> Iterator[Figure]:
         figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(figure)
         yield figure
+        _spell(figure)
+
+
+def _spell(figure: Figure) -> None:
+    """Take dollars for dollars where they enclose no formula, as a name may hold what it likes."""
+    from matplotlib.mathtext import MathTextParser
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        if text.get_text().count("$") > 1:
+            try:
+                MathTextParser("agg").parse(text.get_text())
+            except ValueError:
+                text.set_parse_math(False)
 
 
 def new_axes(ax: Axes | None) -> Axes:
