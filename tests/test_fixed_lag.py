@@ -171,7 +171,7 @@ def test_a_lag_in_seconds() -> None:
 
 
 def test_members_older_than_the_lag_are_refused_or_leave_at_once() -> None:
-    """Who took them was told a step later that a term was on a member that had left, and not why."""
+    """They were taken, and the next term on one of them was refused as on a member that had left, without a why."""
     for late in ("refuse", "drop"):
         smoother, x = smoother_with(FixedLag(seconds=2.0, late=late), fg.Rn(1))
         for k, time in enumerate([0.0, 3.0, 1.5]):  # the last is late, and in time

@@ -164,9 +164,12 @@ class Canvas:
         """Discs (n, 3) x, y, radius [m] on the ground; with a height [m], upright cylinders from ``base`` up.
 
         Raises:
-            ViewError: the shape is another, or a number is not finite.
+            ViewError: the shape is another, a number is not finite, or a radius below zero.
         """
         discs = _rows(name, rows, (3,), "disc", "discs are (n, 3) x, y, radius [m]")
+        if (below := np.flatnonzero(discs[:, 2] < 0.0)).size:
+            k = int(below[0])
+            raise ViewError(f"'{name}': disc {k} has a radius of {discs[k, 2]:g} m", index=k)
         self._content.layer(name, "disc" if opacity == 1.0 else "ghost", colour, legend)
         given = {"rows": discs, "height": height, "base": base, "opacity": opacity}
         low, high = discs - discs[:, 2:], discs + discs[:, 2:]
@@ -232,10 +235,13 @@ class Canvas:
         """Triangles, as made by `unifg.view.shapes`: vertices (n, 3) [m] and faces (m, 3).
 
         Raises:
-            ViewError: a vertex is not finite.
+            ViewError: a vertex is not finite, or a face is not three numbers of vertices.
         """
-        vertices = np.asarray(mesh[0], dtype=np.float64)
+        vertices, faces = np.asarray(mesh[0], dtype=np.float64), np.asarray(mesh[1])
         finite(name, vertices, "vertex")
+        whole = faces.ndim == 2 and faces.shape[1] == 3 and faces.dtype.kind in "iu"
+        if not whole or (faces.size and not 0 <= faces.min() <= faces.max() < len(vertices)):
+            raise ViewError(f"'{name}': faces are (m, 3) numbers of its {len(vertices)} vertices, from 0")
         self._content.layer(name, swatch, colour, legend)
         given = {"mesh": mesh, "lit": lit, "opacity": opacity}
         self._drawn[name] = Thing(things.draw_mesh, given, np.stack([vertices.min(axis=0), vertices.max(axis=0)]))
