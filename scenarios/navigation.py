@@ -325,7 +325,10 @@ class Episode:
             self._dead_reckoning = self.controller.kind.step(self._dead_reckoning[None], moved[None], dt)[0]
             self._driven += float(np.hypot(*moved[:2]) if self.controller.kind.slides else abs(moved[0])) * dt
             odometry = faults.odometry(measured, now)
-        told, beams = self.world.scan(), (len(self.world.lidar.angles),)
+        directions = self.world.lidar.angles
+        told, beams = self.world.scan(), (len(directions),)
+        if told is None:  # of a user's world, whose lidar has not answered
+            told = Scan(directions, np.full(beams, np.nan))
         true_scan = Scan(_told("scan", told.angles, beams), _told("scan", told.ranges, beams), told.time, told.turn)
         self.pilot.planless = faults.hold("solver-timeout", now)
         seen = faults.scan(true_scan, now)

@@ -91,6 +91,10 @@ class Unplugged(World):
     def scan(self):
         raise TimeoutError("no scan came")
 
+class Silent(World):
+    def scan(self):
+        return super().scan() if self.time < 0.25 else None
+
 class Unsaid(World):
     def odometry(self):
         return [float("nan")] * 2
@@ -258,6 +262,13 @@ def test_a_world_that_says_nothing_of_its_wheels_leaves_a_record(own: Path) -> N
     settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), world="my_planners:Unsaid")
     log = Episode(settings, rehearsal=True).run(stop_after(5))
     assert np.isfinite(log.dead_reckoning).all() and log.dropped
+
+
+def test_a_world_without_a_scan_leaves_a_record(own: Path) -> None:
+    settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), world="my_planners:Silent")
+    log = Episode(settings, rehearsal=True).run(stop_after(5))
+    assert np.isfinite(log.scan[:3]).any() and np.isnan(log.scan[3:]).all()
+    assert log.dropped == {"lidar: no beam came back (not numbers)": 2}
 
 
 def test_a_world_may_answer_in_lists_of_the_right_length(own: Path) -> None:
