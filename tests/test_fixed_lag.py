@@ -181,6 +181,8 @@ def test_members_older_than_the_lag_are_refused_or_leave_at_once() -> None:
         if late == "refuse":
             with pytest.raises(GraphError, match=r"time 0.1 is 2.9 s before the newest, 3: .* does time run backwards"):
                 smoother.update({x: [0.0]}, time=0.1)
+            with pytest.raises(GraphError, match="such members leave a lag of 2 s at once"):
+                smoother.update({x: [0.0]}, time=1.0)
             smoother.update({x: [0.0]}, time=3.1)
             assert list(smoother.window(x).indices) == [1, 2, 3]
         else:

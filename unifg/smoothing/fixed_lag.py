@@ -110,7 +110,7 @@ class FixedLag(Smoother):
             )
         if time is not None and not np.isfinite(time):
             raise GraphError(f"FixedLag: time must be finite, found {time}")
-        if time is not None and time < self._newest - self.lag and not self._drop:
+        if time is not None and time <= self._newest - self.lag and not self._drop:
             raise GraphError(
                 f"FixedLag: time {time:g} is {self._newest - time:g} s before the newest, {self._newest:g}: such "
                 f"members leave a lag of {self.lag:g} s at once; does time run backwards? late='drop' takes them"
