@@ -49,9 +49,11 @@ def judge(graph: fg.Graph, solution: fg.Solution, data: dict[Data, Array] | None
     most = max(float(np.abs(gradient).max(initial=0.0)), float(bend.max(initial=0.0)))
     least = most if 0.0 < most < 1.0 else 1.0  # size of costs
     duals = _duals(graph, solution)
-    scale = max(least, float(np.abs(duals).mean()) / 100.0) if len(duals) else least
+    force = float(np.abs(duals).mean()) / 100.0 if len(duals) else 0.0
+    worth = max(least, min(1.0, float((gradient**2 / np.where(bend > 0.0, bend, np.inf)).max(initial=0.0))))
+    scale, worth = max(least, force), max(worth, force)
     # Or relative, to a hundredth of the largest of what a gradient is a sum of.
-    sizes, shares = np.maximum(0.01 * np.abs(gradient), scale), np.full(len(duals), 1.0 / scale)
+    sizes, shares = np.maximum(0.01 * np.abs(gradient), scale), np.full(len(duals), 1.0 / worth)
     if len(duals):
         columns = [(_g(graph, _at(values, m, STEP), data) - _g(graph, _at(values, m, -STEP), data)) for m in moved]
         slopes = np.array(columns) / (2.0 * STEP)

@@ -65,6 +65,19 @@ def far_units() -> tuple[fg.Graph, Guess, Guess]:
     return graph, guess, _moved(guess, 0.2)
 
 
+def priced() -> tuple[fg.Graph, Guess, Guess]:
+    """Controls with a price that is no square, along equalities."""
+    graph, x, u = graph_of(("x", fg.Rn(1), 6), ("u", fg.Rn(1), 5))
+    graph.fix(x[0], [2.0])
+    graph.minimize_scalar(lambda u: np.sqrt(1.0 + u[:, 0] ** 2) + u[:, 0], u, name="general")
+    graph.minimize(lambda x: x, x[1:], sigma=0.5, name="state")
+    motion = fg.residual(lambda x, u, y: y - x - 0.5 * np.sin(x) - u)
+    graph.constrain(motion, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")
+    graph.bound(u, lower=-1.0, upper=1.0)
+    guess = {x: np.full((6, 1), 2.0), u: np.zeros((5, 1))}
+    return graph, guess, _moved(guess, 0.4)
+
+
 def open_drive() -> tuple[fg.Graph, Guess, Guess]:
     """A drive with nothing but dynamics."""
     from unifg.models import unicycle
@@ -103,6 +116,7 @@ def _moved(guess: Guess, size: float) -> Guess:
 
 CASES = [
     *[(build, name, solver) for name, solver in CONSTRAINED.items() for build in (beside_disc, far_units)],
+    *[(priced, name, solver) for name, solver in CONSTRAINED.items() if solver.scalar_costs],
     *[(open_drive, name, solver) for name, solver in EQUALITIES.items()],
     *[(ring, name, solver) for name, solver in COSTS.items()],
 ]

@@ -443,6 +443,27 @@ def cost_size(diagonal: IntArray, hessian: Array, slope: Array) -> float:
 
 
 @compiled
+def worth_of_costs(size: float, diagonal: IntArray, free: IntArray, hessian: Array, slope: Array) -> float:
+    """Largest decrease of the costs along one unknown by their model; at least their size, and at most one.
+
+    A product of a multiplier and a distance has the unit of costs, whatever the unknowns are measured in.
+
+    Args:
+        size: as of :func:`cost_size`.
+        diagonal: (n,) as there.
+        free: (n,) columns of the unknowns.
+        hessian: as there.
+        slope: as there.
+    """
+    worth = size
+    for k in range(len(free)):
+        curvature, square = abs(hessian[diagonal[k]]), slope[free[k]] ** 2
+        if curvature > 0.0:
+            worth = max(worth, min(square / curvature, 1.0))
+    return worth
+
+
+@compiled
 def find_sizes(
     terms: TermArrays,
     coordinates: IntArray,

@@ -11,9 +11,11 @@ For min f(x) s.t. l <= g(x) <= u with L = f + lambda' g, at a point and multipli
 Stationarity and complementarity are divided by max(c, mean|lambda| / 100), with c the largest slope or curvature of the
 costs or, if less, one (`cost_size` of :mod:`unifg.problem.units`); or they are relative, whichever is less: the
 gradient to s, the size of what it is a sum of along the coordinate of a family (`find_sizes` there), and lambda_i to
-what makes its force as large. Limits of slacks do not count in the mean (`mean_force` there). Where numbers are large,
-relative ones alone can be met. So no unit of cost decides, nor one of rows and unknowns where numbers are large. The
-violation is in the graph's units, with a tolerance of its own, which tells the unit of rows.
+what makes its force as large. For complementarity, which has the unit of costs, c is also at least the largest slope
+squared over its curvature or, if less, one (`worth_of_costs` there). Limits of slacks do not count in the mean
+(`mean_force` there). Where numbers are large, relative ones alone can be met. So no unit of cost decides, nor one of
+rows and unknowns where numbers are large. The violation is in the graph's units, with a tolerance of its own, which
+tells the unit of rows.
 
 Pure least squares, a graph without constraints and scalar costs, has a zero point of cost, and with it a measure that
 does not depend on the unit of the information: there the stationarity is the relative offset of
@@ -47,7 +49,7 @@ from unifg.problem import evaluation
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.table import COLUMN, COST, COUNT, DIFFERENCED, ENTRY, KIND, ROW, ROWS, SLACKS, WIDTH, TermArrays
-from unifg.problem.units import cost_size, find_sizes, mean_force
+from unifg.problem.units import cost_size, find_sizes, mean_force, worth_of_costs
 from unifg.solution.relative_offset import Factored, relative_offset
 from unifg.solution.violation import ViolationModel
 from unifg.typing import Array, IntArray
@@ -260,7 +262,7 @@ def _complementarity(
     entries: Array,
     multipliers: Array,
 ) -> float:
-    coordinates, sizes, violation_unit, scale = shares
+    coordinates, sizes, violation_unit, worth = shares
     fields, columns, lower, upper, result = terms.fields, terms.columns, terms.lower, terms.upper, 0.0
     unit = violation_unit if violation_unit > 0.0 else 1.0
     for t in range(len(fields)):
@@ -285,7 +287,7 @@ def _complementarity(
             limit = upper[at] if multipliers[at] > 0.0 else lower[at]
             slack = max(abs(constraints[at] - limit), unpaid(terms, t, k, constraints))
             slack = slack if math.isfinite(limit) else unit
-            share = min(share / unit, 1.0 / scale) if share > 0.0 else 1.0 / scale
+            share = min(share / unit, 1.0 / worth) if share > 0.0 else 1.0 / worth
             result = max(result, abs(multipliers[at]) * slack * share)
     return result
 
@@ -355,8 +357,9 @@ def kkt_numbers(
             for k in range(terms.fields[t, COUNT] * terms.fields[t, ROWS]):
                 force = abs(multipliers[terms.fields[t, ROW] + k])
                 complementarity = max(complementarity, force * unpaid(terms, t, k, constraints))
-    scale = max(cost_size(diagonal, hessian, slope), mean_force(terms, multipliers, np.ones(count)))
-    stationarity, complementarity, least = stationarity / scale, complementarity / scale, scale
+    size, force = cost_size(diagonal, hessian, slope), mean_force(terms, multipliers, np.ones(count))
+    scale, worth = max(size, force), max(worth_of_costs(size, diagonal, free, hessian, slope), force)
+    stationarity, complementarity, least = stationarity / scale, complementarity / worth, scale
     if not max(stationarity, complementarity) <= enough and finite:
         find_sizes(terms, coordinates, residual, jacobian, multipliers, entries, sizes)
         least, relative = math.inf, 0.0
@@ -366,7 +369,7 @@ def kkt_numbers(
             if force > 0.0:
                 relative = max(relative, force / size if size > 0.0 else math.inf)
         stationarity, least = min(stationarity, relative), max(least, scale)
-        shares = coordinates, sizes, violation_unit, scale
+        shares = coordinates, sizes, violation_unit, worth
         complementarity = _complementarity(terms, shares, constraints, entries, multipliers)
     found[0], found[1], found[2] = stationarity, violation, complementarity
     found[3], found[4], found[5] = worst, finite, least

@@ -172,6 +172,8 @@ class Conditions:
         self.gradient, self._doubt, self._rounding = slope[:size], doubtful[:size], float(np.sqrt(squares))
         largest = float(max(np.abs(slope[:size]).max(initial=0.0), curved[:size].max(initial=0.0)))
         self.least = largest if 0.0 < largest < 1.0 else 1.0
+        curved, square = np.where(curved > 0.0, curved, np.inf)[:size], np.square(slope[:size])
+        self._worth_of_costs = max(self.least, min(1.0, float((square / curved).max(initial=0.0))))
         self._hessian, at, parts = Entries.of(blocks), 0, []
         for term in self._own:
             numbers = at + np.arange(term.rows.size).reshape(*term.rows.shape, 1)
@@ -185,7 +187,8 @@ class Conditions:
         slope = self.gradient + np.bincount(A.columns, A.numbers * multipliers[A.rows], size)
         doubt = self._doubt + np.bincount(A.columns, A.errors * np.abs(multipliers[A.rows]), size)
         counted = np.abs(multipliers[self._counted])
-        scale = max(self.least, float(counted.mean()) / 100.0) if len(counted) else self.least
+        force = float(counted.mean()) / 100.0 if len(counted) else 0.0
+        scale, worth = max(self.least, force), max(self._worth_of_costs, force)
         sizes = self._sizes(multipliers)
         either = [
             tuple(float(np.abs(part / size).max(initial=0.0)) for part in (slope, doubt)) for size in (scale, sizes)
@@ -198,7 +201,7 @@ class Conditions:
         slack = np.maximum(slack, self._unpaid)
         shares = np.zeros(len(multipliers))
         np.maximum.at(shares, A.rows, np.abs(A.numbers) / sizes[A.columns])
-        shares = np.where(shares > 0.0, np.minimum(shares, 1.0 / scale), 1.0 / scale)[self._worth]
+        shares = np.where(shares > 0.0, np.minimum(shares, 1.0 / worth), 1.0 / worth)[self._worth]
         wrong = np.where(self.lower != self.upper, np.abs(multipliers) * slack * shares, 0.0)
         columns = self.program.columns
         at = columns.name(int(columns.free[np.abs(slope).argmax()])) if len(slope) else None
