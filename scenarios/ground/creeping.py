@@ -68,8 +68,8 @@ class Creeping:
             turn = float(np.clip(2.0 * self._heading, -TURN, TURN))
             return (SPEED if abs(self._heading) < AHEAD else 0.0), turn
         back = abs(self._heading) > 0.5 * np.pi
-        aside, most = float(wrap_angle(self._heading - np.pi * back)), min(TURN, SPEED / self.radius)
-        return (-SPEED if back else SPEED), float(np.clip(2.0 * aside, -most, most))
+        off, most = float(wrap_angle(self._heading - np.pi * back)), min(TURN, SPEED / self.radius)
+        return (-SPEED if back else SPEED), float(np.clip(2.0 * off, -most, most))
 
     def blocked(self) -> None:
         """Turn back: something stops the robot that beams ahead do not see, and in an aisle there is no other way."""
