@@ -43,6 +43,7 @@ logger = logging.getLogger("unifg")
 LARGEST_PENALTY = 1e10
 LARGEST_EASY = 1e6  # up to here rho grows after subproblems of one step
 COLD_PENALTY = 10.0  # Birgin and Martinez
+STEEP = 5.0  # times the slopes of scalar costs, along which a curved one may fall further
 FALL = 0.25  # of the change of multipliers over rho, between outer iterations; else rho grows
 FALLING = 0.9  # of the violation, between outer iterations: progress where rho cannot grow
 STEADY = 20  # steps of the literal loop without a lower violation, before a warning
@@ -283,10 +284,10 @@ class AugmentedLagrangian(Solver):
             weights = np.where(given, run.penalties / rho, weights)
         else:
             outside = float(np.square(scale * run.program.violation(run.lin.constraints)).sum())
-            # A constant may be added to scalar costs: their slopes tell how large they are.
-            scalars = sum(float(each.sum()) for each in run.lin.scalars.values())
-            size = max(unit, abs(run.lin.cost - scalars), largest(run.lin.gradient) if run.lin.scalars else 0.0)
-            rho = COLD_PENALTY * size / max(1.0, 0.5 * outside)
+            size = abs(run.lin.cost - sum(float(each.sum()) for each in run.lin.scalars.values()))
+            if run.lin.scalars:  # to which a constant may be added: slopes tell how large they are
+                unit, size = STEEP * unit, max(size, STEEP * largest(run.lin.gradient))
+            rho = COLD_PENALTY * max(unit, size) / max(1.0, 0.5 * outside)
         return float(np.clip(max(rho, least), 1e-3 * unit, 1e6)), weights
 
     def _scale(self, primal: Primal, lin: Linearization) -> Array:

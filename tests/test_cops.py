@@ -189,7 +189,7 @@ def test_steps_of_restoration_are_counted() -> None:
     assert "restoration" not in InteriorPoint().solve(*electrons(6)).report()
 
 
-@pytest.mark.parametrize("name", ["polygon", "orbit"])
+@pytest.mark.parametrize("name", ["orbit", "catalyst"])
 def test_first_penalties_follow_slopes_of_scalar_costs(name: str) -> None:
     """Their values say nothing: a constant may be added to them."""
     found = []
@@ -198,4 +198,4 @@ def test_first_penalties_follow_slopes_of_scalar_costs(name: str) -> None:
         graph.minimize_scalar(lambda v, c=constant: 0.0 * v[:, 0] + c, next(iter(guess))[0], name="constant")
         found.append(AugmentedLagrangian().solve(graph, guess, check=True))
         assert found[-1].cost - constant == pytest.approx(NAMED[name].best, rel=1e-4)
-    assert found[0].iterations == found[1].iterations <= 40
+    assert found[0].iterations == found[1].iterations <= 70

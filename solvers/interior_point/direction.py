@@ -112,7 +112,6 @@ def examine(address: int) -> None:
     """
     data, free, hessian, links, measures = parts(address, "data free hessian links measures")
     plan, rows, scalars, shift, units = parts(address, "plan rows scalars shift units")
-    (row_units,) = parts(address, "row_units")
     now = scalars[0]
     share, largest, diagonal = now.share, 0.0, measures.diagonal
     for k in range(len(free)):
@@ -122,7 +121,7 @@ def examine(address: int) -> None:
     for k in range(len(free)):
         shift[k] = -FLAT * largest / units[free[k]] ** 2
     for k in range(len(rows)):
-        shift[len(free) + k] = -DUAL_SHIFT / now.cost_unit * row_units[rows[k]] ** 2
+        shift[len(free) + k] = 0.0  # whatever the solve before has left
     definite = largest > 0.0 and holds(links[0].factor, (plan, data, shift)) and plan.state[NEGATIVE] == len(rows)
     now.share, now.definite = share, YES if definite else NO
 
