@@ -39,7 +39,7 @@ UNSOLVED: dict[str, set[str]] = {
     # at 1e-12 of the residuals.
     "LevenbergMarquardt": {"Jennrich and Sampson", "Powell's singular function"},
     "DogLeg": {"Freudenstein and Roth", "Beale", "Jennrich and Sampson"},
-    "KKT": {"HS27"},
+    "KKT": {"HS27", "Powell's singular function"},
     # A largest penalty leaves violations; and large penalties are hard least-squares problems.
     "Penalty": {
         *("HS13", "HS15", "HS17", "HS20", "HS27", "HS58", "discs that touch"),
@@ -47,7 +47,7 @@ UNSOLVED: dict[str, set[str]] = {
     "AugmentedLagrangian": {"HS13"},  # no multipliers
     # Convexified costs without curvature send the first steps far away; where they land decides, to the last digit.
     "SQP": {"HS93", "Powell's singular function"},
-    "SQP, exact": {"HS93", "Powell's singular function"},
+    "SQP, exact": {"HS25", "HS93", "Powell's singular function"},
     "InteriorPoint": set(),
 }
 # Solved or not, by the version of the QP solver: with PIQP 0.7 the first ends 4e-5 short of stationarity, with 0.6 it

@@ -263,3 +263,25 @@ def test_manhattan_3500_in_a_window(shared_data: Path) -> None:
             steps.append(fg.SE2.between(*smoother.estimate(x[[k - 49, k]])))
     assert np.isfinite(steps).all() and smoother.dropped > 900
     assert np.abs(np.linalg.norm(np.array(steps)[:, :2], axis=1)).max() < 50.0  # poses are one metre apart
+
+
+@pytest.mark.parametrize("fixed_points", [False, True])
+def test_a_point_that_was_about_to_move_when_a_prior_touched_it(fixed_points: bool) -> None:
+    """A step beyond the limit waits for the next update, by when the point is fixed: the whole history is linear."""
+    rng, count = np.random.default_rng(0), 12
+    window = FixedLag(3, fixed_points=fixed_points)
+    x = window.variables("x", fg.Rn(1))
+    information, right = np.zeros((count, count)), np.zeros(count)
+    for k in range(count):
+        seen = rng.normal()
+        window.minimize(fg.prior, x[k], [seen], sigma=1.0)
+        information[k, k] += 1.0
+        right[k] += seen
+        if k:
+            window.minimize(fg.between, x[k - 1], x[k], [1.0], sigma=0.1)
+            information[k - 1 : k + 1, k - 1 : k + 1] += 100.0 * np.array([[1.0, -1.0], [-1.0, 1.0]])
+            right[k - 1 : k + 1] += [-100.0, 100.0]
+        window.update({x: [float(k)]})
+        whole = np.linalg.solve(information[: k + 1, : k + 1], right[: k + 1])
+        inside = window.window(x)
+        np.testing.assert_allclose(window.estimate(inside)[:, 0], whole[inside.indices], atol=1e-10)

@@ -120,8 +120,6 @@ def examine(address: int) -> None:
     run(links[0].assemble, (address,))
     for k in range(len(free)):
         shift[k] = -FLAT * largest / units[free[k]] ** 2
-    for k in range(len(rows)):
-        shift[len(free) + k] = 0.0  # whatever the solve before has left
     definite = largest > 0.0 and holds(links[0].factor, (plan, data, shift)) and plan.state[NEGATIVE] == len(rows)
     now.share, now.definite = share, YES if definite else NO
 

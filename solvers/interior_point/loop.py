@@ -130,7 +130,7 @@ def bend(address: int) -> None:
 @linked
 def reset(address: int) -> None:
     """Forget the last solve."""
-    row_units, scalars, units = parts(address, "row_units scalars units")
+    row_units, scalars, shift, units = parts(address, "row_units scalars shift units")
     steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
     now = scalars[0]
     now.asked, now.iteration, now.kept, now.raises, now.definite = 0.0, 0, 0, 0, UNKNOWN
@@ -138,6 +138,7 @@ def reset(address: int) -> None:
     now.evaluating = now.solving = now.judging = 0.0
     fill(row_units, 1.0)
     fill(units, 1.0)
+    fill(shift, 0.0)
     fill(steepest_gradient, 0.0)
     fill(steepest_jacobian, 0.0)
 

@@ -49,7 +49,7 @@ def move_points(memory: Address, limit: float, update: int, chain: int, scratch:
         for d in range(variables[v].dim):
             largest = max(largest, abs(numbers[step + d]))
         variables[v].candidate = 0
-        if largest > limit:
+        if largest > limit and variables[v].frozen != 1:  # a prior may have frozen it since
             count += 1
             relinearize(memory, v, scratch)
             for c in range(counters.clique_end if variables[v].frozen == 2 else 0):
