@@ -22,7 +22,7 @@ from unifg.typing import Array, IntArray
 __all__ = ["BundleAdjustment", "project", "reprojection", "triangulate"]
 
 UNDISTORTED = 20  # steps of Newton's method that take the distortion out of a pixel
-HELD = 1e-6  # of the distance of two cameras: how firmly it is kept
+HELD = 1e-3  # of the angle of sigma: how firmly a distance is kept, relatively; firmer, it drowns the pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,12 +73,13 @@ class BundleAdjustment:
         points = graph.variables("points", Rn(3), len(self.points))
         graph.fix(poses[0], self.poses[0], name="first camera")
         graph.minimize(
-            _apart, poses[other], centres[0], far[other], sigma=HELD * float(far[other]), name="scale of the map"
-        )
-        graph.minimize(
             reprojection, poses[self.camera], intrinsics[self.camera], points[self.point], self.pixels, sigma=sigma,
             robust=robust, name="observations",
         )  # fmt: skip
+        angle = np.mean(sigma) / (float(np.median(np.abs(self.intrinsics[:, 0]))) or 1.0)
+        graph.minimize(
+            _apart, poses[other], centres[0], far[other], sigma=HELD * angle * far[other], name="scale of the map"
+        )
         if calibrated:
             graph.fix(intrinsics, self.intrinsics, name="calibration")
         seen = np.flatnonzero(np.bincount(self.point, minlength=len(self.points)) < 2)

@@ -36,6 +36,19 @@ def test_the_camera_looks_along_its_negative_axis() -> None:
     np.testing.assert_allclose(found, 100.0 * (1 + 0.1 * squared + 0.01 * squared**2) * np.array([[0.2, 0.1]]))
 
 
+@pytest.mark.parametrize("sigma", [1e-5, 1e5])
+def test_the_size_of_pixel_noise_changes_nothing_but_covariances(sigma: float) -> None:
+    """The scale is kept in proportion to it: it neither drowns the pixels nor adds to what is uncertain."""
+    problem, found = scene(), []
+    for deviation in (1.0, sigma):
+        graph, guess = problem.graph(sigma=deviation, calibrated=True)
+        solution = LevenbergMarquardt().solve(graph, guess, check=True)
+        points = graph.families["points"]
+        found.append((solution[points], solution.covariance(points[:2]) / deviation**2))
+    np.testing.assert_allclose(found[1][0], found[0][0], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(found[1][1], found[0][1], rtol=1e-3, atol=1e-3 * np.abs(found[0][1]).max())
+
+
 @pytest.mark.parametrize("name", ["tower.txt", "tower.txt.gz"])
 def test_a_file_holds_the_same_numbers(tmp_path: Path, name: str) -> None:
     problem = scene()
