@@ -145,6 +145,34 @@ def test_poses_far_from_the_origin_with_loose_ends(largest: int, tmp_path: Path)
     assert found.status is Status.CONVERGED and found.iterations < 12
 
 
+@pytest.mark.parametrize("wrong", [np.diag([1.0, 1.0, -1.0]), np.full((3, 3), np.nan), np.triu(np.ones((3, 3)))])
+def test_information_that_is_none_is_refused_by_the_number_of_the_edge(
+    wrong: Array, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Submaps count their edges anew: "factor 1" of one of them says nothing to a user."""
+    monkeypatch.setattr(submaps, "AT_ONCE", 100)
+    made = begun(PLANE)
+    information = made.edges.information.copy()
+    information[345] = wrong
+    with pytest.raises(GraphError, match="edge 345: its information") as caught:
+        Submaps.split(replace(made, edges=replace(made.edges, information=information)), tmp_path, 60)
+    assert caught.value.index == 345 and not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"tolerance": float("nan")}, "tolerance must be positive, found nan"),
+        ({"tolerance": -1.0}, "tolerance must be positive"),
+        ({"max_iterations": -1}, "max_iterations must not be negative, found -1"),
+    ],
+)
+def test_an_end_that_cannot_come_is_refused(options: dict[str, Any], words: str, tmp_path: Path) -> None:
+    parted = Submaps.split(begun(PLANE), tmp_path, 60)
+    with pytest.raises(GraphError, match=words):
+        parted.optimize(**options)
+
+
 def test_known_poses_are_kept(tmp_path: Path) -> None:
     made = replace(begun(PLANE), fixed_ids=(0, 140, 299))
     _, poses = whole(made)

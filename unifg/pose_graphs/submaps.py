@@ -28,9 +28,10 @@ from unifg.codegen.inner import inner
 from unifg.elimination.factorization import Factorization
 from unifg.elimination.reduction import Reduction
 from unifg.elimination.symmetric import Symmetric, distinct, scatter
-from unifg.errors import GraphError, require_kinds
+from unifg.errors import GraphError, require_kinds, require_positive
 from unifg.factors.robust import Loss
 from unifg.factors.steps import EPSILON
+from unifg.factors.whitening import square_roots
 from unifg.lie import LieGroup
 from unifg.modeling.factors import between
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph, group_of
@@ -47,6 +48,7 @@ INDEX, SEPARATOR, INFORMATION = "submaps.json", "separator.npz", "information.np
 POSES, NEXT = "poses.npy", "next.npy"
 EDGES = "first", "second", "measured", "information"
 ARMIJO, SHORTEST = 1e-4, 2.0**-10
+AT_ONCE = 100_000  # edges whose information is looked at
 
 
 class Optimized(NamedTuple):
@@ -199,8 +201,8 @@ class Submaps:
             robust: as of the class.
 
         Raises:
-            GraphError: sightings or priors, which submaps do not know; no edges; a submap of no pose; NaN; a
-                pose that only edges without information reach. What the folder held stays.
+            GraphError: sightings or priors, which submaps do not know; no edges; a submap of no pose; NaN; information
+                that is none; a pose that only edges without information reach. What the folder held stays.
         """
         require_kinds("split", GraphError, cls.split.__annotations__, {"largest": largest})
         if pose_graph.sightings or pose_graph.priors:
@@ -212,6 +214,7 @@ class Submaps:
             if not np.isfinite(numbers).all():
                 at = int(np.flatnonzero(~np.isfinite(numbers).all(axis=1))[0])
                 raise GraphError(f"{what} {at} is not finite: {numbers[at]}", index=at)
+        _require_information(edges.information)
         tied = pose_graph.parts()
         if len(apart := np.flatnonzero(tied[edges.first] != tied[edges.second])):
             at, to = int(apart[0]), int(edges.second[apart[0]])
@@ -264,11 +267,14 @@ class Submaps:
             max_iterations: steps at most.
 
         Raises:
-            GraphError: the edges do not determine the poses.
+            GraphError: the edges do not determine the poses; a tolerance that is not positive, or a negative number.
             OSError: the disk is full.
         """
         options = {"tolerance": tolerance, "max_iterations": max_iterations}
         require_kinds("optimize", GraphError, Submaps.optimize.__annotations__, options)
+        require_positive("optimize", GraphError, tolerance=tolerance)
+        if max_iterations < 0:
+            raise GraphError(f"optimize: max_iterations must not be negative, found {max_iterations}")
         self._optimized = False
         (self.folder / INFORMATION).unlink(missing_ok=True)
         result = self._optimize(tolerance, max_iterations)
@@ -476,6 +482,21 @@ class _Separator:
         if len(free):
             result[np.ix_(free, free)] = self._tree.inverse_block(columns[free])
         return result
+
+
+def _require_information(information: Array) -> None:
+    """Refuse what a graph refuses, by the number of the edge: submaps count edges by numbers of their own."""
+    for begin in range(0, len(information), AT_ONCE):
+        some = information[begin : begin + AT_ONCE]
+        try:
+            square_roots("edges", some, len(some), information.shape[-1])
+        except GraphError as error:
+            at = begin + (error.index or 0)
+            raise GraphError(
+                f"edge {at}: its information must be finite, symmetric and positive semi-definite, found "
+                f"{information[at].tolist()}",
+                index=at,
+            ) from error
 
 
 def _largest(offsets: Array) -> float:
