@@ -433,6 +433,20 @@ def test_redundant_equalities_leave_values_and_refuse_multipliers() -> None:
     refused(solution, "one limit of the equality 'third'", "x", "r")
 
 
+def test_what_rounding_leaves_unsolved_is_no_contradiction(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A graph of least squares alone has no constraints that could contradict each other."""
+
+    def state(graph: fg.Graph, x: fg.Family) -> None:
+        graph.minimize(fg.prior, x, graph.data("p", [1.0, 2.0]))
+
+    solution = point(state)
+    assert np.allclose(solution.sensitivity("x", "p"), np.eye(2))
+    monkeypatch.setattr(sensitivity, "SOLVED", -1.0)
+    monkeypatch.setattr(sensitivity, "_tried", lambda _, right: (right, np.full(len(right), 2.0)))
+    with pytest.raises(fg.GraphError, match="lost to rounding: a direction is hardly determined"):
+        solution.sensitivity("x", "p")
+
+
 def test_a_free_gauge_is_refused_by_name() -> None:
     def state(graph: fg.Graph, x: fg.Family) -> None:
         graph.minimize(lambda x, p: x[:, :1] - p, x, graph.data("p", 1.0))

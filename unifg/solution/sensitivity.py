@@ -468,9 +468,12 @@ class Sensitivities:
             for k in () if left.max(initial=0.0) <= SOLVED else np.flatnonzero(~(left <= SOLVED)):
                 solutions[k], rest = _tried(system, right[k])
                 if not rest.max() <= 1.0:
-                    what = f": {self._dependent} depends on other active rows" if self._dependent else ""
                     raise GraphError(
-                        f"sensitivity: after a change of the data the active constraints contradict each other{what}"
+                        "sensitivity: after a change of the data the active constraints contradict each other: "
+                        f"{self._dependent} depends on other active rows"
+                        if self._dependent
+                        else "sensitivity: the curvature at the solution is lost to rounding: a direction is hardly "
+                        "determined, as where a robust loss leaves hardly any weight"
                     )
         return solutions
 
