@@ -94,6 +94,19 @@ def test_clusters_that_the_rest_contradicts_are_named(count: int, spatial: bool)
     assert not kept.of("contradicted")
 
 
+@pytest.mark.parametrize("seed", [2, 5, 6])
+def test_neighbours_with_opposite_errors_are_named(seed: int) -> None:
+    """Five metres to either side: the error that both have in common is nothing."""
+    city = manhattan(200, seed=seed)
+    first, second = np.array([40, 44]), np.array([120, 124])
+    aside = fg.SE2.compose([[5.0, 0.0, 0.0], [-5.0, 0.0, 0.0]], city.truth[second])
+    edges, count = city.pose_graph.edges, len(city.pose_graph.edges)
+    wrong = Edges(first, second, fg.SE2.between(city.truth[first], aside), edges.information[:2])
+    every = Edges(*(np.concatenate(both) for both in zip(vars(edges).values(), vars(wrong).values(), strict=True)))
+    verdict = solved(replace(city.pose_graph, edges=every)).verdict(effort="cheap")
+    assert sorted(np.concatenate([one.edges for one in verdict.of("contradicted")])) == [count, count + 1]
+
+
 def test_maps_without_a_cluster_are_those_of_the_others() -> None:
     """Least squares from a map that wrong closures bend may end in a fold; what was suspected in vain counts again."""
     made = manhattan(400, 1)

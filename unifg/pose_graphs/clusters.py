@@ -152,11 +152,13 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         # What agrees with the map of the rest, whose noise may be larger than stated, was not at fault.
         over = over_stated(now.chi2, left)
         out = ~active
-        for group in [*np.flatnonzero(out & edges.odometry)[:, None], *_clusters(edges, closures & out)]:
+        waiting = [*np.flatnonzero(out & edges.odometry)[:, None], *_clusters(edges, closures & out)]
+        for group in waiting:
             innovation = float(now.statistics([group])[1][0])
             first, *others = next(picked for picked in taken if np.isin(picked[0].edges, group).any())
             if not innovation > over * limit:
-                active[group] = True
+                active[group] = len(group) == 1
+                waiting += [*group[:, None]] if len(group) > 1 else []  # opposite errors have nothing in common
             elif edges.odometry[group[0]]:
                 slipped.append(first)
             else:
