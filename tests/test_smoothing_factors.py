@@ -367,8 +367,9 @@ def test_a_function_that_fails_loses_nothing() -> None:
     smoother.update({y: [1.0]})
     smoother.minimize(moody, y[1], sigma=1.0)
     smoother.minimize(fg.between, y[0], y[1], [5.0], sigma=1.0)
-    with pytest.raises(ValueError, match="not today"):
+    with pytest.raises(ValueError, match="not today") as caught:
         smoother.update({y: [7.0]})
+    assert "at factor 0, whose first variable is y[1]" in caught.value.__notes__
     with pytest.raises(GraphError, match="last update failed"):
         smoother.covariance(y)
     calls[0] = 10**6

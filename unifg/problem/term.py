@@ -105,6 +105,7 @@ class CompiledTerm:
         dims: tangent dimension of each variable argument.
         columns: (n, d_k) full tangent columns of each variable argument.
         data: all data the term reads.
+        named: variables by whose members errors say where.
         differenced: whether the Jacobian of a term that is no scalar cost is made of differences.
         trace: of a plain function that has been traced.
         route: how it is evaluated and differentiated, in words.
@@ -121,7 +122,7 @@ class CompiledTerm:
         self.name = term.name
         self.count = term.count
         selections = term.selections
-        self.gathers = [Gather(s, term.count) for s in selections]
+        self.gathers, self.named = [Gather(s, term.count) for s in selections], selections[0]
         self.starts = [columns.starts(s) for s in selections]
         self.columns = [np.broadcast_to(part, (term.count, part.shape[1])) for part in map(columns.of, selections)]
         self.manifolds = [s.manifold for s in selections]
@@ -438,7 +439,7 @@ class CompiledTerm:
             return
         factor = self._batched.culprit(points, self.count)
         if factor is not None:
-            first = self.gathers[0].selection
+            first = self.named
             place_error(error, first.family.name, int(first.indices[factor % len(first)]), factor)
 
     def jacobians(self, values: Values, numerical: bool = False, search: bool = False) -> list[Array]:

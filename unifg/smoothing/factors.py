@@ -204,6 +204,7 @@ class Types:
             if kernel is None or form is None:
                 rest = np.zeros((count, 0))
                 kind = self._kind(None, (0, 0, 0, term.size), selections, (), *PLAIN)
+                term.named = selections[0]  # its own families begin at zero
                 staged = Staged(kind, families, members, rest, name, term, np.arange(count))
                 staged.reach = None if term.kernel else self._read_by(wrapped.function)
                 return _active(staged, active), None

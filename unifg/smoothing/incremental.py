@@ -99,7 +99,7 @@ class Incremental(Smoother):
 
         Raises:
             GraphError: naming a member without value, a value that is not on its manifold, or a member that no factor
-                determines. Only in the last case are values and factors kept, for another try.
+                determines. Factors are kept for another try, and values in the last case.
         """
         self._update(values, None, iterations)
         if len(self._revocables):
