@@ -6,7 +6,7 @@ returns. One that is refused leaves the graph as it was.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from difflib import get_close_matches
@@ -115,20 +115,7 @@ class Model:
             GraphError: when the name is taken, ``count`` is no positive integer, ``manifold`` is no manifold, or the
                 units do not fit it.
         """
-        _require_name("family", name)
-        if name in self.families:
-            raise GraphError(f"family '{name}' exists already: choose another name", family=name)
-        if isinstance(manifold, type) or not hasattr(manifold, "name"):
-            raise GraphError(
-                f"family '{name}' needs a manifold such as fg.SE2 or fg.Rn(3), found {manifold!r}", family=name
-            )
-        hidden = [part for part in getattr(manifold, "components", ()) if part in RESERVED]
-        if isinstance(manifold, Product) and hidden:
-            raise GraphError(
-                f"family '{name}': the component '{hidden[0]}' of {manifold.name} could not be selected, because "
-                f"{name}.{hidden[0]} means something else: give it another name",
-                family=name,
-            )
+        require_family(name, manifold, self.families)
         try:
             count = index(count)
         except TypeError:
@@ -636,6 +623,24 @@ def _overlap(first: Selection, second: Selection) -> bool:
 def title(function: Any) -> str:
     """Name of a residual."""
     return getattr(function, "name", None) or getattr(function, "__name__", None) or "residual"
+
+
+def require_family(name: str, manifold: Manifold, taken: Container[str]) -> None:
+    """Refuse what is no name, or taken, and what is no manifold, or has components that could not be selected."""
+    _require_name("family", name)
+    if name in taken:
+        raise GraphError(f"family '{name}' exists already: choose another name", family=name)
+    if isinstance(manifold, type) or not hasattr(manifold, "name"):
+        raise GraphError(
+            f"family '{name}' needs a manifold such as fg.SE2 or fg.Rn(3), found {manifold!r}", family=name
+        )
+    hidden = [part for part in getattr(manifold, "components", ()) if part in RESERVED]
+    if isinstance(manifold, Product) and hidden:
+        raise GraphError(
+            f"family '{name}': the component '{hidden[0]}' of {manifold.name} could not be selected, because "
+            f"{name}.{hidden[0]} means something else: give it another name",
+            family=name,
+        )
 
 
 def _require_name(what: str, name: Any) -> None:

@@ -14,7 +14,7 @@ from unifg.factors.robust import Loss
 from unifg.lie import Manifold
 from unifg.locks import ReentrantLock, synchronized
 from unifg.modeling.duplicates import doubles
-from unifg.modeling.model import AnyResidual
+from unifg.modeling.model import AnyResidual, require_family
 from unifg.modeling.variables import Data, ParameterLike, Selection, Variable, as_selection
 from unifg.smoothing.batched import Batch, Batches, move_by_python
 from unifg.smoothing.factors import Parts, Staged, Types
@@ -129,13 +129,19 @@ class Smoother:
             keep: members never leave a fixed lag.
 
         Raises:
-            GraphError: when the name is taken.
+            GraphError: when the name is taken, or ``manifold`` is no manifold.
         """
-        if name in self.families:
-            raise GraphError(f"family '{name}' exists already: choose another name", family=name)
+        require_family(name, manifold, self.families)
         parts = self._parts.of(manifold)
         self._types.scratch = max(self._types.scratch, manifold.storage + manifold.dim * (2 * manifold.dim + 1) + 8)
         family = GrowingFamily(name, manifold, len(self._order), parts, keep)
+        for part in getattr(manifold, "components", ()):
+            if hasattr(family, part) and not isinstance(getattr(family, part), Selection):
+                raise GraphError(
+                    f"family '{name}': {name}.{part} means something else in a smoother: give the component '{part}' "
+                    f"of {manifold.name} another name",
+                    family=name,
+                )
         self._hold(self._state._replace(parts=np.array(self._parts.fields, dtype=PART)))
         if self._parts.by_python(parts):
             self._by_python.append(family)
@@ -263,8 +269,10 @@ class Smoother:
         It is that of the linear problem at the present linearisation points, conditioned on nothing else.
 
         Raises:
-            GraphError: when a member has no value, or was marginalised.
+            GraphError: when a member has no value, or was marginalised; when nothing is selected.
         """
+        if not variables:
+            raise GraphError("covariance() of what? Name families or members, as covariance(x[-1])")
         selections = [as_selection(variable) for variable in variables]
         rows = np.concatenate([self._rows(selection) for selection in selections])
         self._require_solved()
@@ -295,6 +303,8 @@ class Smoother:
             require_kinds("update", GraphError, {"iterations": "int"}, {"iterations": iterations})
             if iterations < 1:
                 raise GraphError(f"update: iterations must be at least 1, found {iterations}")
+        if not isinstance(values, Mapping | None):
+            raise GraphError(f"update: values are given by family, as {{x: [...]}}, found {f'{values!r}'[:80]}")
         new = [self._checked(family, value) for family, value in values.items()] if values else []
         if self._staged:
             self._admit({family: len(array) for family, array in new})
