@@ -6,7 +6,8 @@ A new one is accepted if its innovation, normalised by the covariances of predic
 that counts is revoked where its residual is beyond c^2 at the estimates, and with those beside it where the rest would
 cost less by more than c^2 each without them; it is accepted again where its residual is within. Two that agree with
 each other, or belong together, and not with the rest are tried together, against those that contradict them. What is
-tried is kept if the truncated cost has become less.
+tried is kept if the truncated cost has become less. Where some are revoked, the innovations of what was left out
+because of them are looked at again.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ NEWEST = 8  # left out ones with which a new one is tried
 PASSES = 3  # in each round of a trial
 ROUNDS = 5
 SHARE = 0.1  # of a disagreement that curvature may leave
+WITHIN = 100.0  # limits: what is farther off is not looked at again
 SINGULAR = 1e-9  # of one minus leverage
 BESIDE = 10  # variables between the ends of factors that belong together, by the order in which they came
 TOGETHER = 6
@@ -123,12 +125,24 @@ class Revocables:
             if self._innovation(smoother, [new]) <= self._limits[new]:
                 self.accepted[new] = True
         self._apply(smoother, before)
+        counted = self.accepted.copy()
         if first == len(self) and not several and smoother._effort().eliminated < MANY:
             return
         self._revise(smoother)
         self._take_back(smoother)
         for new in np.flatnonzero(~self.accepted[first:]).tolist():
             self._try(smoother, first + new)
+        if (counted & ~self.accepted).any():
+            self._look_again(smoother)
+
+    def _look_again(self, smoother: Smoother) -> None:
+        """Accept what was left out because of others that have been revoked since."""
+        out = ~self.accepted & (self._squared(smoother) <= WITHIN * self._limits)
+        for k in np.flatnonzero(out).tolist():
+            if self._innovation(smoother, [k]) <= self._limits[k]:
+                before = self.accepted.copy()
+                self.accepted[k] = True
+                self._apply(smoother, before)
 
     def _revise(self, smoother: Smoother) -> None:
         """Accept what is within its limit, and revoke of those that are beyond the one that is farthest."""
