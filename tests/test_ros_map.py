@@ -52,6 +52,14 @@ def test_thresholds_are_exclusive_and_come_from_the_file(tmp_path: Path) -> None
     assert occupancy.occupied.tolist() == [[False, False, False, True, True]]
 
 
+def test_keys_that_no_map_has_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A misspelt threshold was the default without a word."""
+    load_map(write(tmp_path, [[0, 254]]))
+    assert not caplog.messages
+    load_map(write(tmp_path, [[0, 254]], HEADER.replace("free_thresh", "free_threshold")))
+    assert "m.yaml: keys that are not read: ['free_threshold']; those of a map: image" in caplog.text
+
+
 def test_colours_are_averaged_not_weighted(tmp_path: Path) -> None:
     image = pytest.importorskip("PIL.Image")
     # Luma of pure blue is 29 and of green 150; the mean of both is 85, p = 2/3.

@@ -10,6 +10,7 @@ unknown, which is neither.
 from __future__ import annotations
 
 import json
+import logging
 import math
 import reprlib
 from dataclasses import dataclass
@@ -24,6 +25,9 @@ from unifg.errors import FileFormatError, ModelError
 from unifg.files.contents import LIMITS, Limits, legible, read_text
 from unifg.typing import Array, BoolArray
 
+logger = logging.getLogger("unifg")
+
+_KEYS = ("image", "resolution", "origin", "occupied_thresh", "free_thresh", "negate", "mode")
 _DEFAULT_OCCUPIED, _DEFAULT_FREE = 0.65, 0.196
 # Values of ROS's own map_saver; 205 lies between the default thresholds.
 _WIDEST = 1e6  # of a map [m]
@@ -117,7 +121,7 @@ def load_map(path: str | Path, limits: Limits = LIMITS) -> OccupancyMap:
     Modes ``trinary`` (the default) and ``scale`` are read; both give the same three classes here, because the
     grey levels that ``scale`` keeps between the thresholds are neither occupied nor free. Mode ``raw``
     (pixels are cost values, thresholds are ignored) is not supported. Transparency is ignored, except that a
-    fully transparent pixel is unknown.
+    fully transparent pixel is unknown. One warning names other keys than those of a map, such as a misspelt one.
 
     Args:
         path: the YAML file.
@@ -236,6 +240,8 @@ def _read_header(path: Path, limits: Limits) -> dict[str, Any]:
     for key in ("image", "resolution", "origin"):
         if key not in header:
             raise FileFormatError(f"{name}: the key {key!r} is missing; a map needs image, resolution, origin")
+    if unread := [legible(str(key)) for key in header if key not in _KEYS]:
+        logger.warning("%s: keys that are not read: %s; those of a map: %s", name, unread, ", ".join(_KEYS))
     return header
 
 
