@@ -63,6 +63,13 @@ def test_the_truth_may_be_missing(tmp_path: Path) -> None:
         read_mrclam(tmp_path, robot=2)
 
 
+def test_true_headings_beyond_a_turn_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Degrees were radians without a word; unwrapped radians are right, and stay."""
+    log = read_mrclam(put(tmp_path, MRCLAM, Robot1_Groundtruth=(b"1 2 0.5", b"1 2 -135")))
+    assert log.truth.tolist() == [[1.0, 2.0, -135.0]]
+    assert "Robot1_Groundtruth.dat: headings of up to 135 are read as radians: are they degrees?" in caplog.text
+
+
 def test_times_that_run_backwards_are_sorted_with_what_belongs_to_them(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:

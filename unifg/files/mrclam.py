@@ -75,8 +75,8 @@ class MrclamLog:
 def read_mrclam(folder: str | Path, robot: int = 1, limits: Limits = LIMITS) -> MrclamLog:
     """Read the log of one robot.
 
-    Barcodes that nobody bears, and lines whose time runs backwards, are named in one warning each; the latter are
-    sorted.
+    Barcodes that nobody bears, headings beyond a turn, and lines whose time runs backwards, are named in one warning
+    each; the latter are sorted.
 
     Args:
         folder: of the dataset.
@@ -102,6 +102,8 @@ def read_mrclam(folder: str | Path, robot: int = 1, limits: Limits = LIMITS) -> 
     if truth_path.exists():
         poses = Table.read(truth_path, 0, "time x y heading", limits)
         truth = poses.numbers[poses.in_time()]
+        if (most := float(np.abs(truth[:, 3]).max(initial=0.0))) > _TURN:  # unwrapped ones are right, too
+            logger.warning("%s: headings of up to %g are read as radians: are they degrees?", poses.path, most)
     order, motion = seen.in_time(), moves.numbers[moves.in_time()]
     barcode, sightings = seen.whole(1, "barcode")[order], seen.numbers[order]
     subject = np.array([owners.get(code, NOBODY) for code in barcode.tolist()], dtype=np.int64)
