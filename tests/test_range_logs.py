@@ -143,6 +143,7 @@ def test_other_units_are_no_log(log: RangeLog, tmp_path: Path, ranges: float, po
         ("", "the header has no time, x, y, theta"),
         ("time,x,y,theta,0.1\n0,0,0,0,1\n1,0,0\n", "row 2 is not 5 numbers"),
         ("time,x,y,theta,0.1\n0,0,0,zero,1\n", "row 1 is not 5 numbers"),
+        ("time,x,y,theta,0.1\n0,0,0,0,1_5\n", "row 1 is not 5 numbers"),
         ("time,x,y,theta,0.1\n0,0,0,0,1\n", "at least two scans"),
         ("time,x,y,theta\n0,0,0,0\n1,0,0,0\n", "at least two scans"),
         ("time,x,y,theta,0.1\n0,0,0,0,1\n1,0,0,inf,1\n", "row 2: theta is inf, not finite"),

@@ -322,6 +322,7 @@ def test_wrong_settings_are_refused() -> None:
         ("v_ref_mps\n1\nnan\n", "3: no finite number"),
         ("v_ref_mps\n1\n", "holds 1 speeds"),
         ("t_s,v_ref_mps\n0,1\n1,1\n3,1\n", "4: times must grow by the same step"),
+        ("v_ref_mps\n0\n1_5\n", "line 3: no finite number in column 'v_ref_mps'"),
         ("t_ms,v_ref_mps\n0,1\n500,1\n", "1: the column 't_ms' is not read: convert it to 't_s'"),
         ("v_ref_mps,slope_deg\n1,5\n1,5\n", "1: the column 'slope_deg' is not read: convert it to 'slope_rad'"),
         ("t_s,v_ref_mps\n0,1\n0,1\n", "3: times must grow by the same step"),

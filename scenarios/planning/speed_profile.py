@@ -136,7 +136,8 @@ def _column(
         if not any(word.strip() for word in line):
             continue
         try:
-            value = float(line[matching[0]])
+            word = line[matching[0]]
+            value = float(word) if "_" not in word else math.nan  # 1_5 is 15 for programs alone
         except (IndexError, ValueError):
             value = math.nan
         if not math.isfinite(value):

@@ -244,6 +244,6 @@ def _table(path: Path, limits: Limits) -> RangeLog:
 
 def _number(word: str) -> float | None:
     try:
-        return float(word)
+        return float(word) if "_" not in word else None  # 1_5 is 15 for programs alone
     except ValueError:
         return None
