@@ -88,6 +88,17 @@ def test_bad_lines_are_named(
         read(put(tmp_path, f"{before}{line}\n"))
 
 
+@pytest.mark.parametrize(("view", "right"), [(3.0, True), (3.75, True), (-3.0, True), (6.0, False), (1.5, False)])
+def test_a_field_of_view_that_is_not_that_of_the_beams_is_said(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, view: float, right: bool
+) -> None:
+    """A step of half or twice the right one bent every scan without a word."""
+    scans = read_carmen(put(tmp_path, CARMEN.replace("-1.5 3.0 0.75", f"-1.5 {view} 0.75"))).scans
+    assert scans[1].angles.tolist() == [-1.5, -0.75, 0.0, 0.75, 1.5]
+    said = f"line 6: a field of view of {view:g} rad is not that of 5 beams in steps of 0.75 rad, by which it is read"
+    assert (said in caplog.text) != right and len(caplog.messages) == (not right)
+
+
 # ---------------------------------------------------------------- TUM, KITTI and EuRoC
 
 

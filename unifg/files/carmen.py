@@ -90,7 +90,10 @@ class CarmenLog:
 
 
 def read_carmen(path: str | Path, field_of_view: float = math.pi, limits: Limits = LIMITS) -> CarmenLog:
-    """Read a log, gzipped or not; negative ranges, and times that run backwards, are named in one warning each.
+    """Read a log, gzipped or not.
+
+    Negative ranges, times that run backwards, and a field of view that is not that of the beams, are named in one
+    warning each.
 
     Args:
         path: the file.
@@ -124,7 +127,7 @@ def read_carmen(path: str | Path, field_of_view: float = math.pi, limits: Limits
 
 
 def _configuration(file: TextFile, row: int) -> tuple[str | float, ...]:
-    """Tag, numbers of readings and of remissions of a scan and, where they stand there, start, step, maximum range.
+    """Tag, readings and remissions of a scan and, where they stand there, start, field of view, step, maximum range.
 
     Raises:
         FileFormatError: the line is too short, or has something else in the place of these.
@@ -144,10 +147,10 @@ def _configuration(file: TextFile, row: int) -> tuple[str | float, ...]:
     if front:
         return tag, count, 0
     remissions = readings(first + 1 + count)
-    start, step, maximum = (decimal(f"{place}: field {_LASER[k]}", words[k]) for k in (1, 3, 4))
+    start, view, step, maximum = (decimal(f"{place}: field {_LASER[k]}", words[k]) for k in (1, 2, 3, 4))
     if not abs(start) + count * abs(step) < _WIDEST:
         raise FileFormatError(f"{place}: {count} beams from {start:g} rad in steps of {step:g} rad are no scan")
-    return tag, count, remissions, start, step, maximum
+    return tag, count, remissions, start, view, step, maximum
 
 
 def _scans(file: TextFile, key: tuple[Any, ...], rows: IntArray, field_of_view: float) -> Scans:
@@ -155,7 +158,12 @@ def _scans(file: TextFile, key: tuple[Any, ...], rows: IntArray, field_of_view: 
     tag, count, remissions, *laser = key
     ranges = " ".join(f"r{k}" for k in range(1, count + 1))
     if laser:
-        start, step, maximum = laser
+        start, view, step, maximum = laser
+        if abs(abs(view) - (count - 0.5) * abs(step)) > 1.6 * abs(step):  # loggers count beams or the steps between
+            logger.warning(
+                "%s: a field of view of %g rad is not that of %d beams in steps of %g rad, by which it is read",
+                file.place(int(rows[0])), view, count, step,
+            )  # fmt: skip
         head, tail, ignored = f"{'- ' * len(_LASER)}-", "- - - - -", f"- {'- ' * remissions}"
     else:
         step = field_of_view / max(count - count % 2, 1)
