@@ -36,7 +36,9 @@ def test_poses_go_through_all_formats_of_trajectories(tmp_path: Path) -> None:
     convert(tmp_path / "a.tum", tmp_path / "d.TUM")
     np.testing.assert_allclose(read_tum(tmp_path / "d.TUM").time, times, rtol=0, atol=1e-6)
     (tmp_path / "e.csv").write_text("#timestamp\n1403636580838555648,4.5,-1.7,0.6,1,0,0,0\n")
-    assert convert(tmp_path / "e.csv", tmp_path / "f.tum") == "1 poses"
+    assert convert(tmp_path / "e.csv", tmp_path / "f.tum") == "1 poses; times are seconds from the first one"
+    assert convert(tmp_path / "b.kitti", tmp_path / "f.tum").endswith("; their numbers are the times")
+    assert convert(tmp_path / "c.tum.gz", tmp_path / "f.tum").endswith(" poses")
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is(

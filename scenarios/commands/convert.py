@@ -27,13 +27,15 @@ TRAJECTORIES: dict[str, Callable[[Path, Array, Array], Path]] = {
     ".kitti": lambda path, time, poses: write_kitti(path, poses),
 }
 """Formats of trajectories that can be written."""
+_SOURCES = {".tum": "", ".csv": "; times are seconds from the first one"}  # what becomes of times
 
 
 def convert(source: Path, target: Path) -> str:
     """Read one file and write the other; returns a sentence about what is in it.
 
     Sources are TUM (``.tum``), KITTI (``.kitti``) and EuRoC (``.csv``) trajectories, and in any other file pose graphs
-    (g2o, TORO, GTSAM). A graph may become a trajectory, with the numbers of its poses as times; KITTI has no times.
+    (g2o, TORO, GTSAM). A graph may become a trajectory, with the numbers of its poses as times; KITTI has no times, and
+    those of EuRoC are written from the first pose.
 
     Raises:
         FileFormatError: the source cannot be read, the target's ending is none of these, or a trajectory is to become
@@ -47,7 +49,8 @@ def convert(source: Path, target: Path) -> str:
     if ending in TRAJECTORIES:
         time, poses = (_numbers(graph.poses), graph.poses) if graph else _read_trajectory(source)
         TRAJECTORIES[ending](target, time, poses)
-        return f"{len(poses)} poses"
+        counted = {".kitti": "", ".tum": _SOURCES.get(suffix_of(source), "; their numbers are the times")}[ending]
+        return f"{len(poses)} poses{counted}"
     if graph is None:
         raise FileFormatError(f"{legible(source)} is a trajectory: it has no measurements for {legible(target)}")
     GRAPHS[ending](target, graph)
