@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import logging
 import os
 import re
 import shlex
@@ -42,6 +43,8 @@ from unifg.scenarios.commands.outcome import Outcome, Progress
 from unifg.scenarios.options import Help, Unasked, count, existing, settings_of
 
 __all__ = ["main"]
+
+logger = logging.getLogger("unifg")
 
 SUCCEEDED, FAILED, REFUSED, INTERRUPTED = 0, 1, 2, 130
 
@@ -356,7 +359,7 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
             show(0.0, "preparing")
             try:
                 outcome: Outcome = module.run(settings, told(show), **watched)
-            except OSError as error:  # of what a run reads, or of a user's part: nothing is written yet
+            except (OSError, SystemExit) as error:  # of what a run reads, or of a user's part: nothing is written yet
                 raise ScenarioError(f"{name}: {type(error).__name__}: {error}") from error
         if getattr(chosen, "mcap", False):
             outcome.record()
@@ -377,6 +380,9 @@ def _run_settings(chosen: argparse.Namespace, module: Any, settings: Any, name: 
     if reused and others:
         named = f"{legible(folder)} holds files that this run has not written: {', '.join(others)}"
         print(f"unifg: note: {named}", file=sys.stderr)
+    if outcome.error is not None:
+        logger.error("%s was ended before its end", name, exc_info=outcome.error)
+        return FAILED
     if outcome.interrupted:
         return INTERRUPTED
     return SUCCEEDED if outcome.succeeded else FAILED

@@ -203,19 +203,26 @@ class Flight:
             rehearse(kind, lambda: Flight(replace(settings, faults=()), rehearsal=True))
 
     def run(self, progress: Progress) -> FlightLog:
-        """Fly to the target, or until it is no use."""
+        """Fly to the target, or until it is no use; what was recorded is the `log` of an exception, too."""
         settings, world, dt = self.settings, self.world, self.settings.controller.dt
         recorder = Recorder(
             FlightLog, layout=world.layout, settings=settings.summary(), dt=dt, parameters_true=world.parameters.packed
         )
         self._control: Array | None = None
         self._reached = self._landed = self._astray = False
-        interrupted = run_ticks(round(settings.time_limit / dt), lambda number: self._tick(recorder), progress)
-        return recorder.finish(
-            collisions=world.collisions, reached=self._reached, interrupted=interrupted,
-            outcome=self._outcome(interrupted), dropped=dict(self.watch.validator.dropped),
-            subproblems=dict(self.pilot.controller.loop.subproblems),
-        )  # fmt: skip
+
+        def finished(interrupted: bool, outcome: str) -> FlightLog:
+            return recorder.finish(
+                collisions=world.collisions, reached=self._reached, interrupted=interrupted, outcome=outcome,
+                dropped=dict(self.watch.validator.dropped), subproblems=dict(self.pilot.controller.loop.subproblems),
+            )  # fmt: skip
+
+        try:
+            interrupted = run_ticks(round(settings.time_limit / dt), lambda number: self._tick(recorder), progress)
+            return finished(interrupted, self._outcome(interrupted))
+        except (Exception, SystemExit) as error:
+            vars(error)["log"] = finished(False, f"ended by {error!r}")
+            raise
 
     def _outcome(self, interrupted: bool) -> str:
         """Outcome of the flight in words."""

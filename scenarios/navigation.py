@@ -140,6 +140,8 @@ def run_navigation(settings: NavigationSettings, progress: Progress | None = Non
         settings: what to run.
         progress: called with the fraction done and a short text, once a tick.
 
+    An exception that a world of the user's raises in a tick has the attribute ``log``: what was recorded before.
+
     Raises:
         ScenarioError: when start, goals or obstacles do not fit the map, or an option is unknown.
     """
@@ -254,10 +256,18 @@ class Episode:
         return pilot
 
     def run(self, progress: Progress) -> EpisodeLog:
-        """Tick until the last goal is reached or given up."""
+        """Tick until the last goal is reached or given up; what was recorded is the `log` of an exception, too."""
         self.begin()
         most = int(2.0 * sum(map(_longest, self.legs)) / self.settings.controller.dt)  # a detour doubles a way
-        interrupted = run_ticks(most, self._tick, progress)
+        try:
+            return self._finished(run_ticks(most, self._tick, progress))
+        except (Exception, SystemExit) as error:
+            self._outcomes[self._goal :] = [f"ended by {error!r}"] * (len(self.goals) - self._goal)
+            vars(error)["log"] = self._finished(False)
+            raise
+
+    def _finished(self, interrupted: bool) -> EpisodeLog:
+        """Close the log."""
         return self._recorder.finish(
             collisions=self.world.collisions,
             reached=[outcome == REACHED for outcome in self._outcomes],

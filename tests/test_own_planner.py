@@ -19,11 +19,15 @@ from unifg import scenarios
 from unifg.errors import ScenarioError
 from unifg.files.ros_map import save_map
 from unifg.scenarios.command import main
+from unifg.scenarios.episode import silent
+from unifg.scenarios.flight import Flight, FlightSettings
 from unifg.scenarios.ground.drive_settings import ControllerSettings
 from unifg.scenarios.ground.local_planner import PlannerContext, load_planner
 from unifg.scenarios.logs.drive_metrics import episode_metrics
 from unifg.scenarios.navigation import Episode, NavigationSettings
 from unifg.scenarios.perception.tracks import Tracks
+from unifg.scenarios.simulation.air import QuadrotorWorld
+from unifg.typing import ArrayLike
 
 MODULE = """
 import numpy as np
@@ -50,6 +54,30 @@ class Careful(Straight):
 class Wrong(Straight):
     def control(self, now):
         return [1.0, 2.0, 3.0]
+
+class Raising(Straight):
+    kind, what, left = KeyError, "lane", 4
+
+    def control(self, now):
+        self.left -= 1
+        if self.left < 0:
+            raise self.kind(self.what)
+        return super().control(now)
+
+class Leaving(Raising):
+    kind, what = SystemExit, 0
+
+class Telling(Straight):
+    answer = None
+
+    def control(self, now):
+        return self.answer
+
+class Jammed(World):
+    def step(self, *control, dt):
+        if self.time > 0.25:
+            raise SystemExit(0)
+        super().step(*control, dt=dt)
 
 class Mute:
     pass
@@ -187,6 +215,55 @@ def test_an_answer_of_another_shape_is_refused(own: Path) -> None:
         adapter.plan(np.zeros(3), ahead(), Tracks.none())
 
 
+@pytest.mark.parametrize(
+    "answer", ["fast", [1j, 0.0], np.array([1j, 0.0]), [[1.0, 2.0], [3.0]], {"v": 1.0}, [None, 1.0]]
+)
+def test_an_answer_that_is_no_control_is_named(answer: Any, own: Path) -> None:
+    """Dictionaries and complex numbers ended a drive in a TypeError, or lost their imaginary part."""
+    adapter = load_planner("my_planners:Telling", context())
+    vars(adapter.planner)["answer"] = answer
+    with pytest.raises(
+        ScenarioError, match=r"the planner returned .*: give finite controls \(2,\) or \(K, 2\), or None"
+    ):
+        adapter.plan(np.zeros(3), ahead(), Tracks.none())
+
+
+@pytest.mark.product(2, of="drives and flights")
+@pytest.mark.parametrize(("kind", "said"), [("Raising", "KeyError('lane')"), ("Leaving", "SystemExit(0)")])
+def test_a_planner_that_raises_is_named_and_recorded(
+    own: Path, caplog: pytest.LogCaptureFixture, kind: str, said: str
+) -> None:
+    """Its ticks were lost, and sys.exit(0) was a success that had written nothing."""
+    words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=3,0,0", "--obstacles", "0"]
+    assert main([*words, "--planner", f"my_planners:{kind}", "--out", "out"]) == 1
+    metrics = json.loads((own / "out" / "metrics.json").read_text())
+    named = f"the planner 'my_planners:{kind}' raised {said}"
+    assert metrics["outcomes"] == [f"degraded: the tick failed: {named}"] and metrics["path_length_m"] > 0.0
+    assert f"failed, the robot brakes: {named}" in caplog.text and caplog.text.count("raise self.kind(") <= 2
+
+
+def test_a_localiser_that_raises_is_named_and_recorded(own: Path) -> None:
+    settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), localiser="my_planners:Odd")
+    episode = Episode(settings, rehearsal=True)
+    odd = cast(Any, sys.modules["my_planners"]).Odd
+    odd.after, odd.wrong = 5, 3  # vars().update(3) is a TypeError
+    log = episode.run(stop_after(10))
+    assert log.ticks == 10 and "the tick failed: the localiser 'my_planners:Odd' raised TypeError(" in log.cause[-1]
+
+
+@pytest.mark.product(2, of="drives and flights")
+def test_a_world_that_raises_leaves_what_was_recorded(own: Path, caplog: pytest.LogCaptureFixture) -> None:
+    words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=3,0,0", "--obstacles", "0"]
+    assert main([*words, "--world", "my_planners:Jammed", "--out", "out"]) == 1
+    metrics = json.loads((own / "out" / "metrics.json").read_text())
+    assert metrics["outcomes"] == ["ended by SystemExit(0)"] and metrics["steps"] == 4
+    assert "navigation was ended before its end" in caplog.text and "in step" in caplog.text
+    settings = NavigationSettings(own / "room.yaml", (0.0, 0.0, 0.0), ((3.0, 0.0, 0.0),), world="my_planners:Jammed")
+    with pytest.raises(SystemExit) as raised:
+        Episode(settings, rehearsal=True).run(silent)
+    assert vars(raised.value)["log"].ticks == 4
+
+
 @pytest.mark.product(2, of="drives and flights")
 def test_an_answer_that_stays_wrong_is_told_once(own: Path, caplog: pytest.LogCaptureFixture) -> None:
     words = ["run", "navigation", "--map", "room.yaml", "--start=0,0,0", "--goal=0.8,0,0", "--obstacles", "0"]
@@ -308,3 +385,16 @@ def test_scenarios_list_what_can_be_replaced() -> None:
         assert inspect.getdoc(getattr(scenarios, name)), name
     with pytest.raises(AttributeError, match="nothing"):
         _ = scenarios.nothing
+
+
+def test_a_world_of_flights_that_raises_leaves_what_was_recorded() -> None:
+    class Torn(QuadrotorWorld):
+        def step(self, control: ArrayLike, dt: float = 0.05) -> None:
+            if self.time > 0.2:
+                raise RuntimeError("cable")
+            super().step(control, dt)
+
+    with pytest.raises(RuntimeError, match="cable") as raised:
+        Flight(FlightSettings(world=Torn), rehearsal=True).run(silent)
+    log = vars(raised.value)["log"]
+    assert log.ticks > 2 and log.outcome == "ended by RuntimeError('cable')" and not log.succeeded

@@ -75,6 +75,8 @@ def run_task(task: Task) -> str:
             _warmed(task, module, settings)
             began, cpu = time.perf_counter(), time.process_time()
             outcome = module.run(settings, silent)
+            if outcome.error is not None:
+                raise outcome.error
             unclear = list[str]()
             found = {"outcome": OK if outcome.succeeded else FAILED, "metrics": strict(outcome.metrics, unclear)}
             if unclear:

@@ -8,7 +8,7 @@ from unifg.errors import ScenarioError
 from unifg.files.tum import write_tum
 from unifg.scenarios import navigation
 from unifg.scenarios.commands import replays
-from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, recorded
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.drive_log import EpisodeLog
 from unifg.scenarios.logs.drive_metrics import episode_metrics
@@ -42,11 +42,9 @@ def run(settings: navigation.NavigationSettings, progress: Progress, announce: A
             raise ScenarioError(f"a recorded drive is not simulated, leave out: {', '.join(idle)}")
         return replays.run(replays.SETTINGS(**taken), progress)
     with watching_ticks(announce, drive_stage, drive_frame):
-        log = navigation.run_navigation(settings, progress=progress)
-    if log.ticks == 0:
-        raise KeyboardInterrupt
+        log, error = recorded(lambda: navigation.run_navigation(settings, progress=progress))
     numbers = episode_metrics(log)
-    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log), {"drive": log})
+    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log), {"drive": log}, error)
 
 
 def results(log: EpisodeLog) -> dict[str, Writer]:

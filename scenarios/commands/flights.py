@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from unifg.scenarios import flight
-from unifg.scenarios.commands.outcome import Outcome, Progress, Writer
+from unifg.scenarios.commands.outcome import Outcome, Progress, Writer, recorded
 from unifg.scenarios.commands.watching import Announce, watching_ticks
 from unifg.scenarios.logs.flight_log import FlightLog
 from unifg.scenarios.logs.flight_metrics import flight_metrics
@@ -29,11 +29,9 @@ def run(settings: flight.FlightSettings, progress: Progress, announce: Announce 
         ScenarioError: when the movers do not fit into the corridor.
     """
     with watching_ticks(announce, flight_stage, flight_frame):
-        log = flight.run_flight(settings, progress)
-    if log.ticks == 0:
-        raise KeyboardInterrupt
+        log, error = recorded(lambda: flight.run_flight(settings, progress))
     numbers = flight_metrics(log)
-    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log, numbers), {"flight": log})
+    return Outcome(log.succeeded, log.interrupted, summary(log), numbers, results(log, numbers), {"flight": log}, error)
 
 
 def results(log: FlightLog, metrics: Mapping[str, object]) -> dict[str, Writer]:

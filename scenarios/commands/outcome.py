@@ -7,16 +7,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from unifg.scenarios.episode import Progress
+from unifg.scenarios.logs.vehicle_log import VehicleLog
 
 logger = logging.getLogger("unifg")
 if TYPE_CHECKING:
     from unifg.scenarios.logs.mcap_log import Log
 
-__all__ = ["Outcome", "Progress", "Writer"]
+__all__ = ["Outcome", "Progress", "Writer", "recorded"]
 
+L = TypeVar("L", bound=VehicleLog)
 Writer: TypeAlias = Callable[[Path], object]
 """Writes a file of this path."""
 
@@ -33,6 +35,7 @@ class Outcome:
         files: results by file name, in the order they are written: the cheapest and most precious first, in case the
             user loses patience.
         logs: what ``--mcap`` writes, by file name without its end.
+        error: what has ended the run before its end; None where nothing has.
     """
 
     succeeded: bool
@@ -41,6 +44,7 @@ class Outcome:
     metrics: Mapping[str, Any]
     files: dict[str, Writer]
     logs: Mapping[str, Log] = field(default_factory=dict)
+    error: BaseException | None = None
 
     def record(self) -> None:
         """Let :meth:`write` write the logs as MCAP, too."""
@@ -61,3 +65,22 @@ class Outcome:
             write(folder / name)
         progress(1.0, "done")
         return [folder / name for name in reversed(self.files)]
+
+
+def recorded(run: Callable[[], L]) -> tuple[L, BaseException | None]:
+    """The log of a run, and what has ended it after at least one tick.
+
+    Raises:
+        KeyboardInterrupt: when stopped before the first tick.
+    """
+    error: BaseException | None = None
+    try:
+        log = run()
+    except (Exception, SystemExit) as raised:
+        kept: L | None = vars(raised).get("log")
+        if kept is None or not kept.ticks:
+            raise
+        log, error = kept, raised
+    if log.ticks == 0:
+        raise KeyboardInterrupt
+    return log, error

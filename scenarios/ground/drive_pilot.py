@@ -109,7 +109,7 @@ class Pilot(Generic[PlannerT]):
         self._pause, self._doubt, self._elsewhere = 0, 0, 0.0
         self._creeping: Creeping | None = None
         self._moved = np.zeros(3)  # since the scan that is searched for was taken
-        self._awake, self._failed = False, ""
+        self._awake, self._failed, self._traced = False, "", set[str]()
         self._first: Scan | None = None
 
     @property
@@ -157,7 +157,9 @@ class Pilot(Generic[PlannerT]):
             plan, self._failed = self._decide(scan, odometry, route, now, first), ""
         except (UnifgError, ArithmeticError, ValueError) as error:  # a robot that drives has to come to rest
             if str(error) != self._failed:  # what goes on failing is counted by the supervisor
-                logger.warning("the tick at %.2f s failed, the robot brakes: %s", now, error)
+                trace = None if str(error) in self._traced else error.__cause__  # has the lines of a user's part
+                logger.warning("the tick at %.2f s failed, the robot brakes: %s", now, error, exc_info=trace)
+                self._traced.add(str(error))
             self._failed = str(error)
             self.supervisor.fail(self._failed)
             plan = self._rest(self.pose)

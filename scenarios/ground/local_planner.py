@@ -20,7 +20,7 @@ from unifg.errors import ScenarioError
 from unifg.horizon import Plan
 from unifg.models.distance_map import DistanceMap
 from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.ground.protocols import constructed, load_class
+from unifg.scenarios.ground.protocols import constructed, load_class, named
 from unifg.scenarios.perception.tracks import Tracks
 from unifg.scenarios.planning.polyline import arc_lengths
 from unifg.typing import Array, ArrayLike, BoolArray
@@ -156,7 +156,8 @@ class PlannerAdapter:
             covariance: (3, 3) of the estimate; None for one without error.
 
         Raises:
-            ScenarioError: the planner returned something else than finite controls (2,) or (K, 2), or None.
+            ScenarioError: the planner raised something, or returned something else than finite controls (2,) or (K, 2),
+                or None.
         """
         begin, s = time.perf_counter(), self.settings
         self.estimate = np.array(pose, dtype=np.float64)
@@ -164,9 +165,15 @@ class PlannerAdapter:
         doubt = s.sigmas * float(np.sqrt(max(variance, 0.0)))
         lent, held, way = self.estimate.copy(), self.applied.copy(), reference.copy()  # which it may write into
         now = Situation(lent, held, way, tracks, self._walls, s, doubt)
-        answer = self.planner.control(now)
         size = s.kind.size
-        wanted = np.zeros((1, size)) if answer is None else np.atleast_2d(np.asarray(answer, dtype=np.float64))
+        with named("planner", self.planner):
+            answer = self.planner.control(now)
+            iterations = 0 if answer is None else int(getattr(self.planner, "iterations", 1))
+        try:
+            given = np.atleast_2d(np.asarray(np.zeros(size) if answer is None else answer))
+            wanted = given.astype(np.float64) if given.dtype.kind in "biuf" else np.zeros(0)
+        except ValueError:  # rows of several lengths
+            wanted = np.zeros(0)
         if wanted.ndim != 2 or wanted.shape[1] != size or not len(wanted) or not np.isfinite(wanted).all():
             raise ScenarioError(
                 f"the planner returned {answer!r}: give finite controls ({size},) or (K, {size}), or None"
@@ -180,7 +187,6 @@ class PlannerAdapter:
         status, source = fg.Status.STOP_RULE, "solved"
         if answer is None:
             status, source = fg.Status.LOCALLY_INFEASIBLE, "braking"
-        iterations = 0 if answer is None else int(getattr(self.planner, "iterations", 1))
         states = s.kind.rollout(self.estimate, controls, s.dt)
         return Plan(controls, states, status, iterations, source, excess, 1e3 * (time.perf_counter() - begin))
 
@@ -200,7 +206,8 @@ class PlannerAdapter:
         """Drop earlier plans, as when a new route makes them misleading."""
         forget = getattr(self.planner, "forget", None)
         if forget is not None:
-            forget()
+            with named("planner", self.planner):
+                forget()
 
 
 def reachable(wanted: Array, applied: Array, settings: ControllerSettings) -> Array:

@@ -6,7 +6,8 @@ Each is a class that `unifg run navigation` takes as MODULE:CLASS, and `Navigati
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from unifg.errors import ScenarioError
+from unifg.errors import ScenarioError, UnifgError
 from unifg.files.ros_map import OccupancyMap
 from unifg.models.distance_map import DistanceMap
 from unifg.models.planar import Base
@@ -22,7 +23,7 @@ from unifg.scenarios.options import find_modules_in
 from unifg.scenarios.perception.readings import Scan
 from unifg.typing import Array, ArrayLike
 
-__all__ = ["Estimator", "Judged", "LocaliserContext", "World", "constructed", "load_class", "name_of"]
+__all__ = ["Estimator", "Judged", "LocaliserContext", "World", "constructed", "load_class", "name_of", "named"]
 
 
 class World(Protocol):
@@ -115,23 +116,26 @@ class Judged:
         """Update the localiser, and take its estimate.
 
         Raises:
-            ScenarioError: it is none.
+            ScenarioError: it is none, or the localiser raised something.
         """
-        self.own.update(scan, odometry, dt)
+        with named("localiser", self.own):
+            self.own.update(scan, odometry, dt)
         self._take()
 
     def reset(self, pose: Array, sigma: Array) -> None:
         """Begin anew, as `Estimator.reset`.
 
         Raises:
-            ScenarioError: the estimate is none.
+            ScenarioError: the estimate is none, or the localiser raised something.
         """
-        self.own.reset(pose, sigma)
+        with named("localiser", self.own):
+            self.own.reset(pose, sigma)
         self._take()
 
     def _take(self) -> None:
-        said = self.own.pose, self.own.covariance
-        pose, covariance = (np.array(part, dtype=np.float64) for part in said)
+        with named("localiser", self.own):
+            said = self.own.pose, self.own.covariance
+            pose, covariance = (np.array(part, dtype=np.float64) for part in said)
         right = (pose.shape, covariance.shape) == ((3,), (3, 3)) and np.isfinite([*pose, *covariance.flat]).all()
         if not right or np.linalg.eigvalsh(covariance)[0] <= 0.0:
             what = " and covariance ".join(" ".join(repr(part).split()) for part in said)
@@ -168,6 +172,25 @@ class LocaliserContext:
 def name_of(given: str | type) -> str:
     """MODULE:CLASS of a class, or the name itself."""
     return given if isinstance(given, str) else f"{given.__module__}:{given.__qualname__}"
+
+
+@contextmanager
+def named(what: str, own: object) -> Iterator[None]:
+    """Name a user's part in what it raises: a robot that drives comes to rest where a part fails, and is recorded.
+
+    Args:
+        what: it is.
+        own: the user's object.
+
+    Raises:
+        ScenarioError: anything was raised, also SystemExit, which is its cause; other errors of unifg stay.
+    """
+    try:
+        yield
+    except UnifgError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ScenarioError(f"the {what} '{name_of(type(own))}' raised {error!r}") from error
 
 
 def load_class(
