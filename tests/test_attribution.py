@@ -342,5 +342,18 @@ def test_a_second_contact_soon_after_has_the_cause_of_the_first() -> None:
     assert found[2].cause.startswith(FAULT) and found[3].cause.startswith(FAULT)
 
 
+def test_contacts_that_begin_in_one_tick_are_contacts_with_several_things() -> None:
+    """Both began between two rows, and one of them was named: three entries of four collisions."""
+    contacts, away = made().contacts.copy(), made().obstacles.copy()
+    contacts[21:] = 2
+    place = np.concatenate([away, away - [0.0, 0.1, 0.0]], axis=1)
+    log = made(contacts=contacts, collisions=2, obstacles=place, obstacle_moves=np.zeros(2, dtype=bool))
+    found = judged(log).contacts
+    assert [each.thing for each in found] == ["obstacle 1", "obstacle 0"] and {each.tick for each in found} == {21}
+    contacts[24:] = 3  # less than 0.5 s later it can be neither
+    found = judged(replace(log, contacts=contacts, collisions=3)).contacts
+    assert [each.thing for each in found] == ["obstacle 1", "obstacle 0", "wall"]
+
+
 def test_metrics_are_plain_numbers() -> None:
     assert json.loads(json.dumps(episode_metrics(made())))["contacts"][0]["thing"] == "obstacle 0"

@@ -12,7 +12,7 @@ had met a known wall before.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -34,6 +34,8 @@ ALIKE = 0.1  # [m] between the hulls of a disc and of its track
 BRAKES = 0.1  # [m/s] by which a base may be faster than it is told
 CARRIED = 5.0  # [m/s]; a faster robot was carried
 REST, RESTED = 0.05, 0.5  # [m/s, s] of a robot that is run into
+FAR = 1e3  # [m] away, for what is left out
+RENEWED = 0.5  # [s] within which a contact with the same thing is no event of its own
 TOUCH = 0.01  # [m] inside of a known wall, from which a way out meets it
 
 
@@ -95,10 +97,10 @@ def judged(log: EpisodeLog) -> Judgement:
     }  # fmt: skip
     ticks = {kind: int(np.count_nonzero(held)) for kind, held in flags.items()}
     # The contact of the last tick has no row behind it.
-    events = np.flatnonzero(np.diff(np.concatenate([[0], log.contacts, [log.collisions]])) > 0).tolist()
+    begun = np.maximum(np.diff(np.concatenate([[0], log.contacts, [log.collisions]])), 0)
     contacts: list[Contact] = []
-    for k in events:
-        found = judge.contact(min(k, len(log.time) - 1))
+    for k in np.repeat(np.minimum(np.arange(len(begun)), len(log.time) - 1), begun).tolist():
+        found = judge.contact(k, {each.thing for each in contacts if log.time[k] - each.time < RENEWED})
         pushed = contacts and found.tick - contacts[-1].tick <= judge.steps  # on, by what it had met before
         contacts.append(replace(found, cause=contacts[-1].cause) if pushed else found)
     return Judgement(tuple(contacts), ticks, float(np.mean(judge.distance > log.assumed.sigmas)))
@@ -188,11 +190,19 @@ class _Judge:
             return True
         return bool((np.hypot(*(tracks[:, :2] - place).T) - tracks[:, 2] < distance + ALIKE).any())
 
-    def contact(self, tick: int) -> Contact:
-        """Attribute the contact that the row of a tick, or the end of the log, is the first to record."""
+    def contact(self, tick: int, but: Collection[str] = ()) -> Contact:
+        """Attribute a contact that the row of a tick, or the end of the log, is the first to record.
+
+        Args:
+            tick: of the row.
+            but: things that were touched just before, or in the same tick by another contact.
+        """
         log, rows = self.log, slice(max(tick - 1, 0), tick + 1)
         discs, walls = self._gaps_to_discs()[rows].min(axis=0), self._wall_gaps(self.true, log.true_pose[rows]).min()
-        thing = int(np.argmin(discs)) if discs.min(initial=np.inf) < walls else None
+        names = [*(f"obstacle {disc}" for disc in range(len(discs))), "wall"]
+        gaps = np.append(discs, walls) + [FAR * (name in but) for name in names]  # the nearest of the others
+        nearest = int(np.argmin(gaps))
+        thing = nearest if nearest < len(discs) else None
         first = max(0, tick - self.steps - 1)
         broken = min(self._broken(thing, first, tick), key=lambda each: each.tick, default=None)
         met = np.flatnonzero(self._wall_gaps(self.known, log.way_out[first : tick + 1]).min(axis=1) < -TOUCH) + first
@@ -202,7 +212,7 @@ class _Judge:
             cause = f"{FAULT}: no assumption was broken in the {tick - first} ticks before"
         else:
             cause = f"{BREAKS} ({broken.kind}) at {log.time[broken.tick]:.1f} s: {broken.words}"
-        return Contact(tick, float(log.time[tick]), "wall" if thing is None else f"obstacle {thing}", cause)
+        return Contact(tick, float(log.time[tick]), names[nearest], cause)
 
     def _broken(self, thing: int | None, first: int, last: int) -> Sequence[Broken]:
         """Assumptions that were broken in some ticks and can be the cause of a contact with a wall or a disc."""
