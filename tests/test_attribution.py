@@ -278,6 +278,14 @@ def test_brakes_may_err_by_a_tenth_of_a_metre_a_second(step: float, broken: bool
     assert found.startswith(BREAKS + " (brakes) at 1.8 s") is broken and found.startswith(FAULT) is not broken
 
 
+@pytest.mark.parametrize(("tick", "broken"), [(20, True), (21, False)])
+def test_a_push_by_what_was_met_is_no_fault_of_the_brakes(tick: int, broken: bool) -> None:
+    """Row 21 has the contact: its speed is that of a robot that was hit."""
+    pose = made().true_pose.copy()
+    pose[tick + 1 :, 0] += 0.1
+    assert cause(made(true_pose=pose, estimate=pose)).startswith(BREAKS + " (brakes)") is broken
+
+
 @pytest.mark.parametrize(("tick", "broken"), [(14, False), (15, True), (21, True), (22, False)])
 def test_only_what_could_still_matter_is_a_cause(tick: int, broken: bool) -> None:
     log = made()

@@ -219,7 +219,7 @@ class _Judge:
         log, ticks = self.log, range(first, last + 1)
         told = self.speed - self.too_fast
         found = self._where(
-            self.too_fast > BRAKES, ticks, "brakes",
+            self.too_fast > BRAKES, range(first, last), "brakes",  # later speeds are those of who was hit
             lambda k: f"{self.speed[k]:.2f} m/s where {told[k]:.2f} was asked of "
             f"brakes of {self.assumed.deceleration:g} m/s^2",
         )  # fmt: skip
