@@ -205,9 +205,7 @@ class Flight:
     def run(self, progress: Progress) -> FlightLog:
         """Fly to the target, or until it is no use; what was recorded is the `log` of an exception, too."""
         settings, world, dt = self.settings, self.world, self.settings.controller.dt
-        recorder = Recorder(
-            FlightLog, layout=world.layout, settings=settings.summary(), dt=dt, parameters_true=world.parameters.packed
-        )
+        recorder = Recorder(FlightLog, layout=world.layout, settings=settings.summary(), dt=dt)
         self._control: Array | None = None
         self._reached = self._landed = self._astray = False
 
@@ -303,6 +301,7 @@ class Flight:
             landmarks=landmark_rows(marks.ids, marks.positions, marks.covariances, marks.radii),
             parameters=belief.parameters.packed,
             parameters_sigma=belief.parameters_sigma,
+            parameters_true=world.parameters.packed,
             seen=reading.ids,
             movers=world.discs()[:, :3],
             **pilot.clock.milliseconds,

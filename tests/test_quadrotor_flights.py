@@ -14,10 +14,13 @@ from scipy import stats
 from benchmarks import quadrotor_tables
 from benchmarks.comparison import against, paired, share
 from benchmarks.quadrotor_flights import STUDIES, cells
-from unifg.scenarios.flight import FlightSettings, run_flight
+from unifg.scenarios.episode import silent
+from unifg.scenarios.flight import Flight, FlightSettings, run_flight
 from unifg.scenarios.logs.flight_log import FlightLog
+from unifg.scenarios.logs.flight_metrics import flight_metrics
 from unifg.scenarios.papers import corridor_flights
 from unifg.scenarios.papers.corridor_flights import Job
+from unifg.scenarios.simulation.faults import FLIGHT_FAULTS, one_of
 
 Row = dict[str, Any]
 
@@ -51,6 +54,17 @@ def test_every_study_flies_what_it_should() -> None:
     assert next(job for job in jobs if job.study == "potential").settings().controller.avoidance == "potential"
     assert next(job for job in jobs if job.study == "association").settings().estimator.association == "unknown"
     assert next(job for job in jobs if job.study == "movers").settings().movers == 2
+
+
+def test_the_truth_of_a_loaded_vehicle_has_its_load() -> None:
+    """Errors and coverage of the mass were those against the empty vehicle."""
+    fault = one_of(FLIGHT_FAULTS)("payload=0.25@0.2")
+    log = Flight(FlightSettings(seed=1, time_limit=0.6, faults=(fault,)), rehearsal=True).run(silent)
+    empty = log.parameters_true[0, 0]
+    assert log.parameters_true.shape == (log.ticks, 7)
+    np.testing.assert_allclose(log.parameters_true[:, 0], empty * np.where(log.time > 0.2 + 1e-9, 1.25, 1.0))
+    error = flight_metrics(log)["mass_error_relative"]
+    assert error == pytest.approx(abs(log.parameters[-1, 0] / (1.25 * empty) - 1.0))
 
 
 @pytest.mark.product(2, of="drives and flights")

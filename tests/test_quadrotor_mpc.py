@@ -74,7 +74,7 @@ def test_a_flight_reaches_the_target_and_learns_the_mass() -> None:
     assert log.target_distance[-1] < episode.REACHED_DISTANCE
     assert np.linalg.norm(log.believed[-1, :3] - log.layout.target) < episode.REACHED_DISTANCE
     assert np.linalg.norm(log.truth[-1, 7:]) < episode.REACHED_SPEED
-    assert abs(log.parameters[0, 0] / log.parameters_true[0] - 1.0) > 0.03
+    assert abs(log.parameters[0, 0] / log.parameters_true[0, 0] - 1.0) > 0.03
     error = flight_metrics(log)["mass_error_relative_5s"]
     assert error is not None
     assert error < 0.01

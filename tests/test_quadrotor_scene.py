@@ -46,7 +46,7 @@ def flight(ticks: int = 24, *, estimated: bool = True, movers: int = 1, reached:
     things, settings = layout(), {"scenario": "quadrotor-mpc", "solver": "ipm", "coupling": "sequential", "seed": 7}
     limits = {"rate_limits": [4.0, 4.0, 2.0], "thrust_limits": [2.0, 20.0]}
     true = np.array([1.0, 0.1, 0.1, 0.2, 0.3, -0.1, 0.0])
-    known = {"layout": things, "settings": {**settings, "controller": limits}, "dt": DT, "parameters_true": true}
+    known = {"layout": things, "settings": {**settings, "controller": limits}, "dt": DT}
     recorder = Recorder(FlightLog, **known)
     share = np.linspace(0.0, 1.0, max(ticks, 2))
 
@@ -77,6 +77,7 @@ def flight(ticks: int = 24, *, estimated: bool = True, movers: int = 1, reached:
             ),
             parameters=np.concatenate([[mass], true[1:]]) if estimated else true,
             parameters_sigma=np.array([0.02, 0.1, 0.1, 0.1, 0.1, 0.1, 0.0]) if estimated else np.zeros(7),
+            parameters_true=true,
             seen=ids,
             movers=[[8.0 + 0.01 * k, -2.0, 0.4]] * movers,
             estimate_ms=5.0 if estimated else 0.0,

@@ -389,5 +389,5 @@ def test_a_flight_log_survives_its_file(ticks: int, tmp_path: Path) -> None:
 
 def test_a_file_that_is_no_flight_log_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "other.npz", a=np.zeros(3))
-    with pytest.raises(FileFormatError, match="is no unifg flight log 4"):
+    with pytest.raises(FileFormatError, match="is no unifg flight log 5"):
         FlightLog.load(tmp_path / "other.npz")

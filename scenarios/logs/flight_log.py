@@ -36,16 +36,14 @@ class FlightLog(VehicleLog):
     Attributes:
         layout: start, target and what stands between.
         settings: everything that says how the flight was made (solver, coupling, seed, ...); JSON values.
-        parameters_true: (7,).
         reached: the target was reached.
         outcome: of the flight, in words.
     """
 
-    KIND: ClassVar[str] = "unifg flight log 4"
+    KIND: ClassVar[str] = "unifg flight log 5"
 
     layout: Layout
     settings: dict[str, Any]
-    parameters_true: Array
     reached: bool
     outcome: str = ""
 
@@ -64,6 +62,8 @@ class FlightLog(VehicleLog):
     parameters: Array = column("kg, kg/s, m/s^2", 7)
     """As believed."""
     parameters_sigma: Array = column("kg, kg/s, m/s^2", 7)
+    parameters_true: Array = column("kg, kg/s, m/s^2", 7)
+    """Those of the step that led here, with the load and the wind of injected faults."""
     seen: list[IntArray] = ragged(dtype=np.intp)
     """Ids the sensor reported."""
     movers: Array = column("m", None, 3)

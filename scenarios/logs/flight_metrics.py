@@ -58,7 +58,8 @@ def flight_metrics(log: FlightLog) -> dict[str, Any]:
     active = estimated_parameters(log)
     early = round(_EARLY / log.dt)  # the tick of that time
     long_enough = early < log.ticks
-    mass = np.abs(log.parameters[:, 0] / log.parameters_true[0] - 1.0)
+    wrong = log.parameters - log.parameters_true
+    mass = np.abs(log.parameters[:, 0] / log.parameters_true[:, 0] - 1.0)
     return {
         "settings": dict(log.settings),
         "layout": log.layout.name,
@@ -78,8 +79,8 @@ def flight_metrics(log: FlightLog) -> dict[str, Any]:
         "velocity_error_m_per_s": norms(log.believed[:, 7:] - log.truth[:, 7:]) if estimated else None,
         "attitude_error_rad": norms(errors[:, 3:6]) if estimated else None,
         "coverage": _coverage(log, errors, active) if estimated else None,
-        "parameter_error": _by_name(log.parameters[-1] - log.parameters_true, active),
-        "parameter_error_5s": _by_name(log.parameters[early] - log.parameters_true, active) if long_enough else None,
+        "parameter_error": _by_name(wrong[-1], active),
+        "parameter_error_5s": _by_name(wrong[early], active) if long_enough else None,
         "parameter_sigma": _by_name(log.parameters_sigma[-1], active),
         "mass_error_relative": float(mass[-1]) if active[0] else None,
         "mass_error_relative_5s": float(mass[early]) if active[0] and long_enough else None,

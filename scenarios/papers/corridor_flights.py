@@ -53,7 +53,7 @@ def fly(**cell: Any) -> dict[str, Any]:
 
 def _mass(log: FlightLog) -> dict[str, list[float]]:
     """Relative error of the mass and its sigma at some times [s]."""
-    true = float(log.parameters_true[0])
+    true = log.parameters_true[:, 0]
     error, sigma = log.parameters[:, 0] / true - 1.0, log.parameters_sigma[:, 0] / true
     marks = [round(mark / log.dt) for mark in MARKS]
     return {f"{log.dt * k:g}": [float(error[k]), float(sigma[k])] for k in marks if k < log.ticks}

@@ -151,8 +151,8 @@ def plot_parameter(log: FlightLog, index: int, ax: Axes) -> Axes:
         ax: axes to draw into.
     """
     values, sigmas = log.parameters[:, index], log.parameters_sigma[:, index]
-    true = float(log.parameters_true[index])
-    ends = f"ends {100.0 * (values[-1] / true - 1.0):+.1f} %" if index == 0 else f"ends {values[-1] - true:+.3f}"
+    true = log.parameters_true[:, index]
+    ends = f"ends {100.0 * (values / true - 1.0)[-1]:+.1f} %" if index == 0 else f"ends {(values - true)[-1]:+.3f}"
     # A first guess that knows nothing would flatten the rest.
     settled = slice(min(10, log.ticks - 1), None)
     bounds = padded(true, values, (values - 2.5 * sigmas)[settled], (values + 2.5 * sigmas)[settled])
@@ -181,19 +181,19 @@ def _band(
     unit: str,
     values: Array,
     sigmas: Array,
-    true: float | None = None,
+    true: Array | None = None,
     bounds: tuple[float, float] | None = None,
 ) -> Axes:
     """Values, the truth, and a band of two sigmas around the values, or around zero for errors, which have no truth."""
     zero = np.zeros_like(values)
-    middle, truth, name, colour = zero, 0.0, "error", "robot"
+    middle, truth, name, colour = zero, zero, "error", "robot"
     if true is not None:
         middle, truth, name, colour = values, true, "estimate", "estimate"
     band: dict[str, Any] = {"color": css(colour), "alpha": 0.17, "lw": 0, "label": "\u00b1 2\u03c3"}
     ax.fill_between(log.time, middle - 2.0 * sigmas, middle + 2.0 * sigmas, **band)
     curves = (
         (values, {"color": css(colour), "lw": 1.4, "label": name}),
-        (zero + truth, {"color": INK, "lw": 1.0, "ls": "--", "label": "truth (errors: zero)"}),
+        (truth, {"color": INK, "lw": 1.0, "ls": "--", "label": "truth (errors: zero)"}),
     )
     inside = 100.0 * float(np.mean(np.abs(values - truth) <= 2.0 * sigmas))
     return over_time(log, ax, f"{title}; {inside:.0f} % within 2\u03c3", unit, curves, bounds=bounds)

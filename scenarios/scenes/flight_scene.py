@@ -73,7 +73,7 @@ NUMBERS = (
         "position error", lambda log, k: f"{_error(log, k):.1f} cm", _error, plot={"unit": "cm", "colour": "estimate"}
     ),
     Number("mass \u00b1 \u03c3", _mass),
-    Number("true mass", lambda log, k: f"{log.parameters_true[0]:.3f} kg" if _mass(log, k) else ""),
+    Number("true mass", lambda log, k: f"{log.parameters_true[k][0]:.3f} kg" if _mass(log, k) else ""),
     Number(
         "estimate, plan", lambda log, k: spent(log.estimate_ms[k], log.plan_ms[k], log.compiled[k]),
         alarm=lambda log, k: log.compiled[k] > 0,
