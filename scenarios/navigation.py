@@ -132,6 +132,13 @@ class NavigationSettings(Settings):
     plant: str = option("light", choices=tuple(PLANTS))
     log: Path | None = option(None, text=existing("a log of a laser", folders=True), metavar="LOG")
 
+    def __post_init__(self) -> None:
+        """Refuse a planner or a localiser in one graph with something else."""
+        super().__post_init__()
+        for word, chosen, default in (("planner", self.planner, MPC), ("localiser", self.localiser, LOCALISERS[0])):
+            if self.coupling != "sequential" and chosen != default:
+                raise ScenarioError(f"the {word} '{name_of(chosen)}' stands for itself: its coupling is 'sequential'")
+
 
 def run_navigation(settings: NavigationSettings, progress: Progress | None = None) -> EpisodeLog:
     """Run one episode.
@@ -156,15 +163,6 @@ class Episode:
         settings = replace(settings, drivetrain=plant(settings.plant, settings.drivetrain))
         self.settings = settings
         self.controller = control = replace(settings.controller, accelerations=settings.drivetrain.sheet)
-        if settings.coupling != "sequential":
-            for word, chosen, default in (
-                ("planner", settings.planner, MPC),
-                ("localiser", settings.localiser, LOCALISERS[0]),
-            ):
-                if chosen != default:
-                    raise ScenarioError(
-                        f"the {word} '{name_of(chosen)}' stands for itself: its coupling is 'sequential'"
-                    )
         self._localiser = (
             None
             if settings.localiser in LOCALISERS

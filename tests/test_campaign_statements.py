@@ -138,6 +138,7 @@ def test_the_same_episode_has_the_same_key_however_it_is_stated(tmp_path: Path) 
         ({"scenario": "navigation", "grid": {"fault": ["lidar-nan@2:1", "gust@1"]}}, "unknown fault 'gust'"),
         ({"scenario": "navigation", "settings": {"fault": 3}}, "cannot be stated in a file but by a word"),
         ({"scenario": "navigation", "settings": {"fault": "lidar-nan"}}, "is not KIND"),
+        ({"scenario": "navigation", "settings": {"coupling": "joint", "localiser": "amcl"}}, "'amcl' stands"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused(entries: dict[str, Any], message: str) -> None:
