@@ -354,6 +354,34 @@ def test_scans_that_nothing_moves_or_of_other_beams_are_left_out(
         read_range_log("drive.mcap")
 
 
+def test_scans_and_odometry_that_are_none_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Clocks were to blame for scans without a step, and no file for a quaternion of zeros."""
+    for wrong, said in ((0.0, "5 beams in steps of 0 rad"), (math.nan, "5 beams in steps of nan rad")):
+        told = messages([1.0, 2.0])
+        for _, kind, message in told:
+            vars(message).update({"angle_increment": wrong} if kind == "LaserScan" else {})
+        monkeypatch.setattr(recordings, "_mcap", lambda path, told=told: iter(told))
+        with pytest.raises(FileFormatError, match=rf"drive\.mcap: scans of {said} are none"):
+            read_range_log("drive.mcap")
+    told = messages([1.0, 2.0])
+    told[-1][2].pose.pose.orientation = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=0.0)
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter(told))
+    with pytest.raises(FileFormatError, match=r"drive\.mcap: odometry: quaternion \(4,\) .* names no rotation"):
+        read_range_log("drive.mcap")
+
+
+def test_frames_that_do_not_meet_are_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    """Without /tf_static the laser stood where the odometry is, without a word."""
+    for child, said in (("base", True), ("/laser", False)):
+        told = messages([1.0, 2.0])
+        for _, kind, message in told:
+            vars(message).update({"child_frame_id": child} if kind == "Odometry" else {})
+        monkeypatch.setattr(recordings, "_mcap", lambda path, told=told: iter(told))
+        caplog.clear()
+        read_range_log("drive.mcap")
+        assert ("no static frames lead from 'laser' of the laser to 'base' of the odometry" in caplog.text) is said
+
+
 def hung(child: str, parent: str, place: tuple[float, float], turn: tuple[float, float, float, float]) -> Any:
     """A static frame; the quaternion has its scalar last."""
     where = SimpleNamespace(

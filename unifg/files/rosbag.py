@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from unifg.errors import FileFormatError
+from unifg.errors import FileFormatError, UnifgError
 from unifg.files.contents import legible
 from unifg.lie import SE2, SE3
 from unifg.typing import Array
@@ -51,7 +51,7 @@ def read_rosbag(path: Path) -> Recorded:
 
     Scans before or after all odometry, or of another frame or other directions than most, are left out with a warning.
     The laser stands where the static frames say, however many there are between it and the odometry's; of one that
-    hangs upside down the beams turn the other way round.
+    hangs upside down the beams turn the other way round. A warning says so where no static frames join the two.
 
     Raises:
         FileFormatError: it cannot be read, or holds no scans or no odometry.
@@ -80,6 +80,8 @@ def read_rosbag(path: Path) -> Recorded:
     scans, wheels = (max(topics[kind].values(), key=len) for kind in (SCAN, ODOMETRY))
     forms = Counter((scan.header.frame_id, len(scan.ranges), scan.angle_min, scan.angle_increment) for scan in scans)
     (frame, count, first, step), _ = forms.most_common(1)[0]
+    if not 0.0 < count * abs(step) < math.inf:
+        raise FileFormatError(f"{name}: scans of {count} beams in steps of {step:g} rad are none")
     known, every = np.array([_stamp(one) for one in wheels]), len(scans)
     scans = [
         scan
@@ -93,10 +95,18 @@ def read_rosbag(path: Path) -> Recorded:
     if len(scans) < every:
         logger.warning("%s: %d of %d scans left out: no odometry then, or other beams", name, every - len(scans), every)
     time = np.array([_stamp(scan) for scan in scans])
-    poses = _planar(_poses([one.pose.pose for one in wheels]))[np.argsort(known, kind="stable")]
+    try:
+        poses = _planar(_poses([one.pose.pose for one in wheels]))[np.argsort(known, kind="stable")]
+    except UnifgError as error:
+        raise FileFormatError(f"{name}: odometry: {error}") from error
     columns = (*poses[:, :2].T, np.unwrap(poses[:, 2]))
     at = np.column_stack([np.interp(time, np.sort(known), column) for column in columns])
-    base, laser = (_hung(links, one) for one in (wheels[0].child_frame_id, frame))
+    (root, base), (other, laser) = (_hung(links, one) for one in (wheels[0].child_frame_id, frame))
+    if root != other:
+        logger.warning(
+            "%s: no static frames lead from %r of the laser to %r of the odometry, which is taken to be %r",
+            name, frame, wheels[0].child_frame_id, other,
+        )  # fmt: skip
     mount = SE3.between(base, laser)
     ranges = np.array([scan.ranges for scan in scans], dtype=np.float64)
     ranges[ranges < scans[0].range_min] = np.nan
@@ -161,11 +171,11 @@ def _planar(poses: Array) -> Array:
     return np.stack([*np.moveaxis(poses[..., :2], -1, 0), np.arctan2(matrix[..., 1, 0], matrix[..., 0, 0])], axis=-1)
 
 
-def _hung(links: dict[str, tuple[str, Array]], frame: str) -> Array:
-    """(7,) pose of a frame in the last one that it hangs on; ROS 1 may begin their names with a slash."""
+def _hung(links: dict[str, tuple[str, Array]], frame: str) -> tuple[str, Array]:
+    """The last frame that a frame hangs on, and its pose (7,) there; ROS 1 may begin their names with a slash."""
     pose = SE3.identity()
     for _ in links:  # at most; frames may hang on each other
         if (name := frame.lstrip("/")) in links:
             frame, own = links[name]
             pose = SE3.compose(own, pose)
-    return pose
+    return frame.lstrip("/"), pose
