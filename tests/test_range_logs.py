@@ -424,6 +424,40 @@ def test_a_broken_recording_is_refused(tmp_path: Path) -> None:
         read_range_log(tmp_path / "drive.bag")
 
 
+@pytest.mark.parametrize("wrong", ["no schema", "no summary", "damaged"])
+def test_what_is_wrong_with_an_mcap_file_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str) -> None:
+    """A channel without a schema, of no message of ROS, was an error; damaged chunks were read as they are."""
+    mcap = pytest.importorskip("mcap.writer")
+    decoder = SimpleNamespace(decoder_for=lambda encoding, schema: lambda data: json.loads(data, object_hook=held))
+    package = SimpleNamespace(DecoderFactory=lambda: decoder)
+    monkeypatch.setitem(sys.modules, "mcap_ros2", SimpleNamespace(decoder=package))
+    monkeypatch.setitem(sys.modules, "mcap_ros2.decoder", package)
+
+    def held(words: dict[str, Any]) -> Any:
+        return SimpleNamespace(**words)
+
+    path, bare = tmp_path / "drive.mcap", {"use_statistics": False, "use_summary_offsets": False}
+    bare |= {"repeat_channels": False, "repeat_schemas": False, "index_types": mcap.IndexType.NONE}
+    with path.open("wb") as file:
+        none = mcap.CompressionType.NONE
+        writer = mcap.Writer(file, compression=none, **(bare if wrong == "no summary" else {}))
+        writer.start()
+        writer.add_message(writer.register_channel("/note", "json", 0), log_time=0, publish_time=0, data=b"{}")
+        for topic, kind, message in messages([1.0, 2.0]):
+            schema = writer.register_schema(f"x/msg/{kind}", "json", b"{}")
+            data = json.dumps(message, default=vars).encode()
+            writer.add_message(writer.register_channel(topic, "json", schema), log_time=1, publish_time=1, data=data)
+        writer.finish()
+    if wrong == "no schema":
+        assert len(read_range_log(path)) == 2
+        return
+    if wrong == "damaged":
+        path.write_bytes(path.read_bytes().replace(b"40.0", b"20.0", 1))
+    words = "no summary of its channels" if wrong == "no summary" else "CRCValidationError"
+    with pytest.raises(FileFormatError, match=rf"drive\.mcap: cannot be read \(.*{words}"):
+        read_range_log(path)
+
+
 # ---------------------------------------------------------------- maps
 
 

@@ -122,9 +122,12 @@ def _mcap(path: Path) -> Iterator[tuple[str, str, Any]]:
     except ImportError as error:
         raise ImportError(f"reading {path.name} needs mcap and mcap-ros2-support: pip install 'unifg[logs]'") from error
     with path.open("rb") as file:
-        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         summary: Any = reader.get_summary()
-        kinds = {one.topic: _kind(summary.schemas[one.schema_id].name) for one in summary.channels.values()}
+        if summary is None:
+            raise FileFormatError("no summary of its channels at the end: `mcap recover` makes one")
+        schemas = {0: ""} | {number: schema.name for number, schema in summary.schemas.items()}  # 0: none
+        kinds = {one.topic: _kind(schemas[one.schema_id]) for one in summary.channels.values()}
         wanted = [topic for topic, kind in kinds.items() if kind]
         for _, channel, _, message in reader.iter_decoded_messages(topics=wanted):
             yield channel.topic, kinds[channel.topic], message
