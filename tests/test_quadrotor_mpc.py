@@ -413,7 +413,7 @@ def test_arguments_arrive() -> None:
     assert settings.controller.avoidance == "potential"
     parser = argparse.ArgumentParser()
     SCENARIOS["quadrotor-mpc"].add_options(parser)
-    assert parser.parse_args([]).solver == FlightSettings().solver
+    assert settings_of(FlightSettings, parser.parse_args([])).solver == FlightSettings().solver
 
 
 @pytest.mark.parametrize("words", [("--movers", "-1"), ("--mass-error", "1"), ("--coupling", "loose")])
