@@ -18,7 +18,7 @@ from unifg.lie import SE2
 from unifg.pose_graphs import Edges, PoseGraph, Submaps
 from unifg.solvers import GaussNewton
 
-CASES = (1_000_000, 0), (1_000_000, 50_000), (3_000_000, 50_000), (10_000_000, 50_000)
+CASES = ((1_000_000, 0), (1_000_000, 50_000), (3_000_000, 50_000))
 """Poses, and those of a submap at most; 0 for the whole graph in memory."""
 WIDTH = 250
 SIGMA, BEGUN, TOLERANCE = np.array([0.05, 0.05, 0.01]), np.array([0.05, 0.05, 0.002]), 1e-3
