@@ -11,7 +11,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.collection import BACKENDS, CASES, GROUPS, OPTIMUM, RIGHT, ipopt, verdict
+from problems.collection import BACKENDS, CASES, GROUPS, OPTIMUM, RIGHT, attempt, ipopt, verdict
 from problems.graphs import graph_with
 from problems.hock_schittkowski import Case
 from problems.known import short_drive
@@ -91,6 +91,13 @@ def test_backend_solves_what_its_class_allows(name: str, case: str) -> None:
             handle = graph.families[family]
             distance = handle.manifold.local(np.asarray(expected, dtype=np.float64), solution[handle])
             assert np.abs(distance).max() < 1e-5
+
+
+@pytest.mark.parametrize("case", ["HS24", "HS45", "HS61", "HS104"])
+def test_penalties_hold_what_curved_scalar_costs_run_down(case: str) -> None:
+    """Slopes at the guess are small, those farther on are not."""
+    outcome = attempt(case, BACKENDS["AugmentedLagrangian"])
+    assert outcome is not None and outcome.verdict == OPTIMUM and outcome.iterations <= 40
 
 
 @pytest.mark.product(1, of="studies")

@@ -83,6 +83,8 @@ def test_small_scalar_costs_are_judged_in_their_own_size() -> None:
         solution = solver.solve(graph, {x: np.zeros((1, 2))}, check=True)
         assert solution.cost == pytest.approx(1.875e-10, rel=1e-3)
         assert solution.verify()
+        solution.cost *= 2.0
+        assert "the cost is" in solution.verify().sentence
 
 
 def test_without_scaling_units_decide() -> None:

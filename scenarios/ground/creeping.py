@@ -59,8 +59,7 @@ class Creeping:
         now = int(np.argmin(away))
         ended = free[now] < bound + NEAR
         worth = free - ASIDE * (np.abs(FAN) if ended else away)  # there is more room along an aisle than across
-        axis = np.pi * (np.abs(FAN) > 0.5 * np.pi) if self.radius else 0.0 * FAN
-        reached = np.abs(wrap_angle(FAN - axis)) < (STEERED if self.radius else np.inf)
+        reached = (np.abs(np.sin(FAN)) < np.sin(STEERED)) | (self.radius == 0.0)
         best = int(np.argmax(np.where((ended | (away < AHEAD)) & reached, worth, -np.inf)))
         if ended or best != now:
             self._heading = float(FAN[best])

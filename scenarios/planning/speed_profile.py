@@ -12,6 +12,7 @@ import numpy as np
 
 from unifg.errors import FileFormatError, ScenarioError
 from unifg.files.contents import LIMITS, Limits, legible, read_text
+from unifg.files.text import number_of
 from unifg.typing import Array
 
 __all__ = ["Profile", "drive_cycle", "read_profile"]
@@ -135,12 +136,8 @@ def _column(
     for number, line in enumerate(lines[1:], start=2):
         if not any(word.strip() for word in line):
             continue
-        try:
-            word = line[matching[0]]
-            value = float(word) if "_" not in word else math.nan  # 1_5 is 15 for programs alone
-        except (IndexError, ValueError):
-            value = math.nan
-        if not math.isfinite(value):
+        value = number_of(line[matching[0]]) if matching[0] < len(line) else None
+        if value is None or not math.isfinite(value):
             raise FileFormatError(f"{file}, line {number}: no finite number in column '{head[matching[0]]}'")
         if not within[0] <= value <= within[1]:
             text = f"{value:g} in column '{head[matching[0]]}' is not between {within[0]:g} and {within[1]:g}"

@@ -13,6 +13,7 @@ import numpy as np
 
 from unifg.errors import FileFormatError
 from unifg.files.contents import LIMITS, Limits, legible, read_text, require_finite, write_text
+from unifg.files.text import number_of
 from unifg.lie import SO3
 from unifg.models.bundle_adjustment import BundleAdjustment
 
@@ -37,7 +38,7 @@ def read_bal(path: str | Path, limits: Limits = LIMITS) -> BundleAdjustment:
     except ValueError:
         numbers = np.zeros(0)
     if not len(numbers):
-        numbers = np.array([_number(word) for word in words])
+        numbers = np.array([number_of(word) for word in words], dtype=np.float64)  # NaN for none
     wrong = np.flatnonzero(~np.isfinite(numbers))
     if wrong.size:
         raise FileFormatError(f"{name}, line {_line(text, int(wrong[0]))}: '{words[wrong[0]]}' is no finite number")
@@ -87,14 +88,6 @@ def write_bal(path: str | Path, problem: BundleAdjustment) -> Path:
         *map("{:.17g}".format, numbers.tolist()),
     ]
     return write_text(Path(path), "\n".join(lines) + "\n")
-
-
-def _number(word: str) -> float:
-    """Value of a word, NaN where it is no number; ``1_000`` and the digits of other scripts are for programs."""
-    try:
-        return float(word) if word.isascii() and "_" not in word else np.nan
-    except ValueError:
-        return np.nan
 
 
 def _line(text: str, place: int) -> int:

@@ -23,6 +23,7 @@ from unifg.errors import FileFormatError
 from unifg.files.carmen import CarmenLog, Odometry, Scans, read_carmen
 from unifg.files.contents import LIMITS, Limits, legible, read_text, suffix_of
 from unifg.files.rosbag import read_rosbag
+from unifg.files.text import number_of
 from unifg.lie import SE2, wrap_angle
 from unifg.typing import Array
 
@@ -216,7 +217,7 @@ def _table(path: Path, limits: Limits) -> RangeLog:
         list(csv.reader(io.StringIO(read_text(path, replace(limits, digits=LONGEST)), newline=""))),
     )
     header = [word.strip() for word in lines[0]] if lines else []
-    beams = [k for k, word in enumerate(header) if _number(word) is not None]
+    beams = [k for k, word in enumerate(header) if number_of(word) is not None]
     if missing := [word for word in ("time", *POSE) if word not in header]:
         raise FileFormatError(f"{name}: the header has no {', '.join(missing)}; it needs time, x, y, theta and beams")
     if twice := [word for k, word in enumerate(header) if word in header[:k]]:
@@ -224,7 +225,7 @@ def _table(path: Path, limits: Limits) -> RangeLog:
     rows = [line for line in lines[1:] if line]
     values = np.empty((len(rows), len(header)))
     for number, row in enumerate(rows):
-        found = [_number(word or "nan") for word in row]
+        found = [number_of(word or "nan") for word in row]
         if len(row) != len(header) or None in found:
             raise FileFormatError(f"{name}: row {number + 1} is not {len(header)} numbers, as in the header")
         values[number] = found
@@ -240,10 +241,3 @@ def _table(path: Path, limits: Limits) -> RangeLog:
             raise FileFormatError(f"{name}: row {lost[0] + 1}: {word} is {values[lost[0], columns[word]]}, not finite")
     angles, odometry = np.array([float(header[k]) for k in beams]), values[:, [columns[word] for word in POSE]]
     return _in_order(name, values[:, columns["time"]], angles, values[:, beams], np.inf, odometry, reference)
-
-
-def _number(word: str) -> float | None:
-    try:
-        return float(word) if "_" not in word else None  # 1_5 is 15 for programs alone
-    except ValueError:
-        return None

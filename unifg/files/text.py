@@ -39,8 +39,16 @@ _UNIT = 1e-12  # a squared norm this close to one is one: what was written here 
 _TAGS = 64  # told apart by compiled code, the others by Python
 
 
+def number_of(word: str) -> float | None:
+    """The number that a word stands for, if any; ``1_000`` and the digits of other scripts are for programs."""
+    try:
+        return float(word) if word.isascii() and "_" not in word else None
+    except ValueError:
+        return None
+
+
 def decimal(place: str, word: str) -> float:
-    """The finite number that a word stands for; ``1_000`` and the digits of other scripts are for programs.
+    """The finite number that a word stands for, as :func:`number_of` has it.
 
     Args:
         place: file, line and field, for messages.
@@ -49,10 +57,7 @@ def decimal(place: str, word: str) -> float:
     Raises:
         FileFormatError: the word is no number, or not a finite one.
     """
-    try:
-        value = float(word) if word.isascii() and "_" not in word else None
-    except ValueError:
-        value = None
+    value = number_of(word)
     if value is None or not math.isfinite(value):
         what = "not a number" if value is None else "not a finite number"
         raise FileFormatError(f"{place} is {reprlib.repr(word)}, {what}")
