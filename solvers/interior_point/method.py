@@ -142,9 +142,9 @@ class InteriorPoint(Solver):
         step: Array = now["alpha"] * workspace.work.step[: run.program.size]
         return step if now["answer"] == state.TRY else None
 
-    def at_once(self, workspace: Workspace, values: Values, multipliers: Array) -> Conclusion | bool:
+    def at_once(self, workspace: Workspace, values: Array, multipliers: Array) -> Conclusion | bool:
         """One compiled call, where nobody looks and the last solve has left its settings."""
-        if not workspace.unfinished and not workspace.repeats(self, values.flat, multipliers):
+        if not workspace.unfinished and not workspace.repeats(self, values, multipliers):
             return False
         try:
             workspace.run_portion(self.max_iterations)

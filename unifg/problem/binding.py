@@ -138,7 +138,7 @@ class Binding:
                 holder._data = self.kept() if self._flags else self._flat.tobytes()
             self.holder = None
         slots = self._slots
-        if not isinstance(data, Mapping):
+        if type(data) is not dict and not isinstance(data, Mapping):
             raise GraphError(f"data of a solve are {{handle: value, ...}}, found {f'{data!r}'[:80]}")
         for handle, value in data.items():
             slot = slots.get(handle)

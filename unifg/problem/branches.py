@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from unifg.codegen.calls import matrix, vector
 from unifg.codegen.jit import compiled
-from unifg.problem.columns import Values
 from unifg.problem.evaluation import run_kernel
 from unifg.problem.table import ACTIVE, COUNT, TermTable
 from unifg.problem.term import CompiledTerm
@@ -43,17 +42,17 @@ class Branches:
         """Test whether there are comparisons."""
         return len(self._watched) > 0
 
-    def new(self, values: Values, verified: bool) -> bool:
+    def new(self, stored: Array, verified: bool) -> bool:
         """Test whether the comparisons of a factor come out as those of no factor did at a verified answer.
 
         Args:
-            values: an answer.
+            stored: values of an answer.
             verified: whether its outcomes are to be remembered.
         """
         table, arrays = self._table, self._table.arrays
         return _new_outcomes(
             table.fields, self._watched, arrays.gather, arrays.sizes, arrays.parameters, arrays.active,
-            values.flat, self._scratch, self._outcomes, self._seen, verified,
+            stored, self._scratch, self._outcomes, self._seen, verified,
         )  # fmt: skip
 
 

@@ -71,7 +71,8 @@ class Columns:
             self.width += family.count * family.manifold.dim
             self.stored += family.count * family.manifold.storage
         self.dimensions = sum(family.manifold.dim for family in families)
-        self.parts = [(family, *self.place(family)) for family in families]
+        self._places = {family: self._place(family) for family in families}
+        self.parts = [(family, *place) for family, place in self._places.items()]
         is_free = np.ones(self.width, dtype=bool)
         self.fixed: dict[str, IntArray] = {}
         for fix in fixes:
@@ -151,6 +152,9 @@ class Columns:
 
     def place(self, family: Family) -> tuple[slice, tuple[int, int]]:
         """Place of a family among the stored values, and its shape (count, storage)."""
+        return self._places[family]
+
+    def _place(self, family: Family) -> tuple[slice, tuple[int, int]]:
         first, shape = self.storage[family], (family.count, family.manifold.storage)
         return slice(first, first + shape[0] * shape[1]), shape
 

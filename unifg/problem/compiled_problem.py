@@ -298,33 +298,36 @@ class CompiledProblem:
             self.renew_verifications()
             self._watched = [term for term in self.terms if term.trace is not None and not term.trace.constant]
         for term in self._watched:
-            if term.trace is None:
+            if term.trace is None or not term.trace.changed:
                 continue
-            if term.trace.outdated:
-                if not term.trace_again(values):
-                    self._give_up(term)
-                else:
-                    self.table.renew(term)
-                    self.table.bind([term], self.lower, self.upper)
-                self.renew_verifications()
-            elif term.trace.moved:
+            if not (outdated := term.trace.outdated):
                 term.refresh()
+            elif term.trace_again(values):
+                self.table.renew(term)
+            else:
+                self._give_up(term)
+            if term.trace is not None:
                 self.table.bind([term], self.lower, self.upper)
+            if outdated:
+                self.renew_verifications()
         if self.soft:
             self._start_slacks(values)
         return values
+
+    def stored_from(self, guess: Array) -> Array:
+        """The same of a guess as it is stored, which is viewed by families only where somebody has to look at them."""
+        moved, stored = any(term.trace.changed for term in self._watched if term.trace), guess.copy()
+        plain = self._vetted and not (moved or self.soft or self.reader.particular)
+        return stored if plain and self.reader.settles(stored) else self.values_from(guess).flat
 
     def _start_slacks(self, values: Values) -> None:
         """Set slack variables to what the limits of soft constraints are violated by."""
         for slack in self.soft.values():
             values[slack.family][:] = 0.0
-        found = self.evaluate(values).constraints
-        for term, rows in zip(self.constraint_terms, self.slices, strict=True):
-            if term.name in self.soft:
-                slack, shape = self.soft[term.name], (term.count, term.size)
-                above, below = found[rows] - self.upper[rows], self.lower[rows] - found[rows]
-                outside = [np.nan_to_num(np.maximum(part, 0.0), posinf=0.0).reshape(shape) for part in (above, below)]
-                values[slack.family][:] = slack.stored(*outside)
+        beyond = np.nan_to_num(self.violation(self.evaluate(values).constraints), posinf=0.0, neginf=0.0)
+        above, below = self.by_term(np.maximum(beyond, 0.0)), self.by_term(np.maximum(-beyond, 0.0))
+        for name, slack in self.soft.items():
+            values[slack.family][:] = slack.stored(above[name], below[name])
 
     def mistraced(self, values: Values, slopes: bool, seed: int) -> dict[str, str]:
         """Leave to Python the terms whose traces are not their functions at an answer.
@@ -373,9 +376,9 @@ class CompiledProblem:
         self._watching = True
         self.renew_verifications()
 
-    def new_branches(self, values: Values, verified: bool) -> bool:
+    def new_branches(self, stored: Array, verified: bool) -> bool:
         """Test whether comparisons in watched traces come out as at no verified answer; ``verified``: this is one."""
-        return self.branches is not None and bool(self.branches) and self.branches.new(values, verified)
+        return self.branches is not None and bool(self.branches) and self.branches.new(stored, verified)
 
     def renew_verifications(self) -> None:
         """Keep what verifies the present traces."""
@@ -607,8 +610,7 @@ class CompiledProblem:
     @property
     def inequalities(self) -> BoolArray:
         """(M,) rows that have a limit and are no equalities."""
-        found: BoolArray = (np.isfinite(self.lower) | np.isfinite(self.upper)) & ~self.equality
-        return found
+        return cast(BoolArray, (np.isfinite(self.lower) | np.isfinite(self.upper)) & ~self.equality)
 
     def violation(self, constraints: Array) -> Array:
         """(M,) signed distance outside the limits: positive above, negative below, zero inside."""

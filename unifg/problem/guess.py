@@ -57,11 +57,15 @@ class GuessReader:
             values = Values(self._columns, guess.flat.copy())
         else:
             values = self._read(guess)
-        fixed = self._retraction
-        fine = settle(values.flat, fixed.fixed, fixed.fixed_values, self.quaternions)
+        fine = self.settles(values.flat)
         if not (fine and all(leaf.is_valid(values[f][:, part]).all() for f, part, leaf in self.particular)):
             self._name_invalid(values)
         return values
+
+    def settles(self, stored: Array) -> bool:
+        """Give fixed variables their values; test that all numbers are finite, and quaternions of norm 1."""
+        fixed = self._retraction
+        return bool(settle(stored, fixed.fixed, fixed.fixed_values, self.quaternions))
 
     def _read(self, guess: Mapping[Family, ArrayLike]) -> Values:
         """A copy of values from anywhere."""

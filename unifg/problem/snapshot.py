@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -60,16 +59,17 @@ class Snapshot(Linearization):
         """Made by :meth:`LinearizationMemory.copied`."""
         self.cost = cost
         self._program, self._flat, self._parts = program, flat, parts
+        self._stored = flat[parts["values"]]
 
-    @cached_property
+    @property
     def stored(self) -> Array:
         """Stored values of all families."""
-        return self._flat[self._parts["values"]]
+        return self._stored
 
     def of(self, family: Family) -> Array:
         """(count, storage) values of one family, without a look at the others."""
         part, shape = self._program.columns.place(family)
-        return self.stored[part].reshape(shape)
+        return self._stored[part].reshape(shape)
 
     def __getattr__(self, name: str) -> Any:
         """View an array, once."""

@@ -172,6 +172,11 @@ class Trace:
         """True if parameters have changed that are no data."""
         return bool(self.free) and changed_arrays(self.free)
 
+    @property
+    def changed(self) -> bool:
+        """True if the one or the other has changed."""
+        return self.outdated or self.moved
+
     def refreshed(self) -> Trace:
         """The same trace with the present content of its parameters."""
         return replace(self, free=_contents([array for array, _ in self.free]))

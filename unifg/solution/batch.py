@@ -200,7 +200,7 @@ def flat_guesses(prepared: Worker, guesses: AnyGuess | Sequence[AnyGuess]) -> tu
     for index, guess in enumerate(guesses if isinstance(guesses, Sequence) else [guesses]):
         with _of_instance(index):
             rows.append(prepared.read(guess))
-    return np.stack([values.flat for values, *_ in rows]), np.stack([multipliers for _, multipliers, _ in rows])
+    return np.stack([values for values, *_ in rows]), np.stack([multipliers for _, multipliers, _ in rows])
 
 
 def solve_batch(

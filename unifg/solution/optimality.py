@@ -167,7 +167,7 @@ def read_numbers(found: Array, cost: float) -> Optimality:
     stationarity, violation, complementarity, worst, finite, slope = found.tolist()
     if finite == 0.0 or not math.isfinite(cost):
         return Optimality(np.inf, np.inf, np.inf, -1, False)
-    return Optimality(stationarity, violation, complementarity, int(worst), True, slope=slope)
+    return Optimality(stationarity, violation, complementarity, int(worst), True, True, 0.0, 1.0, slope)
 
 
 def _relative_rounding(program: CompiledProblem, lin: Linearization, multipliers: Array) -> float:

@@ -194,7 +194,7 @@ class IterativeMethod(Backend):
         """The compiled loop of :meth:`solve_each` for one instance, for :meth:`Prepared.export`."""
         raise NotImplementedError
 
-    def at_once(self, workspace: Any, values: Values, multipliers: Array) -> Conclusion | bool:
+    def at_once(self, workspace: Any, values: Array, multipliers: Array) -> Conclusion | bool:
         """Solve in one compiled call that judges its answer.
 
         Args:

@@ -113,7 +113,7 @@ class Prepared:
                 raise BackendError(f"this prepared {self.solver.name} has no unfinished solve to proceed with")
             values, multipliers, data = self._begun
             self.program.bind(data)  # of which other solves of the graph may have left their own
-            start = self.program.values_from(values), multipliers.copy(), self.program.no_penalties
+            start = self.program.stored_from(values), multipliers.copy(), self.program.no_penalties
             solution = self._answered(*start, None, time.perf_counter())
             self._last, self._bound = ref(solution), self.program.binding.edition
             return solution
@@ -278,7 +278,7 @@ class Prepared:
         began = time.perf_counter()
         if getattr(self._workspace, "portion", None) is not None:
             present = {handle: value.copy() for handle, value in program.binding.present.items()}
-            self._begun = values.flat.copy(), multipliers.copy(), present
+            self._begun = values.copy(), multipliers.copy(), present
         solution = self._verified(self._answered(values, multipliers, penalties, callback, began), began, callback)
         self._last, self._bound = ref(solution), program.binding.edition
         if check and not solution.converged:
@@ -286,7 +286,7 @@ class Prepared:
         return solution
 
     def _answered(
-        self, values: Values, multipliers: Array, penalties: Array, callback: Callback | None, began: float
+        self, values: Array, multipliers: Array, penalties: Array, callback: Callback | None, began: float
     ) -> Solution:
         """The solution of a solve from there: by one compiled call, if the backend has one and it succeeds."""
         program, solver = self.program, self.solver
@@ -303,12 +303,12 @@ class Prepared:
                 program.binding.edition,
             )
             return solution
-        run = SolveState(solver, program, values, multipliers, callback)
+        run = SolveState(solver, program, program.columns.view(values), multipliers, callback)
         run._started, run.penalties, run.begun = began, penalties, found
         return self._finished(run)
 
-    def read(self, guess: AnyGuess, duals: Mapping[str, Numbers] | None = None) -> tuple[Values, Array, Array]:
-        """Values, multipliers (M,) and penalties (M,) of a guess, checked; fixed variables have their values."""
+    def read(self, guess: AnyGuess, duals: Mapping[str, Numbers] | None = None) -> tuple[Array, Array, Array]:
+        """Stored values, multipliers (M,) and penalties (M,) of a guess, checked; fixed variables have their values."""
         program = self.program
         stored = guess.flat(program) if isinstance(guess, Guess | Solution) and not duals else None
         if stored is not None:
@@ -316,7 +316,7 @@ class Prepared:
             self._require_finite("multipliers", multipliers)
             if penalties is not program.no_penalties:
                 self._require_finite("penalties", penalties)
-            return program.values_from(flat), self._pressing(multipliers.copy()), penalties
+            return program.stored_from(flat), self._pressing(multipliers.copy()), penalties
         values = program.values_from(guess if isinstance(guess, Mapping) else values_of(guess))
         if duals is not None:
             require_kinds("solve", GraphError, {"duals": "Mapping"}, {"duals": duals}, Mapping)
@@ -326,11 +326,12 @@ class Prepared:
             carried = guess.multipliers
             penalties = self._stacked("penalties", guess.penalties) if guess.penalties else penalties
         multipliers = self._stacked("multipliers", {**carried, **duals} if duals else carried)
-        return values, self._pressing(multipliers), penalties
+        return values.flat, self._pressing(multipliers), penalties
 
     def _pressing(self, multipliers: Array) -> Array:
         """Multipliers without those of rows that have no limit, as of factors that have been switched off."""
-        multipliers[self.program.unlimited] = 0.0
+        if len(self.program.unlimited):
+            multipliers[self.program.unlimited] = 0.0
         return multipliers
 
     def _verified(self, solution: Solution, began: float, callback: Callback | None) -> Solution:
@@ -346,24 +347,24 @@ class Prepared:
         solution.checked = not program.verifications
         if solution.checked or not solution.finite or solution.status is Status.INTERRUPTED:
             return solution
-        values = solution._lin.values
+        lin = solution._lin
         broken = bool(program.demanding) and self._broken(solution)
         due = slopes or self._solves % EVERY == 0 or self._owed or broken
-        if not due and self._of_branches < AT_ONCE + self._solves // LATER and program.new_branches(values, False):
+        if not due and self._of_branches < AT_ONCE + self._solves // LATER and program.new_branches(lin.stored, False):
             due = True
             self._of_branches += 1
         late = time.perf_counter() - began > self.solver.time_limit
         self._owed = due and late and not broken  # verified after the next solve that leaves time for it
         if not due or self._owed:
             return solution
-        program.new_branches(values, True)
+        program.new_branches(lin.stored, True)
         mistraced: dict[str, str] = {}
-        while found := program.mistraced(values, slopes, self._solves):
+        while found := program.mistraced(lin.values, slopes, self._solves):
             mistraced |= found
             solution = self._continued(solution, program.columns.values(solution.values), began, callback)
             if not solution.finite:
                 break
-            values = solution._lin.values
+            lin = solution._lin
             self._broken(solution)
         solution.checked, solution.mistraced = solution.finite, mistraced
         solution.seconds = time.perf_counter() - began

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from unifg.lie import Manifold
-from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution.guess import Guess
 from unifg.typing import Array
@@ -20,17 +19,17 @@ WAVES = 3  # half waves along a family at most
 LONG = 5  # members from which on a family is taken for a trajectory
 
 
-def spread(program: CompiledProblem, guess: tuple[Values, Array, Array], count: int) -> Iterator[Guess]:
+def spread(program: CompiledProblem, guess: tuple[Array, Array, Array], count: int) -> Iterator[Guess]:
     """Starts around a guess, the same ones each time, within the bounds of the unknowns; made one by one.
 
     Args:
         program: the compiled graph, with its data bound whenever a start is asked for.
-        guess: values, multipliers and penalties.
+        guess: stored values, multipliers and penalties.
         count: of starts.
     """
     rng, (values, multipliers, penalties) = np.random.default_rng(0), guess
     for _ in range(count):
-        moved = Values(program.columns, values.flat.copy())
+        moved = program.columns.view(values.copy())
         for family, points in moved.items():
             points[:] = family.manifold.retract(points, _steps(family.manifold, points, rng))
         program.retraction.fix(moved)

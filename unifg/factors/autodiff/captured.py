@@ -65,8 +65,10 @@ class _Watched:
             present = entries_of(container)
             if len(present) != len(entries) or any(now is not kept for now, kept in zip(present, entries, strict=True)):
                 return True
-        changed = any(fingerprint_of(interpolator) != content for interpolator, content in self.interpolators)
-        return changed or changed_arrays(self.arrays)
+        for interpolator, content in self.interpolators:
+            if fingerprint_of(interpolator) != content:
+                return True
+        return bool(self.arrays) and changed_arrays(self.arrays)
 
 
 def changed_arrays(contents: Sequence[tuple[Array, bytes]]) -> bool:
