@@ -19,7 +19,6 @@ import numpy as np
 from unifg.errors import GraphError
 from unifg.modeling.duplicates import doubles
 from unifg.modeling.variables import Data, Family
-from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.solution.guess import Guess
 from unifg.solution.solution import AnyGuess, Solution
@@ -61,8 +60,8 @@ class Worker(Protocol):
     def solve(self, guess: AnyGuess, *, data: Mapping[Data, Numbers] | None = None) -> Solution:
         """Solve one instance."""
 
-    def read(self, guess: AnyGuess) -> tuple[Values, Array, Array]:
-        """Values, multipliers and penalties of a guess."""
+    def read(self, guess: AnyGuess) -> tuple[Array, Array, Array]:
+        """Stored values, multipliers and penalties of a guess."""
 
     def twins(self, count: int) -> Sequence[Worker]:
         """Workers of other threads."""
