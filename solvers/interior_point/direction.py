@@ -18,7 +18,7 @@ LEAST_SHIFT, SINGULAR_SHIFT = 1e-12, 1e-8  # less leaves singular arcs of costs 
 DUAL_SHIFT = 1e-11
 SHORT = 0.01  # length of a step
 LEAST_SHARE = 0.2  # of the second derivatives, before they are left out
-FLAT = 1e-9  # curvature relative to the largest that counts as none
+FLAT = 1e-9  # curvature relative to the largest that counts as none; without equalities, to that along each unknown
 
 
 @linked
@@ -119,7 +119,8 @@ def examine(address: int) -> None:
     now.share, now.definite = 0.0, EXAMINED
     run(links[0].assemble, (address,))
     for k in range(len(free)):
-        shift[k] = -FLAT * largest / units[free[k]] ** 2
+        own = abs(hessian[diagonal[k]])
+        shift[k] = -FLAT * (own if own > 0.0 and len(rows) == 0 else largest / units[free[k]] ** 2)
     definite = largest > 0.0 and holds(links[0].factor, (plan, data, shift)) and plan.state[NEGATIVE] == len(rows)
     now.share, now.definite = share, YES if definite else NO
 
