@@ -131,3 +131,10 @@ def test_a_function_whose_arrays_have_a_row_for_each_factor_is_told_how_to_say_s
     x, y = np.array(MISRA.x)[:, None], np.array(MISRA.y)[:, None]
     with pytest.raises(fg.GraphError, match=r"row for each of 14 factors, say so: fg.each\(array\)"):
         graph.minimize(lambda b, x, y: _saturation(b, x) - y, b[0], x, y)
+    data = graph.data("x", x)
+    with pytest.raises(fg.GraphError, match=r"factors, say so: fg.each\(array\), graph.data\(..., each=True\)"):
+        graph.minimize(lambda b, x: _saturation(b, x), b[0], data)
+    with pytest.raises(fg.GraphError, match=r"say it where they are made: graph.data\('x', ..., each=True\)"):
+        fg.each(data)
+    with pytest.raises(fg.GraphError, match=r"fg.shared takes constants; of data 'x' say it .* each=False\)"):
+        fg.shared(data)

@@ -150,9 +150,10 @@ def size_of(found: Array, name: str, arguments: Sequence[Any], count: int, scala
         expected = "(n,)" if scalar else "(n, m)"
         column = not scalar and found.shape == (count,)
         hint = "; a number for each factor is a column, (n, 1): return r[:, None]" if column else ""
-        arrays = [argument for argument in arguments if isinstance(argument, np.ndarray) and argument.ndim > 0]
-        if found.ndim == 2 and any(len(array) == len(found) for array in arrays):
-            hint = f"; where arrays have a row for each of {len(found)} factors, say so: fg.each(array)"
+        arrays = [a.value if isinstance(a, Data) else a for a in arguments if isinstance(a, Data | np.ndarray)]
+        if found.ndim == 2 and any(array.shape[:1] == found.shape[:1] for array in arrays):
+            said = "fg.each(array), graph.data(..., each=True)"
+            hint = f"; where arrays have a row for each of {len(found)} factors, say so: {said}"
         raise GraphError(
             f"term '{name}': its function returned shape {found.shape}, expected {expected} with n = {count}{hint}; "
             f"arguments were {told(arguments, count)}",

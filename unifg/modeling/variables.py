@@ -177,7 +177,7 @@ def each(value: ArrayLike, *, units: str | None = None, frame: str | None = None
     Raises:
         GraphError: it is a scalar, or not made of real numbers or booleans.
     """
-    array = doubles("an argument of fg.each", value, flags=True)
+    array = _constant("each", value)
     if array.ndim == 0:
         raise GraphError("fg.each needs one row per factor, found a scalar")
     return Declared(array, True, quantity("fg.each", units, frame))
@@ -191,8 +191,14 @@ def shared(value: ArrayLike, *, units: str | None = None, frame: str | None = No
     Raises:
         GraphError: it is not made of real numbers or booleans.
     """
-    array = doubles("an argument of fg.shared", value, flags=True)
-    return Declared(array, False, quantity("fg.shared", units, frame))
+    return Declared(_constant("shared", value), False, quantity("fg.shared", units, frame))
+
+
+def _constant(declared: str, value: ArrayLike) -> Array:
+    if isinstance(value, Data):
+        said = f"graph.data('{value.name}', ..., each={declared == 'each'})"
+        raise GraphError(f"fg.{declared} takes constants; of data '{value.name}' say it where they are made: {said}")
+    return doubles(f"an argument of fg.{declared}", value, flags=True)
 
 
 ParameterLike: TypeAlias = ArrayLike | Data | Declared
