@@ -35,7 +35,7 @@ import numpy as np
 from unifg.elimination.saddle import NOTHING
 from unifg.errors import BackendError
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.problem.hessian import lagrangian_hessian
+from unifg.problem.hessian import lagrangian_hessian, require_second
 from unifg.problem.linearization import Linearization
 from unifg.problem.systems import aim, fill
 from unifg.solution.solve_state import SolveState
@@ -48,7 +48,7 @@ from unifg.solvers.globalize.feasibility_restoration import leave, settle
 from unifg.solvers.globalize.line_search import search
 from unifg.solvers.globalize.merit import OnePrice
 from unifg.solvers.globalize.norms import largest, norm
-from unifg.solvers.globalize.slow_convergence import converges_slowly
+from unifg.solvers.globalize.slow_convergence import converges_slowly, iterations_left
 from unifg.typing import Array
 
 RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved
@@ -60,6 +60,7 @@ DAMPING_DECAY = 0.9  # faster forgetting cycles between overshooting and shorten
 FIRST_SLACKNESS = 1e-4
 FIRST_LEVENBERG = 1e-6
 RETRY_GROWTH = 100.0
+WORTH = 4.0  # iterations of Gauss-Newton that are left, from which on second derivatives pay
 SHORT = 0.1  # share of a step with the Hessian of the Lagrangian below which one of Gauss-Newton is tried as well
 PRICE = 2.0  # times the largest multiplier: the penalty of violation at most
 ENTERING = 1e-3  # share of the tolerance by which a row is violated that enters the active set
@@ -96,6 +97,8 @@ class KKT(Solver):
 
     def workspace(self, program: CompiledProblem) -> Newton:
         """Structure of the KKT matrix."""
+        if program.fully_compiled and not self.full_steps:
+            require_second(program)
         return Newton(program)
 
     def search_step(self, run: SolveState, workspace: Newton, lin: Linearization) -> Array | None:
@@ -113,7 +116,7 @@ class KKT(Solver):
         damping = slackness = 0.0
         failures, slow = 0, False
         while run.status is None:
-            taken, slow = None, slow or (converges_slowly(run.history) and not self.full_steps)
+            taken, slow = None, slow or (self._bends(run) and not self.full_steps)
             if slow and (found := workspace.step(run.lin, run.multipliers, 0.0, slackness, curved=True)) is not None:
                 taken = self._search(run, workspace, merit, *found, hopeful=True)
             if doubtful := taken is None or taken[3] < SHORT:
@@ -154,12 +157,17 @@ class KKT(Solver):
             slackness = 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
         return None
 
+    def _bends(self, run: SolveState) -> bool:
+        """Test whether second derivatives pay."""
+        few = iterations_left(run.history, self.tolerance) <= WORTH or run.program.batched
+        return not few or converges_slowly(run.history)
+
     def _damped(self, run: SolveState, workspace: Newton) -> Status | None:
         """Levenberg and Marquardt's iteration."""
         merit, damping = OnePrice(run.program), Damping(FIRST_LEVENBERG)
         rejected, slackness, slow = 0, 0.0, False
         while run.status is None:
-            lin, slow = run.lin, slow or converges_slowly(run.history)
+            lin, slow = run.lin, slow or self._bends(run)
             less = damping.value / (1.0 + damping.value)
             curved = slow and rejected == 0
             found = workspace.step(lin, run.multipliers, damping.value, slackness, less, curved)

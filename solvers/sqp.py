@@ -22,6 +22,7 @@ import numpy as np
 
 from unifg.errors import BackendError
 from unifg.problem.compiled_problem import CompiledProblem
+from unifg.problem.hessian import require_second
 from unifg.problem.linearization import Linearization
 from unifg.solution.capabilities import require
 from unifg.solution.solve_state import SolveState
@@ -29,7 +30,7 @@ from unifg.solution.solver import Solver
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import RestorationTrigger, leave, resume, settle
 from unifg.solvers.globalize.norms import largest
-from unifg.solvers.globalize.slow_convergence import PATIENCE, converges_slowly
+from unifg.solvers.globalize.slow_convergence import PATIENCE, converges_slowly, iterations_left
 from unifg.solvers.quadratic_programs.attempt import LOGGED, SMALLEST_DAMPING, STARTED, STOPPED
 from unifg.solvers.quadratic_programs.loop import kkt_size, rests, useful_accuracy
 from unifg.solvers.quadratic_programs.routes import Subproblems
@@ -37,6 +38,7 @@ from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
 from unifg.typing import Array
 
 FAILURES = 4  # damped attempts at one step before giving up
+WORTH, WORTH_ON_GRAPH = 8.0, 30.0  # iterations of Gauss-Newton that the last few with second derivatives cost
 
 
 @dataclass(kw_only=True)
@@ -48,8 +50,8 @@ class SQP(Solver):
         hessian: "gauss-newton", or "exact": of the Lagrangian with the present multipliers, second derivatives of
             residuals and constraints included, which converges quadratically where Gauss-Newton is linear. A step for
             which it has the wrong inertia, or along which the merit does not fall, takes Gauss-Newton's. "auto" begins
-            with the first and goes on with the second on slow convergence; under a
-            ``time_limit`` it stays with the first, for the second has to be compiled.
+            with the first and goes on with the second where steps converge more slowly than the second would, which
+            the last two iterations tell; under a ``time_limit`` it stays with the first.
         qp: "osqp" (called directly, warm-started; what it finds active is completed on the graph), "graph" (active
             sides, or an interior point, whose systems are eliminated on the graph), "elimination" (Ta's primal and dual
             linear graphs, for equalities only; a reference, written to be read) or any name qpsolvers knows. A
@@ -109,6 +111,8 @@ class SQP(Solver):
 
     def workspace(self, program: CompiledProblem) -> Subproblems:
         """QP workspaces."""
+        if program.fully_compiled and self.hessian != "gauss-newton" and self.time_limit == np.inf:
+            require_second(program)
         return Subproblems(
             program,
             hessian=self.hessian,
@@ -123,7 +127,7 @@ class SQP(Solver):
         """The full step of the subproblem."""
         workspace.start(lin)
         qp = subproblem(run.program, lin, SMALLEST_DAMPING * workspace.scaling.metric, workspace.pattern)
-        answer = workspace.solve(qp, run.multipliers, self._accuracy(run, workspace))
+        answer = workspace.solve(qp, run.multipliers, self._accuracy(run, workspace, False))
         return answer.step if np.isfinite(answer.error) else None
 
     def iterate(self, run: SolveState, workspace: Subproblems) -> Status | None:
@@ -148,7 +152,7 @@ class SQP(Solver):
             if now["answer"] == STOPPED:
                 return Status.STOP_RULE
             if not steps.pending:
-                if turning and converges_slowly(run.history):
+                if turning and (converges_slowly(run.history) or self._bends(run, workspace)):
                     turning, workspace = False, workspace.curved()
                     self._begin(run, workspace)
                 calls = watch.calls(run.optimality.violation, run.tolerances.violation)
@@ -200,6 +204,11 @@ class SQP(Solver):
                 return Status.STOP_RULE
         return None
 
+    def _bends(self, run: SolveState, workspace: Subproblems) -> bool:
+        """Test whether Gauss-Newton has more iterations to go than a few with second derivatives cost."""
+        worth = WORTH_ON_GRAPH if workspace.first.name == "graph" else WORTH
+        return not run.program.batched and iterations_left(run.history, self.tolerance) > worth
+
     def _begin(self, run: SolveState, workspace: Subproblems) -> None:
         """Begin at the present iterate, with nothing learned."""
         workspace.start(run.lin)
@@ -210,8 +219,8 @@ class SQP(Solver):
 
         Without ``qp`` the subproblem is Gauss-Newton's, and is put together where it is looked at.
         """
-        steps, accuracy = workspace.steps, self._accuracy(run, workspace)
-        curved = qp is not None and qp.curved_by is not None
+        steps, curved = workspace.steps, qp is not None and qp.curved_by is not None
+        accuracy = self._accuracy(run, workspace, curved)
         steps.pose(run.lin, run.multipliers, shift, accuracy, workspace.exact, curved)
         answer, good = steps.on_graph() if qp is None and workspace.compiled and run.program.sided else (None, False)
         if good:
@@ -230,9 +239,9 @@ class SQP(Solver):
 
         return answer if steps.taken(correct) else None
 
-    def _accuracy(self, run: SolveState, workspace: Subproblems) -> float:
-        """Accuracy to ask of the QP."""
-        return useful_accuracy(workspace.exact, _size(run, workspace), self.tolerance, workspace.scaling.smallest)
+    def _accuracy(self, run: SolveState, workspace: Subproblems, curved: bool) -> float:
+        """Accuracy to ask of the QP, ``curved`` by second derivatives or not."""
+        return useful_accuracy(curved, _size(run, workspace), self.tolerance, workspace.scaling.smallest)
 
 
 def _budget(watch: RestorationTrigger, rows: int) -> int:

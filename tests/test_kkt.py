@@ -15,7 +15,7 @@ from problems.graphs import drawn_to, graph_of, graph_with
 from problems.known import STARTS, ecg2o, pose_chain, three_variable_qp
 from unifg.models import unicycle
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.solvers import KKT, SQP, InteriorPoint
+from unifg.solvers import KKT, SQP, InteriorPoint, kkt
 from unifg.solvers.active_set import ALL_AT_ONCE, ONE_BY_ONE, ActiveSet
 from unifg.typing import Array
 
@@ -123,8 +123,9 @@ def test_feasibility_is_restored_although_the_cost_rises() -> None:
     np.testing.assert_allclose(solution[graph.families["x"]], 0.5**0.5, atol=1e-6)
 
 
-def test_strong_curvature_needs_the_merit_function() -> None:
+def test_strong_curvature_needs_the_merit_function(monkeypatch: pytest.MonkeyPatch) -> None:
     """On a small circle the Hessian of Gauss-Newton is 30 times too weak: full steps cycle, shortened ones damp."""
+    monkeypatch.setattr(kkt, "WORTH", np.inf)  # before second derivatives take over
     graph, guess = circle((1.0, 0.5), (0.3, 0.1), 1e-4)
     assert not KKT(full_steps=True).solve(graph, guess).converged
     solution = KKT().solve(graph, guess, check=True)
@@ -133,8 +134,9 @@ def test_strong_curvature_needs_the_merit_function() -> None:
     assert any(row.step_length < 1.0 for row in solution.history[1:])
 
 
-def test_second_order_correction_repairs_a_full_step() -> None:
+def test_second_order_correction_repairs_a_full_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """Along a circle a full step leaves the constraint: Maratos."""
+    monkeypatch.setattr(kkt, "WORTH", np.inf)
     graph, guess = circle((np.cos(2.0), np.sin(2.0)), target=(3.0, 0.0))
     corrected = KKT().solve(graph, guess, check=True)
     rows = [row for row in corrected.history if "correction" in row.details]

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.control import Unicycle
 from problems.graphs import drawn_to
 from problems.known import short_drive
-from unifg.solvers import SQP
+from unifg.solvers import KKT, SQP, kkt, sqp
 from unifg.solvers.globalize.feasibility_restoration import FALLING, PATIENCE, RestorationTrigger
-from unifg.solvers.globalize.slow_convergence import converges_slowly
+from unifg.solvers.globalize.slow_convergence import converges_slowly, iterations_left
 from unifg.solvers.quadratic_programs.attempt import highest_price, next_damping, raise_prices
 from unifg.solvers.quadratic_programs.routes import RESTING
 from unifg.solvers.quadratic_programs.subproblem import LEFT, QPAnswer, subproblem
@@ -97,8 +98,47 @@ def test_the_first_route_rests_after_a_step_that_led_nowhere() -> None:
     assert routes == [work.first.name, *[work.fallback.name] * RESTING, work.first.name]
 
 
-def row(missing: float) -> Any:
-    return SimpleNamespace(stationarity=missing, violation=0.1 * missing, complementarity=0.01 * missing)
+def row(missing: float, length: float = 1.0) -> Any:
+    """Row of a history."""
+    parts = {"stationarity": missing, "violation": 0.1 * missing, "complementarity": 0.01 * missing}
+    return SimpleNamespace(**parts, step_length=length)
+
+
+def test_the_last_two_full_steps_tell_how_many_are_left() -> None:
+    history = [row(0.01 * 0.5**k) for k in range(5)]
+    assert iterations_left(history, 1e-6) == pytest.approx(np.log(1e-6 / (0.01 / 16.0)) / np.log(0.5))
+    assert iterations_left(history[:3], 1e-6) == 0.0, "two steps of a start tell nothing"
+    for shortened in (-1, -2):
+        other = [*history]
+        other[shortened] = row(0.01 * 0.5 ** (5 + shortened), 0.5)
+        assert iterations_left(other, 1e-6) == 0.0
+    assert iterations_left(history[::-1], 1e-6) == 0.0, "they diverge"
+    assert iterations_left([row(20.0 * 0.5**k) for k in range(5)], 1e-6) == 0.0, "far from an answer"
+    assert iterations_left(history, 0.01 / 16.0) == 0.0, "none is left"
+
+
+@pytest.mark.parametrize("backend", [SQP, KKT])
+def test_second_derivatives_take_over_where_gauss_newton_has_far_to_go(
+    backend: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stated = Unicycle("straight", True, 20).formulation()
+
+    def solved(graph: fg.Graph, **options: Any) -> fg.Solution:
+        return backend(**options).solve(graph, stated.guess, check=True)
+
+    found = solved(stated.graph)
+    assert found.iterations <= 8, "for twenty"
+    if backend is SQP:
+        assert "exact" in str(found.history[-1].details.get("hessian"))
+        assert solved(stated.graph, time_limit=60.0).iterations >= 15, "what it needs has to be compiled"
+    monkeypatch.setattr(sqp, "WORTH", np.inf)
+    monkeypatch.setattr(kkt, "WORTH", np.inf)
+    other = solved(stated.graph)
+    assert other.iterations >= 15 and other.cost == pytest.approx(found.cost, rel=1e-7)
+    monkeypatch.undo()
+    x = stated.x
+    stated.graph.minimize(fg.residual(lambda p: 1e-3 * p[:, :1], derivatives="differences"), x[-1], name="own")
+    assert solved(stated.graph).iterations >= 15, "second derivatives of Python's terms cost more"
 
 
 @pytest.mark.parametrize(("pace", "slow"), [(0.75, False), (0.9, True), (1.1, True)])

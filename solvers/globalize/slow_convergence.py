@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from unifg.solution.history import Iteration
 
 PATIENCE = 20  # iterations that any solve may take to get near
 LOOK_BACK = 10  # iterations over which progress is judged
+NEAR = 0.1  # largest KKT number: farther away second derivatives may lead to another optimum, or to none
+FEW = 4  # rows of a history, from which on its last two iterations tell the rate
 PROGRESS = 0.1  # of the error, that a sound linear convergence leaves after them: 0.8 per iteration
 
 
@@ -16,6 +19,14 @@ def converges_slowly(history: Sequence[Iteration]) -> bool:
     if len(history) <= PATIENCE:
         return False
     return _missing(history[-1]) > PROGRESS * _missing(history[-1 - LOOK_BACK])
+
+
+def iterations_left(history: Sequence[Iteration], tolerance: float) -> float:
+    """Iterations to the tolerance at the rate of the last two; 0 where these are not full steps that converge."""
+    if len(history) < FEW or any(row.step_length < 1.0 for row in history[-2:]):
+        return 0.0
+    before, now = _missing(history[-3]), _missing(history[-1])
+    return 2.0 * math.log(now / tolerance) / math.log(before / now) if tolerance < now < min(before, NEAR) else 0.0
 
 
 def _missing(row: Iteration) -> float:

@@ -182,9 +182,8 @@ class Subproblems:
 
     def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
         """Test whether an answer leaves most of the violation, as the least error of contradicting rows does."""
-        if answer.error <= 0.1 * self.tolerance:  # which is no less than what is left
-            return False
-        return bool(leaves_most(qp.linear(answer.step), qp.lower, qp.upper, 0.1 * self.tolerance))
+        most = leaves_most(qp.linear(answer.step), qp.lower, qp.upper, 0.1 * self.tolerance)
+        return bool(most and answer.error > 0.1 * self.tolerance)  # which is no less than what is left
 
     def distrust(self) -> bool:
         """Leave the first route out for a while, after a step of it that led nowhere; whether it gave the last step."""
