@@ -57,12 +57,15 @@ def test_scans_that_nothing_moves_or_of_other_beams_are_left_out(
 
 def test_scans_and_odometry_that_are_none_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """Clocks were to blame for scans without a step, and no file for a quaternion of zeros."""
-    for wrong, said in ((0.0, "5 beams in steps of 0 rad"), (math.nan, "5 beams in steps of nan rad")):
+    for key, wrong, said in (
+        ("angle_increment", 0.0, "from -1 rad in steps of 0 rad"), ("angle_min", math.inf, "from inf rad in steps of"),
+        ("angle_increment", math.nan, "from -1 rad in steps of nan rad"),
+    ):  # fmt: skip
         told = messages([1.0, 2.0])
         for _, kind, message in told:
-            vars(message).update({"angle_increment": wrong} if kind == "LaserScan" else {})
+            vars(message).update({key: wrong} if kind == "LaserScan" else {})
         monkeypatch.setattr(recordings, "_mcap", lambda path, told=told: iter(told))
-        with pytest.raises(FileFormatError, match=rf"drive\.mcap: scans of {said} are none"):
+        with pytest.raises(FileFormatError, match=rf"drive\.mcap: scans of 5 beams {said}.* are none"):
             read_range_log("drive.mcap")
     told = messages([1.0, 2.0])
     told[-1][2].pose.pose.orientation = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=0.0)
@@ -81,6 +84,53 @@ def test_frames_that_do_not_meet_are_said(monkeypatch: pytest.MonkeyPatch, caplo
         caplog.clear()
         read_range_log("drive.mcap")
         assert ("no static frames lead from 'laser' of the laser to 'base' of the odometry" in caplog.text) is said
+
+
+def test_scans_in_a_hole_of_odometry_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Over 40 s without odometry the way was a straight line; a robot that stands may be silent as long."""
+    for moved, left in ((100.0, [1.0, 3.0, 44.0]), (0.0, [1.0, 3.0, 20.0, 44.0])):
+        told = messages([1.0, 3.0, 20.0, 44.0])
+        late = messages([])
+        for _, _, message in late:
+            message.header.stamp.sec += 43
+            message.pose.pose = SimpleNamespace(**vars(message.pose.pose))
+            message.pose.pose.position = SimpleNamespace(x=4.0 + moved, y=0.0, z=0.0)
+        monkeypatch.setattr(recordings, "_mcap", lambda path, told=told + late: iter(told))
+        assert read_range_log("drive.mcap").time.tolist() == left
+    assert "1 of 4 scans left out: no odometry then" in caplog.text
+
+
+def test_drives_and_topics_that_are_mixed_are_said(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Two drives of one simulated clock were one that jumped; of several odometries one was taken without a word."""
+    told = messages([1.0, 2.0])
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter([*told, *messages([])]))
+    read_range_log("drive.mcap")
+    assert "stamps of odometry run backwards by up to 4 s" in caplog.text
+    caplog.clear()
+    other = messages([])[1:4]
+    for _, _, message in other:
+        message.child_frame_id = "arm"
+        message.pose.pose = SimpleNamespace(**vars(message.pose.pose))
+        message.pose.pose.position = SimpleNamespace(x=50.0, y=0.0, z=0.0)
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter([*told, *other, ("/ekf", *messages([])[0][1:])]))
+    np.testing.assert_array_equal(read_range_log("drive.mcap").odometry[:, 0], [1.0, 2.0])
+    assert "odometry of other frames than 'base' in 'laser' left out" in caplog.text
+    assert "several topics of Odometry, of which that with most is taken: /odom (8), /ekf (1)" in caplog.text
+
+
+def test_a_laser_that_does_not_scan_level_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of one that stands on its side, rounding decided to which side its beams turn."""
+    for turn in ((0.5**0.5, 0.0, 0.0, 0.5**0.5), (0.0, 0.5**0.5, 0.0, 0.5**0.5)):
+        told = [*messages([1.0, 2.0]), ("/tf_static", "TFMessage", SimpleNamespace(transforms=[
+            hung("laser", "base", (0.2, 0.0), turn)
+        ]))]  # fmt: skip
+        monkeypatch.setattr(recordings, "_mcap", lambda path, told=told: iter(told))
+        with pytest.raises(FileFormatError, match=r"drive\.mcap: the laser 'laser' is tilted by 90 degrees"):
+            read_range_log("drive.mcap")
 
 
 def hung(child: str, parent: str, place: tuple[float, float], turn: tuple[float, float, float, float]) -> Any:

@@ -19,13 +19,16 @@ import numpy as np
 from unifg.errors import FileFormatError, UnifgError
 from unifg.files.contents import legible
 from unifg.lie import SE2, SE3
-from unifg.typing import Array
+from unifg.typing import Array, BoolArray
 
 __all__ = ["Recorded", "read_rosbag"]
 
 logger = logging.getLogger("unifg")
 
 SCAN, ODOMETRY, FRAMES = "LaserScan", "Odometry", "TFMessage"
+LEVEL = 0.9  # cosine of the tilt of a laser, below which its plane is not that of the map
+BACK = 1.0  # [s] by which stamps run backwards in one drive at most
+HOLE = 1.0, 10.0, 0.1  # [s], over the usual interval, and [m] of way, beyond which odometry is not interpolated
 
 
 class Recorded(NamedTuple):
@@ -49,12 +52,12 @@ class Recorded(NamedTuple):
 def read_rosbag(path: Path) -> Recorded:
     """Read the topic with most scans, and the one with most odometry.
 
-    Scans before or after all odometry, or of another frame or other directions than most, are left out with a warning.
-    The laser stands where the static frames say, however many there are between it and the odometry's; of one that
-    hangs upside down the beams turn the other way round. A warning says so where no static frames join the two.
+    Scans before, after or in a hole of the odometry, or of another frame or other directions than most, are left out
+    with a warning. The laser stands where the static frames say, however many there are between it and the odometry's;
+    of one that hangs upside down the beams turn the other way round. A warning says so where none join the two.
 
     Raises:
-        FileFormatError: it cannot be read, or holds no scans or no odometry.
+        FileFormatError: it cannot be read, holds no scans or no odometry, or the laser does not scan level.
         ImportError: the package that reads it is not installed.
     """
     own = path / "drive.npz" if path.is_dir() else path.with_name("drive.npz")
@@ -78,15 +81,20 @@ def read_rosbag(path: Path) -> Recorded:
     if lacking := [kind for kind in (SCAN, ODOMETRY) if kind not in topics]:
         raise FileFormatError(f"{name}: no message of ROS of the kind {' and '.join(lacking)}{hint}")
     scans, wheels = (max(topics[kind].values(), key=len) for kind in (SCAN, ODOMETRY))
+    for kind in (SCAN, ODOMETRY):
+        if len(topics[kind]) > 1:
+            said = ", ".join(f"{topic} ({len(found)})" for topic, found in topics[kind].items())
+            logger.warning("%s: several topics of %s, of which that with most is taken: %s", name, kind, said)
     forms = Counter((scan.header.frame_id, len(scan.ranges), scan.angle_min, scan.angle_increment) for scan in scans)
     (frame, count, first, step), _ = forms.most_common(1)[0]
-    if not 0.0 < count * abs(step) < math.inf:
-        raise FileFormatError(f"{name}: scans of {count} beams in steps of {step:g} rad are none")
-    known, every = np.array([_stamp(one) for one in wheels]), len(scans)
+    if not (math.isfinite(first) and 0.0 < count * abs(step) < math.inf):
+        raise FileFormatError(f"{name}: scans of {count} beams from {first:g} rad in steps of {step:g} rad are none")
+    (known, poses, holes, robot), every = _odometry(name, wheels), len(scans)
     scans = [
         scan
         for scan in scans
-        if known.min() <= _stamp(scan) <= known.max()
+        if known[0] <= _stamp(scan) <= known[-1]
+        and not holes[np.searchsorted(known, _stamp(scan))]
         and (scan.header.frame_id, len(scan.ranges)) == (frame, count)
         and abs(scan.angle_min - first) + count * abs(scan.angle_increment - step) < abs(step)
     ]
@@ -95,23 +103,47 @@ def read_rosbag(path: Path) -> Recorded:
     if len(scans) < every:
         logger.warning("%s: %d of %d scans left out: no odometry then, or other beams", name, every - len(scans), every)
     time = np.array([_stamp(scan) for scan in scans])
-    try:
-        poses = _planar(_poses([one.pose.pose for one in wheels]))[np.argsort(known, kind="stable")]
-    except UnifgError as error:
-        raise FileFormatError(f"{name}: odometry: {error}") from error
     columns = (*poses[:, :2].T, np.unwrap(poses[:, 2]))
-    at = np.column_stack([np.interp(time, np.sort(known), column) for column in columns])
-    (root, base), (other, laser) = (_hung(links, one) for one in (wheels[0].child_frame_id, frame))
+    at = np.column_stack([np.interp(time, known, column) for column in columns])
+    (root, base), (other, laser) = (_hung(links, one) for one in (robot, frame))
     if root != other:
         logger.warning(
             "%s: no static frames lead from %r of the laser to %r of the odometry, which is taken to be %r",
-            name, frame, wheels[0].child_frame_id, other,
+            name, frame, robot, other,
         )  # fmt: skip
     mount = SE3.between(base, laser)
+    if abs(level := float(SE3.matrix(mount)[2, 2])) < LEVEL:
+        tilt = math.degrees(math.acos(abs(level)))
+        raise FileFormatError(f"{name}: the laser {frame!r} is tilted by {tilt:.0f} degrees: scans are to be level")
     ranges = np.array([scan.ranges for scan in scans], dtype=np.float64)
     ranges[ranges < scans[0].range_min] = np.nan
-    angles = math.copysign(1.0, SE3.matrix(mount)[2, 2]) * (first + step * np.arange(count, dtype=np.float64))
+    angles = math.copysign(1.0, level) * (first + step * np.arange(count, dtype=np.float64))
     return Recorded(time, angles, ranges, float(scans[0].range_max), SE2.compose(at, _planar(mount)))
+
+
+def _odometry(name: str, wheels: list[Any]) -> tuple[Array, Array, BoolArray, str]:
+    """Times (n,) and planar poses (n, 3) in order, which of them (n,) end a hole, and the frame of the robot.
+
+    Raises:
+        FileFormatError: an attitude is none.
+    """
+    ((world, robot), _), *others = Counter((one.header.frame_id, one.child_frame_id) for one in wheels).most_common()
+    if others:
+        wheels = [one for one in wheels if (one.header.frame_id, one.child_frame_id) == (world, robot)]
+        logger.warning("%s: odometry of other frames than %r in %r left out", name, robot, world)
+    time = np.array([_stamp(one) for one in wheels])
+    if (back := float((np.maximum.accumulate(time) - time).max())) > BACK:
+        logger.warning("%s: stamps of odometry run backwards by up to %g s: is it more than one drive?", name, back)
+    order = np.argsort(time, kind="stable")
+    try:
+        time, poses = time[order], _planar(_poses([one.pose.pose for one in wheels]))[order]
+    except UnifgError as error:
+        raise FileFormatError(f"{name}: odometry: {error}") from error
+    gaps, (least, usual, way) = np.diff(time, prepend=time[0]), HOLE
+    holes = (gaps > max(least, usual * float(np.median(gaps)))) & (
+        np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T) > way
+    )
+    return time, poses, holes, robot
 
 
 def _mcap(path: Path) -> Iterator[tuple[str, str, Any]]:
