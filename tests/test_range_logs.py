@@ -143,7 +143,8 @@ def test_other_units_are_no_log(log: RangeLog, tmp_path: Path, ranges: float, po
         ("time,x,y,theta,0.1\n0,0,0,zero,1\n", "row 1 is not 5 numbers"),
         ("time,x,y,theta,0.1\n0,0,0,0,1_5\n", "row 1 is not 5 numbers"),
         ("time,x,y,theta,0.1\n0,0,0,0,1\n", "at least two scans"),
-        ("time,x,y,theta\n0,0,0,0\n1,0,0,0\n", "at least two scans"),
+        ("time,x,y,theta,0.1\n", "there is no scan in this log"),
+        ("time,x,y,theta\n0,0,0,0\n1,0,0,0\n", "the header has no beam;"),
         ("time,x,y,theta,0.1\n0,0,0,0,1\n1,0,0,inf,1\n", "row 2: theta is inf, not finite"),
         ("time,x,y,theta,-5,0,5\n0,0,0,0,1,1,1\n1,0,0,0,1,1,1\n", "beams 10 rad apart are more than a turn"),
         ("time,x,y,theta,-90,90\n0,0,0,0,1,1\n1,0,0,0,1,1\n", "-90 is no direction of a beam"),
@@ -217,6 +218,21 @@ def test_a_carmen_log_says_which_poses_are_corrected(log: RangeLog, truth: Array
     )
     carmen(path, log, truth, truth, truth)
     assert read_range_log(path).corrected is None
+
+
+def test_scans_without_odom_lines_are_left_out(
+    log: RangeLog, truth: Array, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The wheels stood still before and after all of them, and plain poses so seemed to be corrected ones."""
+    path, half = tmp_path / "log.clf", len(log) // 2
+    for wheeled, corrected in ((truth, False), (wheels(truth, np.random.default_rng(3), scale=0.5), True)):
+        carmen(path, log, truth, truth, wheeled)
+        lines = path.read_text().splitlines()
+        path.write_text("\n".join(line for k, line in enumerate(lines) if k < 2 * half or k % 2) + "\n")
+        found = read_range_log(path)
+        assert (found.corrected is not None) is corrected
+        assert len(found) == (half if corrected else len(log))
+    assert f"{len(log) - half} of {len(log)} scans left out: no ODOM line then" in caplog.text
 
 
 def test_poses_are_laid_on_each_other(log: RangeLog, truth: Array) -> None:

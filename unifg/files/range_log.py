@@ -120,7 +120,11 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
     if len(log.scans) > 1:
         logger.warning("%s: %d kinds of scans, of which %d of one kind are taken", name, len(log.scans), len(scans))
     odometry, corrected = _poses(log, scans)
-    return _in_order(name, scans.time, scans.angles, scans.ranges, scans.maximum, odometry, corrected)
+    seen = np.isfinite(odometry[:, 0])
+    if not seen.all():
+        logger.warning("%s: %d of %d scans left out: no ODOM line then", name, len(seen) - seen.sum(), len(seen))
+    odometry, corrected = odometry[seen], None if corrected is None else corrected[seen]
+    return _in_order(name, scans.time[seen], scans.angles, scans.ranges[seen], scans.maximum, odometry, corrected)
 
 
 def _drive(path: Path, limits: Limits) -> RangeLog:
@@ -158,22 +162,25 @@ def _poses(log: CarmenLog, scans: Scans) -> tuple[Array, Array | None]:
     if len(log.odometry.time) < 2:
         return scans.pose, None
     wheels = SE2.compose(_between_times(log.odometry, scans.time), mounts[0])
-    parted = float(np.abs(aligned(wheels, scans.pose) - scans.pose)[:, :2].max())
+    seen = np.isfinite(wheels[:, 0])
+    parted = np.abs(aligned(wheels[seen], scans.pose[seen]) - scans.pose[seen])[:, :2].max() if seen.any() else 0.0
     return (wheels, scans.pose) if parted > PARTED else (scans.pose, None)
 
 
 def _between_times(odometry: Odometry, time: Array) -> Array:
-    """Poses (n, 3) at some times (n,), straight between those that are known."""
+    """Poses (n, 3) at some times (n,), straight between those that are known, NaN before and after all of them."""
     order = np.argsort(odometry.time, kind="stable")
     x, y, heading = odometry.pose[order].T
     columns = (x, y, np.unwrap(heading))
-    return np.column_stack([np.interp(time, odometry.time[order], column) for column in columns])
+    return np.column_stack([np.interp(time, odometry.time[order], column, np.nan, np.nan) for column in columns])
 
 
 def _in_order(
     name: str, time: Array, angles: Array, ranges: Array, maximum: float, odometry: Array, corrected: Array | None
 ) -> RangeLog:
     """The log in the order of time and of beams, in seconds, with readings that mean something."""
+    if not len(time):
+        raise FileFormatError(f"{name}: there is no scan in this log")
     order, beams = np.argsort(time, kind="stable"), np.argsort(angles, kind="stable")
     time, odometry, ranges = time[order], odometry[order], ranges[np.ix_(order, beams)]
     corrected = None if corrected is None else corrected[order]
@@ -218,7 +225,7 @@ def _table(path: Path, limits: Limits) -> RangeLog:
     )
     header = [word.strip() for word in lines[0]] if lines else []
     beams = [k for k, word in enumerate(header) if number_of(word) is not None]
-    if missing := [word for word in ("time", *POSE) if word not in header]:
+    if missing := [word for word in ("time", *POSE) if word not in header] + ["beam"] * (not beams):
         raise FileFormatError(f"{name}: the header has no {', '.join(missing)}; it needs time, x, y, theta and beams")
     if twice := [word for k, word in enumerate(header) if word in header[:k]]:
         raise FileFormatError(f"{name}: the header has {twice[0]!r} twice; leave one of the columns out")
