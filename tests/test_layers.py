@@ -293,3 +293,14 @@ def test_vmap_over_what_instances_share_is_a_loop() -> None:
             np.testing.assert_allclose(many[k], one, rtol=1e-6)
     with pytest.raises(fg.GraphError, match=r"data 'goal' have shape \(3,\), expected \(2,\)"):
         solve(STARTS[0], np.zeros(3), 0.5)
+
+
+def test_short_numbers_serve_jax_and_complex_ones_are_refused() -> None:
+    """Slopes of bfloat16 were no real numbers; of complex data the imaginary part was dropped."""
+    jax = pytest.importorskip("jax", reason="the extra 'jax' is not installed")
+    solve, _ = _jax()
+    start = jax.numpy.asarray(STARTS[1], dtype=jax.numpy.bfloat16)
+    slope = jax.grad(lambda numbers: solve(numbers, GOALS[0], 0.5)[0].sum())(start)
+    assert slope.dtype == jax.numpy.bfloat16 and bool(slope.any())
+    with pytest.raises(fg.GraphError, match="must be real numbers, found complex"):
+        solve(STARTS[0], GOALS[0] * 1j, 0.5)

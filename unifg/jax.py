@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from unifg.errors import GraphError
 from unifg.layers import Answers, Layer
 from unifg.typing import Array
 
@@ -22,10 +23,11 @@ REMEMBERED = 8  # answers whose slopes may be asked for without another solve
 
 
 def layer(*args: Any, **options: Any) -> Callable[..., Any]:
-    """Function from arrays to values of families; arguments and errors as of `unifg.layers.Layer`.
+    """Function from arrays to values of families; arguments as of `unifg.layers.Layer`.
 
     Arrays have the shapes of the data, or (..., shape) for several instances. The result is the array of the output, a
-    tuple of several, of the type of the first input; whole numbers count as JAX's default type of real ones.
+    tuple of several, of the type of the first input; whole numbers count as JAX's default type of real ones. Shapes
+    that do not fit raise a `GraphError`; what a solve raises comes as an error of JAX that quotes it.
     """
     inner = Layer(*args, **options)
     known: OrderedDict[bytes, Answers] = OrderedDict()
@@ -44,7 +46,7 @@ def layer(*args: Any, **options: Any) -> Callable[..., Any]:
         return tuple(values.astype(given[0].dtype) for values in solved(given).values)
 
     def pull(given: tuple[Any, ...], slopes: tuple[Any, ...]) -> tuple[Array, ...]:
-        found = inner.pull(solved(given), [np.asarray(slope) for slope in slopes])
+        found = inner.pull(solved(given), [np.asarray(slope, dtype=np.float64) for slope in slopes])
         return tuple(slope.astype(one.dtype) for slope, one in zip(found, given, strict=True))
 
     @jax.custom_vjp  # type: ignore[untyped-decorator]
@@ -62,6 +64,8 @@ def layer(*args: Any, **options: Any) -> Callable[..., Any]:
 
     def call(*given: Any) -> Any:
         arrays = [jax.numpy.asarray(one) for one in given]
+        if any(map(jax.numpy.iscomplexobj, arrays)):
+            raise GraphError("layer: data must be real numbers, found complex numbers: convert to real ones first")
         # all instances in front of each, so that an axis that vmap adds stands in the same place of all
         alike = map(jax.numpy.broadcast_to, arrays, inner.together([one.shape for one in arrays])[1])
         found = solve(*(one.astype(jax.numpy.result_type(one, float)) for one in alike))
