@@ -7,6 +7,7 @@ from collections import Counter
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,13 @@ import pandas as pd
 import pytest
 
 from unifg.errors import ScenarioError
-from unifg.scenarios import command
+from unifg.scenarios import command, manoeuvres
 from unifg.scenarios.campaigns.campaign import Campaign
 from unifg.scenarios.campaigns.statement import Statement
 from unifg.scenarios.campaigns.task import FAILED, OK
 from unifg.scenarios.episode import Progress
-from unifg.scenarios.papers import bazzana, catalogue, corridor_flights, ecg2o, factormpc, ta
+from unifg.scenarios.papers import barrier_flights, bazzana, catalogue, corridor_flights, ecg2o, factormpc, ta
+from unifg.scenarios.papers.barrier_flights import Job
 from unifg.scenarios.papers.comparison import Comparison, Effort, Line, counted, measured, paired, stated
 from unifg.scenarios.papers.printed import numbers, pairs, printed
 
@@ -257,6 +259,33 @@ def test_an_interrupt_names_the_drives_that_are_on_file(
     monkeypatch.setattr(catalogue, "found", lambda *_: stop)
     assert command.main(["reproduce", "bazzana", "--table", "I"]) == 130
     assert capsys.readouterr().err.endswith("unifg: interrupted; drives in here: 3\n")
+
+
+@pytest.mark.parametrize(("there", "said"), [(1.0, "agrees"), (0.4, "differs")])
+def test_speeds_count_where_the_way_inflects(
+    there: float, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The paper's is greatest in the inflection; here the greatest of the whole way counted, wherever it was."""
+    made = SimpleNamespace(
+        controls=np.array([[1.0, 0.5], [there, 0.1], [there, -0.1]]), time=np.arange(3.0), cusps=[1], inflections=[2],
+        within_limits=True,
+    )  # fmt: skip
+    monkeypatch.setattr(manoeuvres, "run_manoeuvre", lambda case, solver: made)
+    assert [line.difference for line in bazzana.figure_7(effort(tmp_path)).lines] == ["agrees", "agrees", said] * 2
+
+
+def test_times_of_flights_are_those_of_a_warm_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first tick of a process took half a second, beside less than 20 ms in the paper."""
+    flown: list[float] = []
+    real = Job.flight
+
+    def flight(job: Job) -> Any:
+        flown.append(job.duration)
+        return real(job)
+
+    monkeypatch.setattr(Job, "flight", flight)
+    barrier_flights.fly(study="times", case="ellipse", duration=2.1)
+    assert flown == [0.5, 2.1]
 
 
 @cache
