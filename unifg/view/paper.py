@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from unifg.errors import ViewError
 from unifg.lie import SO3
 from unifg.style.colours import css
 from unifg.style.figures import ground as set_ground
@@ -105,9 +106,11 @@ def draw_frame(content: Content, ax: Axes, frame: int = -1) -> Axes:
         frame: which.
 
     Raises:
-        ViewError: nothing is drawn.
+        ViewError: nothing is drawn, or there is no such frame.
     """
     shots = content.shots or [Shot(0)]
+    if frame not in range(-len(shots), len(shots)):
+        raise ViewError(f"there is no frame {frame!r}: the scene has {len(shots)}, counted from 0 or backwards from -1")
     shots = shots[: frame % len(shots) + 1]
     shot, ground = shots[-1], ground_of(content, shots)
     paper = Paper(ax, ground.stroke)

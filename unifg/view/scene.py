@@ -202,7 +202,12 @@ class Scene(Content, Canvas):
             log: whether on a logarithmic axis.
             limit: a dashed line.
             colour: of the curve.
+
+        Raises:
+            ViewError: the limit is not finite, or there is no such colour.
         """
+        if limit is not None and not np.isfinite(limit):
+            raise ViewError(f"the limit of the plot '{name}' is {limit}: leave it out")
         rgb(colour)
         self.plots[name] = Plot(name, [], unit, log, limit, colour)
 
@@ -234,8 +239,14 @@ class Scene(Content, Canvas):
             ahead: (3,) of it, the place in the middle of the picture [m].
 
         Raises:
-            ViewError: there is no such body.
+            ViewError: there is no such body, or the camera looks from nowhere.
         """
+        numbers = np.array([*direction, *ahead, fov, distance])
+        if len(numbers) != 8 or not np.isfinite(numbers).all() or not np.any(direction) or not 0.0 < fov < 180.0:
+            raise ViewError(
+                f"view '{name}': a direction other than zero and a place (3,), an angle between 0 and 180 degrees and "
+                f"a distance are finite numbers, found {direction!r}, {ahead!r}, {fov!r} and {distance!r}"
+            )
         if follows is not None and follows not in self.bodies:
             raise ViewError(f"view '{name}' follows '{follows}', which is no body of this scene")
         self.views.append(View(name, text, direction, fov, follows, distance, ahead))
@@ -255,13 +266,13 @@ class Scene(Content, Canvas):
 
         Args:
             ax: axes to draw on; None for new ones.
-            frame: which; what stays is drawn with each.
+            frame: which, from 0 or backwards from -1; what stays is drawn with each.
 
         Returns:
             The axes; their legend names what is drawn.
 
         Raises:
-            ViewError: nothing is drawn.
+            ViewError: nothing is drawn, or there is no such frame.
         """
         return draw_frame(self, new_axes(ax), frame)
 
