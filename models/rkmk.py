@@ -243,7 +243,7 @@ def rollout(
         inputs: (n, k) each, held over a step; (k,) or (1, k) when held over all of them.
         h: step [s], one or (n,).
         method: as for :func:`integrator`.
-        count: n, needed only when neither inputs nor steps tell it.
+        count: n; where neither inputs nor steps tell it, one step is taken without it.
         substeps: steps of the method, of length h / substeps, for each row of the inputs.
 
     Raises:

@@ -58,7 +58,7 @@ class Tableau:
             raise ModelError(f"{self.name}: the rows of the matrix have {rows} numbers, expected {list(range(stages))}")
         if len(self.ends) not in (0, stages):
             raise ModelError(f"{self.name}: {len(self.ends)} ends for {stages} stages")
-        if abs(sum(self.weights) - 1.0) > 1e-12:
+        if not abs(sum(self.weights) - 1.0) <= 1e-12:
             raise ModelError(f"{self.name}: the weights sum to {sum(self.weights)}, expected 1")
         if not set(self.flat) <= set(range(stages)):
             raise ModelError(f"{self.name}: flat names stages {self.flat}, there are {stages}")

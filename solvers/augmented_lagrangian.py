@@ -90,14 +90,17 @@ class AugmentedLagrangian(Solver):
     hessian: Literal["exact", "gauss-newton"] = "exact"
 
     def __post_init__(self) -> None:
-        """Refuse unknown words and penalties that are not positive."""
+        """Refuse unknown words, penalties that are not positive or do not grow, and no inner iterations."""
         super().__post_init__()
         if self.schedule not in ("bcl", "bazzana", "bazzana-damped"):
             words = "'bcl', 'bazzana' or 'bazzana-damped'"
             raise BackendError(f"{self.name}: schedule must be {words}, found '{self.schedule}'")
         if self.hessian not in ("exact", "gauss-newton"):
             raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
-        require_positive(self.name, BackendError, penalty=1.0 if self.penalty is None else self.penalty)
+        numbers = {"penalty": 1.0 if self.penalty is None else self.penalty, "inner_iterations": self.inner_iterations}
+        require_positive(self.name, BackendError, **numbers)
+        if not self.penalty_growth > 1.0:
+            raise BackendError(f"{self.name}: penalty_growth must be above 1, found {self.penalty_growth}")
 
     def workspace(self, program: CompiledProblem) -> Primal:
         """The factorisation of the primal step."""

@@ -58,9 +58,9 @@ class Penalty(Solver):
     damping: float = 1e-6
 
     def __post_init__(self) -> None:
-        """Refuse schedules that do not grow."""
+        """Refuse schedules that do not grow, or make no step."""
         super().__post_init__()
-        require_positive(self.name, BackendError, penalty=self.penalty)
+        require_positive(self.name, BackendError, penalty=self.penalty, inner_iterations=self.inner_iterations)
         if not self.penalty_growth > 1.0:
             raise BackendError(f"{self.name}: penalty_growth must be above 1, found {self.penalty_growth}")
 

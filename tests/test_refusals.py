@@ -30,8 +30,10 @@ from unifg.models.quadrotor import STATE
 from unifg.models.space_landmarks import bearing_3d, bearing_range_3d, observe_3d
 from unifg.models.spline import SplineCurve, SplineField
 from unifg.models.stamped import StampedMeasurements
+from unifg.models.tableau import Tableau
 from unifg.models.terminal import brakeable
 from unifg.models.trajectory import CubicTrajectory
+from unifg.pose_graphs import manhattan, sphere
 from unifg.pose_graphs.residuals import chart_between
 from unifg.solvers import (
     KKT,
@@ -295,6 +297,14 @@ MADE: list[tuple[type[fg.UnifgError], Callable[[], object], str]] = [
     (fg.BackendError, lambda: KKT(full_steps=True, globalization="levenberg-marquardt"), "choose one"),
     (fg.BackendError, lambda: Penalty(penalty=0.0), "penalty must be positive"),
     (fg.BackendError, lambda: Penalty(penalty_growth=1.0), "penalty_growth must be above 1"),
+    (fg.BackendError, lambda: AugmentedLagrangian(penalty_growth=-3.0), "penalty_growth must be above 1"),
+    # This one never ended, and the other went nowhere.
+    (fg.BackendError, lambda: Penalty(inner_iterations=0), "inner_iterations must be positive, found 0"),
+    (fg.BackendError, lambda: AugmentedLagrangian(inner_iterations=0), "inner_iterations must be positive, found 0"),
+    (fg.ModelError, lambda: manhattan(2.5), "manhattan: count must be a whole number"),  # type: ignore[arg-type]
+    (fg.ModelError, lambda: manhattan(50, -1), "seed -1 not negative"),
+    (fg.ModelError, lambda: sphere(3, 6, radius=np.inf), "a finite radius inf > 0"),
+    (fg.ModelError, lambda: Tableau("mine", 1, (np.nan,), ((),)), "weights sum to nan"),
     (fg.BackendError, lambda: GraduatedNonConvexity(growth=1.0), "growth"),
     (fg.BackendError, lambda: GraduatedNonConvexity(stage_iterations=0), "stage_iterations"),
     (fg.BackendError, lambda: GaussNewton(search_iterations=-1), "search_iterations must not be negative, found -1"),

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from unifg.errors import ModelError
+from unifg.errors import ModelError, require_kinds
 from unifg.lie import SE2, SE3, LieGroup
 from unifg.pose_graphs.initialise import odometric
 from unifg.pose_graphs.pose_graph import Edges, PoseGraph
@@ -49,8 +49,11 @@ def manhattan(count: int = 1000, seed: int = 0, outliers: float = 0.0, block: in
     Raises:
         ModelError: an argument is out of its range.
     """
-    if count < 2 or block < 1:
-        raise ModelError(f"manhattan: count {count} must be at least 2 and block {block} at least 1")
+    require_kinds("manhattan", ModelError, manhattan.__annotations__, locals())
+    if count < 2 or block < 1 or seed < 0:
+        raise ModelError(
+            f"manhattan: count {count} must be at least 2, block {block} at least 1, and seed {seed} not negative"
+        )
     rng = np.random.default_rng(seed)
     side = max(2, round((count / (4.0 * block)) ** 0.5))  # each street is driven a few times
     cells = np.zeros((count, 3), dtype=np.int64)  # x and y [m], heading in quarter turns
@@ -89,8 +92,12 @@ def sphere(
     Raises:
         ModelError: an argument is out of its range.
     """
-    if rings < 2 or per_ring < 4 or not radius > 0.0:
-        raise ModelError(f"sphere: rings {rings} >= 2, per_ring {per_ring} >= 4 and radius {radius} > 0 are needed")
+    require_kinds("sphere", ModelError, sphere.__annotations__, locals())
+    if rings < 2 or per_ring < 4 or seed < 0 or not 0.0 < radius < np.inf:
+        raise ModelError(
+            f"sphere: rings {rings} >= 2, per_ring {per_ring} >= 4, seed {seed} >= 0 and a finite radius {radius} > 0 "
+            "are needed"
+        )
     rng = np.random.default_rng(seed)
     count = rings * per_ring
     turn = np.arange(count) / per_ring
