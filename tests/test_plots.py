@@ -328,16 +328,20 @@ def test_factors_between_poses_apart_are_lines() -> None:
 @pytest.mark.product(1, of="scenes and pictures")
 def test_odd_selections_are_plotted_without_a_warning() -> None:
     graph, x = line(4)
-    wide = graph.variables("wide", fg.Rn(12), 2)
+    wide, poses = graph.variables("wide", fg.Rn(12), 2), graph.variables("poses", fg.SE2, 2)
     graph.minimize(fg.prior, x, [1.0, 2.0])
     graph.minimize(fg.prior, wide, np.arange(12.0))
+    graph.minimize(fg.prior, poses, np.zeros(3))
     graph.bound(x[0], lower=-1.0, upper=5.0)
-    solution = SQP().solve(graph, {x: np.zeros((4, 2)), wide: np.zeros((2, 12))})
+    solution = SQP().solve(graph, {x: np.zeros((4, 2)), wide: np.zeros((2, 12)), poses: np.zeros((2, 3))})
     for chosen in (x[0], x[[3, 0, 2]], x[[1, 1]], wide, wide[0]):
         for marginals in (False, True):
             solution.plot(chosen, marginals=marginals).canvas.draw()
     with pytest.raises(fg.GraphError, match="not part of this solution"):
         solution.plot(line(2)[1])
+    for empty in (x[:0], poses[:0]):
+        with pytest.raises(fg.ViewError, match="there are no variables to plot"):
+            solution.plot(empty, marginals=empty.family is x)
     with pytest.raises(fg.ViewError, match="panels do not fit"):
         solution.plot(*[x] * (shown.PANELS + 1))
 

@@ -81,7 +81,7 @@ def draw_shown(parts: Sequence[Shown], title: str = "") -> Figure:
     Raises:
         ViewError: there is nothing to draw, or more than fits into a figure.
     """
-    leaves = [leaf for part in parts for leaf in part.components()]
+    leaves = [leaf for part in parts for leaf in part.components() if len(leaf.members)]
     panels = [(leaf, draw) for leaf in leaves for draw in _panels(leaf)]
     if not panels:
         raise ViewError("there are no variables to plot")
