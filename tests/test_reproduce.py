@@ -274,6 +274,13 @@ def test_speeds_count_where_the_way_inflects(
     assert [line.difference for line in bazzana.figure_7(effort(tmp_path)).lines] == ["agrees", "agrees", said] * 2
 
 
+def test_a_solve_that_does_not_end_has_no_iterations(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that stopped at the third iteration agreed with the paper's three to four."""
+    monkeypatch.setattr(ecg2o, "drive", lambda length, drag: None)
+    monkeypatch.setattr(ecg2o, "iterations", lambda solver, problem: (3, False))
+    assert {line.ours for line in ecg2o.figure_3(effort(tmp_path)).lines} == {"-"}
+
+
 def test_times_of_flights_are_those_of_a_warm_process(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first tick of a process took half a second, beside less than 20 ms in the paper."""
     flown: list[float] = []

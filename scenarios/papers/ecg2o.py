@@ -166,7 +166,8 @@ def figure_3(effort: Effort) -> Comparison:
     ):
         for length in LENGTHS:
             found = iterations(solver, drive(length, drag))
-            lines.append(measured(f"iterations, {what}, N = {length}", printed(name), [found[0]] if found else [], 0))
+            count = [found[0]] if found is not None and found[1] else []
+            lines.append(measured(f"iterations, {what}, N = {length}", printed(name), count, 0))
     return Comparison(lines, "One solve each, to a step below 1e-3; --quick and --full are the same.")
 
 
