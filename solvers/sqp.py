@@ -51,7 +51,7 @@ class SQP(Solver):
             residuals and constraints included, which converges quadratically where Gauss-Newton is linear. A step for
             which it has the wrong inertia, or along which the merit does not fall, takes Gauss-Newton's. "auto" begins
             with the first and goes on with the second where steps converge more slowly than the second would, which
-            the last two iterations tell; under a ``time_limit`` it stays with the first.
+            the last two iterations tell.
         qp: "osqp" (called directly, warm-started; what it finds active is completed on the graph), "graph" (active
             sides, or an interior point, whose systems are eliminated on the graph), "elimination" (Ta's primal and dual
             linear graphs, for equalities only; a reference, written to be read) or any name qpsolvers knows. A
@@ -111,7 +111,7 @@ class SQP(Solver):
 
     def workspace(self, program: CompiledProblem) -> Subproblems:
         """QP workspaces."""
-        if program.fully_compiled and self.hessian != "gauss-newton" and self.time_limit == np.inf:
+        if program.fully_compiled and self.hessian != "gauss-newton":
             require_second(program)
         return Subproblems(
             program,
@@ -133,7 +133,7 @@ class SQP(Solver):
     def iterate(self, run: SolveState, workspace: Subproblems) -> Status | None:
         """Iterate to convergence."""
         program, steps, watch, failures = run.program, workspace.steps, RestorationTrigger(), 0
-        now, turning = steps.now, self.hessian == "auto" and self.time_limit == np.inf and self.qp != "elimination"
+        now, turning = steps.now, self.hessian == "auto" and self.qp != "elimination"
         alone = program.sided and (run.alone or (not run.watched and self._known(program)))
         rule = self.step_tolerance, self.violation_tolerance
         steps.prepare(self.tolerances, self.full_steps, self.second_order_correction, self.max_iterations, rule)

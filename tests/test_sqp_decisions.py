@@ -130,7 +130,7 @@ def test_second_derivatives_take_over_where_gauss_newton_has_far_to_go(
     assert found.iterations <= 8, "for twenty"
     if backend is SQP:
         assert "exact" in str(found.history[-1].details.get("hessian"))
-        assert solved(stated.graph, time_limit=60.0).iterations >= 15, "what it needs has to be compiled"
+        assert solved(stated.graph, time_limit=60.0).iterations == found.iterations
     monkeypatch.setattr(sqp, "WORTH", np.inf)
     monkeypatch.setattr(kkt, "WORTH", np.inf)
     other = solved(stated.graph)
