@@ -612,7 +612,7 @@ def test_columns_of_fixed_variables_are_those_of_the_problem_without_the_fix(kin
     numbers[columns] = np.arange(len(columns))
     found = FixedColumns(program, numbers)
     matrix = np.zeros((program.size + len(multipliers), len(columns)))
-    matrix[found.rows, found.coordinates] = found.entries(program, lin, multipliers)
+    matrix[found.rows, found.coordinates] = found.entries(program, lin, multipliers, np.zeros(len(matrix), dtype=bool))
     assert (np.diff(found.coordinates * len(matrix) + found.rows) > 0).all()
     twin, here = unfixed(program, columns, lin)
     upper = twin.normal.matrix(lagrangian_hessian(twin, here, multipliers)).toarray()

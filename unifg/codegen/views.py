@@ -8,8 +8,9 @@ handed on, and views of them own nothing: they are good for as long as someone e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar, cast
+from collections.abc import Callable, Iterable, Sequence
+from itertools import count
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from llvmlite import ir
@@ -23,38 +24,74 @@ T = TypeVar("T")
 WORD = ir.IntType(64)
 
 
-def described(arrays: Sequence[Any]) -> IntArray:
-    """Addresses and lengths of flat arrays, as read by the function made by :func:`opener`."""
+class Form(NamedTuple):
+    """A named tuple of arrays.
+
+    Attributes:
+        made: what makes one.
+        parts: dtypes of flat arrays, dtypes and numbers of columns of others, and forms of named tuples.
+    """
+
+    made: Callable[..., Any]
+    parts: Sequence[Any]
+
+    @property
+    def kind(self) -> Any:
+        """Type for compiled code."""
+        return types.NamedTuple([_kind(part) for part in self.parts], self.made)
+
+
+def _kind(part: Any) -> Any:
+    """Type of a part."""
+    if isinstance(part, Form):
+        return part.kind
+    dtype, *columns = part if isinstance(part, tuple) else (part,)
+    return types.Array(from_dtype(dtype), 1 + len(columns), "C")
+
+
+def described(arrays: Iterable[Any]) -> IntArray:
+    """Addresses and lengths of arrays, as read by the function made by :func:`opener`."""
     return np.array([[array.ctypes.data, len(array)] for array in arrays], dtype=np.int64).ravel()
 
 
-def opener(form: Callable[..., T], dtypes: Sequence[np.dtype[Any]]) -> Callable[[int], T]:
-    """Function for compiled code that opens a named tuple of flat arrays by the address of their description.
+def opener(form: Callable[..., T], parts: Sequence[Any]) -> Callable[[int], T]:
+    """Function for compiled code that opens a named tuple of arrays by the address of their description.
 
     What it does not use of them costs nothing.
 
     Numba's cache does not see the dtypes: call it from a compiled function in the file where they stand.
+
+    Args:
+        form: what makes one.
+        parts: as of :class:`Form`.
     """
-    kinds = [types.Array(from_dtype(dtype), 1, "C") for dtype in dtypes]
-    whole = types.NamedTuple(kinds, form)
+    whole = Form(form, parts)
 
     def opened(typing: Any, where: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             from numba.np import arrayobj  # a fortieth of a second, for what is compiled alone
 
-            data, parts = builder.inttoptr(values[0], WORD.as_pointer()), []
-            for k, kind in enumerate(kinds):
-                begin, length = (builder.load(cgutils.gep(builder, data, 2 * k + j)) for j in range(2))
-                array = context.make_array(kind)(context, builder)
-                item = context.get_constant(types.intp, dtypes[k].itemsize)
+            data, words = builder.inttoptr(values[0], WORD.as_pointer()), count()
+
+            def load(part: Any) -> Any:
+                if isinstance(part, Form):
+                    return context.make_tuple(builder, part.kind, [load(one) for one in part.parts])
+                dtype, *columns = part if isinstance(part, tuple) else (part,)
+                begin, length = (builder.load(cgutils.gep(builder, data, next(words))) for _ in range(2))
+                array = context.make_array(_kind(part))(context, builder)
+                shape, sizes = [length], [dtype.itemsize]
+                for width in columns:
+                    shape, sizes = [length, WORD(width)], [width * dtype.itemsize, dtype.itemsize]
                 pointer = builder.inttoptr(begin, cast(ir.PointerType, array.data.type))
                 arrayobj.populate_array(
-                    array, data=pointer, shape=[length], strides=[item], itemsize=item, meminfo=None
-                )
-                parts.append(array._getvalue())
-            return context.make_tuple(builder, whole, parts)
+                    array, data=pointer, shape=shape, strides=list(map(WORD, sizes)), itemsize=WORD(dtype.itemsize),
+                    meminfo=None,
+                )  # fmt: skip
+                return array._getvalue()
 
-        return whole(types.int64), generate
+            return load(whole)
+
+        return whole.kind(types.int64), generate
 
     return cast(Callable[[int], T], intrinsic(opened))
 

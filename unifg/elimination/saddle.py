@@ -141,22 +141,6 @@ class SaddlePoint:
         )
         return out, float(error)
 
-    def solve_rows(self, right: Array, enough: float, small: float = 0.0) -> tuple[Array, Array]:
-        """Solve for the rows of (k, n); no other shift is tried.
-
-        Args:
-            right: right-hand sides.
-            enough: residual at which refinement ends, as of :meth:`solve`.
-            small: residual relative to the right-hand side at which it ends, too.
-
-        Returns:
-            (k, n) solutions, and (k,) largest residual of each relative to the right-hand side, both equilibrated.
-        """
-        out, left, pattern = np.empty_like(right), np.empty(len(right)), self.arrays[2:5]
-        given = self.factorization.plan, *pattern, right, self.scale, self.unknowns
-        substitution.refine_rows(*given, out, left, enough, small, CORRECTIONS)
-        return out, left
-
     def residual(self, solution: Array, right: Array) -> Array:
         """(n,) right - K x of the equilibrated system."""
         return self.scale * (right - self.factorization.pattern.times(self._data, solution))

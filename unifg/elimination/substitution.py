@@ -273,33 +273,6 @@ def refine(
 
 
 @compiled
-def refine_rows(
-    plan: Plan,
-    indptr: IntArray,
-    indices: IntArray,
-    data: Array,
-    right: Array,
-    scale: Array,
-    first: int,
-    out: Array,
-    left: Array,
-    tolerance: float,
-    small: float,
-    steps: int,
-) -> None:
-    """:func:`refine` for the rows of (k, n); ``left`` (k,) receives max scale |right - A x| / max scale |right|.
-
-    Below ``small`` that will do, however small the part of some rows in it.
-    """
-    rest = np.empty(right.shape[1])
-    for k in range(len(right)):
-        size = largest_of(scale, right[k])
-        best = refine(plan, indptr, indices, data, right[k], scale, first, out[k], rest, tolerance, small * size, steps)
-        worst = largest_of(scale, rest)
-        left[k] = (worst / size if size > 0.0 else worst) if best < np.inf else np.inf
-
-
-@compiled
 def largest_of(scale: Array, numbers: Array) -> float:
     """Largest magnitude of numbers times their scales."""
     largest = 0.0

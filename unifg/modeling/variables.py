@@ -89,6 +89,8 @@ class Family:
 
     def __getitem__(self, index: Index) -> Selection:
         """Select members as NumPy would; an int gives a selection of length 1."""
+        if type(index) is int and -self.count <= index < self.count:
+            return Selection(self, np.array([index % self.count]))
         return Selection(self, pick(np.arange(self.count), index, self))
 
     def __getattr__(self, name: str) -> Selection:

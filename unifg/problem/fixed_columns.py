@@ -9,14 +9,15 @@ from __future__ import annotations
 import numpy as np
 
 from unifg.codegen.jit import compiled
+from unifg.codegen.views import described
 from unifg.modeling.terms import ScalarCost
 from unifg.problem.compiled_problem import CompiledProblem
-from unifg.problem.hessian import curve, require_second, row_weights
+from unifg.problem.hessian import Block, block_of, curve, opened_block, require_second, row_weights
 from unifg.problem.linearization import Linearization
 from unifg.problem.scalars import add_scalars
-from unifg.problem.table import COLUMN, COUNT, POSITION, WIDTH, TermArrays
+from unifg.problem.table import COLUMN, COUNT, POSITION, WIDTH, opened_terms
 from unifg.problem.term import CompiledTerm
-from unifg.typing import Array, IntArray
+from unifg.typing import Array, BoolArray, IntArray
 
 
 class FixedColumns:
@@ -69,6 +70,8 @@ class FixedColumns:
         self._fields = fields[fields < len(arrays.fields)], fields[fields >= len(arrays.fields)]
         own = [program.table.fields[rows] for rows in self._fields]
         self._arrays = arrays._replace(fields=own[0], scalars=own[1], positions=self._positions)
+        self._words = described(self._arrays)
+        self._address = int(self._words.ctypes.data)
         rows.append(program.size + constraints.rows[self._slopes])
         coordinates.append(numbers[constraints.columns[self._slopes]])
         height = program.size + constraints.count
@@ -76,27 +79,28 @@ class FixedColumns:
         places, self._order = np.unique(every, return_inverse=True)
         self.coordinates, self.rows = np.divmod(places, height)
 
-    def entries(self, program: CompiledProblem, lin: Linearization, multipliers: Array) -> Array:
+    def entries(self, program: CompiledProblem, lin: Linearization, multipliers: Array, out: BoolArray) -> Array:
         """(E,) numbers.
 
         Args:
             program: the compiled graph, with its data bound and locked.
             lin: where.
             multipliers: (M,) there.
+            out: rows of the KKT system whose numbers are zero.
         """
         require_second(program)
-        arrays, values, found = self._arrays, lin.stored, np.zeros(self._pairs)
-        for rows, fields in zip(self._fields, (arrays.fields, arrays.scalars), strict=True):
-            program.table.fields.take(rows, axis=0, out=fields, mode="clip")  # of machine code that may be another now
+        arrays, found = self._arrays, np.zeros(self._pairs)
         if len(arrays.scalars):
+            program.table.fields.take(self._fields[1], axis=0, out=arrays.scalars, mode="clip")
             ignored = np.empty(program.table.scalars), np.zeros(program.columns.width)
-            add_scalars(arrays, values, *ignored, found, np.zeros(self._pairs), program.scratch, False)
+            add_scalars(arrays, lin.stored, *ignored, found, np.zeros(self._pairs), program.scratch, False)
         for term in self._terms:
             if term.kernel is None and not term.is_bound:
                 self._differenced(program, term, lin, multipliers, found)
-        every, weights = np.zeros(len(self.rows)), (lin.residual, lin.weights, lin.squares, multipliers)
-        own, places = (self._touched, self._own), (*self._squares, self._slopes, self._order)
-        add_up(arrays, values, *weights, lin.jacobian, lin.constraint_jacobian, *own, *places, found, every)
+        every, places = np.zeros(len(self.rows)), (*self._squares, self._slopes, self._order)
+        fields, own = (program.table.fields, self._fields[0]), (self._touched, self._own)
+        given = self._address, *fields, block_of(program, lin), multipliers, *own, *places, found, self.rows, out
+        add_up(*given, every)
         return every
 
     def _differenced(
@@ -114,14 +118,11 @@ class FixedColumns:
 
 @compiled
 def add_up(
-    terms: TermArrays,
-    values: Array,
-    residual: Array,
-    robust: Array,
-    squares: Array,
+    terms_at: int,
+    fields: IntArray,
+    taken: IntArray,
+    block: Block,
     multipliers: Array,
-    jacobian: Array,
-    constraint_jacobian: Array,
     touched: Array,
     own: Array,
     first: IntArray,
@@ -129,19 +130,18 @@ def add_up(
     slopes: IntArray,
     order: IntArray,
     pairs: Array,
+    rows: IntArray,
+    left_out: BoolArray,
     out: Array,
 ) -> None:
     """Add the entries of squares, of second derivatives and of constraints, each to its place.
 
     Args:
-        terms: those with a factor that counts.
-        values: stored ones.
-        residual: as linearised.
-        robust: weights of losses.
-        squares: of robust factors.
+        terms_at: address of those with a factor that counts.
+        fields: of all terms, whose machine code may be another now.
+        taken: which of them these are.
+        block: linearisation.
         multipliers: of the constraint rows.
-        jacobian: of the costs.
-        constraint_jacobian: of the constraints.
         touched: rows of costs that count.
         own: rows of constraints that do.
         first: entries of the Jacobian whose products count.
@@ -149,9 +149,16 @@ def add_up(
         slopes: entries of the constraint Jacobian.
         order: places of all of these, products, pairs and slopes.
         pairs: second derivatives that are there already; the others are added.
+        rows: of the entries in the KKT system.
+        left_out: those whose entries are zero.
         out: entries to add to.
     """
-    curve(terms, values, residual * touched, jacobian, squares, robust, multipliers * own, pairs)
+    terms, lin = opened_terms(terms_at), opened_block(block)
+    for k in range(len(taken)):
+        for field in range(fields.shape[1]):
+            terms.fields[k, field] = fields[taken[k], field]
+    jacobian, forces = lin.jacobian, multipliers * own
+    curve(terms, lin.values, lin.residual * touched, jacobian, lin.squares, lin.weights, forces, pairs)
     at = len(first)
     for k in range(at):
         out[order[k]] += jacobian[first[k]] * jacobian[second[k]]
@@ -159,4 +166,7 @@ def add_up(
         out[order[at + k]] += pairs[k]
     at += len(pairs)
     for k in range(len(slopes)):
-        out[order[at + k]] += constraint_jacobian[slopes[k]]
+        out[order[at + k]] += lin.constraint_jacobian[slopes[k]]
+    for k in range(len(out)):
+        if left_out[rows[k]]:
+            out[k] = 0.0

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from math import sqrt
 from time import perf_counter
+from typing import NamedTuple
 
 import numpy as np
 
 from unifg.codegen.calls import call_residual, matrix, vector, vector_at
 from unifg.codegen.function_pointers import run
-from unifg.codegen.jit import compiled
+from unifg.codegen.jit import compiled, inlined
 from unifg.factors.robust import bend_of, form_of
 from unifg.factors.whitening import DIAGONAL, FULL
 from unifg.modeling.terms import Cost
@@ -23,6 +24,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.evaluation import gather_variables
 from unifg.problem.linearization import Linearization
 from unifg.problem.second_differences import differencing
+from unifg.problem.snapshot import LinearizationMemory, Snapshot
 from unifg.problem.table import (
     ACTIVE,
     ADDRESS,
@@ -56,6 +58,58 @@ from unifg.problem.table import (
 )
 from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, IntArray
+
+
+class Viewed(NamedTuple):
+    """Arrays of a :class:`Linearization`."""
+
+    values: Array
+    residual: Array
+    jacobian: Array
+    squares: Array
+    weights: Array
+    constraints: Array
+    constraint_jacobian: Array
+    gradient: Array
+    hessian: Array
+    concavity: Array
+
+
+class Block(NamedTuple):
+    """Arrays of a linearisation as one, of which Python need not view each.
+
+    Attributes:
+        flat: all of them.
+        places: (10, 2) where each array of :class:`Viewed` begins and ends there.
+    """
+
+    flat: Array
+    places: IntArray
+
+
+def block_of(program: CompiledProblem, lin: Linearization) -> Block:
+    """The arrays of a linearisation as one; those of another kind than a solver keeps are copied."""
+    if isinstance(lin, Snapshot):
+        return Block(lin._flat, program.once(_places))
+    arrays = [lin.stored, *(getattr(lin, name) for name in Viewed._fields[1:])]
+    ends = np.cumsum([len(array) for array in arrays])
+    return Block(np.concatenate(arrays), np.stack([ends - [len(array) for array in arrays], ends], axis=1))
+
+
+def _places(program: CompiledProblem) -> IntArray:
+    """Places in the linearisations that solvers keep."""
+    parts = LinearizationMemory(program)._parts
+    return np.array([(parts[name].start, parts[name].stop) for name in Viewed._fields])
+
+
+@inlined
+def opened_block(block: Block) -> Viewed:
+    """Views of the arrays."""
+    a, p = block.flat, block.places
+    return Viewed(
+        a[p[0, 0] : p[0, 1]], a[p[1, 0] : p[1, 1]], a[p[2, 0] : p[2, 1]], a[p[3, 0] : p[3, 1]], a[p[4, 0] : p[4, 1]],
+        a[p[5, 0] : p[5, 1]], a[p[6, 0] : p[6, 1]], a[p[7, 0] : p[7, 1]], a[p[8, 0] : p[8, 1]], a[p[9, 0] : p[9, 1]],
+    )  # fmt: skip
 
 
 def require_second(program: CompiledProblem) -> None:

@@ -7,19 +7,20 @@ elimination tree. Ordering and layout cost more than a factorisation, and are th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from threading import Lock
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from unifg.codegen.jit import compiled
+from unifg.codegen.jit import compiled, inlined
+from unifg.codegen.views import Form, described, opener
 from unifg.elimination.factorization import Factorization
-from unifg.elimination.plan import Plan
-from unifg.elimination.saddle import NOTHING, SaddlePoint
+from unifg.elimination.plan import COLUMNS, Plan
+from unifg.elimination.saddle import NOTHING, SaddleArrays, SaddlePoint
 from unifg.elimination.symmetric import Symmetric
 from unifg.problem.evaluation import add_constraints, transposed_times
 from unifg.problem.linearization import Rows
@@ -55,7 +56,7 @@ class Systems:
 
     def borrowed(self) -> AbstractContextManager[Factorization]:
         """The same for one question: its memory serves the next one too."""
-        return _borrowed(self._spare, self.normal)
+        return _Borrowed(self._spare, self.normal)
 
     def kkt(self, held: BoolArray) -> KktSystem:
         """The KKT matrix with some rows of the constraints (M,) held as equalities, to keep."""
@@ -72,17 +73,21 @@ class Systems:
         return structure
 
 
-@contextmanager
-def _borrowed(spare: list[T], make: Callable[[], T]) -> Iterator[T]:
+class _Borrowed(AbstractContextManager[T]):
     """One that nobody uses now, or a new one; it is spare again afterwards."""
-    try:
-        found = spare.pop()
-    except IndexError:
-        found = make()
-    try:
-        yield found
-    finally:
-        spare.append(found)
+
+    def __init__(self, spare: list[T], make: Callable[[], T]) -> None:
+        self._spare, self._make = spare, make
+
+    def __enter__(self) -> T:
+        try:
+            self._found = self._spare.pop()
+        except IndexError:
+            self._found = self._make()
+        return self._found
+
+    def __exit__(self, *raised: object) -> None:
+        self._spare.append(self._found)
 
 
 class KktArrays(NamedTuple):
@@ -129,7 +134,7 @@ class KktStructure:
 
     def borrowed(self) -> AbstractContextManager[KktSystem]:
         """A system for one question: its memory, and its factor if nobody has replaced it, serve the next one too."""
-        return _borrowed(self.spare, lambda: KktSystem(self))
+        return _Borrowed(self.spare, partial(KktSystem, self))
 
     @staticmethod
     def of(normal: Symmetric, blocks: IntArray, constraints: Rows, held: BoolArray) -> KktStructure:
@@ -202,6 +207,31 @@ class KktSystem:
     def arrays(self) -> KktArrays:
         """For compiled code."""
         return KktArrays(self.factorization.plan, *self._structure.arrays)
+
+    @cached_property
+    def address(self) -> int:
+        """Address at which :class:`Opened` is described, for :func:`opened`."""
+        self._words = described([*self.arrays.plan, *self._structure.arrays, *self.saddle.arrays])
+        return int(self._words.ctypes.data)
+
+
+class Opened(NamedTuple):
+    """The arrays of a :class:`KktSystem` for compiled code, by one address."""
+
+    kkt: KktArrays
+    saddle: SaddleArrays
+
+
+_LONG, _SHORT, _DOUBLE = map(np.dtype, (np.int64, np.int32, np.float64))
+_PLAN = _LONG, (_LONG, COLUMNS), _LONG, *[_SHORT] * 4, *[_DOUBLE] * 4, _LONG, _LONG
+_KKT, _SADDLE = (Form(Plan, _PLAN), *[_LONG] * 7), (*[_LONG] * 4, *[_DOUBLE] * 3)
+_open = opener(Opened, (Form(KktArrays, _KKT), Form(SaddleArrays, _SADDLE)))
+
+
+@inlined
+def opened(address: int) -> Opened:
+    """The arrays whose description stands at an address."""
+    return _open(address)
 
 
 def stacked(arrays: KktArrays) -> tuple[Plan, IntArray]:

@@ -13,14 +13,15 @@ import numpy as np
 from numba import NumbaError
 
 from unifg.codegen.bisect import first_not_below
-from unifg.codegen.jit import compiled
+from unifg.codegen.jit import compiled, inlined
 from unifg.codegen.native import Source
+from unifg.codegen.views import opener
 from unifg.elimination.symmetric import Symmetric
 from unifg.errors import GraphError
 from unifg.factors.autodiff.expression import Expression
 from unifg.factors.kernel import Kernel
 from unifg.factors.robust import Loss, form_of
-from unifg.factors.steps import as_table, movable_parts
+from unifg.factors.steps import Part, as_table, movable_parts
 from unifg.modeling.terms import Constraint, Cost, ScalarCost
 from unifg.problem.columns import Columns
 from unifg.problem.pose_pairs import PLANE, SPACE, loops_of, paired
@@ -102,6 +103,18 @@ class TermArrays(NamedTuple):
     whiteners: Array
     lower: Array
     upper: Array
+
+
+_LONG, _DOUBLE = np.dtype(np.int64), np.dtype(np.float64)
+_TABLES = (_LONG, FIELDS), (_LONG, FIELDS)
+_PLACES = *[_LONG] * 4, np.dtype(np.int32), (_LONG, len(Part._fields) + 1), np.dtype(np.uint8)
+_open = opener(TermArrays, (*_TABLES, *_PLACES, *[_DOUBLE] * 4))
+
+
+@inlined
+def opened_terms(address: int) -> TermArrays:
+    """The arrays that :func:`unifg.codegen.views.described` has described at an address."""
+    return _open(address)
 
 
 class TermTable:

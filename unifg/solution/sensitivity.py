@@ -22,31 +22,34 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from unifg.codegen.jit import compiled
-from unifg.elimination.saddle import CORRECTIONS, EXACT, NOTHING, SaddleArrays, prepared
-from unifg.elimination.substitution import refine_rows
+from unifg.codegen.jit import compiled, inlined
+from unifg.codegen.views import described
+from unifg.elimination.plan import NEGATIVE, POSITIVE, ZERO
+from unifg.elimination.saddle import CORRECTIONS, EXACT, NOTHING, prepared
+from unifg.elimination.substitution import largest_of, refine, solve
 from unifg.errors import GraphError
 from unifg.factors.robust import form_of
 from unifg.modeling.terms import Constraint, Cost
 from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.fixed_columns import FixedColumns
-from unifg.problem.hessian import curve, uncompiled_hessian
+from unifg.problem.hessian import Block, block_of, curve, opened_block, require_second, uncompiled_hessian
 from unifg.problem.linearization import Linearization
 from unifg.problem.parameters import Parameter, datum, fixed_variables, parts_of
-from unifg.problem.systems import KktArrays, KktSystem, fill, leave_out
-from unifg.problem.table import TermArrays
-from unifg.problem.units import mean_force
+from unifg.problem.systems import KktSystem, Opened, fill, opened
+from unifg.problem.table import opened_terms
+from unifg.problem.units import cost_size, mean_force
 from unifg.solution.covariance import SOLVED
 from unifg.solution.gains import REPLACED, SAME, require_data
 from unifg.solution.multipliers import size_of_costs, weakest
 from unifg.typing import Array, BoolArray, IntArray, Numbers
 
 COST, HEIGHT = "cost", -2  # its name, and its place beside those of the KKT system
-ENOUGH = 1e-10  # residual of most solves
+ENOUGH, SMALL = 1e-10, 1e-11  # residual of most solves, by size of rows and of the right-hand side
 AT_ONCE = 64  # right-hand sides in one call
 KEPT = 32  # structures of questions
 WEAK = 10.0  # times the root of the tolerance: slack and multiplier of a row that may be active or not
+ONE = str, Family, Selection, Data
 Named = Variable | str
 Weights = Mapping[Family, Numbers] | Mapping[Selection, Numbers] | Mapping[str, Numbers] | Mapping[Named, Numbers]
 Wrt = Data | Variable | str
@@ -91,6 +94,8 @@ class Structure:
         probe: (size,) random numbers.
         open: (M,) rows with an unknown.
         scale: (size,) diagonal that equilibrates the first matrix; those of later ones begin there.
+        hessian: memory, for who holds the lock of the program.
+        terms: address of the arrays of the terms.
         parts, parameters: the ones asked for.
         fixed: columns of fixed variables, by the coordinates.
     """
@@ -113,6 +118,9 @@ class Structure:
         self.open = np.ones(program.constraints.count, dtype=bool)
         self.open[program.fixed_rows()] = False
         self.scale: Array = NOTHING
+        self.hessian = np.empty(program.normal.nnz)
+        self._words = described(program.arrays)
+        self.terms = int(self._words.ctypes.data)
         self.parts: dict[Hashable, Part] = {}
         self.parameters: dict[Hashable, Parameters] = {}
         self.fixed: dict[Hashable, FixedColumns] = {}
@@ -174,19 +182,19 @@ class Sensitivities:
             GraphError: as of the class.
         """
         program, lin, structure, saddle = self._program, self._lin, self._structure, system.saddle
-        self._entries, right = np.empty(system.pattern.nnz), np.empty((2, len(self._out)))
-        unit = size_of_costs(program, lin)
-        held = lin.constraints, *self._limits, multipliers, structure.open, equality, self._multipliers, self._out, unit
+        block, extra = block_of(program, lin), NOTHING
+        require_second(program)
+        held = *self._limits, multipliers, structure.open, equality, self._multipliers, self._out
         if program.batched:
-            weakest(*held)
-        linearized = lin.stored, lin.residual, lin.jacobian, lin.squares, lin.weights, lin.constraint_jacobian
-        hessian, system.loaded = uncompiled_hessian(program, lin, self._multipliers), None
-        row, slack, force, left = settle(
-            program.arrays, system.arrays, saddle.arrays, held, linearized, hessian, self._near, structure.probe,
-            self._entries, right,
+            weakest(lin.constraints, *held, size_of_costs(program, lin))
+            extra = uncompiled_hessian(program, lin, self._multipliers) - lin.hessian
+        self._entries, system.loaded = np.empty(system.pattern.nnz), None
+        row, slack, force, left, regular = settle(
+            structure.terms, system.address, block, held, program.normal.diagonal, extra, self._near, structure.probe,
+            self._entries, structure.hessian,
         )  # fmt: skip
         if row >= 0 and max(slack, force) < (least := WEAK * math.sqrt(tolerance)):
-            row, slack, force = self._weakest(multipliers, equality, unit)
+            row, slack, force = self._weakest(multipliers, equality, size_of_costs(program, lin))
         if row >= 0 and max(slack, force) < least:
             term, factor, place = self._place(row)
             raise GraphError(
@@ -203,7 +211,8 @@ class Sensitivities:
             structure.scale = saddle.scale.copy()
         if not 0.0 <= left <= SOLVED:
             dependent = self._singular(system, np.where(self._out, 0.0, structure.probe / saddle.scale))
-        if system.factorization.inertia != (program.size, len(self._out) - program.size, 0):
+            regular = system.factorization.inertia == (program.size, len(self._out) - program.size, 0)
+        if not regular:
             raise GraphError(
                 "sensitivity: the reduced Hessian is indefinite: the solution is no strict local minimum, and what "
                 "becomes of it when data change is not determined; start elsewhere"
@@ -286,12 +295,10 @@ class Sensitivities:
         result = np.empty((len(places), change.count))
         if self._forward(places) or change.count <= len(places):
             for part in _chunks(change.count if len(places) else 0):
-                result[:, part] = self._solved(self._columns(change, part))[:, places].T
+                result[:, part] = self._solved(self._columns(change, part))[0][:, places].T
             return result
         for part in _chunks(len(places)):
-            right = np.zeros((part.stop - part.start, len(self._out)))
-            right[np.arange(len(right)), places[part]] = 1.0
-            result[part] = change.pulled(self._solved(right))
+            result[part] = self._solved(np.zeros((part.stop - part.start, len(self._out))), change, places[part])[1]
         return result
 
     def gradient(self, of: Mapping[Selection | str, Array], wrt: Wrt) -> Array:
@@ -311,9 +318,9 @@ class Sensitivities:
             asked = asked or len(places) > 0
         if self._dependent and self._forward(np.flatnonzero(right)):
             for part in _chunks(change.count):
-                total[part] += self._solved(self._columns(change, part)) @ right
+                total[part] += self._solved(self._columns(change, part))[0] @ right
         elif asked:
-            total += change.pulled(self._solved(right[None]))[0]
+            total += self._solved(right[None], change)[1][0]
         return total.reshape(change.shape)
 
     def _weights(self, of: Selection | str, weights: Array) -> Array:
@@ -328,6 +335,8 @@ class Sensitivities:
             shape: tuple[int, ...] = len(of), of.manifold.dim
         else:
             shape = next((shape for name, _, shape in self._program.places if name == of), ())
+        if weights.shape == shape or not weights.ndim:
+            return np.full(shape, weights).ravel()
         try:
             return np.broadcast_to(weights, shape).ravel()
         except ValueError:
@@ -399,16 +408,13 @@ class Sensitivities:
             self._require_data()
             for first, one, fixed in zip(given.starts, given.each, given.fixed, strict=False):
                 if fixed is not None:
-                    values = fixed.entries(program, self._lin, self._multipliers)
-                    parts.append((fixed.rows, fixed.coordinates + first, values))
+                    values = fixed.entries(program, self._lin, self._multipliers, self._out)
+                    parts.append((fixed.rows, fixed.coordinates + first if first else fixed.coordinates, values))
                 if one.handle is not None:
                     parts += self._of_data(one, first, heights)
-        if len(parts) == 1 and given.fixed[0] is not None:  # ordered already
-            rows, numbers, values = parts[0]
-            entries = rows, numbers, np.where(self._out[rows], 0.0, values)
-        else:
-            entries = _ordered(parts, self._out)
-        self._changes[asked] = change = Change(given.each[0].shape, *entries, heights, given.numbers)
+        ordered = len(parts) == 1 and given.fixed[0] is not None
+        rows, numbers, values = parts[0] if ordered else _ordered(parts, self._out)
+        self._changes[asked] = change = Change(given.each[0].shape, rows, numbers, values, heights, given.numbers)
         return change
 
     def _parameters(self, wrt: Sequence[Wrt]) -> Parameters:
@@ -456,16 +462,25 @@ class Sensitivities:
         right = np.bincount(places, -change.values[first:last], count * size)
         return np.asarray(right, dtype=np.float64).reshape(count, size)
 
-    def _solved(self, right: Array) -> Array:
-        """Solutions for the rows of (k, size).
+    def _solved(self, right: Array, change: Change | None = None, ones: IntArray | None = None) -> tuple[Array, Array]:
+        """Solutions for the rows of (k, size), and (k, K) what they make of a change.
+
+        Args:
+            right: right-hand sides.
+            change: the change.
+            ones: (k,) where each row receives a one.
 
         Raises:
             GraphError: one has none.
         """
+        change, ones = change or NO_CHANGE, NONE if ones is None else ones
+        solutions, left, found = np.empty(right.shape), np.empty(len(right)), np.zeros((len(right), change.count))
         with self._structure.kkt.borrowed() as system:
             system.load(self._entries, self._near)
-            solutions, left = system.saddle.solve_rows(right, ENOUGH)
-            for k in () if left.max(initial=0.0) <= SOLVED else np.flatnonzero(~(left <= SOLVED)):
+            given = change.rows, change.coordinates, change.values
+            if answer(system.address, right, ones, solutions, left, *given, found) <= SOLVED:
+                return solutions, found
+            for k in np.flatnonzero(~(left <= SOLVED)):
                 solutions[k], rest = _tried(system, right[k])
                 if not rest.max() <= 1.0:
                     raise GraphError(
@@ -475,7 +490,9 @@ class Sensitivities:
                         else "sensitivity: the curvature at the solution is lost to rounding: a direction is hardly "
                         "determined, as where a robust loss leaves hardly any weight"
                     )
-        return solutions
+        found[:] = 0.0
+        pull(*given, solutions, found)
+        return solutions, found
 
 
 def _called(asked: Named | Wrt) -> Hashable:
@@ -498,8 +515,7 @@ def _joined(parts: Sequence[Part]) -> Part:
 
 def _ordered(parts: Sequence[tuple[IntArray, IntArray, Array]], out: BoolArray) -> tuple[IntArray, IntArray, Array]:
     """Rows, coordinates and values of entries, by coordinates, without those of no row or of one that is not held."""
-    none = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros(0)
-    rows, numbers, values = map(np.concatenate, zip(none, *parts, strict=True))
+    rows, numbers, values = map(np.concatenate, zip((NONE, NONE, NOTHING), *parts, strict=True))
     kept = np.flatnonzero((rows >= 0) & (values != 0.0) & ~out[rows])
     order = kept[np.argsort(numbers[kept], kind="stable")]
     return rows[order], numbers[order], values[order]
@@ -545,57 +561,117 @@ class Change:
         """Coordinates of all parameters."""
         return len(self.heights)
 
-    def pulled(self, adjoints: Array) -> Array:
-        """(k, K) derivatives, of the solutions (k, size) for the rows that are asked for."""
-        found = np.zeros((len(adjoints), self.count))
-        pull(self.rows, self.coordinates, self.values, adjoints, found)
-        return found
+
+NONE = np.zeros(0, dtype=np.intp)
+NO_CHANGE = Change((), NONE, NONE, NOTHING, NOTHING, np.zeros((0, 0), dtype=np.intp))
 
 
 @compiled
 def settle(
-    terms: TermArrays,
-    kkt: KktArrays,
-    saddle: SaddleArrays,
-    held: tuple[Array, Array, Array, Array, BoolArray, BoolArray, Array, BoolArray, float],
-    linearized: tuple[Array, Array, Array, Array, Array, Array],
-    hessian: Array,
+    terms_at: int,
+    system_at: int,
+    block: Block,
+    held: tuple[Array, Array, Array, BoolArray, BoolArray, Array, BoolArray],
+    diagonal: IntArray,
+    extra: Array,
     near: Array,
     probe: Array,
     entries: Array,
-    right: Array,
-) -> tuple[int, float, float, float]:
+    hessian: Array,
+) -> tuple[int, float, float, float, bool]:
     """Factorise the matrix of the rows that are held.
 
     Args:
-        terms: of the program.
-        kkt: of the matrix.
-        saddle: of the same.
-        held: arguments of :func:`weakest`.
-        linearized: those of :func:`curve`, and the constraint Jacobian.
-        hessian: the part of it that is there already; receives all.
+        terms_at: address of those of the program.
+        system_at: address of the matrix.
+        block: linearisation.
+        held: arguments of :func:`weakest`, from the limits on.
+        diagonal: places of the curvatures in the Hessian of the costs.
+        extra: what Python has found of the Hessian besides, the concavity included; empty for that alone.
         near: as of :func:`prepared`.
         probe: (size,) random numbers.
         entries: receive those of the matrix.
-        right: (2, size) memory.
+        hessian: memory.
 
     Returns:
-        What :func:`weakest` does; what is left of the random numbers, negative where the factorisation fails.
+        What :func:`weakest` does; what is left of the random numbers, negative where the factorisation fails; whether
+        as many pivots are positive as there are unknowns, and all others negative.
     """
-    row, slack, force = weakest(*held)
-    forces, out, left = held[6], held[7], np.empty(1)
-    curve(terms, *linearized[:5], forces, hessian)
-    fill(kkt, hessian, linearized[5], entries)
-    leave_out(saddle.indptr, saddle.indices, entries, out, kkt.size[0], entries)
-    if not prepared(kkt.plan, saddle, entries, kkt.size[0], near):
-        return row, slack, force, -1.0
-    for k in range(len(probe)):
-        right[0, k] = 0.0 if out[k] else probe[k] / saddle.scale[k]
-    refine_rows(
-        kkt.plan, saddle.starts, saddle.rows, saddle.entries, right[:1], saddle.scale, kkt.size[0], right[1:], left,
-        ENOUGH, SOLVED, CORRECTIONS,
+    terms, system, lin = opened_terms(terms_at), opened(system_at), opened_block(block)
+    kkt, saddle, forces, out = system.kkt, system.saddle, held[5], held[6]
+    row, slack, force = weakest(lin.constraints, *held, cost_size(diagonal, lin.hessian, lin.gradient))
+    added = extra if len(extra) else lin.concavity
+    for k in range(len(hessian)):
+        hessian[k] = lin.hessian[k] + (added[k] if len(added) else 0.0)
+    curve(terms, lin.values, lin.residual, lin.jacobian, lin.squares, lin.weights, forces, hessian)
+    fill(kkt, hessian, lin.constraint_jacobian, entries)
+    n, state = kkt.size[0], kkt.plan.state
+    for k in range(n, len(out)):
+        if out[k]:
+            last = saddle.indptr[k + 1] - 1
+            entries[saddle.indptr[k] : last], entries[last] = 0.0, -1.0
+    if not prepared(kkt.plan, saddle, entries, n, near):
+        return row, slack, force, -1.0, False
+    right, solution, rest = np.empty(len(out)), np.empty(len(out)), np.empty(len(out))
+    for k in range(len(out)):
+        right[k] = 0.0 if out[k] else probe[k] / saddle.scale[k]
+    left = _solve(system, right, solution, rest, SOLVED)[1]
+    return row, slack, force, left, state[POSITIVE] == n and state[NEGATIVE] == kkt.size[1] and state[ZERO] == 0
+
+
+@inlined
+def _solve(system: Opened, right: Array, out: Array, rest: Array, small: float) -> tuple[float, float]:
+    """Solve for one right-hand side; ``rest`` is what is left of it.
+
+    Returns:
+        The residual, as of :func:`refine`; the largest that is left relative to the right-hand side, both equilibrated,
+        which will do below ``small``.
+    """
+    plan, saddle, scale = system.kkt.plan, system.saddle, system.saddle.scale
+    size = largest_of(scale, right)
+    best = refine(
+        plan, saddle.starts, saddle.rows, saddle.entries, right, scale, system.kkt.size[0], out, rest, ENOUGH,
+        small * size, CORRECTIONS,
     )  # fmt: skip
-    return row, slack, force, left[0]
+    worst = largest_of(scale, rest)
+    return best, (worst / size if size > 0.0 else worst) if best < np.inf else np.inf
+
+
+@compiled
+def answer(
+    system_at: int, right: Array, ones: IntArray, out: Array, left: Array, rows: IntArray, numbers: IntArray,
+    values: Array, found: Array,
+) -> float:  # fmt: skip
+    """Solve for the rows of (k, size), and :func:`pull`.
+
+    What the shift of the diagonal leaves of a row, however small, is solved for once more, and not looked at again.
+
+    Args:
+        system_at: address of the matrix.
+        right: right-hand sides.
+        ones: where each row receives a one, or none.
+        out: receive the solutions.
+        left: (k,) receives what is left of each, as of :func:`_solve`.
+        rows: as of :func:`pull`, with what follows.
+        numbers: see there.
+        values: see there.
+        found: see there.
+
+    Returns:
+        The largest in ``left``.
+    """
+    system, rest, most = opened(system_at), np.empty(right.shape[1]), 0.0
+    for k in range(len(ones)):
+        right[k, ones[k]] = 1.0
+    for k in range(len(right)):
+        best, left[k] = _solve(system, right[k], out[k], rest, SMALL)
+        most = max(most, left[k])
+        if best > ENOUGH and left[k] <= SMALL:
+            solve(system.kkt.plan, rest, rest)
+            for i in range(len(rest)):
+                out[k, i] += rest[i]
+    pull(rows, numbers, values, out, found)
+    return most
 
 
 @compiled

@@ -30,7 +30,7 @@ from unifg.solution.multipliers import hold, size_of_costs
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.saved import write_answer
-from unifg.solution.sensitivity import COST, Named, Sensitivities, Weights, Wrt
+from unifg.solution.sensitivity import COST, ONE, Named, Sensitivities, Weights, Wrt
 from unifg.solution.status import Found, Status
 from unifg.solution.tube import tube
 from unifg.solution.verify import Verified, require_tolerance, verified
@@ -343,8 +343,8 @@ class Solution:
                 scaled multiplier both below 10 times the root of the tolerance), the reduced Hessian is singular or
                 indefinite, multipliers are not unique, or a function has a kink.
         """
-        asked = [of] if isinstance(of, str) or not isinstance(of, Sequence) else of
-        by = [wrt] if isinstance(wrt, str) or not isinstance(wrt, Sequence) else wrt
+        asked = [of] if isinstance(of, ONE) or not isinstance(of, Sequence) else of
+        by = [wrt] if isinstance(wrt, ONE) or not isinstance(wrt, Sequence) else wrt
         return self._sensitivities.matrix([self._part(part) for part in asked], by)
 
     def gradient(self, of: Weights | str, wrt: Wrt) -> Array:
