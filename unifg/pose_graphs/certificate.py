@@ -86,7 +86,7 @@ def certify(
     if residual != "log" or chosen is not None:
         missing = f"the residual is {residual!r}" if residual != "log" else "edges were chosen, or have a robust loss"
     else:
-        least = Relaxation.of(scaled, below=True)
+        least = problem.below()
         whole = float(pose_graph.squared_errors().sum()) if len(pose_graph.edges) else 0.0
         # Where nothing was lost, both are one problem.
         same = np.allclose(least.by_first, problem.by_first, rtol=1e-12, atol=0.0)

@@ -8,6 +8,8 @@ is factorised once and is the same for all dimensions (D. Rosen, L. Carlone, A. 
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 
 from unifg.codegen.jit import compiled
@@ -22,34 +24,37 @@ REGULAR = 1e-6  # of the largest weight, added to the quadratic, which sees no c
 SHARE = 0.01  # of the squared slope that a step may leave
 ROUNDS = 100
 STILL = 1e-12  # of the cost, what a step must promise
-FAR = 1e-3  # of the cost, half the squared slope: from there Newton's method is quicker
+FAR = 1e-3  # of the cost, what a step promises or half the squared slope: from there Newton's method is quicker
 FRAME = 1e-9  # a bend of the quadratic below this share of its diagonal is damped
 KEPT, POOR, GOOD = 0.05, 0.25, 0.75  # measured by predicted decrease: taken, shorter radius, longer radius
 
 
 class Descent:
-    """Descents of one relaxation: its quadratic is factorised once.
+    """Descents of one relaxation: its quadratic is factorised once, when the first begins.
 
     Attributes:
         problem: the relaxation.
         factorization: of the quadratic over positions and frames, regularised.
         frames: (n (d + 1),) one for the numbers of frames, zero for those of positions.
-        able: False where it cannot be factorised.
     """
 
     def __init__(self, problem: Relaxation) -> None:
-        """Factorise the quadratic, regularised."""
+        """Find the structure of the quadratic."""
         self.problem, above = problem, problem.dim + 1
         self._system = BlockQuadratic(problem.first, problem.second, problem.count, above, np.zeros(0, dtype=np.intp))
         self._scale = float(np.max(problem.by_second**2, initial=0.0))
         self.frames = np.tile(np.arange(above) > 0, problem.count).astype(np.float64)
-        self.factorization, shift = self._system.factorization, REGULAR * self._scale
-        entries, self.able = self.entries(np.zeros((problem.count, problem.dim, problem.dim))), shift > 0.0
-        while self.able and not (
-            self.factorization.factor(entries, shift * self.frames) and self.factorization.definite
-        ):
+        self.factorization = self._system.factorization
+
+    @cached_property
+    def able(self) -> bool:
+        """False where the quadratic cannot be factorised, regularised."""
+        problem, shift = self.problem, REGULAR * self._scale
+        entries, able = self.entries(np.zeros((problem.count, problem.dim, problem.dim))), shift > 0.0
+        while able and not (self.factorization.factor(entries, shift * self.frames) and self.factorization.definite):
             shift *= 10.0
-            self.able = np.isfinite(shift)
+            able = bool(np.isfinite(shift))
+        return able
 
     def entries(self, multipliers: Array) -> Array:
         """(nnz,) entries of the quadratic less multipliers (n, d, d) of the frames."""
@@ -96,7 +101,7 @@ class Descent:
         """A local minimum of rank d near a point, by Newton's method on positions and frames; anchors stay.
 
         The second derivative along the manifold is the quadratic less the multipliers; where it is not positive, it is
-        damped. Far from a minimum a descent goes before.
+        damped. Far from a minimum, where the first step promises much or there is none, a descent goes before.
         """
         problem, dim = self.problem, self.problem.dim
         spins = [(i, k) for i in range(dim) for k in range(i)]
@@ -104,8 +109,7 @@ class Descent:
         system = BlockQuadratic(problem.first, problem.second, problem.count, size, problem.anchors)
         if not len(system.free) or not len(problem.first):
             return point
-        point = problem.anchored(self(point, FAR), point)
-        cost, damping, scale = problem.cost(point), 0.0, self._scale
+        near, cost, damping, scale = False, problem.cost(point), 0.0, self._scale
         for _ in range(ROUNDS):
             basis = _tangents(point, spins)
             flat = basis.reshape(problem.count, dim + 1, dim * size)
@@ -123,11 +127,18 @@ class Descent:
                 added = np.full(len(system.free) * size, damping)
                 if system.factorization.factor(entries, added) and system.factorization.definite:
                     step = -system.solve(gradient)
+                elif not near:
+                    break
                 elif not damping < 1e3 * scale:  # so, too, where no edge has a weight
                     return point
                 else:
                     damping = max(10.0 * damping, FRAME * scale)
-            promised = -float(np.sum(gradient * step))
+            promised = np.inf if step is None else -float(np.sum(gradient * step))
+            if step is None or not (near or promised <= FAR * cost):
+                point, near = problem.anchored(self(point, FAR), point), True
+                cost = problem.cost(point)
+                continue
+            near = True
             whole = np.zeros((problem.count, size))
             whole[system.free] = step[:, :, 0]
             trial = _retract(point, basis, whole)

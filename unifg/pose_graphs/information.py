@@ -83,26 +83,23 @@ def bounded_below(information: Array, dim: int) -> tuple[Array, Array]:
         one, own = bounded_below(information[:1], dim)
         return np.repeat(one, len(information)), np.repeat(own, len(information), axis=0)
     lengths, axes = np.linalg.eigh(information[:, :dim, :dim])
-    cross = np.swapaxes(axes, 1, 2) @ information[:, :dim, dim:]
-    turning = information[:, dim:, dim:]
+    turning, least = information[:, dim:, dim:], np.maximum(lengths[:, 0], 0.0)
     greatest = np.maximum(np.abs(turning).max(axis=(1, 2), initial=0.0), np.finfo(np.float64).tiny)
-    least = np.maximum(lengths[:, 0], 0.0)
-    tau, omega, best = np.zeros(len(information)), np.zeros_like(turning), np.full(len(information), -np.inf)
-    for share in SHARES:
-        left = lengths - share * least[:, None]
+    sound = np.linalg.eigvalsh(turning)[:, 0] >= -ROUNDING * greatest
+    tau, omega = np.where(sound, least, 0.0), turning.copy()  # without a coupling, all of tau is free
+    some = np.flatnonzero(information[:, :dim, dim:].any(axis=(1, 2)))
+    cross = np.swapaxes(axes[some], 1, 2) @ information[some, :dim, dim:]
+    coupled, best = (cross != 0.0).any(axis=2), np.full(len(some), -np.inf)
+    for share in SHARES if len(some) else ():
+        left = lengths[some] - share * least[some, None]
         open_ = left > 0.0
-        coupled = (cross != 0.0).any(axis=2)
         inverse = np.where(open_, 1.0 / np.where(open_, left, 1.0), 0.0)
-        schur = turning - np.swapaxes(cross, 1, 2) @ (inverse[:, :, None] * cross)
-        bends = np.linalg.eigvalsh(schur) / greatest[:, None]
+        schur = turning[some] - np.swapaxes(cross, 1, 2) @ (inverse[:, :, None] * cross)
+        bends = np.linalg.eigvalsh(schur) / greatest[some, None]
         size = dim * np.log(share + FLOOR) + np.sum(np.log(np.maximum(bends, 0.0) + FLOOR), axis=1)
-        valid = (
-            (bends[:, 0] >= -ROUNDING) & (open_ | ~coupled).all(axis=1)
-            if share
-            else np.ones(len(information), dtype=bool)
-        )
-        better = valid & (size > best)
-        tau[better], omega[better], best[better] = share * least[better], schur[better], size[better]
+        better = (size > best) & (((bends[:, 0] >= -ROUNDING) & (open_ | ~coupled).all(axis=1)) | (share == 0.0))
+        taken = some[better]
+        tau[taken], omega[taken], best[better] = share * least[taken], schur[better], size[better]
     own, frames = np.linalg.eigh(omega)
     own = np.maximum(own, 0.0)
     if own.shape[1] == 3:

@@ -65,6 +65,7 @@ class Relaxation:
         parts: (n,) number of the connected part of every pose.
         anchors: (parts,) a pose of each.
         caveats: sentences, what of the graph's weights this form cannot hold; empty when it holds all.
+        pose_graph: the graph, with the edges that count.
     """
 
     dim: int
@@ -76,16 +77,15 @@ class Relaxation:
     parts: IntArray
     anchors: IntArray
     caveats: tuple[str, ...]
+    pose_graph: PoseGraph
 
     @classmethod
-    def of(cls, pose_graph: PoseGraph, used: BoolArray | None = None, *, below: bool = False) -> Relaxation:
-        """State it.
+    def of(cls, pose_graph: PoseGraph, used: BoolArray | None = None) -> Relaxation:
+        """State it; means stand for the weights that it cannot hold.
 
         Args:
             pose_graph: poses and edges.
             used: (m,) edges that count, say the inliers; all by default.
-            below: take weights that no information matrix lies below (`bounded_below`), which makes this cost at most
-                that of the logarithm: |t| <= |v| and 2 sin(w / 2) <= w. Otherwise means stand for what it cannot hold.
 
         Raises:
             GraphError: the graph has landmarks, or several poses of one part are known.
@@ -94,42 +94,29 @@ class Relaxation:
         kept = replace(pose_graph, edges=pose_graph.edges[real if used is None else used & real])
         edges, anchors, parts = kept.edges, kept.anchors()[0], kept.parts()
         admit(kept)
-        dim, angles = pose_graph.group.point_dim, pose_graph.group.dim - pose_graph.group.point_dim
-        caveats = []
+        dim, caveats = pose_graph.group.point_dim, list[str]()
         if not real.all():
             caveats.append(f"{(~real).sum()} edges from a pose to itself, which cost the same in any map, are left out")
-        if below:
-            tau, turning = bounded_below(edges.information, dim)
-        else:
-            tau, turning = (
-                np.trace(edges.information[:, :dim, :dim], axis1=1, axis2=2) / dim,
-                edges.information[:, dim:, dim:],
-            )
-            caveats += _lost(edges.information, dim, tau)
-        mean = np.trace(turning, axis1=1, axis2=2)[:, None, None]
-        squared = 0.5 * turning if angles == 1 else 0.5 * mean * np.eye(3) - turning
-        if angles == 1:
-            squared = squared * np.eye(2)
-        lengths, axes = np.linalg.eigh(squared)
-        bent = lengths[:, 0] < -ISOTROPIC * np.abs(lengths[:, -1])
-        if bent.any():
+        tau = np.trace(edges.information[:, :dim, :dim], axis1=1, axis2=2) / dim
+        caveats += _lost(edges.information, dim, tau)
+        by_first, by_second, bent = _weighed(kept, tau, edges.information[:, dim:, dim:])
+        if bent:
             caveats.append(
-                f"rotation information of {bent.sum()} edges is larger about one axis than about the others together: "
+                f"rotation information of {bent} edges is larger about one axis than about the others together: "
                 "its mean stands for it"
             )
-            lengths[bent] = mean[bent, :, 0] / 6.0
-        root = axes @ (np.sqrt(np.maximum(lengths, 0.0))[:, :, None] * np.swapaxes(axes, 1, 2))
-        pull = np.sqrt(np.maximum(tau, 0.0))
-        matrices = pose_graph.group.matrix(edges.measured)
-        by_first = np.zeros((len(edges), dim + 1, dim + 1))
-        by_second = np.zeros_like(by_first)
-        by_first[:, 0, 0], by_second[:, 0, 0] = -pull, pull
-        by_first[:, 0, 1:] = -pull[:, None] * matrices[:, :dim, dim]
-        by_first[:, 1:, 1:] = -root @ np.swapaxes(matrices[:, :dim, :dim], 1, 2)
-        by_second[:, 1:, 1:] = root
-        count = len(pose_graph.poses)
-        order = np.argsort(parts[anchors])
-        return cls(dim, count, edges.first, edges.second, by_first, by_second, parts, anchors[order], tuple(caveats))
+        count, order = len(pose_graph.poses), np.argsort(parts[anchors])
+        ends = edges.first, edges.second
+        return cls(dim, count, *ends, by_first, by_second, parts, anchors[order], tuple(caveats), kept)
+
+    def below(self) -> Relaxation:
+        """The same with weights that no information matrix lies below (`bounded_below`).
+
+        This cost is at most that of the logarithm: |t| <= |v| and 2 sin(w / 2) <= w.
+        """
+        weights = bounded_below(self.pose_graph.edges.information, self.dim)
+        by_first, by_second, _ = _weighed(self.pose_graph, *weights)
+        return replace(self, by_first=by_first, by_second=by_second)
 
     def lift(self, pose_graph: PoseGraph) -> Array:
         """(n, d + 1, d) the point of a graph's poses."""
@@ -169,6 +156,26 @@ class Relaxation:
         back: Array = moved @ turn[self.parts]
         back[:, 0] += like[self.anchors, 0][self.parts]
         return back
+
+
+def _weighed(pose_graph: PoseGraph, tau: Array, turning: Array) -> tuple[Array, Array, int]:
+    """A and B of edges with weights (m,) of translation and (m, k, k) of rotation; of how many a mean stands for it."""
+    edges, dim = pose_graph.edges, pose_graph.group.point_dim
+    mean = np.trace(turning, axis1=1, axis2=2)[:, None, None]
+    squared = 0.5 * turning * np.eye(2) if dim == 2 else 0.5 * mean * np.eye(3) - turning
+    lengths, axes = np.linalg.eigh(squared)
+    bent = lengths[:, 0] < -ISOTROPIC * np.abs(lengths[:, -1])
+    lengths[bent] = mean[bent, :, 0] / 6.0
+    root = axes @ (np.sqrt(np.maximum(lengths, 0.0))[:, :, None] * np.swapaxes(axes, 1, 2))
+    pull = np.sqrt(np.maximum(tau, 0.0))
+    matrices = pose_graph.group.matrix(edges.measured)
+    by_first = np.zeros((len(edges), dim + 1, dim + 1))
+    by_second = np.zeros_like(by_first)
+    by_first[:, 0, 0], by_second[:, 0, 0] = -pull, pull
+    by_first[:, 0, 1:] = -pull[:, None] * matrices[:, :dim, dim]
+    by_first[:, 1:, 1:] = -root @ np.swapaxes(matrices[:, :dim, :dim], 1, 2)
+    by_second[:, 1:, 1:] = root
+    return by_first, by_second, int(bent.sum())
 
 
 def _lost(information: Array, dim: int, tau: Array) -> list[str]:
