@@ -86,6 +86,7 @@ class Search:
         leverage: (m,) of the cluster of each edge; that of odometry is zero.
         weak: names of unknowns of which less than five digits are known.
         ended: False where more may be contradicted than was taken out, or an unknown is not determined.
+        partial: optima of parts of the edges.
     """
 
     solved: PoseGraph
@@ -94,6 +95,7 @@ class Search:
     leverage: Array
     weak: tuple[str, ...]
     ended: bool
+    partial: Partial
 
 
 def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") -> Search:
@@ -110,7 +112,8 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     edges, dim = pose_graph.edges, pose_graph.group.dim
     active, leverage = np.ones(len(edges), dtype=np.bool_), np.zeros(len(edges))
     closures = ~edges.odometry & (edges.first != edges.second)
-    now = Map(pose_graph, active, residual)
+    partial = Partial(pose_graph, residual)
+    now = Map(pose_graph, active, residual, partial)
     solved, weak, maps = now.graph, now.weak(), {active.tobytes(): (now.graph, now.chi2)}
     ended, clusters = now.innovations.determined, list[Suspect]()
     taken: list[list[Suspect]] = []
@@ -184,7 +187,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         "slipped": slipped,
         "unsupported": sorted(unsupported, key=lambda one: -one.moved),
     }
-    return Search(solved, maps, by_kind, leverage, weak, ended)
+    return Search(solved, maps, by_kind, leverage, weak, ended, partial)
 
 
 def optimum(pose_graph: PoseGraph, active: BoolArray, residual: ResidualName = "log") -> tuple[PoseGraph, float]:
@@ -198,12 +201,13 @@ class Partial:
 
     Attributes:
         graph: all edges, at the poses that solves begin from.
+        stated: the graph, its poses and their guess; every edge counts unless data say otherwise.
     """
 
     def __init__(self, pose_graph: PoseGraph, residual: ResidualName) -> None:
         """State it."""
         self.graph = pose_graph
-        self._stated, self._x, _ = pose_graph.graph(residual=residual)
+        self.stated = self._stated, self._x, _ = pose_graph.graph(residual=residual)
         self._counting: list[tuple[Data, BoolArray]] = []
         for name in ("odometry", "closures"):
             chosen = pose_graph.edges.odometry == (name == "odometry")
@@ -259,10 +263,12 @@ class Map:
         chi2: their sum of squares.
     """
 
-    def __init__(self, pose_graph: PoseGraph, active: BoolArray, residual: ResidualName) -> None:
-        """Solve."""
+    def __init__(
+        self, pose_graph: PoseGraph, active: BoolArray, residual: ResidualName, whole: Partial | None = None
+    ) -> None:
+        """Solve; where all edges count, what a `whole` has stated serves as well."""
         part = replace(pose_graph, edges=pose_graph.edges[active])
-        stated, x, guess = part.graph(residual=residual)
+        stated, x, guess = part.graph(residual=residual) if whole is None else whole.stated
         solution, self.graph = _solved(pose_graph, stated, x, guess, {})
         self.active, self.residual = active.copy(), residual
         self.chi2 = 2.0 * solution.cost

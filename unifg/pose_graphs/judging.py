@@ -11,7 +11,7 @@ import numpy as np
 
 from unifg.errors import GraphError
 from unifg.pose_graphs.certificate import certify, require_one_for_each
-from unifg.pose_graphs.clusters import Partial, Search, optimum, search
+from unifg.pose_graphs.clusters import Search, optimum, search
 from unifg.pose_graphs.consistency import most_consistent
 from unifg.pose_graphs.initialise import odometric, starts
 from unifg.pose_graphs.judgement import judge
@@ -87,7 +87,6 @@ def _verdict(
 def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[Cluster]:
     """Clusters with the names of their stretches, the first of them solved again without."""
     dim, count = judged.group.point_dim, len(judged.edges)
-    partial: Partial | None = None
     errors: dict[bytes, tuple[Array, float]] = {}
 
     def chi2_of(known: bytes, mask: BoolArray) -> float:
@@ -100,14 +99,12 @@ def _clusters(found: Search, judged: PoseGraph, residual: ResidualName) -> list[
 
     def solved(left_out: IntArray) -> tuple[BoolArray, bytes]:
         """Edges that are left, and the name of their map; from a bent map least squares may find another minimum."""
-        nonlocal partial
         mask = np.ones(count, dtype=np.bool_)
         mask[left_out] = False
         name = mask.tobytes()
         near = min(found.maps, key=lambda known: chi2_of(known, mask))
         if len(left_out) and near != name:
-            partial = partial or Partial(found.solved, residual)
-            found.maps[name] = partial.optimum(mask, found.maps[near][0])
+            found.maps[name] = found.partial.optimum(mask, found.maps[near][0])
             errors.pop(name, None)
         return mask, name
 
