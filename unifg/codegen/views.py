@@ -35,16 +35,11 @@ class Form(NamedTuple):
     made: Callable[..., Any]
     parts: Sequence[Any]
 
-    @property
-    def kind(self) -> Any:
-        """Type for compiled code."""
-        return types.NamedTuple([_kind(part) for part in self.parts], self.made)
-
 
 def _kind(part: Any) -> Any:
-    """Type of a part."""
+    """Type of a part, or of all, for compiled code."""
     if isinstance(part, Form):
-        return part.kind
+        return types.NamedTuple(list(map(_kind, part.parts)), part.made)
     dtype, *columns = part if isinstance(part, tuple) else (part,)
     return types.Array(from_dtype(dtype), 1 + len(columns), "C")
 
@@ -75,23 +70,19 @@ def opener(form: Callable[..., T], parts: Sequence[Any]) -> Callable[[int], T]:
 
             def load(part: Any) -> Any:
                 if isinstance(part, Form):
-                    return context.make_tuple(builder, part.kind, [load(one) for one in part.parts])
+                    return context.make_tuple(builder, _kind(part), list(map(load, part.parts)))
                 dtype, *columns = part if isinstance(part, tuple) else (part,)
                 begin, length = (builder.load(cgutils.gep(builder, data, next(words))) for _ in range(2))
                 array = context.make_array(_kind(part))(context, builder)
-                shape, sizes = [length], [dtype.itemsize]
-                for width in columns:
-                    shape, sizes = [length, WORD(width)], [width * dtype.itemsize, dtype.itemsize]
-                pointer = builder.inttoptr(begin, cast(ir.PointerType, array.data.type))
-                arrayobj.populate_array(
-                    array, data=pointer, shape=shape, strides=list(map(WORD, sizes)), itemsize=WORD(dtype.itemsize),
-                    meminfo=None,
-                )  # fmt: skip
+                shape = [length, *map(WORD, columns)]
+                sizes = [WORD(width * dtype.itemsize) for width in (*columns, 1)]
+                pointer, item = builder.inttoptr(begin, cast(ir.PointerType, array.data.type)), WORD(dtype.itemsize)
+                arrayobj.populate_array(array, data=pointer, shape=shape, strides=sizes, itemsize=item, meminfo=None)
                 return array._getvalue()
 
             return load(whole)
 
-        return whole.kind(types.int64), generate
+        return _kind(whole)(types.int64), generate
 
     return cast(Callable[[int], T], intrinsic(opened))
 

@@ -153,12 +153,14 @@ def add_up(
         left_out: those whose entries are zero.
         out: entries to add to.
     """
-    terms, lin = opened_terms(terms_at), opened_block(block)
+    terms, (values, residual, jacobian, squares, weights, _, slope, _, _, _) = (
+        opened_terms(terms_at),
+        opened_block(block),
+    )
     for k in range(len(taken)):
         for field in range(fields.shape[1]):
             terms.fields[k, field] = fields[taken[k], field]
-    jacobian, forces = lin.jacobian, multipliers * own
-    curve(terms, lin.values, lin.residual * touched, jacobian, lin.squares, lin.weights, forces, pairs)
+    curve(terms, values, residual * touched, jacobian, squares, weights, multipliers * own, pairs)
     at = len(first)
     for k in range(at):
         out[order[k]] += jacobian[first[k]] * jacobian[second[k]]
@@ -166,7 +168,7 @@ def add_up(
         out[order[at + k]] += pairs[k]
     at += len(pairs)
     for k in range(len(slopes)):
-        out[order[at + k]] += lin.constraint_jacobian[slopes[k]]
+        out[order[at + k]] += slope[slopes[k]]
     for k in range(len(out)):
         if left_out[rows[k]]:
             out[k] = 0.0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from math import sqrt
 from time import perf_counter
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -59,20 +59,11 @@ from unifg.problem.table import (
 from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, IntArray
 
-
-class Viewed(NamedTuple):
-    """Arrays of a :class:`Linearization`."""
-
-    values: Array
-    residual: Array
-    jacobian: Array
-    squares: Array
-    weights: Array
-    constraints: Array
-    constraint_jacobian: Array
-    gradient: Array
-    hessian: Array
-    concavity: Array
+ARRAYS = (
+    "values", "residual", "jacobian", "squares", "weights", "constraints", "constraint_jacobian", "gradient", "hessian",
+    "concavity",
+)  # fmt: skip
+Views: TypeAlias = tuple[Array, Array, Array, Array, Array, Array, Array, Array, Array, Array]
 
 
 class Block(NamedTuple):
@@ -80,7 +71,7 @@ class Block(NamedTuple):
 
     Attributes:
         flat: all of them.
-        places: (10, 2) where each array of :class:`Viewed` begins and ends there.
+        places: (10, 2) where each of `ARRAYS` begins and ends there.
     """
 
     flat: Array
@@ -91,7 +82,7 @@ def block_of(program: CompiledProblem, lin: Linearization) -> Block:
     """The arrays of a linearisation as one; those of another kind than a solver keeps are copied."""
     if isinstance(lin, Snapshot):
         return Block(lin._flat, program.once(_places))
-    arrays = [lin.stored, *(getattr(lin, name) for name in Viewed._fields[1:])]
+    arrays = [lin.stored, *(getattr(lin, name) for name in ARRAYS[1:])]
     ends = np.cumsum([len(array) for array in arrays])
     return Block(np.concatenate(arrays), np.stack([ends - [len(array) for array in arrays], ends], axis=1))
 
@@ -99,14 +90,14 @@ def block_of(program: CompiledProblem, lin: Linearization) -> Block:
 def _places(program: CompiledProblem) -> IntArray:
     """Places in the linearisations that solvers keep."""
     parts = LinearizationMemory(program)._parts
-    return np.array([(parts[name].start, parts[name].stop) for name in Viewed._fields])
+    return np.array([(parts[name].start, parts[name].stop) for name in ARRAYS])
 
 
 @inlined
-def opened_block(block: Block) -> Viewed:
-    """Views of the arrays."""
+def opened_block(block: Block) -> Views:
+    """Views of `ARRAYS`."""
     a, p = block.flat, block.places
-    return Viewed(
+    return (
         a[p[0, 0] : p[0, 1]], a[p[1, 0] : p[1, 1]], a[p[2, 0] : p[2, 1]], a[p[3, 0] : p[3, 1]], a[p[4, 0] : p[4, 1]],
         a[p[5, 0] : p[5, 1]], a[p[6, 0] : p[6, 1]], a[p[7, 0] : p[7, 1]], a[p[8, 0] : p[8, 1]], a[p[9, 0] : p[9, 1]],
     )  # fmt: skip

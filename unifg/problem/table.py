@@ -106,9 +106,8 @@ class TermArrays(NamedTuple):
 
 
 _LONG, _DOUBLE = np.dtype(np.int64), np.dtype(np.float64)
-_TABLES = (_LONG, FIELDS), (_LONG, FIELDS)
 _PLACES = *[_LONG] * 4, np.dtype(np.int32), (_LONG, len(Part._fields) + 1), np.dtype(np.uint8)
-_open = opener(TermArrays, (*_TABLES, *_PLACES, *[_DOUBLE] * 4))
+_open = opener(TermArrays, ((_LONG, FIELDS), (_LONG, FIELDS), *_PLACES, *[_DOUBLE] * 4))
 
 
 @inlined

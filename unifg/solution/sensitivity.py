@@ -335,10 +335,8 @@ class Sensitivities:
             shape: tuple[int, ...] = len(of), of.manifold.dim
         else:
             shape = next((shape for name, _, shape in self._program.places if name == of), ())
-        if weights.shape == shape or not weights.ndim:
-            return np.full(shape, weights).ravel()
         try:
-            return np.broadcast_to(weights, shape).ravel()
+            return np.broadcast_to(weights, shape).ravel() if weights.ndim else np.full(shape, weights).ravel()
         except ValueError:
             raise GraphError(f"gradient: weights of {of!r} have shape {weights.shape}, expected {shape}") from None
 
@@ -597,14 +595,15 @@ def settle(
         What :func:`weakest` does; what is left of the random numbers, negative where the factorisation fails; whether
         as many pivots are positive as there are unknowns, and all others negative.
     """
-    terms, system, lin = opened_terms(terms_at), opened(system_at), opened_block(block)
-    kkt, saddle, forces, out = system.kkt, system.saddle, held[5], held[6]
-    row, slack, force = weakest(lin.constraints, *held, cost_size(diagonal, lin.hessian, lin.gradient))
-    added = extra if len(extra) else lin.concavity
+    values, residual, jacobian, squares, weights, rows, slopes, gradient, costs, concavity = opened_block(block)
+    system, out = opened(system_at), held[6]
+    kkt, saddle = system.kkt, system.saddle
+    row, slack, force = weakest(rows, *held, cost_size(diagonal, costs, gradient))
+    added = extra if len(extra) else concavity
     for k in range(len(hessian)):
-        hessian[k] = lin.hessian[k] + (added[k] if len(added) else 0.0)
-    curve(terms, lin.values, lin.residual, lin.jacobian, lin.squares, lin.weights, forces, hessian)
-    fill(kkt, hessian, lin.constraint_jacobian, entries)
+        hessian[k] = costs[k] + (added[k] if len(added) else 0.0)
+    curve(opened_terms(terms_at), values, residual, jacobian, squares, weights, held[5], hessian)
+    fill(kkt, hessian, slopes, entries)
     n, state = kkt.size[0], kkt.plan.state
     for k in range(n, len(out)):
         if out[k]:
