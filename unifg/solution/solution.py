@@ -365,7 +365,10 @@ class Solution:
         weights = {of: 1.0} if isinstance(of, str) else of
         if not isinstance(weights, Mapping):
             raise GraphError(f'gradient of what? "cost", or {{x: weights}}, found {f"{of!r}"[:80]}')
-        parts = {self._part(part): doubles(f"gradient: weights of {part!r}", own) for part, own in weights.items()}
+        parts = {
+            self._part(part): np.asarray(own) if type(own) is float else doubles(f"gradient: weights of {part!r}", own)
+            for part, own in weights.items()
+        }
         return self._sensitivities.gradient(parts, wrt)
 
     def _part(self, named: Named) -> Selection | str:
