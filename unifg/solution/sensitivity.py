@@ -29,6 +29,7 @@ from unifg.elimination.saddle import CORRECTIONS, EXACT, NOTHING, prepared
 from unifg.elimination.substitution import largest_of, refine, solve
 from unifg.errors import GraphError
 from unifg.factors.robust import form_of
+from unifg.modeling.duplicates import doubles
 from unifg.modeling.terms import Constraint, Cost
 from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
@@ -491,6 +492,11 @@ class Sensitivities:
         found[:] = 0.0
         pull(*given, solutions, found)
         return solutions, found
+
+
+def as_weights(of: Named, weights: Numbers) -> Array:
+    """Weights of a part as an array; a plain number needs no name for a message."""
+    return np.asarray(weights) if type(weights) is float else doubles(f"gradient: weights of {of!r}", weights)
 
 
 def _called(asked: Named | Wrt) -> Hashable:

@@ -13,7 +13,6 @@ from weakref import ref
 import numpy as np
 
 from unifg.errors import GraphError, UnifgError, require_kinds
-from unifg.modeling.duplicates import doubles
 from unifg.modeling.soft import SlackFamily
 from unifg.modeling.variables import Data, Family, Selection, Variable, as_selection
 from unifg.problem.compiled_problem import CompiledProblem
@@ -30,7 +29,7 @@ from unifg.solution.multipliers import hold, size_of_costs
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.saved import write_answer
-from unifg.solution.sensitivity import COST, ONE, Named, Sensitivities, Weights, Wrt
+from unifg.solution.sensitivity import COST, ONE, Named, Sensitivities, Weights, Wrt, as_weights
 from unifg.solution.status import Found, Status
 from unifg.solution.tube import tube
 from unifg.solution.verify import Verified, require_tolerance, verified
@@ -365,10 +364,7 @@ class Solution:
         weights = {of: 1.0} if isinstance(of, str) else of
         if not isinstance(weights, Mapping):
             raise GraphError(f'gradient of what? "cost", or {{x: weights}}, found {f"{of!r}"[:80]}')
-        parts = {
-            self._part(part): np.asarray(own) if type(own) is float else doubles(f"gradient: weights of {part!r}", own)
-            for part, own in weights.items()
-        }
+        parts = {self._part(part): as_weights(part, own) for part, own in weights.items()}
         return self._sensitivities.gradient(parts, wrt)
 
     def _part(self, named: Named) -> Selection | str:
