@@ -349,6 +349,8 @@ MADE: list[tuple[type[fg.UnifgError], Callable[[], object], str]] = [
     (fg.ModelError, lambda: grown(resolution=np.nan), "resolution .* must be positive"),
     (fg.ModelError, lambda: grown(cap=-1.0), "cap"),
     (fg.ModelError, lambda: grown(np.zeros(3, dtype=bool)), "grid"),
+    (fg.BackendError, lambda: LevenbergMarquardt(damping=np.nan), "damping must not be negative, found nan"),
+    (fg.BackendError, lambda: AugmentedLagrangian(damping=-5.0), "damping must not be negative, found -5"),
 ]
 
 

@@ -154,8 +154,8 @@ class IterativeMethod(Backend):
                 raise BackendError(f"{self.name}: {name} must be positive and finite, found {vars(self)[name]}")
         if np.isnan(self.time_limit):
             raise BackendError(f"{self.name}: time_limit must be a number of seconds, found {self.time_limit}")
-        for name in ("max_iterations", "search_iterations"):
-            if vars(self)[name] < 0:
+        for name in ("max_iterations", "search_iterations", "damping"):
+            if not vars(self).get(name, 0) >= 0:
                 raise BackendError(f"{self.name}: {name} must not be negative, found {vars(self)[name]}")
 
     @property
