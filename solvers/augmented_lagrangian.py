@@ -97,8 +97,8 @@ class AugmentedLagrangian(Solver):
             raise BackendError(f"{self.name}: schedule must be {words}, found '{self.schedule}'")
         if self.hessian not in ("exact", "gauss-newton"):
             raise BackendError(f"{self.name}: hessian must be 'exact' or 'gauss-newton', found '{self.hessian}'")
-        numbers = {"penalty": 1.0 if self.penalty is None else self.penalty, "inner_iterations": self.inner_iterations}
-        require_positive(self.name, BackendError, **numbers)
+        penalty = 1.0 if self.penalty is None else self.penalty
+        require_positive(self.name, BackendError, penalty=penalty, inner_iterations=self.inner_iterations)
         if not self.penalty_growth > 1.0:
             raise BackendError(f"{self.name}: penalty_growth must be above 1, found {self.penalty_growth}")
 

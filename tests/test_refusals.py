@@ -42,6 +42,7 @@ from unifg.solvers import (
     GaussNewton,
     GraduatedNonConvexity,
     InteriorPoint,
+    LevenbergMarquardt,
     Penalty,
     names,
 )
