@@ -49,7 +49,7 @@ def measure(case: Problem | None, rounds: int) -> tuple[str, ...]:
         size = int(re.findall(r"_WORKSPACE = (\d+)", header.read_text(encoding="utf-8"))[0])
         call = ctypes.CDLL(str(shared)).solver_solve
     values, multipliers, _ = prepared.read(guess)
-    arrays = values.flat, multipliers, values.flat.copy(), multipliers.copy(), np.zeros(7), np.zeros(size // 8 + 1)
+    arrays = values, multipliers, values.copy(), multipliers.copy(), np.zeros(7), np.zeros(size // 8 + 1)
     handles = prepared.program.binding.present
     in_c, compiled, whole = np.empty((3, rounds, len(each)))
     for place in np.ndindex(rounds, len(each)):

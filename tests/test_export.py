@@ -69,7 +69,7 @@ def in_order(prepared: Prepared, data: Mapping[fg.Data, Any]) -> Array:
 def flat(prepared: Prepared, guess: Any) -> tuple[Array, Array]:
     """Values and multipliers of a guess as the C function takes them."""
     values, multipliers, _ = prepared.read(guess)
-    return values.flat, multipliers
+    return values, multipliers
 
 
 def ready(build: Callable[[], tuple[fg.Graph, Any, fg.Data]]) -> tuple[Prepared, Any]:

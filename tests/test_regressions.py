@@ -135,6 +135,6 @@ def test_a_function_whose_arrays_have_a_row_for_each_factor_is_told_how_to_say_s
     with pytest.raises(fg.GraphError, match=r"factors, say so: fg.each\(array\), graph.data\(..., each=True\)"):
         graph.minimize(lambda b, x: _saturation(b, x), b[0], data)
     with pytest.raises(fg.GraphError, match=r"say it where they are made: graph.data\('x', ..., each=True\)"):
-        fg.each(data)
+        fg.each(data)  # type: ignore[arg-type]
     with pytest.raises(fg.GraphError, match=r"fg.shared takes constants; of data 'x' say it .* each=False\)"):
-        fg.shared(data)
+        fg.shared(data)  # type: ignore[arg-type]

@@ -119,7 +119,7 @@ def test_the_last_two_full_steps_tell_how_many_are_left() -> None:
 
 @pytest.mark.parametrize("backend", [SQP, KKT])
 def test_second_derivatives_take_over_where_gauss_newton_has_far_to_go(
-    backend: Any, monkeypatch: pytest.MonkeyPatch
+    backend: type[SQP | KKT], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stated = Unicycle("straight", True, 20).formulation()
 
