@@ -69,6 +69,9 @@ def direct(address: int) -> None:
             if now.definite == UNKNOWN:
                 run(links[0].examine, (address,))
             if now.definite == YES:
+                if delta == 0.0 and not factorised:  # nothing curves an unknown that comes before its equality
+                    delta = LEAST_SHIFT
+                    continue
                 now.share = 0.5 * now.share if now.share > LEAST_SHARE else 0.0
                 continue
         if delta == 0.0:
