@@ -148,10 +148,9 @@ def solve(
 
     `LevenbergMarquardt` for least squares without constraints, `InteriorPoint` for everything else. Where it ends
     without a solution, and not for want of time, another one begins at the same guess: `InteriorPoint` after the
-    first, after the second `AugmentedLagrangian`, or `SQP` where a cost is no square. The solution is that of the
-    second one if it converged, else that of the first. What was picked, and for what, stands in ``solution.picked`` and
-    ``solution.report()``, and goes to the logger ``unifg`` at level INFO. Control loops name a backend and
-    prepare it.
+    first, `AugmentedLagrangian` after the second. The solution is that of the second one if it converged, else that of
+    the first. What was picked, and for what, stands in ``solution.picked`` and ``solution.report()``, and goes to the
+    logger ``unifg`` at level INFO. Control loops name a backend and prepare it.
 
     Args:
         graph: the problem.
