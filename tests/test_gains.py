@@ -163,6 +163,9 @@ def test_gains_are_refused_by_name() -> None:
     good = solved(graph)
     with pytest.raises(fg.GraphError, match=r"\[2\] states for \[3\] controls"):
         good.gains(x[:2], u)
+    for states, controls in (([], u), (x, []), ([], [])):
+        with pytest.raises(fg.GraphError, match=r"gains: .* give as many, and at least one"):
+            good.gains(states, controls)
     for wrong in (5, None):
         with pytest.raises(fg.GraphError, match="expected a family of variables"):
             good.gains(x, wrong)  # type: ignore[arg-type]

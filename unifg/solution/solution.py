@@ -310,16 +310,14 @@ class Solution:
         if not self.converged:
             raise GraphError(f"gains need a solution that is CONVERGED, this one is {self.status.name}")
         x, u = (
-            [
-                self._selection(v)
-                for v in ([named] if isinstance(named, str) or not isinstance(named, Sequence) else named)
-            ]
-            for named in (states, controls)
+            [self._selection(v) for v in ([part] if isinstance(part, str) or not isinstance(part, Sequence) else part)]
+            for part in (states, controls)
         )
-        if all(len(s) == len(u[0]) + 1 for s in x):
+        if u and all(len(s) == len(u[0]) + 1 for s in x):
             x = [s[:-1] for s in x]
-        if len({len(s) for s in (*x, *u)}) > 1:
-            raise GraphError(f"gains: {[len(s) for s in x]} states for {[len(s) for s in u]} controls: give as many")
+        if not (x and u) or len({len(s) for s in (*x, *u)}) > 1:
+            counts = f"{[len(s) for s in x]} states for {[len(s) for s in u]} controls"
+            raise GraphError(f"gains: {counts}: give as many, and at least one")
         if self._edition != self._program.binding.edition:
             require_data(self._program, self._lin)
         return feedback_gains(self._program, self._lin, self._multipliers, self._equality | self._held(), x, u)
