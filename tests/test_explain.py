@@ -47,6 +47,18 @@ def test_the_constraint_that_holds_is_named_with_its_gain() -> None:
     assert "'limits'" not in free.explain()
 
 
+def test_conditions_stated_twice_are_told_beside_what_loosening_saves() -> None:
+    """They may share any multiplier: 184 of cost a unit was promised for a limit whose loosening saves nothing."""
+    graph, x = drawn_to([3.0], 3)
+    graph.constrain(lambda a, b: b - a, x[0], x[1], lower=0.0, upper=0.0, name="meet")
+    graph.constrain(lambda a, b: b - a, x[:-1], x[1:], lower=0.0, name="order")
+    graph.constrain(lambda a: a, x[-1], upper=1.0, name="cap")
+    solution = InteriorPoint().solve(graph, {x: np.zeros((3, 1))}, check=True)
+    assert np.abs(solution.dual("order")).max() > 100.0
+    assert "factor 0, depends on other constraints" in sentence(solution, "'meet', factor 0")
+    assert "depends on" not in InteriorPoint().solve(*chain(0.2), check=True).explain()
+
+
 def test_a_cost_that_a_tolerated_violation_saves_is_told() -> None:
     """Rows in units so small that 1e-6 of them are a part in four hundred of the cost."""
     graph, guess = next(problem for problem in PROBLEMS if problem.name == "pinene").build()

@@ -18,6 +18,7 @@ from unifg.modeling.terms import ScalarCost
 from unifg.modeling.variables import Data, Family
 from unifg.problem.columns import Values
 from unifg.problem.compiled_problem import CompiledProblem, idle_problem
+from unifg.problem.linearization import Linearization
 from unifg.problem.term import CompiledTerm
 from unifg.typing import Array, ArrayLike, IntArray
 
@@ -215,28 +216,29 @@ def _dependent(program: CompiledProblem, values: Values) -> list[Finding]:
     rows = np.flatnonzero(program.equality)
     if not len(rows) or len(rows) > DENSE_ROWS:
         return []
-    lin = program.linearize(values)
+    found = {program.row_name(row): None for row in dependent(program, program.linearize(values), rows)}
+    return [
+        Finding(
+            "dependent constraints",
+            f"term '{term}': equality of factor {index} depends on other equalities at the guess; "
+            "state each condition once",
+            term,
+            None,
+            index,
+        )
+        for term, index in found
+    ]
+
+
+def dependent(program: CompiledProblem, lin: Linearization, rows: IntArray) -> list[int]:
+    """Those of some constraint rows whose gradients are combinations of those of the others."""
     dense = program.constraints.matrix(lin.constraint_jacobian)[rows].toarray()
     lengths = np.linalg.norm(dense, axis=1)
     scaled = dense / np.maximum(lengths, 1e-300)[:, None]
     left, singular, _ = np.linalg.svd(scaled, full_matrices=True)
     rank = int((singular > 1e-10 * max(singular.max(initial=0.0), 1e-300)).sum())
-    result, seen = [], set()
-    for row in np.flatnonzero((np.abs(left[:, rank:]) > 0.1).any(axis=1)).tolist():
-        term, index = program.row_name(int(rows[row]))
-        if (term, index) not in seen:
-            seen.add((term, index))
-            result.append(
-                Finding(
-                    "dependent constraints",
-                    f"term '{term}': equality of factor {index} depends on other equalities at the guess; "
-                    "state each condition once",
-                    term,
-                    None,
-                    index,
-                )
-            )
-    return result
+    found: list[int] = rows[(np.abs(left[:, rank:]) > 0.1).any(axis=1)].tolist()
+    return found
 
 
 def _first_variable(term: CompiledTerm, index: int) -> tuple[str, int]:

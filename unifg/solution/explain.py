@@ -13,7 +13,7 @@ from unifg.modeling.soft import SLACK
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.problem.term import CompiledTerm
-from unifg.solution.check import listed, members_of, null_direction
+from unifg.solution.check import dependent, listed, members_of, null_direction
 from unifg.solution.conditioning import cheap
 from unifg.solution.fit import Fit
 from unifg.typing import Array, BoolArray
@@ -25,6 +25,7 @@ NOTHING = 1e-13  # of one that is not determined at all
 SAVED = 1e-4  # share of the cost
 MUCH = 0.1  # share of the time
 MOST = 3  # sentences of a kind
+COMPARED = 500  # rows whose gradients are compared with each other, at most
 
 
 def violated(program: CompiledProblem, worst: tuple[str, int] | None, violation: float) -> Iterator[str]:
@@ -102,6 +103,17 @@ def holding(program: CompiledProblem, multipliers: Array, equality: BoolArray, h
                 f"which its {'upper' if multipliers[row] > 0.0 else 'lower'} limit is loosened saves about {gain:.3g} "
                 "of the cost."
             )
+
+
+def ambiguous(program: CompiledProblem, lin: Linearization, held: BoolArray) -> Iterator[str]:
+    """Sentence about rows that hold the solution and say the same as others, so that any of them has the multiplier."""
+    rows = np.flatnonzero(held)
+    if lin.finite and 0 < len(rows) <= COMPARED and (found := dependent(program, lin, rows)):
+        name, factor = program.row_name(found[0])
+        yield (
+            f"'{name}', factor {factor}, depends on other constraints that hold the solution: their multipliers are "
+            "not unique, and loosening one of them alone may save nothing. State each condition once."
+        )
 
 
 def disagreeing(program: CompiledProblem, fit: Fit) -> Iterator[str]:

@@ -19,7 +19,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.conditioning import Conditioning, cheap, conditioning
 from unifg.solution.covariance import Covariances
-from unifg.solution.explain import disagreeing, holding, slow, tolerated, violated, weak
+from unifg.solution.explain import ambiguous, disagreeing, holding, slow, tolerated, violated, weak
 from unifg.solution.fit import Fit, fit_of
 from unifg.solution.gains import feedback_gains, require_data
 from unifg.solution.guess import Guess
@@ -600,13 +600,14 @@ class Solution:
         The backend and why it was picked; the status; what violations within the tolerance save; constraints that hold
         the solution, with what a unit of loosening saves; soft ones that give way; measurements that disagree with
         their weights, of least squares; the direction that is hardly determined; terms left to Python. One
-        factorisation, where it is cheap.
+        factorisation, where it is cheap, and the rank of up to 500 gradients.
         """
         program, held = self._program, self._equality | self._held()
         sentences = [f"{self.solver} was {self.picked or 'chosen by name'}.", self.status.value]
         told = self.cost, self._multipliers, self._lin.constraints, self._lower, self._upper, self.tolerance
         sentences += tolerated(*told) if self.converged else violated(program, self.worst, self.violation)
-        sentences += [*holding(program, self._multipliers, self._equality, held), *self._gave_way()]
+        sentences += holding(program, self._multipliers, self._equality, held)
+        sentences += [*ambiguous(program, self._lin, held), *self._gave_way()]
         if self.converged and (fit := self.fit) is not None:
             sentences += disagreeing(program, fit)
         sentences += weak(program, self._lin, held)
