@@ -8,6 +8,7 @@ depend on each other at the guess. Says of every term how it is evaluated.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,6 +27,7 @@ JACOBIAN_TOLERANCE = 1e-5  # relative; a central difference is good to about 1e-
 PIVOT_TOLERANCE = 1e-11  # relative to the largest pivot of the damped normal equations
 VIOLATED = 1e-6  # as the default tolerance of backends
 DENSE_ROWS = 2000  # above this many constraint rows the dependence test, which is dense, is skipped
+APART = 1e-4  # root of the pivot of a row of length one in the products of all, above which no others make it
 
 
 @dataclass(frozen=True)
@@ -232,10 +234,13 @@ def _dependent(program: CompiledProblem, values: Values) -> list[Finding]:
 
 def dependent(program: CompiledProblem, lin: Linearization, rows: IntArray) -> list[int]:
     """Those of some constraint rows whose gradients are combinations of those of the others."""
-    dense = program.constraints.matrix(lin.constraint_jacobian)[rows].toarray()
-    lengths = np.linalg.norm(dense, axis=1)
-    scaled = dense / np.maximum(lengths, 1e-300)[:, None]
-    left, singular, _ = np.linalg.svd(scaled, full_matrices=True)
+    sparse = program.constraints.matrix(lin.constraint_jacobian)[rows]
+    products = (sparse @ sparse.T).toarray()
+    lengths = np.maximum(np.sqrt(products.diagonal()), 1e-300)
+    with suppress(np.linalg.LinAlgError):  # a row that others make has no pivot of its own, but for rounding
+        if (np.linalg.cholesky(products / np.outer(lengths, lengths)).diagonal() > APART).all():
+            return []
+    left, singular, _ = np.linalg.svd(sparse.toarray() / lengths[:, None], full_matrices=True)
     rank = int((singular > 1e-10 * max(singular.max(initial=0.0), 1e-300)).sum())
     found: list[int] = rows[(np.abs(left[:, rank:]) > 0.1).any(axis=1)].tolist()
     return found
