@@ -38,7 +38,7 @@ from unifg.solvers.quadratic_programs.subproblem import QP, QPAnswer, subproblem
 from unifg.typing import Array
 
 FAILURES = 4  # damped attempts at one step before giving up
-WORTH, WORTH_ON_GRAPH = 8.0, 30.0  # iterations of Gauss-Newton that the last few with second derivatives cost
+WORTH = 8.0  # iterations of Gauss-Newton that the last few with second derivatives cost
 
 
 @dataclass(kw_only=True)
@@ -127,7 +127,7 @@ class SQP(Solver):
         """The full step of the subproblem."""
         workspace.start(lin)
         qp = subproblem(run.program, lin, SMALLEST_DAMPING * workspace.scaling.metric, workspace.pattern)
-        answer = workspace.solve(qp, run.multipliers, self._accuracy(run, workspace, False))
+        answer = workspace.solve(qp, run.multipliers, self._accuracy(run, workspace))
         return answer.step if np.isfinite(answer.error) else None
 
     def iterate(self, run: SolveState, workspace: Subproblems) -> Status | None:
@@ -206,8 +206,8 @@ class SQP(Solver):
 
     def _bends(self, run: SolveState, workspace: Subproblems) -> bool:
         """Test whether Gauss-Newton has more iterations to go than a few with second derivatives cost."""
-        worth = WORTH_ON_GRAPH if workspace.first.name == "graph" else WORTH
-        return not run.program.batched and iterations_left(run.history, self.tolerance) > worth
+        cheaper = run.program.batched or workspace.first.name == "graph"  # than second derivatives, by far
+        return not cheaper and iterations_left(run.history, self.tolerance) > WORTH
 
     def _begin(self, run: SolveState, workspace: Subproblems) -> None:
         """Begin at the present iterate, with nothing learned."""
@@ -219,8 +219,8 @@ class SQP(Solver):
 
         Without ``qp`` the subproblem is Gauss-Newton's, and is put together where it is looked at.
         """
-        steps, curved = workspace.steps, qp is not None and qp.curved_by is not None
-        accuracy = self._accuracy(run, workspace, curved)
+        steps, accuracy = workspace.steps, self._accuracy(run, workspace)
+        curved = qp is not None and qp.curved_by is not None
         steps.pose(run.lin, run.multipliers, shift, accuracy, workspace.exact, curved)
         answer, good = steps.on_graph() if qp is None and workspace.compiled and run.program.sided else (None, False)
         if good:
@@ -239,9 +239,9 @@ class SQP(Solver):
 
         return answer if steps.taken(correct) else None
 
-    def _accuracy(self, run: SolveState, workspace: Subproblems, curved: bool) -> float:
-        """Accuracy to ask of the QP, ``curved`` by second derivatives or not."""
-        return useful_accuracy(curved, _size(run, workspace), self.tolerance, workspace.scaling.smallest)
+    def _accuracy(self, run: SolveState, workspace: Subproblems) -> float:
+        """Accuracy to ask of the QP."""
+        return useful_accuracy(workspace.exact, _size(run, workspace), self.tolerance, workspace.scaling.smallest)
 
 
 def _budget(watch: RestorationTrigger, rows: int) -> int:
