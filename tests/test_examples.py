@@ -264,7 +264,7 @@ def test_own_backend_constrained(run: Run) -> None:
     for solution in (own, kkt, augmented):
         assert right(ran["graph"], solution)
         assert np.allclose(solution.dual("motion"), kkt.dual("motion"), atol=1e-3)
-    assert own.iterations <= kkt.iterations + 2
+    assert own.iterations <= 20 and kkt.iterations <= 8  # which turns to second derivatives
 
 
 @run_by_draw
