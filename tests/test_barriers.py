@@ -441,7 +441,7 @@ def test_gauss_newton_creeps_past_a_sphere_and_sqp_turns_to_the_exact_hessian() 
     kinds = [row.details.get("hessian") for row in found.history[1:]]
     turned = kinds.index("exact")
     assert turned >= 20 and all(kind is None for kind in kinds[:turned]) and None not in kinds[turned:]
-    assert SQP(time_limit=60.0).solve(graph, guess).status is fg.Status.ITERATION_LIMIT  # nothing to be compiled there
+    assert SQP(time_limit=60.0).solve(graph, guess).iterations == found.iterations
 
 
 def test_a_start_at_the_very_centre_is_left() -> None:
