@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import numpy as np
 import pytest
 
-from problems.graphs import drawn_to
+import unifg as fg
+from problems.graphs import drawn_to, graph_with
 from scripts import run_script
-from unifg.solvers import GaussNewton
+from unifg.solvers import GaussNewton, InteriorPoint
 
 # In a process of its own: in this one, other tests have long compiled everything.
 SOLVES = """
@@ -181,3 +183,27 @@ def test_no_tick_compiles_whatever_it_turns_to() -> None:
     turned, relocated, columns, *new = found
     assert turned == [True] * 4 and relocated
     assert new == [[], [], []] and columns == 0
+
+
+def test_slacks_of_a_stored_guess_begin_at_what_its_limits_are_violated_by() -> None:
+    graph, x = drawn_to([2.0])
+    graph.constrain(lambda x: x, x, upper=1.0, soft=1e-3, name="soft")
+    run = InteriorPoint().prepare(graph)
+    moved = run.solve({x: [[0.0]]}, check=True).shifted(x, by=0)
+    stored = moved.flat(run.program)
+    assert stored is not None
+    stored[0][:] = 5.0  # the slack among them
+    slack = run.program.soft["soft"].family
+    assert run.program.columns.view(run.read(moved)[0])[slack][0, 0] == pytest.approx(4.0)
+
+
+def test_what_a_function_captures_reaches_a_solve_from_a_stored_guess() -> None:
+    goal = np.array([2.0])
+    graph, x = graph_with(fg.Rn(1))
+    graph.minimize(lambda x: x - goal, x)
+    graph.bound(x, upper=10.0)
+    run = InteriorPoint().prepare(graph)
+    first = run.solve({x: [[0.0]]}, check=True)
+    for wanted in (7.0, -3.0):
+        goal[0] = wanted
+        assert run.solve(first.shifted(x, by=0), check=True)[x][0, 0] == pytest.approx(wanted, abs=1e-4)
