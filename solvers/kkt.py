@@ -48,7 +48,7 @@ from unifg.solvers.globalize.feasibility_restoration import leave, settle
 from unifg.solvers.globalize.line_search import search
 from unifg.solvers.globalize.merit import OnePrice
 from unifg.solvers.globalize.norms import largest, norm
-from unifg.solvers.globalize.slow_convergence import converges_slowly, iterations_left
+from unifg.solvers.globalize.slow_convergence import second_derivatives_pay
 from unifg.typing import Array
 
 RESIDUAL = 1e-8  # relative, in the equilibrated system, of one that counts as solved
@@ -116,7 +116,7 @@ class KKT(Solver):
         damping = slackness = 0.0
         failures, slow = 0, False
         while run.status is None:
-            taken, slow = None, slow or (self._bends(run) and not self.full_steps)
+            taken, slow = None, slow or (second_derivatives_pay(run, WORTH) and not self.full_steps)
             if slow and (found := workspace.step(run.lin, run.multipliers, 0.0, slackness, curved=True)) is not None:
                 taken = self._search(run, workspace, merit, *found, hopeful=True)
             if doubtful := taken is None or taken[3] < SHORT:
@@ -157,17 +157,12 @@ class KKT(Solver):
             slackness = 0.1 * slackness if slackness > SMALLEST_DAMPING else 0.0
         return None
 
-    def _bends(self, run: SolveState) -> bool:
-        """Test whether second derivatives pay."""
-        few = iterations_left(run.history, self.tolerance) <= WORTH or run.program.batched
-        return not few or converges_slowly(run.history)
-
     def _damped(self, run: SolveState, workspace: Newton) -> Status | None:
         """Levenberg and Marquardt's iteration."""
         merit, damping = OnePrice(run.program), Damping(FIRST_LEVENBERG)
         rejected, slackness, slow = 0, 0.0, False
         while run.status is None:
-            lin, slow = run.lin, slow or self._bends(run)
+            lin, slow = run.lin, slow or second_derivatives_pay(run, WORTH)
             less = damping.value / (1.0 + damping.value)
             curved = slow and rejected == 0
             found = workspace.step(lin, run.multipliers, damping.value, slackness, less, curved)

@@ -30,7 +30,7 @@ from unifg.solution.solver import Solver
 from unifg.solution.status import Status
 from unifg.solvers.globalize.feasibility_restoration import RestorationTrigger, leave, resume, settle
 from unifg.solvers.globalize.norms import largest
-from unifg.solvers.globalize.slow_convergence import PATIENCE, converges_slowly, iterations_left
+from unifg.solvers.globalize.slow_convergence import PATIENCE, second_derivatives_pay
 from unifg.solvers.quadratic_programs.attempt import LOGGED, SMALLEST_DAMPING, STARTED, STOPPED
 from unifg.solvers.quadratic_programs.loop import kkt_size, rests, useful_accuracy
 from unifg.solvers.quadratic_programs.routes import Subproblems
@@ -134,6 +134,7 @@ class SQP(Solver):
         """Iterate to convergence."""
         program, steps, watch, failures = run.program, workspace.steps, RestorationTrigger(), 0
         now, turning = steps.now, self.hessian == "auto" and self.qp != "elimination"
+        worth = np.inf if workspace.first.name == "graph" else WORTH  # where steps of Gauss-Newton are cheaper by far
         alone = program.sided and (run.alone or (not run.watched and self._known(program)))
         rule = self.step_tolerance, self.violation_tolerance
         steps.prepare(self.tolerances, self.full_steps, self.second_order_correction, self.max_iterations, rule)
@@ -152,7 +153,7 @@ class SQP(Solver):
             if now["answer"] == STOPPED:
                 return Status.STOP_RULE
             if not steps.pending:
-                if turning and (converges_slowly(run.history) or self._bends(run, workspace)):
+                if turning and second_derivatives_pay(run, worth):
                     turning, workspace = False, workspace.curved()
                     self._begin(run, workspace)
                 calls = watch.calls(run.optimality.violation, run.tolerances.violation)
@@ -203,11 +204,6 @@ class SQP(Solver):
             if run.status is None and rests(now["size"], run.optimality.violation, *rule):
                 return Status.STOP_RULE
         return None
-
-    def _bends(self, run: SolveState, workspace: Subproblems) -> bool:
-        """Test whether Gauss-Newton has more iterations to go than a few with second derivatives cost."""
-        cheaper = run.program.batched or workspace.first.name == "graph"  # than second derivatives, by far
-        return not cheaper and iterations_left(run.history, self.tolerance) > WORTH
 
     def _begin(self, run: SolveState, workspace: Subproblems) -> None:
         """Begin at the present iterate, with nothing learned."""

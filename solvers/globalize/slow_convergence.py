@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 from unifg.solution.history import Iteration
+from unifg.solution.solve_state import SolveState
 
 PATIENCE = 20  # iterations that any solve may take to get near
 LOOK_BACK = 10  # iterations over which progress is judged
@@ -19,6 +20,12 @@ def converges_slowly(history: Sequence[Iteration]) -> bool:
     if len(history) <= PATIENCE:
         return False
     return _missing(history[-1]) > PROGRESS * _missing(history[-1 - LOOK_BACK])
+
+
+def second_derivatives_pay(run: SolveState, worth: float) -> bool:
+    """Test whether a solve converges slowly, or has more than ``worth`` iterations to go where nothing is Python's."""
+    left = 0.0 if run.program.batched else iterations_left(run.history, run.tolerances.kkt)
+    return left > worth or converges_slowly(run.history)
 
 
 def iterations_left(history: Sequence[Iteration], tolerance: float) -> float:

@@ -182,6 +182,7 @@ class Subproblems:
 
     def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
         """Test whether an answer leaves most of the violation, as the least error of contradicting rows does."""
+        # Asked of every answer, so that it is there once a prepared solver has rehearsed.
         most = leaves_most(qp.linear(answer.step), qp.lower, qp.upper, 0.1 * self.tolerance)
         return bool(most and answer.error > 0.1 * self.tolerance)  # which is no less than what is left
 

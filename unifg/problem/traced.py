@@ -174,7 +174,7 @@ class Trace:
 
     @property
     def changed(self) -> bool:
-        """True if the one or the other has changed."""
+        """True if what is compiled in has changed, or parameters have."""
         return self.outdated or self.moved
 
     def refreshed(self) -> Trace:

@@ -18,7 +18,7 @@ from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import accumulate
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -492,6 +492,11 @@ class Sensitivities:
         found[:] = 0.0
         pull(*given, solutions, found)
         return solutions, found
+
+
+def several(named: Any) -> Sequence[Any]:
+    """What is asked for, of one or of several; selections are no sequences of others."""
+    return [named] if isinstance(named, ONE) or not isinstance(named, Sequence) else named
 
 
 def as_weights(of: Named, weights: Numbers) -> Array:

@@ -29,7 +29,7 @@ from unifg.solution.multipliers import hold, size_of_costs
 from unifg.solution.optimality import Optimality
 from unifg.solution.outlier_report import OutlierReport
 from unifg.solution.saved import write_answer
-from unifg.solution.sensitivity import COST, ONE, Named, Sensitivities, Weights, Wrt, as_weights
+from unifg.solution.sensitivity import COST, Named, Sensitivities, Weights, Wrt, as_weights, several
 from unifg.solution.status import Found, Status
 from unifg.solution.tube import tube
 from unifg.solution.verify import Verified, require_tolerance, verified
@@ -309,10 +309,7 @@ class Solution:
         """
         if not self.converged:
             raise GraphError(f"gains need a solution that is CONVERGED, this one is {self.status.name}")
-        x, u = (
-            [self._selection(v) for v in ([part] if isinstance(part, str) or not isinstance(part, Sequence) else part)]
-            for part in (states, controls)
-        )
+        x, u = ([self._selection(one) for one in several(part)] for part in (states, controls))
         if u and all(len(s) == len(u[0]) + 1 for s in x):
             x = [s[:-1] for s in x]
         if not (x and u) or len({len(s) for s in (*x, *u)}) > 1:
@@ -340,9 +337,7 @@ class Solution:
                 scaled multiplier both below 10 times the root of the tolerance), the reduced Hessian is singular or
                 indefinite, multipliers are not unique, or a function has a kink.
         """
-        asked = [of] if isinstance(of, ONE) or not isinstance(of, Sequence) else of
-        by = [wrt] if isinstance(wrt, ONE) or not isinstance(wrt, Sequence) else wrt
-        return self._sensitivities.matrix([self._part(part) for part in asked], by)
+        return self._sensitivities.matrix([self._part(part) for part in several(of)], several(wrt))
 
     def gradient(self, of: Weights | str, wrt: Wrt) -> Array:
         """Gradient of a scalar, by one solve: of the cost, or of a weighted sum of whatever :meth:`sensitivity` takes.

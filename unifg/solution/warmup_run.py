@@ -46,12 +46,10 @@ def rehearse(solver: Any) -> None:
         return
     _rehearsed.add(mode)
     short = replace(solver, max_iterations=ITERATIONS, time_limit=SECONDS, verbose=False, search_iterations=0)
-    turned = [replace(short, hessian="exact")] if getattr(solver, "hessian", "") == "auto" else []
     logger.addFilter(_of_others)
     try:
         for scene in scenes(solver.constraints, solver.scalar_costs):
-            for one in (short, *turned):
-                _play(one, scene)
+            _play(short, scene)
     finally:
         logger.removeFilter(_of_others)
 
