@@ -494,8 +494,8 @@ class Sensitivities:
         return solutions, found
 
 
+def several(named: Any) -> Sequence[Any]:
     """Sequence of names, of one name or of several; a selection is one."""
-    """What is asked for, of one or of several; selections are no sequences of others."""
     return [named] if isinstance(named, ONE) or not isinstance(named, Sequence) else named
 
 
