@@ -122,7 +122,7 @@ def solve(
         how = solution.status.name.lower().replace("_", " ")
         logger.info("picked %s: %s ended as %s", choice.second.name, choice.first.name, how)
         other = replace(choice.second, time_limit=left).solve(graph, guess, data=data, callback=callback)
-        if other.converged:
+        if other.converged or _reached(other, tolerance) < _reached(solution, tolerance):
             other.picked = f"{solution.picked}, after {choice.first.name} ended as {how}"
             solution, other.others = other, others
         else:
@@ -130,6 +130,11 @@ def solve(
     if check and not solution.converged:
         raise NotConverged(solution)
     return solution
+
+
+def _reached(solution: Solution, tolerance: float) -> tuple[float, float]:
+    """Violation, or the tolerance of it, and cost, by which endings without an answer are compared."""
+    return max(solution.violation, tolerance), solution.cost
 
 
 def _best_start(

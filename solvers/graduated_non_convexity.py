@@ -43,7 +43,7 @@ from typing import NamedTuple
 import numpy as np
 
 from unifg.codegen.inner import inner
-from unifg.errors import BackendError, GraphError
+from unifg.errors import BackendError, GraphError, require_kinds
 from unifg.factors.robust import DCS, Graduated, Huber, Loss
 from unifg.modeling.model import Model
 from unifg.modeling.terms import Cost
@@ -163,6 +163,7 @@ class GraduatedNonConvexity(Backend):
 
     def __post_init__(self) -> None:
         """Refuse options no solve could honour."""
+        require_kinds(self.name, BackendError, type(self).__annotations__, vars(self), Solver)
         if not self.growth > 1.0:
             raise BackendError(f"{self.name}: growth must be above 1, found {self.growth}")
         if self.stage_iterations < 1:

@@ -159,3 +159,43 @@ def test_the_second_backend_has_what_is_left_of_the_time(
     solution = fg.solve(*circled(), time_limit=limit)
     assert given == ([] if left is None else [pytest.approx(left)])
     assert solution.converged is (left is not None)
+
+
+@dataclass(kw_only=True)
+class First(InteriorPoint):
+    """Ends as STALLED with a given violation and cost."""
+
+    reached: tuple[float, float]
+
+    def solve(self, *arguments: Any, **options: Any) -> fg.Solution:
+        solution = InteriorPoint().solve(*arguments, **options)
+        solution.status, solution.solver = fg.Status.STALLED, self.name
+        solution.violation, solution.cost = self.reached
+        return solution
+
+
+class Second(First):
+    """Another one."""
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "kept"),
+    [
+        ((1e-2, 5.0), (1e-3, 9.0), "second"),
+        ((1e-2, 9.0), (1e-2, 5.0), "second"),
+        ((1e-3, 9.0), (1e-2, 5.0), "first"),
+        ((0.0, 9.0), (1e-7, 5.0), "second"),
+        ((1e-7, 5.0), (0.0, 9.0), "first"),
+        ((0.0, 5.0), (0.0, 5.0), "first"),
+        ((0.0, 5.0), (0.0, np.nan), "first"),
+    ],
+)
+def test_of_two_that_miss_the_one_that_violates_less_is_kept(
+    first: tuple[float, float], second: tuple[float, float], kept: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    picked = choice.Choice(First(reached=first), Second(reached=second), "a test")
+    monkeypatch.setattr(choice, "choose", lambda *_, **__: picked)
+    solution = fg.solve(*circled())
+    assert (solution.violation, solution.cost) == (first if kept == "first" else second)
+    told = {"first": "a test; Second ended as stalled", "second": "a test, after First ended as stalled"}
+    assert solution.picked == f"picked for {told[kept]}"

@@ -74,6 +74,36 @@ def test_scans_and_odometry_that_are_none_are_named(monkeypatch: pytest.MonkeyPa
         read_range_log("drive.mcap")
 
 
+def test_a_pose_of_odometry_that_is_not_finite_is_left_out(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """One NaN in an hour of odometry refused the whole recording, without saying where."""
+    told = messages([1.0, 2.0])
+    told[-2][2].pose.pose.position.y = math.nan
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter(told))
+    np.testing.assert_array_equal(read_range_log("drive.mcap").odometry[:, 0], [1.0, 2.0])
+    assert "drive.mcap: 1 of 5 poses of odometry left out: not finite" in caplog.text
+    for _, kind, message in told:
+        if kind == "Odometry":
+            message.pose.pose.position.y = math.nan
+    with pytest.raises(FileFormatError, match=r"drive\.mcap: odometry: no pose is finite"):
+        read_range_log("drive.mcap")
+
+
+def test_a_laser_is_placed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A mount that is given was applied on top of that of the static frames."""
+    for frames, said in (([hung("laser", "base", (0.2, 0.0), (0.0, 0.0, 0.0, 1.0))], True), ([], False)):
+        told = [*messages([1.0, 2.0]), ("/tf_static", "TFMessage", SimpleNamespace(transforms=frames))]
+        monkeypatch.setattr(recordings, "_mcap", lambda path, told=told: iter(told))
+        log = read_range_log("drive.mcap")
+        assert log.placed is said
+        if said:
+            with pytest.raises(FileFormatError, match=r"drive\.mcap: says itself where .* leave mount out"):
+                log.mounted(np.array([0.2, 0.0, 0.0]))
+        else:
+            assert log.mounted(np.array([0.2, 0.0, 0.0])).placed
+
+
 def test_frames_that_do_not_meet_are_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
     """Without /tf_static the laser stood where the odometry is, without a word."""
     for child, said in (("base", True), ("/laser", False)):
@@ -175,7 +205,7 @@ def test_a_broken_recording_is_refused(tmp_path: Path) -> None:
         read_range_log(tmp_path / "drive.bag")
 
 
-@pytest.mark.parametrize("wrong", ["no schema", "no summary", "damaged"])
+@pytest.mark.parametrize("wrong", ["no schema", "no summary", "no channels", "no schemas", "damaged"])
 def test_what_is_wrong_with_an_mcap_file_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: str) -> None:
     """A channel without a schema, of no message of ROS, was an error; damaged chunks were read as they are."""
     mcap = pytest.importorskip("mcap.writer")
@@ -191,7 +221,9 @@ def test_what_is_wrong_with_an_mcap_file_is_said(tmp_path: Path, monkeypatch: py
     bare |= {"repeat_channels": False, "repeat_schemas": False, "index_types": mcap.IndexType.NONE}
     with path.open("wb") as file:
         none = mcap.CompressionType.NONE
-        writer = mcap.Writer(file, compression=none, **(bare if wrong == "no summary" else {}))
+        only = f"repeat_{wrong.removeprefix('no ')}"
+        left = {key: value for key, value in bare.items() if wrong == "no summary" or key == only}
+        writer = mcap.Writer(file, compression=none, **left)
         writer.start()
         writer.add_message(writer.register_channel("/note", "json", 0), log_time=0, publish_time=0, data=b"{}")
         for topic, kind, message in messages([1.0, 2.0]):
@@ -204,6 +236,6 @@ def test_what_is_wrong_with_an_mcap_file_is_said(tmp_path: Path, monkeypatch: py
         return
     if wrong == "damaged":
         path.write_bytes(path.read_bytes().replace(b"40.0", b"20.0", 1))
-    words = "no summary of its channels" if wrong == "no summary" else "CRCValidationError"
+    words = "CRCValidationError" if wrong == "damaged" else "no summary of its channels"
     with pytest.raises(FileFormatError, match=rf"drive\.mcap: cannot be read \(.*{words}"):
         read_range_log(path)

@@ -307,6 +307,7 @@ MADE: list[tuple[type[fg.UnifgError], Callable[[], object], str]] = [
     (fg.ModelError, lambda: sphere(3, 6, radius=np.inf), "a finite radius inf > 0"),
     (fg.ModelError, lambda: Tableau("mine", 1, (np.nan,), ((),)), "weights sum to nan"),
     (fg.BackendError, lambda: GraduatedNonConvexity(growth=1.0), "growth"),
+    (fg.BackendError, lambda: GraduatedNonConvexity(solver=1), "solver must be of the class Solver, found 1"),  # type: ignore[arg-type]
     (fg.BackendError, lambda: GraduatedNonConvexity(stage_iterations=0), "stage_iterations"),
     (fg.BackendError, lambda: GaussNewton(search_iterations=-1), "search_iterations must not be negative, found -1"),
     (fg.BackendError, lambda: names.backend("newton"), "unknown backend 'newton': choose one of gn, lm, dogleg, kkt"),

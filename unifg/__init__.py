@@ -148,9 +148,10 @@ def solve(
 
     `LevenbergMarquardt` for least squares without constraints, `InteriorPoint` for everything else. Where it ends
     without a solution, and not for want of time, another one begins at the same guess: `InteriorPoint` after the
-    first, `AugmentedLagrangian` after the second. The solution is that of the second one if it converged, else that of
-    the first. What was picked, and for what, stands in ``solution.picked`` and ``solution.report()``, and goes to the
-    logger ``unifg`` at level INFO. Control loops name a backend and prepare it.
+    first, `AugmentedLagrangian` after the second. The solution is that of the second one if it converged, else the
+    one of the two that violates less or, where both violate no more than the tolerance, costs less. What was picked,
+    and for what, stands in ``solution.picked`` and ``solution.report()``, and goes to the logger ``unifg`` at level
+    INFO. Control loops name a backend and prepare it.
 
     Args:
         graph: the problem.

@@ -58,6 +58,7 @@ class RangeLog:
         ranges: (n, b) [m]; NaN for a beam that is lost, infinite where nothing was hit.
         odometry: (n, 3) poses of the laser by the wheels [m, m, rad].
         corrected: (n, 3) poses of the laser that the log takes for right; None where it says nothing of the kind.
+        placed: whether the log itself says where on the robot the laser stands.
     """
 
     name: str
@@ -66,6 +67,7 @@ class RangeLog:
     ranges: Array
     odometry: Array
     corrected: Array | None = None
+    placed: bool = False
 
     def __post_init__(self) -> None:
         """Refuse what is no log.
@@ -86,8 +88,14 @@ class RangeLog:
         return len(self.time)
 
     def mounted(self, pose: Array) -> RangeLog:
-        """The log of a laser at a pose (3,) on the robot whose odometry this is."""
-        return replace(self, odometry=SE2.compose(self.odometry, np.tile(pose, (len(self), 1))))
+        """The log of a laser at a pose (3,) on the robot whose odometry this is.
+
+        Raises:
+            FileFormatError: the log says itself where the laser stands.
+        """
+        if self.placed:
+            raise FileFormatError(f"{self.name}: says itself where on the robot the laser stands: leave mount out")
+        return replace(self, placed=True, odometry=SE2.compose(self.odometry, np.tile(pose, (len(self), 1))))
 
 
 def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
@@ -112,19 +120,21 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
     if path.suffix == ".npz":
         return _drive(path, limits)
     if path.is_dir() or path.suffix in ROSBAGS:
-        return _in_order(name, *read_rosbag(path), None)
+        *numbers, placed = read_rosbag(path)
+        return replace(_in_order(name, *numbers, None), placed=placed)
     log = read_carmen(path, limits=limits)
     if not log.scans:
         raise FileFormatError(f"{name}: there is no scan in this log")
     scans = max(log.scans, key=len)
     if len(log.scans) > 1:
         logger.warning("%s: %d kinds of scans, of which %d of one kind are taken", name, len(log.scans), len(scans))
-    odometry, corrected = _poses(log, scans)
+    odometry, corrected, placed = _poses(log, scans)
     seen = np.isfinite(odometry[:, 0])
     if not seen.all():
         logger.warning("%s: %d of %d scans left out: no ODOM line then", name, len(seen) - seen.sum(), len(seen))
     odometry, corrected = odometry[seen], None if corrected is None else corrected[seen]
-    return _in_order(name, scans.time[seen], scans.angles, scans.ranges[seen], scans.maximum, odometry, corrected)
+    found = _in_order(name, scans.time[seen], scans.angles, scans.ranges[seen], scans.maximum, odometry, corrected)
+    return replace(found, placed=placed)
 
 
 def _drive(path: Path, limits: Limits) -> RangeLog:
@@ -152,19 +162,20 @@ def aligned(poses: Array, onto: Array) -> Array:
     return SE2.compose(whole, poses)
 
 
-def _poses(log: CarmenLog, scans: Scans) -> tuple[Array, Array | None]:
-    """Odometry of the laser (n, 3), and its corrected poses where these are."""
+def _poses(log: CarmenLog, scans: Scans) -> tuple[Array, Array | None, bool]:
+    """Odometry of the laser (n, 3), its corrected poses where these are, and whether it is off the robot's middle."""
     mounts = SE2.between(scans.robot, scans.pose)
     off = mounts - mounts[0]
     off[:, 2] = wrap_angle(off[:, 2])
     if np.abs(off).max() > FIXED:
-        return scans.robot, scans.pose
+        return scans.robot, scans.pose, False
+    placed = bool(np.abs(mounts[0]).max() > FIXED)
     if len(log.odometry.time) < 2:
-        return scans.pose, None
+        return scans.pose, None, placed
     wheels = SE2.compose(_between_times(log.odometry, scans.time), mounts[0])
     seen = np.isfinite(wheels[:, 0])
     parted = np.abs(aligned(wheels[seen], scans.pose[seen]) - scans.pose[seen])[:, :2].max() if seen.any() else 0.0
-    return (wheels, scans.pose) if parted > PARTED else (scans.pose, None)
+    return (wheels, scans.pose, placed) if parted > PARTED else (scans.pose, None, placed)
 
 
 def _between_times(odometry: Odometry, time: Array) -> Array:

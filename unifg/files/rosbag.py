@@ -40,6 +40,7 @@ class Recorded(NamedTuple):
         ranges: (n, b) [m]; NaN below the least range of the laser.
         maximum: of a range [m].
         odometry: (n, 3) poses of the laser by the wheels, interpolated [m, m, rad].
+        placed: whether static frames say where on the robot the laser stands.
     """
 
     time: Array
@@ -47,6 +48,7 @@ class Recorded(NamedTuple):
     ranges: Array
     maximum: float
     odometry: Array
+    placed: bool
 
 
 def read_rosbag(path: Path) -> Recorded:
@@ -67,7 +69,7 @@ def read_rosbag(path: Path) -> Recorded:
         for topic, kind, message in _mcap(path) if path.suffix == ".mcap" else _bag(path):
             if kind == FRAMES:
                 if topic.endswith("tf_static"):
-                    poses = _poses([one.transform for one in message.transforms])
+                    poses = SE3.from_quaternion(_numbers([one.transform for one in message.transforms]), order="xyzw")
                     for one, pose in zip(message.transforms, poses, strict=True):
                         links[one.child_frame_id.lstrip("/")] = one.header.frame_id, pose
             else:
@@ -106,6 +108,7 @@ def read_rosbag(path: Path) -> Recorded:
     columns = (*poses[:, :2].T, np.unwrap(poses[:, 2]))
     at = np.column_stack([np.interp(time, known, column) for column in columns])
     (root, base), (other, laser) = (_hung(links, one) for one in (robot, frame))
+    placed = root == other and frame.lstrip("/") != robot.lstrip("/")
     if root != other:
         logger.warning(
             "%s: no static frames lead from %r of the laser to %r of the odometry, which is taken to be %r",
@@ -118,7 +121,7 @@ def read_rosbag(path: Path) -> Recorded:
     ranges = np.array([scan.ranges for scan in scans], dtype=np.float64)
     ranges[ranges < scans[0].range_min] = np.nan
     angles = math.copysign(1.0, level) * (first + step * np.arange(count, dtype=np.float64))
-    return Recorded(time, angles, ranges, float(scans[0].range_max), SE2.compose(at, _planar(mount)))
+    return Recorded(time, angles, ranges, float(scans[0].range_max), SE2.compose(at, _planar(mount)), placed)
 
 
 def _odometry(name: str, wheels: list[Any]) -> tuple[Array, Array, BoolArray, str]:
@@ -131,12 +134,18 @@ def _odometry(name: str, wheels: list[Any]) -> tuple[Array, Array, BoolArray, st
     if others:
         wheels = [one for one in wheels if (one.header.frame_id, one.child_frame_id) == (world, robot)]
         logger.warning("%s: odometry of other frames than %r in %r left out", name, robot, world)
-    time = np.array([_stamp(one) for one in wheels])
+    time, numbers = np.array([_stamp(one) for one in wheels]), _numbers([one.pose.pose for one in wheels])
+    finite = np.isfinite(numbers).all(axis=1)
+    if not finite.any():
+        raise FileFormatError(f"{name}: odometry: no pose is finite")
+    if not finite.all():
+        logger.warning("%s: %d of %d poses of odometry left out: not finite", name, sum(~finite), len(finite))
+        time, numbers = time[finite], numbers[finite]
     if (back := float((np.maximum.accumulate(time) - time).max())) > BACK:
         logger.warning("%s: stamps of odometry run backwards by up to %g s: is it more than one drive?", name, back)
     order = np.argsort(time, kind="stable")
     try:
-        time, poses = time[order], _planar(_poses([one.pose.pose for one in wheels]))[order]
+        time, poses = time[order], _planar(SE3.from_quaternion(numbers[order], order="xyzw"))
     except UnifgError as error:
         raise FileFormatError(f"{name}: odometry: {error}") from error
     gaps, (least, usual, way) = np.diff(time, prepend=time[0]), HOLE
@@ -156,10 +165,11 @@ def _mcap(path: Path) -> Iterator[tuple[str, str, Any]]:
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         summary: Any = reader.get_summary()
-        if summary is None:
+        known, channels = ({}, []) if summary is None else (summary.schemas, summary.channels.values())
+        schemas = {0: ""} | {number: schema.name for number, schema in known.items()}  # 0: none
+        if not channels or any(one.schema_id not in schemas for one in channels):
             raise FileFormatError("no summary of its channels at the end: `mcap recover` makes one")
-        schemas = {0: ""} | {number: schema.name for number, schema in summary.schemas.items()}  # 0: none
-        kinds = {one.topic: _kind(schemas[one.schema_id]) for one in summary.channels.values()}
+        kinds = {one.topic: _kind(schemas[one.schema_id]) for one in channels}
         wanted = [topic for topic, kind in kinds.items() if kind]
         for _, channel, _, message in reader.iter_decoded_messages(topics=wanted):
             yield channel.topic, kinds[channel.topic], message
@@ -190,14 +200,14 @@ def _stamp(message: Any) -> float:
     return float(stamp.sec) + 1e-9 * float(getattr(stamp, "nanosec", 0) or getattr(stamp, "nsec", 0))
 
 
-def _poses(given: Iterable[Any]) -> Array:
-    """(n, 7) poses of `unifg.SE3` of poses or transforms."""
+def _numbers(given: Iterable[Any]) -> Array:
+    """(n, 7) x, y, z and quaternions, w last, of poses or transforms."""
     rows = []
     for one in given:
         place = getattr(one, "position", None) or one.translation
         turn = getattr(one, "orientation", None) or one.rotation
         rows.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
-    return SE3.from_quaternion(np.array(rows).reshape(-1, 7), order="xyzw")
+    return np.array(rows, dtype=np.float64).reshape(-1, 7)
 
 
 def _planar(poses: Array) -> Array:
