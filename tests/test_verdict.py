@@ -169,6 +169,25 @@ def test_noise_larger_than_stated_contradicts_nothing() -> None:
     assert "times as large as stated" in verdict.sentence()
 
 
+def test_a_rest_without_redundancy_does_not_make_right_closures_wrong() -> None:
+    """On a spiral all closures are one cluster, which wrong ones join: without it, odometry alone is left."""
+    named, k = 0, np.arange(4)
+    for seed in range(8):
+        made, rng = sphere(6, 12, seed), np.random.default_rng(seed)
+        first, second, edges = 3 + k, 22 + k, made.pose_graph.edges
+        off = fg.SE3.exp(rng.standard_normal(6) * [0.8, 0.8, 0.8, 0.16, 0.16, 0.16])
+        claimed = fg.SE3.compose(off, fg.SE3.between(made.truth[first], made.truth[second]))
+        wrong = Edges(first, second, claimed, edges.information[:4])
+        fields = ("first", "second", "measured", "information")
+        every = Edges(*(np.concatenate([getattr(one, name) for one in (edges, wrong)]) for name in fields))
+        verdict = solved(replace(made.pose_graph, edges=every)).verdict(effort="cheap")
+        found = np.concatenate([np.zeros(0, dtype=np.intp), *(one.edges for one in verdict.of("contradicted"))])
+        assert (found >= len(edges)).all()
+        assert len(found) or not verdict.ended
+        named += int(np.isin(len(edges) + k, found).all())
+    assert named >= 6
+
+
 def test_measurements_without_sense_are_judged() -> None:
     """Rounding of lengths of 1e5 m must not hide the suspect that the search takes out."""
     first, second = np.array([*range(7), 7, 4]), np.array([*range(1, 8), 0, 0])

@@ -125,7 +125,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
         several = [one for one in clusters if len(one.edges) > 1]  # rounding parts the two falls of a single closure
         worst = max([0.0, *(one.fall for one in clusters), *(alone[one.edges].max() for one in several)])
         steps = np.where(edges.odometry, alone, 0.0)
-        slip, left = float(steps.max(initial=0.0)), freedom - dim * len(taken)
+        slip, left = float(steps.max(initial=0.0)), freedom - _rows(edges[~active])
         limit = limit_of(now.chi2 - max(worst, slip), left - dim, dim, len(edges))
         ended = not max(worst, slip) > limit
         if ended or len(taken) == ROUNDS:
@@ -153,7 +153,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     slipped: list[Suspect] = []
     if taken:
         # What agrees with the map of the rest, whose noise may be larger than stated, was not at fault.
-        over = over_stated(now.chi2, left)
+        over = over_stated(now.chi2, freedom - _rows(edges[~active]))
         out = ~active
         waiting = [*np.flatnonzero(out & edges.odometry)[:, None], *_clusters(edges, closures & out)]
         for group in waiting:
@@ -177,6 +177,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     named = np.concatenate([np.zeros(0, dtype=np.intp), *(one.edges for one in contradicted)])
     if taken and now.innovations.determined:
         clusters = now.suspects(_clusters(edges, closures & active))
+        ended = ended and all(one.fall <= over * limit for one in clusters)
     unsupported = [
         replace(one, before=np.flatnonzero(~active))
         for one in clusters
@@ -245,6 +246,11 @@ def limit_of(squared: float, freedom: int, size: int, count: int) -> float:
 def over_stated(squared: float, freedom: int) -> float:
     """Least factor by which noise is larger than stated, one where it may be as stated."""
     return max(1.0, squared / upper_quantile(freedom, 1.0 - CHANCE)) if freedom > 0 else 1.0
+
+
+def _rows(edges: Edges) -> int:
+    """Count of the numbers that edges measure."""
+    return int(np.linalg.matrix_rank(edges.information, hermitian=True).sum())
 
 
 def _clusters(edges: Edges, chosen: BoolArray) -> list[IntArray]:
