@@ -8,12 +8,12 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from benchmarks.casadi_peer import Staged
 from benchmarks.compiled_peers import COMPILER
-from benchmarks.compiled_peers import compiled as in_machine_code
 from benchmarks.control_peers import unicycle_gap
 from benchmarks.report import table
 from benchmarks.runner import Timing
-from benchmarks.timing import clocked, interleave, number
+from benchmarks.timing import interleave, number
 from unifg.models import potential
 from unifg.scenarios.papers.control_instances import (
     CLEAR,
@@ -49,15 +49,11 @@ def clearances(instance: Instance, x: Any) -> list[Any]:
     return [ca.norm_2(x[:2] - ca.DM([a, b])) - r - HULL for a, b, r in instance.discs]
 
 
-class Casadi:
-    """IPOPT or fatrop on an instance, with derivatives of casadi."""
-
-    def __init__(self, plugin: str = "ipopt", compiled: bool = False, **options: Any) -> None:
-        """Take a solver, its options, and whether functions are compiled."""
-        self.plugin, self.compiled, self.options = plugin, compiled, options
+class Casadi(Staged):
+    """IPOPT on an instance, with derivatives of casadi."""
 
     def state(self, instance: Instance) -> None:
-        """Build the program in the order u_0, x_1, u_1, ..., x_N; fatrop sees its stages from it."""
+        """Build the program in the order u_0, x_1, u_1, ..., x_N."""
         import casadi as ca
 
         start, reference = ca.SX.sym("start", 3), instance.reference
@@ -82,32 +78,24 @@ class Casadi:
         pairs = zip(u, x[1:], strict=True)
         unknowns = ca.vertcat(*(part for pair in pairs for part in pair))
         program = {"x": unknowns, "p": start, "f": 0.5 * cost, "g": ca.vertcat(*rows) if rows else ca.SX(0, 1)}
-        chosen: dict[str, Any] = {"print_time": False, self.plugin: {"print_level": 0, **self.options}}
-        chosen[self.plugin] |= {"sb": "yes"}
-        solver = ca.nlpsol("solver", self.plugin, program, chosen)
-        self.solver: Any = in_machine_code(solver, self.plugin, chosen) if self.compiled else solver
         free = np.tile([LIMIT, LIMIT, np.inf, np.inf, np.inf], STEPS)
         states, controls = instance.guess
-        self.call: dict[str, Any] = {
-            "x0": np.hstack([controls, states[1:]]).ravel(), "p": instance.start, "lbx": -free, "ubx": free,
-            "lbg": np.zeros(len(equality)), "ubg": np.where(equality, 0.0, np.inf) if equality else np.zeros(0),
-        }  # fmt: skip
-
-    def __call__(self) -> float:
-        """Solve from the guess; processor time [s]."""
-        self.found, spent = clocked(self.solver, **self.call)
-        return spent
+        bounds: dict[str, Any] = {
+            "lbx": -free,
+            "ubx": free,
+            "lbg": np.zeros(len(equality)),
+            "ubg": np.where(equality, 0.0, np.inf),
+        }
+        self.build(program, x0=np.hstack([controls, states[1:]]).ravel(), p=instance.start, **bounds)
 
     @property
     def outcome(self) -> Outcome:
         """Of the last solve."""
-        stats = self.solver.stats()
-        how = "converged" if stats["success"] else str(stats.get("return_status", "failed")).replace("_", " ").lower()
-        return how, 2.0 * float(self.found["f"]), int(stats["iter_count"])
+        return self.status, 2.0 * self.cost, self.iterations
 
     def move(self, instance: Instance) -> None:
         """Take a moved start, with the last answer and its multipliers as the guess."""
-        found = self.found
+        found = self.answer
         self.call |= {"p": instance.start, "x0": found["x"], "lam_x0": found["lam_x"], "lam_g0": found["lam_g"]}
 
 
@@ -133,22 +121,16 @@ def contestants(hard: bool) -> dict[str, Callable[[], Contestant]]:
     if COMPILER is not None:
         both["IPOPT, compiled"] = lambda: Casadi(compiled=True, tol=STOP)
     if hard:
-        both["fatrop"] = lambda: Fatrop()
+        both["fatrop"] = lambda: Fatrop("fatrop", tol=STOP)
     return both
 
 
 class Fatrop(Casadi):
     """Fatrop, which wants all states to be unknown and the first one held by a constraint."""
 
-    def __init__(self) -> None:
-        """Take its tolerance."""
-        super().__init__("fatrop", tol=STOP)
-
     def state(self, instance: Instance) -> None:
         """State it stage by stage."""
         import casadi as ca
-
-        from benchmarks.casadi_peer import Staged
 
         reference = instance.reference
 
@@ -160,17 +142,8 @@ class Fatrop(Casadi):
             return cost, zero, [distance - CLEAR for distance in clearances(instance, x)] if k else []
 
         free = np.array([np.inf, np.inf, np.inf, LIMIT, LIMIT])
-        self.staged = Staged("fatrop", (3, 2, STEPS), stage, gap, ca.SX.sym("none", 0), (-free, free), tol=STOP)
-        self.guessed = instance.guess
-
-    def __call__(self) -> float:
-        """Solve from the guess; processor time [s]."""
-        return 1e-3 * self.staged.run(*self.guessed, np.zeros(0))
-
-    @property
-    def outcome(self) -> Outcome:
-        """Of the last solve."""
-        return self.staged.status, 2.0 * self.staged.cost, self.staged.iterations
+        self.stages((3, 2, STEPS), stage, gap, ca.SX.sym("none", 0), (-free, free))
+        self.begin(*instance.guess, np.zeros(0))
 
 
 def cold(hard: bool, rounds: int) -> str:

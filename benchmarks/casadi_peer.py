@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from benchmarks.compiled_peers import compiled as in_machine_code
 from benchmarks.timing import clocked
 from unifg.typing import Array
 
@@ -17,43 +18,76 @@ Stage: TypeAlias = Callable[[int, Any, Any], tuple[Any, Rows, Rows]]
 Gap: TypeAlias = Callable[[Any, Any, Any], Any]
 """The next state less where the dynamics lead, of state, control and next state."""
 
-TOLERANCE = 1e-6
-
 
 def available() -> bool:
     """Test whether casadi is installed."""
     return find_spec("casadi") is not None
 
 
-class Staged:
-    """A solver with exact derivatives of one problem.
+class Program:
+    """A solver of casadi, with exact derivatives.
 
     Attributes:
-        answer: of the last solve, with multipliers.
+        call: arguments of a solve, by casadi's names.
+        answer, cost, iterations: of the last solve, the first with multipliers.
+        status: of the last solve in words, "converged" where the solver says so.
+        said: its own words.
     """
 
-    def __init__(
-        self,
-        plugin: str,
-        sizes: tuple[int, int, int],
-        stage: Stage,
-        gap: Gap,
-        parameters: Any,
-        limits: tuple[Array, Array],
-        compiled: bool = False,
-        **options: Any,
+    def __init__(self, plugin: str = "ipopt", compiled: bool = False, **options: Any) -> None:
+        """Choose a solver.
+
+        Args:
+            plugin: "ipopt" (with MUMPS) or "fatrop".
+            compiled: whether functions run in machine code, not in casadi's virtual machine.
+            options: of the plugin.
+        """
+        self._plugin, self._compiled, self._options = plugin, compiled, options
+        self.answer: dict[str, Any] = {}
+
+    def build(self, program: dict[str, Any], equality: Sequence[bool] = (), **call: Any) -> None:
+        """Differentiate a program; ``equality`` tells fatrop which of its rows are zero."""
+        import casadi as ca
+
+        own = {"print_level": 0, **self._options}
+        chosen: dict[str, Any] = {"print_time": False, self._plugin: own}
+        if self._plugin == "fatrop":
+            chosen |= {"structure_detection": "auto", "equality": equality}
+        else:
+            own["sb"] = "yes"
+        self._solver: Any = ca.nlpsol("solver", self._plugin, program, chosen)
+        if self._compiled:
+            self._solver = in_machine_code(self._solver, self._plugin, chosen)
+        self.call = call
+
+    def __call__(self) -> float:
+        """Solve; processor time of the call [s]: a shared machine makes clocks run late."""
+        self.answer, seconds = clocked(self._solver, **self.call)
+        found = self._solver.stats()
+        self.said = str(found.get("return_status", "failed")).replace("_", " ").lower()
+        self.status = "converged" if found["success"] else self.said
+        self.cost, self.iterations = float(self.answer["f"]), int(found["iter_count"])
+        return seconds
+
+    def again(self) -> float:
+        """The last solve once more, when everything it needs is in the caches [ms]."""
+        return 1e3 * self()
+
+
+class Staged(Program):
+    """A solver of an optimal control problem."""
+
+    def stages(
+        self, sizes: tuple[int, int, int], stage: Stage, gap: Gap, parameters: Any, limits: tuple[Array, Array]
     ) -> None:
         """Build and differentiate the expressions.
 
         Args:
-            plugin: "ipopt" (with MUMPS) or "fatrop".
             sizes: numbers of a state and of a control, and horizon N.
             stage: what each node adds.
             gap: the dynamics.
             parameters: symbol of what changes between solves.
             limits: lower and upper ones, (N + 1, states + controls) or one row for all; the last controls are none.
-            compiled: whether functions run in machine code, not in casadi's virtual machine.
-            options: of the plugin.
         """
         import casadi as ca
 
@@ -79,47 +113,15 @@ class Staged:
                 equality += [False] * len(positive)
         unknowns = ca.vertcat(*(part for pair in zip(x[:-1], u, strict=True) for part in pair), x[-1])
         program = {"x": unknowns, "p": parameters, "f": cost, "g": ca.vertcat(*rows)}
-        chosen: dict[str, Any] = {"print_time": False, plugin: {"print_level": 0, "tol": TOLERANCE, **options}}
-        if plugin == "fatrop":
-            chosen |= {"structure_detection": "auto", "equality": equality}
-        else:
-            chosen[plugin]["sb"] = "yes"
-        self._solver: Any = ca.nlpsol("solver", plugin, program, chosen)
-        if compiled:
-            from benchmarks.compiled_peers import compiled as in_machine_code
-
-            self._solver = in_machine_code(self._solver, plugin, chosen)
         lower, upper = (np.broadcast_to(limit, (n + 1, states + controls)).ravel()[:-controls] for limit in limits)
-        self._limits = {"lbx": lower, "ubx": upper, "lbg": 0.0, "ubg": np.where(equality, 0.0, np.inf)}
+        bounds = {"lbx": lower, "ubx": upper, "lbg": 0.0, "ubg": np.where(equality, 0.0, np.inf)}
+        self.build(program, equality, **bounds)
         self._staged = [np.array(found) for found in (gaps, clearances) if found]
-        self.answer: dict[str, Any] = {}
 
-    def run(self, states: Array, controls: Array, parameters: Array, **duals: Any) -> float:
-        """Solve from a guess; processor time of the call [ms]: a shared machine makes clocks run late."""
+    def begin(self, states: Array, controls: Array, parameters: Array, **duals: Any) -> None:
+        """Take a guess and parameters."""
         unknowns = np.append(np.hstack([states[:-1], controls]).ravel(), states[-1])
-        self._call = {"x0": unknowns, "p": parameters, **self._limits, **duals}
-        return self.again()
-
-    def again(self) -> float:
-        """The last solve once more, when everything it needs is in the caches."""
-        self.answer, seconds = clocked(self._solver, **self._call)
-        return 1e3 * seconds
-
-    @property
-    def status(self) -> str:
-        """In words."""
-        statistics = self._solver.stats()
-        return "converged" if statistics["success"] else str(statistics.get("return_status", "failed"))
-
-    @property
-    def iterations(self) -> int:
-        """Of the last solve."""
-        return int(self._solver.stats()["iter_count"])
-
-    @property
-    def cost(self) -> float:
-        """Of the last answer."""
-        return float(self.answer["f"])
+        self.call |= {"x0": unknowns, "p": parameters, **duals}
 
     @property
     def trajectory(self) -> tuple[Array, Array]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from functools import partial
-from typing import TypeAlias
+from dataclasses import dataclass
+from typing import Protocol, TypeAlias
 
 import numpy as np
 
@@ -14,7 +13,8 @@ from benchmarks import compiled_peers
 from benchmarks.casadi_peer import available
 from benchmarks.report import listing, words
 from benchmarks.timing import clocked, interleave, number
-from problems.control import Problem, Stated
+from problems.control import Problem
+from unifg.typing import Array
 
 PEERS = ("ipopt", "fatrop", "fatrop, compiled")
 """The last one with its functions in machine code, the others in the virtual machine of casadi."""
@@ -25,21 +25,46 @@ def runnable(peers: tuple[str, ...] = PEERS) -> tuple[str, ...]:
     return tuple(name for name in peers if available() and (compiled_peers.COMPILER or "compiled" not in name))
 
 
-@dataclass(frozen=True)
-class Rules:
-    """Rules of measuring and judging of a page.
+TOLERANCE = 1e-4  # of every solver
+SAME = 1e-4  # relative difference below which two costs are one optimum
+SLOW = 0.3  # a solve that takes longer is not repeated [s]
+
+
+class Contestant(Protocol):
+    """A solver of one problem, ready to solve cold: ours, or a peer. A call returns the time that counts [s].
 
     Attributes:
-        tolerance: of every solver.
-        same: relative difference below which two costs are one optimum.
-        slow: a solve that takes longer is not repeated [ms].
-        peers: beside ours, of :data:`PEERS`.
+        status: of the last solve, in words; empty where the solver does not tell.
+        iterations: of the last solve; 0 where the solver does not tell.
+        cost: of the last answer.
     """
 
-    tolerance: float
-    same: float
-    slow: float
-    peers: tuple[str, ...]
+    status: str
+    iterations: int
+    cost: float
+
+    def __call__(self) -> float: ...  # noqa: D102
+
+
+class Ours:
+    """A backend of ours as a contestant, the graph compiled before.
+
+    Attributes:
+        solution: of the last solve.
+        answer: values of the families of the guess.
+    """
+
+    def __init__(self, solver: fg.Solver, graph: fg.Graph, guess: fg.Guess) -> None:
+        """Prepare."""
+        self._run, self._guess = solver.prepare(graph), guess
+
+    def __call__(self) -> float:
+        """Solve; processor time [s]."""
+        self.solution, spent = clocked(self._run.solve, self._guess)
+        found = self.solution
+        self.status, self.iterations, self.cost = words(found.status), found.iterations, found.cost
+        self.answer = [np.array(found[family]) for family in self._guess.values]
+        return spent
 
 
 @dataclass
@@ -56,24 +81,25 @@ class Outcome:
 
     problem: Problem
     solver: str
-    status: str = ""
-    iterations: int = 0
-    cost: float = np.nan
-    times: list[float] = field(default_factory=list)
+    status: str
+    iterations: int
+    cost: float
+    times: Array
 
     @property
     def median(self) -> float:
         """[ms]."""
         return float(np.median(self.times))
 
-    def verdict(self, rules: Rules) -> str:
+    @property
+    def verdict(self) -> str:
         """Comparison of the cost with the known optima."""
         if self.status != "converged":
             return self.status
         relative = [self.cost / known - 1.0 for known in self.problem.optima]
-        if abs(relative[0]) < rules.same:
+        if abs(relative[0]) < SAME:
             return "listed"
-        if min(map(abs, relative)) < rules.same:
+        if min(map(abs, relative)) < SAME:
             return "listed alternative"
         return f"{'lower' if relative[0] < 0.0 else 'other'}, {100.0 * relative[0]:+.2g} %"
 
@@ -83,46 +109,30 @@ Results: TypeAlias = Mapping[Problem, Outcomes]
 Told: TypeAlias = Callable[[Outcome], str]
 
 
-def attempt(solver: fg.Solver, stated: Stated) -> Callable[[Outcome], float]:
-    """A cold solve by one of ours, the graph compiled before; its processor time [ms]."""
-    run = solver.prepare(stated.graph)
-
-    def solve(outcome: Outcome) -> float:
-        solution, seconds = clocked(run.solve, stated.guess)
-        outcome.status = words(solution.status)
-        outcome.iterations, outcome.cost = solution.iterations, solution.cost
-        return 1e3 * seconds
-
-    return solve
-
-
-def attempt_peer(name: str, problem: Problem, tolerance: float) -> Callable[[Outcome], float]:
-    """A cold solve through casadi: expressions built, differentiated and, if so named, compiled before."""
+def peer(problem: Problem, name: str) -> Contestant:
+    """A peer of :data:`PEERS`: expressions built, differentiated and, if so named, compiled before."""
     from benchmarks.control_peers import ControlPeer
 
     plugin, _, compiled = name.partition(", ")
-    peer = ControlPeer(problem, plugin, bool(compiled), tol=tolerance)
-    guess = problem.guess()
-
-    def solve(outcome: Outcome) -> float:
-        elapsed = peer.solve(*guess)
-        outcome.status, outcome.iterations, outcome.cost = peer.status, peer.iterations, peer.cost
-        return elapsed
-
-    return solve
+    made = ControlPeer(problem, plugin, bool(compiled), tol=TOLERANCE)
+    made.take(*problem.guess())
+    return made
 
 
-def measure(problem: Problem, solvers: Mapping[str, fg.Solver], rules: Rules, rounds: int) -> Outcomes:
-    """Solve a problem with every solver, ``rounds`` times after one that is not counted."""
-    attempts = {name: attempt(solver, problem.formulation()) for name, solver in solvers.items()}
-    attempts |= {name: attempt_peer(name, problem, rules.tolerance) for name in runnable(rules.peers)}
-    outcomes = {name: Outcome(problem, name) for name in attempts}
-    times = interleave(
-        {name: partial(solve, outcomes[name]) for name, solve in attempts.items()}, rounds, slow=rules.slow
-    )
-    for name, outcome in outcomes.items():
-        outcome.times = times[name].tolist()
-    return outcomes
+def outcomes(problem: Problem, contestants: Mapping[str, Contestant], rounds: int, slow: float = SLOW) -> Outcomes:
+    """Solve a problem with all contestants, ``rounds`` times after one that is not counted."""
+    times = interleave(contestants, rounds, slow=slow)
+    return {
+        name: Outcome(problem, name, one.status, one.iterations, one.cost, 1e3 * times[name])
+        for name, one in contestants.items()
+    }
+
+
+def measure(problem: Problem, solvers: Mapping[str, fg.Solver], rounds: int) -> Outcomes:
+    """Solve a problem with every solver, and with the peers that are here."""
+    stated = problem.formulation()
+    contestants: dict[str, Contestant] = {name: Ours(one, stated.graph, stated.guess) for name, one in solvers.items()}
+    return outcomes(problem, contestants | {name: peer(problem, name) for name in runnable()}, rounds)
 
 
 def ratio(results: Results, outcome: Outcome, peer: str) -> float:
@@ -133,7 +143,7 @@ def ratio(results: Results, outcome: Outcome, peer: str) -> float:
     return outcome.median / other.median if outcome.status == other.status == "converged" else np.nan
 
 
-def summary(results: Results, rules: Rules, counted: Mapping[str, Callable[[Outcome], bool]]) -> str:
+def summary(results: Results, counted: Mapping[str, Callable[[Outcome], bool]]) -> str:
     """One row per solver: how often it did what is counted, its iterations and times."""
 
     def mean(peer: str) -> Callable[[list[Outcome]], str]:
@@ -151,26 +161,26 @@ def summary(results: Results, rules: Rules, counted: Mapping[str, Callable[[Outc
         "iterations in all": lambda mine: str(sum(outcome.iterations for outcome in mine)),
         "median [ms]": lambda mine: number(float(np.median([outcome.median for outcome in mine]))),
         "slowest [ms]": lambda mine: number(max(outcome.median for outcome in mine)),
-        **{f"times {peer} (geometric mean)": mean(peer) for peer in runnable(rules.peers)},
+        **{f"times {peer} (geometric mean)": mean(peer) for peer in runnable()},
     }
     names = dict.fromkeys(name for outcomes in results.values() for name in outcomes)
     groups = {(name,): [outcomes[name] for outcomes in results.values()] for name in names}
     return listing(["solver"], groups, columns)
 
 
-def every(results: Results, rules: Rules) -> str:
+def every(results: Results) -> str:
     """One row per problem and solver."""
 
     def times(peer: str) -> Told:
         return lambda outcome: f"{ratio(results, outcome, peer):.2f}".replace("nan", "-")
 
     columns: dict[str, Told] = {
-        "optimum": lambda outcome: outcome.verdict(rules),
+        "optimum": lambda outcome: outcome.verdict,
         "cost": lambda outcome: f"{outcome.cost:.5f}",
         "listed": lambda outcome: f"{outcome.problem.optima[0]:.5f}",
         "iterations": lambda outcome: str(outcome.iterations),
         "ms": lambda outcome: number(outcome.median),
-        **{f"times {peer}": times(peer) for peer in runnable(rules.peers)},
+        **{f"times {peer}": times(peer) for peer in runnable()},
     }
     every_one = [outcome for outcomes in results.values() for outcome in outcomes.values()]
     return listing(["case", "solver"], {(one.problem.title, one.solver): one for one in every_one}, columns)

@@ -6,10 +6,11 @@ would run it. Compiling one of the larger control cases takes a minute, so libra
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import os
 import shutil
 import subprocess
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -36,25 +37,17 @@ def compiled(solver: Any, plugin: str, options: dict[str, Any]) -> Any:
     if COMPILER is None:
         raise RuntimeError("no C compiler found: install gcc, or leave compiled peers out")
     LIBRARIES.mkdir(parents=True, exist_ok=True)
-    work = LIBRARIES / f"work-{os.getpid()}"
-    work.mkdir(exist_ok=True)
-    here = Path.cwd()
-    try:
-        os.chdir(work)  # casadi writes beside nothing else
+    # casadi writes into the present folder
+    with tempfile.TemporaryDirectory(dir=LIBRARIES) as work, contextlib.chdir(work):
         source = Path(solver.generate_dependencies("functions.c")).resolve()
-        code = source.read_bytes()
-    finally:
-        os.chdir(here)
-    name = hashlib.sha256(code + " ".join((COMPILER, *FLAGS)).encode()).hexdigest()[:16]
-    library = LIBRARIES / f"{name}.so"
-    if not library.is_file():
-        made = work / "made.so"
-        command = [COMPILER, *FLAGS, str(source), "-o", str(made), "-lm"]
-        run = subprocess.run(command, capture_output=True, text=True, check=False)
-        if run.returncode:
-            raise RuntimeError(f"{COMPILER} refused: {run.stderr[:500]}")
-        made.replace(library)
-    shutil.rmtree(work)
+        name = hashlib.sha256(source.read_bytes() + " ".join((COMPILER, *FLAGS)).encode()).hexdigest()[:16]
+        library, made = LIBRARIES / f"{name}.so", Path(work) / "made.so"
+        if not library.is_file():
+            command = [COMPILER, *FLAGS, str(source), "-o", str(made), "-lm"]
+            run = subprocess.run(command, capture_output=True, text=True, check=False)
+            if run.returncode:
+                raise RuntimeError(f"{COMPILER} refused: {run.stderr[:500]}")
+            made.replace(library)
     return ca.nlpsol("solver", plugin, str(library), options)
 
 

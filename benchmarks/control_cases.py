@@ -13,16 +13,15 @@ import pandas as pd
 from tqdm import tqdm
 
 from benchmarks import cold, compiled_peers, control_loops
-from benchmarks.cold import PEERS, Outcome, Results, Rules
+from benchmarks.cold import SAME, SLOW, TOLERANCE, Outcome, Results
 from benchmarks.report import table
 from benchmarks.runner import Timing
 from problems.control import blocked, problems
 from unifg.solution.status import Status
 from unifg.solvers.names import backends
 
-RULES = Rules(tolerance=1e-4, same=1e-4, slow=300.0, peers=PEERS)
 STARTS = 30
-SOLVERS = backends("ipm", "sqp", "alm", tolerance=RULES.tolerance)
+SOLVERS = backends("ipm", "sqp", "alm", tolerance=TOLERANCE)
 
 
 def render(results: Results, rounds: int) -> str:
@@ -30,17 +29,17 @@ def render(results: Results, rounds: int) -> str:
     counted: dict[str, Callable[[Outcome], bool]] = {
         "converged": lambda outcome: outcome.status == "converged",
         "degenerate": lambda outcome: outcome.status == "degenerate",
-        "listed optimum or lower": lambda outcome: outcome.verdict(RULES).startswith(("listed", "lower")),
+        "listed optimum or lower": lambda outcome: outcome.verdict.startswith(("listed", "lower")),
     }
     notes = (
-        f"Cold: from the listed guess, tolerance {RULES.tolerance:.0e} of every solver, median processor time of "
-        f"{rounds} interleaved solves (one where it took more than {RULES.slow:.0f} ms). The cost of an interior point "
+        f"Cold: from the listed guess, tolerance {TOLERANCE:.0e} of every solver, median processor time of "
+        f"{rounds} interleaved solves (one where it took more than {1e3 * SLOW:.0f} ms). The cost of an interior point "
         "is above the optimum by about the tolerance times the number of active limits; listed optima were found at "
-        f"1e-9. Same optimum: within {RULES.same:.0e}. Our residuals are those that ship; "
+        f"1e-9. Same optimum: within {SAME:.0e}. Our residuals are those that ship; "
         "fatrop runs in casadi's virtual machine and compiled "
         f"({compiled_peers.described()}), IPOPT in the virtual machine."
     )
-    return "\n\n".join([cold.summary(results, RULES, counted), cold.every(results, RULES), notes])
+    return "\n\n".join([cold.summary(results, counted), cold.every(results), notes])
 
 
 def starts(count: int) -> str:
@@ -76,10 +75,9 @@ def starts(count: int) -> str:
 
 def tables(rounds: int) -> str:
     """Cold solves, closed loops and random starts."""
-    results = {problem: cold.measure(problem, SOLVERS, RULES, rounds) for problem in tqdm(problems(), unit="case")}
+    results = {problem: cold.measure(problem, SOLVERS, rounds) for problem in tqdm(problems(), unit="case")}
     loops = {problem: control_loops.drive(problem) for problem in tqdm(control_loops.cases(), unit="loop")}
-    parts = [render(results, rounds), control_loops.render(loops), starts(STARTS)]
-    return "\n\n".join(parts)
+    return "\n\n".join([render(results, rounds), control_loops.render(loops), starts(STARTS)])
 
 
 STUDY = Timing(tables, 20)

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 import numpy as np
 
-from benchmarks.cold import PEERS, runnable
+from benchmarks.cold import PEERS, TOLERANCE, runnable
 from benchmarks.report import listing
 from problems.control import Driver, Problem, Quadrotor, Tick, Unicycle
 from unifg.solvers.names import backend
 from unifg.typing import Array
 
 STEPS = 100
-TOLERANCE = 1e-4
 SINGLE = "sqp, 1 iteration"
 SAFE = "ipm, safe"  # one iteration, and more only while the plan violates the constraints
 CONTACT = 1e-4  # depth in an obstacle [m]
@@ -38,22 +37,34 @@ class Drive:
     """Result of one solver on one drive.
 
     Attributes:
-        times: of the solves after the first [ms].
-        repeated: of the same solves repeated at once [ms].
-        iterations: of the same.
-        failures: solves that did not converge, by status, the first included.
+        ticks: the first is cold.
+        repeated: times of the others, repeated at once [ms].
         cost: sum of the stage costs.
         penetration: deepest of the states in an obstacle [m]; negative is a clearance.
     """
 
-    times: list[float] = field(default_factory=list)
+    ticks: list[Tick] = field(default_factory=list)
     repeated: list[float] = field(default_factory=list)
-    iterations: list[int] = field(default_factory=list)
-    failures: Counter[str] = field(default_factory=Counter)
     cost: float = 0.0
     penetration: float = -np.inf
 
+    @property
+    def times(self) -> list[float]:
+        """Of the solves after the first [ms]."""
+        return [tick.milliseconds for tick in self.ticks[1:]]
 
+    @property
+    def iterations(self) -> list[int]:
+        """Of the same."""
+        return [tick.iterations for tick in self.ticks[1:]]
+
+    def failures(self, *good: str) -> Counter[str]:
+        """Solves that ended otherwise than converged, by a stop rule or well, by status, the first included."""
+        return Counter(tick.status for tick in self.ticks if tick.status not in ("converged", "stop rule", *good))
+
+
+Race: TypeAlias = Callable[[Array, int], Tick]
+"""One step of a closed loop, of state and index."""
 Row: TypeAlias = tuple[Problem, str, Drive]
 
 
@@ -81,30 +92,38 @@ def contestant(problem: Problem, name: str) -> Contestant:
     return Driver(problem.formulation(), solver, penalties=how != "new penalties")
 
 
-def drive(problem: Problem, ours: Sequence[str] = OURS, peers: tuple[str, ...] = PEERS) -> dict[str, Drive]:
-    """Drive a problem's robot with backends and peers by their names."""
-    return race(problem, {name: contestant(problem, name) for name in (*ours, *runnable(peers))})
+def drive(problem: Problem) -> dict[str, Drive]:
+    """Drive a problem's robot with backends, and with the peers that are here."""
+    who = {name: contestant(problem, name) for name in (*OURS, *runnable())}
+    return race(problem, {name: one.control for name, one in who.items()}, again=who)
 
 
-def race(problem: Problem, who: Mapping[str, Contestant]) -> dict[str, Drive]:
-    """Drive every robot one step in turn: a slow moment of the machine meets all of them."""
-    drives, states = {name: Drive() for name in who}, dict.fromkeys(who, problem.start)
-    controls: dict[str, Array] = {}
+def race(
+    problem: Problem,
+    racers: Mapping[str, Race],
+    order: Callable[[list[str]], Iterable[str]] = list,
+    again: Mapping[str, Contestant] | None = None,
+) -> dict[str, Drive]:
+    """Drive every robot one step in turn: a slow moment of the machine meets all of them.
+
+    Args:
+        problem: to be driven.
+        racers: a step of each.
+        order: of the names in a step.
+        again: contestants whose steps are repeated at once.
+    """
+    drives, states = {name: Drive() for name in racers}, dict.fromkeys(racers, problem.start)
     for index in range(STEPS + 1):
-        for name, driver in who.items():
+        for name in order(list(racers)):
             found = drives[name]
             if index:
-                found.cost += problem.stage_cost(states[name], controls[name], index - 1)
-                states[name] = problem.plant(states[name], controls[name], index - 1)
+                control = found.ticks[-1].control
+                found.cost += problem.stage_cost(states[name], control, index - 1)
+                states[name] = problem.plant(states[name], control, index - 1)
                 found.penetration = max(found.penetration, problem.penetration(states[name]))
-            tick = driver.control(states[name], index)
-            controls[name] = tick.control
-            if tick.status != "converged" and name != SINGLE and (name, tick.status) != (SAFE, "stop rule"):
-                found.failures[tick.status] += 1
-            if index:  # the cold solve is no step of the loop
-                found.times.append(tick.milliseconds)
-                found.iterations.append(tick.iterations)
-                found.repeated.append(driver.again())
+            found.ticks.append(racers[name](states[name], index))
+            if index and again is not None:  # the cold solve is no step of the loop
+                found.repeated.append(again[name].again())
     return drives
 
 
@@ -121,6 +140,10 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
 
         return told
 
+    def failed(row: Row) -> str:
+        found = Counter[str]() if row[1] == SINGLE else row[2].failures()
+        return ", ".join(f"{count} {status}" for status, count in found.items()) or "0"
+
     def of(told: Callable[[Drive], str]) -> Callable[[Row], str]:
         return lambda row: told(row[2])
 
@@ -130,7 +153,7 @@ def render(results: Mapping[Problem, Mapping[str, Drive]]) -> str:
         "iterations, median": of(lambda drive: f"{np.median(drive.iterations):.0f}"),
         "mean": of(lambda drive: f"{np.mean(drive.iterations):.1f}"),
         "most": of(lambda drive: str(max(drive.iterations))),
-        "failures": of(lambda drive: ", ".join(f"{n} {status}" for status, n in drive.failures.items()) or "0"),
+        "failures": failed,
         "cost": of(lambda drive: f"{drive.cost:.4f}"),
         "penetration [mm]": of(lambda drive: f"{1e3 * drive.penetration:.4f}".replace("-inf", "-")),
         **{f"times {peer}": ratio(peer) for peer in PEERS},

@@ -38,9 +38,10 @@ class ControlPeer(Staged):
     """
 
     def __init__(self, problem: Problem, plugin: str, compiled: bool = False, **options: Any) -> None:
-        """Build and differentiate the expressions; ``compiled`` and ``options`` as for a staged peer."""
+        """Build and differentiate the expressions; ``compiled`` and ``options`` as for any program."""
         import casadi as ca
 
+        super().__init__(plugin, compiled, **options)
         self.problem = problem
         error, gap = MODELS[problem.robot]
         size, controls, n = len(problem.start), len(problem.effort), problem.horizon
@@ -63,22 +64,23 @@ class ControlPeer(Staged):
         limits = np.append(-free, problem.lower), np.append(free, problem.upper)
         given = ca.vertcat(start, ca.vec(reference), ca.vec(cruise))
         dynamics = partial(gap, dt=problem.dt)
-        super().__init__(plugin, (size, controls, n), stage, dynamics, given, limits, compiled, **options)
+        self.stages((size, controls, n), stage, dynamics, given, limits)
 
-    def solve(self, states: Array, controls: Array, state: Array | None = None, first: int = 0, **duals: Any) -> float:
-        """Solve closed-loop step ``first`` from a guess; returns the processor time of the call [ms]."""
+    def take(self, states: Array, controls: Array, state: Array | None = None, first: int = 0, **duals: Any) -> None:
+        """Take closed-loop step ``first`` and a guess."""
         reference, cruise = self.problem.reference(first)
         start = self.problem.start if state is None else state
-        return self.run(states, controls, np.concatenate([start, reference.ravel(), cruise.ravel()]), **duals)
+        self.begin(states, controls, np.concatenate([start, reference.ravel(), cruise.ravel()]), **duals)
 
     def control(self, state: Array, index: int) -> Tick:
         """One step of a closed loop: cold the first time, then from the shifted answer."""
-        if not self.answer:
-            elapsed = self.solve(*self.problem.guess(), state, index)
-        else:
+        if self.answer:
             states, controls, duals = self.shifted()
             states[0] = state
-            elapsed = self.solve(states, controls, state, index, **duals)
+            self.take(states, controls, state, index, **duals)
+        else:
+            self.take(*self.problem.guess(), state, index)
+        elapsed = self.again()
         return Tick(self.trajectory[1][0], elapsed, self.iterations, self.status)
 
 

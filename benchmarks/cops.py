@@ -6,15 +6,15 @@ CasADi with exact derivatives and MUMPS, and its default options.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 from tqdm import tqdm
 
-from benchmarks.report import table, words
+import unifg as fg
+from benchmarks.casadi_peer import Program
+from benchmarks.cold import Ours
+from benchmarks.report import table
 from benchmarks.runner import Timing
-from benchmarks.timing import clocked, interleave, number, ratio
+from benchmarks.timing import interleave, number, ratio
 from problems.cops import LEFT_OUT, PROBLEMS, Problem
 from problems.cops_casadi import program
 from problems.scaled import Units, scaled
@@ -30,51 +30,32 @@ CHANGES = {
 }  # fmt: skip
 
 
-class Ours:
+def ours(problem: Problem, units: Units | None = None, tolerance: float = TOLERANCE) -> Ours:
     """The interior point on a problem."""
-
-    def __init__(self, problem: Problem, units: Units | None = None, tolerance: float = TOLERANCE) -> None:
-        """Prepare."""
-        graph, guess = problem.build()
-        if units is not None:
-            graph, guess = scaled(graph, guess, units)
-        feasible = None if units is None else tolerance * units.rows
-        solver = InteriorPoint(tolerance=tolerance, feasibility_tolerance=feasible)
-        self._guess, self._run = guess, solver.prepare(graph)
-
-    def __call__(self) -> float:
-        """Solve; processor time [s]."""
-        solution, spent = clocked(self._run.solve, self._guess)
-        self.status, self.iterations, self.cost = words(solution.status), solution.iterations, solution.cost
-        self.iterations += solution.restoration_steps
-        return spent
+    graph, guess = problem.build()
+    if units is not None:
+        graph, guess = scaled(graph, guess, units)
+    feasible = None if units is None else tolerance * units.rows
+    return Ours(InteriorPoint(tolerance=tolerance, feasibility_tolerance=feasible), graph, fg.Guess(guess))
 
 
-class Ipopt:
+def ipopt(problem: Problem) -> Program:
     """IPOPT on a problem."""
-
-    def __init__(self, problem: Problem) -> None:
-        """Differentiate."""
-        import casadi as ca
-
-        stated, self._call = program(problem.build())
-        options: dict[str, Any] = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": TOLERANCE}}
-        self._solver: Any = ca.nlpsol("solver", "ipopt", stated, options)
-
-    def __call__(self) -> float:
-        """Solve; processor time [s]."""
-        found, spent = clocked(self._solver, **self._call)
-        stats = self._solver.stats()
-        self.status = str(stats["return_status"]).replace("_", " ").lower()
-        self.iterations, self.cost = int(stats["iter_count"]), float(found["f"])
-        return spent
+    made, (stated, call) = Program(tol=TOLERANCE), program(problem.build())
+    made.build(stated, **call)
+    return made
 
 
-def verdict(problem: Problem, solver: Ours | Ipopt) -> str:
+def steps(one: Ours) -> int:
+    """Iterations of a solve, with those of feasibility restoration."""
+    return one.iterations + one.solution.restoration_steps
+
+
+def verdict(problem: Problem, said: str, cost: float) -> str:
     """Comparison of an answer with the literature's."""
-    if solver.status not in SOLVED:
-        return solver.status
-    off = (solver.cost - problem.best) / abs(problem.best)
+    if said not in SOLVED:
+        return said
+    off = (cost - problem.best) / abs(problem.best)
     return "literature's" if abs(off) <= SAME else f"{'better' if off < 0 else 'another'}, {100.0 * off:+.2g} %"
 
 
@@ -83,21 +64,22 @@ def beside(rounds: int) -> str:
     lines, iterations, times = [], [], []
     counts = {name: [0, 0] for name in ("InteriorPoint", "IPOPT")}
     for problem in tqdm(PROBLEMS, unit="problem"):
-        ours, peer = Ours(problem), Ipopt(problem)
-        spent = interleave({"ours": ours, "ipopt": peer}, rounds, slow=5.0)
-        found = {"InteriorPoint": verdict(problem, ours), "IPOPT": verdict(problem, peer)}
+        own, peer = ours(problem), ipopt(problem)
+        spent = interleave({"ours": own, "ipopt": peer}, rounds, slow=5.0)
+        found = {
+            "InteriorPoint": verdict(problem, own.status, own.cost), "IPOPT": verdict(problem, peer.said, peer.cost),
+        }  # fmt: skip
         for name, word in found.items():
             counts[name][0] += word == "literature's"
             counts[name][1] += word.startswith(("better", "another"))
-        both = ours.status in SOLVED and peer.status in SOLVED
         relative = ratio(spent["ours"], spent["ipopt"])[0]
-        if both:
-            iterations.append((ours.iterations / peer.iterations, problem.name))
+        if own.status in SOLVED and peer.said in SOLVED:
+            iterations.append((steps(own) / peer.iterations, problem.name))
             times.append((relative, problem.name))
         medians = [1e3 * float(np.median(spent[name])) for name in ("ours", "ipopt")]
         lines.append(
             (
-                problem.name, problem.mesh, f"{problem.best:.6g}", *found.values(), str(ours.iterations),
+                problem.name, problem.mesh, f"{problem.best:.6g}", *found.values(), str(steps(own)),
                 str(peer.iterations), number(medians[0]), number(medians[1]), number(relative, 2),
             )
         )  # fmt: skip
@@ -129,9 +111,9 @@ def units() -> str:
     for problem in tqdm(PROBLEMS, unit="problem"):
         cells = []
         for change in (Units(), *CHANGES.values()):
-            ours = Ours(problem, change, 1e-6)
-            ours()
-            cells.append((ours.status, ours.iterations, ours.cost / change.cost))
+            own = ours(problem, change, 1e-6)
+            own()
+            cells.append((own.status, steps(own), own.cost / change.cost))
         shown = [f"{status if status != 'converged' else ''} {its} ({cost:.6g})".strip() for status, its, cost in cells]
         lines.append((problem.name, *shown))
     head = ("problem", "as stated", *CHANGES)
@@ -144,8 +126,7 @@ def units() -> str:
 
 def tables(rounds: int) -> str:
     """Both."""
-    parts: list[Callable[[], str]] = [lambda: beside(rounds), units]
-    return "\n\n".join(part() for part in parts)
+    return f"{beside(rounds)}\n\n{units()}"
 
 
 STUDY = Timing(tables, 7)

@@ -171,7 +171,8 @@ def measure(seed: int) -> Row:
         from benchmarks.control_peers import ControlPeer
 
         peer = ControlPeer(field, "ipopt", tol=TOLERANCE)
-        peer.solve(*field.straight(pose, field.goals[1]), pose, MOVE)
+        peer.take(*field.straight(pose, field.goals[1]), pose, MOVE)
+        peer()
         best = min(best, peer.cost if peer.status == "converged" else np.inf)
     ours = loops["loop"].loop
     times = np.array(ours.milliseconds)

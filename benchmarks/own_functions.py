@@ -13,9 +13,6 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import partial
 from typing import Any, Literal
 
 import numba
@@ -23,10 +20,10 @@ import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks.cold import Outcome, attempt, attempt_peer, runnable
+from benchmarks.cold import TOLERANCE, Contestant, Ours, outcomes, peer, runnable
 from benchmarks.report import CHECKOUT, table
 from benchmarks.runner import Timing
-from benchmarks.timing import interleave, number, ratio, shown
+from benchmarks.timing import number, ratio, shown
 from problems.cart_pole import CartPole, CartPoleGraph, cart_pole_dynamics, cart_pole_dynamics_of_one
 from problems.control import Problem, Quadrotor, QuadrotorGraph, Stated, Unicycle, UnicycleGraph
 from unifg.lie import wrap_angle
@@ -34,7 +31,6 @@ from unifg.models.quadrotor import GRAVITY
 from unifg.solvers import InteriorPoint
 from unifg.typing import Array
 
-TOLERANCE = 1e-4
 WAYS = ("shipped", "numpy", "njit", "differences")
 NAMES = {
     "shipped": "shipped",
@@ -178,61 +174,31 @@ def _in_a_process(title: str, way: str) -> tuple[float, float]:
     return first, second
 
 
-@dataclass
-class Cold:
-    """One way of one problem.
-
-    Attributes:
-        first: seconds until it is prepared, and of the first solve; not a number for peers.
-        outcome: of the repeated solves.
-        ratio: of its times to fatrop's, round by round.
-    """
-
-    first: tuple[float, float]
-    outcome: Outcome
-    ratio: list[float] | None
-
-
-def cold(title: str, problem: Problem, rounds: int) -> dict[str, Cold]:
-    """Every way, and fatrop, interleaved."""
-    solver = InteriorPoint(tolerance=TOLERANCE)
-    attempts: dict[str, Callable[[Outcome], float]] = {
-        way: attempt(solver, stated(problem, way)) for way in ways(problem)
-    }
-    for peer in runnable(("fatrop", "fatrop, compiled")):
-        attempts[peer] = attempt_peer(peer, problem, TOLERANCE)
-    outcomes = {way: Outcome(problem, way) for way in attempts}
-    times = interleave({way: partial(solve, outcomes[way]) for way, solve in attempts.items()}, rounds, slow=100.0)
-    found = {}
-    for way, outcome in outcomes.items():
-        outcome.times = times[way].tolist()
-        first = (math.nan, math.nan) if way not in ways(problem) else _in_a_process(title, way)
-        found[way] = Cold(first, outcome, ratio(times[way], times["fatrop"]) if "fatrop" in times else None)
-    return found
-
-
-def render_cold(results: Mapping[str, Mapping[str, Cold]]) -> str:
-    """A row for each way of each problem."""
-    rows = []
-    for title, found in results.items():
-        for way, one in found.items():
-            first = [number(part) for part in one.first]
-            times = number(one.outcome.median)
-            rows.append(
-                (title, NAMES[way], one.outcome.status, str(one.outcome.iterations), *first, times, shown(one.ratio))
-            )
-    head = ("problem", "functions", "status", "iterations", "to prepared [s]", "first solve [s]", "solve [ms]")
-    return table((*head, "times fatrop"), rows, 3)
+def cold(title: str, problem: Problem, rounds: int) -> list[tuple[str, ...]]:
+    """Rows of every way, and of fatrop, interleaved."""
+    contestants: dict[str, Contestant] = {}
+    for way in ways(problem):
+        own = stated(problem, way)
+        contestants[way] = Ours(InteriorPoint(tolerance=TOLERANCE), own.graph, own.guess)
+    contestants |= {name: peer(problem, name) for name in runnable(("fatrop", "fatrop, compiled"))}
+    found, rows = outcomes(problem, contestants, rounds, slow=0.1), []
+    for way, one in found.items():
+        first = _in_a_process(title, way) if way in ways(problem) else (math.nan, math.nan)
+        beside = ratio(one.times, found["fatrop"].times) if "fatrop" in found else None
+        told = *map(number, (*first, one.median)), shown(beside)
+        rows.append((title, NAMES[way], one.status, str(one.iterations), *told))
+    return rows
 
 
 def tables(rounds: int) -> str:
     """Every way of every problem."""
-    results = {title: cold(title, problem, rounds) for title, problem in tqdm(problems().items(), unit="problem")}
+    rows = [row for title, one in tqdm(problems().items(), unit="problem") for row in cold(title, one, rounds)]
+    head = ("problem", "functions", "status", "iterations", "to prepared [s]", "first solve [s]", "solve [ms]")
     notes = (
         f"Tolerance {TOLERANCE:.0e}, median processor time of {rounds} interleaved solves; ratios with 95 % intervals. "
         "To prepared and first solve: processor time in a new process whose compiled functions are in the cache."
     )
-    return f"{render_cold(results)}\n\n{notes}"
+    return f"{table((*head, 'times fatrop'), rows, 3)}\n\n{notes}"
 
 
 STUDY = Timing(tables, 20)

@@ -16,14 +16,16 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from time import thread_time
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 from unittest import mock
 
 import numpy as np
 from tqdm import tqdm
 
 import unifg as fg
-from benchmarks.control_loops import CONTACT, STEPS, Drive
+from benchmarks import control_loops
+from benchmarks.cold import TOLERANCE, Ours
+from benchmarks.control_loops import CONTACT, Race
 from benchmarks.control_peers import MODELS
 from benchmarks.own_functions import stated
 from benchmarks.pose_graphs import cases
@@ -38,7 +40,6 @@ from unifg.solvers.names import backends
 from unifg.typing import Array
 
 HOME = CHECKOUT / ".venv-peers"
-TOLERANCE = 1e-4  # of every solver, and of violations in the unit of each row [m, rad, m/s, ...]
 WORSE = 0.01  # relative cost above the best from which an answer is not compared
 SLOW = 5.0  # a solve that takes longer is not repeated [s]
 LOOPS: dict[str, fg.Solver] = {
@@ -51,8 +52,6 @@ COLD: dict[str, fg.Solver] = {
     'SQP(qp="graph")': SQP(tolerance=TOLERANCE, qp="graph"),
     "SQP": SQP(tolerance=TOLERANCE),
 }
-Race: TypeAlias = Callable[[Array, int], Tick]
-"""One step of a closed loop, of state and index."""
 Of: TypeAlias = Mapping[str, Callable[[Array], Any]]
 """Numbers that are made of times, by heading."""
 
@@ -79,42 +78,10 @@ def problems() -> list[Problem]:
     return [*driven, SwingUp("swing-up", False, 40), Quadrotor("goto", False, 20), Quadrotor("goto", True, 20)]
 
 
-class Contestant(Protocol):
-    """A solver of one problem, ready to solve cold: ours, or a peer. A call returns the time that counts [s].
-
-    Attributes:
-        answer: of the last solve, as a judge takes it.
-        status: of the last solve, in words; empty where the solver does not tell.
-        iterations: of the last solve; 0 where the solver does not tell.
-    """
-
-    answer: Any
-    status: str
-    iterations: int
-
-    def __call__(self) -> float: ...  # noqa: D102
-
-
-class Ours:
-    """A backend of ours as a contestant, whose answer is the values of the families of a guess."""
-
-    def __init__(self, solver: fg.Solver, graph: fg.Graph, guess: Mapping[fg.Family, Array]) -> None:
-        """Prepare."""
-        self._run, self._guess, self.status, self.iterations = solver.prepare(graph), dict(guess), "", 0
-        self.answer: Any = None
-
-    def __call__(self) -> float:
-        """Solve; seconds."""
-        solution, spent = clocked(self._run.solve, self._guess)
-        self.status, self.iterations = words(solution.status), solution.iterations
-        self.answer = [np.array(solution[family]) for family in self._guess]
-        return spent
-
-
 def on(problem: Problem, solver: fg.Solver) -> Ours:
     """A backend on a control problem that is stated as NumPy functions."""
     own = stated(problem, "numpy")
-    return Ours(solver, own.graph, dict(zip((own.x, own.u), problem.guess(), strict=True)))
+    return Ours(solver, own.graph, own.guess)
 
 
 class Whole(Driver):
@@ -195,28 +162,16 @@ def compared(results: Results, name: str, peer: str, of: Callable[[Array], Array
 
 def race(problem: Problem, racers: Mapping[str, Race], rounds: int) -> Results:
     """Drive every robot one step in turn, in random order, ``rounds`` loops after one that is not counted."""
-    rng, loops = np.random.default_rng(0), list[dict[str, Drive]]()
-    for _ in range(rounds + 1):
-        loop = {name: Drive() for name in racers}
-        states, controls = dict.fromkeys(racers, problem.start), dict[str, Array]()
-        for index in range(STEPS + 1):
-            for name in rng.permutation(list(racers)).tolist():
-                drive = loop[name]
-                if index:
-                    drive.cost += problem.stage_cost(states[name], controls[name], index - 1)
-                    states[name] = problem.plant(states[name], controls[name], index - 1)
-                    drive.penetration = max(drive.penetration, problem.penetration(states[name]))
-                controls[name], milliseconds, iterations, status = racers[name](states[name], index)
-                drive.failures.update([status] if status not in ("converged", "stop rule", "iteration limit") else [])
-                drive.times.append(1e-3 * milliseconds)
-                drive.iterations.append(iterations)
-        loops.append(loop)
+    rng = np.random.default_rng(0)
+    loops = [
+        control_loops.race(problem, racers, lambda names: rng.permutation(names).tolist()) for _ in range(rounds + 1)
+    ]
     results = {}
     for name, last in loops[-1].items():
-        times = np.array([loop[name].times[1:] for loop in loops[1:]])
-        status = ", ".join(f"{count} x {status}" for status, count in last.failures.items()) or "converged"
-        iterated = float(np.mean(last.iterations[1:]))
-        results[name] = Result(times, status, iterated, max(last.penetration, 0.0), last.cost)
+        times = 1e-3 * np.array([loop[name].times for loop in loops[1:]])
+        failed = last.failures("iteration limit").items()
+        status = ", ".join(f"{count} x {status}" for status, count in failed) or "converged"
+        results[name] = Result(times, status, float(np.mean(last.iterations)), max(last.penetration, 0.0), last.cost)
     return results
 
 
@@ -236,8 +191,15 @@ def compiled_share(problem: Problem, racer: Race) -> float:
         return float(race(problem, {"": share}, 1)[""].times.mean())
 
 
-def cold(contestants: Mapping[str, Contestant], judge: Callable[..., tuple[float, float]], rounds: int) -> Results:
-    """Solve with every contestant in turn, and judge the last answers."""
+def cold(contestants: Mapping[str, Any], judge: Callable[..., tuple[float, float]], rounds: int) -> Results:
+    """Solve with every contestant in turn, and judge the last answers.
+
+    Args:
+        contestants: ours or peers. A call solves cold and returns the time that counts [s]; ``answer``, ``status`` and
+            ``iterations`` are of the last one, empty and 0 where a solver does not tell.
+        judge: violation and cost of an answer.
+        rounds: that count.
+    """
     times, results = interleave(contestants, rounds, slow=SLOW), Results()
     for name, one in contestants.items():
         found = times[name], one.status, one.iterations, *judge(*one.answer)
@@ -266,7 +228,7 @@ def colds(problem: Problem, rounds: int) -> Results:
     from benchmarks.acados_peer import Acados
     from benchmarks.python_peers import Crocoddyl, Snopt
 
-    contestants: dict[str, Contestant] = {name: on(problem, solver) for name, solver in COLD.items()}
+    contestants: dict[str, Any] = {name: on(problem, solver) for name, solver in COLD.items()}
     for soft in (False, True)[: 1 + problem.blocked]:
         for steps in ("full", "merit", "corrected"):
             name = f"acados SQP, {steps}{', soft' if soft else ''}"
@@ -283,7 +245,7 @@ def graph_part(rounds: int) -> Found:
 
     case = cases()[0]
     graph, _, guess = case.pose_graph.graph()
-    contestants: dict[str, Contestant] = {one.name: Ours(one, graph, guess) for one in backends("lm", "gn").values()}
+    contestants: dict[str, Any] = {one.name: Ours(one, graph, fg.Guess(guess)) for one in backends("lm", "gn").values()}
     contestants["jaxls"] = jaxls_peer.pose_graph(case.pose_graph)
     return {case.name: cold(contestants, lambda found: (0.0, case.pose_graph.with_poses(found).chi2()), rounds)}
 
@@ -294,7 +256,7 @@ def constrained_part(rounds: int) -> Found:
 
     found, ours = {}, backends("ipm", "alm", tolerance=TOLERANCE).values()
     for problem in problems()[0], problems()[2]:
-        contestants: dict[str, Contestant] = {one.name: on(problem, one) for one in ours}
+        contestants: dict[str, Any] = {one.name: on(problem, one) for one in ours}
         contestants["jaxls"] = jaxls_peer.augmented(problem)
         found[problem.title] = cold(contestants, partial(judge, problem), rounds)
     return found

@@ -37,6 +37,7 @@ from benchmarks import (
     pose_graphs,
     runner,
 )
+from benchmarks.cold import TOLERANCE
 from benchmarks.comparison import Row
 from benchmarks.horizon_and_velocity import Flown
 from benchmarks.report import END, begin, put_results
@@ -143,7 +144,7 @@ def test_every_way_to_state_a_problem_is_the_same_problem(title: str) -> None:
     problem, found = own_functions.problems()[title], {}
     for way in own_functions.ways(problem):
         stated = own_functions.stated(problem, way)
-        solution = InteriorPoint(tolerance=own_functions.TOLERANCE).solve(stated.graph, stated.guess, check=True)
+        solution = InteriorPoint(tolerance=TOLERANCE).solve(stated.graph, stated.guess, check=True)
         found[way] = solution
         routes = stated.graph.check(stated.guess.values).routes
         own = [routes[name] for name in ("dynamics", "tracking", "discs") if name in routes and way != "shipped"]

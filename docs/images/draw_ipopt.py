@@ -29,7 +29,7 @@ def main() -> None:
     ways = [row.values[ours.x] for row in ours.solution.history if row.values is not None]
     times = DT * np.arange(STEPS)
     states, controls = ours.solution[ours.x], ours.solution[ours.u]
-    theirs = np.asarray(ipopt.found["x"]).reshape(STEPS, 5)[:, :2]
+    theirs = np.asarray(ipopt.answer["x"]).reshape(STEPS, 5)[:, :2]
     with new_figure((9.0, 3.6)) as figure:
         left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.3])
         for k, way in enumerate(ways):
