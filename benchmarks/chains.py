@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import listing, words
+from benchmarks.report import listing, told, words
 from benchmarks.section import Result, goal
 from benchmarks.timing import interleave, milliseconds, shown, timed
 from problems.control import Unicycle
@@ -83,9 +83,9 @@ def _repeat(run: fg.Prepared, guess: fg.Guess, times: int) -> None:
 
 
 COLUMNS: dict[str, Callable[[Result], str]] = {
-    "unknowns": lambda row: str(row["unknowns"]),
+    "unknowns": told("unknowns"),
     "iterations": lambda row: f"{row['iterations']}, {row['status']}",
-    "iteration [ms]": lambda row: shown(row["ms"]),
+    "iteration [ms]": told("ms", shown),
     "target": lambda row: f"{TARGET:g}",
 }
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 
@@ -41,8 +41,8 @@ class Case:
 Mine: TypeAlias = list[tuple[Case, Answer]]
 
 
-def measure(kind: str, seed: int, equalities_only: bool) -> Case:
-    """State a problem, solve it with everything."""
+def measure(kind: str, seed: int, equalities_only: bool) -> Row:
+    """State a problem, solve it with everything; all answers, as the file holds them."""
     twin = KINDS[kind](seed, equalities_only)
     judge = Judge(twin)
     apart = disagreement(twin, judge)
@@ -50,7 +50,7 @@ def measure(kind: str, seed: int, equalities_only: bool) -> Case:
         raise RuntimeError(f"{twin.name}: the graph and the casadi statement differ by {apart:.1e}")
     answers = {name: answer(backend, twin, judge) for name, backend in BACKENDS.items()}
     ipopt, fatrop = judge.ipopt(twin.guess, TOLERANCE), judge.fatrop(twin.guess, TOLERANCE)
-    return Case(kind, seed, equalities_only, answers, ipopt, fatrop)
+    return asdict(Case(kind, seed, equalities_only, answers, ipopt, fatrop))
 
 
 def summary(cases: list[Case], names: Iterable[str]) -> str:
@@ -118,11 +118,6 @@ def render(cases: list[Case]) -> str:
     return "\n\n".join(parts)
 
 
-def row(**cell: Any) -> Row:
-    """All answers to one problem, as the file holds them."""
-    return asdict(measure(**cell))
-
-
 def restored(row: Row) -> Case:
     """A case from its line of the file."""
     answers = {name: Answer(**a) for name, a in row["answers"].items()}
@@ -139,4 +134,4 @@ def cells(seeds: Sequence[int]) -> list[Cell]:
     ]  # fmt: skip
 
 
-STUDY = Study(cells, row, lambda rows: render([restored(row) for row in rows]), range(100))
+STUDY = Study(cells, measure, lambda rows: render([restored(row) for row in rows]), range(100))

@@ -24,6 +24,14 @@ def where(rows: Iterable[Row], **wanted: Any) -> list[Row]:
     return [row for row in rows if "error" not in row and all(row[name] == value for name, value in wanted.items())]
 
 
+def grouped(rows: Iterable[Row], *names: str) -> dict[Key, list[Row]]:
+    """Rows by the values of some names, in the order in which these come."""
+    groups: dict[Key, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+    return groups
+
+
 def paired(mine: Iterable[Row], base: Iterable[Row], read: Read) -> tuple[Array, Array]:
     """(n,) values of two variants for the seeds of which both have one."""
     a, b = ({row["seed"]: read(row) for row in rows} for rows in (mine, base))

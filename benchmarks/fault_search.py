@@ -63,7 +63,7 @@ def evaluated(robot: str, fault: Fault, seed: int) -> Row:
     before = log.time <= (math.inf if named is None else named)
     return {
         "size": fault.size, "begin": fault.begin, "after": None if named is None else named - fault.begin,
-        "unnamed": float(log.clearance[before].min()), "clearance": float(log.clearance.min()),
+        "unnamed": float(log.clearance[before].min()),
         "contact": bool(touched.any() or log.collisions),
     }  # fmt: skip
 
@@ -75,27 +75,30 @@ def cells(seeds: Iterable[int]) -> list[Cell]:
 
 def render(rows: list[Row]) -> str:
     """The table of the least faults that harm, and the sums above it."""
-    lines, tried, touching, unseen = [], 0, 0, 0
+    lines, tried = [], list[Row]()
     for kind, (low, high, unit) in SPANS.items():
         mine = [one for row in rows if row["kind"] == kind for one in row["evaluations"]]
-        contacts = [one for one in mine if one["contact"]]
-        harmful = [one for one in mine if one["unnamed"] <= 0.0]
+        contacts, harmful = contacts_of(mine)
         after = [one["after"] for one in mine if one["after"] is not None]
         clearance = min(one["unnamed"] for one in mine)
         sizes = f"{low:g} to {high:g} {unit}" if unit else "-"
         latest = f"{max(after):.2f}" if after else "-"
         found = kind, sizes, len(mine), len(contacts), len(harmful), least(contacts, unit), least(harmful, unit)
         lines.append([*map(str, found), f"{clearance:.2f}", str(len(mine) - len(after)), latest])
-        tried += len(mine)
-        touching += len(contacts)
-        unseen += len(harmful)
-    sums = f"{tried} evaluations: {touching} with a contact, {unseen} of them before a cause was named."
+        tried += mine
+    touching, unseen = map(len, contacts_of(tried))
+    sums = f"{len(tried)} evaluations: {touching} with a contact, {unseen} of them before a cause was named."
     head = (
         "fault", "sizes", "evaluations", "contacts", "before a name", "least that touches",
         "least that touches before a name", "least clearance before a name [m]", "never named",
         "named after at most [s]",
     )  # fmt: skip
     return f"{sums}\n\n{table(head, lines, text=2)}"
+
+
+def contacts_of(evaluations: list[Row]) -> tuple[list[Row], list[Row]]:
+    """Evaluations with a contact, and those with one before a name."""
+    return [one for one in evaluations if one["contact"]], [one for one in evaluations if one["unnamed"] <= 0.0]
 
 
 def least(harmful: list[Row], unit: str) -> str:

@@ -14,7 +14,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from itertools import product
 
-from benchmarks.comparison import Row
+from benchmarks.comparison import Row, grouped
 from benchmarks.report import table
 from benchmarks.runner import Cell, Study
 from unifg.scenarios.flight import FlightSettings, run_flight
@@ -64,7 +64,6 @@ def episode(robot: str, fault: str, duration: float, seed: int) -> Row:
     return {
         "braked": braked,
         "outcome": outcome, "collisions": m["collisions"], "causes": m["causes"], "first": first,
-        "clearance": m["min_clearance_m"], "dropped": sum(m["dropped_samples"].values()),
     }  # fmt: skip
 
 
@@ -105,11 +104,9 @@ def render(rows: list[Row]) -> str:
     order = {
         (robot, fault): (k, n) for k, (robot, faults) in enumerate(ROBOTS.items()) for n, fault in enumerate(faults)
     }
-    groups: dict[tuple[str, str, float], list[Row]] = {}
-    for row in sorted(rows, key=lambda row: (*order[row["robot"], row["fault"]], row["duration"], row["seed"])):
-        groups.setdefault((row["robot"], row["fault"], row["duration"]), []).append(row)
+    ordered = sorted(rows, key=lambda row: (*order[row["robot"], row["fault"]], row["duration"], row["seed"]))
     lines = []
-    for (robot, fault, duration), mine in groups.items():
+    for (robot, fault, duration), mine in grouped(ordered, "robot", "fault", "duration").items():
         ended = [row for row in mine if "outcome" in row]
         words = Counter(named(row) for row in ended)
         begun = [row["first"] - BEGIN[robot] for row in ended if row["first"] is not None]

@@ -15,9 +15,9 @@ import numpy as np
 import unifg as fg
 from benchmarks import pose_graphs
 from benchmarks.gtsam_peer import ANCHOR, Peer, available, joint
-from benchmarks.report import listing
+from benchmarks.report import listing, told
 from benchmarks.section import Result, goal
-from benchmarks.timing import interleave, milliseconds, ratio, shown
+from benchmarks.timing import clocked, interleave, milliseconds, ratio, shown
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solvers import GaussNewton
@@ -47,7 +47,7 @@ def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
     graph, x = pose_graphs.posed(case.pose_graph, ANCHOR)
     solution = GaussNewton().solve(graph, {x: case.pose_graph.poses})
     program = graph.compile()
-    count, dim = len(case.pose_graph.poses), case.pose_graph.group.dim
+    count = len(case.pose_graph.poses)
     rng = np.random.default_rng(0)
     pairs = np.array([rng.choice(count, 2, replace=False) for _ in range(min(PAIRS, count // 2))])
     tree = Tree(program, solution)
@@ -55,14 +55,15 @@ def measure_case(case: pose_graphs.Case, rounds: int) -> Result:
     found: dict[str, Any] = {}
 
     def every() -> float:
-        begin = time.process_time()
-        found["blocks"] = Tree(program, solution).blocks().reshape(count, dim, dim)
-        return time.process_time() - begin
+        found["blocks"], seconds = clocked(lambda: Tree(program, solution).blocks(), by=time.process_time)
+        return seconds
 
     def from_tree() -> float:
-        begin = time.process_time()
-        found["joint"] = np.array([tree.factorization.inverse_block(scalars[pair].ravel()) for pair in pairs])
-        return (time.process_time() - begin) / len(pairs)
+        blocks = [scalars[pair].ravel() for pair in pairs]
+        found["joint"], seconds = clocked(
+            lambda: [*map(tree.factorization.inverse_block, blocks)], by=time.process_time
+        )
+        return seconds / len(pairs)
 
     times = interleave({"all": every, "tree": from_tree}, rounds)
     result: Result = {"name": case.name, "poses": count, "difference": None}
@@ -102,7 +103,7 @@ def _compared(
         "gtsam": milliseconds(times["gtsam"]),
         "ratio": ratio(times["gtsam"], times["all"]),
         "difference": _largest(found["blocks"][chosen], single),
-        "joint difference": _largest(found["joint"], both),
+        "joint difference": _largest(np.array(found["joint"]), both),
         "with its own": _largest(found["blocks"], np.array([peer.ours(block) for block in blocks["own"]])),
     }
 
@@ -134,14 +135,14 @@ def _largest(ours: Array, reference: Array) -> float:
 
 
 COLUMNS: dict[str, Callable[[Result], str]] = {
-    "poses": lambda row: str(row["poses"]),
-    "all poses, ours [ms]": lambda row: shown(row["all"]),
-    "GTSAM [ms]": lambda row: shown(row.get("gtsam")),
-    "times faster": lambda row: shown(row.get("ratio")),
-    "difference": lambda row: _power(row["difference"]),
-    "with GTSAM's own Jacobians": lambda row: _power(row.get("with its own")),
-    "two poses, tree [ms]": lambda row: shown(row["tree"]),
-    "its difference": lambda row: _power(row.get("joint difference")),
+    "poses": told("poses"),
+    "all poses, ours [ms]": told("all", shown),
+    "GTSAM [ms]": told("gtsam", shown),
+    "times faster": told("ratio", shown),
+    "difference": told("difference", "{:.0e}".format),
+    "with GTSAM's own Jacobians": told("with its own", "{:.0e}".format),
+    "two poses, tree [ms]": told("tree", shown),
+    "its difference": told("joint difference", "{:.0e}".format),
 }
 
 
@@ -157,7 +158,3 @@ def render(result: Result) -> str:
         f"{result['rounds']} rounds, one where GTSAM takes longer than {SLOW:g} s."
     )
     return "\n\n".join([listing(("graph",), {(row["name"],): row for row in result["rows"]}, COLUMNS), notes])
-
-
-def _power(value: float | None) -> str:
-    return "-" if value is None else f"{value:.0e}"

@@ -65,9 +65,9 @@ def measured(speed: float, base: float, futures: str, seed: int) -> Row:
     )  # fmt: skip
     log = episode.run(silent)
     return {
-        "reached": all(log.reached), "touched": touched(log), "outcome": log.outcomes[-1],
+        "reached": all(log.reached), "touched": touched(log),
         "arrival": math.inf if way is None else (len(way) - 1) * CELL / s.speed,
-        "time": log.ticks * log.dt, "clearance": float(log.clearance.min()),
+        "time": log.ticks * log.dt,
         "reverse": float((log.control[:, 0] < -REST).mean()), "tick": float(np.percentile(log.solve_ms, 99.0)),
     }  # fmt: skip
 

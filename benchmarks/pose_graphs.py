@@ -12,7 +12,7 @@ import numpy as np
 
 import unifg as fg
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
-from benchmarks.report import listing, shared, words
+from benchmarks.report import listing, shared, told, words
 from benchmarks.section import Result, goal
 from benchmarks.timing import clock, interleave, milliseconds, ratio, shown, timed
 from problems.graphs import graph_with
@@ -109,7 +109,7 @@ def measure_case(case: Case, rounds: int) -> Result:
     best_whole = ""
     if available():
         peer = Peer(pose_graph)
-        candidates |= {ordering: partial(lambda by: peer.iterate(by, count)[0], ordering) for ordering in ORDERINGS}
+        candidates |= {ordering: partial(peer.iterate, ordering, count) for ordering in ORDERINGS}
         best_whole = min(ORDERINGS, key=lambda ordering: min(peer.solve(ordering)[0] for _ in range(2)))
         candidates["GTSAM, whole"] = lambda: _whole(peer, best_whole, ends)
     times = interleave(candidates, rounds)
@@ -201,39 +201,39 @@ def within(row: Result) -> str:
 Columns = dict[str, Callable[[Result], str]]
 
 ITERATIONS: Columns = {
-    "poses": lambda row: str(row["poses"]),
-    "edges": lambda row: str(row["edges"]),
-    "iterations": lambda row: str(row["iterations"]),
-    "ours [ms]": lambda row: shown(row["ours"]),
+    "poses": told("poses"),
+    "edges": told("edges"),
+    "iterations": told("iterations"),
+    "ours [ms]": told("ours", shown),
     "GTSAM, COLAMD [ms]": lambda row: shown(row.get("gtsam", {}).get("COLAMD")),
     "GTSAM, METIS [ms]": lambda row: shown(row.get("gtsam", {}).get("METIS")),
-    "times faster": lambda row: shown(row["ratio"]),
+    "times faster": told("ratio", shown),
     "target (floor)": lambda row: f"{row['target']:g} ({row['floor']:g})",
 }
 WHOLE: Columns = {
-    "ours [ms]": lambda row: shown(row["whole"]),
+    "ours [ms]": told("whole", shown),
     "iterations": lambda row: f"{row['iterations']}, {row['status']}",
-    "GTSAM [ms]": lambda row: shown(row.get("gtsam_whole")),
-    "ordering": lambda row: str(row.get("best_whole", "-")),
-    "its iterations": lambda row: str(row.get("gtsam_iterations", "-")),
-    "times faster": lambda row: shown(row.get("ratio_whole")),
-    "chi2, ours": lambda row: f"{row['chi2']:.7f}",
-    "chi2, GTSAM": lambda row: f"{row['gtsam_chi2']:.7f}" if "gtsam_chi2" in row else "-",
-    "best known": lambda row: f"{row['known']:.7f}" if row["known"] else "-",
+    "GTSAM [ms]": told("gtsam_whole", shown),
+    "ordering": told("best_whole"),
+    "its iterations": told("gtsam_iterations"),
+    "times faster": told("ratio_whole", shown),
+    "chi2, ours": told("chi2", "{:.7f}".format),
+    "chi2, GTSAM": told("gtsam_chi2", "{:.7f}".format),
+    "best known": told("known", "{:.7f}".format),
     "both within 1e-6": within,
 }
 
 
 FILED: Columns = {
-    "ours [ms]": lambda row: shown(row["ours"]),
-    "iterations": lambda row: str(row["iterations"]),
-    "GTSAM [ms]": lambda row: shown(row.get("gtsam")),
-    "ordering": lambda row: str(row.get("best", "-")),
-    "its iterations": lambda row: str(row.get("gtsam_iterations", "-")),
-    "times faster": lambda row: shown(row["ratio"]),
-    "target": lambda row: f"{row['target']:g}",
-    "chi2, ours": lambda row: f"{row['chi2']:.7f}",
-    "chi2, GTSAM": lambda row: f"{row['gtsam_chi2']:.7f}" if "gtsam_chi2" in row else "-",
+    "ours [ms]": told("ours", shown),
+    "iterations": told("iterations"),
+    "GTSAM [ms]": told("gtsam", shown),
+    "ordering": told("best"),
+    "its iterations": told("gtsam_iterations"),
+    "times faster": told("ratio", shown),
+    "target": told("target", "{:g}".format),
+    "chi2, ours": told("chi2", "{:.7f}".format),
+    "chi2, GTSAM": told("gtsam_chi2", "{:.7f}".format),
 }
 
 

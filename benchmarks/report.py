@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from unifg.scenarios.campaigns.markdown import table as table
 from unifg.scenarios.commands.host import processor
@@ -42,6 +42,11 @@ def listing(head: Sequence[str], groups: Mapping[Words, T], columns: Mapping[str
     """Table with a line for each group: the words that name it, then each column of it."""
     lines = ([*names, *(column(group) for column in columns.values())] for names, group in groups.items())
     return table([*head, *columns], lines, len(head))
+
+
+def told(name: str, how: Callable[[Any], str] = str) -> Callable[[Mapping[str, Any]], str]:
+    """Column of a measure of a row, in words; a dash where it has none."""
+    return lambda row: "-" if row.get(name) is None else how(row[name])
 
 
 def machine(codes: Iterable[str] = ()) -> str:

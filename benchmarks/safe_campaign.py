@@ -5,6 +5,7 @@ The study "campaign" flies random situations; the others are those of the paper'
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from itertools import product
 
@@ -66,11 +67,8 @@ def campaign(rows: list[Row]) -> str:
         lost = [row for row in found if not row["margin_kept"]]
         answers = [row["oracle"] for row in found]
         near = np.array([row["boundary"] for row in found])
-        counts: dict[str, int] = {}
-        for row in found:
-            for word, number in row["statuses"].items():
-                counts[word] = counts.get(word, 0) + number
-        ends = [f"{counts.get(word, 0)}" for word in ("last plan", "braking", "too near")]
+        counts = sum((Counter(row["statuses"]) for row in found), Counter[str]())
+        ends = [str(counts[word]) for word in ("last plan", "braking", "too near")]
         lines.append(
             [
                 case, str(len(found)), "/".join(str(answers.count(word)) for word in ("yes", "unknown", "no")),

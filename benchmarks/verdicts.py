@@ -9,14 +9,13 @@ know the two stretches at least eight times worse than the cluster does.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
-from benchmarks.comparison import Row, where
-from benchmarks.report import listing
+from benchmarks.comparison import Row, grouped, where
+from benchmarks.report import listing, told
 from benchmarks.runner import Cell, Study
 from benchmarks.wrong_closures import published
 from problems.closures import adrift, aliased, drive, slipped
@@ -83,7 +82,6 @@ def judged(graph: str, fault: str, seed: int) -> Row:
     planted = np.concatenate([np.zeros(0, dtype=np.intp), *faults])
     return {
         "found": all(np.isin(edges, named).mean() > 0.5 for edges in faults),
-        "contradicted": len(verdict.of("contradicted")),
         "right ones contradicted": sum(not np.isin(one.edges, planted).any() for one in verdict.of("contradicted")),
         "unsupported": len(verdict.of("unsupported")),
         "not so by construction": 0 if faults else not_so(pose_graph, clean(graph, seed)[1], verdict),
@@ -148,10 +146,7 @@ def cells(seeds: Sequence[int]) -> list[Cell]:
 
 def tables(rows: list[Row]) -> str:
     """Faults found, and times."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
-    for row in where(rows):
-        if row["fault"] != "time":
-            groups.setdefault((row["graph"], row["fault"]), []).append(row)
+    groups = grouped((row for row in where(rows) if row["fault"] != "time"), "graph", "fault")
     columns = {
         "named": lambda rows: f"{sum(r['found'] for r in rows)} of {len(rows)}" if rows[0]["fault"] != "none" else "",
         "right clusters contradicted": lambda rows: f"{sum(r['right ones contradicted'] for r in rows)}",
@@ -162,22 +157,18 @@ def tables(rows: list[Row]) -> str:
     }
     times = [row for row in rows if row["fault"] == "time" and "ratio" in row]
     parts = [name for name in times[0] if name.endswith("[ms]")] if times else []
-    spent: dict[str, Callable[[list[Row]], str]] = {
-        "poses": lambda rows: str(rows[0]["poses"]),
-        "cold solve [ms]": lambda rows: f"{1e3 * rows[0]['cold']:.0f}",
-        **{name: partial(_part, name) for name in parts},
-        "verdict, times a cold solve": lambda rows: f"{rows[0]['ratio']:.2f}",
+    spent = {
+        "poses": told("poses"),
+        "cold solve [ms]": told("cold", lambda seconds: f"{1e3 * seconds:.0f}"),
+        **{name: told(name) for name in parts},
+        "verdict, times a cold solve": told("ratio", "{:.2f}".format),
     }
     median = np.median([row["ratio"] for row in times]) if times else np.nan
     return (
         f"{listing(('graph', 'fault'), groups, columns)}\n\n"
-        f"{listing(('graph',), {(row['graph'],): [row] for row in times}, spent)}\n\n"
+        f"{listing(('graph',), {(row['graph'],): row for row in times}, spent)}\n\n"
         f"Median of the last column: {median:.2f}."
     )
-
-
-def _part(name: str, rows: list[Row]) -> str:
-    return str(rows[0][name])
 
 
 STUDY = Study(cells, judged, tables, range(100, 200), alone=lambda job: job["fault"] == "time")

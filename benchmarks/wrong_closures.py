@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 import unifg as fg
-from benchmarks.comparison import Row, where
+from benchmarks.comparison import Row, grouped, where
 from benchmarks.gtsam_peer import Peer, as_array, available
 from benchmarks.kept_rows import ROWS, keep, restore
 from benchmarks.report import OUT, listing, shared
@@ -76,20 +76,18 @@ def by_graduation(pose_graph: PoseGraph) -> Found:
     return Found(solution[x], solution.status.name)
 
 
-def by_scaling(pose_graph: PoseGraph) -> Found:
-    """Dynamic covariance scaling with the same bound, Gauss-Newton from the guess."""
-    graph, x, guess = pose_graph.graph(robust=fg.DCS(THRESHOLD[pose_graph.group.dim] ** 2 / 3.0))
-    return Found(GaussNewton().solve(graph, guess)[x])
-
-
-def by_weights(loss: Loss) -> Callable[[PoseGraph], Found]:
-    """A robust loss on the closures, Gauss-Newton from the guess."""
+def by_weights(loss: Callable[[float], Loss]) -> Callable[[PoseGraph], Found]:
+    """A robust loss of the threshold on the closures, Gauss-Newton from the guess."""
 
     def solve(pose_graph: PoseGraph) -> Found:
-        graph, x, guess = pose_graph.graph(robust=loss)
+        graph, x, guess = pose_graph.graph(robust=loss(THRESHOLD[pose_graph.group.dim]))
         return Found(GaussNewton().solve(graph, guess)[x])
 
     return solve
+
+
+by_scaling = by_weights(lambda threshold: fg.DCS(threshold**2 / 3.0))
+"""Dynamic covariance scaling with the same bound."""
 
 
 def by_consistency(after: Callable[[PoseGraph], Found]) -> Callable[[PoseGraph], Found]:
@@ -97,8 +95,7 @@ def by_consistency(after: Callable[[PoseGraph], Found]) -> Callable[[PoseGraph],
 
     def solve(pose_graph: PoseGraph) -> Found:
         found = after(replace(pose_graph, edges=pose_graph.edges[pairwise_consistent(pose_graph)]))
-        loss = fg.TruncatedLeastSquares(THRESHOLD[pose_graph.group.dim])
-        return by_weights(loss)(pose_graph.with_poses(found.poses))
+        return by_weights(fg.TruncatedLeastSquares)(pose_graph.with_poses(found.poses))
 
     return solve
 
@@ -108,8 +105,8 @@ METHODS: dict[str, Callable[[PoseGraph], Found]] = {
     "PCM + unifg": by_consistency(by_graduation),
     "PCM + DCS": by_consistency(by_scaling),
     "DCS": by_scaling,
-    "Tukey": by_weights(fg.Tukey(4.685)),
-    "Huber": by_weights(fg.Huber(1.345)),
+    "Tukey": by_weights(lambda _: fg.Tukey(4.685)),
+    "Huber": by_weights(lambda _: fg.Huber(1.345)),
     "GTSAM": by_gtsam,
 }
 
@@ -165,13 +162,6 @@ def published(name: str) -> PoseGraph:
     return read_g2o(path if path.is_file() else folder / f"{name}.g2o")
 
 
-COLUMNS: dict[str, Callable[[Row], str]] = {
-    "error [m]": lambda row: f"{row['distance']:.3f}",
-    "right kept": lambda row: f"{row['right kept']:.4f}",
-    "wrong kept": lambda row: f"{row['wrong kept']} of {row['wrong']}",
-    "precision": lambda row: f"{row['precision']:.4f}",
-    "CPU [s]": lambda row: f"{row['seconds']:.1f}",
-}
 NEAR = 0.05  # [m], an aligned error that calls an answer right
 
 
@@ -206,9 +196,8 @@ def cells(seeds: Sequence[int]) -> list[Cell]:
 def tables(rows: list[Row]) -> str:
     """Line per graph, share and method; the rows are kept."""
     keep(STORE, ARCHIVE)
-    groups: dict[tuple[str, ...], list[Row]] = {}
-    for row in where(rows):
-        groups.setdefault((row["graph"], f"{row['share']:.0%}", row["method"]), []).append(row)
+    found = grouped(where(rows), "graph", "share", "method")
+    groups = {(graph, f"{share:.0%}", method): some for (graph, share, method), some in found.items()}
     return listing(("graph", "wrong", "method"), groups, OVER_SEEDS)
 
 
