@@ -199,11 +199,9 @@ class Estimator:
         return cost - worth, path
 
 
-def offsets() -> Array:
-    """(25, 3) where hypotheses begin, in the axes of the believed start."""
-    side = 0.7 * np.arange(-2, 3)
-    grid = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
-    return np.column_stack([grid, np.zeros(len(grid))])
+SIDE = 0.7 * np.arange(-2.0, 3.0)
+OFFSETS = np.column_stack([*map(np.ravel, np.meshgrid(SIDE, SIDE)), np.zeros(len(SIDE) ** 2)])
+"""(25, 3) where hypotheses begin, in the axes of the believed start."""
 
 
 def explained(world: Orchard, scans: Scans, chance: float, clutter: float) -> dict[str, Array]:
@@ -213,8 +211,8 @@ def explained(world: Orchard, scans: Scans, chance: float, clutter: float) -> di
     also moves those that only graze one.
     """
     estimator = Estimator(world, scans, chance, clutter)
-    free = [estimator.hypothesis(offset, bodies=False) for offset in offsets()]
-    kept = [estimator.hypothesis(offset, bodies=True) for offset in offsets()]
+    free = [estimator.hypothesis(offset, bodies=False) for offset in OFFSETS]
+    kept = [estimator.hypothesis(offset, bodies=True) for offset in OFFSETS]
     possible = [found for found in free if gaps(found[1], world.pillars).min() > -SIGMA]
     chosen = {"sightings alone": free, "checked afterwards": possible or free, "in the graph": kept}
     return {name: min(some, key=lambda found: found[0])[1] for name, some in chosen.items()}

@@ -6,14 +6,16 @@ warm.
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from typing import TypeAlias
 
 import numpy as np
+import pandas as pd
 
 import unifg as fg
+from benchmarks.comparison import Row
 from benchmarks.report import listing, words
 from benchmarks.runner import Timing
 from benchmarks.timing import clocked
@@ -27,45 +29,22 @@ WARM = 100  # ticks that are flown and not counted
 SHORT = 40  # of how many ticks slow backends fly one
 AWAY = np.repeat([0.25, 0.2, 0.8], 3)  # standard deviations of cold starts from the reference [m, rad, m/s]
 MATTERS = 1e-3  # of a slack [m]
+Column: TypeAlias = "Callable[[pd.DataFrame], str]"
+"""A measure of the ticks of a flight or of cold starts."""
 KEPT = 1e-3  # violation of constraints up to which an iterate is a plan
 
 
-@dataclass
-class Flight:
-    """Record of the ticks of one flight, or of cold starts, which have no motion.
-
-    Attributes:
-        times: of the solves [ms].
-        iterations: of the solves.
-        statuses: numbers of solves by status.
-        without: ticks without a plan of their own.
-        clearance: at the ticks [m].
-        lost: of the barrier from tick to tick beyond its share [m].
-        slack: the most in the plan of a tick [m].
-        error: distance from the reference [m].
-    """
-
-    times: list[float] = field(default_factory=list)
-    iterations: list[int] = field(default_factory=list)
-    statuses: Counter[str] = field(default_factory=Counter)
-    without: int = 0
-    clearance: list[float] = field(default_factory=list)
-    lost: list[float] = field(default_factory=list)
-    slack: list[float] = field(default_factory=list)
-    error: list[float] = field(default_factory=list)
-
-    def add(self, case: GuardedFlight, solution: fg.Solution, milliseconds: float) -> None:
-        """Record a solve."""
-        self.times.append(milliseconds)
-        self.iterations.append(solution.iterations)
-        self.statuses[words(solution.status)] += 1
-        if case.kept is not None and case.kept.slack is not None:
-            self.slack.append(float(solution[case.kept.slack].max()))
+def record(case: GuardedFlight, solution: fg.Solution, seconds: float) -> Row:
+    """Time of a solve [ms], its iterations and status, and the most slack in its plan [m]."""
+    row: Row = {"ms": 1e3 * seconds, "iterations": solution.iterations, "status": words(solution.status)}
+    if case.kept is not None and case.kept.slack is not None:
+        row["slack"] = float(solution[case.kept.slack].max())
+    return row
 
 
-def fly(case: GuardedFlight, solver: fg.Solver, ticks: int) -> Flight:
-    """Fly for so many ticks; where a solve ends without a plan the last one is flown on, and the next begins there."""
-    run, seen = solver.prepare(case.graph), Flight()
+def fly(case: GuardedFlight, solver: fg.Solver, ticks: int) -> pd.DataFrame:
+    """Ticks of a flight; where a solve ends without a plan the last one is flown on, and the next begins there."""
+    run, rows = solver.prepare(case.graph), list[Row]()
     state, plan, age = START.copy(), cold(case), 0
     for tick in range(-WARM, ticks):
         now = (tick + WARM) * case.tick
@@ -77,12 +56,12 @@ def fly(case: GuardedFlight, solver: fg.Solver, ticks: int) -> Flight:
         state = quadrotor.fly(state, plan[case.u][interval], case.tick, VEHICLE, gust(now), substeps=2)
         after = case.clearance(state[None])[0]
         if tick >= 0:
-            seen.add(case, solution, 1e3 * taken)
-            seen.without += age > 0
-            seen.clearance.append(after)
-            seen.lost.append(np.exp(-case.alpha * case.tick) * before - after)
-            seen.error.append(float(np.linalg.norm(state[:3] - figure_eight(np.array([now + case.tick]))[0][0, :3])))
-    return seen
+            off = state[:3] - figure_eight(np.array([now + case.tick]))[0][0, :3]
+            rows.append(record(case, solution, taken) | {
+                "without": age > 0, "clearance": after, "lost": np.exp(-case.alpha * case.tick) * before - after,
+                "error": float(np.linalg.norm(off)),
+            })  # fmt: skip
+    return pd.DataFrame(rows)
 
 
 def cold(case: GuardedFlight) -> fg.Solution:
@@ -90,9 +69,9 @@ def cold(case: GuardedFlight) -> fg.Solution:
     return InteriorPoint(tolerance=TOLERANCE).solve(case.graph, case.guess(), data=case.data(START, 0.0))
 
 
-def flights(ticks: int) -> dict[tuple[str, str], Callable[[], Flight]]:
+def flights(ticks: int) -> dict[tuple[str, str], Callable[[], pd.DataFrame]]:
     """All of them."""
-    found: dict[tuple[str, str], Callable[[], Flight]] = {}
+    found: dict[tuple[str, str], Callable[[], pd.DataFrame]] = {}
     forms: dict[str, keeping.Form | None] = {
         "none": None, "hinge": "hinge", "hard": "hard", "slack, squared": "slack", "slack, exact": "exact slack",
     }  # fmt: skip
@@ -117,43 +96,50 @@ def flights(ticks: int) -> dict[tuple[str, str], Callable[[], Flight]]:
     return found
 
 
-def started(form: keeping.Form, weight: float | None, count: int) -> Flight:
-    """Solve from random states about the reference, some of them inside spheres, from the reference as a guess."""
-    case, rng, seen = GuardedFlight(form, weight=weight), np.random.default_rng(0), Flight()
+def started(form: keeping.Form, weight: float | None, count: int) -> pd.DataFrame:
+    """Solves from random states about the reference, some of them inside spheres, from the reference as a guess."""
+    case, rng, rows = GuardedFlight(form, weight=weight), np.random.default_rng(0), list[Row]()
     run = InteriorPoint(tolerance=TOLERANCE).prepare(case.graph)
-    for index in range(-1, count):
+    for _ in range(count + 1):
         now = float(rng.uniform(0.0, 2.0 * np.pi / PACE))
         states, controls = figure_eight(now + case.times)
         states[0] = quadrotor.STATE.retract(states[:1], AWAY * rng.normal(size=(1, 9)))[0]
         guess = {**case.guess(), case.x: states, case.u: controls[:-1]}
-        begin = time.thread_time()
-        solution = run.solve(guess, data=case.data(states[0], now))
-        if index >= 0:  # the first is to warm up
-            seen.add(case, solution, 1e3 * (time.thread_time() - begin))
-    return seen
+        rows.append(record(case, *clocked(run.solve, guess, data=case.data(states[0], now))))
+    return pd.DataFrame(rows[1:])  # the first is to warm up
 
 
-def worst(flight: Flight) -> str:
-    """Endings of the ticks that did not converge."""
-    ends = [f"{count} {name}" for name, count in flight.statuses.most_common() if name != "converged"]
+def worst(solves: pd.DataFrame) -> str:
+    """Endings of solves that did not converge."""
+    ends = [f"{count} {name}" for name, count in Counter(solves["status"]).most_common() if name != "converged"]
     return ", ".join(ends) or "none"
 
 
-COLUMNS: dict[str, Callable[[Flight], str]] = {
-    "ticks": lambda f: str(len(f.times)),
-    "median [ms]": lambda f: f"{np.median(f.times):.2f}",
-    "p99": lambda f: f"{np.percentile(f.times, 99.0):.2f}",
-    "p99.9": lambda f: f"{np.percentile(f.times, 99.9):.2f}",
-    "most": lambda f: f"{max(f.times):.2f}",
-    "below 10 ms": lambda f: f"{100.0 * np.mean(np.array(f.times) < 1e3 * LIMIT):.2f} %",
-    "iterations": lambda f: f"{np.mean(f.iterations):.1f}",
+def within(percent: float) -> Column:
+    """Time that so many of the solves keep [ms]."""
+    return lambda solves: f"{np.percentile(solves['ms'], percent):.2f}"
+
+
+def slack(of: Callable[[pd.Series[float]], str]) -> Column:
+    """Sentence on slacks, where there are some."""
+    return lambda solves: of(solves["slack"]) if "slack" in solves else "-"
+
+
+COLUMNS: dict[str, Column] = {
+    "ticks": lambda f: str(len(f)),
+    "median [ms]": within(50.0),
+    "p99": within(99.0),
+    "p99.9": within(99.9),
+    "most": within(100.0),
+    "below 10 ms": lambda f: f"{100.0 * (f['ms'] < 1e3 * LIMIT).mean():.2f} %",
+    "iterations": lambda f: f"{f['iterations'].mean():.1f}",
     "not converged": worst,
-    "without a plan": lambda f: str(f.without),
-    "least clearance [mm]": lambda f: f"{1e3 * min(f.clearance):.1f}",
-    "lost in a tick beyond its share [mm]": lambda f: f"{1e3 * max(0.0, *f.lost):.2f}",
-    "ticks with slack": lambda f: f"{np.sum(np.array(f.slack) > MATTERS)}" if f.slack else "-",
-    "most slack [mm]": lambda f: f"{1e3 * max(f.slack):.2f}" if f.slack else "-",
-    "error, mean [mm]": lambda f: f"{1e3 * np.mean(f.error):.1f}",
+    "without a plan": lambda f: str(f["without"].sum()),
+    "least clearance [mm]": lambda f: f"{1e3 * f['clearance'].min():.1f}",
+    "lost in a tick beyond its share [mm]": lambda f: f"{1e3 * max(0.0, *f['lost']):.2f}",
+    "ticks with slack": slack(lambda some: str((some > MATTERS).sum())),
+    "most slack [mm]": slack(lambda some: f"{1e3 * some.max():.2f}"),
+    "error, mean [mm]": lambda f: f"{1e3 * f['error'].mean():.1f}",
 }
 
 
@@ -163,14 +149,14 @@ COLD: dict[tuple[str, str], tuple[keeping.Form, float | None]] = {
     ("slack, squared", "1e8"): ("slack", 1e8), ("slack, exact", "1e3"): ("exact slack", 1e3),
     ("slack, exact", "1e4"): ("exact slack", None), ("slack, exact", "1e5"): ("exact slack", 1e5),
 }  # fmt: skip
-COLD_COLUMNS: dict[str, Callable[[Flight], str]] = {
-    "starts": lambda s: str(len(s.times)),
+COLD_COLUMNS: dict[str, Column] = {
+    "starts": lambda f: str(len(f)),
     "not converged": worst,
-    "iterations": lambda s: f"{np.mean(s.iterations):.1f}",
-    "median [ms]": lambda s: f"{np.median(s.times):.2f}",
-    "p90": lambda s: f"{np.percentile(s.times, 90.0):.2f}",
-    "most": lambda s: f"{max(s.times):.2f}",
-    "plans with slack": lambda s: f"{np.sum(np.array(s.slack) > MATTERS)}" if s.slack else "-",
+    "iterations": lambda f: f"{f['iterations'].mean():.1f}",
+    "median [ms]": within(50.0),
+    "p90": within(90.0),
+    "most": within(100.0),
+    "plans with slack": slack(lambda some: str((some > MATTERS).sum())),
 }
 
 

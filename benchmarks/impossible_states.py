@@ -30,7 +30,7 @@ def along_a_wall(seed: int, drives: int) -> dict[str, list[float]]:
     truth = np.column_stack([along, across, np.gradient(across, along)])
     moved = SE2.compose(SE2.inverse(truth[:-1]), truth[1:])
 
-    def stated(wall: bool, contact: bool) -> tuple[fg.Graph, fg.Family, Data, Data]:
+    def stated(solver: fg.Solver, wall: bool, contact: bool) -> tuple[fg.Prepared, fg.Family, Data, Data]:
         graph, x = graph_with(SE2, POSES)
         fixes = graph.data("fixes", truth[:, :2], each=True)
         steps = graph.data("steps", moved, each=True)
@@ -41,18 +41,14 @@ def along_a_wall(seed: int, drives: int) -> dict[str, list[float]]:
             graph.constrain(lambda pose: pose[:, 1:2] - RADIUS, x, lower=0.0, name="wall")
         if contact:
             graph.constrain(lambda pose: pose[:, 1:2] - RADIUS, x[int(touched)], lower=0.0, upper=0.0, name="contact")
-        return graph, x, fixes, steps
+        return solver.prepare(graph), x, fixes, steps
 
-    ways: dict[str, tuple[fg.Solver, bool, bool]] = {
-        "measurements": (GaussNewton(), False, False),
-        "and no way through the wall": (InteriorPoint(), True, False),
-        "and where it was touched": (InteriorPoint(), True, True),
+    prepared = {
+        "measurements": stated(GaussNewton(), False, False),
+        "and no way through the wall": stated(InteriorPoint(), True, False),
+        "and where it was touched": stated(InteriorPoint(), True, True),
     }
-    prepared = dict[str, tuple[fg.Prepared, fg.Family, Data, Data]]()
-    for name, (solver, wall, contact) in ways.items():
-        graph, x, fixes, steps = stated(wall, contact)
-        prepared[name] = (solver.prepare(graph), x, fixes, steps)
-    errors: dict[str, list[float]] = {name: [] for name in ways}
+    errors: dict[str, list[float]] = {name: [] for name in prepared}
     for _ in range(drives):
         fixed = truth[:, :2] + FIX * rng.standard_normal((POSES, 2))
         rolled = SE2.retract(moved, WHEELS * rng.standard_normal((POSES - 1, 3)))
@@ -73,20 +69,17 @@ def rolling(seed: int, drives: int) -> dict[str, list[float]]:
     def slower(v: Array, d: Array, after: Array) -> Array:
         return after - v * np.exp(-d * H)
 
-    def stated(known: bool) -> tuple[fg.Graph, fg.Family, fg.Family, Data]:
+    errors = dict[str, list[float]]()
+    noise = METER * rng.standard_normal((drives, SPEEDS, 1))
+    ways: dict[str, fg.Solver] = {"measurements": GaussNewton(), "and air does not push": InteriorPoint()}
+    for name, solver in ways.items():
         graph, v, d = graph_of(("v", fg.Rn(1), SPEEDS), ("d", fg.Rn(1), 1))
         measured = graph.data("measured", speeds[:, None], each=True)
         graph.minimize(fg.prior, v, measured, sigma=METER, name="meter")
         graph.minimize(slower, v[:-1], d, v[1:], sigma=0.02, name="rolling")
-        if known:
+        if name != "measurements":
             graph.bound(d, lower=0.0)
-        return graph, v, d, measured
-
-    errors = dict[str, list[float]]()
-    noise = METER * rng.standard_normal((drives, SPEEDS, 1))
-    for name, known in (("measurements", False), ("and air does not push", True)):
-        graph, v, d, measured = stated(known)
-        run = (InteriorPoint() if known else GaussNewton()).prepare(graph)
+        run = solver.prepare(graph)
         guess = {v: speeds[:, None], d: np.array([[0.01]])}
         found = [run.solve(guess, data={measured: speeds[:, None] + some})[d][0, 0] for some in noise]
         errors[name] = [float(10.0 * abs(value - drag)) for value in found]

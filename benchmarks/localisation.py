@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from functools import cache
 from typing import TypeAlias
 from unittest import mock
 
@@ -173,18 +172,6 @@ def measure(seed: int) -> Row:
 # ---------------------------------------------------------------- the real log
 
 
-@cache
-def log_of_the_lab() -> tuple[Array, Array, Array] | None:
-    """Angles (B,), ranges (n, B) [m] and corrected poses (n, 3), if the log is here."""
-    folder = shared("lidar")
-    path = folder and folder / LOG
-    if not path or not path.is_file():
-        return None
-    scans = read_carmen(path).scans[0]
-    ranges = np.where(scans.ranges >= min(scans.maximum, 79.0), np.inf, scans.ranges)
-    return scans.angles, ranges, scans.pose
-
-
 def real_ticks(angles: Array, ranges: Array, poses: Array, rng: np.random.Generator) -> list[Tick]:
     """Scans with the motion between their corrected poses: a turn, a way and a turn, of which only the last has a scan.
 
@@ -208,10 +195,13 @@ def real_ticks(angles: Array, ranges: Array, poses: Array, rng: np.random.Genera
 
 def real_log() -> Row:
     """Every second scan makes the map, the others are localised on it."""
-    found = log_of_the_lab()
-    if found is None:
+    folder = shared("lidar")
+    path = folder and folder / LOG
+    if not path or not path.is_file():
         return {}
-    angles, ranges, poses = found
+    scans = read_carmen(path).scans[0]
+    angles, poses = scans.angles, scans.pose
+    ranges = np.where(scans.ranges >= min(scans.maximum, 79.0), np.inf, scans.ranges)
     occupancy = mapped(angles, ranges[::2], poses[::2])
     ticks = real_ticks(angles, ranges[1::2], poses[1::2], np.random.default_rng(5))
     sigma = np.array(INITIAL_SIGMA)

@@ -15,7 +15,6 @@ from functools import cache
 import numpy as np
 import pandas as pd
 
-import unifg as fg
 from benchmarks.comparison import Row
 from benchmarks.report import table
 from benchmarks.runner import Study, every
@@ -24,7 +23,7 @@ from problems.control import Stated, Unicycle
 from unifg.models import obstacles
 from unifg.models.potential import Sense, potential
 from unifg.solution.status import Status
-from unifg.solvers.names import backends
+from unifg.solvers.names import backend as named
 from unifg.typing import Array
 
 HORIZON = 50
@@ -34,6 +33,7 @@ GAP = 0.5  # least distance between the surfaces of two discs [m]; the robot is 
 CONTACT = 1e-3  # a node deeper than this in a disc is a collision [m]
 NEAR_END = 0.2  # a robot that ends closer than this to the end of the line has reached it [m]
 TOLERANCE = 1e-4  # of the KKT test: the acceptance of the reference problems
+PUSH = 0.2  # standard deviation of the potential's error
 TUNING = range(1000, 1020)
 BACKENDS = ("alm", "sqp")
 
@@ -87,7 +87,6 @@ class Method:
     Attributes:
         name: for the tables.
         hard: clearance as a constraint; otherwise a potential on the distance to the hull.
-        sigma: of the potential's error.
         vortex: weight of the tangent vector.
         sense: its sense.
         search: iterations with it.
@@ -95,7 +94,6 @@ class Method:
 
     name: str
     hard: bool = False
-    sigma: float = 0.2
     vortex: float = 0.0
     sense: Sense = "circulate"
     search: int = 0
@@ -106,7 +104,7 @@ class Method:
         stated, discs = field.formulation(), field.discs
         if not self.hard:
             push = potential(obstacles.disc_clearance, vortex=self.vortex, sense=self.sense)
-            stated.graph.minimize(push, stated.x[1:], discs[:, :2], discs[:, 2], sigma=self.sigma, name="discs")
+            stated.graph.minimize(push, stated.x[1:], discs[:, :2], discs[:, 2], sigma=PUSH, name="discs")
         return field, stated
 
 
@@ -119,20 +117,16 @@ METHODS = (
 )
 
 
-def solvers(search: int) -> dict[str, fg.Solver]:
-    """Both constrained backends at the tolerance of the reference problems."""
-    return backends("alm", "sqp", tolerance=TOLERANCE, search_iterations=search)
-
-
 def measure(seed: int, method: int, backend: str) -> Row:
     """Solve one field cold; the cost is that of tracking and effort, without the potential."""
     way = METHODS[method]
     field, stated = way.stated(seed)
-    run = solvers(way.search)[backend].prepare(stated.graph)
+    made = named(backend, tolerance=TOLERANCE, search_iterations=way.search)
+    run = made.prepare(stated.graph)
     solution, seconds = clocked(run.solve, stated.guess)
     states, (reference, _) = solution[stated.x], field.reference()
     error = potential(obstacles.disc_clearance)(states[1:], field.discs[:, :2], field.discs[:, 2])
-    pushed = 0.0 if way.hard else 0.5 * float((error**2).sum()) / way.sigma**2
+    pushed = 0.0 if way.hard else 0.5 * float((error**2).sum()) / PUSH**2
     given = 0.5 * float(field.stage @ field.error(states[0], reference[0]) ** 2)  # of the first pose, which is fixed
     return {
         "solved": solution.converged,

@@ -102,8 +102,8 @@ def quadrotor_dynamics(x: Array, u: Array, after: Array, parameters: Array, dt: 
 # ---------------------------------------------------------------- ways
 
 
-def _residuals(way: str, **functions: tuple[Any, Any, int]) -> dict[str, Any]:
-    """Class attributes of a graph: for each name the NumPy function, the one of one factor, and its rows."""
+def _residuals(way: str, functions: dict[str, tuple[Any, Any, int]]) -> dict[str, Any]:
+    """Class attributes of a graph."""
     if way == "shipped":
         return {}
     if way == "njit":
@@ -112,26 +112,22 @@ def _residuals(way: str, **functions: tuple[Any, Any, int]) -> dict[str, Any]:
     return {name: fg.residual(batched, derivatives=forced) for name, (batched, _, _) in functions.items()}
 
 
-def _made(kind: type[Any], functions: dict[str, Any], problem: Problem) -> Stated:
-    graph: Stated = type("Own", (kind,), functions)(problem)
-    return graph
+OWN: dict[type[Problem], tuple[type[Stated], dict[str, tuple[Any, Any, int]]]] = {
+    Quadrotor: (QuadrotorGraph, {"dynamics": (quadrotor_dynamics, None, 9)}),
+    CartPole: (CartPoleGraph, {"dynamics": (cart_pole_dynamics, cart_pole_dynamics_of_one, 4)}),
+    Unicycle: (UnicycleGraph, {
+        "tracking": (tracking, tracking_of_one, 3), "dynamics": (dynamics, dynamics_of_one, 3),
+        "clearance": (clearance, None, 0),
+    }),
+}  # fmt: skip
+"""Graph of each robot and, by attribute, the NumPy function, the one of one factor, and its rows."""
 
 
 def stated(problem: Problem, way: str) -> Stated:
     """A problem with its functions stated in one of the ways of :data:`NAMES`."""
-    if isinstance(problem, Quadrotor):
-        functions = _residuals(way, dynamics=(quadrotor_dynamics, None, 9))
-        return _made(QuadrotorGraph, functions, problem)
-    if isinstance(problem, CartPole):
-        functions = _residuals(way, dynamics=(cart_pole_dynamics, cart_pole_dynamics_of_one, 4))
-        return _made(CartPoleGraph, functions, problem)
-    functions = _residuals(
-        way,
-        tracking=(tracking, tracking_of_one, 3),
-        dynamics=(dynamics, dynamics_of_one, 3),
-        clearance=(clearance, None, 0),
-    )
-    return _made(UnicycleGraph, functions, problem)
+    kind, functions = next(own for robot, own in OWN.items() if isinstance(problem, robot))
+    graph: Stated = type("Own", (kind,), _residuals(way, functions))(problem)
+    return graph
 
 
 def problems() -> dict[str, Problem]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Any
@@ -36,46 +36,34 @@ WARMING_UP = 5  # ticks whose times do not count
 SECONDS = 6.0  # of each flight
 
 
-@dataclass(frozen=True)
-class Job:
-    """The beginning of one flight; the fields after the first two are what is varied."""
-
-    seed: int
-    coupling: str = "joint"
-    solver: str = "ipm"
-    weight: float = 1.0
-    pull: float = 0.5
-    avoidance: Avoidance = "clearance"
+PLAIN: Cell = {"coupling": "joint", "solver": "ipm", "weight": 1.0, "pull": 0.5, "avoidance": "clearance"}
+"""Beginning of a flight of which everything but the seed is varied."""
 
 
 def jobs_of(seeds: Sequence[int]) -> list[Cell]:
     """All variants on some seeds."""
-    jobs = []
-    for seed in seeds:
-        plain = Job(seed)
-        ta = replace(plain, avoidance="potential")
-        jobs += [replace(job, coupling="sequential") for job in (plain, ta)]
-        jobs += [replace(plain, weight=weight, pull=pull) for pull, weight in product(PULLS, WEIGHTS)]
-        jobs += [replace(ta, pull=pull) for pull in PULLS]
-        jobs += [replace(plain, solver=solver) for solver in SOLVERS if solver != plain.solver]
-    return list(map(vars, jobs))
+    changes: list[Cell] = [{"coupling": "sequential"}, {"coupling": "sequential", "avoidance": "potential"}]
+    changes += [{"weight": weight, "pull": pull} for pull, weight in product(PULLS, WEIGHTS)]
+    changes += [{"pull": pull, "avoidance": "potential"} for pull in PULLS]
+    changes += [{"solver": solver} for solver in SOLVERS if solver != PLAIN["solver"]]
+    return [{"seed": seed, **PLAIN, **change} for seed in seeds for change in changes]
 
 
-def flight_of(job: Job) -> Flight:
+def flight_of(seed: int, coupling: str, solver: str, weight: float, pull: float, avoidance: Avoidance) -> Flight:
     """World and pilot."""
-    plain = FlightSettings(job.solver, job.coupling, job.seed)
-    controller = replace(plain.controller, control_weight=job.weight, avoidance=job.avoidance)
+    plain = FlightSettings(solver, coupling, seed)
+    controller = replace(plain.controller, control_weight=weight, avoidance=avoidance)
     flight = Flight(replace(plain, controller=controller))
-    if job.coupling == "joint":
+    if coupling == "joint":
         found, believed = flight.conditions, flight.pilot.belief.state
         common = (found.layout, believed, found.nominal, plain.estimator, controller)
-        flight.pilot = make_pilot("joint", job.solver, *common, JointSettings(job.pull))
+        flight.pilot = make_pilot("joint", solver, *common, JointSettings(pull))
     return flight
 
 
 def fly(**cell: Any) -> Row:
     """Fly for some seconds and measure, at every tick, the pull and the errors."""
-    flight = flight_of(Job(**cell))
+    flight = flight_of(**cell)
     world, pilot, dt = flight.world, flight.pilot, flight.settings.controller.dt
     control: Array | None = None
     ticks: list[dict[str, float]] = []
@@ -85,8 +73,8 @@ def fly(**cell: Any) -> Row:
         reading = world.sense()
         plan, spent = clocked(pilot.tick, reading, control, by=time.process_time)
         belief = pilot.belief
-        alone = pilot.alone
-        ticks.append({**pulled(belief, alone), **errors(belief, world.state, flight, cylinders), "tick": 1e3 * spent})
+        off = errors(belief, world.state, flight, cylinders)
+        ticks.append({**pulled(belief, pilot.alone), **off, "tick": 1e3 * spent})
         emergencies += plan.emergency
         control = plan.controls[0]
         world.step(control, dt)
@@ -200,10 +188,9 @@ def bound(pull: float) -> str:
 
 def render(rows: list[Row]) -> str:
     """Markdown of all variants."""
-    plain = {"coupling": "joint", "solver": "ipm", "weight": 1.0, "pull": 0.5, "avoidance": "clearance"}
 
     def of(**changes: object) -> list[Row]:
-        return where(rows, **(plain | changes))
+        return where(rows, **{**PLAIN, **changes})
 
     base, start = of(coupling="sequential"), of(coupling="sequential", avoidance="potential")
     sweep: Groups = {

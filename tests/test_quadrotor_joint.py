@@ -6,7 +6,7 @@ One window, filled by a flight, serves most tests: several controllers solve it,
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -318,9 +318,9 @@ def test_the_window_goes_on_from_the_past_alone() -> None:
 def test_the_pull_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two short flights of the benchmark: without a bound, and with so small a weight that nothing pulls."""
     monkeypatch.setattr(quadrotor_pull, "SECONDS", 0.5)
-    strong = quadrotor_pull.Job(SEED, weight=10.0, pull=np.inf)
-    weak = replace(strong, weight=1e-6)
-    rows = {job.weight: {**asdict(job), **quadrotor_pull.fly(**asdict(job))} for job in (strong, weak)}
+    strong = {"seed": SEED, **quadrotor_pull.PLAIN, "weight": 10.0, "pull": np.inf}
+    weak = {**strong, "weight": 1e-6}
+    rows = {job["weight"]: {**job, **quadrotor_pull.fly(**job)} for job in (strong, weak)}
     assert rows[10.0]["mean"]["sigma"] > 0.5 > 1e-2 > rows[1e-6]["max"]["sigma"]
     groups: quadrotor_pull.Groups = {(str(weight),): [row] for weight, row in rows.items()}
     for text in (quadrotor_pull.pull_table(groups, ["weight"]), quadrotor_pull.error_table(groups, ["weight"])):

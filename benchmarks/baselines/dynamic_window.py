@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.baselines.shared import GoalTurn, rollouts, to_reference
+from benchmarks.baselines.shared import AtGoal, rollouts, to_reference
 from unifg.scenarios.ground.local_planner import PlannerContext, Situation
 from unifg.typing import Array, BoolArray
 
@@ -55,7 +55,7 @@ class WindowSettings:
     decay: float = 3.0
 
 
-class DynamicWindow:
+class DynamicWindow(AtGoal):
     """Cheapest of many velocities.
 
     Attributes:
@@ -66,14 +66,11 @@ class DynamicWindow:
 
     def __init__(self, context: PlannerContext, numbers: WindowSettings | None = None) -> None:
         """Construct for a map; without ``numbers`` with the published ones."""
-        self.settings, self.numbers = context.settings, numbers or WindowSettings()
-        self.iterations, self._at_goal = 1, GoalTurn()
+        super().__init__(context)
+        self.numbers = numbers or WindowSettings()
 
-    def control(self, now: Situation) -> Array | None:
-        """The cheapest admissible velocity; a turn at the goal."""
-        turn = self._at_goal.control(now)
-        if turn is not None:
-            return turn
+    def drive(self, now: Situation) -> Array | None:
+        """The cheapest admissible velocity."""
         tried = self.window(now)
         steps = round(self.numbers.horizon / self.numbers.step)
         states = rollouts(now.pose, np.tile(tried[:, None], (1, steps, 1)), self.numbers.step)
@@ -86,10 +83,6 @@ class DynamicWindow:
         self.iterations = len(tried)
         best: Array = tried[np.argmin(cost)][None]
         return best
-
-    def forget(self) -> None:
-        """Leave the turn at a goal."""
-        self._at_goal.forget()
 
     def window(self, now: Situation) -> Array:
         """(M, 2) velocities that the robot can have after this tick (eq. 13)."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.baselines.shared import GoalTurn, turn_on_spot
+from benchmarks.baselines.shared import AtGoal, turn_on_spot
 from unifg.models import unicycle
 from unifg.scenarios.ground.local_planner import PlannerContext, Situation
 from unifg.typing import Array
@@ -47,7 +47,7 @@ class PursuitSettings:
     foresight: float = 1.0
 
 
-class PurePursuit:
+class PurePursuit(AtGoal):
     """Arcs to a carrot on the path.
 
     Attributes:
@@ -58,14 +58,11 @@ class PurePursuit:
 
     def __init__(self, context: PlannerContext, numbers: PursuitSettings | None = None) -> None:
         """Construct for a map; without ``numbers`` with the published ones."""
-        self.settings, self.numbers = context.settings, numbers or PursuitSettings()
-        self.iterations, self._at_goal = 1, GoalTurn()
+        super().__init__(context)
+        self.numbers = numbers or PursuitSettings()
 
-    def control(self, now: Situation) -> Array | None:
+    def drive(self, now: Situation) -> Array | None:
         """An arc to the carrot, a turn towards it, or a stop."""
-        turn = self._at_goal.control(now)
-        if turn is not None:
-            return turn
         carrot = self.carrot(now)
         offset = carrot[:2] - now.pose[:2]
         distance = float(np.hypot(*offset))
@@ -77,10 +74,6 @@ class PurePursuit:
         speed = self.speed(now, curvature)
         control = np.array([[speed, np.clip(speed * curvature, *(side[1] for side in self.settings.box))]])
         return control if self.free(now, control[0], distance) else None
-
-    def forget(self) -> None:
-        """Leave the turn at a goal."""
-        self._at_goal.forget()
 
     def carrot(self, now: Situation) -> Array:
         """(3,) pose of the path at the present look-ahead distance from the robot, its end if that is nearer."""

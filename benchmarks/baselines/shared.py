@@ -2,39 +2,49 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 import numpy as np
 
 from unifg.lie import wrap_angle
 from unifg.scenarios.ground.drive_settings import ControllerSettings
-from unifg.scenarios.ground.local_planner import Situation
+from unifg.scenarios.ground.local_planner import PlannerContext, Situation
 from unifg.typing import Array
 
-__all__ = ["GoalTurn", "rollouts", "to_reference", "turn_on_spot"]
+__all__ = ["AtGoal", "rollouts", "to_reference", "turn_on_spot"]
 
 AT_GOAL = 0.05  # [m]; from here on a planner that cannot reach a pose in one motion turns on the spot
 OFF_GOAL = 0.1  # [m]; a robot that has slid so far away drives again
 TURNED = 0.02  # [rad]
 
 
-class GoalTurn:
-    """Turn on the spot where the goal has been reached but for its heading."""
+class AtGoal(ABC):
+    """A planner that turns on the spot where the goal has been reached but for its heading.
 
-    def __init__(self) -> None:
+    Attributes:
+        settings: limits of the robot.
+        iterations: of the last tick.
+    """
+
+    def __init__(self, context: PlannerContext) -> None:
         """Begin away from the goal."""
-        self._turning = False
+        self.settings, self.iterations, self._turning = context.settings, 1, False
 
     def control(self, now: Situation) -> Array | None:
-        """(1, 2) a turn towards the heading of the goal [m/s, rad/s]; None away from the goal."""
+        """(1, 2) a turn towards the heading of the goal [m/s, rad/s]; what is driven away from the goal."""
         goal = now.goal
-        if goal is None:
-            self._turning = False
-            return None
-        away = float(np.hypot(*(goal - now.pose)[:2]))
+        away = np.inf if goal is None else float(np.hypot(*(goal - now.pose)[:2]))
         self._turning = away < (OFF_GOAL if self._turning else AT_GOAL)
-        return turn_on_spot(float(wrap_angle(goal[2] - now.pose[2])), now.settings) if self._turning else None
+        if goal is None or not self._turning:
+            return self.drive(now)
+        return turn_on_spot(float(wrap_angle(goal[2] - now.pose[2])), now.settings)
+
+    @abstractmethod
+    def drive(self, now: Situation) -> Array | None:
+        """Controls away from the goal."""
 
     def forget(self) -> None:
-        """Begin anew."""
+        """Leave the turn at a goal."""
         self._turning = False
 
 
