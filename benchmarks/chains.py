@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import listing, told, words
+from benchmarks.report import Columns, listing, told, words
 from benchmarks.section import Result, goal
 from benchmarks.timing import interleave, milliseconds, shown, timed
 from problems.control import Unicycle
@@ -82,7 +82,7 @@ def _repeat(run: fg.Prepared, guess: fg.Guess, times: int) -> None:
         run.solve(guess)
 
 
-COLUMNS: dict[str, Callable[[Result], str]] = {
+COLUMNS: Columns[Result] = {
     "unknowns": told("unknowns"),
     "iterations": lambda row: f"{row['iterations']}, {row['status']}",
     "iteration [ms]": told("ms", shown),

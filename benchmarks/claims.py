@@ -7,14 +7,14 @@ the answer of every backend (tests/exact_judge.py). Needs casadi.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import TypeAlias
 
 import numpy as np
 
-from benchmarks.comparison import Row, middle
-from benchmarks.report import listing
+from benchmarks.comparison import Row, counted, middle
+from benchmarks.report import Columns, listing
 from benchmarks.runner import Cell, Study
 from exact_judge import AGREED, Answer, Judge, Peer, answer, disagreement
 from problems.twins import KINDS
@@ -71,14 +71,14 @@ def summary(cases: list[Case], names: Iterable[str]) -> str:
         both = np.array([a.cost / case.ipopt.cost - 1.0 for case, a in solved(mine) if case.ipopt.solved])
         return f"{(both < -SAME).sum()} / {(abs(both) <= SAME).sum()} / {(both > SAME).sum()}"
 
-    columns: dict[str, Callable[[Mine], str]] = {
+    columns: Columns[Mine] = {
         "converged": lambda mine: f"{len(solved(mine))} / {len(mine)}",
-        "degenerate": lambda mine: str(sum(a.status == "DEGENERATE" for _, a in mine)),
-        "false": lambda mine: str(sum(a.claim == "false" for _, a in solved(mine))),
+        "degenerate": counted(lambda _, a: a.status == "DEGENERATE"),
+        "false": counted(lambda _, a: a.status == "CONVERGED" and a.claim == "false"),
         "largest exact KKT number": worst,
         "infeasible: true / saddle / false": dead,
-        "lost to IPOPT": lambda mine: str(sum(case.ipopt.solved and a.status != "CONVERGED" for case, a in mine)),
-        "IPOPT lost": lambda mine: str(sum(not case.ipopt.solved for case, _ in solved(mine))),
+        "lost to IPOPT": counted(lambda case, a: case.ipopt.solved and a.status != "CONVERGED"),
+        "IPOPT lost": counted(lambda case, a: a.status == "CONVERGED" and not case.ipopt.solved),
         "cost below / at / above IPOPT's": beside,
         "iterations": lambda mine: middle([a.iterations for _, a in solved(mine)]),
         "CPU [s]": lambda mine: f"{np.median([a.seconds for _, a in mine]):.2f}",

@@ -11,7 +11,7 @@ import numpy as np
 import unifg as fg
 from benchmarks import compiled_peers
 from benchmarks.casadi_peer import available
-from benchmarks.report import listing, words
+from benchmarks.report import Columns, listing, words
 from benchmarks.timing import clocked, interleave, number
 from problems.control import Problem
 from unifg.typing import Array
@@ -156,7 +156,7 @@ def summary(results: Results, counted: Mapping[str, Callable[[Outcome], bool]]) 
     def share(right: Callable[[Outcome], bool]) -> Callable[[list[Outcome]], str]:
         return lambda mine: f"{sum(map(right, mine))} / {len(mine)}"
 
-    columns: dict[str, Callable[[list[Outcome]], str]] = {
+    columns: Columns[list[Outcome]] = {
         **{title: share(right) for title, right in counted.items()},
         "iterations in all": lambda mine: str(sum(outcome.iterations for outcome in mine)),
         "median [ms]": lambda mine: number(float(np.median([outcome.median for outcome in mine]))),

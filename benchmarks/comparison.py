@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import reduce
+from itertools import starmap
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -63,6 +65,26 @@ def bracketed(differences: Array) -> str:
 def mean(name: str, scale: float = 1.0) -> Callable[[Sequence[Row]], str]:
     """Mean of a measure of rows."""
     return lambda rows: f"{scale * np.mean([row[name] for row in rows]):.1f}"
+
+
+def total(name: str) -> Callable[[Sequence[Row]], str]:
+    """Sum of a measure of rows."""
+    return lambda rows: str(sum(row[name] for row in rows))
+
+
+def counted(test: Callable[..., bool]) -> Callable[[Sequence[tuple[Any, ...]]], str]:
+    """Number of pairs of which something holds."""
+    return lambda pairs: str(sum(starmap(test, pairs)))
+
+
+def metric(scale: float, *path: str) -> Read:
+    """A measure among the metrics of a row, by its names from the outermost on."""
+
+    def read(row: Row) -> float | None:
+        value: Any = reduce(lambda found, name: (found or {}).get(name), path, row["metrics"])
+        return None if value is None else scale * value
+
+    return read
 
 
 def middle(values: Sequence[float], places: int = 0) -> str:

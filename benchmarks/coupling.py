@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import product
 
-from benchmarks.comparison import Read, Row, comparison, where
+from benchmarks.comparison import Read, Row, comparison, metric, where
 from benchmarks.navigation import DEPARTMENT, Case, drive
 from benchmarks.runner import Cell, Study
 
@@ -29,14 +29,14 @@ ROUTES = {
 }
 
 MEASURES: dict[str, Read] = {
-    "localisation, mean [mm]": lambda row: 1e3 * row["metrics"]["localisation_error_m"]["mean"],
-    "localisation, max [mm]": lambda row: 1e3 * row["metrics"]["localisation_error_m"]["max"],
-    "heading, mean [mrad]": lambda row: 1e3 * row["metrics"]["localisation_error_rad"]["mean"],
-    "collisions": lambda row: float(row["metrics"]["collisions"]),
-    "duration [s]": lambda row: row["metrics"]["duration_s"],
-    "least clearance [mm]": lambda row: 1e3 * row["metrics"]["min_clearance_m"],
-    "localise + plan, median [ms]": lambda row: row["metrics"]["solve_ms"]["p50"],
-    "localise + plan, p99 [ms]": lambda row: row["metrics"]["solve_ms"]["p99"],
+    "localisation, mean [mm]": metric(1e3, "localisation_error_m", "mean"),
+    "localisation, max [mm]": metric(1e3, "localisation_error_m", "max"),
+    "heading, mean [mrad]": metric(1e3, "localisation_error_rad", "mean"),
+    "collisions": metric(1.0, "collisions"),
+    "duration [s]": metric(1.0, "duration_s"),
+    "least clearance [mm]": metric(1e3, "min_clearance_m"),
+    "localise + plan, median [ms]": metric(1.0, "solve_ms", "p50"),
+    "localise + plan, p99 [ms]": metric(1.0, "solve_ms", "p99"),
 }
 
 

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 import unifg as fg
-from benchmarks.report import listing, table
+from benchmarks.report import Columns, listing, table
 from benchmarks.runner import Timing
 from benchmarks.timing import number
 from problems.known import ecg2o_inequality
@@ -79,7 +79,7 @@ def iterations_by_length() -> str:
     def of(solver: fg.Solver) -> Callable[[int], str]:
         return lambda n: steps(solver, drive(n))
 
-    columns: dict[str, Callable[[int], str]] = {
+    columns: Columns[int] = {
         "costs alone": lambda n: steps(FREE, drive(n, constrained=False)),
         "KKT, linear drag, step rule": lambda n: steps(RULE, drive(n, "linear")),
         "KKT, step rule": of(RULE),

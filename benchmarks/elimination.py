@@ -7,10 +7,9 @@ kept in docs/benchmarks.json, from which the tables are made.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 
 from benchmarks import chains, marginals, pose_graphs, two_threads
-from benchmarks.report import CHECKOUT, listing
+from benchmarks.report import CHECKOUT, Columns, listing
 from benchmarks.runner import Timing
 from benchmarks.section import Result, Section, met
 from benchmarks.timing import number, shown
@@ -22,7 +21,7 @@ SECTIONS = {
     "chains": Section("Chains of control", chains.measure, chains.render),
     "marginals": Section("Marginal covariances", marginals.measure, marginals.render),
 }
-GOAL: dict[str, Callable[[Result], str]] = {
+GOAL: Columns[Result] = {
     "median (bounds)": lambda goal: _value(goal["value"]),
     "target": lambda goal: _value(goal["target"]) + ("" if goal["floor"] is None else f" (floor {goal['floor']:g})"),
     "met": lambda goal: (

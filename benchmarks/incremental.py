@@ -17,7 +17,7 @@ import numpy as np
 
 import unifg as fg
 from benchmarks.gtsam_peer import as_array, available
-from benchmarks.report import listing, shared
+from benchmarks.report import Columns, listing, shared
 from benchmarks.runner import Timing
 from benchmarks.timing import clock, interleave
 from unifg.files.g2o import read_g2o
@@ -45,86 +45,83 @@ class Run(NamedTuple):
     quality: float
 
 
-class Fed(NamedTuple):
-    """A smoother that is fed one pose at a time.
+class Fed:
+    """`Incremental` or `FixedLag`, fed one pose at a time."""
 
-    Attributes:
-        guess: predicts pose k, given its odometry (of the first its value).
-        state: states the edges that end at pose k.
-        update: takes in what was stated.
-        poses: (2, 3) estimates of two poses.
-        cost: 1/2 chi2 of everything stated.
-    """
+    def __init__(self, smoother: Any) -> None:
+        """Begin without poses."""
+        self.smoother, self.x, self.new = smoother, smoother.variables("x", fg.SE2), np.zeros(3)
 
-    guess: Callable[[int, Array], None]
-    state: Callable[[int, Edges], None]
-    update: Callable[[], None]
-    poses: Callable[[int, int], Array]
-    cost: Callable[[], float]
+    def guess(self, k: int, pose: Array) -> None:
+        """Predict pose k, given its odometry (of the first its value)."""
+        self.new = pose if k == 0 else fg.SE2.compose(self.smoother.estimate(self.x[-1])[0], pose)
 
-
-def fed(smoother: Any) -> Fed:
-    """`Incremental` or `FixedLag`."""
-    x = smoother.variables("x", fg.SE2)
-    guess: Array = np.zeros(3)
-
-    def predict(k: int, pose: Array) -> None:
-        nonlocal guess
-        guess = pose if k == 0 else fg.SE2.compose(smoother.estimate(x[-1])[0], pose)
-
-    def state(k: int, edges: Edges) -> None:
+    def state(self, k: int, edges: Edges) -> None:
+        """State the edges that end at pose k."""
         if k == 0:
-            smoother.minimize(fg.prior, x[0], guess, sigma=1e-3)
+            self.smoother.minimize(fg.prior, self.x[0], self.new, sigma=1e-3)
         for i, j, measured, information in zip(*_fields(edges), strict=True):
-            smoother.minimize(fg.between, x[i], x[j], measured, information=information)
+            self.smoother.minimize(fg.between, self.x[i], self.x[j], measured, information=information)
 
-    def update() -> None:
-        smoother.update({x: guess})
+    def update(self) -> None:
+        """Take in what was stated."""
+        self.smoother.update({self.x: self.new})
 
-    return Fed(
-        predict, state, update, lambda *ends: np.asarray(smoother.estimate(x[[*ends]])), lambda: float(smoother.cost)
-    )
+    def poses(self, first: int, last: int) -> Array:
+        """(2, 3) estimates of two poses."""
+        return np.asarray(self.smoother.estimate(self.x[[first, last]]))
+
+    @property
+    def cost(self) -> float:
+        """1/2 chi2 of everything stated."""
+        return float(self.smoother.cost)
 
 
-def fed_gtsam(smoother: Any, isam: bool) -> Fed:
+class FedGtsam(Fed):
     """GTSAM's; its fixed-lag smoothers want a time for each pose, and do not tell the estimate of one alone."""
-    import gtsam
 
-    everything: list[Any] = []
-    stated: tuple[Any, ...] = ()
-    start: Any = None
+    def __init__(self, smoother: Any, isam: bool) -> None:
+        """Begin without poses."""
+        self.smoother, self.isam, self.everything = smoother, isam, list[Any]()
 
-    def predict(k: int, pose: Array) -> None:
-        nonlocal start
-        start = gtsam.Pose2(*pose)
+    def guess(self, k: int, pose: Array) -> None:
+        """Predict pose k."""
+        import gtsam
+
+        self.start = gtsam.Pose2(*pose)
         if k > 0:
-            last = smoother.calculateEstimatePose2(k - 1) if isam else smoother.calculateEstimate().atPose2(k - 1)
-            start = last.compose(start)
+            find = self.smoother
+            last = find.calculateEstimatePose2(k - 1) if self.isam else find.calculateEstimate().atPose2(k - 1)
+            self.start = last.compose(self.start)
 
-    def state(k: int, edges: Edges) -> None:
-        nonlocal stated
+    def state(self, k: int, edges: Edges) -> None:
+        """State the edges that end at pose k."""
+        import gtsam
+
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if k == 0:
-            factors.add(gtsam.PriorFactorPose2(0, start, gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)))
+            factors.add(gtsam.PriorFactorPose2(0, self.start, gtsam.noiseModel.Isotropic.Sigma(3, 1e-3)))
         for i, j, measured, information in zip(*_fields(edges), strict=True):
             noise = gtsam.noiseModel.Gaussian.Information(information)
             factors.add(gtsam.BetweenFactorPose2(i, j, gtsam.Pose2(*measured), noise))
-        values.insert(k, start)
-        everything.append(factors)
-        stated = (factors, values) if isam else (factors, values, {k: float(k)})
+        values.insert(k, self.start)
+        self.everything.append(factors)
+        self.stated = (factors, values) if self.isam else (factors, values, {k: float(k)})
 
-    def update() -> None:
-        smoother.update(*stated)
+    def update(self) -> None:
+        """Take in what was stated."""
+        self.smoother.update(*self.stated)
 
-    def poses(first: int, last: int) -> Array:
-        found = smoother.calculateEstimate()
+    def poses(self, first: int, last: int) -> Array:
+        """(2, 3) estimates of two poses."""
+        found = self.smoother.calculateEstimate()
         return np.array([as_array(found.atPose2(k)) for k in (first, last)])
 
-    def cost() -> float:
-        best = smoother.calculateBestEstimate()
-        return float(sum(factors.error(best) for factors in everything))
-
-    return Fed(predict, state, update, poses, cost)
+    @property
+    def cost(self) -> float:
+        """1/2 chi2 of everything stated."""
+        best = self.smoother.calculateBestEstimate()
+        return float(sum(factors.error(best) for factors in self.everything))
 
 
 def one_by_one(graph: PoseGraph, lag: float = np.inf) -> Iterator[tuple[int, Array, Edges]]:
@@ -150,7 +147,7 @@ def drive(graph: PoseGraph, make: Callable[[], Fed], lag: float, optimum: Array 
         if optimum is not None and k % SPAN == SPAN - 1:
             first = k - int(min(SPAN, lag)) + 2  # GTSAM has dropped the one before
             errors.append(_error(optimum, first, k, *smoother.poses(first, k)))
-    quality = smoother.cost() if optimum is None else float(np.sqrt(np.mean(np.square(errors))))
+    quality = smoother.cost if optimum is None else float(np.sqrt(np.mean(np.square(errors))))
     return Run(update, state, quality)
 
 
@@ -172,7 +169,7 @@ def incremental(graph: PoseGraph, peer: bool) -> Candidates:
     """Smoothers of the whole history."""
 
     def ours(threshold: float, every: int) -> Fed:
-        return fed(fg.Incremental(relinearize=threshold, every=every, wildfire=WILDFIRE))
+        return Fed(fg.Incremental(relinearize=threshold, every=every, wildfire=WILDFIRE))
 
     def theirs(threshold: float, every: int) -> Fed:
         import gtsam
@@ -180,7 +177,7 @@ def incremental(graph: PoseGraph, peer: bool) -> Candidates:
         parameters = gtsam.ISAM2Params()
         parameters.setRelinearizeThreshold(threshold)
         parameters.relinearizeSkip = every
-        return fed_gtsam(gtsam.ISAM2(parameters), isam=True)
+        return FedGtsam(gtsam.ISAM2(parameters), isam=True)
 
     makers = {"`Incremental`": ours} | ({"iSAM2": theirs} if peer else {})
     return {
@@ -196,11 +193,11 @@ def fixed_lag(graph: PoseGraph, optimum: Array, peer: bool) -> Candidates:
     def theirs(lag: int, name: str) -> Fed:
         import gtsam
 
-        return fed_gtsam(getattr(gtsam, name)(float(lag)), isam=False)
+        return FedGtsam(getattr(gtsam, name)(float(lag)), isam=False)
 
     makers: dict[str, Callable[[int], Fed]] = {
-        "`FixedLag`": lambda lag: fed(fg.FixedLag(lag)),
-        "`FixedLag`, all relinearised": lambda lag: fed(fg.FixedLag(lag, relinearize=0.0, wildfire=0.0)),
+        "`FixedLag`": lambda lag: Fed(fg.FixedLag(lag)),
+        "`FixedLag`, all relinearised": lambda lag: Fed(fg.FixedLag(lag, relinearize=0.0, wildfire=0.0)),
     }
     for name in ("IncrementalFixedLagSmoother", "BatchFixedLagSmoother") if peer else ():
         makers[name] = partial(theirs, name=name)
@@ -231,7 +228,7 @@ def told(candidates: Candidates, rounds: int, setting: str, quality: str) -> str
         )
         for name, done in runs.items()
     }
-    columns: dict[str, Callable[[tuple[Array, float, float]], str]] = {
+    columns: Columns[tuple[Array, float, float]] = {
         "median [ms]": lambda found: f"{np.median(found[0]):.3f}",
         "mean [ms]": lambda found: f"{np.mean(found[0]):.3f}",
         "95 % [ms]": lambda found: f"{np.percentile(found[0], 95):.3f}",

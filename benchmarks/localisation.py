@@ -9,7 +9,7 @@ robot that is carried elsewhere, and a map on which furniture has been moved. Th
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 from unittest import mock
@@ -18,7 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks.comparison import Row, difference, mean, middle, where
-from benchmarks.report import listing, shared
+from benchmarks.report import Columns, listing, shared
 from benchmarks.routes import drawn
 from benchmarks.runner import Cell, Study
 from unifg.files.carmen import read_carmen
@@ -222,7 +222,7 @@ def render(rows: Sequence[Row]) -> str:
         tuple(key.split("|")): [row["results"][key] for row in where(rows) if key in row["results"]] for key in keys
     }
 
-    columns: dict[str, Callable[[list[Row]], str]] = {
+    columns: Columns[list[Row]] = {
         "drives": lambda some: str(len(some)),
         "mean [mm]": mean("m", 1e3),
         "std [mm]": mean("m_std", 1e3),

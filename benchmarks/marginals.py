@@ -15,7 +15,7 @@ import numpy as np
 import unifg as fg
 from benchmarks import pose_graphs
 from benchmarks.gtsam_peer import ANCHOR, Peer, available, joint
-from benchmarks.report import listing, told
+from benchmarks.report import Columns, listing, told
 from benchmarks.section import Result, goal
 from benchmarks.timing import clocked, interleave, milliseconds, ratio, shown
 from unifg.problem.compiled_problem import CompiledProblem
@@ -134,7 +134,7 @@ def _largest(ours: Array, reference: Array) -> float:
     return float((np.abs(ours - reference).max(axis=(1, 2)) / size).max())
 
 
-COLUMNS: dict[str, Callable[[Result], str]] = {
+COLUMNS: Columns[Result] = {
     "poses": told("poses"),
     "all poses, ours [ms]": told("all", shown),
     "GTSAM [ms]": told("gtsam", shown),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.comparison import Row, where
-from benchmarks.report import shared, table
+from benchmarks.report import Columns, shared, table, told
 from benchmarks.runner import Cell, Study
 from unifg.scenarios.ground.drive_pilot import COUPLINGS
 from unifg.scenarios.ground.drive_settings import ControllerSettings
@@ -108,18 +108,18 @@ LIMITS: dict[str, Callable[[Row], bool]] = {
     f"duration at most path length / ({LEAST_SPEED} m/s)": lambda m: m["duration_s"] <= limit(m),
     f"bounds exceeded by at most {BOUND_VIOLATION:g}": lambda m: m["max_bound_violation"] <= BOUND_VIOLATION,
 }
-MEASURED: dict[str, Callable[[Row], str]] = {
+MEASURED: Columns[Row] = {
     "reached": lambda m: f"{m['goals_reached']} / {m['goals']}",
-    "collisions": lambda m: str(m["collisions"]),
-    "duration [s]": lambda m: f"{m['duration_s']:.1f}",
+    "collisions": told("collisions"),
+    "duration [s]": told("duration_s", "{:.1f}".format),
     "limit [s]": lambda m: f"{limit(m):.1f}",
-    "path [m]": lambda m: f"{m['path_length_m']:.1f}",
-    "clearance [m]": lambda m: f"{m['min_clearance_m']:.3f}",
+    "path [m]": told("path_length_m", "{:.1f}".format),
+    "clearance [m]": told("min_clearance_m", "{:.3f}".format),
     "localisation [m]": lambda m: f"{m['localisation_error_m']['mean']:.4f}",
     "localisation [rad]": lambda m: f"{m['localisation_error_rad']['mean']:.4f}",
     "odometry [m]": lambda m: f"{m['odometry_error_m']['mean']:.2f}",
-    "bounds": lambda m: f"{m['max_bound_violation']:.0e}",
-    "failed": lambda m: str(m["solver_failures"]),
+    "bounds": told("max_bound_violation", "{:.0e}".format),
+    "failed": told("solver_failures"),
 }
 TIMED = {
     "solve_ms": "localise + plan",

@@ -9,7 +9,7 @@ start, the straight line to the target, and a shortest way. Weights were chosen 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields, replace
 from itertools import pairwise, product
 from typing import Any
@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks.comparison import Row, middle, share, where
-from benchmarks.report import listing, table
+from benchmarks.comparison import Row, counted, middle, portion, where
+from benchmarks.report import Columns, listing, table
 from benchmarks.runner import Cell, Study
 from unifg.scenarios.course import AVOIDANCES, HESSIANS, Avoidance, Start
 from unifg.scenarios.papers.courses import Method, Outcome
@@ -73,17 +73,13 @@ def rates(results: Results) -> str:
     """Success and its opposite, per method."""
     best = {avoidance: lowest(results, avoidance) for avoidance in AVOIDANCES}
     groups = {m.words: [*zip(some, best[m.avoidance], strict=True)] for m, some in results.items()}
-    columns: dict[str, Callable[[list[tuple[Outcome, Outcome | None]]], str]] = {
-        "success": lambda some: str(sum(o.safe for o, _ in some)),
-        "95 % interval": lambda some: "{:.0f} to {:.0f} %".format(
-            *(100 * end for end in share(sum(o.safe for o, _ in some), len(some)))
-        ),
-        "converged": lambda some: str(sum(o.converged for o, _ in some)),
-        "minimum short of target": lambda some: str(sum(o.minimum and not o.safe and not o.arrived for o, _ in some)),
-        "minimum through an obstacle": lambda some: str(sum(o.minimum and not o.safe and o.arrived for o, _ in some)),
-        "cheapest found": lambda some: str(
-            sum(o.minimum and b is not None and o.cost <= b.cost * (1.0 + SAME) for o, b in some)
-        ),
+    columns: Columns[list[tuple[Outcome, Outcome | None]]] = {
+        "success": counted(lambda o, _: o.safe),
+        "95 % interval": lambda some: portion(sum(o.safe for o, _ in some), len(some)).replace("..", "to"),
+        "converged": counted(lambda o, _: o.converged),
+        "minimum short of target": counted(lambda o, _: o.minimum and not o.safe and not o.arrived),
+        "minimum through an obstacle": counted(lambda o, _: o.minimum and not o.safe and o.arrived),
+        "cheapest found": counted(lambda o, b: o.minimum and b is not None and o.cost <= b.cost * (1.0 + SAME)),
         "iterations": lambda some: middle([o.iterations for o, _ in some]),
         "ms": lambda some: middle([o.milliseconds for o, _ in some]),
     }
@@ -115,9 +111,9 @@ def hessians(results: Results) -> str:
         exact = Method(avoidance, EVERYWHERE, solver, "exact")
         rough = replace(exact, hessian="gauss-newton")
         groups[avoidance, solver] = list(zip(results[exact], results[rough], strict=True))
-    columns: dict[str, Callable[[Pairs], str]] = {
-        "converged: exact only": lambda pairs: str(sum(e.converged and not g.converged for e, g in pairs)),
-        "Gauss-Newton only": lambda pairs: str(sum(g.converged and not e.converged for e, g in pairs)),
+    columns: Columns[Pairs] = {
+        "converged: exact only": counted(lambda e, g: e.converged and not g.converged),
+        "Gauss-Newton only": counted(lambda e, g: g.converged and not e.converged),
         "same minimum": lambda pairs: f"{len(same(pairs))} of {sum(e.minimum and g.minimum for e, g in pairs)}",
         "iterations there, exact : GN": lambda pairs: middles(pairs, "iterations"),
         "ms there, exact : GN": lambda pairs: middles(pairs, "milliseconds"),
@@ -135,7 +131,7 @@ def duels(results: Results) -> str:
             pairs = [(a.safe, b.safe) for a, b in zip(*(results[method] for method in duel), strict=True)]
             first, second = (f"{method.guess}, {method.solver}, {method.hessian}" for method in duel)
             groups[avoidance, first, second] = pairs.count((True, False)), pairs.count((False, True))
-    columns: dict[str, Callable[[tuple[int, int]], str]] = {
+    columns: Columns[tuple[int, int]] = {
         "only first": lambda only: str(only[0]),
         "only second": lambda only: str(only[1]),
         "p": lambda only: f"{binomtest(only[0], sum(only)).pvalue if sum(only) else 1.0:.3f}",

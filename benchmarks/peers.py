@@ -29,7 +29,7 @@ from benchmarks.control_loops import CONTACT, Race
 from benchmarks.control_peers import MODELS
 from benchmarks.own_functions import stated
 from benchmarks.pose_graphs import cases
-from benchmarks.report import CHECKOUT, machine, table, words
+from benchmarks.report import CHECKOUT, Columns, machine, table, words
 from benchmarks.runner import Timing, Unavailable
 from benchmarks.timing import clocked, interleave, number, pin, ratio, shown
 from problems.cart_pole import CartPole
@@ -304,7 +304,7 @@ def each(measure: Callable[[Problem, int], Results], rounds: int) -> Found:
     return {problem.title: measure(problem, rounds) for problem in problems()}
 
 
-PARTS: dict[str, Callable[[int], str]] = {
+PARTS: Columns[int] = {
     "Ticks": lambda rounds: rendered(each(loops, rounds), LOOPS, TAILS, "compiled", TICKS),
     "Cold solves": lambda rounds: rendered(each(colds, rounds), COLD, WHOLE, "left out", MEDIAN),
     "Pose graph": lambda rounds: rendered(

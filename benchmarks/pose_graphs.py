@@ -12,7 +12,7 @@ import numpy as np
 
 import unifg as fg
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
-from benchmarks.report import listing, shared, told, words
+from benchmarks.report import Columns, listing, shared, told, words
 from benchmarks.section import Result, goal
 from benchmarks.timing import clock, interleave, milliseconds, ratio, shown, timed
 from problems.graphs import graph_with
@@ -198,9 +198,7 @@ def within(row: Result) -> str:
     return "yes" if all(abs(row.get(end, known) - known) <= SAME * known for end in ("chi2", "gtsam_chi2")) else "no"
 
 
-Columns = dict[str, Callable[[Result], str]]
-
-ITERATIONS: Columns = {
+ITERATIONS: Columns[Result] = {
     "poses": told("poses"),
     "edges": told("edges"),
     "iterations": told("iterations"),
@@ -210,7 +208,7 @@ ITERATIONS: Columns = {
     "times faster": told("ratio", shown),
     "target (floor)": lambda row: f"{row['target']:g} ({row['floor']:g})",
 }
-WHOLE: Columns = {
+WHOLE: Columns[Result] = {
     "ours [ms]": told("whole", shown),
     "iterations": lambda row: f"{row['iterations']}, {row['status']}",
     "GTSAM [ms]": told("gtsam_whole", shown),
@@ -224,7 +222,7 @@ WHOLE: Columns = {
 }
 
 
-FILED: Columns = {
+FILED: Columns[Result] = {
     "ours [ms]": told("ours", shown),
     "iterations": told("iterations"),
     "GTSAM [ms]": told("gtsam", shown),

@@ -8,17 +8,18 @@ wind, disturbances and noise; differences are taken seed by seed.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import product
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from benchmarks.comparison import Row, against, digits, where
+from benchmarks.comparison import Row, against, digits, total, where
 from benchmarks.quadrotor_flights import SOLVERS
-from benchmarks.report import listing
+from benchmarks.report import Columns, listing
 from benchmarks.runner import Cell, Study
 from benchmarks.timing import clocked
 from unifg.models import quadrotor
@@ -81,15 +82,14 @@ def fly(**cell: Any) -> Row:
         clearance = min(clearance, world.clearance())
         if world.collisions:
             break
-    numbers = {name: np.array([tick[name] for tick in ticks]) for name in ticks[0]}
-    known = {name: values for name, some in numbers.items() if len(values := some[np.isfinite(some)])}
+    numbers = pd.DataFrame(ticks).replace([np.inf, -np.inf], np.nan)
     return {
         "collisions": world.collisions,
         "emergencies": emergencies,
         "clearance": clearance,
         "distance": float(world.state[0] - world.layout.start[0]),
-        "mean": {name: float(values.mean()) for name, values in known.items()},
-        "max": {name: float(values.max()) for name, values in known.items()},
+        "mean": numbers.mean().dropna().to_dict(),
+        "max": numbers.max().dropna().to_dict(),
         "tick": numbers["tick"][WARMING_UP:].tolist(),
     }
 
@@ -146,11 +146,11 @@ ERRORS = {
     "wind [mm/s^2]": ("wind error", 1e3),
     "cylinders [mm]": ("cylinder error", 1e3),
 }
-FLOWN: dict[str, Callable[[Sequence[Row]], str]] = {
+FLOWN: Columns[Sequence[Row]] = {
     "flown [m]": lambda rows: f"{np.mean([row['distance'] for row in rows]):.2f}",
     "least clearance [cm]": lambda rows: f"{100 * min(row['clearance'] for row in rows):.0f}",
-    "emergencies": lambda rows: str(sum(row["emergencies"] for row in rows)),
-    "collisions": lambda rows: str(sum(row["collisions"] for row in rows)),
+    "emergencies": total("emergencies"),
+    "collisions": total("collisions"),
     "tick [ms]": lambda rows: "{:.1f} ({:.1f})".format(
         *np.quantile(np.concatenate([row["tick"] for row in rows]), [0.5, 0.99])
     ),

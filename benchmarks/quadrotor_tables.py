@@ -2,29 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from benchmarks.comparison import Read, Row, comparison, middle, share, where
-from benchmarks.report import listing, table
+from benchmarks.comparison import Key, Read, Row, comparison, grouped, metric, middle, share, where
+from benchmarks.report import Columns, listing, table
 from unifg.typing import Array
 
 MASS_ERROR, COVERED = 0.01, 0.9
 EARLY = "5"  # [s]
 
-# How to read each measure from a row; None where a flight has none.
 MEASURES: dict[str, Read] = {
-    "position error, rms [mm]": lambda row: 1e3 * row["metrics"]["position_error_m"]["rms"],
-    "velocity error, rms [mm/s]": lambda row: 1e3 * row["metrics"]["velocity_error_m_per_s"]["rms"],
-    "attitude error, rms [mrad]": lambda row: 1e3 * row["metrics"]["attitude_error_rad"]["rms"],
-    "mass error after 5 s [%]": lambda row: _times(1e2, row["metrics"]["mass_error_relative_5s"]),
-    "landmark error, rms [mm]": lambda row: _times(1e3, (row["metrics"]["landmark_error_m"] or {}).get("rms")),
-    "collisions": lambda row: float(row["metrics"]["collisions"]),
-    "reached without collision [%]": lambda row: 100.0 * float(row["metrics"]["succeeded"]),
-    "time to goal [s]": lambda row: row["metrics"]["time_to_goal_s"],
-    "least clearance [mm]": lambda row: 1e3 * row["metrics"]["min_clearance_m"],
-    "estimate + plan, median [ms]": lambda row: row["metrics"]["tick_ms"]["p50"],
+    "position error, rms [mm]": metric(1e3, "position_error_m", "rms"),
+    "velocity error, rms [mm/s]": metric(1e3, "velocity_error_m_per_s", "rms"),
+    "attitude error, rms [mrad]": metric(1e3, "attitude_error_rad", "rms"),
+    "mass error after 5 s [%]": metric(1e2, "mass_error_relative_5s"),
+    "landmark error, rms [mm]": metric(1e3, "landmark_error_m", "rms"),
+    "collisions": metric(1.0, "collisions"),
+    "reached without collision [%]": metric(100.0, "succeeded"),
+    "time to goal [s]": metric(1.0, "time_to_goal_s"),
+    "least clearance [mm]": metric(1e3, "min_clearance_m"),
+    "estimate + plan, median [ms]": metric(1.0, "tick_ms", "p50"),
 }
 TITLES = {
     "flights": "clearance",
@@ -52,13 +51,13 @@ def worst(runs: Sequence[Array]) -> tuple[float, float, int]:
     return float(median), float(p99), min(run.shape[1] for run in runs)
 
 
-def _timed(rows: Sequence[Row]) -> dict[tuple[str, str], list[Array]]:
+def _timed(rows: Sequence[Row]) -> dict[Key, list[Array]]:
     """Times (2, n) of estimate and plan of every run [ms], by solver and coupling."""
-    groups: dict[tuple[str, str], dict[int, list[Array]]] = {}
-    for row in where(rows, study="timing"):
-        runs = groups.setdefault((row["solver"], row["coupling"]), {})
-        runs.setdefault(row["run"], []).append(np.array([row["estimate_ms"], row["plan_ms"]]))
-    return {key: [np.concatenate(parts, axis=1) for parts in runs.values()] for key, runs in groups.items()}
+    runs: dict[Key, list[Array]] = {}
+    for (solver, coupling, _), flights in grouped(where(rows, study="timing"), "solver", "coupling", "run").items():
+        parts = [np.array([row["estimate_ms"], row["plan_ms"]]) for row in flights]
+        runs.setdefault((solver, coupling), []).append(np.concatenate(parts, axis=1))
+    return runs
 
 
 def ticks(rows: Sequence[Row]) -> str:
@@ -80,7 +79,7 @@ def ticks(rows: Sequence[Row]) -> str:
 
 
 # What is told of the metrics of several flights.
-SUCCESS: dict[str, Callable[[list[Row]], str]] = {
+SUCCESS: Columns[list[Row]] = {
     "succeeded": lambda flights: f"{_good(flights)} of {len(flights)}",
     "95 % [%]": lambda flights: " .. ".join(f"{100 * end:.0f}" for end in share(_good(flights), len(flights))),
     "collided": lambda flights: str(sum(m["collisions"] > 0 for m in flights)),
@@ -166,16 +165,13 @@ def _known(rows: Sequence[Row], mark: str) -> tuple[Array, Array]:
     return np.abs(values[:, 0]), values[:, 1]
 
 
-def _groups(rows: Sequence[Row]) -> dict[tuple[str, str, str], list[Row]]:
+def _groups(rows: Iterable[Row]) -> dict[Key, list[Row]]:
     """Flights by study, solver and coupling, in words."""
-    groups: dict[tuple[str, str, str], list[Row]] = {}
-    for row in rows:
-        if row["study"] in TITLES:
-            groups.setdefault((TITLES[row["study"]], row["solver"], row["coupling"]), []).append(row)
-    return groups
+    known = grouped((row for row in rows if row["study"] in TITLES), "study", "solver", "coupling")
+    return {(TITLES[study], *words): flights for (study, *words), flights in known.items()}
 
 
-def _hard(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+def _hard(rows: Sequence[Row]) -> dict[Key, list[Row]]:
     """Flights with hard clearance that share a belief, by solver and coupling."""
     found = _groups(where(rows, study="flights"))
     return {words[1:]: chosen for words, chosen in found.items() if words[2] != "separate"}
@@ -184,7 +180,3 @@ def _hard(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
 def _section(text: str, head: Sequence[str], lines: Sequence[Sequence[str]], words: int) -> str:
     """A table with what stands before it, nothing when there are no lines."""
     return f"{text}\n\n{table(head, lines, words)}" if lines else ""
-
-
-def _times(factor: float, value: float | None) -> float | None:
-    return None if value is None else factor * value

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from unifg.scenarios.campaigns.markdown import table as table
 from unifg.scenarios.commands.host import processor
@@ -21,6 +21,9 @@ from unifg.scenarios.papers.printed import shared as shared
 
 T = TypeVar("T")
 Words = TypeVar("Words", bound=tuple[str, ...])
+
+Columns: TypeAlias = dict[str, Callable[[T], str]]
+"""Columns of a table by heading: words of what stands in a line."""
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 OUT = CHECKOUT / "out" / "benchmarks"
@@ -38,7 +41,7 @@ def command(doc: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(prog=named and named[0], description=doc.split("\n")[0], allow_abbrev=False)
 
 
-def listing(head: Sequence[str], groups: Mapping[Words, T], columns: Mapping[str, Callable[[T], str]]) -> str:
+def listing(head: Sequence[str], groups: Mapping[Words, T], columns: Columns[T]) -> str:
     """Table with a line for each group: the words that name it, then each column of it."""
     lines = ([*names, *(column(group) for column in columns.values())] for names, group in groups.items())
     return table([*head, *columns], lines, len(head))

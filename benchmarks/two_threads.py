@@ -16,7 +16,7 @@ import numpy as np
 
 import unifg as fg
 from benchmarks.pose_graphs import Case, cases
-from benchmarks.report import listing, told
+from benchmarks.report import Columns, listing, told
 from benchmarks.section import Result, goal
 from benchmarks.timing import all_cores, interleave, milliseconds, ratio, shown
 from unifg.elimination.factorization import Factorization
@@ -112,7 +112,7 @@ def _gain(name: str) -> Callable[[Result], str]:
     return lambda row: shown(row["ratio"][name])
 
 
-COLUMNS: dict[str, Callable[[Result], str]] = {
+COLUMNS: Columns[Result] = {
     "whole solve by one thread [ms]": lambda row: shown(row["alone"]["solve"]),
     **{f"{title}, times faster": _gain(name) for name, title in PIECES.items()},
     "two graphs in two threads, times faster": told("apart", shown),

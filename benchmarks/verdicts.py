@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.comparison import Row, grouped, where
+from benchmarks.comparison import Row, grouped, mean, total, where
 from benchmarks.report import listing, told
 from benchmarks.runner import Cell, Study
 from benchmarks.wrong_closures import published
@@ -149,8 +149,8 @@ def tables(rows: list[Row]) -> str:
     groups = grouped((row for row in where(rows) if row["fault"] != "time"), "graph", "fault")
     columns = {
         "named": lambda rows: f"{sum(r['found'] for r in rows)} of {len(rows)}" if rows[0]["fault"] != "none" else "",
-        "right clusters contradicted": lambda rows: f"{sum(r['right ones contradicted'] for r in rows)}",
-        "unsupported a graph": lambda rows: f"{np.mean([r['unsupported'] for r in rows]):.1f}",
+        "right clusters contradicted": total("right ones contradicted"),
+        "unsupported a graph": mean("unsupported"),
         "of these not by construction": lambda rows: (
             f"{sum(r['not so by construction'] for r in rows)}" if rows[0]["fault"] == "none" else ""
         ),

@@ -20,7 +20,7 @@ import unifg as fg
 from benchmarks.comparison import Row, grouped, where
 from benchmarks.gtsam_peer import Peer, as_array, available
 from benchmarks.kept_rows import ROWS, keep, restore
-from benchmarks.report import OUT, listing, shared
+from benchmarks.report import OUT, Columns, listing, shared
 from benchmarks.runner import Cell, Study
 from benchmarks.timing import clocked
 from problems.closures import Claim, with_wrong_closures
@@ -170,7 +170,7 @@ def _over(rows: list[Row], name: str, digits: int) -> str:
     return f"{np.median(values):.{digits}f} ({values.max():.{digits}f})"
 
 
-OVER_SEEDS: dict[str, Callable[[list[Row]], str]] = {
+OVER_SEEDS: Columns[list[Row]] = {
     "right maps": lambda rows: f"{sum(row['trajectory'] < NEAR for row in rows)} of {len(rows)}",
     "ATE [m], median (largest)": lambda rows: _over(rows, "trajectory", 3),
     "recall": lambda rows: f"{np.median([row['right kept'] for row in rows]):.4f}",

@@ -130,7 +130,7 @@ def marginals(pose_graph: PoseGraph) -> Row:
 def smoothed(pose_graph: PoseGraph, make: Callable[[], Any], lag: float) -> Row:
     """A graph fed pose by pose."""
     run = incremental.drive(
-        pose_graph, lambda: incremental.fed(make()), lag, None if np.isinf(lag) else pose_graph.poses
+        pose_graph, lambda: incremental.Fed(make()), lag, None if np.isinf(lag) else pose_graph.poses
     )
     return Row("smoothed", len(run.update), run.quality, digest(run.quality))
 
