@@ -28,7 +28,7 @@ WEIGHTS = (3.0, 10.0, 30.0)  # of the deviation at the goal [s/m]
 PASSES = (2.0, 1.2, 0.6)  # distances at which a rule passes a beacon [m]
 DISCS = 3
 DRIVES = 300  # of each plan
-WAYS: dict[str, tuple[str, ...]] = {
+WAYS = {
     "rule": tuple(f"{distance:g}" for distance in PASSES),
     "in the cost": tuple(f"{weight:g}" for weight in WEIGHTS),
     "cautious": tuple(f"{weight:g}" for weight in WEIGHTS),

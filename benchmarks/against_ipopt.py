@@ -100,6 +100,7 @@ class Casadi(Staged):
 
 
 Contestant: TypeAlias = Ours | Casadi
+Makers: TypeAlias = dict[str, Callable[[], Contestant]]
 WARM: dict[str, Any] = {
     "warm_start_init_point": "yes", "mu_init": 1e-6, "warm_start_bound_push": 1e-9, "warm_start_mult_bound_push": 1e-9,
     "warm_start_slack_bound_push": 1e-9, "warm_start_bound_frac": 1e-9, "warm_start_slack_bound_frac": 1e-9,
@@ -107,9 +108,9 @@ WARM: dict[str, Any] = {
 QUASI_NEWTON: dict[str, Any] = {"hessian_approximation": "limited-memory", "max_iter": MOST, "tol": STOP}
 
 
-def contestants(hard: bool) -> dict[str, Callable[[], Contestant]]:
+def contestants(hard: bool) -> Makers:
     """Contestants for one form of the problem, from the cold guess."""
-    both: dict[str, Callable[[], Contestant]] = {
+    both: Makers = {
         "literal loop": lambda: Ours(AugmentedLagrangian(schedule="bazzana", **LOOP)),
         "literal loop, damped": lambda: Ours(AugmentedLagrangian(schedule="bazzana-damped", **LOOP)),
         "augmented Lagrangian": lambda: Ours(AugmentedLagrangian(tolerance=STOP)),
@@ -172,7 +173,7 @@ def cold(hard: bool, rounds: int) -> str:
 
 def warm(rounds: int) -> str:
     """Tick of a control loop: the start has moved, everything else is known."""
-    kinds: dict[str, Callable[[], Contestant]] = {
+    kinds: Makers = {
         name: make
         for name, make in contestants(True).items()
         if name in ("augmented Lagrangian", "SQP", "interior point")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 import unifg as fg
 from benchmarks.report import Columns, listing, told, words
 from benchmarks.section import Result, goal
-from benchmarks.timing import interleave, milliseconds, shown, timed
+from benchmarks.timing import Contestants, interleave, milliseconds, shown, timed
 from problems.control import Unicycle
 from problems.graphs import graph_of
 from unifg.models import unicycle
@@ -57,7 +56,7 @@ CASES = {
 def measure(rounds: int, small: bool = False) -> Result:
     """All chains in one set of rounds; a round repeats each solve, the chains being short."""
     horizon, repeats = (4, 1) if small else (HORIZON, REPEATS)
-    contestants: dict[str, Callable[[], float]] = {}
+    contestants: Contestants = {}
     rows: list[Result] = []
     for kind in CASES:
         backend, graph, guess = chain(kind, horizon)

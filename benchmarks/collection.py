@@ -14,7 +14,9 @@ import random
 import re
 from collections import Counter
 from importlib.util import find_spec
+from typing import TypeAlias
 
+from benchmarks.comparison import Key
 from benchmarks.report import END, command, table
 from benchmarks.runner import RESULTS, Timing
 from problems.collection import (
@@ -33,13 +35,15 @@ from problems.collection import (
 )
 from problems.hock_schittkowski import Case
 
+Outcomes: TypeAlias = dict[str, dict[str, Outcome]]
+"""By backend and problem."""
 PEER = "IPOPT"
 DRAWN = 2  # cells of a sample
 
 
-def measure() -> dict[str, dict[str, Outcome]]:
+def measure() -> Outcomes:
     """Outcomes by backend and problem; refused problems are left out."""
-    results: dict[str, dict[str, Outcome]] = {}
+    results: Outcomes = {}
     for name, backend in BACKENDS.items():
         found = {case: attempt(case, backend) for case in CASES}
         results[name] = {case: outcome for case, outcome in found.items() if outcome is not None}
@@ -48,7 +52,7 @@ def measure() -> dict[str, dict[str, Outcome]]:
     return results
 
 
-def render(results: dict[str, dict[str, Outcome]]) -> str:
+def render(results: Outcomes) -> str:
     """The page."""
     notes = "Default options, one solve from the standard start of each problem."
     parts = [notes, _summary(results), "## What is not solved", _failures(results)]
@@ -64,7 +68,7 @@ def repeated(page: str, seed: str) -> bool:
         page: the Markdown.
         seed: of the draw.
     """
-    known: dict[tuple[str, str], str] = {}
+    known: dict[Key, str] = {}
     for part in page.partition(END)[0].split("## Iterations: ")[1:]:
         head, _, *lines = (
             [word.strip() for word in line.split("|")[1:-1]] for line in part.splitlines() if "|" in line
@@ -86,7 +90,7 @@ def _alike(now: str, then: str) -> bool:
     return mark == other and abs(int(count) - int(expected)) <= max(2.0, 0.1 * int(expected))
 
 
-def _summary(results: dict[str, dict[str, Outcome]]) -> str:
+def _summary(results: Outcomes) -> str:
     lines = []
     for name, outcomes in results.items():
         count = Counter(outcome.verdict for outcome in outcomes.values())
@@ -99,7 +103,7 @@ def _summary(results: dict[str, dict[str, Outcome]]) -> str:
     return table(("backend", "takes", *words, "not solved", "right"), lines)
 
 
-def _failures(results: dict[str, dict[str, Outcome]]) -> str:
+def _failures(results: Outcomes) -> str:
     lines = []
     for name, outcomes in results.items():
         wrong: dict[str, list[str]] = {}
@@ -110,7 +114,7 @@ def _failures(results: dict[str, dict[str, Outcome]]) -> str:
     return table(("backend", "ended with", "problems"), lines, text=3)
 
 
-def _iterations(results: dict[str, dict[str, Outcome]], cases: list[Problem]) -> str:
+def _iterations(results: Outcomes, cases: list[Problem]) -> str:
     names = [name for name, outcomes in results.items() if any(case.name in outcomes for case in cases)]
     lines = [(case.name, *(_cell(results[name].get(case.name)) for name in names)) for case in cases]
     return table(("problem", *names), lines)

@@ -25,7 +25,7 @@ from problems.belief_plans import Guess, Plan
 
 RESERVE = 0.05  # margin of those plans that keep standard deviations [m]: the robot cuts corners between nodes
 DEVIATIONS = (1.0, 2.0, 2.5, 3.0, 3.5)
-WAYS: dict[str, tuple[float, ...]] = {
+WAYS = {
     "margin": (0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0, 1.3, 1.6),
     "lagging": DEVIATIONS,
     "in the graph": DEVIATIONS,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from unifg.scenarios.papers.ecg2o import (
 )
 from unifg.solvers import KKT, SQP, AugmentedLagrangian, InteriorPoint, Penalty
 
+Solvers: TypeAlias = dict[str, fg.Solver]
 COSTS = {  # J of the first study, worked out independently with IPOPT and Newton's method
     "quadratic": (34481.995068, 75967.385885, 168678.611533, 345514.797577),
     "linear": (36170.076602, 79709.258534, 177608.498404, 361318.221800),
@@ -68,7 +70,7 @@ def listed(values: Iterable[float]) -> dict[tuple[str], float]:
 
 def iterations_by_length() -> str:
     """Fig. 3: the paper's stop rule, then our own KKT test."""
-    ours: dict[str, fg.Solver] = {
+    ours: Solvers = {
         "KKT": KKT(),
         "AL, literal": literal(LITERAL),
         "AL": AugmentedLagrangian(),
@@ -106,7 +108,7 @@ def costs() -> str:
 def against(
     told: Callable[[fg.Solver, float | None], str],
     multipliers: Iterable[float],
-    solvers: Mapping[str, fg.Solver],
+    solvers: Solvers,
     penalties: Iterable[float],
     loops: Mapping[str, Callable[[float], fg.Solver]],
 ) -> str:
@@ -119,7 +121,7 @@ def against(
 
 def sensitivity() -> str:
     """Iterations of the first study against the first multiplier, and against rho."""
-    solvers: dict[str, fg.Solver] = {"KKT": KKT(), "KKT, full steps": KKT(full_steps=True)}
+    solvers: Solvers = {"KKT": KKT(), "KKT, full steps": KKT(full_steps=True)}
     solvers |= {"AL": AugmentedLagrangian(), "AL, literal": literal(LITERAL)}
     loops = {
         "AL, literal": literal,
@@ -135,7 +137,7 @@ def small_sensitivity() -> str:
     def told(solver: fg.Solver, multiplier: float | None) -> str:
         return ", ".join(steps(solver, small(start), multiplier) for start in STARTS)
 
-    solvers: dict[str, fg.Solver] = {"KKT": KKT(), "KKT, Levenberg": LEVENBERG, "KKT, full steps": KKT(full_steps=True)}
+    solvers: Solvers = {"KKT": KKT(), "KKT, Levenberg": LEVENBERG, "KKT, full steps": KKT(full_steps=True)}
     solvers |= {"AL": AugmentedLagrangian(), "AL, damped loop": damped(LITERAL_SMALL)}
     loops = {
         "AL, literal": literal,
@@ -162,7 +164,7 @@ def inner() -> str:
 
 def case_study_2() -> tuple[str, str]:
     """Table 1: all starts, all backends; the average below. And the variant with an inequality."""
-    solvers: dict[str, fg.Solver] = {
+    solvers: Solvers = {
         "KKT, step < 1e-3": PAPERS_RULE,
         "KKT, full steps": KKT(full_steps=True),
         "KKT": KKT(),

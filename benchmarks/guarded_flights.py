@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 import unifg as fg
-from benchmarks.comparison import Row
-from benchmarks.report import listing, words
+from benchmarks.comparison import Key, Row
+from benchmarks.report import Columns, listing, words
 from benchmarks.runner import Timing
 from benchmarks.timing import clocked
 from problems.guarded_flight import PACE, START, VEHICLE, GuardedFlight, figure_eight, gust
@@ -69,9 +69,9 @@ def cold(case: GuardedFlight) -> fg.Solution:
     return InteriorPoint(tolerance=TOLERANCE).solve(case.graph, case.guess(), data=case.data(START, 0.0))
 
 
-def flights(ticks: int) -> dict[tuple[str, str], Callable[[], pd.DataFrame]]:
+def flights(ticks: int) -> dict[Key, Callable[[], pd.DataFrame]]:
     """All of them."""
-    found: dict[tuple[str, str], Callable[[], pd.DataFrame]] = {}
+    found: dict[Key, Callable[[], pd.DataFrame]] = {}
     forms: dict[str, keeping.Form | None] = {
         "none": None, "hinge": "hinge", "hard": "hard", "slack, squared": "slack", "slack, exact": "exact slack",
     }  # fmt: skip
@@ -125,7 +125,7 @@ def slack(of: Callable[[pd.Series[float]], str]) -> Column:
     return lambda solves: of(solves["slack"]) if "slack" in solves else "-"
 
 
-COLUMNS: dict[str, Column] = {
+COLUMNS: Columns[pd.DataFrame] = {
     "ticks": lambda f: str(len(f)),
     "median [ms]": within(50.0),
     "p99": within(99.0),
@@ -143,13 +143,13 @@ COLUMNS: dict[str, Column] = {
 }
 
 
-COLD: dict[tuple[str, str], tuple[keeping.Form, float | None]] = {
+COLD: dict[Key, tuple[keeping.Form, float | None]] = {
     ("hinge", "1e4"): ("hinge", 1e4), ("hinge", "1e6"): ("hinge", None), ("hard", "-"): ("hard", None),
     ("slack, squared", "1e4"): ("slack", 1e4), ("slack, squared", "1e6"): ("slack", None),
     ("slack, squared", "1e8"): ("slack", 1e8), ("slack, exact", "1e3"): ("exact slack", 1e3),
     ("slack, exact", "1e4"): ("exact slack", None), ("slack, exact", "1e5"): ("exact slack", 1e5),
 }  # fmt: skip
-COLD_COLUMNS: dict[str, Column] = {
+COLD_COLUMNS: Columns[pd.DataFrame] = {
     "starts": lambda f: str(len(f)),
     "not converged": worst,
     "iterations": lambda f: f"{f['iterations'].mean():.1f}",

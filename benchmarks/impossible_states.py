@@ -6,6 +6,7 @@ Each is estimated without that knowledge and with it, on the same noise; :mod:`b
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 
@@ -16,12 +17,14 @@ from unifg.modeling.variables import Data
 from unifg.solvers import GaussNewton, InteriorPoint
 from unifg.typing import Array
 
+Errors: TypeAlias = dict[str, list[float]]
+"""Of each drive, by what is known."""
 POSES, RADIUS = 16, 0.25  # of a drive along a wall; the robot's [m]
 FIX, WHEELS = 0.4, np.array([0.03, 0.03, 0.03])  # deviations of fixes [m] and of a step [m, m, rad]
 SPEEDS, H, METER = 20, 0.5, 0.4  # samples of a vehicle that rolls; between them [s]; deviation of a speed [m/s]
 
 
-def along_a_wall(seed: int, drives: int) -> dict[str, list[float]]:
+def along_a_wall(seed: int, drives: int) -> Errors:
     """Error of the last pose across the wall [m], for drives beside one at y = 0 that touch it once."""
     rng = np.random.default_rng(seed)
     along = 0.3 * np.arange(POSES)
@@ -48,7 +51,7 @@ def along_a_wall(seed: int, drives: int) -> dict[str, list[float]]:
         "and no way through the wall": stated(InteriorPoint(), True, False),
         "and where it was touched": stated(InteriorPoint(), True, True),
     }
-    errors: dict[str, list[float]] = {name: [] for name in prepared}
+    errors: Errors = {name: [] for name in prepared}
     for _ in range(drives):
         fixed = truth[:, :2] + FIX * rng.standard_normal((POSES, 2))
         rolled = SE2.retract(moved, WHEELS * rng.standard_normal((POSES - 1, 3)))
@@ -58,7 +61,7 @@ def along_a_wall(seed: int, drives: int) -> dict[str, list[float]]:
     return errors
 
 
-def rolling(seed: int, drives: int) -> dict[str, list[float]]:
+def rolling(seed: int, drives: int) -> Errors:
     """Error of drag [1/(10 s)], for vehicles that roll with little of it and whose speed is measured."""
     rng = np.random.default_rng(seed)
     drag, speeds = rng.uniform(0.0, 0.03), np.empty(SPEEDS)
@@ -69,7 +72,7 @@ def rolling(seed: int, drives: int) -> dict[str, list[float]]:
     def slower(v: Array, d: Array, after: Array) -> Array:
         return after - v * np.exp(-d * H)
 
-    errors = dict[str, list[float]]()
+    errors = Errors()
     noise = METER * rng.standard_normal((drives, SPEEDS, 1))
     ways: dict[str, fg.Solver] = {"measurements": GaussNewton(), "and air does not push": InteriorPoint()}
     for name, solver in ways.items():
@@ -86,5 +89,5 @@ def rolling(seed: int, drives: int) -> dict[str, list[float]]:
     return errors
 
 
-STUDIES: dict[str, Callable[[int, int], dict[str, list[float]]]] = {"wall": along_a_wall, "drag": rolling}
+STUDIES: dict[str, Callable[[int, int], Errors]] = {"wall": along_a_wall, "drag": rolling}
 UNITS = {"wall": "cm", "drag": "% of the speed lost in 10 s"}

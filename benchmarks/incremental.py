@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import unifg as fg
+from benchmarks.comparison import Key
 from benchmarks.gtsam_peer import as_array, available
 from benchmarks.report import Columns, listing, shared
 from benchmarks.runner import Timing
@@ -161,7 +162,7 @@ def _error(optimum: Array, i: int, k: int, first: Array, last: Array) -> float:
     return float(np.linalg.norm((truth - found)[:2]))
 
 
-Candidates = dict[tuple[str, str], Callable[[], Run]]
+Candidates = dict[Key, Callable[[], Run]]
 """Drives to be timed, by smoother and setting."""
 
 
@@ -210,9 +211,9 @@ def fixed_lag(graph: PoseGraph, optimum: Array, peer: bool) -> Candidates:
 
 def told(candidates: Candidates, rounds: int, setting: str, quality: str) -> str:
     """A table: each candidate's update times, fastest of the rounds, and its quality."""
-    runs: dict[tuple[str, str], list[Run]] = {name: [] for name in candidates}
+    runs: dict[Key, list[Run]] = {name: [] for name in candidates}
 
-    def once(name: tuple[str, str]) -> float:
+    def once(name: Key) -> float:
         gc.collect()
         gc.disable()
         runs[name].append(candidates[name]())

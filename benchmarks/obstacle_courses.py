@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from benchmarks.comparison import Row, counted, middle, portion, where
+from benchmarks.comparison import Key, Row, counted, middle, portion, where
 from benchmarks.report import Columns, listing, table
 from benchmarks.runner import Cell, Study
 from unifg.scenarios.course import AVOIDANCES, HESSIANS, Avoidance, Start
@@ -106,7 +106,7 @@ def hessians(results: Results) -> str:
     def middles(pairs: Pairs, name: str) -> str:
         return " : ".join(middle([getattr(pair[k], name) for pair in same(pairs)]) for k in range(2))
 
-    groups: dict[tuple[str, str], Pairs] = {}
+    groups: dict[Key, Pairs] = {}
     for avoidance, solver in product(AVOIDANCES, ("sqp", "ipm")):
         exact = Method(avoidance, EVERYWHERE, solver, "exact")
         rough = replace(exact, hessian="gauss-newton")
@@ -123,7 +123,7 @@ def hessians(results: Results) -> str:
 
 def duels(results: Results) -> str:
     """Success of two methods on the same layouts, and how likely a difference as large is by chance (McNemar)."""
-    groups: dict[tuple[str, str, str], tuple[int, int]] = {}
+    groups: dict[Key, tuple[int, int]] = {}
     for avoidance in AVOIDANCES:
         sqp, ipm = (Method(avoidance, EVERYWHERE, solver, "exact") for solver in ("sqp", "ipm"))
         rough = [replace(method, hessian="gauss-newton") for method in (sqp, ipm)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import unifg as fg
 from benchmarks.gtsam_peer import ORDERINGS, Peer, available
 from benchmarks.report import Columns, listing, shared, told, words
 from benchmarks.section import Result, goal
-from benchmarks.timing import clock, interleave, milliseconds, ratio, shown, timed
+from benchmarks.timing import Contestants, clock, interleave, milliseconds, ratio, shown, timed
 from problems.graphs import graph_with
 from unifg.files.g2o import read_g2o, write_g2o
 from unifg.lie import SE3
@@ -104,7 +104,7 @@ def measure_case(case: Case, rounds: int) -> Result:
         graph, start = fresh()
         return clock(lambda: GaussNewton().prepare(graph).solve(start))
 
-    candidates: dict[str, Callable[[], float]] = {"ours": timed(partial(run.solve, guess), count), "whole": whole}
+    candidates: Contestants = {"ours": timed(partial(run.solve, guess), count), "whole": whole}
     ends: list[tuple[int, float]] = []
     best_whole = ""
     if available():
@@ -149,7 +149,7 @@ def measure_file(case: Case, rounds: int) -> Result:
             ends[ordering] = iterations, chi2
             return elapsed
 
-        candidates: dict[str, Callable[[], float]] = {"ours": timed(ours)}
+        candidates: Contestants = {"ours": timed(ours)}
         if available():
             candidates |= {ordering: partial(theirs, ordering) for ordering in ORDERINGS}
         times = interleave(candidates, rounds)

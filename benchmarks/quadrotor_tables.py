@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from benchmarks.comparison import Key, Read, Row, comparison, grouped, metric, middle, share, where
+from benchmarks.comparison import Key, Read, Row, comparison, grouped, metric, middle, portion, where
 from benchmarks.report import Columns, listing, table
 from unifg.typing import Array
 
@@ -81,7 +81,7 @@ def ticks(rows: Sequence[Row]) -> str:
 # What is told of the metrics of several flights.
 SUCCESS: Columns[list[Row]] = {
     "succeeded": lambda flights: f"{_good(flights)} of {len(flights)}",
-    "95 % [%]": lambda flights: " .. ".join(f"{100 * end:.0f}" for end in share(_good(flights), len(flights))),
+    "95 % [%]": lambda flights: portion(_good(flights), len(flights)).removesuffix(" %"),
     "collided": lambda flights: str(sum(m["collisions"] > 0 for m in flights)),
     "not there": lambda flights: str(sum(not m["reached"] for m in flights)),
     "time [s]": lambda flights: middle([m["time_to_goal_s"] for m in flights if m["time_to_goal_s"] is not None], 1),

@@ -22,7 +22,7 @@ from unifg.scenarios.papers.printed import shared as shared
 T = TypeVar("T")
 Words = TypeVar("Words", bound=tuple[str, ...])
 
-Columns: TypeAlias = dict[str, Callable[[T], str]]
+Columns: TypeAlias = Mapping[str, Callable[[T], str]]
 """Columns of a table by heading: words of what stands in a line."""
 
 CHECKOUT = Path(__file__).resolve().parent.parent

@@ -95,7 +95,7 @@ class Timing:
         return f"{self.tables(chosen.rounds or self.rounds)}\n\n{machine()}"
 
 
-PAGES: dict[str, dict[str, float]] = {
+PAGES = {
     "bazzana": {"experiments": 3.0, "against_ipopt": 0.1},
     "ta": {
         "obstacle_fields": 0.1, "obstacle_courses": 0.25, "quadrotor_flights": 1.5, "quadrotor_pull": 0.15,

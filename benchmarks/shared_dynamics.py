@@ -9,15 +9,15 @@ flights of a seed meet the same corridor, parameters, disturbances and noise; in
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from benchmarks.comparison import Row, difference, paired, where
-from benchmarks.report import listing
+from benchmarks.comparison import Key, Row, difference, paired, where
+from benchmarks.report import Columns, listing
 from benchmarks.runner import Cell, Study
 from unifg.horizon import Plan
 from unifg.models import quadrotor
@@ -164,8 +164,8 @@ def change(name: str, pair: tuple[Sequence[Row], Sequence[Row]]) -> str:
 
 def render(rows: Sequence[Row]) -> str:
     """Markdown: the combinations, and what each change does."""
-    levels: dict[tuple[str, str, str], list[Row]] = {}
-    changes: dict[tuple[str, str, str], tuple[list[Row], list[Row]]] = {}
+    levels: dict[Key, list[Row]] = {}
+    changes: dict[Key, tuple[list[Row], list[Row]]] = {}
     for there, sensor in ((False, "no"), (True, "yes")):
         flown = {
             (past, plan): where(rows, accelerometer=there, past=past, plan=plan) for past in PASTS for plan in PLANS
@@ -174,16 +174,14 @@ def render(rows: Sequence[Row]) -> str:
         for words, (before, after) in CHANGES.items():
             if flown[before] and flown[after]:
                 changes[sensor, *words] = flown[before], flown[after]
-    told: Mapping[str, Callable[[list[Row]], str]] = {
+    told: Columns[list[Row]] = {
         **{head: partial(mean, name) for head, name in MEASURES.items()},
         "time of those who arrive [s]": lambda some: mean("time", [row for row in some if row["reached"]]),
         "arrived, untouched": lambda some: (
             f"{sum(row['reached'] and not row['collisions'] for row in some)} of {len(some)}"
         ),
     }
-    differences: Mapping[str, Callable[[tuple[list[Row], list[Row]]], str]] = {
-        head: partial(change, name) for head, name in MEASURES.items()
-    }
+    differences: Columns[tuple[list[Row], list[Row]]] = {head: partial(change, name) for head, name in MEASURES.items()}
     parts = [
         "### The combinations",
         "Errors are root mean squares over a flight; everything is the mean over flights.",

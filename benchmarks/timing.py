@@ -18,6 +18,8 @@ from unifg.typing import Array
 
 Spread: TypeAlias = list[float]
 """Median, lower and upper bound; a list because results are written as JSON."""
+Contestants: TypeAlias = dict[str, Callable[[], float]]
+"""By name, what measures a time [s]."""
 
 
 def pin() -> None:

@@ -33,7 +33,7 @@ from unifg.typing import Array
 
 THRESHOLD = {3: 3.37, 6: 4.10}  # by numbers in a measurement: 99 % of right ones
 CLAIMS: tuple[Claim, ...] = ("same place", "anywhere")
-MADE: dict[str, Callable[[], PoseGraph]] = {
+MADE = {
     "city": lambda: manhattan(1000, seed=0).pose_graph,
     "globe": lambda: sphere(15, 30, seed=0).pose_graph,
 }
