@@ -415,10 +415,7 @@ def test_a_rival_loss_is_named_where_it_finds_more(caplog: pytest.LogCaptureFixt
     assert weights[sim.outliers].max() == 0.0 and weights[~sim.outliers].mean() > 0.98
 
 
-def kept(row: dict[str, Any]) -> list[float]:
-    """Numbers of an attempt, as far as methods agree."""
-    precise = round(row["distance"], 3), round(row["right kept"], 4)
-    return [*precise, row["wrong kept"], row["wrong"], round(row["precision"], 4)]
+AGREED = "distance", "right kept", "wrong kept", "wrong", "precision"
 
 
 @pytest.mark.product(1, of="studies")
@@ -438,7 +435,7 @@ def test_the_study_of_wrong_closures_counts_what_each_method_keeps() -> None:
                 continue  # no graduation, no second look
             assert row["wrong kept"] == 0 and row["precision"] == 1.0 and row["right kept"] > 0.95
             assert row["distance"] < 0.2
-        told = {method: kept(row) for method, row in found.items()}
+        told = {method: [round(row[name], 3) for name in AGREED] for method, row in found.items()}
         assert told.get("GTSAM", told["unifg"]) == told["unifg"]
 
 
@@ -450,7 +447,7 @@ def test_wrong_closures_of_a_long_drive(shared_data: Path, name: str, wrong: int
     clean = read_g2o(shared_data / "pose_graphs" / f"{name}.g2o.gz")
     row = attempt(clean, 0.1, "anywhere", 0, "unifg")
     assert row["remark"] == "CONVERGED"
-    assert kept(row) == [0.0, 1.0, 0, wrong, 1.0]
+    assert [round(row[name], 3) for name in AGREED] == [0.0, 1.0, 0, wrong, 1.0]
 
 
 @pytest.mark.data
