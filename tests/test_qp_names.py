@@ -58,6 +58,17 @@ def test_one_subproblem_is_what_the_engine_finds(name: str) -> None:
     np.testing.assert_allclose(theirs.multipliers, mine.multipliers, atol=1e-3)
 
 
+@pytest.mark.parametrize("name", ["piqp", *NAMES])
+@pytest.mark.parametrize("sigma", [1e3, 1e5])
+def test_small_costs_are_solved_like_costs_of_one(name: str, sigma: float) -> None:
+    """Tolerances of a solver are absolute: multipliers of costs of 1e-6 and 1e-10 have as many digits."""
+    graph, x = drawn_to([2.0, 1.0], sigma=sigma)
+    graph.constrain(lambda p: 0.01 * p[:, :1], x, lower=-0.01, upper=0.005, name="wall")
+    solution = SQP(qp=name, fallback=None, max_iterations=5).solve(graph, {x: np.zeros((1, 2))}, check=True)
+    np.testing.assert_allclose(solution[x], [[0.5, 1.0]], atol=1e-5)
+    np.testing.assert_allclose(solution.dual("wall") * sigma**2, [[150.0]], rtol=1e-4)
+
+
 @pytest.mark.parametrize("name", ["osqp", *NAMES])
 def test_contradictions_are_left_to_the_elastic_problem(name: str) -> None:
     """Near the origin the linearised circle asks for an impossible step within the box."""

@@ -33,7 +33,7 @@ def new_solver() -> piqp.SparseSolver:
 
 def limited(qp: QP) -> tuple[Array, Array, Array, BoolArray]:
     """Entries of A, limits and which rows have any; rows without are emptied, which PIQP would do with a complaint."""
-    has = np.isfinite(qp.lower) | np.isfinite(qp.upper)
+    has = (qp.lower > -INFINITY) | (qp.upper < INFINITY)
     constraints = qp.program.constraints
     entries = constraints.compress(qp.jacobian)
     if has.all():
@@ -72,12 +72,13 @@ class PiqpRoute:
         assert self._solver is not None
         self._solver.settings.eps_abs = float(np.clip(0.01 * accuracy, TIGHTEST, LOOSEST))
         entries, lower, upper, has = limited(qp)
-        self._hessian.data[:] = qp.hessian
+        unit = qp.unit
+        self._hessian.data[:] = qp.hessian / unit
         self._equalities.data[:] = entries[self._equality_entries]
         self._inequalities.data[:] = entries[self._inequality_entries]
         numbers = {
             "P": self._hessian,
-            "c": qp.gradient,
+            "c": qp.gradient / unit,
             "A": self._equalities,
             "b": lower[equal],
             "G": self._inequalities,
@@ -93,11 +94,12 @@ class PiqpRoute:
         iterations = int(result.info.iter)
         if status in (piqp.PIQP_PRIMAL_INFEASIBLE, piqp.PIQP_DUAL_INFEASIBLE):
             zero = np.zeros(self.program.size)
-            infeasible = status == piqp.PIQP_PRIMAL_INFEASIBLE
-            return QPAnswer(zero, multipliers, self.name, iterations, np.inf, infeasible)
+            return QPAnswer(
+                zero, multipliers, self.name, iterations, np.inf, infeasible=status == piqp.PIQP_PRIMAL_INFEASIBLE
+            )
         step, dual = np.array(result.x), np.zeros(len(equal))
-        dual[equal] = result.y
-        dual[~equal] = np.asarray(result.z_u) - np.asarray(result.z_l)
+        dual[equal] = unit * np.asarray(result.y)
+        dual[~equal] = unit * (np.asarray(result.z_u) - np.asarray(result.z_l))
         dual[~has] = 0.0
         return QPAnswer(step, dual, self.name, iterations, qp_error(qp, step, dual))
 

@@ -54,17 +54,15 @@ class QpsolversRoute:
 
     def solve(self, qp: QP, multipliers: Array, accuracy: float) -> QPAnswer:
         """Solve and measure; ``multipliers`` and ``accuracy`` are not used: interior points start cold."""
-        hessian = self._full(qp)
+        upper = qp.pattern.matrix(qp.hessian)
+        hessian = (upper + sp.triu(upper, 1).T).tocsc()
         jacobian = self.program.constraints.matrix(qp.jacobian).tocsr()
-        answer = self._solve(hessian, qp.gradient, jacobian, qp.lower, qp.upper)
+        unit = qp.unit
+        answer = self._solve(hessian / unit, qp.gradient / unit, jacobian, qp.lower, qp.upper)
         if answer is None:
             return QPAnswer(np.zeros(self.program.size), multipliers, self.name, 0, np.inf)
-        step, dual, iterations = answer
+        step, dual, iterations = answer[0], unit * answer[1], answer[2]
         return QPAnswer(step, dual, self.name, iterations, qp_error(qp, step, dual))
-
-    def _full(self, qp: QP) -> sp.csc_matrix:
-        upper = qp.pattern.matrix(qp.hessian)
-        return (upper + sp.triu(upper, 1).T).tocsc()
 
     def _solve(
         self, hessian: sp.csc_matrix, gradient: Array, jacobian: sp.csr_matrix, lower: Array, upper: Array
@@ -101,6 +99,5 @@ class QpsolversRoute:
             np.add.at(dual, below, -solution.z[len(above) :])
         if solution.y is not None and len(solution.y):
             dual[fixed] = solution.y
-        info = (solution.extras or {}).get("info")
-        iterations = getattr(info, "iter", 0) if info is not None else 0
-        return np.asarray(solution.x, dtype=np.float64), dual, int(iterations)
+        iterations = int(getattr((solution.extras or {}).get("info"), "iter", 0))
+        return np.asarray(solution.x, dtype=np.float64), dual, iterations

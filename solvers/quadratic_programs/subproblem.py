@@ -19,6 +19,7 @@ from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.evaluation import add_constraints
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization, all_finite
+from unifg.problem.units import cost_size
 from unifg.solvers.globalize.norms import largest
 from unifg.typing import Array, BoolArray
 
@@ -58,6 +59,11 @@ class QP:
     damping: float | Array = 0.0
     curved_by: Array | None = None
     weights: Array | None = None
+
+    @property
+    def unit(self) -> float:
+        """Size of the costs, at most 1: what routes with absolute tolerances divide them by."""
+        return float(cost_size(self.program.normal.diagonal, self.lin.hessian, self.lin.gradient))
 
     def curved(self, step: Array) -> Array:
         """H d."""
