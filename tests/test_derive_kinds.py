@@ -165,6 +165,7 @@ DIRECTED: list[Function] = [
     lambda x: np.float_power(np.abs(x), 0.3) + np.cbrt(x) + np.exp2(x),
     lambda x: np.logaddexp(x, x[:, ::-1]),
     lambda x: np.sinc(x),
+    lambda x: np.logical_xor(x, x > 0.5) + 1.0 * ((x > 0.0) ^ (x < 0.5)),
     reshaped, assigned, masked, outed, summed_builtin,
 ]  # fmt: skip
 

@@ -144,6 +144,7 @@ class Symbol:
     __eq__, __ne__ = _both("equal")[0], _both("not_equal")[0]
     __and__, __rand__ = _both("bitwise_and")
     __or__, __ror__ = _both("bitwise_or")
+    __xor__, __rxor__ = _both("bitwise_xor")
 
     # ---------------------------------------------------------------- what cannot be traced
 
@@ -486,10 +487,10 @@ def _unless(refused: Callable[[tuple[Any, ...]], bool], why: str, operation: Cal
     return guarded
 
 
-def _of_truths(name: str, op: Op) -> Callable[..., Any]:
+def _of_truths(name: str, operation: Callable[..., Any]) -> Callable[..., Any]:
     """An operation on the bits of integers, which is traced for truth values only."""
     why = f"calls np.{name} on numbers, which takes their bits; {INSTEAD}"
-    return _unless(lambda arguments: not _all_truths(arguments), why, _operation(op))
+    return _unless(lambda arguments: not _all_truths(arguments), why, operation)
 
 
 def _of_numbers(name: str, op: Op) -> Callable[..., Any]:
@@ -532,6 +533,10 @@ def _hypot(a: Any, b: Any) -> Any:
 
 def _not_equal(a: Any, b: Any) -> Any:
     return _apply(Op.NOT, _apply(Op.EQUAL, a, b))
+
+
+def _exclusive_or(a: Any, b: Any) -> Any:
+    return _apply(Op.AND, _apply(Op.OR, a, b), _apply(Op.NOT, _apply(Op.AND, a, b)))
 
 
 UFUNCS: dict[str, Callable[..., Any]] = {
@@ -610,9 +615,11 @@ UFUNCS: dict[str, Callable[..., Any]] = {
     "logical_and": _operation(Op.AND),
     "logical_or": _operation(Op.OR),
     "logical_not": _operation(Op.NOT),
-    "bitwise_and": _of_truths("bitwise_and", Op.AND),
-    "bitwise_or": _of_truths("bitwise_or", Op.OR),
-    "invert": _of_truths("invert", Op.NOT),
+    "logical_xor": _exclusive_or,
+    "bitwise_and": _of_truths("bitwise_and", _operation(Op.AND)),
+    "bitwise_or": _of_truths("bitwise_or", _operation(Op.OR)),
+    "bitwise_xor": _of_truths("bitwise_xor", _exclusive_or),
+    "invert": _of_truths("invert", _operation(Op.NOT)),
 }
 """Meaning of the ufuncs of NumPy for single entries, by name."""
 
