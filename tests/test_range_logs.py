@@ -103,8 +103,9 @@ def test_a_frequent_longest_range_means_that_nothing_was_hit(log: RangeLog, tmp_
 def test_who_stands_for_an_hour_counts_in_seconds(log: RangeLog, tmp_path: Path) -> None:
     assert log.corrected is not None
     hour = log.time[-1] + 60.0 * np.arange(1.0, 200.0)
-    stood = [np.concatenate([a, np.repeat(a[-1:], len(hour), 0)]) for a in (log.ranges, log.odometry, log.corrected)]
-    write_csv(tmp_path / "log.csv", RangeLog("log", np.append(log.time, hour), log.angles, *stood))
+    given = {"ranges": log.ranges, "odometry": log.odometry, "corrected": log.corrected}
+    stood: Any = {name: np.concatenate([a, np.repeat(a[-1:], len(hour), 0)]) for name, a in given.items()}
+    write_csv(tmp_path / "log.csv", RangeLog("log", np.append(log.time, hour), log.angles, **stood))
     np.testing.assert_allclose(read_range_log(tmp_path / "log.csv").time[: len(log)], log.time)
 
 

@@ -120,8 +120,8 @@ def read_range_log(path: str | Path, limits: Limits = LIMITS) -> RangeLog:
     if path.suffix == ".npz":
         return _drive(path, limits)
     if path.is_dir() or path.suffix in ROSBAGS:
-        *numbers, placed = read_rosbag(path)
-        return replace(_in_order(name, *numbers, None), placed=placed)
+        recorded = read_rosbag(path)
+        return replace(_in_order(name, *recorded[:5], None), placed=recorded.placed)
     log = read_carmen(path, limits=limits)
     if not log.scans:
         raise FileFormatError(f"{name}: there is no scan in this log")

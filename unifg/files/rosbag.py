@@ -135,11 +135,11 @@ def _odometry(name: str, wheels: list[Any]) -> tuple[Array, Array, BoolArray, st
         wheels = [one for one in wheels if (one.header.frame_id, one.child_frame_id) == (world, robot)]
         logger.warning("%s: odometry of other frames than %r in %r left out", name, robot, world)
     time, numbers = np.array([_stamp(one) for one in wheels]), _numbers([one.pose.pose for one in wheels])
-    finite = np.isfinite(numbers).all(axis=1)
+    finite = np.isfinite(numbers.sum(axis=1))
     if not finite.any():
         raise FileFormatError(f"{name}: odometry: no pose is finite")
     if not finite.all():
-        logger.warning("%s: %d of %d poses of odometry left out: not finite", name, sum(~finite), len(finite))
+        logger.warning("%s: %d of %d poses of odometry left out: not finite", name, np.sum(~finite), len(finite))
         time, numbers = time[finite], numbers[finite]
     if (back := float((np.maximum.accumulate(time) - time).max())) > BACK:
         logger.warning("%s: stamps of odometry run backwards by up to %g s: is it more than one drive?", name, back)
