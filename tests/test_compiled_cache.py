@@ -10,8 +10,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from threading import Event
-from types import FunctionType
-from typing import Any, cast
+from typing import Any
 
 import numba
 import numpy as np
@@ -21,7 +20,7 @@ import pytest
 from scripts import loaded, run_script
 from unifg.codegen import cache_folder, jit
 from unifg.codegen.artifact import Artifact
-from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON, UseDispatcher
+from unifg.codegen.dispatcher import ADDRESS, LINKED, PYTHON
 from unifg.codegen.fingerprint import fingerprint
 from unifg.codegen.jit import compiled
 from unifg.codegen.objects import read_sealed, write_sealed
@@ -403,8 +402,3 @@ def test_a_newer_numba_works_from_sources(tmp_path: Path) -> None:
     assert said() == ("True False False", 1, 0)
     assert said() == ("False False True", 0, 0)
     assert said("renamed") == ("True False False", 0, 1)
-
-
-def test_numbas_dispatcher_is_given_settings() -> None:
-    made = UseDispatcher(cast(FunctionType, read_from_cache))  # Numba 0.61 looks into both, and takes no None
-    assert (made.locals, made.targetoptions) == ({}, {})

@@ -74,8 +74,7 @@ class UseDispatcher(CPUDispatcher):  # type: ignore[misc]
     def __init__(self, py_func: FunctionType, locals: Any = None, targetoptions: Any = None) -> None:
         """Compile nothing yet."""
         self.use: int = ADDRESS
-        given = ({} if one is None else one for one in (locals, targetoptions))  # Numba 0.61 takes no None
-        super().__init__(py_func, *given, partial(_Pipeline, lambda: self.use))
+        super().__init__(py_func, locals, targetoptions, partial(_Pipeline, lambda: self.use))
         self._ready: dict[tuple[Any, ...], int] = {}
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
