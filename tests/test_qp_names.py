@@ -9,7 +9,7 @@ import unifg as fg
 from judge import judge
 from problems.graphs import drawn_to
 from problems.known import PROBLEMS, Problem, active_bounds, short_drive
-from unifg.solvers import SQP
+from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
 from unifg.solvers.quadratic_programs.qpsolvers_route import QpsolversRoute
 from unifg.solvers.quadratic_programs.subproblem import qp_error, subproblem
@@ -67,6 +67,27 @@ def test_small_costs_are_solved_like_costs_of_one(name: str, sigma: float) -> No
     solution = SQP(qp=name, fallback=None, max_iterations=5).solve(graph, {x: np.zeros((1, 2))}, check=True)
     np.testing.assert_allclose(solution[x], [[0.5, 1.0]], atol=1e-5)
     np.testing.assert_allclose(solution.dual("wall") * sigma**2, [[150.0]], rtol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["osqp", "piqp", *NAMES])
+@pytest.mark.parametrize(("sigma", "soft"), [(1e-5, None), (1e-5, 1e3), (1e-7, None)])
+def test_large_costs_are_solved_like_costs_of_one(name: str, sigma: float, soft: float | None) -> None:
+    """Curvatures of 1e10 made the units of unknowns tiny, in which OSQP and PIQP found convex problems infeasible."""
+    for seed in range(6):
+        rng, graph = np.random.default_rng(seed), fg.Graph()
+        x, u = graph.variables("x", fg.Rn(2), 9), graph.variables("u", fg.Rn(1), 8)
+        A, B, start, goal = (rng.normal(size=size) for size in ((2, 2), (2, 1), 2, 2))
+        graph.fix(x[0], start)
+        graph.constrain(
+            lambda a, b, c, A=A, B=B: c - a - 0.1 * (a @ A.T + b @ B.T), x[:-1], u, x[1:], lower=0.0, upper=0.0
+        )
+        graph.minimize(fg.prior, x[-1], goal, sigma=sigma, name="goal")
+        graph.minimize(fg.prior, u, [0.0], sigma=30.0 * sigma, name="effort")
+        graph.bound(u, upper=1.0)
+        graph.constrain(lambda p: p[:, :1] - p[:, 1:], x[1:], lower=-2.0, upper=2.0, soft=soft, name="room")
+        guess = {x: np.tile(start, (9, 1)), u: np.zeros((8, 1))}
+        solution = SQP(qp=name).solve(graph, guess, check=True)
+        assert solution.cost == pytest.approx(InteriorPoint().solve(graph, guess, check=True).cost, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["osqp", *NAMES])

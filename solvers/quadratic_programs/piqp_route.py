@@ -169,12 +169,12 @@ class ElasticRoute:
 
     def solve(self, qp: QP, price: float) -> QPAnswer:
         """Solve; the error reported is zero when PIQP converged, infinite otherwise."""
-        program, n = self.program, self.program.size
-        self._hessian.data[: self._entries] = qp.hessian
+        program, n, unit = self.program, self.program.size, qp.unit
+        self._hessian.data[: self._entries] = qp.hessian / unit
         self._rows.data[: program.constraints.nnz], lower, upper, has = limited(qp)
         numbers = {
             "P": self._hessian,
-            "c": np.concatenate([qp.gradient, np.full(self._slacks, price)]),
+            "c": np.concatenate([qp.gradient, np.full(self._slacks, price)]) / unit,
             "G": self._rows,
             "h_l": lower,
             "h_u": upper,
@@ -190,6 +190,6 @@ class ElasticRoute:
         status = self._solver.solve()
         result = self._solver.result
         step = np.array(result.x)[:n]
-        dual = np.where(has, np.asarray(result.z_u) - np.asarray(result.z_l), 0.0)
+        dual = unit * np.where(has, np.asarray(result.z_u) - np.asarray(result.z_l), 0.0)
         solved = status == piqp.PIQP_SOLVED and np.isfinite(step).all() and np.isfinite(dual).all()
         return QPAnswer(step, dual, "elastic", int(result.info.iter), 0.0 if solved else np.inf)

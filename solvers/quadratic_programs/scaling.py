@@ -4,7 +4,8 @@ The largest entry of every row and column is brought near one by taking square r
 (Ruiz, A scaling algorithm to equilibrate both rows and columns norms in matrices, RAL-TR-2001-034). Factors are rounded
 to powers of two: stating a problem in them rounds nothing. Passes see no curvature that is small beside the entries of
 its rows everywhere; where it is very small, unknowns grow and rows shrink until the largest curvature is one. Bounds of
-unknowns say nothing about their scale, and take over that of the unknown. A graph whose units are within a thousand of
+unknowns say nothing about their scale, and take over that of the unknown. Curvatures that are large in the mean tell of
+the unit of the costs, not of those of unknowns: they are divided by it first. A graph whose units are within a thousand of
 balance is solved in them, unless it is one of least squares alone, which has no unit of cost. Answers, and the test
 they have to pass, stay in the units of the graph.
 """
@@ -238,7 +239,11 @@ def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_facto
             if hessian[at] != 0.0:
                 entries[count], firsts[count], seconds[count] = abs(hessian[at]), indices[at], column
                 count += 1
-    squares = count
+    squares, unit, curved = count, 0.0, 0
+    for k in range(squares):
+        if firsts[k] == seconds[k] and entries[k] < np.inf:
+            unit, curved = unit + np.log2(entries[k]), curved + 1
+    entries[:squares] /= np.exp2(max(unit / max(curved, 1), 0.0))
     for k in range(len(free)):
         if jacobian[free[k]] != 0.0 and not of_bounds[rows[k]]:
             entries[count], firsts[count], seconds[count] = abs(jacobian[free[k]]), rows[k], columns[k]

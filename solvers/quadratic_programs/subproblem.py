@@ -62,8 +62,11 @@ class QP:
 
     @property
     def unit(self) -> float:
-        """Size of the costs, at most 1: what routes with absolute tolerances divide them by."""
-        return float(cost_size(self.program.normal.diagonal, self.lin.hessian, self.lin.gradient))
+        """Size of the costs, or their mean curvature above 1: what routes with absolute tolerances divide them by."""
+        size = float(cost_size(self.program.normal.diagonal, self.lin.hessian, self.lin.gradient))
+        curvatures = np.abs(self.hessian[self.pattern.diagonal])
+        known = curvatures[(curvatures > 0.0) & np.isfinite(curvatures)]
+        return size if size < 1.0 or not len(known) else max(1.0, float(np.exp2(np.log2(known).mean())))
 
     def curved(self, step: Array) -> Array:
         """H d."""
