@@ -5,8 +5,8 @@ The largest entry of every row and column is brought near one by taking square r
 to powers of two: stating a problem in them rounds nothing. Passes see no curvature that is small beside the entries of
 its rows everywhere; where it is very small, unknowns grow and rows shrink until the largest curvature is one. Bounds of
 unknowns say nothing about their scale, and take over that of the unknown. Curvatures that are large in the mean tell of
-the unit of the costs, not of those of unknowns: they are divided by it first. A graph whose units are within a thousand of
-balance is solved in them, unless it is one of least squares alone, which has no unit of cost. Answers, and the test
+the unit of the costs, not of those of unknowns: they are divided by it first. A graph whose units are within a thousand
+of balance is solved in them, unless it is one of least squares alone, which has no unit of cost. Answers, and the test
 they have to pass, stay in the units of the graph.
 """
 
