@@ -230,7 +230,6 @@ def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_facto
     indptr, indices, free, rows, columns, of_bounds = patterns
     column_factors[:] = 1.0
     row_factors[:] = 1.0
-    of_columns, of_rows = np.empty(len(column_factors)), np.empty(len(row_factors))
     entries = np.empty(len(indices) + len(free))  # but zeros, which a fixed pattern has many of: those of H, then of A
     firsts, seconds = np.empty(len(entries), dtype=np.int64), np.empty(len(entries), dtype=np.int64)
     count = 0
@@ -239,40 +238,21 @@ def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_facto
             if hessian[at] != 0.0:
                 entries[count], firsts[count], seconds[count] = abs(hessian[at]), indices[at], column
                 count += 1
-    squares, unit, curved = count, 0.0, 0
-    for k in range(squares):
-        if firsts[k] == seconds[k] and entries[k] < np.inf:
-            unit, curved = unit + np.log2(entries[k]), curved + 1
-    entries[:squares] /= np.exp2(max(unit / max(curved, 1), 0.0))
+    squares = count
     for k in range(len(free)):
         if jacobian[free[k]] != 0.0 and not of_bounds[rows[k]]:
             entries[count], firsts[count], seconds[count] = abs(jacobian[free[k]]), rows[k], columns[k]
             count += 1
-    for _ in range(PASSES):
-        furthest = 1.0
-        of_columns[:], of_rows[:] = 0.0, 0.0
-        for k in range(squares):
-            row, column = firsts[k], seconds[k]
-            size = entries[k] * column_factors[row] * column_factors[column]
-            if size < np.inf:
-                of_columns[row] = max(of_columns[row], size)
-                of_columns[column] = max(of_columns[column], size)
-        for k in range(squares, count):
-            row, column = firsts[k], seconds[k]
-            size = entries[k] * row_factors[row] * column_factors[column]
-            if size < np.inf:
-                of_rows[row] = max(of_rows[row], size)
-                of_columns[column] = max(of_columns[column], size)
-        for k in range(len(column_factors)):
-            if of_columns[k] > 0.0:
-                column_factors[k] /= np.sqrt(of_columns[k])
-                furthest = max(furthest, of_columns[k], 1.0 / of_columns[k])
-        for k in range(len(row_factors)):
-            if of_rows[k] > 0.0:
-                row_factors[k] /= np.sqrt(of_rows[k])
-                furthest = max(furthest, of_rows[k], 1.0 / of_rows[k])
-        if furthest < NEAR:
-            break
+    # The constraints alone tell the size of the costs from units of unknowns.
+    _balance(entries[squares:count], firsts[squares:count], seconds[squares:count], 0, column_factors, row_factors)
+    unit, curved = 0.0, 0
+    for k in range(squares):
+        if firsts[k] == seconds[k] and entries[k] < np.inf:
+            unit, curved = unit + np.log2(entries[k] * column_factors[firsts[k]] ** 2), curved + 1
+    entries[:squares] /= np.exp2(max(unit / max(curved, 1), 0.0))
+    column_factors[:] = 1.0
+    row_factors[:] = 1.0
+    _balance(entries[:count], firsts[:count], seconds[:count], squares, column_factors, row_factors)
     steepest = 0.0
     for k in range(squares):
         steepest = max(steepest, entries[k] * column_factors[firsts[k]] * column_factors[seconds[k]])
@@ -292,6 +272,48 @@ def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_facto
         if not of_bounds[row] and not 1.0 / MODEST <= row_factors[row] <= MODEST:
             return False
     return not small
+
+
+@compiled
+def _balance(
+    entries: Array, firsts: IntArray, seconds: IntArray, squares: int, column_factors: Array, row_factors: Array
+) -> None:
+    """Improve factors until the largest entries of all columns and rows are near one.
+
+    Args:
+        entries: of H, then of A.
+        firsts: rows of them.
+        seconds: columns of them.
+        squares: count of those of H.
+        column_factors: (n,) factors of unknowns.
+        row_factors: (M,) factors of the rows of A.
+    """
+    of_columns, of_rows = np.empty(len(column_factors)), np.empty(len(row_factors))
+    for _ in range(PASSES):
+        furthest = 1.0
+        of_columns[:], of_rows[:] = 0.0, 0.0
+        for k in range(squares):
+            row, column = firsts[k], seconds[k]
+            size = entries[k] * column_factors[row] * column_factors[column]
+            if size < np.inf:
+                of_columns[row] = max(of_columns[row], size)
+                of_columns[column] = max(of_columns[column], size)
+        for k in range(squares, len(entries)):
+            row, column = firsts[k], seconds[k]
+            size = entries[k] * row_factors[row] * column_factors[column]
+            if size < np.inf:
+                of_rows[row] = max(of_rows[row], size)
+                of_columns[column] = max(of_columns[column], size)
+        for k in range(len(column_factors)):
+            if of_columns[k] > 0.0:
+                column_factors[k] /= np.sqrt(of_columns[k])
+                furthest = max(furthest, of_columns[k], 1.0 / of_columns[k])
+        for k in range(len(row_factors)):
+            if of_rows[k] > 0.0:
+                row_factors[k] /= np.sqrt(of_rows[k])
+                furthest = max(furthest, of_rows[k], 1.0 / of_rows[k])
+        if furthest < NEAR:
+            break
 
 
 @compiled
