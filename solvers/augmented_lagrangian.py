@@ -171,7 +171,7 @@ class AugmentedLagrangian(Solver):
         scale = np.sqrt(weights)
         unit = self._scale(primal, run.lin)
         # Goals are for scaled violations, the KKT test and the last resort for those as stated.
-        heaviest = LARGEST_PENALTY / min(1.0, float(weights.min(initial=1.0)))
+        heaviest = _stiffness(run, weights) * LARGEST_PENALTY / min(1.0, float(weights.min(initial=1.0)))
         least = 0.1 * run.tolerances.violation * min(1.0, float(scale.min(initial=1.0)))
         gradient_goal, violation_goal = self._goals(run, primal, rho, multipliers, rho * weights)
         exact = self.hessian == "exact" and (len(weights) > 0 or bool(run.program.scalar_terms))
@@ -325,6 +325,15 @@ class AugmentedLagrangian(Solver):
 
     def _stop_rule(self, run: SolveState, step_norm: float) -> bool:
         return step_norm < self.step_tolerance and run.optimality.violation < self.violation_tolerance
+
+
+def _stiffness(run: SolveState, weights: Array) -> float:
+    """Curvatures of the costs over those of the weighed constraints, in the mean and at least one: rho outweighs it."""
+    program, lin = run.program, run.lin
+    pull = program.constraints.transposed_times(lin.constraint_jacobian**2, weights)[program.columns.free]
+    curvatures = lin.hessian[program.normal.diagonal]
+    both = (pull > 0.0) & (curvatures > 0.0)
+    return max(1.0, float(np.exp(np.log(curvatures[both] / pull[both]).mean()))) if both.any() else 1.0
 
 
 @compiled

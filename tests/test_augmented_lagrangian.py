@@ -15,11 +15,11 @@ from judge import judge
 from out_of_reach import goal_too_far
 from problems.control import Driver, Unicycle
 from problems.cylinders import flight
-from problems.graphs import drawn_to, graph_of, graph_with
+from problems.graphs import drawn_to, graph_of, graph_with, weighed_chain
 from problems.known import STARTS, ecg2o, ecg2o_inequality, pose_beside_disc, short_drive
 from unifg.models import obstacles, unicycle
 from unifg.scenarios.manoeuvres import CASES, ManoeuvreSettings, state_problem
-from unifg.solvers import SQP, AugmentedLagrangian
+from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import model_step
 from unifg.typing import Array
@@ -402,3 +402,12 @@ def test_rows_that_become_equalities_are_so_for_the_compiled_steps() -> None:
         graph, again, other = stated()
         fresh = AugmentedLagrangian().prepare(graph).solve(again, data={other: limit}, check=True)
         assert [row.cost for row in found.history] == [row.cost for row in fresh.history]
+
+
+def test_the_largest_penalty_is_that_of_the_costs() -> None:
+    """With curvatures of 1e10 a penalty of 1e10 left violations of centimetres, and solves ended STALLED."""
+    for seed in range(6):
+        graph, guess = weighed_chain(seed, 1e-5)
+        solution = AugmentedLagrangian().solve(graph, guess, check=True)
+        best = InteriorPoint().solve(graph, guess, check=True).cost  # a violation of 1e-6 is worth 1e-5 of it
+        assert solution.cost == pytest.approx(best, rel=1e-4)

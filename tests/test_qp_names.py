@@ -7,7 +7,7 @@ import pytest
 
 import unifg as fg
 from judge import judge
-from problems.graphs import drawn_to
+from problems.graphs import drawn_to, weighed_chain
 from problems.known import PROBLEMS, Problem, active_bounds, short_drive
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
@@ -74,18 +74,7 @@ def test_small_costs_are_solved_like_costs_of_one(name: str, sigma: float) -> No
 def test_large_costs_are_solved_like_costs_of_one(name: str, sigma: float, soft: float | None) -> None:
     """Curvatures of 1e10 made the units of unknowns tiny, in which OSQP and PIQP found convex problems infeasible."""
     for seed in range(6):
-        rng, graph = np.random.default_rng(seed), fg.Graph()
-        x, u = graph.variables("x", fg.Rn(2), 9), graph.variables("u", fg.Rn(1), 8)
-        A, B, start, goal = (rng.normal(size=size) for size in ((2, 2), (2, 1), 2, 2))
-        graph.fix(x[0], start)
-        graph.constrain(
-            lambda a, b, c, A=A, B=B: c - a - 0.1 * (a @ A.T + b @ B.T), x[:-1], u, x[1:], lower=0.0, upper=0.0
-        )
-        graph.minimize(fg.prior, x[-1], goal, sigma=sigma, name="goal")
-        graph.minimize(fg.prior, u, [0.0], sigma=30.0 * sigma, name="effort")
-        graph.bound(u, upper=1.0)
-        graph.constrain(lambda p: p[:, :1] - p[:, 1:], x[1:], lower=-2.0, upper=2.0, soft=soft, name="room")
-        guess = {x: np.tile(start, (9, 1)), u: np.zeros((8, 1))}
+        graph, guess = weighed_chain(seed, sigma, soft)
         solution = SQP(qp=name).solve(graph, guess, check=True)
         assert solution.cost == pytest.approx(InteriorPoint().solve(graph, guess, check=True).cost, rel=1e-5)
 

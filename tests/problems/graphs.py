@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, TypeVar, overload
 
+import numpy as np
+
 import unifg as fg
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.smoothing.families import GrowingFamily
 from unifg.smoothing.smoother import Smoother
+from unifg.typing import Array
 
 Members = tuple[str, fg.Manifold, int]
 AnySmoother = TypeVar("AnySmoother", bound=Smoother)
@@ -49,3 +52,17 @@ def program_of(graph: fg.Graph) -> CompiledProblem:
     program = graph.compile()
     program.bind({})
     return program
+
+
+def weighed_chain(seed: int, sigma: float, soft: float | None = None) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """A linear robot of two states and one bounded control, drawn to a goal with ``sigma``, and a guess at rest."""
+    rng, graph = np.random.default_rng(seed), fg.Graph()
+    x, u = graph.variables("x", fg.Rn(2), 9), graph.variables("u", fg.Rn(1), 8)
+    A, B, start, goal = (rng.normal(size=size) for size in ((2, 2), (2, 1), 2, 2))
+    graph.fix(x[0], start)
+    graph.constrain(lambda a, b, c: c - a - 0.1 * (a @ A.T + b @ B.T), x[:-1], u, x[1:], lower=0.0, upper=0.0)
+    graph.minimize(fg.prior, x[-1], goal, sigma=sigma, name="goal")
+    graph.minimize(fg.prior, u, [0.0], sigma=30.0 * sigma, name="effort")
+    graph.bound(u, upper=1.0)
+    graph.constrain(lambda p: p[:, :1] - p[:, 1:], x[1:], lower=-2.0, upper=2.0, soft=soft, name="room")
+    return graph, {x: np.tile(start, (9, 1)), u: np.zeros((8, 1))}
