@@ -70,7 +70,7 @@ def test_small_costs_are_solved_like_costs_of_one(name: str, sigma: float) -> No
 
 
 @pytest.mark.parametrize("name", ["osqp", "piqp", *NAMES])
-@pytest.mark.parametrize(("sigma", "soft"), [(1e-5, None), (1e-5, 1e3), (1e-7, None)])
+@pytest.mark.parametrize(("sigma", "soft"), [(1e-5, None), (1e-5, 1e3), (1e-6, None)])
 def test_large_costs_are_solved_like_costs_of_one(name: str, sigma: float, soft: float | None) -> None:
     """Curvatures of 1e10 made the units of unknowns tiny, in which OSQP and PIQP found convex problems infeasible."""
     for seed in range(6):

@@ -97,7 +97,7 @@ def _begin(problem: Problem, work: Work) -> bool:
         if not _record(problem, work, False):
             return False
     if now.scaling == 1:
-        units = problem.units, work.next_hessian, work.next_jacobian, work.columns, work.rows
+        units = problem.units, work.next_hessian, work.next_jacobian, work.columns, work.rows, True
         if not holds(problem.links[FIND_UNITS], units):
             return False
     work.columns[:] = 1.0

@@ -61,7 +61,7 @@ class Scaling:
         """
         columns, rows = np.empty(program.size), np.empty(program.constraints.count)
         patterns = Patterns.of(program, program.normal)
-        modest = find_units(patterns, lin.hessian, lin.constraint_jacobian, columns, rows)
+        modest = find_units(patterns, lin.hessian, lin.constraint_jacobian, columns, rows, True)
         if modest and not program.least_squares:
             return neutral or cls.none(program)
         return cls(program, columns, rows)
@@ -217,15 +217,25 @@ def equilibrate(program: CompiledProblem, pattern: Symmetric, hessian: Array, ja
         jacobian: entries of A in evaluation order.
     """
     columns, rows = np.empty(program.size), np.empty(program.constraints.count)
-    find_units(Patterns.of(program, pattern), hessian, jacobian, columns, rows)
+    find_units(Patterns.of(program, pattern), hessian, jacobian, columns, rows, False)
     return columns, rows
 
 
 @compiled
-def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_factors: Array, row_factors: Array) -> bool:
+def find_units(
+    patterns: Patterns, hessian: Array, jacobian: Array, column_factors: Array, row_factors: Array, apart: bool
+) -> bool:
     """Write factors by Ruiz' passes, and rounding; true where no factor, but for those of bounds, is large or small.
 
     Entries that are not finite do not count.
+
+    Args:
+        patterns: of H and A.
+        hessian: entries of H.
+        jacobian: entries of A in evaluation order.
+        column_factors: (n,) that are written.
+        row_factors: (M,) that are written.
+        apart: whether the size of large costs is taken out of H first.
     """
     indptr, indices, free, rows, columns, of_bounds = patterns
     column_factors[:] = 1.0
@@ -243,15 +253,15 @@ def find_units(patterns: Patterns, hessian: Array, jacobian: Array, column_facto
         if jacobian[free[k]] != 0.0 and not of_bounds[rows[k]]:
             entries[count], firsts[count], seconds[count] = abs(jacobian[free[k]]), rows[k], columns[k]
             count += 1
-    # The constraints alone tell the size of the costs from units of unknowns.
-    _balance(entries[squares:count], firsts[squares:count], seconds[squares:count], 0, column_factors, row_factors)
-    unit, curved = 0.0, 0
-    for k in range(squares):
-        if firsts[k] == seconds[k] and entries[k] < np.inf:
-            unit, curved = unit + np.log2(entries[k] * column_factors[firsts[k]] ** 2), curved + 1
-    entries[:squares] /= np.exp2(max(unit / max(curved, 1), 0.0))
-    column_factors[:] = 1.0
-    row_factors[:] = 1.0
+    if apart:  # the constraints alone tell the size of the costs from units of unknowns
+        _balance(entries[squares:count], firsts[squares:count], seconds[squares:count], 0, column_factors, row_factors)
+        unit, curved = 0.0, 0
+        for k in range(squares):
+            if firsts[k] == seconds[k] and entries[k] < np.inf:
+                unit, curved = unit + np.log2(entries[k] * column_factors[firsts[k]] ** 2), curved + 1
+        entries[:squares] /= np.exp2(max(unit / max(curved, 1), 0.0))
+        column_factors[:] = 1.0
+        row_factors[:] = 1.0
     _balance(entries[:count], firsts[:count], seconds[:count], squares, column_factors, row_factors)
     steepest = 0.0
     for k in range(squares):

@@ -341,7 +341,7 @@ def _problem(program: CompiledProblem, work: Work) -> Problem:
             add_scalars, NUMBER, terms, work.trial, work.heights, work.next_gradient, work.next_hessian, work.concavity,
             scratch, True,
         ),
-        link_like(find_units, TRUTH, units, work.hessian, work.constraint_jacobian, work.columns, work.rows),
+        link_like(find_units, TRUTH, units, work.hessian, work.constraint_jacobian, work.columns, work.rows, True),
     ]  # fmt: skip
     return Problem(
         np.array(links), terms, system, program.normal.diagonal, program.equality, retraction.parts, free,
