@@ -253,13 +253,11 @@ def find_units(
         if jacobian[free[k]] != 0.0 and not of_bounds[rows[k]]:
             entries[count], firsts[count], seconds[count] = abs(jacobian[free[k]]), rows[k], columns[k]
             count += 1
-    if apart:  # the constraints alone tell the size of the costs from units of unknowns
+    curved = entries[:squares], firsts[:squares], seconds[:squares]
+    if apart and _curvature(*curved, column_factors) > MODEST:
+        # The constraints alone tell the size of the costs from units of unknowns.
         _balance(entries[squares:count], firsts[squares:count], seconds[squares:count], 0, column_factors, row_factors)
-        unit, curved = 0.0, 0
-        for k in range(squares):
-            if firsts[k] == seconds[k] and entries[k] < np.inf:
-                unit, curved = unit + np.log2(entries[k] * column_factors[firsts[k]] ** 2), curved + 1
-        entries[:squares] /= np.exp2(max(unit / max(curved, 1), 0.0))
+        entries[:squares] /= max(_curvature(*curved, column_factors), 1.0)
         column_factors[:] = 1.0
         row_factors[:] = 1.0
     _balance(entries[:count], firsts[:count], seconds[:count], squares, column_factors, row_factors)
@@ -282,6 +280,16 @@ def find_units(
         if not of_bounds[row] and not 1.0 / MODEST <= row_factors[row] <= MODEST:
             return False
     return not small
+
+
+@compiled
+def _curvature(entries: Array, firsts: IntArray, seconds: IntArray, factors: Array) -> float:
+    """Mean curvature of scaled unknowns, by its logarithm; one where there is none."""
+    total, count = 0.0, 0
+    for k in range(len(entries)):
+        if firsts[k] == seconds[k] and entries[k] < np.inf:
+            total, count = total + np.log2(entries[k] * factors[firsts[k]] ** 2), count + 1
+    return float(np.exp2(total / max(count, 1)))
 
 
 @compiled
