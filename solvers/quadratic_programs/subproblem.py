@@ -24,6 +24,7 @@ from unifg.solvers.globalize.norms import largest
 from unifg.typing import Array, BoolArray
 
 LEFT = 0.3  # share of the violation that a step may leave in the linear model
+LARGE = 2.0**7  # curvature that is taken out of the costs
 FINER = 0.01  # than the accuracy asked for: what interior points reach, and OSQP with a polish or not at all
 
 
@@ -62,11 +63,12 @@ class QP:
 
     @property
     def unit(self) -> float:
-        """Size of the costs, or their mean curvature above 1: what routes with absolute tolerances divide them by."""
+        """Size of the costs below 1, or their mean curvature if large: absolute tolerances are for costs over it."""
         size = float(cost_size(self.program.normal.diagonal, self.lin.hessian, self.lin.gradient))
         curvatures = np.abs(self.hessian[self.pattern.diagonal])
         known = curvatures[(curvatures > 0.0) & np.isfinite(curvatures)]
-        return size if size < 1.0 or not len(known) else max(1.0, float(np.exp2(np.log2(known).mean())))
+        mean = float(np.exp2(np.log2(known).mean())) if len(known) else 1.0
+        return mean if size == 1.0 and mean > LARGE else size
 
     def curved(self, step: Array) -> Array:
         """H d."""
