@@ -169,7 +169,7 @@ class ElasticRoute:
 
     def solve(self, qp: QP, price: float) -> QPAnswer:
         """Solve; the error reported is zero when PIQP converged, infinite otherwise."""
-        program, n, unit = self.program, self.program.size, qp.unit
+        program, n, unit = self.program, self.program.size, max(1.0, qp.unit)
         self._hessian.data[: self._entries] = qp.hessian / unit
         self._rows.data[: program.constraints.nnz], lower, upper, has = limited(qp)
         numbers = {
