@@ -35,7 +35,7 @@ from unifg.solvers.augmented_objective import Primal
 from unifg.solvers.augmented_step import STRAIGHT, damped_step, model_step
 from unifg.solvers.globalize.damping import Damping
 from unifg.solvers.globalize.feasibility_restoration import leave, resume, settle
-from unifg.solvers.globalize.norms import largest, norm
+from unifg.solvers.globalize.norms import geometric_mean, largest, norm
 from unifg.typing import Array, IntArray
 
 logger = logging.getLogger("unifg")
@@ -332,8 +332,7 @@ def _stiffness(run: SolveState, weights: Array) -> float:
     program, lin = run.program, run.lin
     pull = program.constraints.transposed_times(lin.constraint_jacobian**2, weights)[program.columns.free]
     curvatures = lin.hessian[program.normal.diagonal]
-    both = (pull > 0.0) & (curvatures > 0.0)
-    return max(1.0, float(np.exp(np.log(curvatures[both] / pull[both]).mean()))) if both.any() else 1.0
+    return max(1.0, geometric_mean(curvatures[pull > 0.0] / pull[pull > 0.0]))
 
 
 @compiled

@@ -25,6 +25,12 @@ def largest(vector: Array) -> float:
     return float(_largest(vector))
 
 
+def geometric_mean(numbers: Array) -> float:
+    """Geometric mean of those that are positive and finite; one where there are none."""
+    known = numbers[(numbers > 0.0) & np.isfinite(numbers)]
+    return float(np.exp2(np.log2(known).mean())) if len(known) else 1.0
+
+
 @compiled
 def total(vector: Array) -> float:
     """Sum of the absolute numbers."""

@@ -20,6 +20,7 @@ INFINITY = 1e30  # PIQP treats larger limits as absent
 TIGHTEST = 1e-12
 LOOSEST = 1e-7
 SLACK_CURVATURE = 1e-8
+LEAST_PRICE = 1e3  # of violation, in the unit of the costs
 
 
 def new_solver() -> piqp.SparseSolver:
@@ -168,8 +169,9 @@ class ElasticRoute:
         self._solver = None
 
     def solve(self, qp: QP, price: float) -> QPAnswer:
-        """Solve; the error reported is zero when PIQP converged, infinite otherwise."""
+        """Solve at a price, at least :data:`LEAST_PRICE`; the error is zero when PIQP converged, infinite otherwise."""
         program, n, unit = self.program, self.program.size, max(1.0, qp.unit)
+        price = max(price, LEAST_PRICE * unit)
         self._hessian.data[: self._entries] = qp.hessian / unit
         self._rows.data[: program.constraints.nnz], lower, upper, has = limited(qp)
         numbers = {

@@ -178,8 +178,7 @@ class Subproblems:
             return best
         # Where no step satisfies the rows, nothing says along which steps the curvature of constraints should count.
         self.elastic_asked = True
-        relaxed, known = elastic(), float(np.abs(multipliers).max(initial=0.0))
-        return self.elastic.solve(relaxed, max(10.0 * known, 1e3 * max(1.0, relaxed.unit)))
+        return self.elastic.solve(elastic(), 10.0 * float(np.abs(multipliers).max(initial=0.0)))
 
     def _contradicts(self, qp: QP, answer: QPAnswer) -> bool:
         """Test whether an answer leaves most of the violation, as the least error of contradicting rows does."""

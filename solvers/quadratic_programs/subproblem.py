@@ -20,7 +20,7 @@ from unifg.problem.evaluation import add_constraints
 from unifg.problem.hessian import lagrangian_hessian
 from unifg.problem.linearization import Linearization, all_finite
 from unifg.problem.units import cost_size
-from unifg.solvers.globalize.norms import largest
+from unifg.solvers.globalize.norms import geometric_mean, largest
 from unifg.typing import Array, BoolArray
 
 LEFT = 0.3  # share of the violation that a step may leave in the linear model
@@ -65,9 +65,7 @@ class QP:
     def unit(self) -> float:
         """Size of the costs below 1, or their mean curvature if large: absolute tolerances are for costs over it."""
         size = float(cost_size(self.program.normal.diagonal, self.lin.hessian, self.lin.gradient))
-        curvatures = np.abs(self.hessian[self.pattern.diagonal])
-        known = curvatures[(curvatures > 0.0) & np.isfinite(curvatures)]
-        mean = float(np.exp2(np.log2(known).mean())) if len(known) else 1.0
+        mean = geometric_mean(np.abs(self.hessian[self.pattern.diagonal]))
         return mean if size == 1.0 and mean > LARGE else size
 
     def curved(self, step: Array) -> Array:

@@ -153,7 +153,7 @@ def search(pose_graph: PoseGraph, freedom: int, residual: ResidualName = "log") 
     slipped: list[Suspect] = []
     if taken:
         # What agrees with the map of the rest, whose noise may be larger than stated, was not at fault.
-        over = over_stated(now.chi2, freedom - _rows(edges[~active]))
+        over = over_stated(now.chi2, left)
         out = ~active
         waiting = [*np.flatnonzero(out & edges.odometry)[:, None], *_clusters(edges, closures & out)]
         for group in waiting:
