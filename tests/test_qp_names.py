@@ -11,6 +11,7 @@ from problems.graphs import drawn_to, weighed_chain
 from problems.known import PROBLEMS, Problem, active_bounds, short_drive
 from unifg.solvers import SQP, InteriorPoint
 from unifg.solvers.quadratic_programs.graph_route import GraphRoute
+from unifg.solvers.quadratic_programs.piqp_route import ElasticRoute
 from unifg.solvers.quadratic_programs.qpsolvers_route import QpsolversRoute
 from unifg.solvers.quadratic_programs.subproblem import qp_error, subproblem
 
@@ -75,8 +76,21 @@ def test_large_costs_are_solved_like_costs_of_one(name: str, sigma: float, soft:
     """Curvatures of 1e10 made the units of unknowns tiny, in which OSQP and PIQP found convex problems infeasible."""
     for seed in range(6):
         graph, guess = weighed_chain(seed, sigma, soft)
-        solution = SQP(qp=name).solve(graph, guess, check=True)
-        assert solution.cost == pytest.approx(InteriorPoint().solve(graph, guess, check=True).cost, rel=1e-5)
+        best = InteriorPoint().solve(graph, guess, check=True).cost
+        for limit in (np.inf, 100.0):  # compiled code begins the one, Python the other
+            solution = SQP(qp=name, time_limit=limit).solve(graph, guess, check=True)
+            assert solution.cost == pytest.approx(best, rel=1e-5)
+
+
+def test_the_elastic_problem_outweighs_large_costs() -> None:
+    """Multipliers of costs of 1e10 are 1e10, and a price of 1e3 left the rows violated that can be met."""
+    graph, x = drawn_to([0.0], sigma=1e-5)
+    graph.constrain(fg.prior, x, [1.0], lower=0.0, upper=0.0)
+    program = graph.compile()
+    qp = subproblem(program, program.linearize(program.values_from({x: [[0.0]]})), 0.0, program.normal)
+    answer = ElasticRoute(program, program.normal).solve(qp, 0.0)
+    np.testing.assert_allclose(answer.step, [1.0], atol=1e-6)
+    np.testing.assert_allclose(answer.multipliers, [-1e10], rtol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["osqp", *NAMES])

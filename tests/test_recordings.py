@@ -102,6 +102,11 @@ def test_a_laser_is_placed_once(monkeypatch: pytest.MonkeyPatch) -> None:
                 log.mounted(np.array([0.2, 0.0, 0.0]))
         else:
             assert log.mounted(np.array([0.2, 0.0, 0.0])).placed
+    told = messages([1.0, 2.0])
+    for _, kind, message in told:
+        vars(message).update({"child_frame_id": "/laser"} if kind == "Odometry" else {})
+    monkeypatch.setattr(recordings, "_mcap", lambda path: iter(told))
+    assert not read_range_log("drive.mcap").placed, "one name for both says nothing of a mount"
 
 
 def test_frames_that_do_not_meet_are_said(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
