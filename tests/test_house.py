@@ -286,7 +286,7 @@ def test_wrong_imports_are_found(source: str, module: str, wrong: bool) -> None:
 # Statements (without imports and docstrings) by part and room. They go down with every change that takes something
 # away; what raises one takes as much away elsewhere, or says in CHANGELOG why not.
 BUDGETS = {
-    "unifg solvers models": 34_477, "scenarios": 13_101, "benchmarks": 4_740, "tests": 38_563,
+    "unifg solvers models": 34_477, "scenarios": 13_101, "benchmarks": 4_740, "tests": 38_578,
     "docs examples": 1_989, "unifg/factors": 4_309, "unifg/problem": 3_596, "models": 2_347,
     "unifg/elimination": 2_192, "solvers": 5_230, "unifg/solution": 3_407, "unifg/smoothing": 1_952,
     "unifg/lie": 1_399, "unifg/view": 1_526, "unifg/files": 1_370, "unifg/pose_graphs": 2_035,
