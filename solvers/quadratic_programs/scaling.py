@@ -257,7 +257,9 @@ def find_units(
     if apart and _curvature(*curved, column_factors) > MODEST:
         # The constraints alone tell the size of the costs from units of unknowns.
         _balance(entries[squares:count], firsts[squares:count], seconds[squares:count], 0, column_factors, row_factors)
-        entries[:squares] /= max(_curvature(*curved, column_factors), 1.0)
+        size = max(_curvature(*curved, column_factors), 1.0)
+        for k in range(squares):  # a slice that is written to raises errors that cannot be shipped
+            entries[k] /= size
         column_factors[:] = 1.0
         row_factors[:] = 1.0
     _balance(entries[:count], firsts[:count], seconds[:count], squares, column_factors, row_factors)
