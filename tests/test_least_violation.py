@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import unifg as fg
+from problems.cart_pole import CartPole
 from problems.graphs import graph_of, graph_with
 from unifg.models import unicycle
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
@@ -100,3 +101,24 @@ def test_a_hard_goal_past_a_disc_dead_ahead_is_reached(solver: fg.Solver, count:
     straight = np.linspace([0.0, 0.0, 0.0], [3.0, 0.0, 0.0], count + 1)
     solution = solver.solve(graph, {x: straight, u: np.tile([0.75, 0.0], (count, 1))}, check=True)
     assert np.abs(solution[x][:, 1]).max() > 0.3  # round it, on one side
+
+
+class Balanced(CartPole):
+    """An upright pole at rest, controls far stronger than it needs."""
+
+    stage, terminal, effort = np.array([2.0, 2.0, 0.02, 0.02]), np.array([200.0, 200.0, 2.0, 2.0]), np.array([0.02])
+    lower, upper = np.full(1, -15.0), np.full(1, 15.0)
+
+
+THROWN = np.random.default_rng(5).uniform([-1.0, -np.pi, -2.0, -3.0], [1.0, np.pi, 2.0, 3.0], (12, 4))
+
+
+@pytest.mark.parametrize("solver", [InteriorPoint(tolerance=1e-4), SQP(tolerance=1e-4, qp="graph")], ids=["ipm", "sqp"])
+def test_a_pole_thrown_off_its_plan_is_caught(solver: fg.Solver) -> None:
+    """Controls at their limits leave a long way from the plan for the old state to one for where the pole is now."""
+    stated = Balanced("balanced", False, 40).formulation()
+    prepared = solver.prepare(stated.graph)
+    plan = prepared.solve(stated.guess, data=stated.data(np.zeros(4), 0), check=True)
+    guess = plan.shifted(stated.x, stated.u)
+    for state in THROWN:
+        prepared.solve(guess, data=stated.data(state, 0), check=True)

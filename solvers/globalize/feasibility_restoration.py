@@ -12,13 +12,16 @@ from collections.abc import Callable
 
 import numpy as np
 
+from unifg.elimination.factorization import Factorization
+from unifg.elimination.symmetric import Symmetric
 from unifg.problem.compiled_problem import CompiledProblem
 from unifg.problem.linearization import Linearization
 from unifg.solution.optimality import infeasible_stationary, within_bounds
 from unifg.solution.solve_state import SolveState
 from unifg.solution.status import Status
-from unifg.solution.violation import ViolationModel, descent
+from unifg.solution.violation import ViolationModel, bounds_of_step, descent
 from unifg.solvers.globalize.norms import norm
+from unifg.typing import Array
 
 STEPS = 200
 FIRST_DAMPING, LARGEST_DAMPING, GROWTH, SHRINK = 1e-3, 1e10, 4.0, 0.2
@@ -27,6 +30,9 @@ ROUNDING = 1e-14
 ASIDE = 1e-3  # standard deviation of the step off a point that may be a saddle
 PATIENCE = 20  # iterations whose violation has not fallen
 FALLING = 0.9
+ASTRAY = 0.1  # of the squared violation: where the least so far is less than this share, iterates have gone astray
+SMALLER = 0.25  # of the squared violation: a point from which a solve may go on
+ROUNDS = 5  # of holding unknowns that a step would move past a bound
 LESS = 1e-4  # relative decrease that tells a saddle from a minimum in a flat valley
 
 
@@ -40,18 +46,24 @@ def settle(run: SolveState, status: Status) -> Status:
 
 
 def resume(run: SolveState, status: Status) -> Status | None:
-    """End a solve that stalled as :func:`settle` does, or None once the iterate was moved to where it is feasible.
+    """End a solve that stalled as :func:`settle` does, or None once the iterate was moved to where it may go on.
 
-    That happens once, as it has been feasible then. Multipliers begin anew.
+    See :func:`goes_on`; that it is feasible there happens once. Multipliers begin anew.
     """
     found = _settled(run)
     if found is None or found[1]:
         return status if found is None else Status.LOCALLY_INFEASIBLE
-    if run.violates(found[0].constraints):
+    if not goes_on(run, found[0]):
         return status
     run.multipliers = np.zeros(len(run.multipliers))
     run.begin_at(found[0])
     return run.status
+
+
+def goes_on(run: SolveState, found: Linearization) -> bool:
+    """Test whether a point is feasible, or violates less than half of what the present one and the last such did."""
+    before, run.resumed = min(_squared(run.program, run.lin), run.resumed), _squared(run.program, found)
+    return not run.violates(found.constraints) or run.resumed < SMALLER * before
 
 
 def _settled(run: SolveState) -> tuple[Linearization, bool] | None:
@@ -67,9 +79,14 @@ def _settled(run: SolveState) -> tuple[Linearization, bool] | None:
 
 def nearest(run: SolveState) -> tuple[Linearization, bool]:
     """End of the descent on the violation from the present iterate, and true if nothing near violates less."""
-    found = within_bounds(run.program, run.lin)
+    program = run.program
+    found, least = (within_bounds(program, lin) for lin in (run.lin, program.linearize(run.least_violated)))
+    if _squared(program, least) < ASTRAY * _squared(program, found):  # NaN is not less
+        found = least
     if not infeasible_stationary(run.program, found, run.tolerances.violation):
-        found = least_violation(run.program, found, run.tolerances.violation, run.begin_restoration_step)
+        found = least_violation(program, found, run.tolerances.violation, run.begin_restoration_step)
+        if run.violates(found.constraints):  # the next time goes on from there
+            run.look_at(found)
     while infeasible_stationary(run.program, found, run.tolerances.violation):
         lower = _downhill(run, found)
         if lower is None:
@@ -122,8 +139,9 @@ def least_violation(
 ) -> Linearization:
     """Descend on the violation until it is stationary, gone, or nothing helps.
 
-    Unknowns at a bound that holds them back are held there for the step. Damping is relative to the largest curvature
-    that each unknown has shown (More, The Levenberg-Marquardt algorithm, 1978), so units do not matter.
+    Unknowns at a bound that holds them back are held there for the step, and so are those that would pass one: the
+    others take that into account. Damping is relative to the largest curvature that each unknown has shown (More, The
+    Levenberg-Marquardt algorithm, 1978), so units do not matter.
 
     Args:
         program: the compiled graph.
@@ -142,10 +160,12 @@ def least_violation(
         model = ViolationModel(program, lin)
         if model.stationary(tolerance) or out_of_time():
             return lin
-        size = np.maximum(size, model.size)
+        size, room = np.maximum(size, model.size), bounds_of_step(program, lin)
         while damping <= LARGEST_DAMPING:
-            if solver.factor(model.damped(damping, size)) and (solver.definite or not convex):
-                values = program.within_bounds(program.retract(lin.values, -solver.solve(model.gradient)))
+            entries = model.damped(damping, size)
+            if solver.factor(entries) and (solver.definite or not convex):
+                step = _bounded(solver, program.normal, entries, model.gradient, room)
+                values = program.within_bounds(program.retract(lin.values, step))
                 trial = program.evaluate(values)
                 there = 0.5 * float((program.violation(trial.constraints) ** 2).sum()) if trial.finite else np.inf
                 if there < (1.0 - PROGRESS) * model.value:
@@ -160,6 +180,28 @@ def least_violation(
         lin = program.linearize(values)
         damping *= SHRINK
     return lin
+
+
+def _bounded(
+    solver: Factorization, normal: Symmetric, entries: Array, gradient: Array, room: tuple[Array, Array]
+) -> Array:
+    """Minimise a factorised model; while it is convex, with unknowns that would pass a bound held there."""
+    step, (lower, upper) = -solver.solve(gradient), room
+    held = np.zeros(normal.size, dtype=bool)
+    for _ in range(ROUNDS):
+        passed = ((step < lower) | (step > upper)) & ~held
+        if not solver.definite or not passed.any():
+            break
+        held |= passed
+        fixed = np.where(held, np.clip(step, lower, upper), 0.0)
+        right = np.where(held, 0.0, -gradient - normal.times(entries, fixed))
+        reduced = entries.copy()
+        reduced[held[normal.indices] | held[normal.columns]] = 0.0
+        reduced[normal.diagonal[held]] = 1.0
+        if not solver.factor(reduced) or not solver.definite:
+            break
+        step = solver.solve(right) + fixed
+    return step
 
 
 class RestorationTrigger:

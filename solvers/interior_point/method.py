@@ -34,7 +34,7 @@ from unifg.solution.optimality import Optimality, Tolerances, optimality, read_n
 from unifg.solution.solve_state import UNBOUNDED_COST, Conclusion, SolveState
 from unifg.solution.solver import Solver
 from unifg.solution.status import Status
-from unifg.solvers.globalize.feasibility_restoration import nearest
+from unifg.solvers.globalize.feasibility_restoration import goes_on, nearest
 from unifg.solvers.interior_point import each, state
 from unifg.solvers.interior_point.barrier import FINER
 from unifg.solvers.interior_point.loop import addresses, call
@@ -215,18 +215,19 @@ class InteriorPoint(Solver):
                 return reason
             if run.optimality.violation <= run.tolerances.violation:
                 return reason
-            found = run.lin
+            found, closer = run.lin, False
             if not run.has_been_feasible and self.restoration:
                 found, least = nearest(run)
+                closer = goes_on(run, found) and (now["answer"] != state.VIOLATED or not run.violates(found.constraints))
                 if least:
                     run.begin_at(found)
                     run.status = Status.LOCALLY_INFEASIBLE
                     return run.status
             if restarts == RESTARTS or now["iteration"] >= self.max_iterations or run.out_of_time:
                 return reason
-            if now["answer"] == state.VIOLATED:  # the penalty was too low
+            if now["answer"] == state.VIOLATED and not closer:  # the penalty was too low
                 now["going_on"] = 1
-            elif run.has_been_feasible or not run.violates(found.constraints):
+            elif run.has_been_feasible or closer:
                 workspace.begin_at(run.least_violated.flat if run.has_been_feasible else found.values.flat, self)
                 restarts += 1
             else:

@@ -237,6 +237,7 @@ class SolveState:
         history: rows so far.
         iterations: so far.
         restoration_steps: of descents on the violation alone so far.
+        resumed: squared violation where the last one ended that the solve was to go on from.
         parts: seconds of a compiled loop in evaluation, linear systems and the test of the answer, and of all of the
             loop; None where nobody took them.
         begun: whether the workspace holds a first attempt that :meth:`IterativeMethod.at_once` has made.
@@ -275,7 +276,7 @@ class SolveState:
         self.lent: Factored | None = None
         self.slopes: Slopes | None = None
         self.iterations = self.restoration_steps = 0
-        self.begun = False
+        self.begun, self.resumed = False, np.inf
         self.parts: tuple[float, float, float, float] | None = None
         if solver.verbose:
             show(HEADER)
@@ -385,6 +386,12 @@ class SolveState:
         if violation < self._least:
             self._least, self._least_at = violation, values
         self.consider(cost, constraints, values, multipliers)
+
+    def look_at(self, lin: Linearization) -> None:
+        """Take note of a point that may violate less than all iterates."""
+        violation = float(np.abs(self.program.violation(lin.constraints)).max(initial=0.0))
+        if violation < self._least:
+            self._least, self._least_at = violation, lin.stored
 
     def go_on(self) -> None:
         """Go on with :meth:`accept` after :meth:`conclude`, which has told of a part of the solve only."""

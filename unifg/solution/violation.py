@@ -40,7 +40,7 @@ class ViolationModel:
         self.entries = constraint_curvature(program, lin, outside)
         counted = (outside != 0.0) | program.equality
         add_constraints(program.arrays, lin.constraint_jacobian, counted.astype(np.float64), self.entries)
-        columns = np.repeat(np.arange(program.size), np.diff(normal.indptr))
+        columns = normal.columns
         self.entries[held[normal.indices] | held[columns]] = 0.0
         # An unknown that no violated row touches is moved by none; rows that hold still tell its unit.
         constraints = program.constraints
@@ -71,7 +71,7 @@ class ViolationModel:
         if not np.isfinite(enough):
             return False
         normal, scale = self._program.normal, 1.0 / np.sqrt(self.size)
-        columns = np.repeat(np.arange(normal.size), np.diff(normal.indptr))
+        columns = normal.columns
         scaled = np.abs(self.entries * scale[normal.indices] * scale[columns])
         sums = np.bincount(columns, scaled, normal.size) + np.bincount(normal.indices, scaled, normal.size)
         slope = float(np.square(scale * self.gradient).sum())
@@ -104,17 +104,31 @@ def blocked(program: CompiledProblem, constraints: Array, gradient: Array) -> In
     return columns[((gradient[columns] > 0.0) & at_lower) | ((gradient[columns] < 0.0) & at_upper)]
 
 
+def bounds_of_step(program: CompiledProblem, lin: Linearization) -> tuple[Array, Array]:
+    """(n,) smallest and largest step of each unknown that keeps its bounds."""
+    rows, columns = _bounds(program)
+    lower, upper = np.full(program.size, -np.inf), np.full(program.size, np.inf)
+    np.maximum.at(lower, columns, program.lower[rows] - lin.constraints[rows])
+    np.minimum.at(upper, columns, program.upper[rows] - lin.constraints[rows])
+    return lower, upper
+
+
 def _definite(solver: Factorization, entries: Array) -> bool:
     return solver.factor(entries) and solver.definite
 
 
 def _walls(program: CompiledProblem, constraints: Array) -> tuple[IntArray, BoolArray, BoolArray]:
     """Unknowns with bounds, and whether each rests on its lower or upper one."""
-    rows, columns = program.constraints.free_rows, program.constraints.free_columns
-    bounds = program.bound_rows[rows]
-    rows, columns = rows[bounds], columns[bounds]
+    rows, columns = _bounds(program)
     room = program.upper[rows] - program.lower[rows]
     near = 1e-9 * np.maximum(np.where(np.isfinite(room), room, 1.0), np.abs(constraints[rows]))
     at_lower = np.abs(constraints[rows] - program.lower[rows]) <= near
     at_upper = np.abs(constraints[rows] - program.upper[rows]) <= near
     return columns, at_lower, at_upper
+
+
+def _bounds(program: CompiledProblem) -> tuple[IntArray, IntArray]:
+    """Rows that bound an unknown, and the unknowns."""
+    rows, columns = program.constraints.free_rows, program.constraints.free_columns
+    bounds = program.bound_rows[rows]
+    return rows[bounds], columns[bounds]
