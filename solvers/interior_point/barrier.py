@@ -280,7 +280,8 @@ def begin(address: int) -> None:
         sides[k].y, sides[k].s, sides[k].e = y, s, mu / (penalty - y)
         sides[k].ds = sides[k].de = sides[k].dy = 0.0
     theta = merit(now, sides, pairs, penalties, row_units, rows, lower, 0.0, constraints, 0.0)[1]
-    now.theta_small, now.theta_large = 1e-4 * max(1.0, theta), 1e3 * max(1.0, theta)
+    now.theta_small = 1e-4 * max(1.0, theta)
+    now.theta_large = min(1e3 * max(1.0, theta), max(now.theta_most, theta))
     now.filtered = now.failures = now.short_steps = 0
     now.delta = now.last_delta = now.step = now.taken = 0.0
     now.estimated, now.stuck_phi = 0, math.inf
@@ -441,4 +442,4 @@ def relax(address: int) -> None:
         pairs[k].p, pairs[k].n, pairs[k].dp, pairs[k].dn = p, n, 0.0, 0.0
     run(links[0].measure, (address,))
     theta = merit(now, sides, pairs, penalties, row_units, rows, terms.lower, 0.0, constraints, 0.0)[1]
-    now.theta_large = max(now.theta_large, 1e3 * max(1.0, theta))
+    now.theta_large = max(now.theta_large, min(1e3 * max(1.0, theta), max(now.theta_most, theta)))

@@ -134,7 +134,7 @@ def reset(address: int) -> None:
     steepest_gradient, steepest_jacobian = parts(address, "steepest_gradient steepest_jacobian")
     now = scalars[0]
     now.asked, now.iteration, now.kept, now.raises, now.definite = 0.0, 0, 0, 0, UNKNOWN
-    now.finer, now.concluded = 1.0, 0
+    now.finer, now.concluded, now.theta_most = 1.0, 0, math.inf
     now.evaluating = now.solving = now.judging = 0.0
     fill(row_units, 1.0)
     fill(units, 1.0)

@@ -25,6 +25,7 @@ NOW = np.dtype(
         ("alpha_dual", np.float64),
         ("theta_small", np.float64),
         ("theta_large", np.float64),
+        ("theta_most", np.float64),  # largest theta_large that a restart may have
         ("delta", np.float64),  # shift of the Hessian's diagonal that the present direction needed
         ("last_delta", np.float64),  # the last one that was not zero
         ("cost", np.float64),
