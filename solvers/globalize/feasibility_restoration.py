@@ -79,20 +79,26 @@ def _settled(run: SolveState) -> tuple[Linearization, bool] | None:
 
 def nearest(run: SolveState) -> tuple[Linearization, bool]:
     """End of the descent on the violation from the present iterate, and true if nothing near violates less."""
-    program = run.program
-    found, least = (within_bounds(program, lin) for lin in (run.lin, program.linearize(run.least_violated)))
-    if _squared(program, least) < ASTRAY * _squared(program, found):  # NaN is not less
-        found = least
-    if not infeasible_stationary(run.program, found, run.tolerances.violation):
-        found = least_violation(program, found, run.tolerances.violation, run.begin_restoration_step)
-        if run.violates(found.constraints):  # the next time goes on from there
-            run.look_at(found)
+    found = descended(run)
     while infeasible_stationary(run.program, found, run.tolerances.violation):
         lower = _downhill(run, found)
         if lower is None:
             return found, True
         found = lower
     return found, False
+
+
+def descended(run: SolveState) -> Linearization:
+    """End of a descent on the violation from the present iterate, or from the least violated if that is far below."""
+    program, violation = run.program, run.tolerances.violation
+    found, least = (within_bounds(program, lin) for lin in (run.lin, program.linearize(run.least_violated)))
+    if _squared(program, least) < ASTRAY * _squared(program, found):  # NaN is not less
+        found = least
+    if not infeasible_stationary(program, found, violation):
+        found = least_violation(program, found, violation, run.begin_restoration_step)
+        if run.violates(found.constraints):  # the next time goes on from there
+            run.look_at(found)
+    return found
 
 
 def leave(run: SolveState) -> Status | None:

@@ -50,6 +50,7 @@ from unifg.solvers.interior_point.state import (
     LIMIT_REACHED,
     NO,
     NOT_FINITE,
+    RESTORE,
     STALLED,
     STOPPED,
     TRY,
@@ -337,6 +338,9 @@ def test(address: int) -> None:
         now.answer = STALLED  # no penalty holds back an objective that falls faster than violation grows
         return
     if now.short_steps >= MOST_SHORT_STEPS and now.elastic == 0 and now.violated == 1:
+        if now.restores == 1 and now.cold == 1 and now.definite == NO:
+            now.answer = RESTORE
+            return
         run(links[0].relax, (address,))
     smallest = 0.1 * tolerance * now.finer * min(1.0, now.size)
     bound = False

@@ -34,7 +34,7 @@ from unifg.solution.optimality import Optimality, Tolerances, optimality, read_n
 from unifg.solution.solve_state import UNBOUNDED_COST, Conclusion, SolveState
 from unifg.solution.solver import Solver
 from unifg.solution.status import Status
-from unifg.solvers.globalize.feasibility_restoration import goes_on, nearest
+from unifg.solvers.globalize.feasibility_restoration import descended, goes_on, nearest
 from unifg.solvers.interior_point import each, state
 from unifg.solvers.interior_point.barrier import FINER
 from unifg.solvers.interior_point.loop import addresses, call
@@ -49,12 +49,13 @@ ENDINGS = {
     state.STALLED: Status.STALLED,
     state.NOT_FINITE: Status.NOT_FINITE,
     state.VIOLATED: Status.STALLED,
+    state.RESTORE: Status.STALLED,
     state.STOPPED: Status.STOP_RULE,
     state.TRY: Status.TIME_LIMIT,  # there was no time for the step
 }
 NO_ANSWER = -1
 ROOM = 2**18  # bytes for arrays that compiled functions allocate, besides those that grow with the graph
-STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED)
+STUCK = (state.STALLED, state.SINGULAR, state.VIOLATED, state.RESTORE)
 RESTARTS = 3  # from points that violate less than where the method came to a halt
 
 
@@ -213,6 +214,9 @@ class InteriorPoint(Solver):
             reason = self._attempt(run, workspace)
             if now["answer"] not in STUCK or run.status not in (None, Status.ITERATION_LIMIT):
                 return reason
+            if now["answer"] == state.RESTORE:
+                self._restore(run, workspace)
+                continue
             if run.optimality.violation <= run.tolerances.violation:
                 return reason
             found, closer = run.lin, False
@@ -235,6 +239,18 @@ class InteriorPoint(Solver):
             else:
                 return reason
             run.status = None
+
+    def _restore(self, run: SolveState, workspace: Workspace) -> None:
+        """Begin anew where a descent on the violation ends, if that violates less; else equalities become elastic."""
+        now, run.status = workspace.now, None
+        now["restores"] = 0
+        if not run.has_been_feasible:
+            found = descended(run)
+            if goes_on(run, found):
+                workspace.begin_at(found.values.flat, self)
+                return
+        workspace.call("relax")
+        now["going_on"] = 1
 
     def _attempt(self, run: SolveState, workspace: Workspace) -> Status | None:
         """From where the workspace is to one of the endings."""
@@ -434,6 +450,7 @@ class Workspace:
         kkt, violation, unit = options.tolerances
         now["tolerance"] = 0.0 if self.program.least_squares else kkt
         now["feasible"], now["violation_unit"] = violation, unit
+        now["restores"] = bool(options.restoration)
         now["scaling"], now["assisted"] = bool(options.scaling), not self.program.fully_compiled
         now["step_tolerance"] = options.step_tolerance
         now["violation_tolerance"] = options.violation_tolerance

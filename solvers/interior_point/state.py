@@ -84,6 +84,7 @@ NOW = np.dtype(
         ("concluded", np.int64),  # whether the present iterate has been judged
         ("kept", np.int64),  # whether an iterate kept all constraints
         ("short_steps", np.int64),  # in a row
+        ("restores", np.int64),  # whether to ask for a descent on the violation before equalities become elastic
         ("stuck", np.int64),  # iteration after which nothing has become better
         ("scaling", np.int64),  # whether units are to be found
         ("raises", np.int64),  # of the penalties
@@ -131,7 +132,7 @@ LINKS = np.dtype([(name, np.int64) for name in FUNCTIONS.split()])
 # What a call answers.
 TRY, ACCEPTED, AGAIN, CONVERGED, LIMIT_REACHED, SINGULAR, STALLED, NOT_FINITE, VIOLATED, STOPPED = range(10)
 # What the loop asks of Python, before it is called again.
-LINEARIZE, BEND, EVALUATE, SHOW = range(10, 14)
+LINEARIZE, BEND, EVALUATE, SHOW, RESTORE = range(10, 15)
 # What is known of the Hessian of Gauss-Newton; while it is examined, the matrix is written without the sides.
 UNKNOWN, YES, NO, EXAMINED = range(4)
 # Where it goes on then.
