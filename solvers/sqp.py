@@ -168,7 +168,6 @@ class SQP(Solver):
                     if not steps.pending:
                         continue
             shift = max(now["next_damping"], now["missing"])
-            shift = _bounded(run, workspace, shift) if failures == 0 else shift
             qp = workspace.subproblem(run.lin, run.multipliers, shift) if workspace.exact else None
             answer = self._attempt(run, workspace, shift, qp)
             if answer is None and workspace.distrust():
@@ -260,11 +259,6 @@ def _noted(run: SolveState, workspace: Subproblems, watch: RestorationTrigger, r
     if stepped := run.iterations >= rows:
         workspace.answered()
     return stepped
-
-
-def _bounded(run: SolveState, workspace: Subproblems, damping: float) -> float:
-    """With the exact Hessian damping must vanish with the error, or convergence would be linear."""
-    return max(min(damping, _size(run, workspace)), SMALLEST_DAMPING) if workspace.exact else damping
 
 
 def _size(run: SolveState, workspace: Subproblems) -> float:

@@ -113,7 +113,14 @@ class Balanced(CartPole):
 THROWN = np.random.default_rng(5).uniform([-1.0, -np.pi, -2.0, -3.0], [1.0, np.pi, 2.0, 3.0], (12, 4))
 
 
-@pytest.mark.parametrize("solver", [InteriorPoint(tolerance=1e-4), SQP(tolerance=1e-4, qp="graph")], ids=["ipm", "sqp"])
+CATCHERS = {
+    "ipm": InteriorPoint(tolerance=1e-4),
+    "sqp": SQP(tolerance=1e-4, qp="graph"),
+    "sqp exact": SQP(tolerance=1e-4, qp="graph", hessian="exact"),
+}
+
+
+@pytest.mark.parametrize("solver", CATCHERS.values(), ids=CATCHERS)
 def test_a_pole_thrown_off_its_plan_is_caught(solver: fg.Solver) -> None:
     """Controls at their limits leave a long way from the plan for the old state to one for where the pole is now."""
     stated = Balanced("balanced", False, 40).formulation()
