@@ -133,6 +133,20 @@ sys.exit(command.main(["warmup"]))
 
 
 @pytest.mark.product(2, of="processes of their own")
+def test_what_could_come_precompiled_and_does_not_fails_the_making(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def leaves(progress: precompile.Progress, anew: bool) -> None:
+        assert precompiled.recorder is not None and anew
+        precompiled.recorder.left_out |= {"a:plain": "its result is of no plain type", "a:sliced": "raises errors"}
+
+    monkeypatch.setattr(warm.numba.config, "CPU_NAME", "generic")
+    monkeypatch.setattr(warm, "run", leaves)
+    monkeypatch.setattr(precompiled, "ARCHIVE", tmp_path / "kernels.zip")
+    assert command.main(["warmup", "--ship"]) == 2 and (tmp_path / "kernels.zip").exists()
+    assert "by everybody: a:sliced: write loops" in capsys.readouterr().err
+
+
 def test_the_library_is_compiled_without_extras() -> None:
     done = run_script(WITHOUT_EXTRAS)
     assert done.stdout.startswith("library 2\n")

@@ -45,7 +45,8 @@ def ship(progress: Progress) -> Path:
     It is optimised for no processor: what is, with vectors of eight, is a tenth slower in the short loops of factors.
 
     Raises:
-        ScenarioError: Numba optimises for this processor.
+        ScenarioError: Numba optimises for this processor; or, once the archive is written, a function raises errors by
+            which it cannot be part of it.
     """
     if numba.config.CPU_NAME != "generic":
         raise ScenarioError("kernels that ship are for no processor: set NUMBA_CPU_NAME=generic (make kernels)")
@@ -53,6 +54,8 @@ def ship(progress: Progress) -> Path:
     with precompiled.recording() as recorder:
         run(progress, anew=True)
     recorder.write(precompiled.ARCHIVE)
+    if refused := [name for name, reason in recorder.left_out.items() if reason.startswith("raises")]:
+        raise ScenarioError(f"compiled on first use by everybody: {', '.join(refused)}: write loops instead of slices")
     return precompiled.ARCHIVE
 
 
