@@ -7,6 +7,7 @@ import re
 from functools import partial
 from pathlib import Path
 
+import numba
 import pytest
 
 from scripts import run_script
@@ -140,7 +141,7 @@ def test_what_could_come_precompiled_and_does_not_fails_the_making(
         assert precompiled.recorder is not None and anew
         precompiled.recorder.left_out |= {"a:plain": "its result is of no plain type", "a:sliced": "raises errors"}
 
-    monkeypatch.setattr(warm.numba.config, "CPU_NAME", "generic")
+    monkeypatch.setattr(numba.config, "CPU_NAME", "generic")
     monkeypatch.setattr(warm, "run", leaves)
     monkeypatch.setattr(precompiled, "ARCHIVE", tmp_path / "kernels.zip")
     assert command.main(["warmup", "--ship"]) == 2 and (tmp_path / "kernels.zip").exists()

@@ -222,7 +222,9 @@ class InteriorPoint(Solver):
             found, closer = run.lin, False
             if not run.has_been_feasible and self.restoration:
                 found, least = nearest(run)
-                closer = goes_on(run, found) and (now["answer"] != state.VIOLATED or not run.violates(found.constraints))
+                closer = goes_on(run, found)
+                if now["answer"] == state.VIOLATED and run.violates(found.constraints):
+                    closer = False  # a higher penalty is to tell first
                 if least:
                     run.begin_at(found)
                     run.status = Status.LOCALLY_INFEASIBLE
