@@ -129,3 +129,38 @@ def test_a_pole_thrown_off_its_plan_is_caught(solver: fg.Solver) -> None:
     guess = plan.shifted(stated.x, stated.u)
     for state in THROWN:
         prepared.solve(guess, data=stated.data(state, 0), check=True)
+
+
+def swing_up(seed: int, count: int = 50, dt: float = 0.06) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """Two links that hang, of which the elbow alone is driven, are to stand upright (an acrobot)."""
+    start = np.random.default_rng(seed).uniform(-np.ones(4), np.ones(4))
+
+    def rate(x: Array, u: Array) -> Array:
+        cosine, lean = np.cos(x[:, 1]), np.sin(x[:, 0] + x[:, 1])
+        pull, spin = 0.5 * np.sin(x[:, 1]), 2.0 * x[:, 2] + x[:, 3]
+        a, b, c = 1.7 + cosine, 0.6 + 0.5 * cosine, 0.6
+        p = pull * x[:, 3] * spin - 9.81 * (1.5 * np.sin(x[:, 0]) + 0.5 * lean) - 0.05 * x[:, 2]
+        q = 6.0 * u[:, 0] - pull * x[:, 2] ** 2 - 4.905 * lean - 0.05 * x[:, 3]
+        return np.stack([x[:, 2], x[:, 3], c * p - b * q, a * q - b * p], axis=1) / np.stack(
+            [np.ones(len(x)), np.ones(len(x)), a * c - b**2, a * c - b**2], axis=1
+        )
+
+    def gap(x: Array, u: Array, y: Array) -> Array:
+        first = rate(x, u)
+        second = rate(x + 0.5 * dt * first, u)
+        third = rate(x + 0.5 * dt * second, u)
+        return np.asarray(y - x - dt / 6.0 * (first + 2.0 * second + 2.0 * third + rate(x + dt * third, u)))
+
+    graph, x, u = graph_of(("x", fg.Rn(4), count + 1), ("u", fg.Rn(1), count))
+    graph.fix(x[0], start)
+    graph.minimize(fg.prior, u, np.zeros(1))
+    graph.constrain(gap, x[:-1], u, x[1:], lower=0.0, upper=0.0, name="motion")
+    graph.constrain(fg.prior, x[-1], [np.pi, 0.0, 0.0, 0.0], lower=0.0, upper=0.0, name="upright")
+    graph.bound(u, lower=-3.0, upper=3.0)
+    return graph, {x: np.linspace(start, [np.pi, 0.0, 0.0, 0.0], count + 1), u: np.zeros((count, 1))}
+
+
+def test_a_restart_does_not_leave_the_constraints_as_far_as_before() -> None:
+    """Where a feasible point has been found, and the solve has gone far from it twice; else all of these stall."""
+    found = [InteriorPoint().solve(*swing_up(seed)).converged for seed in (5, 26, 45, 76, 86)]
+    assert sum(found) >= 4, found
