@@ -9,11 +9,11 @@ import unifg as fg
 from problems.control import Unicycle
 from problems.cops import PROBLEMS, electrons
 from problems.graphs import drawn_to, graph_of, graph_with
+from problems.parkings import least_time
 from problems.scaled import Units, scaled
 from unifg.problem import units as measures
 from unifg.solvers import SQP, AugmentedLagrangian, InteriorPoint
 from unifg.solvers.interior_point.barrier import STUCK
-from unifg.typing import Array
 
 NAMED = {problem.name: problem for problem in PROBLEMS}
 TIMES = ("robot", "steering", "brachistochrone, squared")
@@ -202,34 +202,10 @@ def test_first_penalties_follow_slopes_of_scalar_costs(name: str) -> None:
     assert found[0].iterations == found[1].iterations <= 70
 
 
-def parked(seed: int) -> tuple[fg.Graph, dict[fg.Family, Array]]:
-    """A car that is to stand at the origin in least time, from a pose at random; states (x, y, heading, speed, steer)."""
-    count, start = 40, np.zeros(5)
-    rng = np.random.default_rng(seed)
-    start[:3] = rng.uniform([-6.0, 2.0, -np.pi], [6.0, 6.0, np.pi])
-
-    def rate(x: Array, u: Array) -> Array:
-        speed, turn = x[:, 3], x[:, 3] * np.tan(x[:, 4]) / 2.5
-        return np.stack([speed * np.cos(x[:, 2]), speed * np.sin(x[:, 2]), turn, u[:, 0], u[:, 1]], axis=1)
-
-    graph, x, u, time = graph_of(("x", fg.Rn(5), count + 1), ("u", fg.Rn(2), count), ("time", fg.Rn(1), 1))
-    graph.minimize_scalar(lambda t: t[:, 0], time)
-    graph.minimize(fg.prior, u, np.zeros(2), sigma=10.0)
-    graph.fix(x[0], start)
-    graph.constrain(
-        lambda a, u, b, t: b - a - t / count * rate(0.5 * (a + b), u), x[:-1], u, x[1:], time[0], lower=0.0, upper=0.0
-    )
-    graph.constrain(fg.prior, x[-1], np.zeros(5), lower=0.0, upper=0.0, name="goal")
-    graph.bound(u, lower=[-2.0, -1.0], upper=[2.0, 1.0])
-    graph.bound(x, lower=[-np.inf, -np.inf, -np.inf, -3.0, -0.6], upper=[np.inf, np.inf, np.inf, 3.0, 0.6])
-    graph.bound(time, lower=1.0, upper=30.0)
-    return graph, {x: np.linspace(start, 0.0, count + 1), u: np.zeros((count, 2)), time: np.array([[8.0]])}
-
-
 def test_a_feasible_point_is_looked_for_before_equalities_become_elastic() -> None:
-    """Where the cost is a time; there is no other curvature than that of the constraints."""
+    """A cost that is a time has no other curvature than that of the constraints."""
     taken = {True: 0, False: 0}
     for seed in range(6):
         for restoration in taken:
-            taken[restoration] += InteriorPoint(restoration=restoration).solve(*parked(seed), check=True).iterations
+            taken[restoration] += InteriorPoint(restoration=restoration).solve(*least_time(seed), check=True).iterations
     assert taken[True] < 0.5 * taken[False], taken

@@ -21,6 +21,7 @@ from fences import fences
 from problems.around_a_disc import around_a_disc
 from problems.control import Quadrotor, Stated, Unicycle
 from problems.graphs import drawn_to, graph_of, graph_with
+from problems.parkings import least_time
 from scripts import CHECKOUT
 from unifg.codegen import standalone
 from unifg.errors import BackendError
@@ -126,6 +127,17 @@ def test_c_gives_the_bits_of_python(make: Callable[[], tuple[fg.Graph, Any, fg.D
     rng = np.random.default_rng(0)
     each = [{handle: handle.value + 0.1 * rng.standard_normal(handle.value.shape)} for _ in range(12)]
     assert_same(prepared, tmp_path, guess, each)
+
+
+@compiled_by_c
+def test_c_does_without_the_restoration_of_python(tmp_path: Path) -> None:
+    """Equalities become elastic where Python would look for a feasible point first."""
+    graph, guess = least_time(3)
+    prepared = InteriorPoint().prepare(graph)
+    assert prepared.solve(guess, check=True).restoration_steps > 0
+    prepared.export(tmp_path)
+    assert prepared.solve(guess).restoration_steps > 0
+    assert_same(InteriorPoint(restoration=False).prepare(graph), tmp_path, guess, [{}])
 
 
 @pytest.mark.product(1, of="exports")

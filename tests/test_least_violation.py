@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -113,17 +114,11 @@ class Balanced(CartPole):
 THROWN = np.random.default_rng(5).uniform([-1.0, -np.pi, -2.0, -3.0], [1.0, np.pi, 2.0, 3.0], (12, 4))
 
 
-CATCHERS = {
-    "ipm": InteriorPoint(tolerance=1e-4),
-    "sqp": SQP(tolerance=1e-4, qp="graph"),
-    "sqp exact": SQP(tolerance=1e-4, qp="graph", hessian="exact"),
-}
-
-
-@pytest.mark.parametrize("solver", CATCHERS.values(), ids=CATCHERS)
-def test_a_pole_thrown_off_its_plan_is_caught(solver: fg.Solver) -> None:
+@pytest.mark.parametrize("name", ["ipm", "sqp graph", "sqp exact"])
+def test_a_pole_thrown_off_its_plan_is_caught(name: str) -> None:
     """Controls at their limits leave a long way from the plan for the old state to one for where the pole is now."""
     stated = Balanced("balanced", False, 40).formulation()
+    solver = replace(BACKENDS[name], tolerance=1e-4)
     prepared = solver.prepare(stated.graph)
     plan = prepared.solve(stated.guess, data=stated.data(np.zeros(4), 0), check=True)
     guess = plan.shifted(stated.x, stated.u)
@@ -161,6 +156,6 @@ def swing_up(seed: int, count: int = 50, dt: float = 0.06) -> tuple[fg.Graph, di
 
 
 def test_a_restart_does_not_leave_the_constraints_as_far_as_before() -> None:
-    """Where a feasible point has been found, and the solve has gone far from it twice; else all of these stall."""
+    """These stall otherwise: a feasible point has been found, and the solve has gone far from it twice."""
     found = [InteriorPoint().solve(*swing_up(seed)).converged for seed in (5, 26, 45, 76, 86)]
     assert sum(found) >= 4, found

@@ -510,6 +510,7 @@ class Workspace:
         assert rows is not None
         guess = np.zeros((1, len(work.values))), np.zeros((1, len(work.multipliers)))
         arguments = self.instances(options, rows, *guess)
+        self.now["restores"] = 0  # there is nobody to ask
         words = each.instances.describe(arguments)
         found = arguments.found, arguments.found_multipliers, arguments.numbers
         fields, links = program.table.fields, (arguments.functions, problem.links)

@@ -15,6 +15,7 @@ import numba
 import numpy as np
 
 import unifg as fg
+from problems.graphs import graph_of
 from unifg.typing import Array
 
 HORIZON, DT = 50, 0.2  # steps, [s]
@@ -120,3 +121,27 @@ class Parking:
         if self._cars is not None:
             data[self._cars] = drawn.cars.ravel()
         return self._run.solve({self.x: states, self.u: controls}, data=data, **options)
+
+
+def least_time(seed: int) -> tuple[fg.Graph, dict[fg.Family, Array]]:
+    """A car that is to stand at the origin in least time, from a pose at random: x, y, heading, speed, steering."""
+    count, start = 40, np.zeros(5)
+    rng = np.random.default_rng(seed)
+    start[:3] = rng.uniform([-6.0, 2.0, -np.pi], [6.0, 6.0, np.pi])
+
+    def rate(x: Array, u: Array) -> Array:
+        speed, turn = x[:, 3], x[:, 3] * np.tan(x[:, 4]) / 2.5
+        return np.stack([speed * np.cos(x[:, 2]), speed * np.sin(x[:, 2]), turn, u[:, 0], u[:, 1]], axis=1)
+
+    graph, x, u, time = graph_of(("x", fg.Rn(5), count + 1), ("u", fg.Rn(2), count), ("time", fg.Rn(1), 1))
+    graph.minimize_scalar(lambda t: t[:, 0], time)
+    graph.minimize(fg.prior, u, np.zeros(2), sigma=10.0)
+    graph.fix(x[0], start)
+    graph.constrain(
+        lambda a, u, b, t: b - a - t / count * rate(0.5 * (a + b), u), x[:-1], u, x[1:], time[0], lower=0.0, upper=0.0
+    )
+    graph.constrain(fg.prior, x[-1], np.zeros(5), lower=0.0, upper=0.0, name="goal")
+    graph.bound(u, lower=[-2.0, -1.0], upper=[2.0, 1.0])
+    graph.bound(x[1:], lower=[-np.inf, -np.inf, -np.inf, -3.0, -0.6], upper=[np.inf, np.inf, np.inf, 3.0, 0.6])
+    graph.bound(time, lower=1.0, upper=30.0)
+    return graph, {x: np.linspace(start, 0.0, count + 1), u: np.zeros((count, 2)), time: np.array([[8.0]])}
