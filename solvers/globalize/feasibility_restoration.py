@@ -31,7 +31,7 @@ ASIDE = 1e-3  # standard deviation of the step off a point that may be a saddle
 PATIENCE = 20  # iterations whose violation has not fallen
 FALLING = 0.9
 ASTRAY = 0.1  # of the squared violation: where the least so far is less than this share, iterates have gone astray
-SMALLER = 0.25  # of the squared violation: a point from which a solve may go on
+SMALLER = 0.25  # of the squared violation: where restoration has ended, to go on from there
 ROUNDS = 5  # of holding unknowns that a step would move past a bound
 LESS = 1e-4  # relative decrease that tells a saddle from a minimum in a flat valley
 
@@ -61,7 +61,7 @@ def resume(run: SolveState, status: Status) -> Status | None:
 
 
 def goes_on(run: SolveState, found: Linearization) -> bool:
-    """Test whether a point is feasible, or violates less than half of what the present one and the last such did."""
+    """Note where a restoration ended; true if that is feasible, or violates less than half of here and the last end."""
     before, run.resumed = min(_squared(run.program, run.lin), run.resumed), _squared(run.program, found)
     return not run.violates(found.constraints) or run.resumed < SMALLER * before
 
