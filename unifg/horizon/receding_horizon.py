@@ -222,8 +222,6 @@ class RecedingHorizon:
         self.waited = 0
         self._believe_nothing()
 
-    # ---------------------------------------------------------------- a tick
-
     def tick(
         self,
         given: Any = None,
@@ -333,7 +331,8 @@ class RecedingHorizon:
 
     def now(self, present: ArrayLike, given: Any = None, constants: Mapping[str, Array] | None = None) -> Context[Any]:
         """Context for the terms; arguments as of :meth:`plan`."""
-        require_kinds("plan", GraphError, RecedingHorizon.now.__annotations__, {"constants": constants}, Mapping)
+        if constants is not None:
+            require_kinds("plan", GraphError, RecedingHorizon.now.__annotations__, {"constants": constants}, Mapping)
         history = None if self.window is None else self.window.history
         known = (
             {static.name: static.values for static in self.robot.constants} if history is None else history.constants
@@ -602,7 +601,7 @@ class RecedingHorizon:
         if self._branches is not None:
             guess = solution.shifted(*along, by=0)
             return self._resampled(guess, solution[self.x], solution[self.u], later)
-        if np.allclose(np.diff(self.times), self.times[1], rtol=1e-9, atol=0.0):
+        if np.ptp(self.kept.lengths) <= 1e-9 * self.times[1]:
             return solution.shifted(*along, by=ticks) if self.waited else solution.shifted(*along)
         joint = len(self.x.family) > self.steps + 1
         whole = 1 if joint else round(self.steps * ticks * self.times[1] / self.times[-1])
